@@ -1,0 +1,55 @@
+"""Every way dynsim refuses or stops: one exception class per cause, each with the exit code the CLI uses."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+
+class DynsimError(Exception):
+    """Base of all errors a user can meet; printed without a traceback."""
+
+    exit_code: ClassVar[int] = 2
+
+
+class ScenarioError(DynsimError):
+    """A scenario cannot be read or is not valid: the message names file, line, key, value and the fix."""
+
+
+class ModelError(DynsimError):
+    """A description of bodies, joints, motors or contacts that no physics can be made of."""
+
+
+class UnreachableReference(DynsimError):
+    """A reference path that the named joints cannot follow (time and distance are in the message)."""
+
+
+class RecordError(DynsimError):
+    """A record cannot be written or read."""
+
+
+class SimulationStopped(DynsimError):
+    """The simulation could not go on (divergence, no solution).
+
+    Attributes
+    ----------
+    time : float
+        Simulated time of the stop [s].
+    state : dict[str, Any]
+        The last good state, by name.
+    record : Record | None
+        What was simulated until then.
+    """
+
+    exit_code: ClassVar[int] = 3
+
+    def __init__(self, message: str, *, time: float = float("nan"), state: dict[str, Any] | None = None) -> None:
+        super().__init__(message)
+        self.time = time
+        self.state = state or {}
+        self.record: Any = None
+
+
+class SimulationInterrupted(SimulationStopped):
+    """The user pressed Ctrl-C; what was simulated so far is kept and marked incomplete."""
+
+    exit_code: ClassVar[int] = 130

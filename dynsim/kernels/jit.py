@@ -1,0 +1,68 @@
+"""The one place that compiles: ``@kernel`` on plain module-level functions.
+
+``cache=True`` of numba checks only the file that holds the function: an edit in a callee elsewhere silently runs old
+machine code. So the cache lives in a folder named by a hash of all kernel sources and the numba version.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+import numpy as np
+from numba.core import config
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+@lru_cache(maxsize=1)
+def cache_folder() -> Path:
+    """Folder of the compiled kernels: user-writable, named by what would make its content stale."""
+    digest = hashlib.sha256(f"{numba.__version__} {np.__version__}".encode())
+    for source in sorted(Path(__file__).parent.rglob("*.py")):
+        digest.update(source.read_bytes())
+    base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    name = Path("dynsim", digest.hexdigest()[:16])
+    for root in (Path(base).expanduser(), Path(tempfile.gettempdir(), f"cache-{os.getuid()}")):
+        try:
+            (root / name).mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(root / name, os.W_OK):
+            return root / name
+    return Path(tempfile.mkdtemp(prefix="dynsim-"))
+
+
+def is_cached() -> bool:
+    """True when compiled kernels of these sources are on disk (a first run compiles them)."""
+    return any(cache_folder().rglob("*.nbi"))
+
+
+def kernel(function: F) -> F:
+    """Compile ``function`` on first call and keep the machine code on disk.
+
+    No ``fastmath``: NaN must stay NaN so that divergence is seen. ``error_model="numpy"``: a division by zero gives
+    inf or NaN and does not branch.
+    """
+    previous = config.CACHE_DIR
+    config.CACHE_DIR = str(cache_folder())
+    try:
+        return numba.njit(cache=True, error_model="numpy")(function)
+    finally:
+        config.CACHE_DIR = previous
+
+
+def reals(values: Any) -> np.ndarray:
+    """The canonical float array of every kernel argument: float64, C order, writable, a copy."""
+    return np.array(values, dtype=np.float64, order="C")
+
+
+def integers(values: Any) -> np.ndarray:
+    """The canonical integer array of every kernel argument: int64, C order, writable, a copy."""
+    return np.array(values, dtype=np.int64, order="C")
