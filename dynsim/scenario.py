@@ -470,9 +470,9 @@ def _locate(data: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any
     keys: list[int | str] = []
     node, found = data, True
     for part in loc:
-        if found and isinstance(node, Mapping) and part in node:
-            node = node[part]
-        elif found and isinstance(node, list) and isinstance(part, int) and part < len(node):
+        in_mapping = isinstance(node, Mapping) and part in node
+        in_list = isinstance(node, list) and isinstance(part, int) and part < len(node)
+        if found and (in_mapping or in_list):
             node = node[part]
         elif isinstance(node, Mapping) and node.get("type") == part:
             continue
@@ -494,7 +494,7 @@ def _line(source: Any, keys: list[int | str]) -> int | None:
         if not lines or key not in lines:
             break
         line = lines[key][0] + 1
-        node = node[key]
+        node = node[key]  # type: ignore[index]
     return line
 
 
