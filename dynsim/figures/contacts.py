@@ -60,7 +60,7 @@ def forces_comparison(records: Mapping[str, Record]) -> Figure | None:
                 style.line(axes, record.time, _force(record, name), label=label, **styles[variant])
             _mark_pulling(axes)
         panels[0].set_ylabel(f"{name}\n$f_n$ [N]")
-        style.legend_above(panels[-1], columns=len(having[name]) if len(having[name]) < 3 else 2)
+        style.legend_above(panels[-1], columns=2 if len(having[name]) > 2 else 3)
     return figure
 
 
@@ -118,17 +118,5 @@ def _mark_pulling(axes: Axes) -> None:
     low, high = axes.get_ylim()
     if low >= 0.0:
         return
-    axes.axhspan(low, 0.0, color=style.PULLING, alpha=0.08, linewidth=0)
+    axes.axhspan(low, 0.0, color=style.PULLING, alpha=0.13, linewidth=0, label="surface pulls")
     axes.set_ylim(low, high)
-    # Only where there is room for the word.
-    if low < -0.12 * (high - low):
-        axes.annotate(
-            "surface pulls",
-            (1.0, 0.0),
-            xycoords="axes fraction",
-            xytext=(-3, 3),
-            textcoords="offset points",
-            ha="right",
-            color=style.PULLING,
-            fontsize=7,
-        )

@@ -133,9 +133,11 @@ def edge_on(points: Array) -> Array:
     Running to and fro over itself it would fill the gaps of its own dashes.
     """
     points = style.sparse(points)
+    if len(points) < 3 or not np.isfinite(points).all():
+        return points
     centred = points - points.mean(axis=0)
     sizes, directions = np.linalg.svd(centred, full_matrices=False)[1:]
-    if len(points) < 3 or sizes[-1] > 1e-6 * sizes[0]:
+    if sizes[-1] > 1e-6 * sizes[0]:
         return points
     along = centred @ directions[0]
     return points[[int(along.argmin()), int(along.argmax())]]

@@ -24,9 +24,13 @@ def motors(record: Record) -> Figure | None:
     late = record.time >= style.settle_time(record)
     effort = np.sqrt((record["current"][late if late.any() else slice(None)] ** 2).mean(axis=0))
     shown = np.arange(count) if count <= ALL else np.sort(np.argsort(effort)[::-1][:LARGEST])
-    what = "motor currents and voltages" + (f", {LARGEST} largest of {count}" if count > ALL else "")
+    what = "motor currents and voltages" + (
+        f"; {LARGEST} of {count} with the largest rms current" if count > ALL else ""
+    )
     figure = style.new_figure(4.4, style.title(record, what))
-    rows = style.time_rows(figure, [[(record.time, record[name])] for name, _ in signals], style.settle_time(record))
+    rows = style.time_rows(
+        figure, [[(record.time, record[name])] for name, _ in signals], style.settle_time(record), compress=True
+    )
     for (name, label), panels in zip(signals, rows, strict=True):
         for axes in panels:
             _draw(axes, record, name, shown)

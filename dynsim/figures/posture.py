@@ -92,13 +92,14 @@ def posture(record: Record) -> Figure | None:
     drawn = [] if body is None else [body.segments(record["q"][k]) for k in _moments(len(record))]
     plane = _side_plane(record, drawn)
     low, high = _bounds([record], drawn)
-    wide = np.hypot(high[0] - low[0], high[1] - low[1]) > 1.3 * (high[2] - low[2])
+    wide = np.hypot(high[0] - low[0], high[1] - low[1]) > 2.2 * (high[2] - low[2])
     height = 5.6 if wide else 4.0
     figure = style.new_figure(height, style.title(record, f"posture at {record.time[-1]:.4g} s, and before (faint)"))
-    grid = figure.add_gridspec(2, 1, height_ratios=[1.25, 1.0]) if wide else figure.add_gridspec(1, 2)
+    # Side by side, the labels of the 3D view need some room to their right.
+    grid = figure.add_gridspec(2, 1, height_ratios=[1.25, 1.0]) if wide else figure.add_gridspec(1, 2, wspace=0.15)
     space: Any = figure.add_subplot(grid[0], projection="3d")
     side = figure.add_subplot(grid[1])
-    _space_view(space, record, body, drawn, (low, high))
+    _space_view(space, record, body, drawn, (low, high), zoom=1.75 if wide else 0.95)
     _side_view(side, record, body, drawn, plane, colour=ARM_COLOUR)
     _frame_side(side, plane, drawn, [record], [] if body is None else list(body.surfaces.values()))
     if note:
@@ -198,9 +199,11 @@ def _side_plane(record: Record, drawn: Sequence[Array]) -> SidePlane:
 def _extent(plane: SidePlane, drawn: Sequence[Array], records: Sequence[Record]) -> tuple[Array, Array]:
     flat = plane.project(_points(records, drawn))
     low, high = flat.min(axis=0), flat.max(axis=0)
-    margin = 0.05 * float((high - low).max() or 1.0)
+    span = float((high - low).max() or 1.0)
+    # An upright arm would leave no width for the axis.
+    extra = np.maximum(np.array([0.3, 0.05]) * span - 0.5 * (high - low), 0.0) + 0.05 * span
     # Below there must be room for what is written at the contacts.
-    return low - margin * np.array([1.0, 1.6]), high + margin
+    return low - extra - np.array([0.0, 0.05 * span]), high + extra
 
 
 def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
@@ -249,7 +252,8 @@ def _side_view(
             colors=colour,
             linewidths=2.4 if last else 1.2,
             alpha=1.0 if last else 0.22,
-            capstyle="round",
+            # Round ends of faint segments would overlap to dark dots.
+            capstyle="round" if last else "butt",
             zorder=3 if last else 2,
         )
         axes.add_collection(lines)
@@ -276,7 +280,7 @@ def _side_view(
 
 
 def _space_view(
-    axes: Axes3D, record: Record, body: Body | None, drawn: Sequence[Array], bounds: tuple[Array, Array]
+    axes: Axes3D, record: Record, body: Body | None, drawn: Sequence[Array], bounds: tuple[Array, Array], zoom: float
 ) -> None:
     low, high = bounds
     # The order of drawing is given: by depth, the floor would hide the contacts that lie on it.
@@ -305,7 +309,7 @@ def _space_view(
     axes.set_ylim(low[1], high[1])
     axes.set_zlim(low[2], high[2])
     # The square of the axes is smaller than the room that a long arm has: fill it, and do not clip at the square.
-    axes.set_box_aspect(tuple(high - low), zoom=1.75)
+    axes.set_box_aspect(tuple(high - low), zoom=zoom)
     for artist in axes.get_children():
         artist.set_clip_on(False)
         artist.set_in_layout(False)
@@ -313,8 +317,8 @@ def _space_view(
     axes.set_ylabel("y [m]", labelpad=-2)
     axes.set_zlabel("z [m]", labelpad=-6)
     axes.tick_params(pad=-2)
-    axes.locator_params(nbins=5)
-    axes.locator_params(axis="z", nbins=3)
+    for name, share in zip("xyz", (high - low) / (high - low).max(), strict=True):
+        axes.locator_params(axis=name, nbins=2 + int(4 * share))
     axes.view_init(elev=22, azim=-70)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
@@ -335,7 +339,7 @@ def _draw_surface(axes: Axes3D, surface: Quadric, low: Array, high: Array) -> No
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
     reach = (corners - anchor) @ across.T
     # A flat surface is one polygon: seams between many would show.
-    count = 25 if np.any(surface.Q) else 2
+    count = 41 if np.any(surface.Q) else 2
     u, v = np.meshgrid(*(np.linspace(reach[:, k].min(), reach[:, k].max(), count) for k in (0, 1)))
     start = anchor + u[..., None] * across[0] + v[..., None] * across[1]
     a = 0.5 * float(normal @ surface.Q @ normal)

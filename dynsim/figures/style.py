@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, SymmetricalLogLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
 from dynsim.errors import RecordError
@@ -117,13 +117,12 @@ def variant_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
     Later variants lie on top and are thinner, so that equal curves are still seen to be several.
     """
     many = len(VARIANT_COLOURS)
-    widths = np.linspace(2.8, 1.1, len(names)) if len(names) > 1 else [1.4]
     dashes = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)))
     return {
         name: {
             "color": VARIANT_COLOURS[k % many],
             "linestyle": dashes[(k // many) % len(dashes)],
-            "linewidth": widths[k],
+            "linewidth": 1.0 + 1.6 * 0.4**k if len(names) > 1 else 1.4,
         }
         for k, name in enumerate(names)
     }
@@ -138,7 +137,7 @@ def log_axis(axes: Axes) -> None:
     """A logarithmic y axis with plain numbers, also for ranges of less than a decade."""
     axes.set_yscale("log")
     low, high = axes.get_ylim()
-    near = high < 30.0 * low
+    near = high < 200.0 * low
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if near else (1.0,)))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
@@ -146,7 +145,10 @@ def log_axis(axes: Axes) -> None:
 
 def legend_above(axes: Axes, columns: int = 3) -> None:
     """The legend over the axes, where it hides nothing."""
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=columns, borderaxespad=0.0)
+    legend = axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=columns, borderaxespad=0.0)
+    # It may reach over the panel to its left; the empty title keeps the room above.
+    legend.set_in_layout(False)
+    axes.set_title(" ")
 
 
 def settle_time(record: Record) -> float:
@@ -179,7 +181,7 @@ def line(axes: Axes, time: Array, values: Array, **options: Any) -> None:
 
 
 def time_rows(
-    figure: Figure, rows: Sequence[Sequence[Series]], settle: float, *, zero: bool = True
+    figure: Figure, rows: Sequence[Sequence[Series]], settle: float, *, compress: bool = False
 ) -> list[tuple[Axes, ...]]:
     """Axes for quantities over time, one row each, with a column for the initial transient where it needs one.
 
@@ -190,14 +192,14 @@ def time_rows(
     ----------
     rows : for each row the series that will be drawn in it
     settle : time from which on the values count as settled [s]
-    zero : keep zero in the cut axes
+    compress : draw what exceeds the settled range in the transient's panel on a logarithmic axis
 
     Returns
     -------
     list of tuples of Axes
         For each row (transient, whole run) or (whole run,); draw everything in all of them.
     """
-    found = [_transient(row, settle, zero) for row in rows]
+    found = [_transient(row, settle) for row in rows]
     ends = [time[-1] for row in rows for time, _ in row]
     end = max(ends)
     window = max((one.end for one in found if one is not None), default=0.0)
@@ -212,7 +214,8 @@ def time_rows(
             axes[0].set_xlim(0.0, min(1.2 * window, end))
         if one is not None:
             axes[-1].set_ylim(one.low, one.high)
-            _compress(axes[0], one)
+            if compress:
+                _compress(axes[0], one)
     for axis in grid[-1]:
         axis.set_xlabel("time [s]")
     if split:
@@ -231,16 +234,14 @@ class _Transient:
     largest: float
 
 
-def _transient(row: Sequence[Series], settle: float, zero: bool) -> _Transient | None:
+def _transient(row: Sequence[Series], settle: float) -> _Transient | None:
     """The transient of a row; None when the axis need not be cut."""
     settled = np.concatenate([values[time >= settle].ravel() for time, values in row])
     everything = np.concatenate([values.ravel() for _, values in row])
     settled, everything = settled[np.isfinite(settled)], everything[np.isfinite(everything)]
     if settled.size < 2:
         return None
-    low, high = float(settled.min()), float(settled.max())
-    if zero:
-        low, high = min(low, 0.0), max(high, 0.0)
+    low, high = min(float(settled.min()), 0.0), max(float(settled.max()), 0.0)
     span = high - low
     if span <= 0.0 or np.ptp(np.append(everything, [low, high])) < 2.0 * span:
         return None
@@ -259,5 +260,7 @@ def _compress(axes: Axes, transient: _Transient) -> None:
     settled = max(abs(transient.low), abs(transient.high))
     if transient.largest > 5.0 * settled:
         axes.set_yscale("symlog", linthresh=settled)
+        ticks = [m * 10.0**k for k in range(-9, 10) for m in (1, 3) if settled <= m * 10.0**k <= transient.largest]
+        axes.set_yticks([-tick for tick in ticks[::-1]] + [0.0, *ticks])
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
-        axes.yaxis.set_major_locator(SymmetricalLogLocator(base=10.0, linthresh=settled, subs=[1.0, 3.0]))
+        axes.yaxis.set_minor_locator(NullLocator())
