@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
 from dynsim import metrics
 from dynsim.figures import style
@@ -131,6 +132,7 @@ def _residual(axes: Axes, record: Record, turnover: float) -> None:
     size = np.abs(record["energy_residual"])
     if np.any(size > 0.0):
         axes.set_yscale("log", nonpositive="mask")
+        axes.yaxis.set_minor_locator(NullLocator())
     shown = np.where(size > 0.0, size, np.nan)
     if np.isfinite(shown).any():
         style.line(axes, record.time, np.where(np.isnan(shown), np.nanmin(shown), shown), color=style.BLACK, lw=0.9)

@@ -36,7 +36,7 @@ def path_comparison(records: Mapping[str, Record]) -> Figure | None:
     shown = {name: record for name, record in records.items() if "hand_position" in record}
     if not shown:
         return None
-    figure = style.new_figure(3.0, style.comparison_title(list(shown.values()), "hand paths"))
+    figure = style.new_figure(3.2, style.comparison_title(list(shown.values()), "hand paths"))
     panels = _planes(figure, list(shown.values()))
     styles = style.variant_styles(list(records))
     for axes, plane in zip(panels, PLANES, strict=True):

@@ -99,7 +99,7 @@ def posture(record: Record) -> Figure | None:
     grid = figure.add_gridspec(2, 1, height_ratios=[1.25, 1.0]) if wide else figure.add_gridspec(1, 2, wspace=0.15)
     space: Any = figure.add_subplot(grid[0], projection="3d")
     side = figure.add_subplot(grid[1])
-    _space_view(space, record, body, drawn, (low, high), zoom=1.75 if wide else 0.95)
+    _space_view(space, record, body, drawn, (low, high), zoom=1.65 if wide else 0.95)
     _side_view(side, record, body, drawn, plane, colour=ARM_COLOUR)
     _frame_side(side, plane, drawn, [record], [] if body is None else list(body.surfaces.values()))
     if note:
@@ -313,7 +313,7 @@ def _space_view(
     for artist in axes.get_children():
         artist.set_clip_on(False)
         artist.set_in_layout(False)
-    axes.set_xlabel("x [m]", labelpad=-2)
+    axes.set_xlabel("x [m]", labelpad=-5)
     axes.set_ylabel("y [m]", labelpad=-2)
     axes.set_zlabel("z [m]", labelpad=-6)
     axes.tick_params(pad=-2)
@@ -372,12 +372,11 @@ def _contact_points(record: Record, body: Body | None) -> list[tuple[Contact, Ar
 
 
 def _contact_mark(force: float) -> dict[str, Any]:
-    """Pointing the way the surface acts: up and blue where it pushes, down and red where it would have to pull."""
-    pulls = force < 0.0
-    return {
-        "marker": "v" if pulls else "^",
-        "color": style.PULLING if pulls else style.BLUE,
-        "markersize": 7,
-        "markeredgecolor": "white",
-        "label": "contact, surface pulls" if pulls else "contact, surface pushes",
-    }
+    """A blue triangle up where the surface pushes, a red one down where it would have to pull, a grey dot if open."""
+    if force < 0.0:
+        marker, colour, label = "v", style.PULLING, "contact, surface pulls"
+    elif force > 0.0:
+        marker, colour, label = "^", style.BLUE, "contact, surface pushes"
+    else:
+        marker, colour, label = "o", style.GREY, "contact, open"
+    return {"marker": marker, "color": colour, "label": label, "markersize": 7, "markeredgecolor": "white"}

@@ -145,7 +145,7 @@ def log_axis(axes: Axes) -> None:
 
 def legend_above(axes: Axes, columns: int = 3) -> None:
     """The legend over the axes, where it hides nothing."""
-    legend = axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=columns, borderaxespad=0.0)
+    legend = axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.0)
     # It may reach over the panel to its left; the empty title keeps the room above.
     legend.set_in_layout(False)
     axes.set_title(" ")
@@ -258,7 +258,7 @@ def _transient(row: Sequence[Series], settle: float) -> _Transient | None:
 def _compress(axes: Axes, transient: _Transient) -> None:
     """Linear within the settled range and logarithmic beyond, where a peak would hide what follows it."""
     settled = max(abs(transient.low), abs(transient.high))
-    if transient.largest > 5.0 * settled:
+    if transient.largest > 3.0 * settled:
         axes.set_yscale("symlog", linthresh=settled)
         ticks = [m * 10.0**k for k in range(-9, 10) for m in (1, 3) if settled <= m * 10.0**k <= transient.largest]
         axes.set_yticks([-tick for tick in ticks[::-1]] + [0.0, *ticks])
