@@ -53,19 +53,19 @@ def error(record: Record) -> Figure | None:
         return None
     deviation = MILLI * (record["hand_position"] - record["target_position"])
     norm = np.linalg.norm(deviation, axis=1)
-    figure = style.new_figure(3.9, style.title(record, "tracking error"))
+    figure = style.new_figure(4.1, style.title(record, "tracking error"))
     top, bottom = figure.subplots(2, 1, sharex=True)
     for k, name in enumerate("xyz"):
         style.line(top, record.time, deviation[:, k], label=f"$e_{name}$", color=style.AXIS_COLOURS[name])
     top.set_ylabel("hand − target [mm]")
-    top.legend(ncols=3, loc="upper right")
+    style.legend_above(top)
     style.line(bottom, record.time, norm, label=_error_label("|e|", record), color=style.BLACK)
     bottom.set_ylabel("distance from target [mm]")
     bottom.set_ylim(bottom=0.0)
     bottom.set_xlabel("time [s]")
     for axes in (top, bottom):
         _mark_settle(axes, record)
-    bottom.legend(loc="upper right")
+    style.legend_above(bottom)
     return figure
 
 

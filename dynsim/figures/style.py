@@ -185,8 +185,8 @@ def time_rows(
 ) -> list[tuple[Axes, ...]]:
     """Axes for quantities over time, one row each, with a column for the initial transient where it needs one.
 
-    A transient that would squeeze the settled rest of some row to less than half the height gets an enlarged panel on
-    the left; the axes on the right are then cut to the settled range.
+    A transient that would squeeze the settled rest of some row to less than two thirds of the height gets an enlarged
+    panel on the left; the axes on the right are then cut to the settled range.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ def _transient(row: Sequence[Series], settle: float) -> _Transient | None:
         return None
     low, high = min(float(settled.min()), 0.0), max(float(settled.max()), 0.0)
     span = high - low
-    if span <= 0.0 or np.ptp(np.append(everything, [low, high])) < 2.0 * span:
+    if span <= 0.0 or np.ptp(np.append(everything, [low, high])) < 1.5 * span:
         return None
     low, high = low - 0.12 * span, high + 0.12 * span
     end = 0.0
@@ -260,7 +260,8 @@ def _compress(axes: Axes, transient: _Transient) -> None:
     settled = max(abs(transient.low), abs(transient.high))
     if transient.largest > 3.0 * settled:
         axes.set_yscale("symlog", linthresh=settled)
-        ticks = [m * 10.0**k for k in range(-9, 10) for m in (1, 3) if settled <= m * 10.0**k <= transient.largest]
+        steps = [m * 10.0**k for k in range(-9, 10) for m in (1, 3)]
+        ticks = [step for step in steps if 0.5 * settled <= step <= transient.largest]
         axes.set_yticks([-tick for tick in ticks[::-1]] + [0.0, *ticks])
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
         axes.yaxis.set_minor_locator(NullLocator())
