@@ -265,3 +265,6 @@ def _compress(axes: Axes, transient: _Transient) -> None:
         axes.set_yticks([-tick for tick in ticks[::-1]] + [0.0, *ticks])
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
         axes.yaxis.set_minor_locator(NullLocator())
+        # Curves bend where the scale changes: say so.
+        text = f"logarithmic beyond ±{number(settled, 2)}"
+        axes.text(0.98, 0.03, text, transform=axes.transAxes, ha="right", color=GREY, fontsize=6.5)
