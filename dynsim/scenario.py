@@ -158,12 +158,14 @@ class Scenario:
         """The controller for the robot."""
         return member("controller", self.controller.type).build(self.controller, model, self.duration_s)
 
+    def surfaces(self) -> dict[str, Quadric]:
+        """All surfaces by name, whether anything touches them or not."""
+        return {name: member("surface", surface.type).build(surface) for name, surface in self.config.surfaces.items()}
+
     def contacts(self) -> list[Contact]:
         """All enabled contact points with their surfaces."""
         options = self.config.contacts
-        surfaces: dict[str, Quadric] = {
-            name: member("surface", surface.type).build(surface) for name, surface in self.config.surfaces.items()
-        }
+        surfaces = self.surfaces()
         result = []
         for name, point in options.points.items():
             if not point.enabled:
