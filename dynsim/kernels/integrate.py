@@ -609,11 +609,11 @@ def accept(system: System, ws: Workspace, run: Run):
 
 
 @kernel
-def next_step(run: Run, error, order):
-    """Proportional–integral step control (Hairer, Nørsett, Wanner II.4): calm where stability sets the step."""
+def next_step(run: Run, error, order, beta):
+    """Proportional–integral step control (Hairer, Nørsett, Wanner II.4)."""
     clock = run.clock
     error = max(error, 1e-10)
-    change = 0.9 * error ** (-(1.0 / order - 0.03)) * clock[LAST_ERROR] ** 0.04
+    change = 0.9 * error ** (0.75 * beta - 1.0 / order) * clock[LAST_ERROR] ** beta
     clock[LAST_ERROR] = max(error, 1e-4)
     clock[STEP] = min(clock[STEP] * min(max(change, 0.2), 5.0), clock[STEP_MAX])
 
@@ -644,7 +644,9 @@ def advance_explicit(system: System, ws: Workspace, run: Run, limit):
         if run.method == RK4:
             run.clock[STEP] = proposed
         else:
-            next_step(run, error, 5.0)
+            # Twice the usual β: the closed-loop arms of this field sit at the stability limit, where 0.04 rejects every
+            # tenth step and 0.08 none.
+            next_step(run, error, 5.0, 0.08)
 
 
 @kernel
@@ -660,7 +662,7 @@ def advance_rodas4(system: System, ws: Workspace, run: Run, limit):
         if rejected(ws, run, error, 4.0):
             continue
         accept(system, ws, run)
-        next_step(run, error, 4.0)
+        next_step(run, error, 4.0, 0.04)
 
 
 def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:
