@@ -154,13 +154,23 @@ class Contact:
 
 @dataclass(frozen=True)
 class Robot:
-    """A tree of links with its motors; ``hand`` is the controlled point (body name, point in its frame [m])."""
+    """A tree of links with its motors.
+
+    ``hand`` is the controlled point (body name, point in its frame [m]); ``q0`` the initial configuration [rad or m],
+    zero unless given.
+    """
 
     name: str
     links: tuple[Link, ...]
     motors: tuple[Motor, ...]
     hand: tuple[str, Array]
     gravity: Array = field(default_factory=lambda: vector(0.0, 0.0, -9.81))
+    q0: Array | None = None
+
+    @property
+    def initial(self) -> Array:
+        """Initial configuration, (n,)."""
+        return np.zeros(len(self.links)) if self.q0 is None else np.asarray(self.q0, dtype=np.float64)
 
     @property
     def joint_names(self) -> tuple[str, ...]:

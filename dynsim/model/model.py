@@ -110,10 +110,14 @@ class Model:
 
     def point_jacobian(self, body: str | int, point: ArrayLike, q: ArrayLike) -> Array:
         """∂(world position)/∂q of a body-fixed point, (3, n) [m/rad]."""
+        return self.point_position_and_jacobian(body, point, q)[1]
+
+    def point_position_and_jacobian(self, body: str | int, point: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
+        """World position, (3,) [m], and its Jacobian, (3, n) [m/rad], from one sweep."""
         position = self.point_position(body, point, q)
-        out = np.zeros((3, self.n))
-        kinematics.point_jacobian(self.arrays, self._workspace, self.body_index(body), position, out)
-        return out
+        jacobian = np.zeros((3, self.n))
+        kinematics.point_jacobian(self.arrays, self._workspace, self.body_index(body), position, jacobian)
+        return position, jacobian
 
     def body_pose(self, body: str | int, q: ArrayLike) -> tuple[Array, Array]:
         """Rotation R_WB, (3, 3), and origin p_WB, (3,) [m], of a body."""
