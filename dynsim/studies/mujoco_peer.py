@@ -6,6 +6,7 @@ Built from the compiled tables of a system, so that both programs get the same n
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
@@ -18,6 +19,8 @@ Array = NDArray[np.float64]
 
 # A sphere of this radius, centred in the contact point, rests on a plane that lies this much lower [m].
 FOOT_RADIUS = 0.01
+# Constraint impedance close to one: the least softness that MuJoCo's solver accepts.
+STIFFEST = [0.9999, 0.9999, 0.001, 0.5, 2.0]
 
 
 def build_mujoco(
@@ -26,7 +29,7 @@ def build_mujoco(
     step: float,
     integrator: Literal["euler", "implicitfast", "rk4"] = "euler",
     motors: bool = True,
-    contacts: Literal["none", "soft", "hard_bilateral"] = "none",
+    contacts: Literal["none", "soft", "equality"] = "none",
     stiffness_time: float | None = None,
 ) -> Any:
     """The bodies, motors and contacts of ``system`` as a ``mujoco.MjModel``.
@@ -35,10 +38,10 @@ def build_mujoco(
     ----------
     step : time step [s]
     motors : with ``dcmotor`` actuators and their PD (see :func:`setpoints`), or bodies alone
-    contacts : {"none", "soft", "hard_bilateral"}
+    contacts : {"none", "soft", "equality"}
         "soft": MuJoCo's own contact of a small sphere with the floor z = 0: unilateral, with its soft friction.
-        "hard_bilateral": the point is held at its distance from the centre of a sphere surface by an equality
-        constraint on a tendon: bilateral and without friction, the one-row constraint that MuJoCo has.
+        "equality": the point is held at its distance from the centre of a sphere surface by an equality constraint
+        on the length of a tendon, the one-row bilateral constraint that MuJoCo has; without friction.
     stiffness_time : time constant of the soft constraints [s]; default: two steps, the stiffest that MuJoCo allows.
 
     Notes
@@ -61,14 +64,19 @@ def build_mujoco(
     if motors:
         _add_motors(spec, system)
     solref = [2.0 * step if stiffness_time is None else stiffness_time, 1.0]
+    radii = []
     for k in range(len(system.contacts.link)):
         body = bodies[system.contacts.link[k, ka.LINK]]
         point = system.contacts.point[k]
         if contacts == "soft":
             _add_soft_contact(spec, body, k, point, solref)
-        elif contacts == "hard_bilateral":
-            _add_tendon(spec, body, k, point, solref)
-    return spec.compile()
+        elif contacts == "equality":
+            radii.append(_add_tendon(spec, body, k, point, solref))
+    model = spec.compile()
+    # The equality counts from the tendon's length at q = 0, which only the compiled model knows.
+    for k, radius in enumerate(radii):
+        model.eq_data[k, 0] = radius - model.tendon_length0[k]
+    return model
 
 
 def state_of(model: Any, q: Array) -> Array:
@@ -123,6 +131,16 @@ def roll_out(model: Any, data: Any, start: Array, controls: Array) -> tuple[Arra
     path = states[0]
     nq, nv = model.nq, model.nv
     return path[:, 1 : 1 + nq], path[:, 1 + nq : 1 + nq + nv], path[:, 1 + nq + nv :]
+
+
+def steps_call(model: Any, q: Array, batch: int, steps: int) -> Callable[[], Any]:
+    """A call that runs ``batch`` short runs of ``steps`` steps from rest at q natively: contacts stay as they start."""
+    import mujoco
+    from mujoco import rollout
+
+    data = mujoco.MjData(model)
+    start = np.tile(state_of(model, q), (batch, 1))
+    return lambda: rollout.rollout(model, data, start, nstep=steps)
 
 
 def _add_bodies(spec: Any, system: System) -> list[Any]:
@@ -203,7 +221,7 @@ def _add_soft_contact(spec: Any, body: Any, k: int, point: Array, solref: list[f
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
 
 
-def _add_tendon(spec: Any, body: Any, k: int, point: Array, solref: list[float]) -> None:
+def _add_tendon(spec: Any, body: Any, k: int, point: Array, solref: list[float]) -> float:
     import mujoco
 
     Q = point[[ka.QUADRIC, ka.QUADRIC + 3, ka.QUADRIC + 5]]
@@ -213,10 +231,9 @@ def _add_tendon(spec: Any, body: Any, k: int, point: Array, solref: list[float])
     radius = float(np.sqrt(centre @ centre - 2.0 * point[ka.QUADRIC + 9] / Q[0]))
     spec.worldbody.add_site(name=f"centre_{k}", pos=centre)
     body.add_site(name=f"point_{k}", pos=point[ka.POINT : ka.POINT + 3])
-    tendon = spec.add_tendon(name=f"tendon_{k}", springlength=[radius, radius])
+    tendon = spec.add_tendon(name=f"tendon_{k}")
     tendon.wrap_site(f"centre_{k}")
     tendon.wrap_site(f"point_{k}")
-    # The equality holds the length of the start configuration q = 0 plus data[0].
     equality = spec.add_equality(name=f"held_{k}", type=mujoco.mjtEq.mjEQ_TENDON, name1=f"tendon_{k}", solref=solref)
-    equality.solimp = [0.9999, 0.9999, 0.001, 0.5, 2.0]
-    equality.data = np.concatenate([[radius], np.zeros(10)])
+    equality.solimp = STIFFEST
+    return radius
