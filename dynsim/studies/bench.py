@@ -49,7 +49,7 @@ _PYTHON_ABA = "Pinocchio ABA, one Python call each"
 
 
 @kernel
-def repeat_derivative(system: System, y, ws: ka.Workspace, dy, count):
+def repeat_derivative(system: System, y: Array, ws: ka.Workspace, dy: Array, count: int) -> float:
     """``count`` right-hand sides at slightly different states; returns a sum, so that none can be left out."""
     total = 0.0
     first = y[0]
@@ -86,17 +86,32 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
     """
     report = progress or (lambda text, fraction: None)
     mujoco_missing = _why_no_mujoco()
-    rounds, share = (5, 0.01) if quick else (15, 0.05)
-    sizes = []
+    # Many short samples: the median then leaves out those in which another process had the core.
+    rounds, share = (25, 2e-3) if quick else (101, 5e-3)
+    sizes: list[dict[str, Any]] = []
+    python_call = None
     for k, n in enumerate(SIZES):
         report(f"right-hand side, {n} links", 0.6 * k / len(SIZES))
         with_mujoco = not mujoco_missing and n <= MUJOCO_LINKS_MAX[quick]
         with_pinocchio = n <= PINOCCHIO_LINKS_MAX[quick]
-        sizes.append(_measure_size(n, rounds, share, with_mujoco=with_mujoco, with_pinocchio=with_pinocchio))
+        arms = {contacts: prepare(_arm(n, contacts)) for contacts in (False, True)}
+        timed = [
+            Timed(DYNSIM_FREE, _derivative_loop(arms[False])),
+            Timed(DYNSIM_CONTACTS, _derivative_loop(arms[True])),
+        ]
+        if with_pinocchio:
+            timed += _pinocchio_contenders(arms[True])
+        if with_mujoco:
+            timed += _mujoco_contenders(arms[True])
+        samples = _take_turns(timed, rounds, share)
+        # What a call from Python costs does not depend on the size; where the work is least, it is seen best.
+        if python_call is None and _PYTHON_ABA in samples and ABA in samples:
+            python_call = max(0.0, float(np.median(samples[_PYTHON_ABA]) - np.median(samples[ABA])))
+        sizes.append(_row(n, samples, python_call or 0.0))
     jobs: list[dict[str, Any]] = []
     for k, case in enumerate(CASES):
         report(f"10 s job, {case}", 0.6 + 0.4 * k / len(CASES))
-        jobs += _measure_job(case, 3 if quick else 11, with_mujoco=not mujoco_missing)
+        jobs += _measure_job(case, 4 if quick else 21, with_mujoco=not mujoco_missing)
     report("done", 1.0)
     result: dict[str, Any] = {
         "machine": _machine(),
@@ -104,7 +119,8 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
         "method": {
             "quick": quick,
             "rounds": rounds,
-            "seconds_per_round_and_contender": share,
+            "seconds_per_sample": share,
+            "python_call_us": None if python_call is None else 1e6 * python_call,
             "statistic": "median over interleaved rounds; minima beside it",
             "mujoco_step_s": STEP,
             "dynsim": "right-hand side with motors, references, friction and all energy integrals, in a compiled loop",
@@ -121,29 +137,15 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
     return result
 
 
-def _measure_size(n: int, rounds: int, share: float, *, with_mujoco: bool, with_pinocchio: bool) -> dict[str, Any]:
-    """Microseconds per right-hand side or step of every contender at n links."""
-    arms = {contacts: prepare(_arm(n, contacts)) for contacts in (False, True)}
-    timed = [
-        Timed(DYNSIM_FREE, _derivative_loop(arms[False])),
-        Timed(DYNSIM_CONTACTS, _derivative_loop(arms[True])),
-    ]
-    if with_pinocchio:
-        timed += _pinocchio_contenders(arms[True])
-    if with_mujoco:
-        timed += _mujoco_contenders(arms[True])
-    samples = _take_turns(timed, rounds, share)
-    median = {name: 1e6 * float(np.median(values)) for name, values in samples.items()}
-    minimum = {name: 1e6 * float(np.min(values)) for name, values in samples.items()}
-    row: dict[str, Any] = {"links": n, "median_us": median, "minimum_us": minimum}
-    if _PYTHON_ABA in median:
-        for values in (median, minimum):
-            overhead = values.pop(_PYTHON_ABA) - values[ABA]
-            if values is median:
-                row["python_call_us"] = overhead
-            for name in _CALLED_FROM_PYTHON:
-                if name in values:
-                    values[name] -= overhead
+def _row(n: int, samples: dict[str, list[float]], python_call: float) -> dict[str, Any]:
+    """Microseconds of every contender at n links, Python calls taken off where the work is called from Python."""
+    row: dict[str, Any] = {"links": n, "median_us": {}, "minimum_us": {}}
+    for name, values in samples.items():
+        if name == _PYTHON_ABA:
+            continue
+        off = python_call if name in _CALLED_FROM_PYTHON else 0.0
+        row["median_us"][name] = 1e6 * (float(np.median(values)) - off)
+        row["minimum_us"][name] = 1e6 * (float(np.min(values)) - off)
     return row
 
 
@@ -234,8 +236,11 @@ def _take_turns(timed: list[Timed], rounds: int, share: float) -> dict[str, list
         done = contender.call(count)
         counts[contender.name] = max(1, int(share * done / (time.perf_counter() - started)))
     samples: dict[str, list[float]] = {contender.name: [] for contender in timed}
-    for _ in range(rounds):
+    for k in range(rounds):
         for contender in timed:
+            # A contender that takes far longer than a sample should gets fewer of them.
+            if k >= 3 and sum(samples[contender.name]) * counts[contender.name] > 4.0 * rounds * share:
+                continue
             started = time.perf_counter()
             done = contender.call(counts[contender.name])
             samples[contender.name].append((time.perf_counter() - started) / done)
@@ -263,17 +268,15 @@ CASES = {
 }
 DYNSIM_DEFAULT, DYNSIM_RK4 = "dynsim dopri5 rtol 1e-6", "dynsim RK4 1 ms"
 MUJOCO_EULER, MUJOCO_IMPLICIT = "MuJoCo Euler 1 ms", "MuJoCo implicitfast 1 ms"
-_INTEGRATORS = {
-    DYNSIM_DEFAULT: {"integrator.method": "dopri5", "integrator.rtol": 1e-6},
-    DYNSIM_RK4: {"integrator.method": "rk4", "integrator.step_s": STEP},
-}
+# Method, first or fixed step, rtol, atol.
+_INTEGRATORS = {DYNSIM_DEFAULT: ("dopri5", 0.0, 1e-6, 1e-8), DYNSIM_RK4: ("rk4", STEP, 1e-6, 1e-8)}
 _TIGHT = {"integrator.method": "dopri5", "integrator.rtol": 1e-11, "integrator.atol": 1e-13}
 
 
 def _measure_job(case_name: str, rounds: int, *, with_mujoco: bool) -> list[dict[str, Any]]:
     """Wall time and error of the 10 s run for every program; the reference is dynsim at rtol 1e-11."""
     case = CASES[case_name]
-    reference = _prepared(case, _TIGHT)
+    reference = prepare_case(case, _TIGHT)
     _advance(reference)
     n = reference.model.n
     run = reference.run
@@ -282,8 +285,8 @@ def _measure_job(case_name: str, rounds: int, *, with_mujoco: bool) -> list[dict
 
     paths: dict[str, tuple[Array, Array]] = {}
     timed: list[Timed] = []
-    for name, options in _INTEGRATORS.items():
-        timed.append(Timed(name, _dynsim_job(name, case, options, paths)))
+    for name in _INTEGRATORS:
+        timed.append(Timed(name, _dynsim_job(name, reference, paths)))
     if with_mujoco:
         for name, integrator in ((MUJOCO_EULER, "euler"), (MUJOCO_IMPLICIT, "implicitfast")):
             timed.append(Timed(name, _mujoco_job(name, case, integrator, reference, paths)))
@@ -315,8 +318,8 @@ def _measure_job(case_name: str, rounds: int, *, with_mujoco: bool) -> list[dict
     return rows
 
 
-def _prepared(case: Case, options: dict[str, Any]) -> Prepared:
-    """The case compiled for dynsim at its initial state."""
+def prepare_case(case: Case, options: dict[str, Any]) -> Prepared:
+    """The case compiled for dynsim at its initial state; ``options`` are overrides of the scenario."""
     overrides = dict(options)
     if case.mujoco_contacts == "equality":
         model = load_scenario(SCENARIO, case.variant)
@@ -339,12 +342,27 @@ def _advance(prepared: Prepared) -> None:
         raise RuntimeError(f"the benchmark run stopped at t = {prepared.run.clock[ki.TIME]:.3f} s")
 
 
-def _dynsim_job(
-    name: str, case: Case, options: dict[str, Any], paths: dict[str, tuple[Array, Array]]
-) -> Callable[[int], int]:
-    prepared = _prepared(case, options)
-    n, na = prepared.model.n, len(prepared.system.drives.link)
-    fresh = {field: getattr(prepared.run, field).copy() for field in ("y", "clock", "count", "extremes")}
+def _dynsim_job(name: str, reference: Prepared, paths: dict[str, tuple[Array, Array]]) -> Callable[[int], int]:
+    method, step, rtol, atol = _INTEGRATORS[name]
+    n, na, c = reference.model.n, len(reference.system.drives.link), len(reference.contacts)
+    y = np.zeros_like(reference.run.y)
+    y[:n] = reference.model.robot.initial
+    run = ki.new_run(
+        ki.METHODS[method],
+        y,
+        n=n,
+        na=na,
+        c=c,
+        sample_time=reference.run.sample_time,
+        hand=(reference.run.hand_link, reference.run.hand_point),
+        end=float(reference.run.clock[ki.END]),
+        step=step,
+        step_max=np.inf,
+        rtol=rtol,
+        atol=atol,
+    )
+    prepared = replace(reference, run=run)
+    fresh = {field: getattr(run, field).copy() for field in ("y", "clock", "count", "extremes")}
 
     def call(count: int) -> int:
         for field, values in fresh.items():
@@ -400,18 +418,20 @@ def _ratios(sizes: list[dict[str, Any]], jobs: list[dict[str, Any]]) -> list[dic
         (MUJOCO_CONTACTS, DYNSIM_CONTACTS),
     )
     for peer, ours in pairs:
-        ratio = {
-            str(row["links"]): row["median_us"][peer] / row["median_us"][ours] if peer in row["median_us"] else None
-            for row in sizes
-        }
-        rows.append({"task": "right-hand side or step", "peer": peer, "dynsim": ours, "time_by_links": ratio})
+        entry: dict[str, Any] = {"task": "right-hand side or step", "peer": peer, "dynsim": ours}
+        for key, kind in (("time_by_links", "median_us"), ("time_by_links_minima", "minimum_us")):
+            entry[key] = {
+                str(row["links"]): row[kind][peer] / row[kind][ours] if peer in row[kind] else None for row in sizes
+            }
+        rows.append(entry)
     for case in CASES:
         row = {job["program"]: job for job in jobs if job["case"] == case}
         for peer in (MUJOCO_EULER, MUJOCO_IMPLICIT):
             for ours in (DYNSIM_DEFAULT, DYNSIM_RK4):
-                entry: dict[str, Any] = {"task": f"10 s job, {case}", "peer": peer, "dynsim": ours}
+                entry = {"task": f"10 s job, {case}", "peer": peer, "dynsim": ours}
                 known = peer in row
-                entry["time"] = row[peer]["wall_median_s"] / row[ours]["wall_median_s"] if known else None
+                for key, kind in (("time", "wall_median_s"), ("time_minima", "wall_minimum_s")):
+                    entry[key] = row[peer][kind] / row[ours][kind] if known else None
                 comparable = known and row[peer]["same_physics"]
                 entry["hand_error"] = (
                     row[peer]["hand_error_max_m"] / row[ours]["hand_error_max_m"] if comparable else None
@@ -447,21 +467,28 @@ def format_table(result: dict[str, Any]) -> list[Table]:
                 _number(row.get("current_error_max_A")),
             )
 
-    ratios = Table(title="How many times longer than dynsim")
-    for heading in ("task", "peer", "dynsim", "time", "hand error"):
-        ratios.add_column(heading, justify="right" if heading in ("time", "hand error") else "left")
+    ratios = Table(title="Peer's time over dynsim's; for the job also peer's hand error over dynsim's")
+    for heading in ("task", "peer", "dynsim"):
+        ratios.add_column(heading)
+    for row in sizes:
+        ratios.add_column(f"{row['links']} links", justify="right")
+    ratios.add_column("10 s job", justify="right")
+    ratios.add_column("hand error", justify="right")
     for row in result["ratios"]:
+        labels = row["task"], row["peer"], row["dynsim"]
         if "time_by_links" in row:
-            for links, ratio in row["time_by_links"].items():
-                ratios.add_row(f"{row['task']}, {links} links", row["peer"], row["dynsim"], _number(ratio), "")
+            ratios.add_row(*labels, *(_number(ratio) for ratio in row["time_by_links"].values()), "", "")
         else:
-            ratios.add_row(row["task"], row["peer"], row["dynsim"], _number(row["time"]), _number(row["hand_error"]))
+            ratios.add_row(*labels, *("" for _ in sizes), _number(row["time"]), _number(row["hand_error"]))
     return [times, whole, ratios]
 
 
 def _number(value: float | None, scale: float = 1.0) -> str:
     """Three significant digits, or a dash for what was not measured."""
-    return "–" if value is None else f"{value * scale:.3g}" if abs(value * scale) < 1e3 else f"{value * scale:.0f}"
+    if value is None:
+        return "–"
+    value *= scale
+    return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
 def _why_no_mujoco() -> str:

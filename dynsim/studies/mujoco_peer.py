@@ -119,7 +119,9 @@ def references(system: System, times: Array) -> tuple[Array, Array]:
 
 
 def roll_out(model: Any, data: Any, start: Array, controls: Array) -> tuple[Array, Array, Array]:
-    """Run one step per row of ``controls`` in one native call; returns q, v, i after each step, (T, n), (T, n), (T, na).
+    """Run one step per row of ``controls`` in one native call.
+
+    Returns q, v and i after each step, (T, n), (T, n), (T, na).
 
     Parameters
     ----------
