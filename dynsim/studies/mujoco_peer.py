@@ -31,6 +31,7 @@ def build_mujoco(
     motors: bool = True,
     contacts: Literal["none", "soft", "equality"] = "none",
     stiffness_time: float | None = None,
+    cone: Literal["pyramidal", "elliptic"] = "pyramidal",
 ) -> Any:
     """The bodies, motors and contacts of ``system`` as a ``mujoco.MjModel``.
 
@@ -42,6 +43,7 @@ def build_mujoco(
         "soft": MuJoCo's own contact of a small sphere with the floor z = 0: unilateral, with its soft friction.
         "equality": the point is held at its distance from the centre of a sphere surface by an equality constraint
         on the length of a tendon, the one-row bilateral constraint that MuJoCo has; without friction.
+    cone : of the friction; MuJoCo's default, which is faster, or the one that is Coulomb's
     stiffness_time : time constant of the soft constraints [s]; default: two steps, the stiffest that MuJoCo allows.
 
     Notes
@@ -60,6 +62,7 @@ def build_mujoco(
         "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
         "rk4": mujoco.mjtIntegrator.mjINT_RK4,
     }[integrator]
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC if cone == "elliptic" else mujoco.mjtCone.mjCONE_PYRAMIDAL
     bodies = _add_bodies(spec, system)
     if motors:
         _add_motors(spec, system)
@@ -220,7 +223,6 @@ def _add_soft_contact(spec: Any, body: Any, k: int, point: Array, solref: list[f
     mu = float(point[ka.MU])
     pair = spec.add_pair(geomname1="floor", geomname2=f"foot_{k}", condim=3 if mu > 0.0 else 1, solref=solref)
     pair.friction = [mu, mu, 0.0, 0.0, 0.0]
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
 
 
 def _add_tendon(spec: Any, body: Any, k: int, point: Array, solref: list[float]) -> float:

@@ -150,7 +150,7 @@ def test_force_of_a_soft_contact_with_friction() -> None:
     """
     prepared = prepare(load_scenario("elbow_comparison", "elbow_4", {**TIGHT, "duration_s": 3.0}))
     run, n, na = integrate(prepared), prepared.model.n, len(prepared.system.drives.link)
-    peer = build_mujoco(prepared.system, step=1e-3, contacts="soft")
+    peer = build_mujoco(prepared.system, step=1e-3, contacts="soft", cone="elliptic")
     sample = _forces(peer, prepared, 1e-3, 3.0, _contact_force)[-1]
     f, fx, fy, fz, _, *slip = run.output[-1, n + 2 * na + 6 :]
     assert sample[0] == pytest.approx(f, rel=2e-3)
