@@ -111,7 +111,7 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
     jobs: list[dict[str, Any]] = []
     for k, case in enumerate(CASES):
         report(f"10 s job, {case}", 0.6 + 0.4 * k / len(CASES))
-        jobs += _measure_job(case, 4 if quick else 21, with_mujoco=not mujoco_missing)
+        jobs += _measure_job(case, 3 if quick else 21, with_mujoco=not mujoco_missing)
     report("done", 1.0)
     result: dict[str, Any] = {
         "machine": _machine(),
