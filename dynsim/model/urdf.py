@@ -160,6 +160,15 @@ def _check_tree(path: Path, root: ElementTree.Element) -> None:
         roots.remove(child)
     if len(roots) != 1:
         raise ModelError(f"{path}: a tree has one root link; here: {', '.join(map(str, roots)) or 'none'}")
+    reached, pending = set(roots), root.findall("joint")
+    while True:
+        grown = [joint for joint in pending if _link_name(joint, "parent") in reached]
+        if not grown:
+            break
+        reached |= {_link_name(joint, "child") for joint in grown}
+        pending = [joint for joint in pending if joint not in grown]
+    if pending:
+        raise ModelError(f"{path}: joint {pending[0].get('name')!r} is part of a loop that the root does not reach")
 
 
 def _check_numbers(path: Path, owner: ElementTree.Element) -> None:

@@ -164,6 +164,12 @@ def joint(kind: str, inside: str = "", *, name: str = "hinge", child: str = "tip
         (TIP + joint("continuous", child="tup"), ["hinge", "tup"]),
         (TIP + '<link name="loose"/>' + joint("continuous"), ["base, loose"]),
         (TIP + joint("continuous") + joint("continuous", name="second"), ["second", "tip"]),
+        (
+            '<link name="a"/><link name="b"/>'
+            '<joint name="there" type="fixed"><parent link="a"/><child link="b"/></joint>'
+            '<joint name="back" type="continuous"><parent link="b"/><child link="a"/></joint>',
+            ["there", "loop"],
+        ),
         ("<link", ["not XML"]),
     ],
 )
