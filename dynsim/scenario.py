@@ -59,8 +59,9 @@ class Contacts(StrictConfig):
 class Integrator(StrictConfig):
     """Time integration."""
 
-    method: Literal["dopri5", "rk4", "rodas4"] = Field(
-        default="dopri5", description="adaptive 5(4), fixed step, or linearly implicit for stiff motors"
+    method: Literal["rk43", "dopri5", "rk4", "rodas4"] = Field(
+        default="rk43",
+        description="adaptive 4(3) or 5(4), fixed step, or adaptive linearly implicit for stiff motors",
     )
     solver: Literal["articulated", "m_star"] = Field(default="articulated", description="O(n) sweeps or the dense M*")
     rtol: float = Field(default=1e-6, ge=1e-13, le=1e-1)

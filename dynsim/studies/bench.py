@@ -24,7 +24,7 @@ from dynsim.kernels import integrate as ki
 from dynsim.kernels.coupled import System, derivative
 from dynsim.kernels.jit import kernel
 from dynsim.scenario import load_scenario
-from dynsim.simulate.dynamics import Prepared, prepare
+from dynsim.engine.dynamics import Prepared, prepare
 from dynsim.studies import mujoco_peer, pinocchio_peer
 
 Array = NDArray[np.float64]
