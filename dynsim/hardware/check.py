@@ -47,10 +47,12 @@ class Margin:
     margin: float
     time: float
 
-    UNITS = {"position": "rad", "velocity": "rad/s", "torque": "N·m"}
+    @property
+    def unit(self) -> str:
+        return {"position": "rad", "velocity": "rad/s", "torque": "N·m"}[self.quantity]
 
     def __str__(self) -> str:
-        unit = self.UNITS[self.quantity]
+        unit = self.unit
         return (
             f"{self.joint}: {self.quantity} {self.value:.4f} {unit} at t = {self.time:.3f} s, limit {self.limit:.4f} {unit}, "
             f"margin {self.margin:+.4f} {unit}"

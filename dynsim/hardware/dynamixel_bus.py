@@ -43,6 +43,7 @@ class SerialPort(PortHandler):
 
     def __init__(self, name: str, *, exclusive: bool = True) -> None:
         super().__init__(name)
+        self.is_open = False
         self.exclusive = exclusive
 
     def setupPort(self, cflag_baud: int) -> bool:
@@ -204,7 +205,10 @@ class DynamixelBus:
             while len(replies) < len(ids) and not self.port.isPacketTimeout():
                 for packet in decoder.feed(self.port.readPort(answer_bytes)):
                     self._sort_in(packet, ids, length, replies)
-            for packet in decoder.flush():
+            # What came while this process was not running is here, however late it is.
+            late = self.port.getBytesAvailable()
+            arrived = [*decoder.feed(self.port.readPort(late))] if late else []
+            for packet in [*arrived, *decoder.flush()]:
                 self._sort_in(packet, ids, length, replies)
         return BlockRead(replies, stray + decoder.garbage)
 

@@ -110,7 +110,7 @@ class AbortRules:
         count = len(servo_map.servos)
         self._servos = servo_map.servos
         self._safety = servo_map.safety
-        self._late_after = 0.5 / plan.rate
+        self._late_after = 1.0 / plan.rate
         self._in_position_mode = np.array([servo.in_position_mode for servo in self._servos])
         self._following_limit = np.array([servo.kind.following_error for servo in self._servos])
         self._torque_limit = np.array([servo.kind.limits.torque for servo in self._servos])

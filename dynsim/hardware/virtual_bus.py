@@ -101,6 +101,7 @@ class VirtualLine:
         self._profile_velocity, self._profile_acceleration = np.zeros(count), np.zeros(count)
         self._set_rate = np.zeros(count)
         self._watchdog = np.zeros(count)
+        self._temperature_limit, self._min_voltage = np.zeros(count), np.zeros(count)
         self._temperature = np.full(count, AMBIENT + 5.0)
         self._overload = np.zeros(count)
         self._play = self.plant.position.copy()
@@ -110,6 +111,7 @@ class VirtualLine:
         self._registered: dict[int, tuple[int, bytes]] = {}
         self._fired: set[int] = set()
         self._dead: set[int] = set()
+        self._overload_torque = OVERLOAD_FRACTION * np.array([model.stall_torque for model in self._models])
         self._resistance = np.array([12.0 / model.stall_current for model in self._models])
         self._ampere_per_newtonmetre = np.array([1 / model.torque_constant for model in self._models])
         self._jammed_at: dict[int, float] = {}
@@ -313,24 +315,26 @@ class VirtualLine:
         """Profile generator: a set point that runs to the goal with limited speed and acceleration (0: unlimited)."""
         drive = self._drive
         to_go = self._goal_position - drive.set_position
+        acceleration = np.where(self._profile_acceleration > 0, self._profile_acceleration, np.inf)
         speed = np.where(self._profile_velocity > 0, self._profile_velocity, np.inf)
-        braking = np.where(
-            self._profile_acceleration > 0, np.sqrt(2 * self._profile_acceleration * np.abs(to_go)), np.inf
-        )
-        wanted = np.sign(to_go) * np.minimum(np.minimum(speed, braking), np.abs(to_go) / dt)
-        change = np.where(self._profile_acceleration > 0, self._profile_acceleration * dt, np.inf)
-        self._set_rate = np.clip(wanted, self._set_rate - change, self._set_rate + change)
+        distance = np.abs(to_go)
+        # The speed from which it can still brake before the goal; at the goal that is 0, whatever the acceleration.
+        braking = np.sqrt(2 * acceleration * np.maximum(distance, 1e-12))
+        wanted = np.sign(to_go) * np.minimum(np.minimum(speed, braking), distance / dt)
+        change = acceleration * dt
+        self._set_rate = np.minimum(np.maximum(wanted, self._set_rate - change), self._set_rate + change)
         drive.set_position = drive.set_position + dt * self._set_rate
-        drive.set_velocity = np.clip(self._goal_velocity, drive.set_velocity - change, drive.set_velocity + change)
+        drive.set_velocity = np.minimum(
+            np.maximum(self._goal_velocity, drive.set_velocity - change), drive.set_velocity + change
+        )
 
     def _warm(self, dt: float) -> None:
-        current = np.abs(self.plant.torque) * self._ampere_per_newtonmetre * self._drive.enabled
+        torque = np.abs(self.plant.torque) * self._drive.enabled
+        current = torque * self._ampere_per_newtonmetre
         heat = current**2 * self._resistance
         target = AMBIENT + THERMAL_RESISTANCE * heat
         self._temperature += (target - self._temperature) * -math.expm1(-dt / THERMAL_TIME)
-        stall = np.array([model.stall_torque for model in self._models])
-        loaded = np.abs(self.plant.torque) > OVERLOAD_FRACTION * stall
-        self._overload = np.where(loaded & self._drive.enabled, self._overload + dt, 0.0)
+        self._overload = np.where(torque > self._overload_torque, self._overload + dt, 0.0)
         sag = sum(fault.drop for fault in self._active_faults() if isinstance(fault, VoltageSag))
         self._drive.voltage = self.supply - sag - SUPPLY_RESISTANCE * float(current.sum())
         for fault in self._active_faults():
@@ -338,15 +342,21 @@ class VirtualLine:
                 self._temperature[self.ids.index(fault.id)] += dt * fault.heating_rate
 
     def _watch(self) -> None:
-        for index in np.flatnonzero(self._drive.enabled):
-            registers = self.servos[self.ids[index]]
-            if self._overload[index] > OVERLOAD_TIME:
+        enabled = self._drive.enabled
+        low_voltage = self._drive.voltage < self._min_voltage
+        unheard = (self._watchdog > 0) & (self.time - self._last_packet > self._watchdog)
+        hot = self._temperature > self._temperature_limit
+        overloaded = self._overload > OVERLOAD_TIME
+        if not (enabled & (low_voltage | unheard | hot | overloaded)).any():
+            return
+        for index in map(int, np.flatnonzero(enabled)):
+            if overloaded[index]:
                 self._raise_error(index, OVERLOAD)
-            if self._temperature[index] > registers["temperature_limit"]:
+            if hot[index]:
                 self._raise_error(index, OVERHEATING)
-            if self._drive.voltage < registers["min_voltage"] * VOLT_PER_UNIT:
+            if low_voltage[index]:
                 self._raise_error(index, INPUT_VOLTAGE)
-            if self._watchdog[index] > 0 and self.time - self._last_packet > self._watchdog[index]:
+            if unheard[index]:
                 self._trip_watchdog(index)
 
     def _raise_error(self, index: int, bit: int) -> None:
@@ -405,6 +415,8 @@ class VirtualLine:
         self._goal_velocity[index] = sense * registers["goal_velocity"] * RAD_S_PER_UNIT
         self._profile_velocity[index] = registers["profile_velocity"] * RAD_S_PER_UNIT
         self._profile_acceleration[index] = registers["profile_acceleration"] * RAD_S2_PER_UNIT
+        self._temperature_limit[index] = registers["temperature_limit"]
+        self._min_voltage[index] = registers["min_voltage"] * VOLT_PER_UNIT
         self._watchdog[index] = max(0, registers["bus_watchdog"]) * WATCHDOG_SECONDS_PER_UNIT
 
     def _measure(self, index: int) -> None:
@@ -420,14 +432,16 @@ class VirtualLine:
                     angle = self._play[index]
                 else:
                     angle = angle + fault.angle
-        registers["present_position"] = self._present_ticks(index, angle)
-        registers["present_velocity"] = round(sense * self.plant.velocity[index] / RAD_S_PER_UNIT)
-        effort = self._models[index].effort(sense * float(self.plant.torque[index]) * bool(self._drive.enabled[index]))
-        registers["present_current" if self._models[index].measures_current else "present_load"] = effort
+        model = self._models[index]
+        effort = model.effort(sense * float(self.plant.torque[index]) * bool(self._drive.enabled[index]))
+        velocity = round(sense * float(self.plant.velocity[index]) / RAD_S_PER_UNIT)
+        registers["present_current" if model.measures_current else "present_load"] = effort
+        registers["present_velocity"] = velocity
+        registers["present_position"] = self._present_ticks(index, float(angle))
         registers["present_voltage"] = max(0, round(self._drive.voltage / VOLT_PER_UNIT))
-        registers["present_temperature"] = min(255, max(0, round(self._temperature[index])))
+        registers["present_temperature"] = min(255, max(0, round(float(self._temperature[index]))))
         registers["realtime_tick"] = int(self.time * 1e3) % 32768
-        registers["moving"] = int(abs(registers["present_velocity"]) > registers["moving_threshold"])
+        registers["moving"] = int(abs(velocity) > registers["moving_threshold"])
 
     # -- faults -------------------------------------------------------------------------------------------------------
 

@@ -32,11 +32,13 @@ class ServoRegisters:
 
     def __getitem__(self, name: str) -> int:
         field = self.model.fields[name]
-        return field.decode(bytes(self._table[field.address : field.address + field.size]))
+        return int.from_bytes(self._table[field.address : field.address + field.size], "little", signed=field.signed)
 
     def __setitem__(self, name: str, value: int) -> None:
         field = self.model.fields[name]
-        self._table[field.address : field.address + field.size] = field.encode(value)
+        self._table[field.address : field.address + field.size] = value.to_bytes(
+            field.size, "little", signed=field.signed
+        )
 
     def restart(self) -> None:
         """RAM as after power-on."""
@@ -55,6 +57,8 @@ class ServoRegisters:
         """Bytes, indirect ones resolved; None outside of the table."""
         if length < 1 or address + length > TABLE_SIZE:
             return None
+        if address + length <= INDIRECT_BLOCKS[0][1]:
+            return bytes(self._table[address : address + length])
         return bytes(self._table[self._resolve(a)] for a in range(address, address + length))
 
     def write(self, address: int, data: bytes) -> StatusError:
