@@ -526,10 +526,10 @@ def line_for_map(servo_map: ServoMap, **options: Any) -> VirtualLine:
 class VirtualPort(PortHandler):
     """The client library's port on a :class:`VirtualLine` and a :class:`VirtualClock`.
 
-    Nothing here waits: reading with nothing to read lets virtual time pass until the next byte or a short while.
+    Nothing here waits: reading with nothing to read lets virtual time pass until the next byte or the time-out.
     """
 
-    POLL = 1e-4
+    POLL = 1e-5
 
     def __init__(self, line: VirtualLine, clock: VirtualClock, *, baud: int, name: str = "virtual") -> None:
         super().__init__(name)
@@ -576,7 +576,8 @@ class VirtualPort(PortHandler):
     def readPort(self, length: int) -> bytes:
         self._receive()
         if not self._input:
-            soon = self.clock.now() + self.POLL
+            time_out = (self.packet_start_time + self.packet_timeout) * 1e-3
+            soon = max(self.clock.now(), time_out) + self.POLL
             self.clock.sleep_until(min(soon, self._arriving[0][0]) if self._arriving else soon)
             self._receive()
         data = bytes(self._input[:length])
