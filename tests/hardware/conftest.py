@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dynsim.hardware.check import CheckedMotion, check_motion
+from dynsim.hardware.check import CheckedMotion, check_motion, velocity_limit
 from dynsim.hardware.clock import VirtualClock
 from dynsim.hardware.dynamixel_bus import DynamixelBus
 from dynsim.hardware.packet import Instruction, Packet
@@ -92,6 +92,20 @@ def goals_in(time: float, packet: Packet) -> list[tuple[float, int, int]]:
     if packet.instruction == Instruction.WRITE and int.from_bytes(p[:2], "little") in GOAL_ADDRESSES:
         return [(time, packet.id, int.from_bytes(p[2:6], "little", signed=True))]
     return []
+
+
+def check_goals_within_limits(run: Run) -> None:
+    limits = {servo.id: servo.tick_limits for servo in run.map.servos if servo.in_position_mode}
+    fastest = {
+        servo.id: abs(servo.to_velocity_units(velocity_limit(servo)))
+        for servo in run.map.servos
+        if not servo.in_position_mode
+    }
+    for _, id_, value in run.goals():
+        if id_ in limits:
+            assert limits[id_][0] <= value <= limits[id_][1]
+        else:
+            assert abs(value) <= fastest[id_]
 
 
 @dataclass
