@@ -126,7 +126,7 @@ def test_reverse_mode_turns_the_shaft_but_not_the_homing_offset(line) -> None:
 def test_voltage_sags_with_current(line) -> None:
     write(line, 1, "torque_enable", 1)
     write(line, 1, "goal_position", 4000)
-    line.advance(line.time + 0.03)
+    line.advance(line.time + 0.003)
     line._measure(0)
     assert line.servos[1]["present_voltage"] < 120
     assert line.servos[1]["present_current"] != 0
