@@ -343,11 +343,13 @@ def read_yaml(path: Path, schema: type[_Schema]) -> _Schema:
     try:
         return schema.model_validate(data)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
+        # A misspelt key makes two errors: the wrong one says more than the missing one.
+        first = min(error.errors(include_url=False), key=lambda found: found["type"] != "extra_forbidden")
         where = ".".join(str(part) for part in first["loc"])
         message = first["msg"].removeprefix("Value error, ")
         if first["type"] == "extra_forbidden":
-            message = f"unknown key; known are {', '.join(_known_keys(schema, first['loc']))}"
+            known = _known_keys(schema, first["loc"])
+            message = f"unknown key; known are {', '.join(known)}" if known else "unknown key"
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
         raise ServoMapError(
             f"{path}:{_line(data, first['loc'])}: {where + ': ' if where else ''}{message}{more}"
@@ -369,10 +371,16 @@ def _line(data: Any, location: tuple[int | str, ...]) -> int:
 def _known_keys(schema: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
     """Keys a mapping at the parent of ``location`` may hold."""
     current: Any = schema
-    for part in location[:-1]:
-        annotation = current.model_fields[part].annotation if _is_schema(current) else current
-        arguments = [argument for argument in getattr(annotation, "__args__", ()) if _is_schema(argument)]
-        current = arguments[0] if arguments else annotation
+    parts = iter(location[:-1])
+    for part in parts:
+        if not _is_schema(current) or part not in current.model_fields:
+            return []
+        annotation = current.model_fields[part].annotation
+        members = [argument for argument in getattr(annotation, "__args__", ()) if _is_schema(argument)]
+        if members:
+            # A mapping or list of entries: the next part is a key or an index.
+            next(parts, None)
+        current = members[0] if members else annotation
     return list(current.model_fields) if _is_schema(current) else []
 
 

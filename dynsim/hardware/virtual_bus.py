@@ -35,7 +35,7 @@ from dynsim.hardware.servo_plant import Drive, InertialLoad, ServoPlant
 from dynsim.hardware.virtual_faults import AngleFault, FaultScript, TemperatureRamp, VoltageSag, WrongRegister
 from dynsim.hardware.virtual_servo import ServoRegisters
 
-PHYSICS_STEP = 1e-3
+PHYSICS_STEP = 2e-3
 TURNAROUND = 20e-6
 """Time a servo takes beyond its return delay before it answers [s] (unverified)."""
 ADAPTER_LATENCY = 1e-3

@@ -159,6 +159,12 @@ def rig(map_file: Path) -> Rig:
     return Rig(load_servo_map(map_file))
 
 
+@pytest.fixture(scope="session")
+def clean_run(rig: Rig) -> Run:
+    """A replay without faults, for those who only look at it."""
+    return rig.run()
+
+
 @pytest.fixture
 def write_map(tmp_path: Path) -> Callable[..., Path]:
     """Write the rig's map with replacements: write_map(("a", "b"), …)."""

@@ -10,7 +10,7 @@ from dynsim.hardware.control_table import MX_28, MX_106, RAD_PER_TICK, Operating
 from dynsim.hardware.dynamixel_bus import DynamixelBus
 from dynsim.hardware.packet import StatusError
 from dynsim.hardware.servo_plant import MotorLaw
-from dynsim.hardware.virtual_bus import BOOT_TIME, VirtualLine, VirtualPort
+from dynsim.hardware.virtual_bus import BOOT_TIME, PHYSICS_STEP, VirtualLine, VirtualPort
 from dynsim.hardware.virtual_servo import ServoRegisters
 
 F = MX_106.fields
@@ -153,16 +153,16 @@ def test_the_step_response_is_that_of_the_motor_law(line) -> None:
     line.advance(line.time + t)
     step = 50 * RAD_PER_TICK
     expected = step * (1 - (1 + omega * t) * np.exp(-omega * t))
-    # Semi-implicit Euler at 1 ms: error of order ω·dt = 5 %.
-    assert line.plant.position[0] - start == pytest.approx(expected, rel=0.06)
+    # Semi-implicit Euler at 2 ms: error of order ω·dt = 9 %.
+    assert line.plant.position[0] - start == pytest.approx(expected, rel=0.09)
 
 
 def test_no_servo_exceeds_its_no_load_speed(line) -> None:
     write(line, 1, "torque_enable", 1)
     write(line, 1, "goal_position", 4095)
     fastest = 0.0
-    for _ in range(800):
-        line.advance(line.time + 0.001)
+    for _ in range(200):
+        line.advance(line.time + 2.5 * PHYSICS_STEP)
         fastest = max(fastest, abs(line.plant.velocity[0]))
     assert 0.8 * MX_106.no_load_speed < fastest <= MX_106.no_load_speed
 
