@@ -49,7 +49,7 @@ class Margin:
 
     @property
     def unit(self) -> str:
-        return {"position": "rad", "velocity": "rad/s", "torque": "N·m"}[self.quantity]
+        return {"position": "rad", "velocity": "rad/s", "torque": "N m"}[self.quantity]
 
     def __str__(self) -> str:
         unit = self.unit
@@ -215,7 +215,7 @@ def _torque_margins(record: Record, servo_map: ServoMap) -> list[Margin]:
         signal = servo.kind.follows.torque
         if signal is None or servo.hold_at is not None:
             continue
-        torque = column_of(record, signal, servo, "N·m")
+        torque = column_of(record, signal, servo, "N m")
         highest = int(np.abs(torque).argmax())
         limit = servo.kind.limits.torque
         at = record.time[highest] - record.time[0]

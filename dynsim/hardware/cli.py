@@ -168,6 +168,8 @@ def replay(
     yes: Annotated[bool, typer.Option("--yes", help="do not ask before moving")] = False,
     configure: Annotated[bool, typer.Option("--configure", help="write differing EEPROM settings")] = False,
     faults: Annotated[Path | None, typer.Option("--faults", help="fault script for virtual servos")] = None,
+    plant: Annotated[str | None, typer.Option("--plant", help="scenario whose robot the virtual servos move")] = None,
+    variant: Annotated[str | None, typer.Option("--variant", help="variant of that scenario")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="no progress bar")] = False,
 ) -> None:
     """Check, verify, arm, move to the start, replay, and keep the measured run.
@@ -206,6 +208,7 @@ def replay(
                     live=live,
                     write_eeprom=configure,
                     script=script,
+                    plant=_plant(plant, variant, servo_map, motion) if plant else None,
                     stop=stop,
                     observer=observer,
                     provenance={"record": str(record), "simulated": simulated.provenance},
@@ -218,6 +221,13 @@ def replay(
         f"replayed; torque {'ON, holding' if result.end_state == 'holding' else 'off'}; {folder / 'measured.h5'}"
     )
     console.print(f"compare: dynsim hw compare {record} {folder / 'measured.h5'}")
+
+
+def _plant(scenario: str, variant: str | None, servo_map: Any, motion: Any) -> Any:
+    from dynsim.hardware.simulated_plant import simulated_arm
+
+    posture = dict(zip((servo.label for servo in servo_map.servos), motion.path.position[0], strict=True))
+    return simulated_arm(scenario, variant, servo_map, posture)
 
 
 def _confirm(servo_map: Any, motion: Any) -> None:

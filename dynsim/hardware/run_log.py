@@ -154,7 +154,7 @@ class Recorder:
                 record.add(name + suffix, data, unit, labels=labels)
         shape = (len(rows), len(servos))
         torque = np.array([row.cycle.torque for row in rows]).reshape(shape)
-        record.add("torque_estimate", torque, "N·m", labels=joints, description="from motor current or load")
+        record.add("torque_estimate", torque, "N m", labels=joints, description="from motor current or load")
         record.add("supply_voltage", np.array([row.volts for row in rows]).reshape(shape), "V", labels=joints)
         record.add("temperature", np.array([row.celsius for row in rows]).reshape(shape), "degC", labels=joints)
         missed = np.array([row.cycle.missed for row in rows], dtype=bool).reshape(shape)

@@ -111,8 +111,8 @@ def test_torque_of_the_record_is_checked_where_the_map_names_it(write_map) -> No
     record = swing()
     torque = np.zeros((len(record), 2))
     torque[7, 1] = -7.0
-    record.add("torque", torque, "N·m", labels=("shoulder", "elbow"))
-    with pytest.raises(CheckRefused, match=r"elbow: torque -7\.0000 N·m at t = 0\.035 s, limit 6"):
+    record.add("torque", torque, "N m", labels=("shoulder", "elbow"))
+    with pytest.raises(CheckRefused, match=r"elbow: torque -7\.0000 N m at t = 0\.035 s, limit 6"):
         check_motion(record, servo_map)
 
 
