@@ -129,10 +129,11 @@ def check_motion(
     margins = _motion_margins(path, servo_map, speed) + _torque_margins(record, servo_map)
     violations = [margin for margin in margins if margin.margin < 0]
     if violations:
-        raise CheckRefused(
-            f"{len(violations)} limit(s) violated, nothing was sent:\n"
-            + "\n".join(f"  {entry}" for entry in violations)
-        )
+        lines = [f"{len(violations)} limit(s) violated, nothing was sent:", *(f"  {entry}" for entry in violations)]
+        if all(entry.quantity == "velocity" for entry in violations):
+            slower = speed * min(entry.limit / abs(entry.value) for entry in violations)
+            lines.append(f"  --speed {math.floor(100 * slower) / 100:g} would pass")
+        raise CheckRefused("\n".join(lines))
     warnings = [] if record.complete else ["the record is marked incomplete: it ends before its scenario does"]
     return CheckedMotion(path, speed, plan, tuple(margins), tuple(warnings))
 

@@ -45,7 +45,7 @@ class Gate(StrictModel):
 
 @dataclass(frozen=True)
 class JointError:
-    """Measured minus simulated angle of one joint [rad]; ``delay`` [s] is NaN for a joint at rest."""
+    """Measured minus simulated angle of one joint [rad]; ``delay`` [s] is NaN where none explains the error."""
 
     joint: str
     rms: float
@@ -62,7 +62,7 @@ class Comparison:
     Attributes
     ----------
     delay : float
-        By which the measured run lags, common to all joints [s].
+        By which the measured run lags, common to all joints [s]; 0 where no delay explains the error.
     joints : tuple of JointError
     time : array, shape (T,)
         Record time [s].
@@ -131,7 +131,8 @@ def compare_records(simulated: Record, measured: Record) -> Comparison:
 
     moving = np.ptp(reference, axis=0) > MOVING
     speed = float(measured.provenance.get("speed", 1.0))
-    delay = _delay(at, time, actual, moving)
+    common = _delay(at, time, actual, moving)
+    delay = 0.0 if np.isnan(common) else common
     joints = []
     for column, label in enumerate(labels):
         error = actual[:, column] - at(time)[:, column]
@@ -146,7 +147,7 @@ def compare_records(simulated: Record, measured: Record) -> Comparison:
                 max=float(abs(error[worst])),
                 time_of_max=float(time[worst]),
                 rms_delay_removed=float(np.sqrt(np.nanmean(shifted**2))),
-                delay=_delay(at, time, actual, only) / speed if only.any() else float("nan"),
+                delay=_delay(at, time, actual, only) / speed,
             )
         )
     return Comparison(delay / speed, tuple(joints), time, at(time), actual)
@@ -167,9 +168,12 @@ def _common_angles(simulated: Record, measured: Record) -> list[tuple[str, Array
 
 
 def _delay(at: Any, time: Array, actual: Array, columns: NDArray[np.bool_]) -> float:
-    """Shift of the simulated angles that fits the measured ones best [s of record time]."""
+    """Shift of the simulated angles that fits the measured ones best [s of record time].
+
+    NaN where none in the range explains half of the mean square error: then the error is sag or play, not delay.
+    """
     if not columns.any():
-        return 0.0
+        return float("nan")
 
     def misfit(delay: float) -> float:
         error = (actual - at(time - delay))[:, columns]
@@ -177,8 +181,10 @@ def _delay(at: Any, time: Array, actual: Array, columns: NDArray[np.bool_]) -> f
         return float(np.nanmean((error - np.nanmean(error, axis=0)) ** 2))
 
     grid = np.linspace(-0.1, MAX_DELAY, 61)
-    best = grid[int(np.argmin([misfit(delay) for delay in grid]))]
-    step = grid[1] - grid[0]
+    nearest = int(np.argmin([misfit(delay) for delay in grid]))
+    if nearest in (0, len(grid) - 1):
+        return float("nan")
+    best, step = grid[nearest], grid[1] - grid[0]
     return float(
         minimize_scalar(misfit, bounds=(best - step, best + step), method="bounded", options={"xatol": 1e-5}).x
     )

@@ -41,7 +41,7 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
     if rate is not None:
         if not rate > 0:
             raise RecordError(f"--rate must be positive, not {rate}")
-        path_between = JointPath(time, position, velocity, float(time[-1]))
+        path_between = JointPath(time, position, velocity[:-1], velocity[1:], float(time[-1]))
         time = np.arange(0.0, time[-1] + 0.5 / rate, 1.0 / rate).clip(max=time[-1])
         knots = [_within(path_between, instant) for instant in time]
         position, velocity = np.array([q for q, _ in knots]), np.array([v for _, v in knots])
@@ -82,9 +82,9 @@ def joint_motion(
 def _within(path: JointPath, time: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     # The path is at rest beyond its ends; the record is not.
     if time <= path.start:
-        return path.position[0], path.velocity[0]
+        return path.position[0], path.rate_after[0]
     if time >= path.end:
-        return path.position[-1], path.velocity[-1]
+        return path.position[-1], path.rate_before[-1]
     return path.at(time)
 
 

@@ -43,11 +43,22 @@ class StrictModel(BaseModel):
 
 
 class Follows(StrictModel):
-    """Signals of the record a servo follows: ``position`` [rad] and its rate ``velocity`` [rad/s]."""
+    """Signals of the record a servo follows.
+
+    Attributes
+    ----------
+    position, velocity : str
+        Angle [rad] and its rate [rad/s].
+    torque : str or None
+        Joint torque [N m] to be held against ``limits.torque`` by the offline check.
+    rates : "continuous" or "held"
+        Whether the rate changes smoothly between samples, or is held until the next one (a sampled controller).
+    """
 
     position: str
     velocity: str
     torque: str | None = None
+    rates: Literal["continuous", "held"] = "continuous"
 
 
 class Limits(StrictModel):

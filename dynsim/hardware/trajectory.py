@@ -1,8 +1,9 @@
 """A record as a path for the servos: continuous in time, with rest at both ends.
 
-Between the samples of a record joint angles are the cubic Hermite interpolant of (q, v). Where the record begins or ends
-in motion, a stretch of constant acceleration is added (a parabola, which the same interpolant represents exactly), so that
-the robot starts and ends at rest without a jump in velocity.
+Between the samples of a record joint angles are the cubic Hermite interpolant of (q, v), or straight where the record's
+rates are held from sample to sample (a sampled controller). Where the record begins or ends in motion, a stretch of
+constant acceleration is added (a parabola, which the same interpolant represents exactly), so that the robot starts and
+ends at rest without a jump in velocity.
 """
 
 from __future__ import annotations
@@ -28,15 +29,18 @@ class Path:
     ----------
     time : array, shape (T,)
         Knots [s]; 0 is the first sample of the record, negative knots are the run-up.
-    position, velocity : array, shape (T, N)
-        [rad], [rad/s], in the order of the servo map.
+    position : array, shape (T, N)
+        At the knots [rad], in the order of the servo map.
+    rate_after, rate_before : array, shape (T-1, N)
+        Joint rates at the beginning and the end of every interval [rad/s].
     record_end : float
         Time of the last sample of the record [s], counted from its first.
     """
 
     time: NDArray[np.float64]
     position: NDArray[np.float64]
-    velocity: NDArray[np.float64]
+    rate_after: NDArray[np.float64]
+    rate_before: NDArray[np.float64]
     record_end: float
 
     @property
@@ -57,7 +61,7 @@ class Path:
         h = self.time[left + 1] - self.time[left]
         s = (time - self.time[left]) / h
         q0, q1 = self.position[left], self.position[left + 1]
-        m0, m1 = h * self.velocity[left], h * self.velocity[left + 1]
+        m0, m1 = h * self.rate_after[left], h * self.rate_before[left]
         a, b = 2 * q0 - 2 * q1 + m0 + m1, -3 * q0 + 3 * q1 - 2 * m0 - m1
         return q0 + s * (m0 + s * (b + s * a)), (m0 + s * (2 * b + 3 * s * a)) / h
 
@@ -65,7 +69,7 @@ class Path:
         """Every interval's extreme positions and velocities, between the knots too."""
         h = np.diff(self.time)[:, None]
         q0, q1 = self.position[:-1], self.position[1:]
-        m0, m1 = h * self.velocity[:-1], h * self.velocity[1:]
+        m0, m1 = h * self.rate_after, h * self.rate_before
         a, b = 2 * q0 - 2 * q1 + m0 + m1, -3 * q0 + 3 * q1 - 2 * m0 - m1  # (T-1, N)
         # Position is extreme where 3a s² + 2b s + m0 = 0, velocity where 6a s + 2b = 0. The root is taken in the form
         # that does not cancel; where an interval has none, its ends stand in.
@@ -106,14 +110,19 @@ def path_of_record(record: Record, servo_map: ServoMap) -> Path:
         bad = int(np.flatnonzero(~(np.diff(time) > 0))[0]) + 1
         raise CheckRefused(f"the record's time does not increase at sample {bad} (t = {record.time[bad]:g} s)")
     position = np.empty((len(record), len(servo_map.servos)))
-    velocity = np.empty_like(position)
+    rate_after, rate_before = np.empty_like(position[1:]), np.empty_like(position[1:])
     for column, servo in enumerate(servo_map.servos):
         if servo.hold_at is not None:
-            position[:, column], velocity[:, column] = servo.hold_at, 0.0
+            position[:, column], rate_after[:, column], rate_before[:, column] = servo.hold_at, 0.0, 0.0
             continue
-        position[:, column] = column_of(record, servo.kind.follows.position, servo, "rad")
-        velocity[:, column] = column_of(record, servo.kind.follows.velocity, servo, "rad/s")
-    return _at_rest_at_both_ends(time, position, velocity, servo_map.safety.run_up)
+        follows = servo.kind.follows
+        position[:, column] = column_of(record, follows.position, servo, "rad")
+        velocity = column_of(record, follows.velocity, servo, "rad/s")
+        if follows.rates == "held":
+            rate_after[:, column] = rate_before[:, column] = np.diff(position[:, column]) / np.diff(time)
+        else:
+            rate_after[:, column], rate_before[:, column] = velocity[:-1], velocity[1:]
+    return _at_rest_at_both_ends(Path(time, position, rate_after, rate_before, float(time[-1])), servo_map.safety.run_up)
 
 
 def column_of(record: Record, signal: str, servo: Servo, unit: str) -> NDArray[np.float64]:
@@ -138,23 +147,21 @@ def column_of(record: Record, signal: str, servo: Servo, unit: str) -> NDArray[n
     return data
 
 
-def _at_rest_at_both_ends(
-    time: NDArray[np.float64], position: NDArray[np.float64], velocity: NDArray[np.float64], acceleration: float
-) -> Path:
-    record_end = float(time[-1])
-    first, last = np.abs(velocity[0]).max(), np.abs(velocity[-1]).max()
-    rest = np.zeros((1, position.shape[1]))
-    if first > REST:
-        duration = first / acceleration
+def _at_rest_at_both_ends(path: Path, acceleration: float) -> Path:
+    time, position, rate_after, rate_before = path.time, path.position, path.rate_after, path.rate_before
+    first, last = rate_after[:1], rate_before[-1:]
+    rest = np.zeros_like(first)
+    if (fastest := np.abs(first).max()) > REST:
+        duration = fastest / acceleration
         time = np.concatenate([[-duration], time])
-        position = np.concatenate([position[:1] - 0.5 * duration * velocity[:1], position])
-        velocity = np.concatenate([rest, velocity])
-    if last > REST:
-        duration = last / acceleration
-        time = np.concatenate([time, [record_end + duration]])
-        position = np.concatenate([position, position[-1:] + 0.5 * duration * velocity[-1:]])
-        velocity = np.concatenate([velocity, rest])
-    return Path(time, position, velocity, record_end)
+        position = np.concatenate([position[:1] - 0.5 * duration * first, position])
+        rate_after, rate_before = np.concatenate([rest, rate_after]), np.concatenate([first, rate_before])
+    if (fastest := np.abs(last).max()) > REST:
+        duration = fastest / acceleration
+        time = np.concatenate([time, [path.record_end + duration]])
+        position = np.concatenate([position, position[-1:] + 0.5 * duration * last])
+        rate_after, rate_before = np.concatenate([rate_after, last]), np.concatenate([rate_before, rest])
+    return Path(time, position, rate_after, rate_before, path.record_end)
 
 
 def quintic(duration: float, time: float) -> tuple[float, float]:

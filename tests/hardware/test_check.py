@@ -55,8 +55,22 @@ def test_extremes_between_the_samples_count(rig) -> None:
 
 def test_speed_scales_velocities(rig) -> None:
     check_motion(rig.record, rig.map, speed=1.2)
-    with pytest.raises(CheckRefused, match=r"shoulder: velocity"):
+    with pytest.raises(CheckRefused, match=r"shoulder: velocity") as refusal:
         check_motion(rig.record, rig.map, speed=1.3)
+    assert "--speed 1.25 would pass" in str(refusal.value)
+
+
+def test_held_rates_make_straight_stretches_that_never_overshoot(write_map) -> None:
+    """A joint that runs to 0.9 rad and stays: the smooth interpolant overshoots, the record's robot did not."""
+    time, angle = np.array([0.0, 0.5, 1.0, 1.5]), np.array([0.1, 0.5, 0.9, 0.9])
+    record = record_of(time, angle, np.array([0.8, 0.8, 0.8, 0.0]))
+    old = "{position: q, velocity: v}"
+    smooth = path_of_record(record, load_servo_map(write_map()))
+    held = path_of_record(record, load_servo_map(write_map((old, "{position: q, velocity: v, rates: held}"))))
+    assert smooth.extremes().position[..., 0].max() > 0.95
+    assert held.extremes().position[..., 0].max() == 0.9
+    assert held.extremes().velocity[..., 0].max() == pytest.approx(0.8)
+    assert held.at(0.75)[0][0] == pytest.approx(0.7)
 
 
 def test_a_record_in_motion_gets_a_run_up_and_a_run_out_at_rest(rig) -> None:

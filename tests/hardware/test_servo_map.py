@@ -26,10 +26,10 @@ def test_the_shipped_arm_map_names_ten_joints() -> None:
 def test_the_shipped_snake_map_names_joints_held_joints_and_wheels() -> None:
     servo_map = load_servo_map(SHIPPED / "snake.yaml")
     followed = [servo.label for servo in servo_map.servos if servo.kind.mode == "position" and servo.hold_at is None]
-    assert followed == ["theta_1", "psi_1", "theta_2", "psi_2", "theta_3", "psi_3", *(f"theta_{k}" for k in range(4, 10))]
-    assert [servo.joint for servo in servo_map.servos if servo.hold_at == 0.0] == [f"psi_{k}" for k in range(4, 9)]
+    assert followed == ["theta1", "psi1", "theta2", "psi2", "theta3", "psi3", *(f"theta{k}" for k in range(4, 10))]
+    assert [servo.joint for servo in servo_map.servos if servo.hold_at == 0.0] == [f"psi{k}" for k in range(4, 9)]
     wheels = [servo for servo in servo_map.servos if servo.kind.mode == "velocity"]
-    assert [servo.joint for servo in wheels] == [f"wheel_{k}" for k in range(1, 8)]
+    assert [servo.joint for servo in wheels] == [f"wheel{k}" for k in range(1, 8)]
     assert {servo.model.name for servo in wheels} == {"MX-28"}
 
 
