@@ -184,35 +184,33 @@ def replay(
         from dynsim.hardware.servo_map import ServoMapError
         from dynsim.hardware.virtual_faults import load_fault_script
 
+        if (faults or plant) and port != session.VIRTUAL:
+            raise ServoMapError("--faults and --plant are for virtual servos: --port virtual")
+        simulated, servo_map, motion = _checked(record, map_file, rate, speed)
+        script = load_fault_script(faults) if faults else None
+        robot = _plant(plant, variant, servo_map, motion) if plant else None
+        folder = out or Path("results") / f"{servo_map.robot}_replay"
+        for warning in motion.warnings:
+            console.print(f"warning: {warning}")
+        moves = live or port == session.VIRTUAL
+        if live and port != session.VIRTUAL and not yes:
+            _confirm(servo_map, motion)
         stop = StopRequest()
-        with session.stop_on_signals(stop):
-            simulated, servo_map, motion = _checked(record, map_file, rate, speed)
-            if faults and port != session.VIRTUAL:
-                raise ServoMapError(
-                    "--faults is for virtual servos: with a real port there is enough that can go wrong"
-                )
-            script = load_fault_script(faults) if faults else None
-            folder = out or Path("results") / f"{servo_map.robot}_replay"
-            for warning in motion.warnings:
-                console.print(f"warning: {warning}")
-            moves = live or port == session.VIRTUAL
-            if live and port != session.VIRTUAL and not yes:
-                _confirm(servo_map, motion)
-            with _progress(enabled=not quiet) as observer:
-                result = session.run_replay(
-                    motion,
-                    servo_map,
-                    port,
-                    folder,
-                    policy=policy.value if policy else None,
-                    live=live,
-                    write_eeprom=configure,
-                    script=script,
-                    plant=_plant(plant, variant, servo_map, motion) if plant else None,
-                    stop=stop,
-                    observer=observer,
-                    provenance={"record": str(record), "simulated": simulated.provenance},
-                )
+        with session.stop_on_signals(stop), _progress(enabled=not quiet) as observer:
+            result = session.run_replay(
+                motion,
+                servo_map,
+                port,
+                folder,
+                policy=policy.value if policy else None,
+                live=live,
+                write_eeprom=configure,
+                script=script,
+                plant=robot,
+                stop=stop,
+                observer=observer,
+                provenance={"record": str(record), "simulated": simulated.provenance},
+            )
     _print_timing(result)
     if not moves:
         console.print("dry run: servos verified and the bus timed, nothing was moved; --live moves")

@@ -244,7 +244,11 @@ class Replay:
         self._last_logged = -math.inf
 
     def run(self) -> ReplayResult:
-        """Carry the replay through, to its end or to a fault; never raises for trouble on the bus."""
+        """Carry the replay through, to its end or to a fault; never raises for trouble on the bus.
+
+        An exception of another kind (of the observer, a KeyboardInterrupt without :class:`StopRequest`) is raised again
+        after the fault policy was carried out.
+        """
         try:
             self._verify()
             if self.live:
@@ -260,6 +264,10 @@ class Replay:
             self._fault(Fault(Cause.PORT, str(error)))
         except (NoAnswer, RequestRefused) as error:
             self._fault(Fault(Cause.ARMING if self.state == State.ARM else Cause.VERIFICATION, str(error), (error.id,)))
+        except BaseException as error:
+            # A robot with its torque on must not be left to itself, whatever went wrong.
+            self._fault(Fault(Cause.PROGRAM, repr(error)))
+            raise
         self._finish()
         return self.result
 

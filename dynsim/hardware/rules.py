@@ -35,6 +35,7 @@ class Cause(StrEnum):
     DEADLINE = "deadline"
     NOT_SETTLED = "not settled"
     GOAL_GUARD = "goal guard"
+    PROGRAM = "program error"
 
 
 @dataclass(frozen=True)

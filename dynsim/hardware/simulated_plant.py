@@ -115,7 +115,9 @@ class SimulatedArm:
         return of_joints
 
 
-def simulated_arm(scenario_name: str, variant: str | None, servo_map: ServoMap, posture: dict[str, float]) -> SimulatedArm:
+def simulated_arm(
+    scenario_name: str, variant: str | None, servo_map: ServoMap, posture: dict[str, float]
+) -> SimulatedArm:
     """The robot of a scenario behind the servos of a map.
 
     Parameters

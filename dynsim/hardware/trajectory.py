@@ -122,7 +122,9 @@ def path_of_record(record: Record, servo_map: ServoMap) -> Path:
             rate_after[:, column] = rate_before[:, column] = np.diff(position[:, column]) / np.diff(time)
         else:
             rate_after[:, column], rate_before[:, column] = velocity[:-1], velocity[1:]
-    return _at_rest_at_both_ends(Path(time, position, rate_after, rate_before, float(time[-1])), servo_map.safety.run_up)
+    return _at_rest_at_both_ends(
+        Path(time, position, rate_after, rate_before, float(time[-1])), servo_map.safety.run_up
+    )
 
 
 def column_of(record: Record, signal: str, servo: Servo, unit: str) -> NDArray[np.float64]:

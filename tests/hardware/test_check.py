@@ -40,7 +40,9 @@ def test_a_motion_within_limits_passes_with_its_margins(rig) -> None:
 
 def test_a_violation_names_joint_time_and_margin(rig) -> None:
     record = swing(amplitude=1.2)
-    with pytest.raises(CheckRefused, match=r"shoulder: position -1\.2000 rad at t = 1\.178 s, limit -1\.0472 rad, margin -0\.1528 rad") as refusal:
+    with pytest.raises(
+        CheckRefused, match=r"shoulder: position -1\.2000 rad at t = 1\.178 s, limit -1\.0472 rad, margin -0\.1528 rad"
+    ) as refusal:
         check_motion(record, rig.map)
     assert "velocity 4.8" in str(refusal.value)
 
@@ -157,9 +159,7 @@ def test_the_plan_agrees_with_the_estimate_for_eighteen_servos(write_map, baud: 
 
 
 motions = st.lists(
-    st.tuples(
-        st.floats(-1.2, 1.2), st.floats(-1.2, 1.2), st.floats(-3.5, 3.5), st.floats(-3.5, 3.5), st.floats(-6, 6)
-    ),
+    st.tuples(st.floats(-1.2, 1.2), st.floats(-1.2, 1.2), st.floats(-3.5, 3.5), st.floats(-3.5, 3.5), st.floats(-6, 6)),
     min_size=2,
     max_size=5,
 )

@@ -57,7 +57,9 @@ CASES = [
     Case("backlash", {"kind": "backlash", "angle": 0.02}, JOINTS),
     Case("offset_jump", {"kind": "offset_jump", "angle": 0.5}, JOINTS, (Cause.FOLLOWING_ERROR,)),
     Case("voltage_sag", {"kind": "voltage_sag", "drop": 2.0}, (), (Cause.VOLTAGE,)),
-    Case("temperature_ramp", {"kind": "temperature_ramp", "heating_rate": 200.0}, ANY, (Cause.TEMPERATURE,), True, 0.1825),
+    Case(
+        "temperature_ramp", {"kind": "temperature_ramp", "heating_rate": 200.0}, ANY, (Cause.TEMPERATURE,), True, 0.1825
+    ),
 ]
 
 

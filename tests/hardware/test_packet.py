@@ -93,9 +93,10 @@ def test_a_wrong_length_costs_one_packet_only() -> None:
 def fuzz(count: int, seed: int) -> None:
     """A stream of statuses of which a third is damaged.
 
-    Nothing may come out that was not sent, and every whole packet must come out. (A packet cut by three to five bytes
-    whose successor completes it to a right checksum, once in 2¹⁶ such cuts, no receiver can tell from a good one; with
-    these seeds it does not occur.)
+    Nothing may come out that was not sent, and every whole packet must come out but for one case: a packet cut by a byte
+    or two of its checksum is whole again with the FF FF of the next one, which then lacks its beginning. (A packet cut by
+    three to five bytes whose successor completes it to a right checksum, once in 2¹⁶ such cuts, no receiver can tell from
+    a good one; with these seeds it does not occur.)
     """
     draw = random.Random(seed)
     decoder = Decoder()
@@ -104,12 +105,17 @@ def fuzz(count: int, seed: int) -> None:
     for _ in range(0, count, window):
         whole: Counter[Packet] = Counter()
         damaged: Counter[Packet] = Counter()
+        after_a_cut: Counter[Packet] = Counter()
         received: Counter[Packet] = Counter()
+        cut_before = False
         for _ in range(min(window, count)):
             length = draw.randrange(0, 24)
             body = bytes(draw.choices(alphabet, k=length)) if draw.random() < 0.5 else draw.randbytes(length)
             packet = Packet(draw.randrange(253), STATUS, body, draw.choice((0, 0x80)))
             frame, kind = encode(packet), draw.random()
+            if cut_before:
+                after_a_cut[packet] += 1
+            cut_before = 0.67 <= kind < 0.78
             if kind < 0.67:
                 whole[packet] += 1
             elif kind < 0.78:
@@ -124,7 +130,7 @@ def fuzz(count: int, seed: int) -> None:
             received.update(decoder.feed(frame))
         received.update(decoder.flush())
         missing, extra = whole - received, received - whole
-        assert not missing
+        assert not missing - after_a_cut
         # A packet that lost bytes of its checksum only may be completed by the FF that follows: its content is right.
         assert not extra - damaged
 

@@ -58,14 +58,25 @@ class Servos:
             (folder / "faults.yaml").write_text(faults, encoding="utf-8")
             script = ["--faults", folder / "faults.yaml"]
         self.process = subprocess.Popen(
-            command("hw", "virtual", "--map", self.map, "--link", self.device, *script), stdout=subprocess.PIPE, text=True
+            command("hw", "virtual", "--map", self.map, "--link", self.device, *script),
+            stdout=subprocess.PIPE,
+            text=True,
         )
         assert self.process.stdout is not None
         assert "3 virtual servos at 1000000 bit/s" in self.process.stdout.readline()
 
     def replay(self, *options: object) -> list[str]:
         return command(
-            "hw", "replay", self.record, "--map", self.map, "--port", self.device, "--out", self.folder / "out", *options
+            "hw",
+            "replay",
+            self.record,
+            "--map",
+            self.map,
+            "--port",
+            self.device,
+            "--out",
+            self.folder / "out",
+            *options,
         )
 
     @property

@@ -12,7 +12,14 @@ from collections import deque
 
 import pytest
 import serial
-from dynamixel_sdk import COMM_PORT_BUSY, COMM_SUCCESS, GroupSyncRead, GroupSyncWrite, PortHandler, Protocol2PacketHandler
+from dynamixel_sdk import (
+    COMM_PORT_BUSY,
+    COMM_SUCCESS,
+    GroupSyncRead,
+    GroupSyncWrite,
+    PortHandler,
+    Protocol2PacketHandler,
+)
 
 from dynsim.hardware.control_table import BROADCAST_ID, MX_106, STATE_BLOCK
 from dynsim.hardware.dynamixel_bus import WRITE_TIMEOUT, DynamixelBus, open_serial_port

@@ -125,3 +125,22 @@ def test_handlers_are_given_back() -> None:
     with stop_on_signals(StopRequest()):
         assert signal.getsignal(signal.SIGINT) is not before
     assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_an_exception_out_of_the_blue_still_stops_the_robot(rig, error) -> None:
+    """Without the signal handlers a Ctrl-C lands in the middle of a read: the policy is carried out all the same."""
+    run = rig.prepare(policy="off")
+    read = run.replay.bus.port.readPort
+
+    def read_port(length: int) -> bytes:
+        if run.replay.state == State.REPLAY and run.clock.now() > 1.9 and run.replay.result.fault is None:
+            raise error("out of the blue")
+        return read(length)
+
+    run.replay.bus.port.readPort = read_port
+    with pytest.raises(error):
+        run.replay.run()
+    assert run.result.fault.cause == Cause.PROGRAM
+    assert run.result.end_state == "off"
+    assert not any(servo["torque_enable"] for servo in run.line.servos.values())
