@@ -53,7 +53,8 @@ def write_zero_ticks(servo_map: ServoMap, ticks: dict[str, int], path: Path) -> 
     Raises
     ------
     ServoMapError
-        With the new zero a joint's limits would leave the single turn position mode knows, or the file cannot be written.
+        With the new zero a joint's limits would leave the single turn position mode knows, or the file cannot be
+        written.
     """
     yaml = YAML(typ="rt")
     yaml.preserve_quotes = True
@@ -71,8 +72,8 @@ def write_zero_ticks(servo_map: ServoMap, ticks: dict[str, int], path: Path) -> 
             )
             if servo.joint in ticks and (ends[0] < 0 or ends[1] > 4095):
                 raise ServoMapError(
-                    f"{servo.joint}: with zero at tick {servo.zero_tick} its limits reach ticks {ends[0]} to {ends[1]}, "
-                    "position mode ends at 0 and 4095; turn the horn or narrow the limits"
+                    f"{servo.joint}: with zero at tick {servo.zero_tick} its limits reach ticks {ends[0]} to "
+                    f"{ends[1]}, position mode ends at 0 and 4095; turn the horn or narrow the limits"
                 )
         draft.replace(path)
     except OSError as error:

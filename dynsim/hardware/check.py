@@ -1,7 +1,7 @@
 """The offline check: would this record, at this speed and rate, ask anything of a servo that it must not do?
 
-Every interval between samples is examined for the extremes of its interpolant. Nothing is ever clamped: a motion outside
-of the limits is refused as a whole, before a port is opened.
+Every interval between samples is examined for the extremes of its interpolant. Nothing is ever clamped: a motion
+outside of the limits is refused as a whole, before a port is opened.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class Margin:
     def __str__(self) -> str:
         unit = self.unit
         return (
-            f"{self.joint}: {self.quantity} {self.value:.4f} {unit} at t = {self.time:.3f} s, limit {self.limit:.4f} {unit}, "
-            f"margin {self.margin:+.4f} {unit}"
+            f"{self.joint}: {self.quantity} {self.value:.4f} {unit} at t = {self.time:.3f} s, "
+            f"limit {self.limit:.4f} {unit}, margin {self.margin:+.4f} {unit}"
         )
 
 

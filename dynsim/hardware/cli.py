@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -176,7 +176,7 @@ def replay(
 
     Ctrl-C once: controlled stop. Twice: torque off.
 
-    Example: dynsim hw replay results/elbow_comparison/two_elbows/record.h5 --map scenarios/hardware/arm.yaml --port virtual
+    Example: dynsim hw replay record.h5 --map scenarios/hardware/arm.yaml --port virtual
     """
     with _client_library():
         from dynsim.hardware import session
@@ -363,7 +363,7 @@ def stop_servos(
     map_file: Annotated[Path | None, typer.Option("--map", help="ask the servos of this map")] = None,
     baud: Annotated[int | None, typer.Option("--baud", help="only this bit rate [bit/s]")] = None,
 ) -> None:
-    """Torque off for every servo, at every usual bit rate; works beside a running replay. No substitute for a power cut.
+    """Torque off for every servo at every usual bit rate, beside a running replay too. No substitute for a power cut.
 
     Example: dynsim hw stop --port /dev/ttyUSB0
     """

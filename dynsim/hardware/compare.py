@@ -105,8 +105,8 @@ class Comparison:
 def compare_records(simulated: Record, measured: Record) -> Comparison:
     """Compare every joint angle the two records share.
 
-    ``measured`` may be a measured run (its ``record_time`` ties it to the simulated one) or any other record. Wheels are
-    left out: where they stand after a run says nothing about the replay.
+    ``measured`` may be a measured run (its ``record_time`` ties it to the simulated one) or any other record. Wheels
+    are left out: where they stand after a run says nothing about the replay.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def compare_records(simulated: Record, measured: Record) -> Comparison:
         No common angles, or no sample of the replayed motion.
     """
     rows = measured["state"] == State.REPLAY if "state" in measured else np.ones(len(measured), dtype=bool)
-    time = np.asarray(measured["record_time"] if "record_time" in measured else measured.time, dtype=np.float64)
+    time = measured["record_time"] if "record_time" in measured else measured.time  # noqa: SIM401
     rows &= np.isfinite(time) & (time >= 0) & (time <= simulated.time[-1] - simulated.time[0])
     if rows.sum() < 2:
         raise RecordError("the measured record holds no sample of the replayed motion")

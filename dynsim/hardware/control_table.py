@@ -1,8 +1,8 @@
 """Control tables of the MX-106(2.0) and MX-28(2.0), Protocol 2.0, as data.
 
-Source: ROBOTIS e-Manual, "MX-106(2.0)" and "MX-28(2.0)", chapter Control Table. Limits stored in a servo changed between
-firmware versions: the replay reads them from the servo and never assumes the defaults given here, which only fill the
-virtual servos.
+Source: ROBOTIS e-Manual, "MX-106(2.0)" and "MX-28(2.0)", chapter Control Table. Limits stored in a servo changed
+between firmware versions: the replay reads them from the servo and never assumes the defaults given here, which only
+fill the virtual servos.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ each: when one fails, the library was mended and the detour can go):
 
 - A read that is interrupted leaves ``port.is_using`` set, and every later write is dropped: it is cleared before each
   transaction, and signals only set a flag.
-- One lost status costs a time-out and hides all servos behind it: the sync read takes the bytes itself, decodes all that
-  come, and keys them by ID. The library's receive loop would also swallow the status after a cut one.
+- One lost status costs a time-out and hides all servos behind it: the sync read takes the bytes itself, decodes all
+  that come, and keys them by ID. The library's receive loop would also swallow the status after a cut one.
 - Group reads drop the error byte: the decoder keeps it.
 - Byte stuffing of requests is lost, some stuffed answers are mangled: a request whose body holds FF FF FD is rejected
   here, answers of a wrong length count as garbled, and Fast Sync Read is never used.

@@ -8,7 +8,7 @@ from dynsim.errors import DynsimError
 
 
 class ServoMapError(DynsimError):
-    """The servo map, fault script or gate file cannot be read or is not valid (file, line, key and fix in the message)."""
+    """A servo map, fault script or gate file that cannot be read or is not valid (file, line, key, fix)."""
 
 
 class CheckRefused(DynsimError):

@@ -23,9 +23,10 @@ RATES = {"q": "v", "phi": "phi_dot", "rho": "rho_dot"}
 def export_record(record: Record, path: Path, format_: Format, *, rate: float | None = None) -> Path:
     """Write the joint angles and rates of a record.
 
-    ``csv``: one row per sample, columns "time [s]", "<joint> [rad]", "<joint> [rad/s]". ``joint-trajectory``: the fields
-    of a ROS trajectory_msgs/JointTrajectory as YAML, for a joint trajectory controller. ``urdf-log``: one JSON object per
-    line, {"time", "position": {joint: rad}, "velocity": {joint: rad/s}}, joint names being those of the URDF.
+    ``csv``: one row per sample, columns "time [s]", "<joint> [rad]", "<joint> [rad/s]". ``joint-trajectory``: the
+    fields of a ROS trajectory_msgs/JointTrajectory as YAML, for a joint trajectory controller. ``urdf-log``: one JSON
+    object per line, {"time", "position": {joint: rad}, "velocity": {joint: rad/s}}, joint names being those of the
+    URDF.
 
     Parameters
     ----------

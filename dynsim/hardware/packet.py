@@ -34,7 +34,7 @@ class Instruction(IntEnum):
 
 
 class StatusError(IntEnum):
-    """Lower seven bits of the error byte of a status packet; bit 7 (ALERT) says that the hardware error register is set."""
+    """Lower seven bits of a status packet's error byte; bit 7 (ALERT): the hardware error register is set."""
 
     NONE = 0
     RESULT_FAIL = 1
@@ -76,8 +76,10 @@ def stuff(body: bytes) -> bytes:
 
 
 def holds_bare_header(stuffed: bytes) -> bool:
-    """True where FF FF FD is not followed by FD: no sender makes such a body; a cut packet that swallowed the next one is
-    recognised by it, which its checksum alone would miss once in 65536 times."""
+    """True where FF FF FD is not followed by FD: no sender makes such a body.
+
+    It tells a cut packet that swallowed the next one, which the checksum alone would miss once in 65536 times.
+    """
     return HEADER in stuffed.replace(HEADER + b"\xfd", b"\0")
 
 

@@ -19,7 +19,7 @@ _BAUD_BY_CODE = {
     getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()
 }
 IDLE = 1e-3
-"""Longest wait for bytes before the servos move on [s]: short, so that a request finds little motion to catch up with."""
+"""Longest wait for bytes before the servos move on [s]; short, for a request to find little motion to catch up with."""
 
 
 class PseudoTerminal:

@@ -1,8 +1,8 @@
 """The replay: a checked motion on a bus of servos.
 
-CONNECT → VERIFY → ARM → MOVE_TO_START → SETTLE → REPLAY → SETTLE → DISARM, and from everywhere → FAULT. The offline check
-(:mod:`dynsim.hardware.check`) has been passed before. Cycles start at absolute deadlines; one that is more than a period
-late is skipped, never made up for. After a fault nothing is sent but what the fault policy says.
+CONNECT → VERIFY → ARM → MOVE_TO_START → SETTLE → REPLAY → SETTLE → DISARM, and from everywhere → FAULT. The offline
+check (:mod:`dynsim.hardware.check`) has been passed before. Cycles start at absolute deadlines; one that is more than
+a period late is skipped, never made up for. After a fault nothing is sent but what the fault policy says.
 """
 
 from __future__ import annotations
@@ -491,7 +491,7 @@ class Replay:
     def _profile(self, servo: Servo, *, approaching: bool) -> dict[str, int]:
         """The firmware's own limits: slow towards the start, the joint's speed limit during the replay.
 
-        0 would mean "no limit" and is never written as a velocity; as an acceleration it leaves the shaping to the path.
+        0 would mean "no limit" and is never written as a velocity; as an acceleration it leaves shaping to the path.
         """
         velocity = (
             min(2 * self.map.safety.approach_velocity, velocity_limit(servo)) if approaching else velocity_limit(servo)

@@ -1,7 +1,7 @@
 """The abort rules: from what one cycle brought in, whether the replay may go on.
 
-Every rule has a bound on its reaction, in cycles from the first cycle in which the trouble can be seen on the wire to the
-cycle in which the fault is declared; :func:`reaction_bound` gives it.
+Every rule has a bound on its reaction, in cycles from the first cycle in which the trouble can be seen on the wire to
+the cycle in which the fault is declared; :func:`reaction_bound` gives it.
 """
 
 from __future__ import annotations

@@ -90,7 +90,7 @@ def run_replay(
     observer: Callable[[Progress], None] | None = None,
     provenance: dict[str, Any] | None = None,
 ) -> ReplayResult:
-    """Replay a checked motion and leave ``measured.h5``, ``summary.json``, ``replay.log`` and register dumps in ``folder``.
+    """Replay a checked motion; ``measured.h5``, ``summary.json``, ``replay.log`` and register dumps go to ``folder``.
 
     Parameters are those of :class:`dynsim.hardware.replay.Replay` and :func:`bus_on`; on virtual servos ``live`` goes
     without saying.

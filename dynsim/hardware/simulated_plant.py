@@ -1,8 +1,8 @@
 """A simulated robot behind the virtual servos: its bodies, gravity, and the surfaces its elbows are braced on.
 
 The servos' motor law replaces the motors of the scenario. Contact points are pushed by a stiff spring and damper with
-regularised Coulomb friction, and only pushed: unlike the scenario's bilateral law a floor does not pull here. One step is
-linearly implicit,
+regularised Coulomb friction, and only pushed: unlike the scenario's bilateral law a floor does not pull here. One step
+is linearly implicit,
 
     (M + J + Δt (D + Jcᵀ c Jc) + Δt² Jcᵀ k Jc) Δv = Δt (τ − h − g − D v + Jcᵀ f)
 
@@ -33,8 +33,8 @@ HELD = 1e9
 class SimulatedArm:
     """Implements :class:`~dynsim.hardware.servo_plant.ServoPlant` for a robot whose every joint has a position servo.
 
-    A joint rests on the robot's stand until its servo is first switched on: otherwise an arm would fall while it is armed
-    joint by joint.
+    A joint rests on the robot's stand until its servo is first switched on: otherwise an arm would fall while it is
+    armed joint by joint.
 
     Parameters
     ----------

@@ -133,7 +133,8 @@ def _unfit(servo: Servo, registers: Registers, servo_map: ServoMap) -> list[str]
     delay = registers["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT
     if delay > servo_map.bus.return_delay + 1e-9:
         found.append(
-            f"return delay is {delay * 1e6:.0f} µs, planned {servo_map.bus.return_delay * 1e6:.0f} µs (--configure sets it)"
+            f"return delay is {delay * 1e6:.0f} µs, planned {servo_map.bus.return_delay * 1e6:.0f} µs "
+            "(--configure sets it)"
         )
     if registers["status_return_level"] != STATUS_TO_ALL:
         found.append(f"status return level is {registers['status_return_level']}, must be {STATUS_TO_ALL}")

@@ -1,4 +1,4 @@
-"""Servos in memory: a line with wire time, N servos with full control tables, motion, heat, supply, and scripted faults.
+"""Servos in memory: a line with wire time, full control tables, motion, heat, supply, and scripted faults.
 
 :class:`VirtualLine` takes bytes and gives bytes with their arrival times. :class:`VirtualPort` puts it under the client
 library on a virtual clock; :mod:`dynsim.hardware.pseudo_terminal` puts it behind a serial device.

@@ -14,7 +14,7 @@ Probability = Annotated[float, Field(ge=0, le=1)]
 
 
 class _Timed(StrictModel):
-    """Active from ``at`` [s after the first torque enable; always if absent] for ``duration`` [s; for good if absent]."""
+    """Active from ``at`` [s after the first torque enable] for ``duration`` [s]; absent: always, for good."""
 
     at: Annotated[float, Field(ge=0)] | None = None
     duration: Annotated[float, Field(gt=0)] | None = None
@@ -104,7 +104,7 @@ class FaultScript(StrictModel):
     """
 
     seed: int = 0
-    faults: list[Fault] = []
+    faults: list[Fault] = Field(default_factory=list)
 
 
 def load_fault_script(path: str | Path) -> FaultScript:

@@ -48,7 +48,7 @@ def test_a_violation_names_joint_time_and_margin(rig) -> None:
 
 
 def test_extremes_between_the_samples_count(rig) -> None:
-    """Two samples at 0.9 rad, the joint swinging out to 0.9 + 2·1/8·… between them: q(½) = 0.9 + h (v0 − v1)/8 = 1.15."""
+    """Two samples at 0.9 rad, between them q(½) = 0.9 + h (v0 − v1)/8 = 1.15 rad."""
     time = np.array([0.0, 1.0, 2.0])
     record = record_of(time, np.array([0.9, 0.9, 0.9]), np.array([0.0, 1.0, -1.0]))
     with pytest.raises(CheckRefused, match=r"shoulder: position 1\.15"):

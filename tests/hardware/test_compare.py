@@ -23,7 +23,8 @@ from .conftest import swing
 
 
 def test_the_following_error_is_explained_by_the_motor_law(rig, clean_run) -> None:
-    """A critically damped loop at frequency ω = 4 rad/s lags by d/k·(1 + O(ω²)); goals are held one cycle, half on average."""
+    """A critically damped loop at frequency ω = 4 rad/s lags by d/k·(1 + O(ω²)); goals are held one cycle, half on
+    average."""
     run = clean_run
     comparison = compare_records(rig.record, run.result.record)
     law = MotorLaw([MX_106])

@@ -93,10 +93,10 @@ def test_a_wrong_length_costs_one_packet_only() -> None:
 def fuzz(count: int, seed: int) -> None:
     """A stream of statuses of which a third is damaged.
 
-    Nothing may come out that was not sent, and every whole packet must come out but for one case: a packet cut by a byte
-    or two of its checksum is whole again with the FF FF of the next one, which then lacks its beginning. (A packet cut by
-    three to five bytes whose successor completes it to a right checksum, once in 2¹⁶ such cuts, no receiver can tell from
-    a good one; with these seeds it does not occur.)
+    Nothing may come out that was not sent, and every whole packet must come out but for one case: a packet cut by a
+    byte or two of its checksum is whole again with the FF FF of the next one, which then lacks its beginning. (A
+    packet cut by three to five bytes whose successor completes it to a right checksum, once in 2¹⁶ such cuts, no
+    receiver can tell from a good one; with these seeds it does not occur.)
     """
     draw = random.Random(seed)
     decoder = Decoder()

@@ -142,12 +142,10 @@ def test_replay_over_a_serial_device(servos: Servos) -> None:
 
 
 def test_a_second_replay_is_refused_and_stop_works_beside_the_first(servos: Servos) -> None:
+    first = open_serial_port(str(servos.device), 1_000_000)
     with pytest.raises(PortError, match="in use by another process"):
-        first = open_serial_port(str(servos.device), 1_000_000)
-        try:
-            open_serial_port(str(servos.device), 1_000_000)
-        finally:
-            first.closePort()
+        open_serial_port(str(servos.device), 1_000_000)
+    first.closePort()
     running = subprocess.Popen(servos.replay("--live", "--yes", "--speed", "0.1"), stderr=subprocess.PIPE, text=True)
     wait_for(lambda: "REPLAY         enter" in servos.log)
     second = subprocess.run(servos.replay("--live", "--yes"), capture_output=True, text=True, timeout=60, check=False)

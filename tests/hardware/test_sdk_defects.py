@@ -210,11 +210,15 @@ def test_6_a_port_that_blocks_is_given_up() -> None:
     bus = DynamixelBus(port)
     # Nobody reads the other end: the buffer fills, a write would wait for ever.
     with pytest.raises(PortError):
-        for _ in range(10_000):
-            bus.torque_off_all()
+        _fill(bus)
     bus.close()
     os.close(slave)
     os.close(master)
+
+
+def _fill(bus: DynamixelBus) -> None:
+    for _ in range(10_000):
+        bus.torque_off_all()
 
 
 def test_6_missing_ports_and_bit_rates_are_one_clear_line() -> None:
