@@ -35,7 +35,7 @@ class ExportFormat(StrEnum):
 
 
 RecordFile = Annotated[Path, typer.Argument(metavar="RECORD", help="record.h5 of a run")]
-MapFile = Annotated[Path, typer.Option("--map", help="servo map (scenarios/hardware/*.yaml)")]
+MapFile = Annotated[Path, typer.Option("--map", help="servo map: a file, or the name of a shipped one (arm, snake)")]
 Port = Annotated[str, typer.Option("--port", help="serial device, e.g. /dev/ttyUSB0")]
 Rate = Annotated[float | None, typer.Option("--rate", help="goals per second [Hz]; the map's if not given")]
 Speed = Annotated[float, typer.Option("--speed", help="1 is the record's own time, 0.5 half as fast")]
@@ -180,8 +180,8 @@ def replay(
     """
     with _client_library():
         from dynsim.hardware import session
+        from dynsim.hardware.errors import ServoMapError
         from dynsim.hardware.replay import StopRequest
-        from dynsim.hardware.servo_map import ServoMapError
         from dynsim.hardware.virtual_faults import load_fault_script
 
         if (faults or plant) and port != session.VIRTUAL:
@@ -397,16 +397,18 @@ def calibrate(
         from dynsim.hardware import session
         from dynsim.hardware.calibrate import read_zero_ticks, write_zero_ticks
         from dynsim.hardware.errors import ServoMapError
-        from dynsim.hardware.servo_map import load_servo_map
+        from dynsim.hardware.servo_map import SHIPPED, load_servo_map
 
         servo_map = load_servo_map(map_file)
+        target = out or servo_map.path
+        if target.resolve().parent == SHIPPED:
+            raise ServoMapError(f"{target} comes with dynsim; write your own map with --out")
         unknown = [name for name in joint or () if name not in servo_map.joints]
         if unknown:
             raise ServoMapError(f"{map_file} has no joint {', '.join(unknown)}; it has {', '.join(servo_map.joints)}")
         chosen = [servo for servo in servo_map.servos if (servo.joint in joint if joint else servo.in_position_mode)]
         with session.bus_on(port, servo_map) as (bus, _):
             ticks = read_zero_ticks(bus, chosen)
-        target = out or map_file
         write_zero_ticks(servo_map, ticks, target)
     table = Table("joint", "ID", "old zero", "new zero")
     for servo in chosen:

@@ -22,6 +22,10 @@ IDLE = 1e-3
 """Longest wait for bytes before the servos move on [s]; short, for a request to find little motion to catch up with."""
 
 
+STALL = 10e-3
+"""Of a longer pause of this process the servos notice so much [s]."""
+
+
 class PseudoTerminal:
     """Serves a :class:`VirtualLine` in wall time.
 
@@ -57,19 +61,22 @@ class PseudoTerminal:
 
     def serve(self, keep_on: Callable[[], bool]) -> None:
         """Answer until ``keep_on`` says no, or the scripted adapter is pulled out."""
-        origin = time.monotonic()
+        origin = last = time.monotonic()
         outgoing: deque[tuple[float, bytes]] = deque()
         while keep_on() and not self.line.unplugged:
             now = time.monotonic() - origin
             wait = min(IDLE, max(0.0, outgoing[0][0] - now)) if outgoing else IDLE
             readable, _, _ = select.select([self._master], [], [], wait)
-            now = time.monotonic() - origin
-            self.line.advance(now)
+            # When the computer did not run this process the servos stood still too: real ones would not have been late.
+            origin += max(0.0, time.monotonic() - last - STALL)
+            last = time.monotonic()
+            now = last - origin
             if readable:
                 with contextlib.suppress(BlockingIOError, OSError):
                     data = os.read(self._master, 4096)
                     arrivals = self._answer(data, now)
                     outgoing = deque(sorted([*outgoing, *arrivals], key=lambda arrival: arrival[0]))
+            self.line.advance(now)
             while outgoing and outgoing[0][0] <= time.monotonic() - origin:
                 self._send(outgoing.popleft()[1])
 

@@ -31,6 +31,11 @@ from dynsim.hardware.control_table import (
 )
 from dynsim.hardware.errors import ServoMapError
 
+_PACKAGE = Path(__file__).resolve().parents[1]
+_CHECKOUT = _PACKAGE.parent / "scenarios" / "hardware"
+SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else _PACKAGE / "shipped_scenarios" / "hardware"
+"""Folder of the servo maps that come with dynsim."""
+
 FaultPolicy = Literal["hold", "decelerate", "off"]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -318,14 +323,18 @@ class ServoMap:
 
 
 def load_servo_map(path: str | Path) -> ServoMap:
-    """Read and validate a servo map.
+    """Read and validate a servo map: the file of that path, or the one of that name that comes with dynsim ("arm").
 
     Raises
     ------
     ServoMapError
         The file is missing, is not YAML, or an entry is wrong; with file and line.
     """
-    return ServoMap(Path(path), read_yaml(Path(path), _MapFile))
+    path = Path(path)
+    shipped = SHIPPED / f"{path.stem}.yaml"
+    if not path.is_file() and path.parent in (Path(), Path("scenarios/hardware")) and shipped.is_file():
+        path = shipped
+    return ServoMap(path, read_yaml(path, _MapFile))
 
 
 _Schema = TypeVar("_Schema", bound=BaseModel)

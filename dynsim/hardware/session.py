@@ -24,6 +24,8 @@ from dynsim.hardware.virtual_bus import VirtualPort, line_for_map
 from dynsim.hardware.virtual_faults import FaultScript
 
 VIRTUAL = "virtual"
+PSEUDO_TERMINAL_LATENCY = 0.05
+"""Servos behind a pseudo-terminal are a program, which a busy computer may not run for a while [s]."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 SCAN_BAUD_RATES = (57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 STOP_BAUD_RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)
@@ -68,7 +70,10 @@ def bus_on(
                 f"echo 1 | sudo tee /sys/bus/usb-serial/devices/{Path(port).resolve().name}/latency_timer"
             )
         handler = open_serial_port(port, servo_map.bus.baud)
-    bus = DynamixelBus(handler, latency=servo_map.bus.latency, return_delay=servo_map.bus.return_delay)
+    latency = servo_map.bus.latency
+    if port != VIRTUAL and str(Path(port).resolve()).startswith("/dev/pts/"):
+        latency = max(latency, PSEUDO_TERMINAL_LATENCY)
+    bus = DynamixelBus(handler, latency=latency, return_delay=servo_map.bus.return_delay)
     try:
         yield bus, clock
     finally:

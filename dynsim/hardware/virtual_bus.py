@@ -36,6 +36,8 @@ from dynsim.hardware.virtual_faults import AngleFault, FaultScript, TemperatureR
 from dynsim.hardware.virtual_servo import ServoRegisters
 
 PHYSICS_STEP = 2e-3
+BYTE_TIMEOUT = 5e-3
+"""Longest pause within a packet [s] (unverified)."""
 TURNAROUND = 20e-6
 """Time a servo takes beyond its return delay before it answers [s] (unverified)."""
 ADAPTER_LATENCY = 1e-3
@@ -107,6 +109,7 @@ class VirtualLine:
         self._play = self.plant.position.copy()
         self._turns = np.zeros(count, dtype=np.int64)
         self._last_packet = 0.0
+        self._heard = 0.0
         self._boot_until: dict[int, float] = {}
         self._registered: dict[int, tuple[int, bytes]] = {}
         self._fired: set[int] = set()
@@ -142,9 +145,11 @@ class VirtualLine:
         arrivals: list[tuple[float, bytes]] = []
         if self._any_active("echo"):
             arrivals.append((end + ADAPTER_LATENCY, data))
-        # Another bit rate is noise to the servos; a new request ends whatever they were still waiting for.
+        # Another bit rate is noise to the servos; a packet that stopped half-way is given up after a while.
+        packets = [*self._decoder.flush()] if start - self._heard > BYTE_TIMEOUT else []
+        self._heard = end
         if baud == self.baud:
-            for packet in [*self._decoder.feed(data), *self._decoder.flush()]:
+            for packet in [*packets, *self._decoder.feed(data)]:
                 arrivals += self._execute(packet, end, baud)
         return arrivals
 

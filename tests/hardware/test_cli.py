@@ -94,6 +94,10 @@ def test_exit_codes_of_refusal_verification_and_abort(call, files: Path) -> None
         (("hw", "scan", "--port", "/dev/ttyNone"), "no such port"),
         (("hw", "stop", "--port", "/dev/ttyNone"), "no such port"),
         (("hw", "calibrate", "--map", "{map}", "--port", "/dev/ttyNone", "--joint", "knee"), "has no joint knee"),
+        (
+            ("hw", "calibrate", "--map", "arm", "--port", "/dev/ttyNone"),
+            "comes with dynsim; write your own map with --out",
+        ),
         (("hw", "replay", "{record}", "--map", "{map}", "--port", "virtual", "--out", "{map}"), "cannot be written"),
         (("hw", "compare", "{record}", "{map}"), "not a readable HDF5 file"),
         (("export", "{map}", "--format", "csv"), "not a readable HDF5 file"),

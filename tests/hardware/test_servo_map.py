@@ -33,6 +33,12 @@ def test_the_shipped_snake_map_names_joints_held_joints_and_wheels() -> None:
     assert {servo.model.name for servo in wheels} == {"MX-28"}
 
 
+@pytest.mark.parametrize("name", ["arm", "snake.yaml", "scenarios/hardware/arm.yaml"])
+def test_shipped_maps_are_found_by_name_from_anywhere(name: str, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert load_servo_map(name).path.parent == SHIPPED
+
+
 @given(st.integers(0, 4095))
 def test_ticks_and_angles_convert_both_ways(rig, tick: int) -> None:
     for servo in rig.map.servos[:2]:

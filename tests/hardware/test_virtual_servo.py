@@ -200,3 +200,13 @@ def test_the_bits_of_the_error_register_have_names() -> None:
 def test_effort_registers_convert_both_ways() -> None:
     assert MX_106.torque(MX_106.effort(3.0)) == pytest.approx(3.0, abs=0.01)
     assert MX_28.torque(MX_28.effort(-1.0)) == pytest.approx(-1.0, abs=0.01)
+
+
+def test_a_packet_may_come_in_pieces_but_not_for_ever(line) -> None:
+    from dynsim.hardware.packet import Packet, encode
+
+    ping = encode(Packet(1, 1))
+    assert line.transmit(ping[:6], 0.0, 1_000_000) == []
+    assert len(line.transmit(ping[6:], 0.001, 1_000_000)) == 1
+    assert line.transmit(ping[:6], 0.002, 1_000_000) == []
+    assert len(line.transmit(ping, 0.1, 1_000_000)) == 1, "half a packet from long ago does not spoil the next"
