@@ -79,7 +79,7 @@ def scan(
             "MX servos with Protocol 1 firmware do not answer: update them to 2.0"
         )
     owners = {servo.id: servo for servo in servo_map.servos} if servo_map else {}
-    table = Table("ID", "model", "firmware", "baud", "mode", "delay", "supply", "temp.", "torque", "error", "joint")
+    table = Table("ID", "model", "fw", "bit/s", "mode", "delay µs", "V", "°C", "torque", "error", "joint")
     for servo in found:
         table.add_row(
             str(servo.id),
@@ -87,9 +87,9 @@ def scan(
             str(servo.firmware),
             str(servo.baud),
             str(servo.mode),
-            f"{servo.return_delay * 1e6:.0f} µs",
-            f"{servo.voltage:.1f} V",
-            f"{servo.temperature:.0f} °C",
+            f"{servo.return_delay * 1e6:.0f}",
+            f"{servo.voltage:.1f}",
+            f"{servo.temperature:.0f}",
             "ON" if servo.torque else "off",
             f"0x{servo.hardware_error:02x}" if servo.hardware_error else "-",
             owners[servo.id].joint if servo.id in owners else "-",

@@ -18,6 +18,7 @@ each: when one fails, the library was mended and the detour can go):
 from __future__ import annotations
 
 import errno
+import select
 import termios
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -33,6 +34,8 @@ from dynsim.hardware.errors import PortError
 from dynsim.hardware.packet import ALERT, HEADER, STATUS, Decoder, StatusError
 
 WRITE_TIMEOUT = 0.25
+READ_WAIT = 5e-4
+"""Longest wait for a byte before time-outs are looked at [s]."""
 RETRIES = 2
 """Further attempts of a single read or write; the timed loop makes none."""
 TORQUE_ENABLE = 64
@@ -63,14 +66,9 @@ class SerialPort(PortHandler):
         return True
 
     def readPort(self, length: int) -> bytes:
-        # One byte with a short wait instead of the library's busy loop: it leaves the processor to others.
-        waiting = self.ser.in_waiting
-        if waiting == 0:
-            self.ser.timeout = 5e-4
-            first = self.ser.read(1)
-            self.ser.timeout = 0
-            return first
-        return self.ser.read(min(length, waiting))
+        # A short wait instead of the library's busy loop: it leaves the processor to others.
+        select.select([self.ser.fileno()], [], [], READ_WAIT)
+        return self.ser.read(length)
 
 
 def open_serial_port(name: str, baud: int, *, exclusive: bool = True) -> SerialPort:

@@ -445,7 +445,7 @@ class Replay:
         state = int(self.state)
         self._recorder.add(
             time=began,
-            path_time=path_time if self.state in (State.REPLAY, State.FAULT) or self._replay_started else math.nan,
+            path_time=path_time if self._replay_started is not None else math.nan,
             state=state,
             exchange=exchange,
             stray=block.stray_bytes,
@@ -602,7 +602,7 @@ class Replay:
             try:
                 if self.bus.read(servo.id, FIELDS["torque_enable"]):
                     still_on.append(servo.id)
-            except NoAnswer:
+            except (NoAnswer, RequestRefused):
                 still_on.append(servo.id)
         self.result.torque_still_on = tuple(still_on)
         self._say("torque off" + (f"; NOT confirmed by ID {', '.join(map(str, still_on))}" if still_on else ""))
@@ -640,7 +640,10 @@ class Replay:
         now = self.clock.now()
         if now - self._last_logged >= LOG_INTERVAL:
             self._last_logged = now
-            self._say(f"following error {worst:.4f} rad, hottest {self._recorder.hottest:.0f} °C")
+            hottest = self._recorder.hottest
+            self._say(
+                f"following error {worst:.4f} rad" + (f", hottest {hottest:.0f} °C" if hottest == hottest else "")
+            )
         if self._observer:
             span = self._following_end or 1.0
             self._observer(

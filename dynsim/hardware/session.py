@@ -130,9 +130,12 @@ def run_replay(
             provenance={"port": port, **(provenance or {})},
         )
         result = replay.run()
-    result.record.save(folder / "measured.h5")
-    (folder / "summary.json").write_text(json.dumps(result.record.summary, indent=1) + "\n", encoding="utf-8")
-    raise_for(result, folder)
+    try:
+        result.record.save(folder / "measured.h5")
+        (folder / "summary.json").write_text(json.dumps(result.record.summary, indent=1) + "\n", encoding="utf-8")
+    finally:
+        # What happened to the robot matters more than a full disk.
+        raise_for(result, folder)
     return result
 
 
