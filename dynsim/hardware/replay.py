@@ -238,6 +238,7 @@ class Replay:
         self._log_origin = self._origin = clock.now()
         self._tick = 0
         self._cycles = 0
+        self._found_holding = False
         self._replay_started: float | None = None
         self._following: Motion | None = None
         self._following_time = self._following_end = self._following_speed = 0.0
@@ -288,16 +289,17 @@ class Replay:
 
     def _dry_run(self) -> None:
         self._enter(State.DRY_RUN)
+        self._goal = self._goal_rate = np.full(len(self._servos), np.nan)
         self._start_cycles()
         for _ in range(math.ceil(DRY_RUN_TIME / self._period)):
             lateness, skipped = self._wait_for_deadline()
             self._check_stop()
-            self._goal = np.where(np.isnan(self._measured), self._goal, self._measured)
             self._exchange(lateness, skipped, path_time=0.0, write=False)
         self._say("dry run: nothing was moved (--live moves)")
 
     def _arm(self) -> None:
         self._enter(State.ARM)
+        self._found_holding = any(self.bus.read(servo.id, FIELDS["torque_enable"]) for servo in self._servos)
         for index, servo in enumerate(self._servos):
             self._check_stop()
             # A watchdog that tripped in an earlier run keeps goals read-only until it is cleared.
@@ -524,9 +526,11 @@ class Replay:
             return "not armed"
         if struck == State.DISARM:
             return self._leave_holding() if self.map.safety.at_end == "hold" else self._release()
-        # Arming has moved nothing yet: back to how the robot was found. A dead port needs no policy, but the attempt
-        # costs nothing and finds out whether it is really dead.
-        if struck == State.ARM or (self.policy == "off" and fault.cause != Cause.INTERRUPTED):
+        if struck == State.ARM:
+            # Nothing has moved yet: back to how the robot was found.
+            return self._leave_holding() if self._found_holding else self._release()
+        # A dead port needs no policy, but the attempt costs nothing and finds out whether it is really dead.
+        if self.policy == "off" and fault.cause != Cause.INTERRUPTED:
             return self._release()
         if self.policy == "hold" and fault.cause != Cause.INTERRUPTED:
             self._hold_measured(range(len(self._servos)))

@@ -144,3 +144,15 @@ def test_an_exception_out_of_the_blue_still_stops_the_robot(rig, error) -> None:
     assert run.result.fault.cause == Cause.PROGRAM
     assert run.result.end_state == "off"
     assert not any(servo["torque_enable"] for servo in run.line.servos.values())
+
+
+def test_a_robot_found_holding_is_not_dropped_by_a_ctrl_c_while_arming(rig) -> None:
+    stop = StopRequest()
+    run = rig.prepare(stop=stop)
+    for id_ in run.map.ids:
+        run.line._write(id_, 64, b"\1")
+    run.replay._observer = lambda progress: stop() if progress.state == State.ARM else None
+    result = run.replay.run()
+    assert result.fault_state == State.ARM
+    assert result.end_state == "holding"
+    assert all(servo["torque_enable"] for servo in run.line.servos.values())
