@@ -19,7 +19,8 @@ hw = typer.Typer(
     no_args_is_help=True,
     help="Replay a record on Dynamixel servos (or virtual ones). A software stop is no safety device: fit a power cut.",
 )
-console = Console()
+# Paths must survive copy and paste: long lines are left to the terminal.
+console = Console(soft_wrap=True, highlight=False)
 
 
 class Policy(StrEnum):
@@ -55,16 +56,13 @@ def _client_library() -> Iterator[None]:
     yield
 
 
-@hw.command()
+@hw.command(epilog="Example: dynsim hw scan --port /dev/ttyUSB0 --map arm")
 def scan(
     port: Port,
     map_file: Annotated[Path | None, typer.Option("--map", help="compare with this servo map")] = None,
     baud: Annotated[int | None, typer.Option("--baud", help="only this bit rate [bit/s]")] = None,
 ) -> None:
-    """List the servos that answer, at every usual bit rate. Reads only.
-
-    Example: dynsim hw scan --port /dev/ttyUSB0 --map scenarios/hardware/arm.yaml
-    """
+    """List the servos that answer, at every usual bit rate. Reads only."""
     with _client_library():
         from dynsim.hardware import session
         from dynsim.hardware.errors import VerificationFailed
@@ -115,12 +113,9 @@ def _compare_with_map(found: list[Any], servo_map: Any) -> None:
     console.print(f"all {len(seen)} servos of {servo_map.path} answer")
 
 
-@hw.command()
+@hw.command(epilog="Example: dynsim hw check results/elbow_comparison/two_elbows/record.h5 --map arm")
 def check(record: RecordFile, map_file: MapFile, rate: Rate = None, speed: Speed = 1.0) -> None:
-    """Check a whole record against a robot's limits; needs no port.
-
-    Example: dynsim hw check results/elbow_comparison/two_elbows/record.h5 --map scenarios/hardware/arm.yaml
-    """
+    """Check a whole record against a robot's limits; needs no port."""
     _, _, motion = _checked(record, map_file, rate, speed)
     _print_check(motion)
 
@@ -155,7 +150,7 @@ def _print_check(motion: Any) -> None:
     )
 
 
-@hw.command()
+@hw.command(epilog="Example: dynsim hw replay results/elbow_comparison/two_elbows/record.h5 --map arm --port virtual")
 def replay(
     record: RecordFile,
     map_file: MapFile,
@@ -175,8 +170,6 @@ def replay(
     """Check, verify, arm, move to the start, replay, and keep the measured run.
 
     Ctrl-C once: controlled stop. Twice: torque off.
-
-    Example: dynsim hw replay record.h5 --map scenarios/hardware/arm.yaml --port virtual
     """
     with _client_library():
         from dynsim.hardware import session
@@ -287,17 +280,16 @@ def _print_timing(result: Any) -> None:
     )
 
 
-@hw.command()
+@hw.command(
+    epilog="Example: dynsim hw compare results/elbow_comparison/two_elbows/record.h5 results/arm_replay/measured.h5"
+)
 def compare(
     record: RecordFile,
     measured: Annotated[Path, typer.Argument(metavar="MEASURED", help="measured.h5 of a replay")],
     gate: Annotated[Path | None, typer.Option("--gate", help="YAML with bounds; exit code 5 beyond them")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="folder [that of MEASURED]")] = None,
 ) -> None:
-    """Delay, rms and largest error between a simulated and a measured run, with a figure.
-
-    Example: dynsim hw compare results/elbow_comparison/two_elbows/record.h5 results/arm_replay/measured.h5
-    """
+    """Delay, rms and largest error between a simulated and a measured run, with a figure."""
     from dynsim.hardware.compare import check_gate, compare_records, draw_comparison, load_gate
     from dynsim.record import Record
 
@@ -323,16 +315,13 @@ def compare(
         check_gate(comparison, bounds)
 
 
-@hw.command()
+@hw.command(epilog="Example: dynsim hw virtual --map arm --link /tmp/ttyDXL")
 def virtual(
     map_file: MapFile,
     faults: Annotated[Path | None, typer.Option("--faults", help="fault script")] = None,
     link: Annotated[Path | None, typer.Option("--link", help="name the device by this symbolic link")] = None,
 ) -> None:
-    """Virtual servos behind a pseudo-terminal, for any Dynamixel tool. Ctrl-C ends it.
-
-    Example: dynsim hw virtual --map scenarios/hardware/arm.yaml --link /tmp/ttyDXL
-    """
+    """Virtual servos behind a pseudo-terminal, for any Dynamixel tool. Ctrl-C ends it."""
     with _client_library():
         from dynsim.hardware.pseudo_terminal import PseudoTerminal
         from dynsim.hardware.replay import StopRequest
@@ -357,16 +346,13 @@ def virtual(
             terminal.close()
 
 
-@hw.command("stop")
+@hw.command("stop", epilog="Example: dynsim hw stop --port /dev/ttyUSB0")
 def stop_servos(
     port: Port,
     map_file: Annotated[Path | None, typer.Option("--map", help="ask the servos of this map")] = None,
     baud: Annotated[int | None, typer.Option("--baud", help="only this bit rate [bit/s]")] = None,
 ) -> None:
-    """Torque off for every servo at every usual bit rate, beside a running replay too. No substitute for a power cut.
-
-    Example: dynsim hw stop --port /dev/ttyUSB0
-    """
+    """Torque off for every servo at every usual bit rate, beside a replay too; no substitute for a power cut."""
     with _client_library():
         from dynsim.hardware import session
         from dynsim.hardware.errors import VerificationFailed
@@ -382,17 +368,14 @@ def stop_servos(
     console.print(f"torque off, confirmed by {len(torque)} servos")
 
 
-@hw.command()
+@hw.command(epilog="Example: dynsim hw calibrate --map my_arm.yaml --port /dev/ttyUSB0")
 def calibrate(
     map_file: MapFile,
     port: Port,
     joint: Annotated[list[str] | None, typer.Option("--joint", help="only this joint; may be repeated")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="write here instead of into the map")] = None,
 ) -> None:
-    """Write the zero ticks: put the robot into its zero posture by hand (torque off), then run this.
-
-    Example: dynsim hw calibrate --map my_arm.yaml --port /dev/ttyUSB0
-    """
+    """Write the zero ticks: put the robot into its zero posture by hand (torque off), then run this."""
     with _client_library():
         from dynsim.hardware import session
         from dynsim.hardware.calibrate import read_zero_ticks, write_zero_ticks
@@ -427,10 +410,7 @@ def export(
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="file [beside the record]")] = None,
 ) -> None:
-    """Write the joint motion of a record for other programs.
-
-    Example: dynsim export results/elbow_comparison/two_elbows/record.h5 --format csv --rate 100
-    """
+    """Write the joint motion of a record for other programs."""
     from dynsim.hardware.export import SUFFIX, export_record
     from dynsim.record import Record
 

@@ -138,14 +138,6 @@ class DynamixelBus:
             found, _ = self._library.broadcastPing(self.port)
         return {id_: (model, firmware) for id_, (model, firmware) in found.items()}
 
-    def ping(self, id_: int) -> int:
-        """Model number. Raises NoAnswer."""
-        with self._transaction():
-            model, result, _ = self._library.ping(self.port, id_)
-        if result != COMM_SUCCESS:
-            raise NoAnswer(id_, garbled=result != COMM_RX_TIMEOUT)
-        return int(model)
-
     def read(self, id_: int, field: Field) -> int:
         return field.decode(self.read_block(id_, field.address, field.size).data)
 
@@ -170,14 +162,6 @@ class DynamixelBus:
                 self._raise_refusal(id_, error)
                 return
         raise NoAnswer(id_, garbled=result != COMM_RX_TIMEOUT)
-
-    def reboot(self, id_: int) -> None:
-        """Restart one servo; the only way out of an overload shutdown. Raises NoAnswer or RequestRefused."""
-        with self._transaction():
-            result, error = self._library.reboot(self.port, id_)
-        if result != COMM_SUCCESS:
-            raise NoAnswer(id_, garbled=result != COMM_RX_TIMEOUT)
-        self._raise_refusal(id_, error)
 
     def sync_write(self, field: Field, values: dict[int, int]) -> None:
         body = b"".join(bytes([id_]) + field.encode(value) for id_, value in values.items())

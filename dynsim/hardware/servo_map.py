@@ -13,8 +13,6 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError
@@ -316,10 +314,6 @@ class ServoMap:
     @property
     def joints(self) -> tuple[str, ...]:
         return tuple(servo.joint for servo in self.servos)
-
-    def posture(self, ticks: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Joint angles [rad], shape (N,), of servo positions, shape (N,)."""
-        return np.array([servo.to_angle(int(tick)) for servo, tick in zip(self.servos, ticks, strict=True)])
 
 
 def load_servo_map(path: str | Path) -> ServoMap:

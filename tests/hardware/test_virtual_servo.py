@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from dynamixel_sdk import Protocol2PacketHandler
 
 from dynsim.hardware.clock import VirtualClock
 from dynsim.hardware.control_table import MX_28, MX_106, RAD_PER_TICK, OperatingMode, describe_hardware_error
@@ -85,7 +86,7 @@ def test_the_watchdog_stops_the_servo_and_makes_goals_read_only(line) -> None:
 def test_reboot_clears_ram_and_answers_after_a_while(line, bus) -> None:
     bus.write(1, F["profile_velocity"], 40)
     bus.write(1, F["torque_enable"], 1)
-    bus.reboot(1)
+    Protocol2PacketHandler().reboot(bus.port, 1)
     assert 1 not in bus.sync_read((1, 2), 126, 10).replies
     bus.port.clock.sleep_until(bus.port.clock.now() + BOOT_TIME)
     assert bus.read(1, F["profile_velocity"]) == 0
@@ -178,12 +179,10 @@ def test_status_return_level_silences_acknowledgements(line, bus) -> None:
     line.servos[1]["status_return_level"] = 0
     with pytest.raises(NoAnswer):
         bus.read(1, F["id"])
-    assert bus.ping(1) == 321
+    assert Protocol2PacketHandler().ping(bus.port, 1)[0] == 321
 
 
 def test_registered_writes_wait_for_the_action(line, bus) -> None:
-    from dynamixel_sdk import Protocol2PacketHandler
-
     library = Protocol2PacketHandler()
     library.regWriteTxRx(bus.port, 1, 65, 1, [1])
     assert line.servos[1]["led"] == 0
