@@ -19,8 +19,8 @@ hw = typer.Typer(
     no_args_is_help=True,
     help="Replay a record on Dynamixel servos (or virtual ones). A software stop is no safety device: fit a power cut.",
 )
-# Paths must survive copy and paste: long lines are left to the terminal.
-console = Console(soft_wrap=True, highlight=False)
+# Paths must survive copy and paste: long lines are left to the terminal. Without markup: "[rad]" is a unit, no style.
+console = Console(soft_wrap=True, highlight=False, markup=False)
 
 
 class Policy(StrEnum):
