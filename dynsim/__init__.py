@@ -15,10 +15,10 @@ from dynsim._version import __version__
 from dynsim.errors import DynsimError
 
 if TYPE_CHECKING:
+    from dynsim.engine import simulate
     from dynsim.model.model import Model
     from dynsim.record import Record
     from dynsim.scenario import Scenario, build_model, load_scenario
-    from dynsim.simulate import simulate
     from dynsim.studies.compare import compare
 
 __all__ = [
@@ -41,14 +41,11 @@ _HOME = {
     "build_model": "dynsim.scenario",
     "compare": "dynsim.studies.compare",
     "load_scenario": "dynsim.scenario",
-    "simulate": "dynsim.simulate",
+    "simulate": "dynsim.engine",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name in _HOME:
-        # A submodule of the same name as a function (simulate) must not shadow it.
-        value = getattr(importlib.import_module(_HOME[name]), name)
-        globals()[name] = value
-        return value
+        return getattr(importlib.import_module(_HOME[name]), name)
     raise AttributeError(f"module 'dynsim' has no attribute {name!r}")

@@ -48,8 +48,18 @@ class SimulationStopped(DynsimError):
         self.state = state or {}
         self.record: Any = None
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Exceptions travel between processes by their arguments alone; the state and record must come along.
+        return _rebuild, (type(self), str(self), self.time, self.state, self.record)
+
 
 class SimulationInterrupted(SimulationStopped):
     """The user pressed Ctrl-C; what was simulated so far is kept and marked incomplete."""
 
     exit_code: ClassVar[int] = 130
+
+
+def _rebuild(kind: type[SimulationStopped], message: str, time: float, state: dict[str, Any], record: Any) -> Any:
+    stop = kind(message, time=time, state=state)
+    stop.record = record
+    return stop

@@ -161,8 +161,8 @@ def _warnings(
         if contact["pulling_fraction"] > 0.0:
             found.append(
                 f"{contact['name']}: the {contact['surface']} pulls on this brace for "
-                f"{100 * contact['pulling_fraction']:.1f} % of the run, with up to {-contact['normal_force_min_N']:.3g} N; "
-                "a real arm would lift off there"
+                f"{100 * contact['pulling_fraction']:.1f} % of the run, with up to "
+                f"{-contact['normal_force_min_N']:.3g} N; a real arm would lift off"
             )
     if summary["friction_heat_J"] < 0.0:
         found.append(
@@ -173,7 +173,8 @@ def _warnings(
         saturated = np.abs(record["voltage"][:, a]) >= motor.voltage_limit
         if saturated.any():
             found.append(
-                f"{motor.joint}: voltage at its limit of {motor.voltage_limit:g} V in {100 * saturated.mean():.1f} % of the run"
+                f"{motor.joint}: voltage at its limit of {motor.voltage_limit:g} V for "
+                f"{100 * saturated.mean():.1f} % of the run"
             )
     if summary["energy_residual_relative"] > RESIDUAL_LIMIT:
         found.append(

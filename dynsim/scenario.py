@@ -158,12 +158,14 @@ class Scenario:
         """The controller for the robot."""
         return member("controller", self.controller.type).build(self.controller, model, self.duration_s)
 
+    def surfaces(self) -> dict[str, Quadric]:
+        """All surfaces by name, whether anything touches them or not."""
+        return {name: member("surface", surface.type).build(surface) for name, surface in self.config.surfaces.items()}
+
     def contacts(self) -> list[Contact]:
         """All enabled contact points with their surfaces."""
         options = self.config.contacts
-        surfaces: dict[str, Quadric] = {
-            name: member("surface", surface.type).build(surface) for name, surface in self.config.surfaces.items()
-        }
+        surfaces = self.surfaces()
         result = []
         for name, point in options.points.items():
             if not point.enabled:
@@ -470,9 +472,9 @@ def _locate(data: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any
     keys: list[int | str] = []
     node, found = data, True
     for part in loc:
-        if found and isinstance(node, Mapping) and part in node:
-            node = node[part]
-        elif found and isinstance(node, list) and isinstance(part, int) and part < len(node):
+        in_mapping = isinstance(node, Mapping) and part in node
+        in_list = isinstance(node, list) and isinstance(part, int) and part < len(node)
+        if found and (in_mapping or in_list):
             node = node[part]
         elif isinstance(node, Mapping) and node.get("type") == part:
             continue
@@ -494,7 +496,7 @@ def _line(source: Any, keys: list[int | str]) -> int | None:
         if not lines or key not in lines:
             break
         line = lines[key][0] + 1
-        node = node[key]
+        node = node[key]  # type: ignore[index]
     return line
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +15,10 @@ from dynsim.errors import ModelError
 from dynsim.families import union
 from dynsim.kernels.arrays import ReferenceArrays
 from dynsim.kernels.jit import integers, reals
+from dynsim.model.control import JointControl
 from dynsim.model.model import Model
 
-PathChoice = union("path")
+PathChoice: Any = union("path")
 
 
 class HandReference(StrictConfig):
@@ -64,21 +64,7 @@ class Config(StrictConfig):
         return self
 
 
-@dataclass(frozen=True)
-class Control:
-    """What the controller hands to the simulation: gains per motor, reference splines, and the hand's target."""
-
-    k_p: NDArray[np.float64]
-    k_d: NDArray[np.float64]
-    reference: ReferenceArrays
-    path: PathChoice | None
-
-    def target(self, t: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Target of the hand at times t, (T, 3) [m]; None without a hand path."""
-        return None if self.path is None else self.path.position(t)
-
-
-def build(config: Config, model: Model, duration: float) -> Control:
+def build(config: Config, model: Model, duration: float) -> JointControl:
     """Resolve gains and references for a robot.
 
     Raises
@@ -112,7 +98,7 @@ def build(config: Config, model: Model, duration: float) -> Control:
     reference = ReferenceArrays(
         spline=integers(spline), held=reals(held), grid=reals(grid), coefficients=reals(coefficients)
     )
-    return Control(
+    return JointControl(
         k_p=_per_motor(config.k_p_V_per_rad, driven, "k_p_V_per_rad"),
         k_d=_per_motor(config.k_d_V_s_per_rad, driven, "k_d_V_s_per_rad"),
         reference=reference,

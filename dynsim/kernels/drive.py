@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from dynsim.kernels.arrays import (
     CURRENT,
     K_D,
@@ -29,7 +27,7 @@ def evaluate_reference(reference: ReferenceArrays, t, ws: Workspace):
     motors, c = ws.motors, reference.coefficients
     spacing = reference.grid[1]
     x = t - reference.grid[0]
-    segment = min(max(int(math.floor(x / spacing)), 0), c.shape[0] - 1)
+    segment = min(max(int(x / spacing), 0), c.shape[0] - 1)
     x -= segment * spacing
     for a in range(motors.shape[0]):
         s = reference.spline[a]

@@ -45,8 +45,8 @@ def ledger_rates(model: ModelArrays, drives: DriveArrays, contacts: ContactArray
     """Rates of all integrals, into out[start:], LEDGER_SIZE + CONTACT_SIZE c of them [W; N, m/s].
 
     Electrical Σ u i; drawn Σ max(u i, 0); Joule Σ R i²; gear Σ D_m v²; joint Σ D v²; friction −Σ f_n (d − n)·v, d the
-    force direction; constraint Σ f_n n·v (zero on the constraint); mechanical Σ tau v with tau = K_m i − J_m vdot − D_m v
-    ([WM] eq 25).
+    force direction; constraint Σ f_n n·v (zero on the constraint); mechanical Σ tau v with
+    tau = K_m i − J_m vdot − D_m v ([WM] eq 25).
     """
     joints, motors, motor, state = ws.joints, ws.motors, drives.motor, ws.contacts
     electrical, drawn, joule, mechanical = 0.0, 0.0, 0.0, 0.0

@@ -180,7 +180,10 @@ def off_surface(ws: Workspace):
     """True when a contact has left its surface by more than the projection tolerances."""
     state = ws.contacts
     for k in range(state.shape[0]):
-        if abs(state[k, GAP]) > GAP_TOLERANCE or abs(state[k, GAP_RATE]) > RATE_TOLERANCE:
+        # Rounding limits the rate to a fraction of the speed.
+        x, y, z = state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2]
+        rate = RATE_TOLERANCE * (1.0 + math.sqrt(x * x + y * y + z * z))
+        if abs(state[k, GAP]) > GAP_TOLERANCE or abs(state[k, GAP_RATE]) > rate:
             return True
     return False
 

@@ -234,7 +234,8 @@ def newton_euler(model: ModelArrays, ws: Workspace, velocity, acceleration, grav
 def mass_matrix(model: ModelArrays, ws: Workspace, M):
     """M(q), column by column as p(q, 0, e_i, 0) ([WM] eq 55). M: (n, n) output.
 
-    Overwrites V, A, F, vdot and bias of the workspace. M may have more rows and columns than n. Reflected motor inertia is not added.
+    Overwrites V, A, F, vdot and bias of the workspace. M may have more rows and columns than n.
+    Reflected motor inertia is not added.
     """
     n, joints = model.tree.shape[0], ws.joints
     for i in range(n):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -10,10 +10,14 @@ from pydantic import Field, model_validator
 from dynsim.config import NonNegative, Positive, StrictConfig, Vector3, unit_vector
 from dynsim.families import union
 from dynsim.model.description import Inertia, Link, Motor, Robot, vector
+from dynsim.model.motor_parameters import MotorParameters
 
 ENGINE = "dynamics"
 
-MotorChoice = union("motor")
+if TYPE_CHECKING:
+    MotorChoice = MotorParameters
+else:
+    MotorChoice = union("motor")
 AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from pydantic import Field
@@ -13,10 +13,14 @@ from dynsim.config import NonNegative, StrictConfig, Vector3
 from dynsim.errors import ModelError
 from dynsim.families import union
 from dynsim.model.description import Robot
+from dynsim.model.motor_parameters import MotorParameters
 
 ENGINE = "dynamics"
 
-MotorChoice = union("motor")
+if TYPE_CHECKING:
+    MotorChoice = MotorParameters
+else:
+    MotorChoice = union("motor")
 
 
 class HandConfig(StrictConfig):

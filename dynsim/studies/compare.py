@@ -10,11 +10,11 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from dynsim.engine import simulate
 from dynsim.errors import ScenarioError
 from dynsim.record import Record
 from dynsim.results import write_json, write_text
 from dynsim.scenario import load_scenario, variant_names
-from dynsim.simulate import simulate
 
 # Called with the variant's name and the simulated time [s].
 VariantProgress = Callable[[str, float], None]
@@ -26,6 +26,7 @@ def compare(
     overrides: Mapping[str, Any] | None = None,
     jobs: int = 1,
     progress: VariantProgress | None = None,
+    finished: Callable[[str, Record], None] | None = None,
 ) -> dict[str, Record]:
     """Simulate every variant of a scenario.
 
@@ -34,7 +35,8 @@ def compare(
     path : scenario file or name of a shipped one
     overrides : values by dotted key, for all variants
     jobs : processes; one runs the variants here, one after the other
-    progress : called with variant and simulated time (one process only reports each variant's end)
+    progress : called with variant and simulated time (with several processes: only at a variant's end)
+    finished : called with variant and record as soon as a variant is done, so that it can be saved
 
     Returns
     -------
@@ -51,19 +53,22 @@ def compare(
     if not names:
         raise ScenarioError(f"{path}: has no variants to compare; use `dynsim run`")
     scenarios = {name: load_scenario(path, name, overrides) for name in names}
+    records = {}
     if jobs > 1:
         # Spawned, not forked: the parent may hold threads and an open progress display.
         with ProcessPoolExecutor(min(jobs, len(names)), mp_context=get_context("spawn")) as pool:
             futures = {name: pool.submit(simulate, scenario) for name, scenario in scenarios.items()}
-            records = {}
             for name, future in futures.items():
                 records[name] = future.result()
                 if progress is not None:
                     progress(name, scenarios[name].duration_s)
-            return records
-    records = {}
+                if finished is not None:
+                    finished(name, records[name])
+        return records
     for name, scenario in scenarios.items():
         records[name] = simulate(scenario, None if progress is None else _for_variant(progress, name))
+        if finished is not None:
+            finished(name, records[name])
     return records
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dynsim.hardware import __main__ as program
+from dynsim import cli
 from dynsim.record import Record
 
 from .conftest import MAP, swing
@@ -24,7 +24,7 @@ def call(monkeypatch, capsys):
     def run(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["dynsim", *map(str, arguments)])
         with pytest.raises(SystemExit) as leaving:
-            program.main()
+            cli.main()
         output = capsys.readouterr()
         return int(leaving.value.code or 0), output.out, output.err
 

@@ -31,7 +31,7 @@ PATIENT = MAP.replace("{baud: 1000000, rate: 100}", "{baud: 1000000, rate: 50, l
 
 
 def command(*arguments: object) -> list[str]:
-    return [sys.executable, "-m", "dynsim.hardware", *map(str, arguments)]
+    return [sys.executable, "-m", "dynsim", *map(str, arguments)]
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
+from types import ModuleType
 
 from dynsim.record import Record
 from dynsim.scenario import Scenario
@@ -34,5 +35,18 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
     ModelError, UnreachableReference
         The scenario describes no physics, or a path that the hand cannot follow.
     """
-    engine = importlib.import_module(f"dynsim.simulate.{scenario.engine}")
-    return engine.simulate(scenario, progress)
+    return _module(scenario).simulate(scenario, progress)
+
+
+def check(scenario: Scenario) -> None:
+    """Do everything that comes before the first step: model, contacts at the start, references, size of the record.
+
+    Raises
+    ------
+    ModelError, UnreachableReference, ScenarioError
+    """
+    _module(scenario).prepare(scenario)
+
+
+def _module(scenario: Scenario) -> ModuleType:
+    return importlib.import_module(f"dynsim.engine.{scenario.engine}")

@@ -9,20 +9,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from dynsim import metrics
-from dynsim.control.joint_pd import Control
+from dynsim.engine import Progress
+from dynsim.engine.provenance import provenance
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.kernels import arrays as ka
 from dynsim.kernels import integrate as ki
 from dynsim.kernels.coupled import System
 from dynsim.kernels.energy import CONTACT_SIZE, LEDGER_SIZE
-from dynsim.kernels.jit import integers, reals
 from dynsim.model.arrays import compile_contacts, compile_drives
+from dynsim.model.control import JointControl
 from dynsim.model.description import Contact, Robot
 from dynsim.model.model import Model
 from dynsim.record import Record
 from dynsim.scenario import Scenario, build_model
-from dynsim.simulate import Progress
-from dynsim.simulate.provenance import provenance
 
 _SOLVERS = {"articulated": ka.SOLVER_ARTICULATED, "m_star": ka.SOLVER_M_STAR}
 # Wall time between two looks at progress and Ctrl-C [s].
@@ -35,7 +34,7 @@ class Prepared:
 
     model: Model
     contacts: list[Contact]
-    control: Control
+    control: JointControl
     system: System
     run: ki.Run
     workspace: ka.Workspace
@@ -47,7 +46,7 @@ def prepare(scenario: Scenario) -> Prepared:
     Raises
     ------
     ModelError, UnreachableReference
-        See :func:`dynsim.simulate.simulate`.
+        See :func:`dynsim.engine.simulate`.
     ScenarioError
         The record would be larger than ``record.size_limit_GB``.
     """
@@ -88,7 +87,7 @@ def prepare(scenario: Scenario) -> Prepared:
 
 
 def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
-    """See :func:`dynsim.simulate.simulate`."""
+    """See :func:`dynsim.engine.simulate`."""
     prepared = prepare(scenario)
     run = prepared.run
     # Loading or compiling the kernels is no integration time.
@@ -140,21 +139,13 @@ def _sample_times(scenario: Scenario, columns: int) -> np.ndarray:
     return times
 
 
-def _control(scenario: Scenario, model: Model) -> Control:
-    na = len(model.robot.motors)
-    if scenario.controller is not None:
-        control = scenario.build_controller(model)
-        if not isinstance(control, Control):
-            raise ModelError(f"controller {scenario.controller.type!r} cannot drive a {scenario.plant.type!r}")
-        return control
-    # Motors without a controller have zero volts on their terminals: they brake.
-    reference = ka.ReferenceArrays(
-        spline=integers(np.full(na, -1)),
-        held=reals(np.zeros(na)),
-        grid=reals([0.0, 1.0]),
-        coefficients=reals(np.zeros((1, 0, 6))),
-    )
-    return Control(k_p=np.zeros(na), k_d=np.zeros(na), reference=reference, path=None)
+def _control(scenario: Scenario, model: Model) -> JointControl:
+    if scenario.controller is None:
+        return JointControl.short_circuit(len(model.robot.motors))
+    control = scenario.build_controller(model)
+    if not isinstance(control, JointControl):
+        raise ModelError(f"controller {scenario.controller.type!r} cannot drive a {scenario.plant.type!r}")
+    return control
 
 
 def _record(scenario: Scenario, prepared: Prepared, wall: float) -> Record:

@@ -1,0 +1,5 @@
+"""``python -m dynsim``."""
+
+from dynsim.cli import main
+
+main()

@@ -1,0 +1,292 @@
+"""The command line: ``dynsim run``, ``compare``, ``check``, ``list``, ``plot``, ``bench``, ``schema``; ``hw``, ``export``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+
+from dynsim._version import __version__
+from dynsim.errors import DynsimError, SimulationStopped
+from dynsim.hardware.cli import export, hw
+
+if TYPE_CHECKING:
+    from dynsim.record import Record
+    from dynsim.scenario import Scenario
+
+app = typer.Typer(
+    name="dynsim",
+    help="Dynamic simulator of braced hyper-redundant manipulators: energy, tracking, contact and motors.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+)
+console = Console()
+errors = Console(stderr=True, soft_wrap=True, highlight=False)
+
+ScenarioArgument = Annotated[str, typer.Argument(help="Scenario file, or the name of a shipped one.")]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", metavar="a.b.c=VALUE", help="Override a value; may be repeated.")
+]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+FiguresOption = Annotated[bool, typer.Option("--no-figures", help="Do not draw figures.")]
+
+
+def main() -> None:
+    """Entry point: errors become one line and an exit code."""
+    try:
+        app(standalone_mode=True)
+    except DynsimError as error:
+        errors.print(f"[red]error:[/] {_escape(str(error))}")
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        errors.print("interrupted")
+        sys.exit(130)
+
+
+def _escape(text: str) -> str:
+    from rich.markup import escape
+
+    return escape(text)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        console.print(__version__, highlight=False)
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command(epilog="Example: dynsim run elbow_comparison --variant two_elbows --set integrator.rtol=1e-8")
+def run(
+    scenario: ScenarioArgument,
+    variant: Annotated[str | None, typer.Option(help="Variant to run; default: the first.")] = None,
+    overrides: SetOption = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the files; default: results/SCENARIO/VARIANT.")] = None,
+    no_figures: FiguresOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Simulate one scenario and write its record, summary and figures."""
+    from dynsim.engine import simulate
+    from dynsim.results import save_run
+    from dynsim.scenario import load_scenario
+
+    loaded = load_scenario(scenario, variant, _overrides(overrides))
+    folder = out or Path("results", loaded.name, loaded.variant)
+    try:
+        with _progress([loaded], quiet) as report:
+            record = simulate(loaded, lambda time: report(loaded.variant, time))
+    except SimulationStopped as stop:
+        if stop.record is not None:
+            save_run(stop.record, folder)
+            errors.print(f"what was simulated until then is in {folder}, marked incomplete")
+        raise
+    save_run(record, folder)
+    if not no_figures:
+        _draw(record, folder / "figures", quiet)
+    if not quiet:
+        from dynsim.tables import print_summary
+
+        print_summary(console, record.summary)
+        console.print(f"Written to {folder}", highlight=False, soft_wrap=True)
+
+
+@app.command(epilog="Example: dynsim compare scenarios/elbow_comparison.yaml --jobs 2")
+def compare(
+    scenario: ScenarioArgument,
+    overrides: SetOption = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the files; default: results/SCENARIO.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes that simulate variants.")] = 1,
+    no_figures: FiguresOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Simulate all variants of a scenario and compare them in a table and in figures."""
+    from dynsim.results import save_run
+    from dynsim.scenario import load_scenario, variant_names
+    from dynsim.studies.compare import compare as compare_variants
+    from dynsim.studies.compare import save_comparison
+
+    given = _overrides(overrides)
+    loaded = [load_scenario(scenario, name, given) for name in variant_names(scenario)]
+    folder = out or Path("results", loaded[0].name if loaded else "")
+    try:
+        with _progress(loaded, quiet) as report:
+            records = compare_variants(
+                scenario,
+                overrides=given,
+                jobs=jobs,
+                progress=report,
+                finished=lambda name, record: save_run(record, folder / name),
+            )
+    except SimulationStopped as stop:
+        if stop.record is not None:
+            name = stop.record.summary["variant"]
+            save_run(stop.record, folder / name)
+            errors.print(f"what was simulated of {name} until then is in {folder / name}, marked incomplete")
+        raise
+    save_comparison(records, folder)
+    if not no_figures:
+        for name, record in records.items():
+            _draw(record, folder / name / "figures", quiet)
+        _draw_comparison(records, folder, quiet)
+    if not quiet:
+        from dynsim.tables import print_comparison
+
+        print_comparison(console, {name: record.summary for name, record in records.items()})
+        console.print(f"Written to {folder}", highlight=False, soft_wrap=True)
+
+
+@app.command(epilog="Example: dynsim check scenarios/*.yaml")
+def check(
+    scenarios: Annotated[list[str], typer.Argument(help="Scenario files, or names of shipped ones.")],
+    overrides: SetOption = None,
+) -> None:
+    """Validate scenarios without running them: schema, model, contacts at the start, reachable references."""
+    from dynsim.engine import check as check_scenario
+    from dynsim.scenario import load_scenario, variant_names
+
+    failed = False
+    for name in scenarios:
+        try:
+            variants: Sequence[str | None] = variant_names(name) or [None]
+            for variant in variants:
+                check_scenario(load_scenario(name, variant, _overrides(overrides)))
+        except DynsimError as error:
+            failed = True
+            errors.print(f"[red]error:[/] {_escape(str(error))}")
+        else:
+            count = f"{len(variants)} variants" if len(variants) > 1 else "1 variant"
+            console.print(f"{name}: ok ({count})", highlight=False, soft_wrap=True)
+    if failed:
+        raise typer.Exit(2)
+
+
+@app.command("list", epilog="Example: dynsim list")
+def list_() -> None:
+    """Show shipped scenarios, plants, surfaces, controllers, paths and motors."""
+    from dynsim.tables import print_choices
+
+    print_choices(console)
+
+
+@app.command(epilog="Example: dynsim plot results/elbow_comparison/two_elbows/record.h5")
+def plot(
+    records: Annotated[list[Path], typer.Argument(help="Records (HDF5).")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the figures; default: figures/ beside each record.")
+    ] = None,
+) -> None:
+    """Draw the figures of records; two or more are also laid over each other."""
+    from dynsim.record import Record
+
+    loaded = {str(path): Record.load(path) for path in records}
+    for path, record in loaded.items():
+        folder = out or Path(path).parent / "figures"
+        _draw(record, folder if len(loaded) == 1 or out is None else folder / _label(path, record), quiet=False)
+    if len(loaded) > 1:
+        labelled = {_label(path, record): record for path, record in loaded.items()}
+        _draw_comparison(labelled, out or Path("figures"), quiet=False)
+
+
+@app.command(epilog="Example: dynsim bench --quick --json bench.json")
+def bench(
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer sizes and repetitions.")] = False,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures as JSON.")] = None,
+) -> None:
+    """Time right-hand sides and the whole job beside Pinocchio and MuJoCo (where installed)."""
+    from dynsim.results import write_json
+    from dynsim.studies.bench import format_table, run_bench
+
+    with console.status("measuring"):
+        result = run_bench(quick)
+    for table in format_table(result):
+        console.print(table)
+    if json_file is not None:
+        write_json(json_file, result)
+
+
+@app.command(epilog="Example: dynsim schema > scenario.schema.json")
+def schema() -> None:
+    """Print the JSON schema of scenario files, for editors."""
+    from dynsim.scenario import json_schema
+
+    print(json.dumps(json_schema(), indent=2))
+
+
+# These load serial ports and servos only when called.
+app.add_typer(hw, name="hw")
+app.command(epilog="Example: dynsim export record.h5 --format joint-trajectory --rate 100")(export)
+
+
+def _overrides(given: list[str] | None) -> dict[str, Any]:
+    from dynsim.scenario import parse_override
+
+    return dict(parse_override(text) for text in given or ())
+
+
+def _label(path: str, record: Record) -> str:
+    return record.summary.get("variant") or Path(path).parent.name or Path(path).stem
+
+
+def _draw(record: Record, folder: Path, quiet: bool) -> None:
+    from dynsim.figures import draw
+
+    _drawing(lambda: draw(record, folder), folder, quiet)
+
+
+def _draw_comparison(records: dict[str, Record], folder: Path, quiet: bool) -> None:
+    from dynsim.figures import draw_comparison
+
+    _drawing(lambda: draw_comparison(records, folder), folder, quiet)
+
+
+def _drawing(draw: Any, folder: Path, quiet: bool) -> None:
+    if quiet:
+        draw()
+    else:
+        with console.status(f"drawing {folder}"):
+            draw()
+
+
+@contextmanager
+def _progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[Any]:
+    """A progress bar per scenario, with simulated time and time to go; yields ``report(variant, time)``."""
+    if quiet:
+        yield lambda variant, time: None
+        return
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    from dynsim.kernels.jit import is_cached
+
+    if not is_cached():
+        console.print("Compiling the kernels: once after an installation or an edit, about half a minute.")
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.2f} / {task.total:g} s simulated"),
+        TimeElapsedColumn(),
+        TextColumn("to go"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=not console.is_terminal) as bars:
+        tasks = {s.variant: bars.add_task(f"{s.name} {s.variant}".strip(), total=s.duration_s) for s in scenarios}
+        yield lambda variant, time: bars.update(tasks[variant], completed=time)
+
+
+if __name__ == "__main__":
+    main()

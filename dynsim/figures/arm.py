@@ -1,0 +1,49 @@
+"""All figures of an arm: one run, or variants over each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from dynsim.figures import contacts, energy, hand, motors, posture, style
+from dynsim.record import Record
+
+# File name → figure, None where the record has no data for it.
+FIGURES: dict[str, Callable[[Record], Figure | None]] = {
+    "hand_path": hand.path,
+    "tracking_error": hand.error,
+    "energy": energy.energy,
+    "energy_ledger": energy.ledger,
+    "contact_forces": contacts.forces,
+    "motors": motors.motors,
+    "posture": posture.posture,
+}
+COMPARISONS: dict[str, Callable[[Mapping[str, Record]], Figure | None]] = {
+    "compare_hand_path": hand.path_comparison,
+    "compare_tracking_error": hand.error_comparison,
+    "compare_energy": energy.energy_comparison,
+    "compare_contact_forces": contacts.forces_comparison,
+    "compare_posture": posture.posture_comparison,
+}
+
+
+def draw(record: Record, folder: Path) -> list[Path]:
+    """See :func:`dynsim.figures.draw`."""
+    with style.look():
+        return [
+            style.save(figure, folder / f"{name}.png")
+            for name, draw_one in FIGURES.items()
+            if (figure := draw_one(record)) is not None
+        ]
+
+
+def draw_comparison(records: Mapping[str, Record], folder: Path) -> list[Path]:
+    """See :func:`dynsim.figures.draw_comparison`."""
+    with style.look():
+        return [
+            style.save(figure, folder / f"{name}.png")
+            for name, draw_all in COMPARISONS.items()
+            if (figure := draw_all(records)) is not None
+        ]

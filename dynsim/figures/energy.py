@@ -1,0 +1,175 @@
+"""Electrical energy and work over time ([WM] Figs 7, 8), and the ledger of where the energy went."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
+
+from dynsim import metrics
+from dynsim.figures import style
+from dynsim.figures.style import Array
+from dynsim.record import Record
+
+# Terms of the ledger in the order in which they are stacked.
+TERMS = {
+    "heat_joule": ("Joule heat in the windings", "#E69F00"),
+    "loss_gear": ("gear losses", "#56B4E9"),
+    "loss_joint": ("joint losses", "#0072B2"),
+    "heat_friction": ("contact friction", "#882255"),
+    "energy_kinetic": ("Δ kinetic energy", "#009E73"),
+    "energy_potential": ("Δ potential energy", "#CC79A7"),
+    "energy_magnetic": ("Δ magnetic energy", "#7F7F7F"),
+}
+# Finals further apart than this need a logarithmic axis.
+LOG_RATIO = 8.0
+# A term with more than this share of the turnover hides the others: they get a panel of their own.
+DOMINANT = 0.8
+
+
+def has_motors(record: Record) -> bool:
+    """Whether the record has electrical energy to draw."""
+    return "energy_electrical" in record and "current" in record and record["current"].shape[1] > 0
+
+
+def energy(record: Record) -> Figure | None:
+    """Electrical energy, net and drawn, and mechanical work; None without motors."""
+    if not has_motors(record):
+        return None
+    figure = style.new_figure(4.2, style.title(record, "electrical energy and mechanical work"))
+    top, bottom = figure.subplots(2, 1, sharex=True)
+    net, drawn = record["energy_electrical"], record["energy_electrical_drawn"]
+    style.line(top, record.time, net, label=rf"net $\int\!\Sigma\,u\,i\,dt$: {_joules(net)}", color=style.BLUE, lw=1.8)
+    label = rf"drawn $\int\!\Sigma\,\max(u\,i,0)\,dt$: {_joules(drawn)}"
+    style.line(top, record.time, drawn, label=label, color=style.ORANGE, linestyle=(0, (4, 3)))
+    top.set_ylabel("electrical energy [J]")
+    work = record["work_mechanical"]
+    label = rf"$\int\!\Sigma\,\tau\,\dot{{q}}\,dt$: {_joules(work)}"
+    style.line(bottom, record.time, work, label=label, color=style.GREEN)
+    bottom.axhline(0.0, color=style.GREY, linewidth=0.6)
+    bottom.set_ylabel("mechanical work [J]")
+    bottom.set_xlabel("time [s]")
+    for axes in (top, bottom):
+        axes.legend(loc="best")
+    return figure
+
+
+def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
+    """Electrical energy over time and in total, and mechanical work, of all variants."""
+    shown = {name: record for name, record in records.items() if has_motors(record)}
+    if not shown:
+        return None
+    figure = style.new_figure(
+        5.0, style.comparison_title(list(shown.values()), "electrical energy and mechanical work")
+    )
+    grid = figure.add_gridspec(2, 2, width_ratios=[1.6, 1.0])
+    over_time, total = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[:, 1])
+    work = figure.add_subplot(grid[1, 0], sharex=over_time)
+    styles = style.variant_styles(list(records))
+    for name, record in shown.items():
+        style.line(over_time, record.time, record["energy_electrical"], label=name, **styles[name])
+        style.line(work, record.time, record["work_mechanical"], **styles[name])
+    finals = np.array([record["energy_electrical"][-1] for record in shown.values()])
+    if finals.min() > 0.0 and finals.max() > LOG_RATIO * finals.min():
+        style.log_axis(over_time)
+        # The first milliseconds would spread the axis over many decades in which nothing is to be seen.
+        over_time.set_ylim(0.02 * finals.min(), 1.6 * finals.max())
+    over_time.set_ylabel("electrical energy [J]")
+    over_time.tick_params(labelbottom=False)
+    work.axhline(0.0, color=style.GREY, linewidth=0.6)
+    work.set_ylabel("mechanical work [J]")
+    work.set_xlabel("time [s]")
+    _bars(total, list(shown), finals, [styles[name]["color"] for name in shown])
+    figure.legend(*over_time.get_legend_handles_labels(), loc="outside lower center", ncols=min(len(shown), 5))
+    return figure
+
+
+def ledger(record: Record) -> Figure | None:
+    """Where the energy went, stacked, and what the ledger does not explain; None without a ledger."""
+    if "energy_residual" not in record:
+        return None
+    terms = {name: record[name] - record[name][:1] for name in TERMS}
+    supplied = record["energy_electrical"] + record["work_constraint"]
+    turnover = metrics.energy_turnover(record)
+    dominant = bool(np.abs(terms["heat_joule"]).max() > DOMINANT * turnover > 0.0)
+    figure = style.new_figure(6.6 if dominant else 5.0, style.title(record, "energy ledger"))
+    panels = figure.subplots(2 + dominant, 1, sharex=True, height_ratios=[*[2.0] * (1 + dominant), 1.0])
+    _stack(panels[0], record.time, terms, supplied)
+    panels[0].set_ylabel("energy since start [J]")
+    if dominant:
+        rest = {name: values for name, values in terms.items() if name != "heat_joule"}
+        _stack(panels[1], record.time, rest, supplied - terms["heat_joule"])
+        panels[1].set_ylabel("the same without\nJoule heat [J]")
+    _residual(panels[-1], record, turnover)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
+
+
+def _stack(axes: Axes, time: Array, terms: Mapping[str, Array], supplied: Array) -> None:
+    """Positive terms upward and negative ones downward from zero: both together make up what was supplied."""
+    kept = np.unique(np.linspace(0, len(time) - 1, min(len(time), style.LINE_POINTS // 4)).astype(int))
+    for clip in (np.maximum, np.minimum):
+        base = np.zeros(len(kept))
+        for name, values in terms.items():
+            part = clip(values[kept], 0.0)
+            if not np.any(part):
+                continue
+            text, colour = TERMS[name]
+            known = axes.get_legend_handles_labels()[1]
+            label = f"{text}: {_joules(values)}"
+            axes.fill_between(
+                time[kept], base, base + part, color=colour, linewidth=0.3, label=None if label in known else label
+            )
+            base = base + part
+    label = f"sum = electrical energy: {_joules(supplied)}" if np.any(supplied) else "electrical energy: none"
+    axes.plot(time[kept], supplied[kept], color=style.BLACK, linewidth=1.1, label=label)
+
+
+def _residual(axes: Axes, record: Record, turnover: float) -> None:
+    size = np.abs(record["energy_residual"])
+    if np.any(size > 0.0):
+        axes.set_yscale("log", nonpositive="mask")
+        axes.yaxis.set_minor_locator(NullLocator())
+    shown = np.where(size > 0.0, size, np.nan)
+    if np.isfinite(shown).any():
+        style.line(axes, record.time, np.where(np.isnan(shown), np.nanmin(shown), shown), color=style.BLACK, lw=0.9)
+    if turnover > 0.0:
+        limit = metrics.RESIDUAL_LIMIT * turnover
+        axes.axhline(limit, color=style.PULLING, linestyle="--", linewidth=0.9)
+        axes.annotate(
+            "limit: $10^{-6}$ of the turnover",
+            (0.99, limit),
+            xycoords=("axes fraction", "data"),
+            xytext=(0, -9),
+            textcoords="offset points",
+            ha="right",
+            color=style.PULLING,
+            fontsize=7,
+        )
+    axes.set_ylabel("|residual|\n[J]")
+    axes.set_xlabel("time [s]")
+
+
+def _bars(axes: Axes, names: list[str], values: Array, colours: list[str]) -> None:
+    places = np.arange(len(names))
+    axes.bar(places, values, color=colours, width=0.7)
+    for place, value in zip(places, values, strict=True):
+        axes.annotate(
+            f"{value:.4g}",
+            (float(place), max(float(value), 0.0)),
+            xytext=(0, 2),
+            textcoords="offset points",
+            ha="center",
+            fontsize=7.5,
+        )
+    axes.set_xticks(places, names, rotation=30 if len(names) <= 4 else 60, ha="right")
+    axes.margins(x=0.05, y=0.08)
+    axes.grid(axis="x", visible=False)
+    axes.set_title("electrical energy of the run, net [J]")
+
+
+def _joules(values: Array) -> str:
+    return f"{style.number(float(values[-1]))} J"

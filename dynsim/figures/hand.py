@@ -1,0 +1,174 @@
+"""The hand against its target: paths in three planes and the tracking error ([WM] Figs 4–6)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dynsim import metrics
+from dynsim.figures import style
+from dynsim.figures.style import Array
+from dynsim.record import Record
+
+PLANES = ((0, 1), (0, 2), (1, 2))
+MILLI = 1e3
+
+
+def path(record: Record) -> Figure | None:
+    """Hand path and target in xy, xz and yz at one scale; None without a hand."""
+    if "hand_position" not in record:
+        return None
+    figure = style.new_figure(2.85, style.title(record, "hand path"))
+    panels = _planes(figure, [record])
+    for axes, plane in zip(panels, PLANES, strict=True):
+        _draw_target(axes, record, plane)
+        _draw_path(axes, record, plane, label="hand", color=style.BLUE)
+    _legend_below(figure, panels[0])
+    return figure
+
+
+def path_comparison(records: Mapping[str, Record]) -> Figure | None:
+    """Hand paths of all variants in xy, xz and yz."""
+    shown = {name: record for name, record in records.items() if "hand_position" in record}
+    if not shown:
+        return None
+    figure = style.new_figure(3.2, style.comparison_title(list(shown.values()), "hand paths"))
+    panels = _planes(figure, list(shown.values()))
+    styles = style.variant_styles(list(records))
+    for axes, plane in zip(panels, PLANES, strict=True):
+        _draw_target(axes, next(iter(shown.values())), plane)
+        for name, record in shown.items():
+            _draw_path(axes, record, plane, label=name, **styles[name])
+    _legend_below(figure, panels[0])
+    return figure
+
+
+def error(record: Record) -> Figure | None:
+    """Tracking error over time, components and norm; None without a target."""
+    if "target_position" not in record:
+        return None
+    deviation = MILLI * (record["hand_position"] - record["target_position"])
+    norm = np.linalg.norm(deviation, axis=1)
+    figure = style.new_figure(4.1, style.title(record, "tracking error"))
+    top, bottom = figure.subplots(2, 1, sharex=True)
+    for k, name in enumerate("xyz"):
+        style.line(top, record.time, deviation[:, k], label=f"$e_{name}$", color=style.AXIS_COLOURS[name])
+    top.set_ylabel("hand − target [mm]")
+    style.legend_above(top)
+    style.line(bottom, record.time, norm, label=_error_label("|e|", record), color=style.BLACK)
+    bottom.set_ylabel("distance from target [mm]")
+    bottom.set_ylim(bottom=0.0)
+    bottom.set_xlabel("time [s]")
+    for axes in (top, bottom):
+        _mark_settle(axes, record)
+    style.legend_above(bottom)
+    return figure
+
+
+def error_comparison(records: Mapping[str, Record]) -> Figure | None:
+    """Tracking errors of all variants: distance from the target, logarithmic, and the vertical part."""
+    shown = {name: record for name, record in records.items() if "target_position" in record}
+    if not shown:
+        return None
+    figure = style.new_figure(4.4, style.comparison_title(list(shown.values()), "tracking error"))
+    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[1.3, 1.0])
+    styles = style.variant_styles(list(records))
+    for name, record in shown.items():
+        deviation = MILLI * (record["hand_position"] - record["target_position"])
+        norm = np.linalg.norm(deviation, axis=1)
+        style.line(top, record.time, norm, label=_error_label(name, record), **styles[name])
+        style.line(bottom, record.time, deviation[:, 2], **styles[name])
+    if any(line.get_ydata().max() > 0.0 for line in top.get_lines()):
+        style.log_axis(top)
+    top.set_ylabel("distance from target [mm]")
+    bottom.set_ylabel("vertical error $e_z$ [mm]")
+    bottom.set_xlabel("time [s]")
+    for axes in (top, bottom):
+        _mark_settle(axes, next(iter(shown.values())))
+    figure.legend(loc="outside lower center", ncols=2)
+    return figure
+
+
+def _planes(figure: Figure, records: list[Record]) -> list[Axes]:
+    """Three square panels of one scale, large enough for hands and targets."""
+    points = [record[name] for record in records for name in ("hand_position", "target_position") if name in record]
+    everything = np.concatenate(points)
+    everything = everything[np.isfinite(everything).all(axis=1)]
+    low, high = (everything.min(axis=0), everything.max(axis=0)) if len(everything) else (np.zeros(3), np.zeros(3))
+    span = float((high - low).max())
+    half = 0.56 * span if span > 0.0 else 0.05
+    middle = 0.5 * (low + high)
+    panels = list(figure.subplots(1, 3))
+    for axes, (i, j) in zip(panels, PLANES, strict=True):
+        axes.set_aspect("equal")
+        axes.set_xlim(middle[i] - half, middle[i] + half)
+        axes.set_ylim(middle[j] - half, middle[j] + half)
+        axes.set_xlabel(f"{'xyz'[i]} [m]")
+        axes.set_ylabel(f"{'xyz'[j]} [m]")
+        axes.locator_params(nbins=5)
+    return panels
+
+
+def _draw_path(axes: Axes, record: Record, plane: tuple[int, int], label: str, **options: Any) -> None:
+    position = style.sparse(record["hand_position"][:, plane])
+    axes.plot(*position.T, label=label, **options)
+    axes.plot(*position[0], "o", color=options["color"], markersize=4, zorder=4)
+
+
+def _draw_target(axes: Axes, record: Record, plane: tuple[int, int]) -> None:
+    if "target_position" not in record:
+        return
+    target = record["target_position"][:, plane]
+    axes.plot(*edge_on(target).T, label="target", color=style.BLACK, linestyle=(0, (4, 2)), zorder=3, lw=0.9)
+    axes.plot(*target[0], "x", color=style.BLACK, markersize=5, zorder=4)
+
+
+def edge_on(points: Array) -> Array:
+    """A curve in the plane of the drawing, (T, 2); one seen edge-on as the segment that it covers.
+
+    Running to and fro over itself it would fill the gaps of its own dashes.
+    """
+    points = style.sparse(points)
+    if len(points) < 3 or not np.isfinite(points).all():
+        return points
+    centred = points - points.mean(axis=0)
+    sizes, directions = np.linalg.svd(centred, full_matrices=False)[1:]
+    if sizes[-1] > 1e-6 * sizes[0]:
+        return points
+    along = centred @ directions[0]
+    return points[[int(along.argmin()), int(along.argmax())]]
+
+
+def _legend_below(figure: Figure, axes: Axes) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    start = axes.plot([], [], "o", color=style.GREY, markersize=4)
+    handles, labels = [*handles, *start], [*labels, "start of the hand"]
+    if "target" in labels:
+        handles += axes.plot([], [], "x", color=style.BLACK, markersize=5)
+        labels.append("start of the target")
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 4))
+
+
+def _error_label(name: str, record: Record) -> str:
+    settle = style.settle_time(record)
+    rms = metrics.hand_error(record, settle)["hand_error_rms_m"]
+    return name if rms is None else f"{name}: rms {MILLI * rms:.3g} mm from {settle:g} s on"
+
+
+def _mark_settle(axes: Axes, record: Record) -> None:
+    settle = style.settle_time(record)
+    if record.time[0] < settle < record.time[-1]:
+        axes.axvline(settle, color=style.GREY, linestyle=":", linewidth=1.0)
+        axes.annotate(
+            "settled",
+            (settle, 1.0),
+            xycoords=("data", "axes fraction"),
+            xytext=(3, -8),
+            textcoords="offset points",
+            color=style.GREY,
+            fontsize=7,
+        )

@@ -1,0 +1,61 @@
+"""Currents and voltages of the motors."""
+
+from __future__ import annotations
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dynsim.figures import style
+from dynsim.record import Record
+
+# Up to ALL motors a line each; beyond that the LARGEST few and the envelope of all.
+ALL, LARGEST = 12, 6
+
+
+def motors(record: Record) -> Figure | None:
+    """Motor currents and terminal voltages; None without motors."""
+    if "current" not in record or record["current"].shape[1] == 0:
+        return None
+    signals = (("current", "current [A]"), ("voltage", "voltage [V]"))
+    count = record["current"].shape[1]
+    # By the current after the start, where all motors are busy; the same motors in both panels.
+    late = record.time >= style.settle_time(record)
+    effort = np.sqrt((record["current"][late if late.any() else slice(None)] ** 2).mean(axis=0))
+    shown = np.arange(count) if count <= ALL else np.sort(np.argsort(effort)[::-1][:LARGEST])
+    what = "motor currents and voltages" + (
+        f"; {LARGEST} of {count} with the largest rms current" if count > ALL else ""
+    )
+    figure = style.new_figure(4.4, style.title(record, what))
+    rows = style.time_rows(
+        figure, [[(record.time, record[name])] for name, _ in signals], style.settle_time(record), compress=True
+    )
+    for (name, label), panels in zip(signals, rows, strict=True):
+        for axes in panels:
+            _draw(axes, record, name, shown)
+        panels[0].set_ylabel(label)
+    figure.legend(*rows[0][-1].get_legend_handles_labels(), loc="outside right center")
+    return figure
+
+
+def _draw(axes: Axes, record: Record, name: str, shown: np.ndarray) -> None:
+    values, labels = record[name], record.labels[name]
+    if len(shown) < values.shape[1]:
+        low = style.thin(record.time, values.min(axis=1))
+        high = style.thin(record.time, values.max(axis=1))
+        # Both bounds on the times of either: thinning keeps different ones.
+        time = np.union1d(low[0], high[0])
+        axes.fill_between(
+            time,
+            np.interp(time, *low),
+            np.interp(time, *high),
+            color="#CFCFCF",
+            linewidth=0,
+            label=f"all {len(labels)} motors",
+        )
+    # From base to tip along one map of colours: neighbours look alike, the order is visible.
+    colours = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.92, max(len(shown), 2)))
+    for colour, k in zip(colours, shown, strict=False):
+        style.line(axes, record.time, values[:, k], color=colour, label=labels[k], lw=1.1)
+    axes.axhline(0.0, color=style.GREY, linewidth=0.6)

@@ -1,0 +1,131 @@
+"""Tables of summaries and choices for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+Summary = Mapping[str, Any]
+
+
+def _number(value: Any, scale: float = 1.0, digits: int = 4) -> str:
+    return "–" if value is None else f"{value * scale:.{digits}g}"
+
+
+# Heading, and how to take it from a summary. A row is left out when no run has it.
+_ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = (
+    ("electrical energy [J]", lambda s: s.get("electrical_energy_J"), _number),
+    ("  drawn from supply [J]", lambda s: s.get("electrical_energy_drawn_J"), _number),
+    ("mechanical work [J]", lambda s: s.get("mechanical_work_J"), _number),
+    ("Joule heat [J]", lambda s: s.get("joule_heat_J"), _number),
+    ("friction heat [J]", lambda s: s.get("friction_heat_J"), _number),
+    ("hand error, rms [mm]", lambda s: s.get("hand_error_rms_m"), lambda v: _number(v, 1e3)),
+    ("  max [mm]", lambda s: s.get("hand_error_max_m"), lambda v: _number(v, 1e3)),
+    ("  vertical, rms [mm]", lambda s: s.get("hand_error_z_rms_m"), lambda v: _number(v, 1e3)),
+    ("final position error [m]", lambda s: s.get("final_position_error_m"), lambda v: _number(v, digits=3)),
+    ("final attitude error [rad]", lambda s: s.get("final_attitude_error_rad"), lambda v: _number(v, digits=3)),
+    ("position error, max [m]", lambda s: s.get("position_error_max_m"), lambda v: _number(v, digits=3)),
+    ("attitude error, max [rad]", lambda s: s.get("attitude_error_max_rad"), lambda v: _number(v, digits=3)),
+    (
+        "joint limit passed by [rad]",
+        lambda s: s.get("joint_limit_violation_max_rad"),
+        lambda v: _number(v, digits=3),
+    ),
+    ("cost, initial", lambda s: s.get("cost_initial"), _number),
+    ("cost, final", lambda s: s.get("cost_final"), _number),
+    ("mode switches", lambda s: s.get("mode_switches"), lambda v: str(v)),
+    ("ledger residual, relative", lambda s: s.get("energy_residual_relative"), lambda v: f"{v:.1e}"),
+    ("constraint drift [m]", lambda s: s.get("constraint_drift_max_m"), lambda v: f"{v:.1e}"),
+    ("integration [s]", lambda s: s.get("integration_wall_s"), lambda v: f"{v:.3f}"),
+    ("times real time", lambda s: s.get("real_time_factor"), lambda v: f"{v:.0f}"),
+)
+
+
+def print_summary(console: Console, summary: Summary) -> None:
+    """One run: its numbers, contacts and warnings."""
+    title = f"{summary['scenario']} {summary['variant']}".strip()
+    table = Table(title=title, box=box.SIMPLE_HEAD, show_header=False, title_justify="left")
+    table.add_column()
+    table.add_column(justify="right")
+    for heading, take, show in _ROWS:
+        value = take(summary)
+        if value is not None:
+            table.add_row(escape(heading), show(value))
+    for contact in summary.get("contacts", ()):
+        for heading, show_contact in _CONTACT_ROWS:
+            table.add_row(escape(_of(contact["name"], heading)), show_contact(contact))
+    console.print(table)
+    _print_warnings(console, {"": summary})
+
+
+def print_comparison(console: Console, summaries: Mapping[str, Summary]) -> None:
+    """All variants side by side, one column each."""
+    first = next(iter(summaries.values()))
+    table = Table(title=first["scenario"], box=box.SIMPLE_HEAD, title_justify="left")
+    table.add_column("", no_wrap=True)
+    for name in summaries:
+        table.add_column(name, justify="right", no_wrap=True)
+    for heading, take, show in _ROWS:
+        values = [take(summary) for summary in summaries.values()]
+        if any(value is not None for value in values):
+            table.add_row(escape(heading), *("–" if value is None else show(value) for value in values))
+    energies = [summary.get("electrical_energy_J") or 0.0 for summary in summaries.values()]
+    if min(energies) > 0.0:
+        least = min(energies)
+        table.add_row("energy, times the least", *(f"{energy / least:.3g}" for energy in energies))
+    contacts = list(dict.fromkeys(c["name"] for s in summaries.values() for c in s.get("contacts", ())))
+    for contact in contacts:
+        by_variant = [next((c for c in s["contacts"] if c["name"] == contact), None) for s in summaries.values()]
+        for heading, show in _CONTACT_ROWS:
+            table.add_row(escape(_of(contact, heading)), *(show(c) if c else "–" for c in by_variant))
+    console.print(table)
+    _print_warnings(console, summaries)
+
+
+def print_choices(console: Console) -> None:
+    """Shipped scenarios and the members of every family, with the first line of what they say of themselves."""
+    from dynsim.families import member
+    from dynsim.scenario import choices, load_scenario, shipped_scenarios, variant_names
+
+    table = Table(title="scenarios", box=box.SIMPLE_HEAD, title_justify="left")
+    table.add_column("name", no_wrap=True)
+    table.add_column("variants")
+    table.add_column("what")
+    for path in shipped_scenarios():
+        description = load_scenario(path).config.description
+        table.add_row(path.stem, ", ".join(variant_names(path)), escape(description.split(". ")[0]))
+    console.print(table)
+    for family, names in choices().items():
+        table = Table(title=f"{family}s", box=box.SIMPLE_HEAD, show_header=False, title_justify="left")
+        for name in names:
+            table.add_row(name, escape((member(family, name).__doc__ or "").strip().splitlines()[0]))
+        console.print(table)
+
+
+def _pulling(contact: Summary) -> str:
+    pulling = 100.0 * contact["pulling_fraction"]
+    return f"[bold red]{pulling:.1f}[/]" if pulling > 0.0 else "0"
+
+
+_CONTACT_ROWS: tuple[tuple[str, Callable[[Summary], str]], ...] = (
+    ("force, mean [N]", lambda c: f"{c['normal_force_mean_N']:.2f}"),
+    ("  min [N]", lambda c: f"{c['normal_force_min_N']:.2f}"),
+    ("  max [N]", lambda c: f"{c['normal_force_max_N']:.2f}"),
+    ("  pulling [% of time]", _pulling),
+)
+
+
+def _of(contact: str, heading: str) -> str:
+    return heading if heading.startswith(" ") else f"{contact}: {heading}"
+
+
+def _print_warnings(console: Console, summaries: Mapping[str, Summary]) -> None:
+    for name, summary in summaries.items():
+        for warning in summary.get("warnings", ()):
+            prefix = f"{name}: " if name else ""
+            console.print(f"[yellow]warning:[/] {escape(prefix + warning)}", highlight=False)

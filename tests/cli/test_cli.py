@@ -1,0 +1,126 @@
+"""The command line as a user meets it: files, exit codes, one-line errors, Ctrl-C."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from dynsim.record import Record
+
+SHORT = ["--set", "duration_s=0.2", "--set", "metrics.settle_s=0.05"]
+
+
+def dynsim(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "dynsim", *arguments], cwd=folder, capture_output=True, text=True, timeout=300
+    )
+
+
+def test_run_writes_everything_that_is_promised(tmp_path: Path):
+    result = dynsim("run", "elbow_comparison", "--variant", "elbow_7", "--no-figures", *SHORT, folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    folder = tmp_path / "results" / "elbow_comparison" / "elbow_7"
+    assert {path.name for path in folder.iterdir()} == {"record.h5", "summary.json", "scenario.yaml"}
+    summary = json.loads((folder / "summary.json").read_text())
+    promised = {
+        "scenario", "variant", "dynsim_version", "duration_s", "integration_wall_s", "real_time_factor", "steps",
+        "rhs_evaluations", "hand_error_rms_m", "hand_error_max_m", "hand_error_z_rms_m", "electrical_energy_J",
+        "electrical_energy_drawn_J", "mechanical_work_J", "joule_heat_J", "energy_residual_relative",
+        "constraint_drift_max_m", "contacts", "warnings",
+    }  # fmt: skip
+    assert promised <= set(summary)
+    in_contacts = {
+        "name", "normal_force_min_N", "normal_force_mean_N", "normal_force_max_N", "closed_fraction",
+        "pulling_fraction", "slip_distance_m",
+    }  # fmt: skip
+    assert in_contacts <= set(summary["contacts"][0])
+    # The resolved scenario runs by itself and gives the same numbers.
+    again = dynsim("run", str(folder / "scenario.yaml"), "--no-figures", "--out", "again", "-q", folder=tmp_path)
+    assert (again.returncode, again.stdout) == (0, "")
+    repeated = json.loads((tmp_path / "again" / "summary.json").read_text())
+    assert repeated["electrical_energy_J"] == summary["electrical_energy_J"]
+
+
+def test_compare_prints_the_table_and_writes_the_comparison(tmp_path: Path):
+    result = dynsim("compare", "elbow_comparison", "--no-figures", *SHORT, folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    for name in ("two_elbows", "elbow_7", "elbow_4", "no_elbow"):
+        assert name in result.stdout
+    folder = tmp_path / "results" / "elbow_comparison"
+    variants = json.loads((folder / "comparison.json").read_text())["variants"]
+    assert list(variants) == ["two_elbows", "elbow_7", "elbow_4", "no_elbow"]
+    rows = (folder / "comparison.csv").read_text().splitlines()
+    assert len(rows) == 5
+    assert rows[0].startswith("variant,") or ",variant," in rows[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["run", "nonsense.yaml"], "no such file"),
+        (["run", "elbow_comparison", "--variant", "elbow_5"], "did you mean 'elbow_7'"),
+        (["run", "elbow_comparison", "--set", "integrator.rtol"], "--set integrator.rtol"),
+        (["run", "elbow_comparison", "--set", "plant.link.mass_kg=-1"], "mass_kg"),
+        (["run", "elbow_comparison", "--set", "plant.link.motor.inductance_H=0"], "inductance"),
+        (["compare", "single_pendulum"], "no variants"),
+        (["check", "elbow_comparison", "--set", "duraton_s=1"], "did you mean 'duration_s'"),
+        (["plot", "missing.h5"], "no such record"),
+        (["run", "elbow_comparison", "--set", "record.rate_hz=1e7"], "GB"),
+    ],
+)
+def test_bad_input_is_one_clear_line_and_exit_code_2(tmp_path: Path, arguments: list[str], expected: str):
+    result = dynsim(*arguments, folder=tmp_path)
+    assert result.returncode == 2
+    assert "Traceback" not in result.stderr
+    lines = [line for line in result.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1
+    assert expected in lines[0]
+    assert not (tmp_path / "results").exists()
+
+
+def test_divergence_stops_with_code_3_and_keeps_what_there_is(tmp_path: Path):
+    # RK4 is unstable beyond 1.4 ms for this arm.
+    result = dynsim(
+        "run", "elbow_comparison", "--no-figures", "--set", "integrator.method=rk4", "--set", "integrator.step_s=0.01",
+        folder=tmp_path,
+    )  # fmt: skip
+    assert result.returncode == 3
+    assert "divergence" in result.stderr
+    record = Record.load(tmp_path / "results" / "elbow_comparison" / "two_elbows" / "record.h5")
+    assert not record.complete
+    assert len(record["q"]) > 0
+    assert "q" in record.provenance["stopped"]["state"]
+
+
+def test_ctrl_c_saves_what_was_simulated(tmp_path: Path):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dynsim", "run", "elbow_comparison", "--no-figures", "--set", "duration_s=5000",
+         "--set", "controller.knot_spacing_s=10", "--set", "controller.hand.path.period_s=5000",
+         "--set", "record.rate_hz=10"],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    time.sleep(8.0)
+    os.kill(process.pid, signal.SIGINT)
+    _, stderr = process.communicate(timeout=120)
+    assert process.returncode == 130, stderr
+    record = Record.load(tmp_path / "results" / "elbow_comparison" / "two_elbows" / "record.h5")
+    assert not record.complete
+    assert "incomplete" in record.summary["warnings"][-1]
+
+
+def test_list_check_schema_and_version(tmp_path: Path):
+    for arguments, expected in (
+        (["list"], "wang_minami"),
+        (["check", "elbow_comparison", "single_pendulum"], "ok (4 variants)"),
+        (["schema"], "duration_s"),
+        (["--version"], "."),
+        (["run", "--help"], "Example"),
+    ):
+        result = dynsim(*arguments, folder=tmp_path)
+        assert result.returncode == 0, result.stderr
+        assert expected in result.stdout

@@ -1,0 +1,288 @@
+"""Figures: every one is drawn from every kind of record, and says what the record says."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import dynsim
+from dynsim import figures, metrics
+from dynsim.errors import ModelError, RecordError
+from dynsim.figures import arm, contacts, energy, hand, motors, posture, style
+from dynsim.record import Record
+from dynsim.scenario import load_scenario
+
+SHORT = {"duration_s": 0.3, "metrics.settle_s": 0.1, "integrator.rtol": 1e-4}
+PENDULUM = """\
+duration_s: 0.5
+plant:
+  type: serial_arm
+  chain: [{axis: y, initial_deg: 120, damping_N_m_s_per_rad: 0.005}]
+"""
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fewer pixels: the tests look at what is drawn, not at how sharp it is."""
+    monkeypatch.setattr(style, "DPI", 50)
+
+
+def simulated(variant: str) -> Record:
+    return dynsim.simulate(load_scenario("elbow_comparison", variant, SHORT))
+
+
+@pytest.fixture(scope="module")
+def braced() -> Record:
+    return simulated("two_elbows")
+
+
+@pytest.fixture(scope="module")
+def free() -> Record:
+    return simulated("no_elbow")
+
+
+@pytest.fixture(scope="module")
+def pendulum(tmp_path_factory: pytest.TempPathFactory) -> Record:
+    path = tmp_path_factory.mktemp("scenario") / "pendulum.yaml"
+    path.write_text(PENDULUM)
+    return dynsim.simulate(load_scenario(path))
+
+
+def shortened(record: Record, samples: int) -> Record:
+    """The record as an interrupted run leaves it, with so many samples."""
+    result = Record(record.time[:samples], provenance=record.provenance)
+    for name, signal in record.signals.items():
+        result.add(name, signal.data[:samples].copy(), signal.unit, labels=signal.labels)
+    result.complete = False
+    return result
+
+
+def stretched(record: Record, samples: int) -> Record:
+    """The record repeated to so many samples."""
+    index = np.arange(samples) % len(record)
+    result = Record(np.arange(samples) * 1e-3, provenance=record.provenance)
+    for name, signal in record.signals.items():
+        result.add(name, signal.data[index], signal.unit, labels=signal.labels)
+    return result
+
+
+def without(record: Record, *names: str) -> Record:
+    result = copy.copy(record)
+    result.signals = {name: signal for name, signal in record.signals.items() if name not in names}
+    return result
+
+
+def drawn(figure: Figure | None) -> Figure:
+    assert figure is not None
+    return figure
+
+
+def assert_pngs(paths: list[Path], folder: Path, names: set[str]) -> None:
+    assert {path.stem for path in paths} == names
+    # Nothing is left under a temporary name.
+    assert sorted(folder.iterdir()) == sorted(paths)
+    for path in paths:
+        data = path.read_bytes()
+        assert data.startswith(PNG)
+        assert len(data) > 2000
+
+
+def texts(figure: Figure) -> str:
+    legends = [axes.get_legend() for axes in figure.axes] + list(figure.legends)
+    return "\n".join(text.get_text() for legend in legends if legend is not None for text in legend.get_texts())
+
+
+@pytest.mark.parametrize("samples", [61, 2, 1])
+def test_braced_run_has_every_figure(braced: Record, samples: int, tmp_path: Path) -> None:
+    record = braced if samples == len(braced) else shortened(braced, samples)
+    assert_pngs(figures.draw(record, tmp_path), tmp_path, set(arm.FIGURES))
+
+
+def test_run_without_contacts(free: Record, tmp_path: Path) -> None:
+    assert_pngs(figures.draw(free, tmp_path), tmp_path, set(arm.FIGURES) - {"contact_forces"})
+
+
+def test_run_without_motors_target_or_contacts(pendulum: Record, tmp_path: Path) -> None:
+    assert_pngs(figures.draw(pendulum, tmp_path), tmp_path, {"hand_path", "energy_ledger", "posture"})
+
+
+def test_run_without_target(braced: Record) -> None:
+    record = without(braced, "target_position")
+    available = {name for name, draw in arm.FIGURES.items() if draw(record) is not None}
+    assert available == set(arm.FIGURES) - {"tracking_error"}
+    assert "target" not in texts(drawn(hand.path(record)))
+
+
+def test_record_without_samples_has_no_figures(braced: Record, tmp_path: Path) -> None:
+    empty = shortened(braced, 0)
+    assert figures.draw(empty, tmp_path / "none") == []
+    assert figures.draw_comparison({"a": empty}, tmp_path / "none") == []
+    assert not (tmp_path / "none").exists()
+
+
+def test_comparison(braced: Record, free: Record, tmp_path: Path) -> None:
+    records = {"two_elbows": braced, "no_elbow": shortened(free, 2), "stopped": shortened(braced, 0)}
+    assert_pngs(figures.draw_comparison(records, tmp_path), tmp_path, set(arm.COMPARISONS))
+
+
+def test_comparison_of_pendulums(pendulum: Record, tmp_path: Path) -> None:
+    paths = figures.draw_comparison({"a": pendulum, "b": pendulum}, tmp_path)
+    assert_pngs(paths, tmp_path, {"compare_hand_path", "compare_posture"})
+
+
+def test_drawing_leaves_matplotlib_settings_alone(pendulum: Record, tmp_path: Path) -> None:
+    import matplotlib
+
+    def settings() -> dict[str, object]:
+        # Looking at the backend would choose one.
+        return {key: matplotlib.rcParams[key] for key in matplotlib.rcParams if key != "backend"}
+
+    before = settings()
+    figures.draw(pendulum, tmp_path)
+    assert settings() == before
+
+
+def test_unknown_engine_is_refused(braced: Record, tmp_path: Path) -> None:
+    record = copy.copy(braced)
+    record.provenance = {"engine": "steam"}
+    with pytest.raises(RecordError, match=r"'steam'; known: dynamics"):
+        figures.draw(record, tmp_path)
+
+
+def test_a_folder_that_cannot_be_written_is_a_record_error(pendulum: Record, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RecordError, match="cannot write"):
+        figures.draw(pendulum, tmp_path / "file")
+
+
+def test_contact_figure_states_the_pulling_fraction(braced: Record) -> None:
+    figure = drawn(contacts.forces(braced))
+    for contact in braced.summary["contacts"]:
+        assert f"{contact['name']}: pulling {100 * contact['pulling_fraction']:.1f} % of the run" in texts(figure)
+    # elbow 4 is the brace that the floor would have to hold down.
+    assert braced.summary["contacts"][0]["pulling_fraction"] > 0.8
+    lines = figure.axes[-1].get_lines()
+    np.testing.assert_array_equal(lines[0].get_ydata(), braced["contact_normal_force"][:, 1])
+
+
+def test_pulling_area_ends_where_the_force_crosses_zero() -> None:
+    time, force = contacts._thin_negative(np.array([0.0, 1.0, 2.0]), np.array([1.0, -1.0, 3.0]))
+    np.testing.assert_allclose(time, [0.0, 0.5, 1.0, 1.25, 2.0], rtol=1e-15)
+    np.testing.assert_allclose(force, [0.0, 0.0, -1.0, 0.0, 0.0], rtol=1e-15)
+
+
+def test_ledger_stack_adds_up_to_the_electrical_energy(braced: Record) -> None:
+    """The topmost positive edge plus the lowest negative one is what was supplied, but for the residual."""
+    figure = drawn(energy.ledger(braced))
+    top = figure.axes[0]
+    edges = [collection.get_paths()[0].vertices for collection in top.collections]
+    last = braced.time[-1]
+    at_end = [vertices[vertices[:, 0] == last, 1] for vertices in edges]
+    total = max(y.max() for y in at_end) + min(y.min() for y in at_end)
+    expected = braced["energy_electrical"] + braced["work_constraint"] - braced["energy_residual"]
+    assert total == pytest.approx(expected[-1], rel=1e-12)
+    assert set(energy.TERMS) == {*metrics.SINKS, *metrics.STORES}
+
+
+def test_hand_path_panels_have_one_scale_and_all_points(braced: Record) -> None:
+    figure = drawn(hand.path(braced))
+    spans = [np.ptp(axes.get_xlim()) for axes in figure.axes] + [np.ptp(axes.get_ylim()) for axes in figure.axes]
+    np.testing.assert_allclose(spans, spans[0], rtol=1e-12)
+    for axes, (i, j) in zip(figure.axes, hand.PLANES, strict=True):
+        for name in ("hand_position", "target_position"):
+            inside = axes.viewLim.contains
+            assert all(inside(*point) for point in braced[name][:, (i, j)])
+
+
+def test_tracking_error_states_the_rms_of_the_summary(braced: Record) -> None:
+    assert f"rms {1e3 * braced.summary['hand_error_rms_m']:.3g} mm" in texts(drawn(hand.error(braced)))
+
+
+def test_every_variant_has_its_colour_everywhere(braced: Record, free: Record) -> None:
+    records = {"two_elbows": braced, "no_elbow": free}
+    styles = style.variant_styles(list(records))
+    for figure in (hand.error_comparison(records), energy.energy_comparison(records)):
+        colours = [line.get_color() for line in drawn(figure).axes[0].get_lines()[:2]]
+        assert colours == [styles[name]["color"] for name in records]
+    assert style.PULLING not in style.VARIANT_COLOURS
+
+
+def test_many_motors_are_an_envelope_and_the_largest(braced: Record) -> None:
+    count, samples = 40, len(braced)
+    record = Record(braced.time, provenance=braced.provenance)
+    values = np.outer(np.ones(samples), np.arange(count, dtype=float))
+    for name, unit in (("current", "A"), ("voltage", "V")):
+        record.add(name, values, unit, labels=tuple(f"joint_{k}" for k in range(count)))
+    shown = texts(drawn(motors.motors(record))).splitlines()
+    assert shown == ["all 40 motors", *(f"joint_{k}" for k in range(34, 40))]
+
+
+def test_transient_has_a_panel_and_the_rest_its_own_range() -> None:
+    time = np.linspace(0.0, 10.0, 1001)
+    values = 1.0 + 0.1 * np.sin(time) + 50.0 * np.exp(-time / 0.05)
+    (panels,) = style.time_rows(style.new_figure(3.0, ""), [[(time, values)]], settle=2.0)
+    assert len(panels) == 2
+    assert panels[0].get_xlim()[1] < 1.0
+    assert panels[1].get_ylim()[1] < 1.5
+    (whole,) = style.time_rows(style.new_figure(3.0, ""), [[(time, np.sin(time))]], settle=2.0)
+    assert len(whole) == 1
+
+
+def test_thinning_keeps_peaks() -> None:
+    time = np.arange(1_000_003.0)
+    values = np.zeros_like(time)
+    values[123_457], values[-1] = -7.0, 3.0
+    thinned_time, thinned = style.thin(time, values)
+    assert len(thinned) < 1.2 * style.LINE_POINTS
+    assert np.all(np.diff(thinned_time) > 0.0)
+    assert (thinned.min(), thinned.max()) == (-7.0, 3.0)
+
+
+def test_long_record(braced: Record, tmp_path: Path) -> None:
+    record = stretched(braced, 60_000)
+    for draw in (hand.error, energy.ledger, contacts.forces, motors.motors):
+        figure = drawn(draw(record))
+        assert max(len(line.get_xdata()) for axes in figure.axes for line in axes.get_lines()) < 1.2 * style.LINE_POINTS
+    style.save(figure, tmp_path / "motors.png")
+
+
+def test_values_that_are_not_finite_are_drawn_around(braced: Record, tmp_path: Path) -> None:
+    """A run that diverged may end in them."""
+    record = shortened(braced, 20)
+    for signal in record.signals.values():
+        signal.data[-1:] = np.nan
+    assert figures.draw(record, tmp_path)
+
+
+def test_posture_of_a_plant_that_is_gone_is_left_out(braced: Record, monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(_: object) -> None:
+        raise ModelError("arm.urdf: no such file")
+
+    monkeypatch.setattr(posture, "build_model", gone)
+    figure = drawn(posture.posture(braced))
+    assert any("no such file" in axes.get_title() for axes in figure.axes)
+    assert posture.posture_comparison({"a": braced}) is None
+
+
+def test_side_view_shows_the_arm_and_which_contact_pulls(braced: Record) -> None:
+    figure = drawn(posture.posture(braced))
+    side = figure.axes[1]
+    forces = braced["contact_normal_force"][-1]
+    marks = [line.get_marker() for line in side.get_lines() if str(line.get_label()).startswith("contact")]
+    assert marks == ["v" if force < 0.0 else "^" for force in forces]
+    # The arm stands in the plane x = y: seen from the side, all its 0.3 m links have their true length at the start.
+    first = np.array(side.collections[0].get_segments())
+    np.testing.assert_allclose(np.linalg.norm(first[1:, 1] - first[1:, 0], axis=1)[1:], 0.3, rtol=1e-9)
+
+
+def test_side_plane_of_an_arm_along_minus_y() -> None:
+    record = Record([0.0])
+    record.add("hand_position", [[0.0, -2.0, 0.1]], "m", labels=("x", "y", "z"))
+    segments = np.array([[[0.0, 0.0, 0.0], [0.0, -1.0, 0.3]], [[0.0, -1.0, 0.3], [0.0, -2.0, 0.1]]])
+    plane = posture._side_plane(record, [segments])
+    np.testing.assert_allclose(plane.project(np.array([0.0, -2.0, 0.1])), [2.0, 0.1], atol=1e-12)

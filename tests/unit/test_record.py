@@ -1,0 +1,73 @@
+"""Records: what is written is what is read; a failed write leaves what was there."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dynsim.record
+from dynsim.errors import RecordError
+from dynsim.record import Record
+
+
+@pytest.fixture
+def record() -> Record:
+    record = Record(np.linspace(0.0, 1.0, 5), provenance={"scenario": {"name": "x"}, "engine": "dynamics"})
+    record.add("q", np.arange(10.0).reshape(5, 2), "rad", labels=("a", "b"), description="angles")
+    record.add("force", np.arange(30.0).reshape(5, 2, 3), "N", labels=("c", "d"))
+    record.summary = {"energy": 1.5}
+    return record
+
+
+def test_round_trip(record: Record, tmp_path: Path):
+    record.complete = False
+    again = Record.load(record.save(tmp_path / "a" / "record.h5"))
+    assert np.array_equal(again.time, record.time)
+    for name in record:
+        assert np.array_equal(again[name], record[name])
+    assert again.units == {"q": "rad", "force": "N"}
+    assert again.labels["q"] == ("a", "b")
+    assert (again.summary, again.provenance, again.complete) == (record.summary, record.provenance, False)
+
+
+def test_wrong_length_and_labels_are_refused(record: Record):
+    with pytest.raises(RecordError, match="samples"):
+        record.add("x", np.zeros(4), "m")
+    with pytest.raises(RecordError, match="labels"):
+        record.add("x", np.zeros((5, 2)), "m", labels=("only",))
+
+
+def test_unknown_signal_lists_what_there_is(record: Record):
+    with pytest.raises(KeyError, match="q, force"):
+        record["qq"]
+
+
+def test_full_disk_leaves_the_old_record(record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = record.save(tmp_path / "record.h5")
+    before = path.read_bytes()
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(dynsim.record, "_write", fail)
+    with pytest.raises(RecordError, match="No space left"):
+        record.save(path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+def test_a_really_full_device_is_reported(record: Record, tmp_path: Path):
+    # The temporary name is a link to a device on which every write fails for lack of space.
+    (tmp_path / "record.h5.tmp").symlink_to("/dev/full")
+    with pytest.raises(RecordError, match="cannot write"):
+        record.save(tmp_path / "record.h5")
+    assert not (tmp_path / "record.h5").exists()
+
+
+def test_what_is_no_record_is_refused(tmp_path: Path):
+    with pytest.raises(RecordError, match="no such record"):
+        Record.load(tmp_path / "none.h5")
+    (tmp_path / "text.h5").write_text("hello")
+    with pytest.raises(RecordError, match="not a readable HDF5"):
+        Record.load(tmp_path / "text.h5")

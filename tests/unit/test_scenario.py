@@ -1,0 +1,137 @@
+"""Scenario files: merging, errors that name file, line, key, value and fix, and round trips."""
+
+from pathlib import Path
+
+import pytest
+
+from dynsim.engine import check
+from dynsim.errors import ModelError, ScenarioError, UnreachableReference
+from dynsim.scenario import (
+    build_model,
+    find_scenario,
+    json_schema,
+    load_scenario,
+    parse_override,
+    scenario_from_resolved,
+    to_yaml,
+    variant_names,
+)
+
+MINIMAL = "duration_s: 1\nplant: {type: serial_arm, chain: [{axis: y}]}\n"
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "case.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_variants_differ_only_where_they_say():
+    full, lone = (load_scenario("elbow_comparison", name) for name in ("two_elbows", "elbow_7"))
+    assert [c.name for c in full.contacts()] == ["elbow_4", "elbow_7"]
+    assert [c.name for c in lone.contacts()] == ["elbow_7"]
+    assert full.resolved["plant"] == lone.resolved["plant"]
+    assert variant_names("elbow_comparison") == ["two_elbows", "elbow_7", "elbow_4", "no_elbow"]
+
+
+def test_first_variant_is_the_default():
+    assert load_scenario("elbow_comparison").variant == "two_elbows"
+
+
+def test_overrides_reach_mappings_lists_and_new_keys():
+    scenario = load_scenario(
+        "elbow_comparison",
+        overrides={"plant.chain.1.mass_kg": 0.2, "integrator.rtol": 1e-8, "contacts.points.elbow_4.friction": 0.3},
+    )
+    assert build_model(scenario).robot.links[5].inertia.mass == 0.2
+    assert scenario.integrator.rtol == 1e-8
+    assert scenario.contacts()[0].friction == 0.3
+
+
+def test_resolved_scenario_reads_back_as_itself(tmp_path: Path):
+    scenario = load_scenario("elbow_comparison", "elbow_7")
+    again = load_scenario(write(tmp_path, to_yaml(scenario.resolved)))
+    assert again.resolved == scenario.resolved
+    assert scenario_from_resolved(scenario.resolved).resolved == scenario.resolved
+
+
+def test_null_removes_a_key(tmp_path: Path):
+    path = write(tmp_path, MINIMAL + "integrator: {rtol: 1e-9}\nvariants: {a: {integrator: {rtol: null}}, b: {}}\n")
+    assert load_scenario(path, "a").integrator.rtol == 1e-6
+    assert load_scenario(path, "b").integrator.rtol == 1e-9
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", ["case.yaml", "empty"]),
+        ("- 1\n", ["must be a mapping"]),
+        ("a: [1\n", ["case.yaml:2", "not YAML"]),
+        ("duration_s: 1\nduration_s: 2\n", ["case.yaml:2", "duplicate key"]),
+        (MINIMAL + "integrater: {}\n", ["case.yaml:3", "integrater", "did you mean 'integrator'"]),
+        (MINIMAL + "integrator:\n  rtoll: 1\n", ["case.yaml:4", "integrator.rtoll", "did you mean 'rtol'"]),
+        (MINIMAL.replace("duration_s: 1", "duration_s: soon"), ["case.yaml:1", "duration_s = 'soon'", "number"]),
+        (MINIMAL.replace("duration_s: 1\n", ""), ["duration_s", "is missing"]),
+        (MINIMAL.replace("serial_arm", "serial_amr"), ["plant.type", "unknown type 'serial_amr'", "serial_arm"]),
+        (MINIMAL.replace("axis: y", "mass_kg: -1"), ["case.yaml:2", "plant.chain.0.mass_kg = -1", "greater"]),
+        (MINIMAL.replace("axis: y", "axis: w"), ["plant.chain.0.axis"]),
+        (MINIMAL.replace("duration_s: 1", "duration_s: .nan"), ["duration_s", "finite"]),
+        (MINIMAL + "integrator: {step_s: 0}\n", ["integrator.step_s = 0"]),
+    ],
+)
+def test_errors_are_one_line_that_names_the_place(tmp_path: Path, text: str, expected: list[str]):
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(write(tmp_path, text))
+    message = str(caught.value)
+    assert "\n" not in message
+    for part in expected:
+        assert part in message
+
+
+def test_error_in_a_variant_names_the_variants_line(tmp_path: Path):
+    text = MINIMAL + "variants:\n  good: {}\n  bad:\n    metrics:\n      settle: 1\n"
+    with pytest.raises(ScenarioError, match=r"case.yaml:7: metrics.settle: unknown key; did you mean 'settle_s'"):
+        load_scenario(write(tmp_path, text), "bad")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "error", "expected"),
+    [
+        ({"plant.link.motor.inductance_H": 0}, ModelError, "inductance 0.0 H must be positive"),
+        ({"plant.initial_deg.1": 40}, ModelError, "starts +0.03698 m from surface 'floor'"),
+        ({"contacts.points.elbow_4.surface": "flor"}, ModelError, "did you mean 'floor'"),
+        ({"contacts.points.elbow_4.body": "link_44"}, ModelError, "link_44"),
+        ({"controller.hand.path.center_m": [3, 3, 0.4]}, UnreachableReference, "at t = 0.000 s it stays 2.0"),
+        ({"controller.hand.path.radius_m": 0.6}, UnreachableReference, "at t = "),
+        ({"controller.hand.joints": ["joint_99"]}, ModelError, "joint_99"),
+        ({"controller.k_p_V_per_rad": [1, 2]}, ModelError, "2 values, there are 10 motors"),
+        ({"record.rate_hz": 1e7}, ScenarioError, "record.rate_hz"),
+    ],
+)
+def test_what_no_simulation_can_be_made_of_is_refused_by_check(overrides, error, expected):
+    with pytest.raises(error) as caught:
+        check(load_scenario("elbow_comparison", overrides=overrides))
+    assert expected in str(caught.value)
+
+
+def test_a_record_of_10_GB_is_refused_with_a_rate_that_fits():
+    with pytest.raises(ScenarioError, match=r"need 10\.\d GB, the limit .* is 2 GB; \S+ Hz would fit"):
+        check(load_scenario("elbow_comparison", overrides={"record.rate_hz": 1.3433e6}))
+
+
+def test_missing_file_lists_what_is_shipped():
+    with pytest.raises(ScenarioError, match=r"did you mean 'elbow_comparison'.*single_pendulum"):
+        find_scenario("elbow_comparision.yaml")
+
+
+def test_parse_override():
+    assert parse_override("a.b=1e-8") == ("a.b", 1e-8)
+    assert parse_override("a=[1, x]") == ("a", [1, "x"])
+    with pytest.raises(ScenarioError):
+        parse_override("a.b")
+
+
+def test_schema_knows_every_family():
+    text = str(json_schema())
+    for word in ("serial_arm", "joint_pd", "wang_minami", "circle", "cylinder", "variants"):
+        assert word in text
