@@ -1,4 +1,4 @@
-"""The command line: ``dynsim run``, ``compare``, ``check``, ``list``, ``plot``, ``bench``, ``schema``; ``hw``, ``export``."""
+"""The command line: ``dynsim run``, ``compare``, ``check``, ``list``, ``plot``, ``bench``, ``schema``, ``hw`` …"""
 
 from __future__ import annotations
 
