@@ -62,14 +62,13 @@ POINT_SIZE = 15
 R = 0  # 9: R_WB, row-major
 P = 9  # 3: p_WB [m]
 S = 12  # 6: joint axis as a motion vector at the world origin
-RIGID = 18  # 10: m; h = m c; inertia about the world origin xx xy xz yy yz zz
-V = 28  # 6: spatial velocity
-A = 34  # 6: spatial acceleration minus gravity
-F = 40  # 6: wrench through the joint
-IA = 46  # 21: articulated inertia: angular block 6, coupling 9 row-major, linear block 6
-U = 67  # 6: IA S
-D = 73  # 1 / (S.U + J_m)
-LINK_SIZE = 74
+V = 18  # 6: spatial velocity
+A = 24  # 6: spatial acceleration minus gravity
+F = 30  # 6: wrench through the joint; scratch of the solves
+U = 36  # 6: IA S / D
+D = 42  # 1 / (S.IA S + J_m)
+IA = 43  # 21: articulated inertia handed down by branches: angular block 6, coupling 9 row-major, linear block 6
+LINK_SIZE = 64
 # Workspace.joints
 Q = 0  # [rad or m]
 QD = 1  # v [rad/s or m/s]
@@ -136,12 +135,13 @@ class Workspace(NamedTuple):
 
     links: np.ndarray  # (n, LINK_SIZE)
     joints: np.ndarray  # (n, JOINT_SIZE)
+    trig: np.ndarray  # (2, n) sine and cosine of q
     motors: np.ndarray  # (na, MOTOR_STATE_SIZE)
     contacts: np.ndarray  # (c, CONTACT_STATE_SIZE)
     column: np.ndarray  # (n, 1 + 2c) eliminated right-hand sides: applied force, c rows, c force directions
     small: np.ndarray  # (4, c, c) the p×p system J M^-1 F and the scratch of its solve
     dense: np.ndarray  # (m, m + 1), m = n + c + na: M* of [WM] eq 33 and b; empty unless the solver is m_star
-    deficient: np.ndarray  # (1,) int: number of right-hand sides whose constraint forces were not unique
+    deficient: np.ndarray  # (2,) int: right-hand sides whose constraint forces were not unique, and that had none
 
 
 def workspace(n: int, na: int, c: int, *, dense: bool) -> Workspace:
@@ -152,10 +152,11 @@ def workspace(n: int, na: int, c: int, *, dense: bool) -> Workspace:
     return Workspace(
         links=np.zeros((n, LINK_SIZE)),
         joints=np.zeros((n, JOINT_SIZE)),
+        trig=np.zeros((2, n)),
         motors=np.zeros((na, MOTOR_STATE_SIZE)),
         contacts=contacts,
         column=np.zeros((n, 1 + 2 * c)),
         small=np.zeros((4, c, c)),
         dense=np.zeros((size, size + 1)),
-        deficient=np.zeros(1, dtype=np.int64),
+        deficient=np.zeros(2, dtype=np.int64),
     )

@@ -18,7 +18,6 @@ from dynsim.kernels.arrays import (
     PARENT,
     QDD,
     RHS,
-    RIGID,
     ROW,
     TARGET,
     ContactArrays,
@@ -30,7 +29,7 @@ from dynsim.kernels.arrays import (
     Workspace,
 )
 from dynsim.kernels.jit import inlined_kernel, kernel
-from dynsim.kernels.newton_euler import forward_sweep
+from dynsim.kernels.newton_euler import body_inertia, forward_sweep, inertial_wrench
 
 
 @inlined_kernel
@@ -47,6 +46,8 @@ def factor(model: ModelArrays, ws: Workspace):
         if tree[i, BRANCHES] != 0:
             for k in range(21):
                 links[i, IA + k] = 0.0
+            for k in range(6):
+                links[i, F + k] = 0.0
     # What link i + 1 hands down, kept in registers while the chain is serial; only links with further children
     # collect in memory.
     a0, a1, a2, a3, a4, a5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -54,13 +55,15 @@ def factor(model: ModelArrays, ws: Workspace):
     m0, m1, m2, m3, m4, m5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     f0, f1, f2, f3, f4, f5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(n - 1, -1, -1):
-        m, hx, hy, hz = links[i, RIGID], links[i, RIGID + 1], links[i, RIGID + 2], links[i, RIGID + 3]
-        a0, a1, a2 = a0 + links[i, RIGID + 4], a1 + links[i, RIGID + 5], a2 + links[i, RIGID + 6]
-        a3, a4, a5 = a3 + links[i, RIGID + 7], a4 + links[i, RIGID + 8], a5 + links[i, RIGID + 9]
+        m, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz = body_inertia(model, ws, i)
+        n0, n1, n2, n3, n4, n5 = inertial_wrench(ws, i, m, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz)
+        # Inertia about the world origin: I_c + m (c² 1 − c cᵀ), with the coupling block [h]× of h = m c.
+        hx, hy, hz = m * cx, m * cy, m * cz
+        a0, a1, a2 = a0 + (ixx + hy * cy + hz * cz), a1 + (ixy - hx * cy), a2 + (ixz - hx * cz)
+        a3, a4, a5 = a3 + (iyy + hx * cx + hz * cz), a4 + (iyz - hy * cz), a5 + (izz + hx * cx + hy * cy)
         h1, h2, h3, h5, h6, h7 = h1 - hz, h2 + hy, h3 + hz, h5 - hx, h6 - hy, h7 + hx
         m0, m3, m5 = m0 + m, m3 + m, m5 + m
-        f0, f1, f2 = f0 + links[i, F], f1 + links[i, F + 1], f2 + links[i, F + 2]
-        f3, f4, f5 = f3 + links[i, F + 3], f4 + links[i, F + 4], f5 + links[i, F + 5]
+        f0, f1, f2, f3, f4, f5 = f0 + n0, f1 + n1, f2 + n2, f3 + n3, f4 + n4, f5 + n5
         if tree[i, BRANCHES] != 0:
             a0, a1, a2 = a0 + links[i, IA], a1 + links[i, IA + 1], a2 + links[i, IA + 2]
             a3, a4, a5 = a3 + links[i, IA + 3], a4 + links[i, IA + 4], a5 + links[i, IA + 5]
@@ -69,6 +72,8 @@ def factor(model: ModelArrays, ws: Workspace):
             h6, h7, h8 = h6 + links[i, IA + 12], h7 + links[i, IA + 13], h8 + links[i, IA + 14]
             m0, m1, m2 = m0 + links[i, IA + 15], m1 + links[i, IA + 16], m2 + links[i, IA + 17]
             m3, m4, m5 = m3 + links[i, IA + 18], m4 + links[i, IA + 19], m5 + links[i, IA + 20]
+            f0, f1, f2 = f0 + links[i, F], f1 + links[i, F + 1], f2 + links[i, F + 2]
+            f3, f4, f5 = f3 + links[i, F + 3], f4 + links[i, F + 4], f5 + links[i, F + 5]
         sx, sy, sz = links[i, S], links[i, S + 1], links[i, S + 2]
         lx, ly, lz = links[i, S + 3], links[i, S + 4], links[i, S + 5]
         # Sums in pairs: the chain of dependent additions is what this loop waits for.
@@ -80,13 +85,12 @@ def factor(model: ModelArrays, ws: Workspace):
         u5 = ((h2 * sx + h5 * sy) + (h8 * sz + m2 * lx)) + (m4 * ly + m5 * lz)
         d = 1.0 / (((sx * u0 + sy * u1) + (sz * u2 + lx * u3)) + ((ly * u4 + lz * u5) + body[i, ARMATURE]))
         w = joints[i, APPLIED] - (((sx * f0 + sy * f1) + (sz * f2 + lx * f3)) + (ly * f4 + lz * f5))
-        links[i, U], links[i, U + 1], links[i, U + 2] = u0, u1, u2
-        links[i, U + 3], links[i, U + 4], links[i, U + 5] = u3, u4, u5
+        d0, d1, d2, d3, d4, d5 = d * u0, d * u1, d * u2, d * u3, d * u4, d * u5
+        links[i, U], links[i, U + 1], links[i, U + 2] = d0, d1, d2
+        links[i, U + 3], links[i, U + 4], links[i, U + 5] = d3, d4, d5
         links[i, D] = d
         column[i, 0] = w
-        w *= d
-        f0, f1, f2, f3, f4, f5 = f0 + u0 * w, f1 + u1 * w, f2 + u2 * w, f3 + u3 * w, f4 + u4 * w, f5 + u5 * w
-        d0, d1, d2, d3, d4, d5 = d * u0, d * u1, d * u2, d * u3, d * u4, d * u5
+        f0, f1, f2, f3, f4, f5 = f0 + d0 * w, f1 + d1 * w, f2 + d2 * w, f3 + d3 * w, f4 + d4 * w, f5 + d5 * w
         a0, a1, a2, a3, a4, a5 = a0 - d0 * u0, a1 - d0 * u1, a2 - d0 * u2, a3 - d1 * u1, a4 - d1 * u2, a5 - d2 * u2
         h0, h1, h2 = h0 - d0 * u3, h1 - d0 * u4, h2 - d0 * u5
         h3, h4, h5 = h3 - d1 * u3, h4 - d1 * u4, h5 - d1 * u5
@@ -133,8 +137,6 @@ def eliminate_contact(model: ModelArrays, ws: Workspace, link, k):
         w = ((s0 * w0 + s1 * w1) + (s2 * w2 + s3 * w3)) + (s4 * w4 + s5 * w5)
         column[i, row] = r
         column[i, direction] = w
-        r *= links[i, D]
-        w *= links[i, D]
         s0, s1, s2 = links[i, U], links[i, U + 1], links[i, U + 2]
         s3, s4, s5 = links[i, U + 3], links[i, U + 4], links[i, U + 5]
         r0, r1, r2, r3, r4, r5 = r0 - s0 * r, r1 - s1 * r, r2 - s2 * r, r3 - s3 * r, r4 - s4 * r, r5 - s5 * r
@@ -181,41 +183,28 @@ def add_contact_forces(model: ModelArrays, contacts: ContactArrays, ws: Workspac
 def accelerate(model: ModelArrays, ws: Workspace):
     """Forward sweep: vdot = (M + J_m)⁻¹ b from the eliminated b in ``ws.column[:, 0]``. Uses F as scratch.
 
-    vdot_i = (column_i − U·a_p) / D, a_i = a_p + S vdot_i.
+    vdot_i = column_i / D − (U/D)·a_p, a_i = a_p + S vdot_i.
     """
     tree, links, joints, column = model.tree, ws.links, ws.joints, ws.column
+    # The acceleration of link i − 1 stays in registers; it is read back only where the tree branches.
+    a0, a1, a2, a3, a4, a5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(tree.shape[0]):
         j = tree[i, PARENT]
-        if j >= 0:
-            a0, a1, a2, a3, a4, a5 = (
-                links[j, F],
-                links[j, F + 1],
-                links[j, F + 2],
-                links[j, F + 3],
-                links[j, F + 4],
-                links[j, F + 5],
-            )
-            x = (
-                column[i, 0]
-                - (
-                    links[i, U] * a0
-                    + links[i, U + 1] * a1
-                    + links[i, U + 2] * a2
-                    + links[i, U + 3] * a3
-                    + links[i, U + 4] * a4
-                    + links[i, U + 5] * a5
-                )
-            ) * links[i, D]
-        else:
-            a0, a1, a2, a3, a4, a5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-            x = column[i, 0] * links[i, D]
+        if j != i - 1:
+            if j >= 0:
+                a0, a1, a2 = links[j, F], links[j, F + 1], links[j, F + 2]
+                a3, a4, a5 = links[j, F + 3], links[j, F + 4], links[j, F + 5]
+            else:
+                a0, a1, a2, a3, a4, a5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        u0, u1, u2 = links[i, U], links[i, U + 1], links[i, U + 2]
+        u3, u4, u5 = links[i, U + 3], links[i, U + 4], links[i, U + 5]
+        x = column[i, 0] * links[i, D] - (((u0 * a0 + u1 * a1) + (u2 * a2 + u3 * a3)) + (u4 * a4 + u5 * a5))
         joints[i, QDD] = x
-        links[i, F] = a0 + links[i, S] * x
-        links[i, F + 1] = a1 + links[i, S + 1] * x
-        links[i, F + 2] = a2 + links[i, S + 2] * x
-        links[i, F + 3] = a3 + links[i, S + 3] * x
-        links[i, F + 4] = a4 + links[i, S + 4] * x
-        links[i, F + 5] = a5 + links[i, S + 5] * x
+        a0, a1, a2 = a0 + links[i, S] * x, a1 + links[i, S + 1] * x, a2 + links[i, S + 2] * x
+        a3, a4, a5 = a3 + links[i, S + 3] * x, a4 + links[i, S + 4] * x, a5 + links[i, S + 5] * x
+        if tree[i, BRANCHES] != 0:
+            links[i, F], links[i, F + 1], links[i, F + 2] = a0, a1, a2
+            links[i, F + 3], links[i, F + 4], links[i, F + 5] = a3, a4, a5
 
 
 @kernel

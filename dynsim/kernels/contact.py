@@ -33,6 +33,9 @@ from dynsim.kernels.arrays import (
 )
 from dynsim.kernels.jit import inlined_kernel
 
+# Tries, beyond two per contact, to find signs of dissipative contacts that agree with their forces.
+SIGN_PASSES = 64
+
 
 @inlined_kernel
 def surface_distance(value, slope, curvature):
@@ -124,13 +127,28 @@ def force_direction(contacts: ContactArrays, ws: Workspace, k):
 
 
 @inlined_kernel
-def sign_changed(contacts: ContactArrays, ws: Workspace):
-    """True when a dissipative contact's solved force contradicts its assumed sign; turns that direction around."""
+def sign_changed(contacts: ContactArrays, ws: Workspace, passes):
+    """True when dissipative contacts' solved forces contradict their assumed signs; turns those directions around.
+
+    All at once in the first passes, then only the first of them (least-index pivoting, which cannot cycle while a
+    unique consistent choice exists). Without a consistent choice (Painlevé) the forces become NaN, the count in
+    ``ws.deficient[1]`` goes up and the search ends; forces that vanish to rounding may keep either sign.
+    """
     state = ws.contacts
-    changed = False
-    for k in range(contacts.link.shape[0]):
+    p = state.shape[0]
+    changed, largest, worst = False, 0.0, 0.0
+    for k in range(p):
+        largest = max(largest, abs(state[k, FORCE]))
         if contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE and state[k, FORCE] * state[k, SIGN] < 0.0:
-            state[k, SIGN] = -state[k, SIGN]
-            force_direction(contacts, ws, k)
-            changed = True
+            worst = max(worst, abs(state[k, FORCE]))
+            if not (changed and passes > p):
+                state[k, SIGN] = -state[k, SIGN]
+                force_direction(contacts, ws, k)
+                changed = True
+    if changed and passes > 2 * p + SIGN_PASSES:
+        if worst > 1e-10 * largest:
+            ws.deficient[1] += 1
+            for k in range(p):
+                state[k, FORCE] = math.nan
+        return False
     return changed

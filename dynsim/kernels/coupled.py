@@ -55,13 +55,14 @@ class System(NamedTuple):
 def constrained_acceleration(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
     """vdot and contact forces of the applied forces, by the articulated solve, into ``ws.joints``, ``ws.contacts``."""
     factor(model, ws)
-    p = ws.contacts.shape[0]
+    p, passes = ws.contacts.shape[0], 0
     while p > 0:
+        passes += 1
         for k in range(p):
             eliminate_contact(model, ws, contacts.link[k, LINK], k)
         contact_system(model, contacts, ws)
         ws.deficient[0] += solve_small(ws.small, ws.contacts)
-        if not sign_changed(contacts, ws):
+        if not sign_changed(contacts, ws, passes):
             break
     add_contact_forces(model, contacts, ws)
     accelerate(model, ws)
@@ -84,12 +85,14 @@ def derivative(system: System, t, y, ws: Workspace, dy):
     forward_sweep(model, ws, 1.0, 0.0, 1.0)
     contact_rows(model, contacts, ws)
     motor_voltage(drives, system.reference, t, ws)
+    constrained_acceleration(model, contacts, ws)
     if system.solver == SOLVER_M_STAR:
+        passes = 1
         solve_m_star(model, drives, contacts, ws)
-        while sign_changed(contacts, ws):
+        while sign_changed(contacts, ws, passes):
+            passes += 1
             solve_m_star(model, drives, contacts, ws)
     else:
-        constrained_acceleration(model, contacts, ws)
         for a in range(na):
             motors[a, DIDT] = emf_balance(drives, ws, a) / motor[a, INDUCTANCE]
 

@@ -20,7 +20,6 @@ from dynsim.kernels.arrays import (
     QD,
     QDD,
     RESISTANCE,
-    RIGID,
     SLIP_VELOCITY,
     VOLTAGE,
     ContactArrays,
@@ -31,6 +30,7 @@ from dynsim.kernels.arrays import (
     Workspace,
 )
 from dynsim.kernels.jit import inlined_kernel, kernel
+from dynsim.kernels.newton_euler import body_inertia
 
 # Integrals at the end of the state vector, all in joules. MECHANICAL and DRAWN are reported, not part of the balance.
 ELECTRICAL, DRAWN, JOULE, GEAR, JOINT, FRICTION, CONSTRAINT, MECHANICAL = 0, 1, 2, 3, 4, 5, 6, 7
@@ -101,15 +101,14 @@ def kinetic_energy(model: ModelArrays, ws: Workspace):
             links[i, V + 4],
             links[i, V + 5],
         )
-        m, hx, hy, hz = links[i, RIGID], links[i, RIGID + 1], links[i, RIGID + 2], links[i, RIGID + 3]
+        m, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz = body_inertia(model, ws, i)
+        vx, vy, vz = ox + wy * cz - wz * cy, oy + wz * cx - wx * cz, oz + wx * cy - wy * cx
         total += 0.5 * (
-            wx * (links[i, RIGID + 4] * wx + 2.0 * (links[i, RIGID + 5] * wy + links[i, RIGID + 6] * wz))
-            + wy * (links[i, RIGID + 7] * wy + 2.0 * links[i, RIGID + 8] * wz)
-            + links[i, RIGID + 9] * wz * wz
-            + m * (ox * ox + oy * oy + oz * oz)
+            wx * (ixx * wx + 2.0 * (ixy * wy + ixz * wz))
+            + wy * (iyy * wy + 2.0 * iyz * wz)
+            + izz * wz * wz
+            + m * (vx * vx + vy * vy + vz * vz)
         )
-        # v·(ω × h)
-        total += ox * (wy * hz - wz * hy) + oy * (wz * hx - wx * hz) + oz * (wx * hy - wy * hx)
         total += 0.5 * model.body[i, ARMATURE] * joints[i, QD] * joints[i, QD]
     return total
 
@@ -119,8 +118,8 @@ def potential_energy(model: ModelArrays, ws: Workspace):
     """−Σ m g·c [J], zero at the world origin, after ``forward_sweep``."""
     total = 0.0
     for i in range(ws.links.shape[0]):
-        for s in range(3):
-            total -= ws.links[i, RIGID + 1 + s] * model.gravity[s]
+        m, cx, cy, cz, _, _, _, _, _, _ = body_inertia(model, ws, i)
+        total -= m * (cx * model.gravity[0] + cy * model.gravity[1] + cz * model.gravity[2])
     return total
 
 

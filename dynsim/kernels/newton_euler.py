@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from dynsim.kernels.arrays import (
     AXIS,
     BIAS,
@@ -20,7 +22,6 @@ from dynsim.kernels.arrays import (
     REVOLUTE,
     REVOLUTE_X,
     REVOLUTE_Y,
-    RIGID,
     TURNED,
     A,
     F,
@@ -34,15 +35,44 @@ from dynsim.kernels.arrays import (
 )
 from dynsim.kernels.jit import inlined_kernel, kernel
 
+TWO_OVER_PI = 2.0 / math.pi
+HALF_PI_HIGH, HALF_PI_MIDDLE = 1.57079632673412561417, 6.07710050630396597660e-11
+HALF_PI_LOW = 2.02226624879595063154e-21
+SIN3, SIN5, SIN7 = -1.66666666666666324348e-01, 8.33333333332248946124e-03, -1.98412698298579493134e-04
+SIN9, SIN11, SIN13 = 2.75573137070700676789e-06, -2.50507602534068634195e-08, 1.58969099521155010221e-10
+COS4, COS6, COS8 = 4.16666666666666019037e-02, -1.38888888888741095749e-03, 2.48015872894767294178e-05
+COS10, COS12, COS14 = -2.75573143513906633035e-07, 2.08757232129817482790e-09, -1.13596475577881948265e-11
+
+
+@inlined_kernel
+def sine_cosine(joints, trig):
+    """Sine and cosine of every q, into trig: (2, n); within one unit in the last place of libm's.
+
+    Free of calls and branches so that the compiler takes several joints at once: r = q − k π/2 with π/2 in three parts,
+    then the polynomials of FreeBSD's msun (k_sin.c, k_cos.c) on |r| ≤ π/4. Infinite q gives NaN.
+    """
+    for i in range(joints.shape[0]):
+        q = joints[i, Q]
+        k = np.rint(q * TWO_OVER_PI)
+        r = ((q - k * HALF_PI_HIGH) - k * HALF_PI_MIDDLE) - k * HALF_PI_LOW
+        z = r * r
+        s = r + r * z * (SIN3 + z * (SIN5 + z * (SIN7 + z * (SIN9 + z * (SIN11 + z * SIN13)))))
+        c = 1.0 - 0.5 * z + z * z * (COS4 + z * (COS6 + z * (COS8 + z * (COS10 + z * (COS12 + z * COS14)))))
+        # k = 4 turns + 2 half + odd; sin and cos of r + k π/2 without a branch.
+        odd = k - 2.0 * np.floor(0.5 * k)
+        half = 0.5 * (k - odd)
+        sign = 1.0 - 2.0 * (half - 2.0 * np.floor(0.5 * half))
+        trig[0, i] = sign * (s + odd * (c - s))
+        trig[1, i] = sign * (c - odd * (c + s))
+
 
 @inlined_kernel
 def forward_sweep(model: ModelArrays, ws: Workspace, velocity, acceleration, gravity):
-    """Root to tips: pose, axis, velocity, acceleration, inertia and inertial wrench of every link ([WM] eqs 36–43).
+    """Root to tips: pose, axis, velocity and acceleration of every link ([WM] eqs 36–41).
 
     X_WB = X_WP X_PJ X_J(q). A revolute axis a through p is S = (a, p × a), a prismatic one S = (0, a).
-    V = V_p + S v and A = A_p + V_p × S v + S vdot with A_world = −gravity, so that every wrench
-    F = (I_c α + ω × I_c ω + c × m a_c, m a_c) holds the weight. The inertia about the world origin is
-    (m, m c, I_c + m (c² 1 − c cᵀ)).
+    V = V_p + S v and A = A_p + V_p × S v + S vdot with A_world = −gravity, so that every inertial wrench holds the
+    weight.
 
     Parameters
     ----------
@@ -50,7 +80,8 @@ def forward_sweep(model: ModelArrays, ws: Workspace, velocity, acceleration, gra
         Factors on v, vdot (both from ``ws.joints``) and gravity: (1, 0, 1) gives the bias forces ([WM] eq 54),
         (0, 1, 0) the product M vdot ([WM] eq 55), (1, 1, 1) the inverse dynamics.
     """
-    tree, body, links, joints = model.tree, model.body, ws.links, ws.joints
+    tree, body, links, joints, trig = model.tree, model.body, ws.links, ws.joints, ws.trig
+    sine_cosine(joints, trig)
     gx, gy, gz = gravity * model.gravity[0], gravity * model.gravity[1], gravity * model.gravity[2]
     for i in range(tree.shape[0]):
         j = tree[i, PARENT]
@@ -95,7 +126,7 @@ def forward_sweep(model: ModelArrays, ws: Workspace, velocity, acceleration, gra
             pz += zz * qi
             sx, sy, sz, lx, ly, lz = 0.0, 0.0, 0.0, zx, zy, zz
         else:
-            c, s = math.cos(qi), math.sin(qi)
+            s, c = trig[0, i], trig[1, i]
             if k == REVOLUTE:
                 # Rodrigues: B R(u, q) = c B + s B [u]x + (1 - c) (B u) uᵀ
                 ux, uy, uz = body[i, AXIS], body[i, AXIS + 1], body[i, AXIS + 2]
@@ -139,26 +170,6 @@ def forward_sweep(model: ModelArrays, ws: Workspace, velocity, acceleration, gra
         links[i, R + 3], links[i, R + 4], links[i, R + 5] = b3, b4, b5
         links[i, R + 6], links[i, R + 7], links[i, R + 8] = b6, b7, b8
         links[i, P], links[i, P + 1], links[i, P + 2] = px, py, pz
-        # Inertia about the centre of mass, turned to W.
-        ixx, ixy, ixz = body[i, INERTIA], body[i, INERTIA + 1], body[i, INERTIA + 2]
-        iyy, iyz, izz = body[i, INERTIA + 3], body[i, INERTIA + 4], body[i, INERTIA + 5]
-        t0, t1, t2 = b0 * ixx + b1 * ixy + b2 * ixz, b0 * ixy + b1 * iyy + b2 * iyz, b0 * ixz + b1 * iyz + b2 * izz
-        t3, t4, t5 = b3 * ixx + b4 * ixy + b5 * ixz, b3 * ixy + b4 * iyy + b5 * iyz, b3 * ixz + b4 * iyz + b5 * izz
-        t6, t7, t8 = b6 * ixx + b7 * ixy + b8 * ixz, b6 * ixy + b7 * iyy + b8 * iyz, b6 * ixz + b7 * iyz + b8 * izz
-        ixx, ixy, ixz = t0 * b0 + t1 * b1 + t2 * b2, t0 * b3 + t1 * b4 + t2 * b5, t0 * b6 + t1 * b7 + t2 * b8
-        iyy, iyz, izz = t3 * b3 + t4 * b4 + t5 * b5, t3 * b6 + t4 * b7 + t5 * b8, t6 * b6 + t7 * b7 + t8 * b8
-        m, ux, uy, uz = body[i, MASS], body[i, COM], body[i, COM + 1], body[i, COM + 2]
-        cx = px + b0 * ux + b1 * uy + b2 * uz
-        cy = py + b3 * ux + b4 * uy + b5 * uz
-        cz = pz + b6 * ux + b7 * uy + b8 * uz
-        hx, hy, hz = m * cx, m * cy, m * cz
-        links[i, RIGID], links[i, RIGID + 1], links[i, RIGID + 2], links[i, RIGID + 3] = m, hx, hy, hz
-        links[i, RIGID + 4] = ixx + hy * cy + hz * cz
-        links[i, RIGID + 5] = ixy - hx * cy
-        links[i, RIGID + 6] = ixz - hx * cz
-        links[i, RIGID + 7] = iyy + hx * cx + hz * cz
-        links[i, RIGID + 8] = iyz - hy * cz
-        links[i, RIGID + 9] = izz + hx * cx + hy * cy
         # Velocity and acceleration; V × S v = V_p × S v, because S × S = 0.
         links[i, S], links[i, S + 1], links[i, S + 2] = sx, sy, sz
         links[i, S + 3], links[i, S + 4], links[i, S + 5] = lx, ly, lz
@@ -199,16 +210,46 @@ def forward_sweep(model: ModelArrays, ws: Workspace, velocity, acceleration, gra
             fy,
             fz,
         )
-        # Acceleration of the centre of mass, and the wrench about the origin.
-        vx, vy, vz = ox + wy * cz - wz * cy, oy + wz * cx - wx * cz, oz + wx * cy - wy * cx
-        fx = m * (fx + ey * cz - ez * cy + wy * vz - wz * vy)
-        fy = m * (fy + ez * cx - ex * cz + wz * vx - wx * vz)
-        fz = m * (fz + ex * cy - ey * cx + wx * vy - wy * vx)
-        kx, ky, kz = ixx * wx + ixy * wy + ixz * wz, ixy * wx + iyy * wy + iyz * wz, ixz * wx + iyz * wy + izz * wz
-        links[i, F] = ixx * ex + ixy * ey + ixz * ez + wy * kz - wz * ky + cy * fz - cz * fy
-        links[i, F + 1] = ixy * ex + iyy * ey + iyz * ez + wz * kx - wx * kz + cz * fx - cx * fz
-        links[i, F + 2] = ixz * ex + iyz * ey + izz * ez + wx * ky - wy * kx + cx * fy - cy * fx
-        links[i, F + 3], links[i, F + 4], links[i, F + 5] = fx, fy, fz
+
+
+@inlined_kernel
+def body_inertia(model: ModelArrays, ws: Workspace, i):
+    """Mass, centre of mass c in W, and inertia I_c about it in the axes of W (xx xy xz yy yz zz), after a sweep."""
+    body, links = model.body, ws.links
+    b0, b1, b2 = links[i, R], links[i, R + 1], links[i, R + 2]
+    b3, b4, b5 = links[i, R + 3], links[i, R + 4], links[i, R + 5]
+    b6, b7, b8 = links[i, R + 6], links[i, R + 7], links[i, R + 8]
+    ixx, ixy, ixz = body[i, INERTIA], body[i, INERTIA + 1], body[i, INERTIA + 2]
+    iyy, iyz, izz = body[i, INERTIA + 3], body[i, INERTIA + 4], body[i, INERTIA + 5]
+    t0, t1, t2 = b0 * ixx + b1 * ixy + b2 * ixz, b0 * ixy + b1 * iyy + b2 * iyz, b0 * ixz + b1 * iyz + b2 * izz
+    t3, t4, t5 = b3 * ixx + b4 * ixy + b5 * ixz, b3 * ixy + b4 * iyy + b5 * iyz, b3 * ixz + b4 * iyz + b5 * izz
+    t6, t7, t8 = b6 * ixx + b7 * ixy + b8 * ixz, b6 * ixy + b7 * iyy + b8 * iyz, b6 * ixz + b7 * iyz + b8 * izz
+    ixx, ixy, ixz = t0 * b0 + t1 * b1 + t2 * b2, t0 * b3 + t1 * b4 + t2 * b5, t0 * b6 + t1 * b7 + t2 * b8
+    iyy, iyz, izz = t3 * b3 + t4 * b4 + t5 * b5, t3 * b6 + t4 * b7 + t5 * b8, t6 * b6 + t7 * b7 + t8 * b8
+    ux, uy, uz = body[i, COM], body[i, COM + 1], body[i, COM + 2]
+    cx = links[i, P] + b0 * ux + b1 * uy + b2 * uz
+    cy = links[i, P + 1] + b3 * ux + b4 * uy + b5 * uz
+    cz = links[i, P + 2] + b6 * ux + b7 * uy + b8 * uz
+    return body[i, MASS], cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz
+
+
+@inlined_kernel
+def inertial_wrench(ws: Workspace, i, m, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz):
+    """Wrench about the world origin that moves body i as the sweep says: (I_c α + ω × I_c ω + c × m a_c, m a_c)."""
+    links = ws.links
+    wx, wy, wz, ox, oy, oz = (
+        links[i, V], links[i, V + 1], links[i, V + 2], links[i, V + 3], links[i, V + 4], links[i, V + 5]
+    )  # fmt: skip
+    ex, ey, ez = links[i, A], links[i, A + 1], links[i, A + 2]
+    vx, vy, vz = ox + wy * cz - wz * cy, oy + wz * cx - wx * cz, oz + wx * cy - wy * cx
+    fx = m * (links[i, A + 3] + ey * cz - ez * cy + wy * vz - wz * vy)
+    fy = m * (links[i, A + 4] + ez * cx - ex * cz + wz * vx - wx * vz)
+    fz = m * (links[i, A + 5] + ex * cy - ey * cx + wx * vy - wy * vx)
+    kx, ky, kz = ixx * wx + ixy * wy + ixz * wz, ixy * wx + iyy * wy + iyz * wz, ixz * wx + iyz * wy + izz * wz
+    nx = ixx * ex + ixy * ey + ixz * ez + wy * kz - wz * ky + cy * fz - cz * fy
+    ny = ixy * ex + iyy * ey + iyz * ez + wz * kx - wx * kz + cz * fx - cx * fz
+    nz = ixz * ex + iyz * ey + izz * ez + wx * ky - wy * kx + cx * fy - cy * fx
+    return nx, ny, nz, fx, fy, fz
 
 
 @kernel
@@ -220,6 +261,11 @@ def newton_euler(model: ModelArrays, ws: Workspace, velocity, acceleration, grav
     """
     forward_sweep(model, ws, velocity, acceleration, gravity)
     tree, links, joints = model.tree, ws.links, ws.joints
+    for i in range(tree.shape[0]):
+        m, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz = body_inertia(model, ws, i)
+        links[i, F], links[i, F + 1], links[i, F + 2], links[i, F + 3], links[i, F + 4], links[i, F + 5] = (
+            inertial_wrench(ws, i, m, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz)
+        )
     for i in range(tree.shape[0] - 1, -1, -1):
         tau = 0.0
         j = tree[i, PARENT]

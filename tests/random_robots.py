@@ -1,0 +1,175 @@
+"""Random trees of bodies, states and contacts: every joint kind, branches, general axes and full inertia tensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.coupled import System, derivative
+from dynsim.kernels.jit import integers, reals
+from dynsim.model.arrays import compile_contacts, compile_drives, compile_model
+from dynsim.model.description import Contact, Inertia, Link, Motor, Quadric, Robot
+from dynsim.model.model import Model
+
+SURFACES = ("plane", "sphere", "cylinder")
+
+
+def random_unit(rng: np.random.Generator) -> np.ndarray:
+    """Direction, uniform on the sphere, (3,)."""
+    u = rng.normal(size=3)
+    return u / np.linalg.norm(u)
+
+
+def random_rotation(rng: np.random.Generator) -> np.ndarray:
+    """Rotation matrix, (3, 3)."""
+    Q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    return Q * np.sign(np.linalg.det(Q))
+
+
+def random_inertia(rng: np.random.Generator) -> Inertia:
+    """A solid box of random edges, mass, place and attitude: a full tensor that a real body can have."""
+    mass = rng.uniform(0.1, 2.0)
+    square = rng.uniform(0.05, 0.4, size=3) ** 2
+    R = random_rotation(rng)
+    tensor = R @ np.diag(mass * (square.sum() - square) / 12.0) @ R.T
+    return Inertia(mass, rng.normal(scale=0.2, size=3), 0.5 * (tensor + tensor.T))
+
+
+def random_robot(rng: np.random.Generator, n: int, *, branches: bool = True, motors: bool = True) -> Robot:
+    """n links: revolute about x, y, z or any axis, prismatic along any; about every third link starts a branch."""
+    links, axes = [], np.eye(3)
+    for i in range(n):
+        kind = rng.integers(5)
+        parent = i - 1
+        if branches and rng.random() < 0.35:
+            parent = int(rng.integers(-1, i))
+        links.append(
+            Link(
+                name=f"body_{i}",
+                joint=f"joint_{i}",
+                parent=None if parent < 0 else f"body_{parent}",
+                kind="prismatic" if kind == 4 else "revolute",
+                axis=axes[kind] if kind < 3 else random_unit(rng),
+                inertia=random_inertia(rng),
+                R_PJ=np.eye(3) if rng.random() < 0.5 else random_rotation(rng),
+                p_PJ=rng.normal(scale=0.3, size=3),
+                damping=rng.uniform(0.0, 0.5),
+            )
+        )
+    driven = [i for i in range(n) if motors and rng.random() < 0.7]
+    return Robot(
+        name="random",
+        links=tuple(links),
+        motors=tuple(
+            Motor(
+                joint=f"joint_{i}",
+                torque_constant=rng.uniform(0.05, 0.3),
+                resistance=rng.uniform(0.5, 2.0),
+                inductance=rng.uniform(1e-3, 5e-3),
+                rotor_inertia=rng.uniform(1e-5, 3e-4),
+                gear_ratio=rng.uniform(1.0, 10.0),
+                gear_damping=rng.uniform(0.0, 0.02),
+            )
+            for i in driven
+        ),
+        hand=(f"body_{n - 1}", rng.normal(scale=0.2, size=3)),
+        gravity=rng.normal(scale=6.0, size=3),
+    )
+
+
+def surface_through(rng: np.random.Generator, kind: str, position: np.ndarray) -> Quadric:
+    """A plane, sphere or cylinder of random attitude and size that passes through a point."""
+    normal, radius = random_unit(rng), rng.uniform(0.3, 2.0)
+    if kind == "plane":
+        return Quadric(np.zeros((3, 3)), normal, -float(normal @ position))
+    Q = np.eye(3)
+    if kind == "cylinder":
+        axis = np.cross(normal, random_unit(rng))
+        axis /= np.linalg.norm(axis)
+        Q -= np.outer(axis, axis)
+    centre = position - radius * normal
+    return Quadric(Q, -Q @ centre, 0.5 * float(centre @ Q @ centre - radius**2))
+
+
+def random_contacts(rng: np.random.Generator, robot: Robot, q: np.ndarray, count: int) -> list[Contact]:
+    """Contacts at points of random bodies that lie on their surfaces at q, with both friction laws."""
+    model, contacts = Model(robot), []
+    for k in range(count):
+        body, point = int(rng.integers(len(robot.links))), rng.normal(scale=0.3, size=3)
+        kind = SURFACES[rng.integers(3)]
+        contacts.append(
+            Contact(
+                name=f"contact_{k}",
+                body=f"body_{body}",
+                point=point,
+                surface=surface_through(rng, kind, model.point_position(body, point, q)),
+                surface_name=kind,
+                friction=rng.uniform(0.0, 0.3),
+                pulling_friction="dissipative" if rng.random() < 0.5 else "signed",
+            )
+        )
+    return contacts
+
+
+def held_reference(angles: np.ndarray) -> ka.ReferenceArrays:
+    """References that hold the given angles, (na,)."""
+    return ka.ReferenceArrays(
+        spline=integers(np.full(len(angles), -1)),
+        held=reals(angles),
+        grid=reals([0.0, 1.0]),
+        coefficients=reals(np.zeros((1, 1, 6))),
+    )
+
+
+@dataclass
+class Bench:
+    """A system with its workspace: what a test needs to evaluate one right-hand side."""
+
+    robot: Robot
+    system: System
+    ws: ka.Workspace
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """n, na, c."""
+        return len(self.robot.links), len(self.robot.motors), len(self.system.contacts.link)
+
+    def state(self, q: np.ndarray, v: np.ndarray, current: np.ndarray | None = None) -> np.ndarray:
+        """State vector with empty ledger, (2 n + na + 8 + 2 c,)."""
+        n, na, c = self.sizes
+        y = np.zeros(2 * n + na + 8 + 2 * c)
+        y[:n], y[n : 2 * n] = q, v
+        if current is not None:
+            y[2 * n : 2 * n + na] = current
+        return y
+
+    def derivative(self, y: np.ndarray, t: float = 0.0) -> np.ndarray:
+        """dy/dt."""
+        dy = np.zeros_like(y)
+        derivative(self.system, t, reals(y), self.ws, dy)
+        return dy
+
+
+def bench(
+    robot: Robot,
+    contacts: list[Contact] | None = None,
+    *,
+    solver: int = ka.SOLVER_ARTICULATED,
+    held: np.ndarray | None = None,
+    k_p: float = 30.0,
+    k_d: float = 1.0,
+) -> Bench:
+    """Compile a robot and its contacts, with a voltage PD that holds ``held`` (zero by default)."""
+    na = len(robot.motors)
+    contact_arrays = compile_contacts(robot, contacts or [])
+    system = System(
+        model=compile_model(robot),
+        drives=compile_drives(robot, k_p=[k_p] * na, k_d=[k_d] * na),
+        reference=held_reference(np.zeros(na) if held is None else held),
+        contacts=contact_arrays,
+        solver=solver,
+    )
+    ws = ka.workspace(len(robot.links), na, len(contacts or []), dense=solver == ka.SOLVER_M_STAR)
+    return Bench(robot, system, ws)

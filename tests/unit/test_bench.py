@@ -1,0 +1,55 @@
+"""The benchmark runs, compares like with like, and leaves dashes where a peer is missing. No times are asserted."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import sys
+
+import pytest
+from rich.console import Console
+
+from dynsim.studies import bench
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bench, "SIZES", (10,))
+    monkeypatch.setattr(bench, "CASES", {"free arm": bench.CASES["free arm"]})
+
+
+def text(result: dict) -> str:
+    console = Console(width=200, record=True, file=io.StringIO())
+    for table in bench.format_table(result):
+        console.print(table)
+    return console.export_text()
+
+
+def test_quick_run(small: None) -> None:
+    pytest.importorskip("mujoco", minversion="4.0")
+    told: list[float] = []
+    result = json.loads(json.dumps(bench.run_bench(quick=True, progress=lambda what, done: told.append(done))))
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+    assert set(result["right_hand_side"][0]["median_us"]) == set(bench.CONTENDERS)
+    assert result["machine"]["cpu"]
+    assert result["versions"]["mujoco"]
+    errors = {row["program"]: row["hand_error_max_m"] for row in result["job"]}
+    # RK4 at 1 ms is near its stability limit in the first milliseconds; the adaptive run is held small by stability.
+    assert errors[bench.DYNSIM_DEFAULT] < 1e-7
+    assert errors[bench.DYNSIM_RK4] < 2e-5
+    # First order at 1 ms, but the same arm: a millimetre, not a centimetre.
+    assert 1e-5 < errors[bench.MUJOCO_EULER] < 3e-3
+    assert all(math.isfinite(row["time"]) for row in result["ratios"] if "time" in row)
+    assert "–" not in text(result)
+
+
+def test_without_mujoco(small: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    result = bench.run_bench(quick=True)
+    assert "not installed" in result["unavailable"]["mujoco"]
+    rows = [line for line in text(result).splitlines() if line.startswith("│") and "MuJoCo" in line]
+    assert len(rows) == 10
+    assert all("–" in row for row in rows)
+    assert json.dumps(result)

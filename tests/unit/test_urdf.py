@@ -1,0 +1,226 @@
+"""URDF in and out: what is read is what Pinocchio reads, what is written reads back the same, bad files are named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dynsim.errors import ModelError
+from dynsim.model.description import Inertia, Link, Robot
+from dynsim.model.model import Model
+from dynsim.model.urdf import read_urdf, write_urdf
+
+ARM = Path(__file__).parents[2] / "scenarios" / "robots" / "six_axis_arm.urdf"
+# A text round trip through roll, pitch, yaw costs a few roundings per joint; quantities here are of order 1 to 100.
+ROUNDING = 1e-12
+
+
+def rotation(rng: np.random.Generator) -> np.ndarray:
+    """A random rotation; now and then one with pitch = ±90°, where roll and yaw are not unique."""
+    if rng.random() < 0.3:
+        half_turns = rng.integers(0, 4, 3)
+        R = np.eye(3)
+        for axis, k in enumerate(half_turns):
+            c, s = [(1, 0), (0, 1), (-1, 0), (0, -1)][k]
+            turn = np.roll(np.roll(np.array([[1, 0, 0], [0, c, -s], [0, s, c]], float), axis, 0), axis, 1)
+            R = R @ turn
+        return R
+    Q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    return Q * np.linalg.det(Q)
+
+
+def random_robot(seed: int, n: int) -> Robot:
+    """A tree with random joints, placements and inertia tensors of clouds of point masses."""
+    rng = np.random.default_rng(seed)
+    links = []
+    for i in range(n):
+        cloud, masses = rng.normal(size=(5, 3)) * 0.2, rng.uniform(0.1, 1.0, 5)
+        com = masses @ cloud / masses.sum()
+        arms = cloud - com
+        tensor = np.einsum("k,kij->ij", masses, [np.eye(3) * (r @ r) - np.outer(r, r) for r in arms])
+        axis = rng.normal(size=3) if rng.random() < 0.5 else np.eye(3)[rng.integers(3)]
+        kind = "prismatic" if rng.random() < 0.3 else "revolute"
+        limited = rng.random() < 0.5
+        links.append(
+            Link(
+                name=f"body_{i}",
+                joint=f"joint_{n - i}",  # the order of names is not the order of links
+                parent=None if i == 0 else f"body_{rng.integers(max(0, i - 3), i)}",
+                kind=kind,
+                axis=axis / np.linalg.norm(axis),
+                inertia=Inertia(float(masses.sum()), com, tensor),
+                R_PJ=rotation(rng),
+                p_PJ=rng.normal(size=3) * 0.3,
+                damping=float(rng.integers(0, 2) * rng.uniform()),
+                lower=-1.5 if limited else -np.inf,
+                upper=2.5 if limited else np.inf,
+            )
+        )
+    return Robot("random tree", tuple(links), (), (f"body_{rng.integers(n)}", rng.normal(size=3)))
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 12))
+def test_round_trip_keeps_the_dynamics(seed: int, n: int, tmp_path_factory: pytest.TempPathFactory) -> None:
+    robot = random_robot(seed, n)
+    path = tmp_path_factory.mktemp("urdf") / "robot.urdf"
+    path.write_text(write_urdf(robot))
+    again = read_urdf(path)
+    assert again.name == robot.name
+    for link, copy in zip(robot.links, again.links, strict=True):
+        for name in ("name", "joint", "parent", "kind", "damping", "lower", "upper"):
+            assert getattr(copy, name) == getattr(link, name)
+    assert again.hand[0] == robot.hand[0]
+
+    rng = np.random.default_rng(seed)
+    before, after = Model(robot), Model(again)
+    q, v = rng.uniform(-2, 2, n), rng.uniform(-2, 2, n)
+    M, h = before.mass_matrix(q), before.bias_forces(q, v)
+    np.testing.assert_allclose(after.mass_matrix(q), M, rtol=0, atol=ROUNDING * max(1.0, abs(M).max()))
+    np.testing.assert_allclose(after.bias_forces(q, v), h, rtol=0, atol=ROUNDING * max(1.0, abs(h).max()))
+    for body, point in ((robot.links[-1].name, [0.1, 0.2, 0.3]), robot.hand):
+        point_again = again.hand[1] if body == robot.hand[0] and point is robot.hand[1] else point
+        np.testing.assert_allclose(
+            after.point_position(body, point_again, q),
+            before.point_position(body, point, q),
+            rtol=0,
+            atol=ROUNDING * 10,
+        )
+
+
+def test_writing_what_was_read_gives_the_same_text(tmp_path: Path) -> None:
+    first = Model.from_urdf(ARM).to_urdf()
+    (tmp_path / "copy.urdf").write_text(first)
+    assert Model.from_urdf(tmp_path / "copy.urdf").to_urdf() == first
+
+
+def test_shipped_arm_agrees_with_pinocchio() -> None:
+    model, theirs = Model.from_urdf(ARM), pinocchio.buildModelFromUrdf(str(ARM))
+    data = theirs.createData()
+    assert model.joint_names == tuple(theirs.names)[1:]
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        q, v, a = rng.uniform(-2, 2, (3, 6))
+        M = np.triu(pinocchio.crba(theirs, data, q))
+        np.testing.assert_allclose(np.triu(model.mass_matrix(q)), M, rtol=0, atol=ROUNDING * abs(M).max())
+        tau = pinocchio.rnea(theirs, data, q, v, a)
+        np.testing.assert_allclose(model.inverse_dynamics(q, v, a), tau, rtol=0, atol=ROUNDING * abs(tau).max())
+        np.testing.assert_allclose(model.forward_dynamics(q, v, tau), a, rtol=0, atol=1e-10)
+        pinocchio.framesForwardKinematics(theirs, data, q)
+        tool = data.oMf[theirs.getFrameId("tool")].translation
+        np.testing.assert_allclose(model.point_position(*model.robot.hand, q), tool, rtol=0, atol=ROUNDING)
+    # 0.165 + 0.205 + 0.45 + 0.24 + 0.18 + 0.085 + 0.03 + 0.13 m straight up
+    np.testing.assert_allclose(model.point_position(*model.robot.hand, np.zeros(6)), [0, 0, 1.485], atol=ROUNDING)
+
+
+def test_shipped_arm_is_read_as_written() -> None:
+    robot = read_urdf(ARM)
+    assert robot.name == "six_axis_arm"
+    assert robot.joint_names == (
+        "base_yaw",
+        "shoulder_pitch",
+        "elbow_pitch",
+        "forearm_roll",
+        "wrist_pitch",
+        "tool_roll",
+    )
+    assert robot.hand[0] == "flange"
+    np.testing.assert_allclose(robot.hand[1], [0, 0, 0.16], atol=1e-15)
+    # The gripper, fixed to the flange, is part of the last body: 0.35 kg + 0.9 kg.
+    assert robot.links[-1].inertia.mass == pytest.approx(1.25)
+    assert robot.links[1].damping == 12.0
+    assert (robot.links[1].lower, robot.links[1].upper) == (-2.26893, 2.26893)
+    assert robot.motors == ()
+
+
+BASE = '<link name="base"/>'
+INERTIAL = '<inertial><mass value="1"/><inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial>'
+TIP = f'<link name="tip">{INERTIAL}</link>'
+
+
+def joint(kind: str, inside: str = "", *, name: str = "hinge", child: str = "tip") -> str:
+    return f'<joint name="{name}" type="{kind}"><parent link="base"/><child link="{child}"/>{inside}</joint>'
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (TIP + joint("floating"), ["hinge", "floating"]),
+        (TIP + joint("planar"), ["hinge", "planar"]),
+        (TIP + joint("hyper"), ["hinge", "hyper", "continuous"]),
+        (TIP + joint("continuous", '<mimic joint="other"/>'), ["hinge", "mimic"]),
+        (TIP + joint("revolute"), ["hinge", "limit"]),
+        (TIP + joint("fixed"), ["no moving joint"]),
+        (TIP + joint("continuous", '<axis xyz="0 0 a"/>'), ["hinge", "0 0 a"]),
+        (TIP + joint("continuous", '<axis xyz="0 0 0"/>'), ["hinge", "axis"]),
+        (TIP.replace('"1"', '"heavy"') + joint("continuous"), ["tip", "heavy"]),
+        (TIP.replace('"1"', '"-1"') + joint("continuous"), ["tip", "-1", "negative"]),
+        (TIP.replace('"0.1"', '"nan"') + joint("continuous"), ["tip", "nan"]),
+        (TIP + joint("continuous", child="tup"), ["hinge", "tup"]),
+        (TIP + '<link name="loose"/>' + joint("continuous"), ["base, loose"]),
+        (TIP + joint("continuous") + joint("continuous", name="second"), ["second", "tip"]),
+        (
+            '<link name="a"/><link name="b"/>'
+            '<joint name="there" type="fixed"><parent link="a"/><child link="b"/></joint>'
+            '<joint name="back" type="continuous"><parent link="b"/><child link="a"/></joint>',
+            ["there", "loop"],
+        ),
+        ("<link", ["not XML"]),
+    ],
+)
+def test_bad_files_name_file_and_joint(content: str, words: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "bad.urdf"
+    path.write_text(f'<robot name="bad">{BASE}{content}</robot>')
+    with pytest.raises(ModelError) as caught:
+        read_urdf(path)
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in ["bad.urdf", *words]:
+        assert word in message
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="cannot be read"):
+        read_urdf(tmp_path / "missing.urdf")
+    with pytest.raises(ModelError, match="cannot be read"):
+        read_urdf(tmp_path)
+    (tmp_path / "empty.urdf").write_text("")
+    with pytest.raises(ModelError, match="not XML"):
+        read_urdf(tmp_path / "empty.urdf")
+    (tmp_path / "scene.xml").write_text("<mujoco/>")
+    with pytest.raises(ModelError, match="mujoco"):
+        read_urdf(tmp_path / "scene.xml")
+
+
+def test_coulomb_friction_is_not_dropped_silently(tmp_path: Path) -> None:
+    path = tmp_path / "rubbing.urdf"
+    path.write_text(f'<robot name="r">{BASE}{TIP}{joint("continuous", """<dynamics friction="0.2"/>""")}</robot>')
+    with pytest.warns(UserWarning, match="hinge"):
+        read_urdf(path)
+
+
+def test_hand_is_the_tip_of_the_deepest_chain(tmp_path: Path) -> None:
+    """A finger that moves beats a tool that does not; without a frame at the tip it is the body's own origin."""
+    finger = f'<link name="finger">{INERTIAL}</link>' + (
+        '<joint name="grip" type="continuous"><origin xyz="1 0 0"/><parent link="tip"/><child link="finger"/></joint>'
+    )
+    tool = '<link name="tool"/><joint name="t" type="fixed"><origin xyz="0 0 {}"/><parent link="{}"/>{}</joint>'
+    path = tmp_path / "robot.urdf"
+
+    def hand(content: str) -> tuple[str, list[float]]:
+        path.write_text(f'<robot name="r">{BASE}{TIP}{joint("continuous")}{content}</robot>')
+        body, point = read_urdf(path).hand
+        return body, point.tolist()
+
+    assert hand("") == ("tip", [0, 0, 0])
+    assert hand(tool.format(0.5, "tip", '<child link="tool"/>')) == ("tip", [0, 0, 0.5])
+    assert hand(finger + tool.format(0.5, "tip", '<child link="tool"/>')) == ("finger", [0, 0, 0])
+    assert hand(finger + tool.format(0.5, "tip", '<child link="hand"/>').replace("tool", "hand")) == (
+        "tip",
+        [0, 0, 0.5],
+    )
