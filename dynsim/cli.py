@@ -1,4 +1,4 @@
-"""The command line: ``dynsim run``, ``compare``, ``check``, ``list``, ``plot``, ``bench``, ``schema``."""
+"""The command line: ``dynsim run``, ``compare``, ``check``, ``list``, ``plot``, ``bench``, ``schema``, ``hw`` …"""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from rich.console import Console
 
 from dynsim._version import __version__
 from dynsim.errors import DynsimError, SimulationStopped
+from dynsim.hardware.cli import export, hw
 
 if TYPE_CHECKING:
     from dynsim.record import Record
@@ -225,6 +226,11 @@ def schema() -> None:
     from dynsim.scenario import json_schema
 
     print(json.dumps(json_schema(), indent=2))
+
+
+# These load serial ports and servos only when called.
+app.add_typer(hw, name="hw")
+app.command(epilog="Example: dynsim export record.h5 --format joint-trajectory --rate 100")(export)
 
 
 def _overrides(given: list[str] | None) -> dict[str, Any]:

@@ -1,0 +1,82 @@
+"""Zero ticks: put the robot into its zero posture by hand, and write what the servos read into the map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from ruamel.yaml import YAML
+
+from dynsim.hardware.bus import Bus
+from dynsim.hardware.control_table import MX_106, STATE_BLOCK
+from dynsim.hardware.errors import ServoMapError, VerificationFailed
+from dynsim.hardware.servo_map import Servo, ServoMap, load_servo_map
+
+READS = 20
+STILL = 3
+"""Spread over the reads that still counts as standing still [ticks]."""
+
+
+def read_zero_ticks(bus: Bus, servos: Iterable[Servo]) -> dict[str, int]:
+    """Median servo position of each joint, torque being off.
+
+    Raises
+    ------
+    VerificationFailed
+        Torque is on, a servo does not answer, or moves.
+    NoAnswer, RequestRefused
+        While asking for torque.
+    """
+    chosen = list(servos)
+    for servo in chosen:
+        if bus.read(servo.id, MX_106.fields["torque_enable"]):
+            raise VerificationFailed(f"{servo.joint} (ID {servo.id}): torque is on; `dynsim hw stop` releases it")
+    ticks: dict[str, list[int]] = {servo.joint: [] for servo in chosen}
+    for _ in range(READS):
+        replies = bus.sync_read([servo.id for servo in chosen], *STATE_BLOCK).replies
+        for servo in chosen:
+            if servo.id in replies:
+                ticks[servo.joint].append(int.from_bytes(replies[servo.id].data[6:10], "little", signed=True))
+    for servo in chosen:
+        seen = ticks[servo.joint]
+        if len(seen) < READS // 2:
+            raise VerificationFailed(f"{servo.joint} (ID {servo.id}): {len(seen)} of {READS} reads answered")
+        if max(seen) - min(seen) > STILL:
+            raise VerificationFailed(f"{servo.joint} moves (ticks {min(seen)} to {max(seen)}); hold it still")
+    return {joint: int(np.median(seen)) for joint, seen in ticks.items()}
+
+
+def write_zero_ticks(servo_map: ServoMap, ticks: dict[str, int], path: Path) -> None:
+    """Write the map with new zero ticks to ``path``; everything else, comments too, stays as it is.
+
+    Raises
+    ------
+    ServoMapError
+        With the new zero a joint's limits would leave the single turn position mode knows, or the file cannot be
+        written.
+    """
+    yaml = YAML(typ="rt")
+    yaml.preserve_quotes = True
+    yaml.width = 200
+    data = yaml.load(servo_map.path.read_text(encoding="utf-8"))
+    for joint, tick in ticks.items():
+        data["servos"][joint]["zero_tick"] = tick
+    draft = path.with_name(path.name + ".tmp")
+    try:
+        with draft.open("w", encoding="utf-8") as file:
+            yaml.dump(data, file)
+        for servo in load_servo_map(draft).servos:
+            ends = (
+                sorted(servo.to_ticks(angle) for angle in servo.position_limits) if servo.in_position_mode else [0, 0]
+            )
+            if servo.joint in ticks and (ends[0] < 0 or ends[1] > 4095):
+                raise ServoMapError(
+                    f"{servo.joint}: with zero at tick {servo.zero_tick} its limits reach ticks {ends[0]} to "
+                    f"{ends[1]}, position mode ends at 0 and 4095; turn the horn or narrow the limits"
+                )
+        draft.replace(path)
+    except OSError as error:
+        raise ServoMapError(f"{path}: cannot be written ({error.strerror})") from error
+    finally:
+        draft.unlink(missing_ok=True)

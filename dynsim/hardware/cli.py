@@ -1,0 +1,418 @@
+"""`dynsim hw …` and `dynsim export`. Serial and servo modules are imported by the commands that need them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from dynsim.errors import DynsimError
+
+hw = typer.Typer(
+    no_args_is_help=True,
+    help="Replay a record on Dynamixel servos (or virtual ones). A software stop is no safety device: fit a power cut.",
+)
+# Paths must survive copy and paste: long lines are left to the terminal. Without markup: "[rad]" is a unit, no style.
+console = Console(soft_wrap=True, highlight=False, markup=False)
+
+
+class Policy(StrEnum):
+    hold = "hold"
+    decelerate = "decelerate"
+    off = "off"
+
+
+class ExportFormat(StrEnum):
+    csv = "csv"
+    joint_trajectory = "joint-trajectory"
+    urdf_log = "urdf-log"
+
+
+RecordFile = Annotated[Path, typer.Argument(metavar="RECORD", help="record.h5 of a run")]
+MapFile = Annotated[Path, typer.Option("--map", help="servo map: a file, or the name of a shipped one (arm, snake)")]
+Port = Annotated[str, typer.Option("--port", help="serial device, e.g. /dev/ttyUSB0")]
+Rate = Annotated[float | None, typer.Option("--rate", help="goals per second [Hz]; the map's if not given")]
+Speed = Annotated[float, typer.Option("--speed", help="1 is the record's own time, 0.5 half as fast")]
+
+
+class MissingClientLibrary(DynsimError):
+    """The optional packages for servos are not installed."""
+
+
+@contextmanager
+def _client_library() -> Iterator[None]:
+    try:
+        import dynamixel_sdk  # noqa: F401
+        import serial  # noqa: F401
+    except ImportError as error:
+        raise MissingClientLibrary(f"{error.name} is not installed: pip install 'dynsim[hardware]'") from error
+    yield
+
+
+@hw.command(epilog="Example: dynsim hw scan --port /dev/ttyUSB0 --map arm")
+def scan(
+    port: Port,
+    map_file: Annotated[Path | None, typer.Option("--map", help="compare with this servo map")] = None,
+    baud: Annotated[int | None, typer.Option("--baud", help="only this bit rate [bit/s]")] = None,
+) -> None:
+    """List the servos that answer, at every usual bit rate. Reads only."""
+    with _client_library():
+        from dynsim.hardware import session
+        from dynsim.hardware.errors import VerificationFailed
+        from dynsim.hardware.servo_map import load_servo_map
+
+        servo_map = load_servo_map(map_file) if map_file else None
+        bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else session.SCAN_BAUD_RATES
+        found = session.scan(port, bauds)
+    if not found:
+        raise VerificationFailed(
+            f"{port}: no servo answered at {', '.join(f'{b}' for b in bauds)} bit/s. Is the power on, the cable right? "
+            "MX servos with Protocol 1 firmware do not answer: update them to 2.0"
+        )
+    owners = {servo.id: servo for servo in servo_map.servos} if servo_map else {}
+    table = Table("ID", "model", "fw", "bit/s", "mode", "delay µs", "V", "°C", "torque", "error", "joint")
+    for servo in found:
+        table.add_row(
+            str(servo.id),
+            servo.model_name,
+            str(servo.firmware),
+            str(servo.baud),
+            str(servo.mode),
+            f"{servo.return_delay * 1e6:.0f}",
+            f"{servo.voltage:.1f}",
+            f"{servo.temperature:.0f}",
+            "ON" if servo.torque else "off",
+            f"0x{servo.hardware_error:02x}" if servo.hardware_error else "-",
+            owners[servo.id].joint if servo.id in owners else "-",
+        )
+    console.print(table)
+    if servo_map:
+        _compare_with_map(found, servo_map)
+
+
+def _compare_with_map(found: list[Any], servo_map: Any) -> None:
+    from dynsim.hardware.errors import VerificationFailed
+
+    seen = {servo.id: servo for servo in found}
+    wrong = [f"{servo.joint} (ID {servo.id}) did not answer" for servo in servo_map.servos if servo.id not in seen]
+    wrong += [f"ID {id_} is not in the map" for id_ in seen if id_ not in servo_map.ids]
+    wrong += [
+        f"{servo.joint} (ID {servo.id}) is {seen[servo.id].model_name}, the map says {servo.model.name}"
+        for servo in servo_map.servos
+        if servo.id in seen and seen[servo.id].model != servo.model.number
+    ]
+    if wrong:
+        raise VerificationFailed("; ".join(wrong))
+    console.print(f"all {len(seen)} servos of {servo_map.path} answer")
+
+
+@hw.command(epilog="Example: dynsim hw check results/elbow_comparison/two_elbows/record.h5 --map arm")
+def check(record: RecordFile, map_file: MapFile, rate: Rate = None, speed: Speed = 1.0) -> None:
+    """Check a whole record against a robot's limits; needs no port."""
+    _, _, motion = _checked(record, map_file, rate, speed)
+    _print_check(motion)
+
+
+def _checked(record_file: Path, map_file: Path, rate: float | None, speed: float) -> tuple[Any, Any, Any]:
+    from dynsim.hardware.check import check_motion
+    from dynsim.hardware.servo_map import load_servo_map
+    from dynsim.record import Record
+
+    record, servo_map = Record.load(record_file), load_servo_map(map_file)
+    return record, servo_map, check_motion(record, servo_map, rate=rate, speed=speed)
+
+
+def _print_check(motion: Any) -> None:
+    table = Table("joint", "quantity", "tightest", "limit", "margin", "at [s]")
+    for margin in motion.margins:
+        table.add_row(
+            margin.joint,
+            f"{margin.quantity} [{margin.unit}]",
+            f"{margin.value:.4f}",
+            f"{margin.limit:.4f}",
+            f"{margin.margin:.4f}",
+            f"{margin.time:.3f}",
+        )
+    console.print(table)
+    for warning in motion.warnings:
+        console.print(f"warning: {warning}")
+    plan, path = motion.plan, motion.path
+    console.print(
+        f"check passed: {(path.end - path.start) / motion.speed:.2f} s at {plan.rate:g} Hz, "
+        f"{plan.cycle_time * 1e3:.2f} of {1e3 / plan.rate:.2f} ms a cycle on the bus"
+    )
+
+
+@hw.command(epilog="Example: dynsim hw replay results/elbow_comparison/two_elbows/record.h5 --map arm --port virtual")
+def replay(
+    record: RecordFile,
+    map_file: MapFile,
+    port: Annotated[str, typer.Option("--port", help="serial device, or 'virtual' for servos in memory")],
+    rate: Rate = None,
+    speed: Speed = 1.0,
+    policy: Annotated[Policy | None, typer.Option("--policy", help="on a fault; the map's if not given")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="folder [results/<robot>_replay]")] = None,
+    live: Annotated[bool, typer.Option("--live", help="really move; a real port is a dry run without")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="do not ask before moving")] = False,
+    configure: Annotated[bool, typer.Option("--configure", help="write differing EEPROM settings")] = False,
+    faults: Annotated[Path | None, typer.Option("--faults", help="fault script for virtual servos")] = None,
+    plant: Annotated[str | None, typer.Option("--plant", help="scenario whose robot the virtual servos move")] = None,
+    variant: Annotated[str | None, typer.Option("--variant", help="variant of that scenario")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="no progress bar")] = False,
+) -> None:
+    """Check, verify, arm, move to the start, replay, and keep the measured run.
+
+    Ctrl-C once: controlled stop. Twice: torque off.
+    """
+    with _client_library():
+        from dynsim.hardware import session
+        from dynsim.hardware.errors import ServoMapError
+        from dynsim.hardware.replay import StopRequest
+        from dynsim.hardware.virtual_faults import load_fault_script
+
+        if (faults or plant) and port != session.VIRTUAL:
+            raise ServoMapError("--faults and --plant are for virtual servos: --port virtual")
+        simulated, servo_map, motion = _checked(record, map_file, rate, speed)
+        script = load_fault_script(faults) if faults else None
+        robot = _plant(plant, variant, servo_map, motion) if plant else None
+        folder = out or Path("results") / f"{servo_map.robot}_replay"
+        for warning in motion.warnings:
+            console.print(f"warning: {warning}")
+        moves = live or port == session.VIRTUAL
+        if live and port != session.VIRTUAL and not yes:
+            _confirm(servo_map, motion)
+        stop = StopRequest()
+        with session.stop_on_signals(stop), _progress(enabled=not quiet) as observer:
+            result = session.run_replay(
+                motion,
+                servo_map,
+                port,
+                folder,
+                policy=policy.value if policy else None,
+                live=live,
+                write_eeprom=configure,
+                script=script,
+                plant=robot,
+                stop=stop,
+                observer=observer,
+                provenance={"record": str(record), "simulated": simulated.provenance},
+            )
+    _print_timing(result)
+    if not moves:
+        console.print("dry run: servos verified and the bus timed, nothing was moved; --live moves")
+        return
+    console.print(
+        f"replayed; torque {'ON, holding' if result.end_state == 'holding' else 'off'}; {folder / 'measured.h5'}"
+    )
+    console.print(f"compare: dynsim hw compare {record} {folder / 'measured.h5'}")
+
+
+def _plant(scenario: str, variant: str | None, servo_map: Any, motion: Any) -> Any:
+    from dynsim.hardware.simulated_plant import simulated_arm
+
+    posture = dict(zip((servo.label for servo in servo_map.servos), motion.path.position[0], strict=True))
+    return simulated_arm(scenario, variant, servo_map, posture)
+
+
+def _confirm(servo_map: Any, motion: Any) -> None:
+    from dynsim.hardware.errors import ReplayInterrupted
+
+    duration = (motion.path.end - motion.path.start) / motion.speed
+    console.print(
+        f"{servo_map.robot}: {len(servo_map.servos)} servos will move for {duration:.1f} s plus the way to the start."
+    )
+    console.print("Is everybody clear of the robot, and the power cut within reach?")
+    try:
+        agreed = typer.confirm("move?")
+    except typer.Abort:
+        agreed = False
+    if not agreed:
+        raise ReplayInterrupted("not confirmed; nothing was moved")
+
+
+@contextmanager
+def _progress(*, enabled: bool) -> Iterator[Any]:
+    """A bar with state, following error and temperature; gives the observer that feeds it."""
+    if not enabled:
+        yield None
+        return
+    from rich.progress import BarColumn, TextColumn
+    from rich.progress import Progress as Bar
+
+    columns = (
+        TextColumn("{task.description:<13}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TextColumn("following error {task.fields[error]:6.4f} rad"),
+        TextColumn("hottest {task.fields[temperature]}"),
+    )
+    with Bar(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("", total=1.0, error=0.0, temperature="-")
+
+        def observe(progress: Any) -> None:
+            known = progress.temperature == progress.temperature
+            bar.update(
+                task,
+                description=progress.state.name,
+                completed=progress.fraction,
+                error=progress.following_error,
+                temperature=f"{progress.temperature:.0f} °C" if known else "-",
+            )
+
+        yield observe
+
+
+def _print_timing(result: Any) -> None:
+    timing = result.timing
+    if timing is None:
+        return
+    console.print(
+        f"{timing.cycles} cycles, period {timing.period_mean * 1e3:.3f} ms (longest {timing.period_max * 1e3:.3f}), "
+        f"lateness 99 % {timing.lateness_p99 * 1e3:.3f} ms, bus {timing.exchange_mean * 1e3:.2f} ms a cycle, "
+        f"{timing.skipped_cycles} skipped, {timing.missed_statuses} statuses missed"
+    )
+
+
+@hw.command(
+    epilog="Example: dynsim hw compare results/elbow_comparison/two_elbows/record.h5 results/arm_replay/measured.h5"
+)
+def compare(
+    record: RecordFile,
+    measured: Annotated[Path, typer.Argument(metavar="MEASURED", help="measured.h5 of a replay")],
+    gate: Annotated[Path | None, typer.Option("--gate", help="YAML with bounds; exit code 5 beyond them")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="folder [that of MEASURED]")] = None,
+) -> None:
+    """Delay, rms and largest error between a simulated and a measured run, with a figure."""
+    from dynsim.hardware.compare import check_gate, compare_records, draw_comparison, load_gate
+    from dynsim.record import Record
+
+    bounds = load_gate(gate) if gate else None
+    comparison = compare_records(Record.load(record), Record.load(measured))
+    table = Table("joint", "rms [rad]", "max [rad]", "at [s]", "rms, delay removed [rad]", "delay [ms]")
+    for joint in comparison.joints:
+        table.add_row(
+            joint.joint,
+            f"{joint.rms:.5f}",
+            f"{joint.max:.5f}",
+            f"{joint.time_of_max:.3f}",
+            f"{joint.rms_delay_removed:.5f}",
+            "-" if joint.delay != joint.delay else f"{joint.delay * 1e3:.1f}",
+        )
+    console.print(table)
+    console.print(f"delay {comparison.delay * 1e3:.1f} ms, worst joint {comparison.worst.joint}")
+    folder = out or measured.parent
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "comparison.json").write_text(json.dumps(comparison.summary(), indent=1) + "\n", encoding="utf-8")
+    console.print(f"figure: {draw_comparison(comparison, folder / 'comparison.png')}")
+    if bounds:
+        check_gate(comparison, bounds)
+
+
+@hw.command(epilog="Example: dynsim hw virtual --map arm --link /tmp/ttyDXL")
+def virtual(
+    map_file: MapFile,
+    faults: Annotated[Path | None, typer.Option("--faults", help="fault script")] = None,
+    link: Annotated[Path | None, typer.Option("--link", help="name the device by this symbolic link")] = None,
+) -> None:
+    """Virtual servos behind a pseudo-terminal, for any Dynamixel tool. Ctrl-C ends it."""
+    with _client_library():
+        from dynsim.hardware.pseudo_terminal import PseudoTerminal
+        from dynsim.hardware.replay import StopRequest
+        from dynsim.hardware.servo_map import load_servo_map
+        from dynsim.hardware.session import stop_on_signals
+        from dynsim.hardware.virtual_bus import line_for_map
+        from dynsim.hardware.virtual_faults import load_fault_script
+
+        servo_map = load_servo_map(map_file)
+        script = load_fault_script(faults) if faults else None
+        terminal = PseudoTerminal(line_for_map(servo_map, script=script), link)
+        stop = StopRequest()
+        # A plain line: other programs wait for it.
+        print(
+            f"{len(servo_map.servos)} virtual servos at {servo_map.bus.baud} bit/s on {link or terminal.device}",
+            flush=True,
+        )
+        try:
+            with stop_on_signals(stop):
+                terminal.serve(lambda: stop.count == 0)
+        finally:
+            terminal.close()
+
+
+@hw.command("stop", epilog="Example: dynsim hw stop --port /dev/ttyUSB0")
+def stop_servos(
+    port: Port,
+    map_file: Annotated[Path | None, typer.Option("--map", help="ask the servos of this map")] = None,
+    baud: Annotated[int | None, typer.Option("--baud", help="only this bit rate [bit/s]")] = None,
+) -> None:
+    """Torque off for every servo at every usual bit rate, beside a replay too; no substitute for a power cut."""
+    with _client_library():
+        from dynsim.hardware import session
+        from dynsim.hardware.errors import VerificationFailed
+        from dynsim.hardware.servo_map import load_servo_map
+
+        servo_map = load_servo_map(map_file) if map_file else None
+        bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else session.STOP_BAUD_RATES
+        torque = session.stop_all(port, bauds, servo_map.ids if servo_map else ())
+    on = [id_ for id_, still_on in torque.items() if still_on]
+    if on or not torque:
+        who = f"ID {', '.join(map(str, on))}" if on else "any servo"
+        raise VerificationFailed(f"torque off was sent, but NOT confirmed by {who}: cut the power")
+    console.print(f"torque off, confirmed by {len(torque)} servos")
+
+
+@hw.command(epilog="Example: dynsim hw calibrate --map my_arm.yaml --port /dev/ttyUSB0")
+def calibrate(
+    map_file: MapFile,
+    port: Port,
+    joint: Annotated[list[str] | None, typer.Option("--joint", help="only this joint; may be repeated")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="write here instead of into the map")] = None,
+) -> None:
+    """Write the zero ticks: put the robot into its zero posture by hand (torque off), then run this."""
+    with _client_library():
+        from dynsim.hardware import session
+        from dynsim.hardware.calibrate import read_zero_ticks, write_zero_ticks
+        from dynsim.hardware.errors import ServoMapError
+        from dynsim.hardware.servo_map import SHIPPED, load_servo_map
+
+        servo_map = load_servo_map(map_file)
+        target = out or servo_map.path
+        if target.resolve().parent == SHIPPED:
+            raise ServoMapError(f"{target} comes with dynsim; write your own map with --out")
+        unknown = [name for name in joint or () if name not in servo_map.joints]
+        if unknown:
+            raise ServoMapError(f"{map_file} has no joint {', '.join(unknown)}; it has {', '.join(servo_map.joints)}")
+        chosen = [servo for servo in servo_map.servos if (servo.joint in joint if joint else servo.in_position_mode)]
+        with session.bus_on(port, servo_map) as (bus, _):
+            ticks = read_zero_ticks(bus, chosen)
+        write_zero_ticks(servo_map, ticks, target)
+    table = Table("joint", "ID", "old zero", "new zero")
+    for servo in chosen:
+        table.add_row(servo.joint, str(servo.id), str(servo.zero_tick), str(ticks[servo.joint]))
+    console.print(table)
+    console.print(f"zero ticks of {len(ticks)} joints written to {target}")
+
+
+def export(
+    record: RecordFile,
+    format_: Annotated[
+        ExportFormat, typer.Option("--format", help="csv, joint-trajectory (ROS), urdf-log (JSON lines)")
+    ],
+    rate: Annotated[
+        float | None, typer.Option("--rate", help="resample [Hz]; the record's samples if not given")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="file [beside the record]")] = None,
+) -> None:
+    """Write the joint motion of a record for other programs."""
+    from dynsim.hardware.export import SUFFIX, export_record
+    from dynsim.record import Record
+
+    target = out or record.with_suffix(SUFFIX[format_.value])
+    console.print(f"written: {export_record(Record.load(record), target, format_.value, rate=rate)}")

@@ -1,0 +1,215 @@
+"""Control tables of the MX-106(2.0) and MX-28(2.0), Protocol 2.0, as data.
+
+Source: ROBOTIS e-Manual, "MX-106(2.0)" and "MX-28(2.0)", chapter Control Table. Limits stored in a servo changed
+between firmware versions: the replay reads them from the servo and never assumes the defaults given here, which only
+fill the virtual servos.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+TICKS_PER_TURN = 4096
+RAD_PER_TICK = 2 * math.pi / TICKS_PER_TURN
+RAD_S_PER_UNIT = 0.229 * 2 * math.pi / 60  # 0.229 rpm, present, goal and profile velocity
+RAD_S2_PER_UNIT = 214.577 / 60**2 * 2 * math.pi  # 214.577 rev/min², profile acceleration
+AMPERE_PER_UNIT = 3.36e-3  # present and goal current of the MX-106
+VOLT_PER_UNIT = 0.1
+WATCHDOG_SECONDS_PER_UNIT = 0.020
+RETURN_DELAY_SECONDS_PER_UNIT = 2e-6
+BROADCAST_ID = 254
+MAX_ID = 252
+
+BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
+"""Bits per second by the code stored at address 8. The Python client library refuses 4.5 Mbit/s."""
+
+
+class OperatingMode(IntEnum):
+    """Values of address 11."""
+
+    CURRENT = 0
+    VELOCITY = 1
+    POSITION = 3
+    EXTENDED_POSITION = 4
+    CURRENT_BASED_POSITION = 5
+    PWM = 16
+
+
+HARDWARE_ERRORS = {0: "input voltage", 2: "overheating", 3: "encoder", 4: "electrical shock", 5: "overload"}
+"""Meaning of the bits of address 70."""
+
+
+def describe_hardware_error(register: int) -> str:
+    """Names of the bits set in the hardware error register (address 70)."""
+    names = [name for bit, name in HARDWARE_ERRORS.items() if register >> bit & 1]
+    return ", ".join(names) or f"no known bit (0x{register:02x})"
+
+
+@dataclass(frozen=True)
+class Field:
+    """One item of a control table.
+
+    Attributes
+    ----------
+    address, size : int
+        Byte address and number of bytes.
+    default : int
+        Value after power-on (RAM) or as delivered (EEPROM).
+    low, high : int | None
+        What a write may hold; None where the type's own range is all there is.
+    writable, signed : bool
+    """
+
+    address: int
+    size: int
+    default: int = 0
+    low: int | None = None
+    high: int | None = None
+    writable: bool = True
+    signed: bool = False
+
+    @property
+    def in_eeprom(self) -> bool:
+        """Kept without power, and writable only with torque off."""
+        return self.address < 64
+
+    def decode(self, data: bytes) -> int:
+        """Integer in ``data``, with the field's own sign (the client library's getData knows only unsigned ones)."""
+        return int.from_bytes(data, "little", signed=self.signed)
+
+    def encode(self, value: int) -> bytes:
+        """Bytes of ``value``; a negative number in an unsigned field is an OverflowError."""
+        return int(value).to_bytes(self.size, "little", signed=self.signed)
+
+
+@dataclass(frozen=True)
+class ServoModel:
+    """What the data sheet says about one model.
+
+    Attributes
+    ----------
+    number : int
+        Model number at address 0.
+    no_load_speed : float
+        At 12 V [rad/s].
+    stall_torque, stall_current : float
+        At 12 V [N·m], [A].
+    fields : dict[str, Field]
+        Control table by name.
+    """
+
+    name: str
+    number: int
+    no_load_speed: float
+    stall_torque: float
+    stall_current: float
+    fields: dict[str, Field] = field(repr=False)
+
+    @property
+    def measures_current(self) -> bool:
+        """True when address 126 is a current, False when it is a load in 0.1 % of stall torque."""
+        return "present_current" in self.fields
+
+    @property
+    def torque_constant(self) -> float:
+        """Output torque per ampere [N·m/A], from the stall point (unverified away from it)."""
+        return self.stall_torque / self.stall_current
+
+    def torque(self, effort: int) -> float:
+        """Estimated output torque [N·m] from the signed register at address 126."""
+        if self.measures_current:
+            return effort * AMPERE_PER_UNIT * self.torque_constant
+        return effort * 1e-3 * self.stall_torque
+
+    def effort(self, torque: float) -> int:
+        """Register at address 126 for an output torque [N·m]."""
+        if self.measures_current:
+            return round(torque / self.torque_constant / AMPERE_PER_UNIT)
+        return round(torque / self.stall_torque * 1e3)
+
+
+_COMMON = {
+    "model_number": Field(0, 2, writable=False),
+    "model_information": Field(2, 4, writable=False),
+    "firmware": Field(6, 1, 45, writable=False),
+    "id": Field(7, 1, 1, 0, MAX_ID),
+    "baud": Field(8, 1, 1, 0, 7),
+    "return_delay": Field(9, 1, 250, 0, 254),
+    "drive_mode": Field(10, 1, 0, 0, 0x0D),
+    "operating_mode": Field(11, 1, OperatingMode.POSITION),
+    "shadow_id": Field(12, 1, 255, 0, 255),
+    "protocol": Field(13, 1, 2, 1, 2),
+    "homing_offset": Field(20, 4, 0, -1_044_479, 1_044_479, signed=True),
+    "moving_threshold": Field(24, 4, 10, 0, 1023),
+    "temperature_limit": Field(31, 1, 80, 0, 100),
+    "max_voltage": Field(32, 2, 160, 95, 160),
+    "min_voltage": Field(34, 2, 95, 95, 160),
+    "pwm_limit": Field(36, 2, 885, 0, 885),
+    "acceleration_limit": Field(40, 4, 32767, 0, 32767),
+    "velocity_limit": Field(44, 4, 230, 0, 1023),
+    "max_position": Field(48, 4, 4095, 0, 4095),
+    "min_position": Field(52, 4, 0, 0, 4095),
+    "shutdown": Field(63, 1, 0x34, 0, 0x3D),
+    "torque_enable": Field(64, 1, 0, 0, 1),
+    "led": Field(65, 1, 0, 0, 1),
+    "status_return_level": Field(68, 1, 2, 0, 2),
+    "registered_instruction": Field(69, 1, writable=False),
+    "hardware_error": Field(70, 1, writable=False),
+    "velocity_i_gain": Field(76, 2, 1920, 0, 16383),
+    "velocity_p_gain": Field(78, 2, 100, 0, 16383),
+    "position_d_gain": Field(80, 2, 0, 0, 16383),
+    "position_i_gain": Field(82, 2, 0, 0, 16383),
+    "position_p_gain": Field(84, 2, 850, 0, 16383),
+    "feedforward_2nd_gain": Field(88, 2, 0, 0, 16383),
+    "feedforward_1st_gain": Field(90, 2, 0, 0, 16383),
+    "bus_watchdog": Field(98, 1, 0, 0, 127, signed=True),
+    "goal_pwm": Field(100, 2, 885, signed=True),
+    "goal_velocity": Field(104, 4, 0, signed=True),
+    "profile_acceleration": Field(108, 4, 0, 0, 32767),
+    "profile_velocity": Field(112, 4, 0, 0, 32767),
+    "goal_position": Field(116, 4, 0, signed=True),
+    "realtime_tick": Field(120, 2, writable=False),
+    "moving": Field(122, 1, writable=False),
+    "moving_status": Field(123, 1, writable=False),
+    "present_pwm": Field(124, 2, writable=False, signed=True),
+    "present_velocity": Field(128, 4, writable=False, signed=True),
+    "present_position": Field(132, 4, writable=False, signed=True),
+    "velocity_trajectory": Field(136, 4, writable=False, signed=True),
+    "position_trajectory": Field(140, 4, writable=False, signed=True),
+    "present_voltage": Field(144, 2, writable=False),
+    "present_temperature": Field(146, 1, writable=False),
+}
+
+MX_106 = ServoModel(
+    name="MX-106",
+    number=321,
+    no_load_speed=45 * 2 * math.pi / 60,
+    stall_torque=8.4,
+    stall_current=5.2,
+    fields=_COMMON
+    | {
+        "current_limit": Field(38, 2, 2047, 0, 2047),
+        "goal_current": Field(102, 2, 0, signed=True),
+        "present_current": Field(126, 2, writable=False, signed=True),
+    },
+)
+MX_28 = ServoModel(
+    name="MX-28",
+    number=30,
+    no_load_speed=55 * 2 * math.pi / 60,
+    stall_torque=2.5,
+    stall_current=1.4,
+    fields=_COMMON | {"present_load": Field(126, 2, writable=False, signed=True)},
+)
+MODELS = {model.name: model for model in (MX_106, MX_28)}
+MODEL_BY_NUMBER = {model.number: model for model in MODELS.values()}
+
+INDIRECT_BLOCKS = ((168, 224, 28), (578, 634, 28))
+"""(address of the first two-byte pointer, address of the first data byte, number of pointers)."""
+TABLE_SIZE = 662
+STATE_BLOCK = (126, 10)
+"""Address and length of effort (2), velocity (4), position (4): what the loop reads from every servo each cycle."""
+HEALTH_BLOCK = (64, 83)
+"""Torque enable … temperature: read from one servo per cycle in turn."""

@@ -1,0 +1,127 @@
+"""A record's joint motion for other programs."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.errors import RecordError
+from dynsim.hardware.trajectory import Path as JointPath
+from dynsim.record import Record
+
+Format = Literal["csv", "joint-trajectory", "urdf-log"]
+SUFFIX: dict[str, str] = {"csv": ".csv", "joint-trajectory": ".trajectory.yaml", "urdf-log": ".jsonl"}
+RATES = {"q": "v", "phi": "phi_dot", "rho": "rho_dot"}
+"""Angle signals of the records, and the signals that hold their rates."""
+
+
+def export_record(record: Record, path: Path, format_: Format, *, rate: float | None = None) -> Path:
+    """Write the joint angles and rates of a record.
+
+    ``csv``: one row per sample, columns "time [s]", "<joint> [rad]", "<joint> [rad/s]". ``joint-trajectory``: the
+    fields of a ROS trajectory_msgs/JointTrajectory as YAML, for a joint trajectory controller. ``urdf-log``: one JSON
+    object per line, {"time", "position": {joint: rad}, "velocity": {joint: rad/s}}, joint names being those of the
+    URDF.
+
+    Parameters
+    ----------
+    rate : float, optional
+        Resample to this rate [Hz] (cubic Hermite); the record's own samples if not given.
+
+    Raises
+    ------
+    RecordError
+        No joint angles in the record, or the file cannot be written.
+    """
+    joints, time, position, velocity = joint_motion(record)
+    if rate is not None:
+        if not rate > 0:
+            raise RecordError(f"--rate must be positive, not {rate}")
+        path_between = JointPath(time, position, velocity[:-1], velocity[1:], float(time[-1]))
+        time = np.arange(0.0, time[-1] + 0.5 / rate, 1.0 / rate).clip(max=time[-1])
+        knots = [_within(path_between, instant) for instant in time]
+        position, velocity = np.array([q for q, _ in knots]), np.array([v for _, v in knots])
+    writer = {"csv": _write_csv, "joint-trajectory": _write_joint_trajectory, "urdf-log": _write_urdf_log}[format_]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        writer(path, joints, time, position, velocity)
+    except OSError as error:
+        raise RecordError(f"cannot write {path}: {error.strerror}") from error
+    return path
+
+
+def joint_motion(
+    record: Record,
+) -> tuple[list[str], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Joint names, time from 0 [s], angles [rad] and rates [rad/s] of a record.
+
+    Raises
+    ------
+    RecordError
+        The record holds none, or only one sample.
+    """
+    joints: list[str] = []
+    angles, rates = [], []
+    for name, rate in RATES.items():
+        if name in record and rate in record:
+            joints += record.labels[name]
+            angles.append(record[name])
+            rates.append(record[rate])
+    if not joints:
+        pairs = ", ".join(f"{name} with {rate}" for name, rate in RATES.items())
+        raise RecordError(f"the record holds no joint motion ({pairs}); it has {', '.join(record)}")
+    if len(record) < 2:
+        raise RecordError(f"the record has {len(record)} samples; a motion needs two")
+    return joints, record.time - record.time[0], np.hstack(angles), np.hstack(rates)
+
+
+def _within(path: JointPath, time: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    # The path is at rest beyond its ends; the record is not.
+    if time <= path.start:
+        return path.position[0], path.rate_after[0]
+    if time >= path.end:
+        return path.position[-1], path.rate_before[-1]
+    return path.at(time)
+
+
+def _write_csv(
+    path: Path, joints: list[str], time: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64]
+) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["time [s]", *(f"{joint} [rad]" for joint in joints), *(f"{joint} [rad/s]" for joint in joints)])
+        rows.writerows([f"{value:.9g}" for value in (t, *qs, *vs)] for t, qs, vs in zip(time, q, v, strict=True))
+
+
+def _write_joint_trajectory(
+    path: Path, joints: list[str], time: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64]
+) -> None:
+    with path.open("w", encoding="utf-8") as file:
+        file.write(f"joint_names: [{', '.join(joints)}]\npoints:\n")
+        for t, qs, vs in zip(time, q, v, strict=True):
+            seconds, nanoseconds = divmod(round(t * 1e9), 1_000_000_000)
+            file.write(f"- positions: {_flow(qs)}\n  velocities: {_flow(vs)}\n")
+            file.write(f"  time_from_start: {{sec: {seconds}, nanosec: {nanoseconds}}}\n")
+
+
+def _flow(values: NDArray[np.float64]) -> str:
+    # YAML 1.1 reads "1e-05" as text: a float needs its point.
+    return f"[{', '.join(f'{value:.9f}' for value in values)}]"
+
+
+def _write_urdf_log(
+    path: Path, joints: list[str], time: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64]
+) -> None:
+    with path.open("w", encoding="utf-8") as file:
+        for t, qs, vs in zip(time, q, v, strict=True):
+            line = {
+                "time": round(float(t), 9),
+                "position": dict(zip(joints, (round(float(x), 9) for x in qs), strict=True)),
+                "velocity": dict(zip(joints, (round(float(x), 9) for x in vs), strict=True)),
+            }
+            file.write(json.dumps(line) + "\n")

@@ -1,0 +1,200 @@
+"""Dynamixel Protocol 2.0 packets: checksum, byte stuffing, and a decoder that finds its way back after garbage.
+
+FF FF FD 00 | ID | length (2) | instruction | parameters | CRC-16 (2), the length counting instruction, parameters and
+checksum. Wherever FF FF FD turns up between the length and the checksum the sender inserts another FD.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+
+HEADER = b"\xff\xff\xfd"
+STATUS = 0x55
+MAX_LENGTH = 1024
+"""Longest length field taken for real; a longer one is noise."""
+
+
+class Instruction(IntEnum):
+    """Instruction codes."""
+
+    PING = 0x01
+    READ = 0x02
+    WRITE = 0x03
+    REG_WRITE = 0x04
+    ACTION = 0x05
+    FACTORY_RESET = 0x06
+    REBOOT = 0x08
+    CLEAR = 0x10
+    SYNC_READ = 0x82
+    SYNC_WRITE = 0x83
+    BULK_READ = 0x92
+    BULK_WRITE = 0x93
+
+
+class StatusError(IntEnum):
+    """Lower seven bits of a status packet's error byte; bit 7 (ALERT): the hardware error register is set."""
+
+    NONE = 0
+    RESULT_FAIL = 1
+    INSTRUCTION = 2
+    CRC = 3
+    DATA_RANGE = 4
+    DATA_LENGTH = 5
+    DATA_LIMIT = 6
+    ACCESS = 7
+
+
+ALERT = 0x80
+
+
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for byte in range(256):
+        value = byte << 8
+        for _ in range(8):
+            value = (value << 1) ^ 0x8005 if value & 0x8000 else value << 1
+        table.append(value & 0xFFFF)
+    return tuple(table)
+
+
+_CRC_TABLE = _crc_table()
+
+
+def crc16(data: bytes | bytearray) -> int:
+    """CRC-16, polynomial 0x8005, initial value 0, no reflection."""
+    crc = 0
+    for byte in data:
+        crc = (crc << 8 & 0xFFFF) ^ _CRC_TABLE[crc >> 8 ^ byte]
+    return crc
+
+
+def stuff(body: bytes) -> bytes:
+    """Insert FD after every FF FF FD of an instruction-and-parameters body."""
+    return body.replace(HEADER, HEADER + b"\xfd")
+
+
+def holds_bare_header(stuffed: bytes) -> bool:
+    """True where FF FF FD is not followed by FD: no sender makes such a body.
+
+    It tells a cut packet that swallowed the next one, which the checksum alone would miss once in 65536 times.
+    """
+    return HEADER in stuffed.replace(HEADER + b"\xfd", b"\0")
+
+
+def unstuff(body: bytes) -> bytes:
+    """Undo :func:`stuff`."""
+    return body.replace(HEADER + b"\xfd", HEADER)
+
+
+@dataclass(frozen=True)
+class Packet:
+    """One packet of either direction.
+
+    Attributes
+    ----------
+    id : int
+    instruction : int
+        ``STATUS`` for a reply.
+    error : int
+        Error byte of a reply, 0 otherwise.
+    parameters : bytes
+        Unstuffed.
+    """
+
+    id: int
+    instruction: int
+    parameters: bytes = b""
+    error: int = 0
+
+
+def encode(packet: Packet) -> bytes:
+    """Bytes on the wire."""
+    first = bytes([packet.instruction, packet.error]) if packet.instruction == STATUS else bytes([packet.instruction])
+    body = stuff(first + packet.parameters)
+    frame = HEADER + b"\0" + bytes([packet.id]) + (len(body) + 2).to_bytes(2, "little") + body
+    return frame + crc16(frame).to_bytes(2, "little")
+
+
+class Decoder:
+    """Packets out of a stream of bytes that may hold noise, cut packets and wrong checksums.
+
+    A candidate whose checksum fails costs its header only: the search goes on one byte later, so that a good packet
+    swallowed by a wrong length is still found. Call :meth:`flush` when no more bytes will come.
+
+    Attributes
+    ----------
+    rejected : int
+        Candidates with a wrong checksum so far.
+    garbage : int
+        Bytes skipped so far.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self.rejected = 0
+        self.garbage = 0
+
+    def feed(self, data: bytes | bytearray) -> Iterator[Packet]:
+        """Take bytes, give every packet that is complete."""
+        self._buffer += data
+        return self._packets(final=False)
+
+    def flush(self) -> Iterator[Packet]:
+        """Give the packets behind an incomplete candidate, then forget all."""
+        return self._packets(final=True)
+
+    @property
+    def pending(self) -> int:
+        """Bytes of an incomplete packet."""
+        return len(self._buffer)
+
+    def _packets(self, *, final: bool) -> Iterator[Packet]:
+        buffer = self._buffer
+        while True:
+            start = buffer.find(HEADER)
+            if start < 0:
+                keep = 0 if final else _header_prefix(buffer)
+                self._skip(len(buffer) - keep)
+                return
+            self._skip(start)
+            if len(buffer) < 7 and not final:
+                return
+            length = int.from_bytes(buffer[5:7], "little") if len(buffer) >= 7 else 0
+            if buffer[3:4] != b"\0" or not 3 <= length <= MAX_LENGTH:
+                self._skip(1)
+                continue
+            end = 7 + length
+            if len(buffer) < end:
+                if not final:
+                    return
+                self._skip(1)
+                continue
+            frame = bytes(buffer[:end])
+            if holds_bare_header(frame[7:-2]) or crc16(frame[:-2]) != int.from_bytes(frame[-2:], "little"):
+                self.rejected += 1
+                self._skip(1)
+                continue
+            # Unstuffing must see the body only: FF FF FD may also arise across length field and instruction.
+            body = unstuff(frame[7:-2])
+            del buffer[:end]
+            if body[0] == STATUS:
+                if len(body) < 2:
+                    self.garbage += end
+                    continue
+                yield Packet(frame[4], STATUS, body[2:], body[1])
+            else:
+                yield Packet(frame[4], body[0], body[1:])
+
+    def _skip(self, count: int) -> None:
+        self.garbage += count
+        del self._buffer[:count]
+
+
+def _header_prefix(buffer: bytearray) -> int:
+    """Length of the longest end of ``buffer`` that could begin a header."""
+    for length in (2, 1):
+        if buffer.endswith(HEADER[:length]):
+            return length
+    return 0

@@ -1,0 +1,402 @@
+"""The servo map: which servo follows which column of a record, and what that joint may do.
+
+Joint angle and servo position are tied by
+
+    tick = zero_tick + sign · gear · angle / (2π/4096)
+
+``gear`` being servo turns per joint turn. Angles are radians inside; a key whose unit is not SI carries it in its name.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError
+
+from dynsim.hardware.control_table import (
+    BAUD_RATES,
+    MAX_ID,
+    MODELS,
+    RAD_PER_TICK,
+    RAD_S_PER_UNIT,
+    TICKS_PER_TURN,
+    OperatingMode,
+    ServoModel,
+)
+from dynsim.hardware.errors import ServoMapError
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+_CHECKOUT = _PACKAGE.parent / "scenarios" / "hardware"
+SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else _PACKAGE / "shipped_scenarios" / "hardware"
+"""Folder of the servo maps that come with dynsim."""
+
+FaultPolicy = Literal["hold", "decelerate", "off"]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class StrictModel(BaseModel):
+    """Unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Follows(StrictModel):
+    """Signals of the record a servo follows.
+
+    Attributes
+    ----------
+    position, velocity : str
+        Angle [rad] and its rate [rad/s].
+    torque : str or None
+        Joint torque [N m] to be held against ``limits.torque`` by the offline check.
+    rates : "continuous" or "held"
+        Whether the rate changes smoothly between samples, or is held until the next one (a sampled controller).
+    """
+
+    position: str
+    velocity: str
+    torque: str | None = None
+    rates: Literal["continuous", "held"] = "continuous"
+
+
+class Limits(StrictModel):
+    """What a joint may do.
+
+    Attributes
+    ----------
+    position_deg : tuple of float or None
+        Lowest and highest joint angle [°]; None for a wheel.
+    velocity : float
+        Highest joint speed [rad/s].
+    torque : float
+        Joint torque at which the replay aborts [N·m].
+    """
+
+    position_deg: tuple[Finite, Finite] | None = None
+    velocity: Positive
+    torque: Positive
+
+
+class Kind(StrictModel):
+    """Everything servos of one sort have in common.
+
+    Attributes
+    ----------
+    model : str
+        "MX-106" or "MX-28".
+    mode : "position" or "velocity"
+    firmware_min : int
+        Oldest firmware accepted.
+    follows : Follows
+    limits : Limits
+    following_error : float
+        Abort threshold between measured and commanded: [rad] in position mode, [rad/s] in velocity mode.
+    gear : float
+        Servo turns per joint turn.
+    """
+
+    model: Literal["MX-106", "MX-28"]
+    mode: Literal["position", "velocity"]
+    firmware_min: int = 41
+    follows: Follows
+    limits: Limits
+    following_error: Positive
+    gear: Positive = 1.0
+
+    @model_validator(mode="after")
+    def _position_limits_fit_the_mode(self) -> Kind:
+        limits = self.limits.position_deg
+        if self.mode == "position" and limits is None:
+            raise ValueError("a servo in position mode needs limits.position_deg: [lowest, highest]")
+        if limits is not None and not limits[0] < limits[1]:
+            raise ValueError(f"limits.position_deg: {limits[0]} is not below {limits[1]}")
+        return self
+
+
+class ServoEntry(StrictModel):
+    """One servo: its kind, bus ID, sense, zero, and (held joints) the angle it keeps instead of following a record."""
+
+    kind: str
+    id: Annotated[int, Field(ge=0, le=MAX_ID)]
+    sign: Literal[1, -1] = 1
+    zero_tick: Annotated[int, Field(ge=-(1 << 20), le=1 << 20)] = 2048
+    label: str | None = None
+    hold_at_deg: Finite | None = None
+
+
+class Bus(StrictModel):
+    """The serial line.
+
+    Attributes
+    ----------
+    baud : int
+        [bit/s].
+    rate : float
+        Goal and state cycles per second [Hz].
+    latency : float
+        What adapter and operating system may add to an answer [s].
+    return_delay : float
+        Longest return delay a servo may have stored [s].
+    """
+
+    baud: int = 3_000_000
+    rate: Positive = 200.0
+    latency: Positive = 2e-3
+    return_delay: Annotated[float, Field(ge=0, le=508e-6)] = 0.0
+
+    @model_validator(mode="after")
+    def _baud_is_one_of_the_servos(self) -> Bus:
+        choices = [rate for rate in BAUD_RATES if rate <= 4_000_000]
+        if self.baud not in choices:
+            raise ValueError(f"baud {self.baud} is not one of {', '.join(map(str, choices))}")
+        return self
+
+
+class Supply(StrictModel):
+    """Voltage range in which the robot may move [V]."""
+
+    lowest: Positive = 10.0
+    highest: Positive = 14.8
+
+
+class Safety(StrictModel):
+    """When to abort, and how to stop.
+
+    Attributes
+    ----------
+    policy : "hold", "decelerate" or "off"
+        What to do on a fault: freeze where the robot is; slow down along the path and hold; release torque.
+    stop_time : float
+        Time in which `decelerate` comes to rest [s].
+    run_up : float
+        Acceleration of the stretch added where a record begins or ends in motion [rad/s²].
+    approach_velocity : float
+        Top speed of the move to the start posture [rad/s].
+    watchdog : float
+        Servos stop by themselves when the bus is silent for this long [s].
+    missed_cycles, late_cycles, following_cycles, torque_cycles : int
+        Consecutive cycles of one servo without a status, of late deadlines, of following error and of too much torque
+        that abort.
+    temperature_max : float
+        [°C].
+    at_end : "off" or "hold"
+        Torque after a run that went well. A robot that falls when limp holds.
+    """
+
+    policy: FaultPolicy = "decelerate"
+    stop_time: Positive = 0.3
+    run_up: Positive = 2.0
+    approach_velocity: Positive = 0.3
+    watchdog: Annotated[float, Field(ge=0.02, le=2.54)] = 0.2
+    missed_cycles: Annotated[int, Field(ge=1)] = 3
+    late_cycles: Annotated[int, Field(ge=1)] = 5
+    following_cycles: Annotated[int, Field(ge=1)] = 5
+    torque_cycles: Annotated[int, Field(ge=1)] = 10
+    temperature_max: Positive = 65.0
+    supply: Supply = Supply()
+    at_end: Literal["off", "hold"] = "off"
+
+
+class _MapFile(StrictModel):
+    robot: str
+    bus: Bus = Bus()
+    safety: Safety = Safety()
+    kinds: dict[str, Kind]
+    servos: dict[str, ServoEntry]
+
+    @model_validator(mode="after")
+    def _servos_are_consistent(self) -> _MapFile:
+        if not self.servos:
+            raise ValueError("servos: the map names none")
+        owner: dict[int, str] = {}
+        for joint, entry in self.servos.items():
+            if entry.kind not in self.kinds:
+                raise ValueError(f"servos.{joint}.kind: {entry.kind!r} is not one of {', '.join(self.kinds)}")
+            if entry.id in owner:
+                raise ValueError(f"servos.{joint}.id: {entry.id} is also the ID of {owner[entry.id]}")
+            owner[entry.id] = joint
+        return self
+
+
+class Servo:
+    """One servo of the map, with its conversions.
+
+    Attributes
+    ----------
+    joint, label : str
+        Name of the joint, and of its column in the record.
+    id : int
+    model : ServoModel
+    kind : Kind
+    position_limits : tuple of float
+        Lowest and highest joint angle [rad]; infinite for a wheel.
+    """
+
+    def __init__(self, joint: str, entry: ServoEntry, kind: Kind) -> None:
+        self.joint = joint
+        self.label = entry.label or joint
+        self.id = entry.id
+        self.sign = entry.sign
+        self.zero_tick = entry.zero_tick
+        self.kind = kind
+        self.gear = kind.gear
+        self.hold_at = None if entry.hold_at_deg is None else math.radians(entry.hold_at_deg)
+        self.model: ServoModel = MODELS[kind.model]
+        limits = kind.limits.position_deg
+        self.position_limits = (-math.inf, math.inf) if limits is None else tuple(math.radians(x) for x in limits)
+
+    @property
+    def in_position_mode(self) -> bool:
+        return self.kind.mode == "position"
+
+    @property
+    def operating_mode(self) -> OperatingMode:
+        """Value of address 11 this servo must have."""
+        return OperatingMode.POSITION if self.in_position_mode else OperatingMode.VELOCITY
+
+    def to_ticks(self, angle: float) -> int:
+        """Servo position for a joint angle [rad]."""
+        return self.zero_tick + round(self.sign * self.gear * angle / RAD_PER_TICK)
+
+    def to_angle(self, ticks: int) -> float:
+        """Joint angle [rad] for a servo position."""
+        return self.sign * (ticks - self.zero_tick) * RAD_PER_TICK / self.gear
+
+    def to_velocity_units(self, velocity: float) -> int:
+        """Servo velocity register for a joint velocity [rad/s]."""
+        return round(self.sign * self.gear * velocity / RAD_S_PER_UNIT)
+
+    def to_velocity(self, units: int) -> float:
+        """Joint velocity [rad/s] for a servo velocity register."""
+        return self.sign * units * RAD_S_PER_UNIT / self.gear
+
+    def to_torque(self, effort: int) -> float:
+        """Estimated joint torque [N·m] for the register at address 126."""
+        return self.sign * self.gear * self.model.torque(effort)
+
+    @property
+    def tick_limits(self) -> tuple[int, int]:
+        """Lowest and highest goal position this joint may ever be sent."""
+        if not self.in_position_mode:
+            return (0, TICKS_PER_TURN - 1)
+        ends = [self.to_ticks(angle) for angle in self.position_limits]
+        return max(0, min(ends)), min(TICKS_PER_TURN - 1, max(ends))
+
+
+class ServoMap:
+    """All servos of a robot, in the order of the file.
+
+    Attributes
+    ----------
+    robot : str
+    path : Path
+    bus : Bus
+    safety : Safety
+    servos : tuple of Servo
+    """
+
+    def __init__(self, path: Path, content: _MapFile) -> None:
+        self.path = path
+        self.robot = content.robot
+        self.bus = content.bus
+        self.safety = content.safety
+        self.servos = tuple(Servo(joint, entry, content.kinds[entry.kind]) for joint, entry in content.servos.items())
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        return tuple(servo.id for servo in self.servos)
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        return tuple(servo.joint for servo in self.servos)
+
+
+def load_servo_map(path: str | Path) -> ServoMap:
+    """Read and validate a servo map: the file of that path, or the one of that name that comes with dynsim ("arm").
+
+    Raises
+    ------
+    ServoMapError
+        The file is missing, is not YAML, or an entry is wrong; with file and line.
+    """
+    path = Path(path)
+    shipped = SHIPPED / f"{path.stem}.yaml"
+    if not path.is_file() and path.parent in (Path(), Path("scenarios/hardware")) and shipped.is_file():
+        path = shipped
+    return ServoMap(path, read_yaml(path, _MapFile))
+
+
+_Schema = TypeVar("_Schema", bound=BaseModel)
+
+
+def read_yaml(path: Path, schema: type[_Schema]) -> _Schema:
+    """Read YAML into a pydantic model.
+
+    Raises
+    ------
+    ServoMapError
+        Missing file, bad YAML or bad entry; the message holds file, line and key.
+    """
+    try:
+        data = YAML(typ="rt").load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ServoMapError(f"{path}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise ServoMapError(f"{path}: not a text file") from error
+    except MarkedYAMLError as error:
+        mark = error.problem_mark
+        line = f":{mark.line + 1}" if mark else ""
+        raise ServoMapError(f"{path}{line}: not YAML: {error.problem or error.context}") from error
+    if not isinstance(data, dict):
+        raise ServoMapError(f"{path}: expected a mapping with the keys {', '.join(schema.model_fields)}")
+    try:
+        return schema.model_validate(data)
+    except ValidationError as error:
+        # A misspelt key makes two errors: the wrong one says more than the missing one.
+        first = min(error.errors(include_url=False), key=lambda found: found["type"] != "extra_forbidden")
+        where = ".".join(str(part) for part in first["loc"])
+        message = first["msg"].removeprefix("Value error, ")
+        if first["type"] == "extra_forbidden":
+            known = _known_keys(schema, first["loc"])
+            message = f"unknown key; known are {', '.join(known)}" if known else "unknown key"
+        more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+        raise ServoMapError(
+            f"{path}:{_line(data, first['loc'])}: {where + ': ' if where else ''}{message}{more}"
+        ) from error
+
+
+def _line(data: Any, location: tuple[int | str, ...]) -> int:
+    line = 1
+    for key in location:
+        try:
+            position = data.lc.data[key]
+        except (AttributeError, KeyError, TypeError):
+            break
+        line = position[0] + 1
+        data = data[key]
+    return line
+
+
+def _known_keys(schema: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
+    """Keys a mapping at the parent of ``location`` may hold."""
+    current: Any = schema
+    parts = iter(location[:-1])
+    for part in parts:
+        if not _is_schema(current) or part not in current.model_fields:
+            return []
+        annotation = current.model_fields[part].annotation
+        members = [argument for argument in getattr(annotation, "__args__", ()) if _is_schema(argument)]
+        if members:
+            # A mapping or list of entries: the next part is a key or an index.
+            next(parts, None)
+        current = members[0] if members else annotation
+    return list(current.model_fields) if _is_schema(current) else []
+
+
+def _is_schema(candidate: Any) -> bool:
+    return isinstance(candidate, type) and issubclass(candidate, BaseModel)

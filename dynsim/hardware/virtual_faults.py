@@ -1,0 +1,118 @@
+"""Scripted faults of the virtual bus: what goes wrong, with whom, when, how often; reproducible by its seed."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from dynsim.hardware.servo_map import StrictModel, read_yaml
+
+Probability = Annotated[float, Field(ge=0, le=1)]
+
+
+class _Timed(StrictModel):
+    """Active from ``at`` [s after the first torque enable] for ``duration`` [s]; absent: always, for good."""
+
+    at: Annotated[float, Field(ge=0)] | None = None
+    duration: Annotated[float, Field(gt=0)] | None = None
+
+    def active(self, since_torque: float) -> bool:
+        """True at ``since_torque`` [s] after the first torque enable (−∞ before it)."""
+        if self.at is None:
+            return True
+        return self.at <= since_torque < self.at + (self.duration or math.inf)
+
+
+class LineFault(_Timed):
+    """Trouble with status packets, of one servo or (no ``id``) of all."""
+
+    kind: Literal["lost_status", "truncated_status", "bad_crc", "noise"]
+    id: int | None = None
+    probability: Probability = 1.0
+
+
+class LateStatus(_Timed):
+    """Status packets come later by ``delay`` [s]."""
+
+    kind: Literal["late_status"]
+    id: int | None = None
+    delay: Annotated[float, Field(gt=0)]
+    probability: Probability = 1.0
+
+
+class PortFault(_Timed):
+    """The adapter echoes what is sent, or is pulled out."""
+
+    kind: Literal["echo", "unplug"]
+
+
+class ServoFault(_Timed):
+    """A second servo with the same ID; power or cable lost; a restart; an error shutdown; a tripped watchdog; a jam."""
+
+    kind: Literal["duplicate_id", "drop_off", "reboot", "overload", "overheat", "watchdog_trip", "stuck"]
+    id: int
+
+
+class WrongRegister(_Timed):
+    """A servo that is not the one of the map: ``value`` stands in its register."""
+
+    kind: Literal["wrong_model", "wrong_firmware", "wrong_mode"]
+    id: int
+    value: Annotated[int, Field(ge=0)]
+
+
+class AngleFault(_Timed):
+    """Play of the shaft, or a jump of the measured position, of ``angle`` [rad]."""
+
+    kind: Literal["backlash", "offset_jump"]
+    id: int
+    angle: float
+
+
+class VoltageSag(_Timed):
+    """The supply drops by ``drop`` [V]."""
+
+    kind: Literal["voltage_sag"]
+    drop: Annotated[float, Field(gt=0)]
+
+
+class TemperatureRamp(_Timed):
+    """A servo warms by ``heating_rate`` [K/s] on top of its own losses."""
+
+    kind: Literal["temperature_ramp"]
+    id: int
+    heating_rate: Annotated[float, Field(gt=0)]
+
+
+Fault = Annotated[
+    LineFault | LateStatus | PortFault | ServoFault | WrongRegister | AngleFault | VoltageSag | TemperatureRamp,
+    Field(discriminator="kind"),
+]
+
+
+class FaultScript(StrictModel):
+    """Faults of one run.
+
+    Attributes
+    ----------
+    seed : int
+        Of every random choice the faults make.
+    faults : list
+    """
+
+    seed: int = 0
+    faults: list[Fault] = Field(default_factory=list)
+
+
+def load_fault_script(path: str | Path) -> FaultScript:
+    """Read a fault script.
+
+    Raises
+    ------
+    ServoMapError
+        Missing file, bad YAML or bad entry, with file and line.
+    """
+    return read_yaml(Path(path), FaultScript)

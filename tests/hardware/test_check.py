@@ -1,0 +1,194 @@
+"""The offline check refuses whole motions, with joint, time and margin; and what passes never violates a limit."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+
+from dynsim.hardware.check import check_motion, plan_cycle, velocity_limit
+from dynsim.hardware.control_table import RAD_PER_TICK
+from dynsim.hardware.errors import CheckRefused
+from dynsim.hardware.servo_map import load_servo_map
+from dynsim.hardware.trajectory import path_of_record
+from dynsim.record import Record
+
+from .conftest import Rig, check_goals_within_limits, swing
+
+
+def record_of(time, shoulder, shoulder_rate) -> Record:
+    zero = np.zeros_like(time)
+    record = Record(time)
+    record.add("q", np.stack([shoulder, zero], axis=1), "rad", labels=("shoulder", "elbow"))
+    record.add("v", np.stack([shoulder_rate, zero], axis=1), "rad/s", labels=("shoulder", "elbow"))
+    record.add("rho", zero[:, None], "rad", labels=("wheel",))
+    record.add("rho_dot", zero[:, None], "rad/s", labels=("wheel",))
+    return record
+
+
+def test_a_motion_within_limits_passes_with_its_margins(rig) -> None:
+    motion = rig.motion()
+    tightest = {(margin.joint, margin.quantity): margin for margin in motion.margins}
+    assert tightest["wheel", "velocity"].value == pytest.approx(3.0, abs=1e-3)
+    assert tightest["shoulder", "velocity"].margin == pytest.approx(3.0 - 2.4, abs=1e-3)
+    assert ("wheel", "position") not in tightest
+    assert all(margin.margin >= 0 for margin in motion.margins)
+
+
+def test_a_violation_names_joint_time_and_margin(rig) -> None:
+    record = swing(amplitude=1.2)
+    with pytest.raises(
+        CheckRefused, match=r"shoulder: position -1\.2000 rad at t = 1\.178 s, limit -1\.0472 rad, margin -0\.1528 rad"
+    ) as refusal:
+        check_motion(record, rig.map)
+    assert "velocity 4.8" in str(refusal.value)
+
+
+def test_extremes_between_the_samples_count(rig) -> None:
+    """Two samples at 0.9 rad, between them q(½) = 0.9 + h (v0 − v1)/8 = 1.15 rad."""
+    time = np.array([0.0, 1.0, 2.0])
+    record = record_of(time, np.array([0.9, 0.9, 0.9]), np.array([0.0, 1.0, -1.0]))
+    with pytest.raises(CheckRefused, match=r"shoulder: position 1\.15"):
+        check_motion(record, rig.map)
+
+
+def test_speed_scales_velocities(rig) -> None:
+    check_motion(rig.record, rig.map, speed=1.2)
+    with pytest.raises(CheckRefused, match=r"shoulder: velocity") as refusal:
+        check_motion(rig.record, rig.map, speed=1.3)
+    assert "--speed 1.25 would pass" in str(refusal.value)
+
+
+def test_held_rates_make_straight_stretches_that_never_overshoot(write_map) -> None:
+    """A joint that runs to 0.9 rad and stays: the smooth interpolant overshoots, the record's robot did not."""
+    time, angle = np.array([0.0, 0.5, 1.0, 1.5]), np.array([0.1, 0.5, 0.9, 0.9])
+    record = record_of(time, angle, np.array([0.8, 0.8, 0.8, 0.0]))
+    old = "{position: q, velocity: v}"
+    smooth = path_of_record(record, load_servo_map(write_map()))
+    held = path_of_record(record, load_servo_map(write_map((old, "{position: q, velocity: v, rates: held}"))))
+    assert smooth.extremes().position[..., 0].max() > 0.95
+    assert held.extremes().position[..., 0].max() == pytest.approx(0.9, abs=1e-12)
+    assert held.extremes().velocity[..., 0].max() == pytest.approx(0.8)
+    assert held.at(0.75)[0][0] == pytest.approx(0.7)
+
+
+def test_a_record_in_motion_gets_a_run_up_and_a_run_out_at_rest(rig) -> None:
+    path = path_of_record(rig.record, rig.map)
+    first, last = rig.record["v"][0], rig.record["v"][-1]
+    assert path.start == pytest.approx(-np.abs(first).max() / 20)
+    assert path.end - path.record_end == pytest.approx(
+        max(np.abs(last).max(), np.abs(rig.record["rho_dot"][-1]).max()) / 20
+    )
+    for time in (path.start, path.end):
+        assert np.all(path.at(time)[1] == 0)
+    inside = np.linspace(path.start + 1e-9, -1e-9, 50)
+    accelerations = np.diff([path.at(t)[1] for t in inside], axis=0) / np.diff(inside)[:, None]
+    assert np.abs(accelerations).max() <= 20 * (1 + 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda record: record.signals.pop("v"), "shoulder follows the signal 'v'; the record has q, rho, rho_dot"),
+        (lambda record: record["q"].__setitem__((3, 1), math.nan), "elbow: 'q' is nan at t = 0.015 s"),
+        (lambda record: record.time.__setitem__(4, 0.0), "time does not increase at sample 4"),
+    ],
+)
+def test_unusable_records_are_refused(rig, change, message: str) -> None:
+    record = swing()
+    change(record)
+    with pytest.raises(CheckRefused, match=message):
+        check_motion(record, rig.map)
+
+
+def test_a_missing_column_and_a_wrong_unit_are_refused(rig) -> None:
+    record = swing()
+    record.add("q", record["q"], "rad", labels=("shoulder", "knee"))
+    with pytest.raises(CheckRefused, match="elbow follows column 'elbow' of 'q'; it has shoulder, knee"):
+        check_motion(record, rig.map)
+    record.add("q", record["q"], "deg", labels=("shoulder", "elbow"))
+    with pytest.raises(CheckRefused, match="'q' is in 'deg'"):
+        check_motion(record, rig.map)
+    with pytest.raises(CheckRefused, match="1 samples"):
+        check_motion(swing(duration=0.004), rig.map)
+
+
+def test_an_incomplete_record_passes_with_a_warning(rig) -> None:
+    record = swing()
+    record.complete = False
+    assert "incomplete" in check_motion(record, rig.map).warnings[0]
+
+
+def test_torque_of_the_record_is_checked_where_the_map_names_it(write_map) -> None:
+    servo_map = load_servo_map(write_map(("{position: q, velocity: v}", "{position: q, velocity: v, torque: torque}")))
+    record = swing()
+    torque = np.zeros((len(record), 2))
+    torque[7, 1] = -7.0
+    record.add("torque", torque, "N m", labels=("shoulder", "elbow"))
+    with pytest.raises(CheckRefused, match=r"elbow: torque -7\.0000 N m at t = 0\.035 s, limit 6"):
+        check_motion(record, servo_map)
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, math.nan, math.inf])
+def test_nonsense_speeds_and_rates_are_refused(rig, speed: float) -> None:
+    with pytest.raises(CheckRefused, match="--speed must be positive"):
+        check_motion(rig.record, rig.map, speed=speed)
+    with pytest.raises(CheckRefused, match="--rate must be positive"):
+        check_motion(rig.record, rig.map, rate=speed)
+
+
+def test_a_rate_the_bus_cannot_carry_is_refused_with_one_it_can(rig) -> None:
+    with pytest.raises(CheckRefused, match=r"Use --rate (\d+) or less") as refusal:
+        plan_cycle(rig.map, 2000)
+    possible = int(str(refusal.value).split("--rate ")[1].split()[0])
+    assert plan_cycle(rig.map, possible).health_every <= 10
+
+
+@pytest.mark.parametrize(("baud", "rate"), [(1_000_000, 142), (3_000_000, 277)])
+def test_the_plan_agrees_with_the_estimate_for_eighteen_servos(write_map, baud: int, rate: float) -> None:
+    """18 servos, 1 and 3 Mbit/s: wire time 195 and 584 Hz, with USB and turnaround 142 and 277 Hz."""
+    lines = "".join(f"  j{k}: {{kind: joint, id: {k}}}\n" for k in range(20, 35))
+    text = "  wheel: {kind: wheel, id: 7}\n"
+    path = write_map((text, "  j19: {kind: joint, id: 19}\n" + lines), ("baud: 1000000", f"baud: {baud}"))
+    servo_map = load_servo_map(path)
+    assert len(servo_map.servos) == 18
+    assert 1 / plan_cycle(servo_map, 50).cycle_time == pytest.approx(rate, rel=0.01)
+
+
+motions = st.lists(
+    st.tuples(st.floats(-1.2, 1.2), st.floats(-1.2, 1.2), st.floats(-3.5, 3.5), st.floats(-3.5, 3.5), st.floats(-6, 6)),
+    min_size=2,
+    max_size=5,
+)
+
+
+@given(knots=motions, interval=st.floats(0.05, 0.6), speed=st.floats(0.3, 2.0))
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow])
+def test_what_is_sent_never_violates_a_limit(rig: Rig, knots, interval: float, speed: float) -> None:
+    """Whatever the record: it is refused, or every goal on the wire stays inside position and speed limits."""
+    values = np.array(knots)
+    record = Record(interval * np.arange(len(values)))
+    # Shrunk towards rest until it passes, so that the examples sit at the limits rather than far outside of them.
+    for shrink in (1.0, 0.8, 0.6, 0.4, 0.2, 0.05):
+        record.add("q", shrink * values[:, :2], "rad", labels=("shoulder", "elbow"))
+        record.add("v", shrink * values[:, 2:4], "rad/s", labels=("shoulder", "elbow"))
+        record.add("rho", np.zeros((len(values), 1)), "rad", labels=("wheel",))
+        record.add("rho_dot", shrink * values[:, 4:], "rad/s", labels=("wheel",))
+        try:
+            motion = check_motion(record, rig.map, speed=speed)
+            break
+        except CheckRefused:
+            continue
+    else:
+        assume(False)
+    run = rig.run(motion=motion)
+    check_goals_within_limits(run)
+    for servo in run.map.servos[:2]:
+        sent = [(time, value) for time, id_, value in run.goals() if id_ == servo.id]
+        times, ticks = np.array([t for t, _ in sent]), np.array([v for _, v in sent])
+        # One tick of rounding at each end of the step.
+        allowed = velocity_limit(servo) * np.maximum(np.diff(times), run.replay._period) / RAD_PER_TICK + 1
+        assert np.all(np.abs(np.diff(ticks)) <= allowed)

@@ -1,0 +1,145 @@
+"""The commands: exit codes, one clear line for every mistake, files left behind."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dynsim import cli
+from dynsim.record import Record
+
+from .conftest import MAP, swing
+
+SHIPPED = Path(__file__).parents[2] / "scenarios" / "hardware"
+
+
+@pytest.fixture
+def call(monkeypatch, capsys):
+    """Run a command line in this process; (exit code, stdout, stderr)."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["dynsim", *map(str, arguments)])
+        with pytest.raises(SystemExit) as leaving:
+            cli.main()
+        output = capsys.readouterr()
+        return int(leaving.value.code or 0), output.out, output.err
+
+    return run
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    swing().save(tmp_path / "record.h5")
+    (tmp_path / "rig.yaml").write_text(MAP, encoding="utf-8")
+    return tmp_path
+
+
+def test_check_replay_compare_on_virtual_servos(call, files: Path) -> None:
+    record, map_ = files / "record.h5", files / "rig.yaml"
+    code, out, _ = call("hw", "check", record, "--map", map_)
+    assert code == 0
+    assert "check passed" in out
+    code, out, _ = call("hw", "replay", record, "--map", map_, "--port", "virtual", "--out", files / "out")
+    assert code == 0
+    assert {path.name for path in (files / "out").iterdir()} == {
+        "measured.h5",
+        "summary.json",
+        "replay.log",
+        "registers.json",
+    }
+    log = (files / "out" / "replay.log").read_text(encoding="utf-8")
+    states = [line.split()[1] for line in log.splitlines() if line.endswith("enter")]
+    assert states == ["CONNECT", "VERIFY", "ARM", "MOVE_TO_START", "SETTLE", "REPLAY", "SETTLE", "DISARM"]
+    code, out, _ = call("hw", "compare", record, files / "out" / "measured.h5")
+    assert code == 0
+    assert (files / "out" / "comparison.png").exists()
+    assert json.loads((files / "out" / "comparison.json").read_text(encoding="utf-8"))["delay_s"] > 0
+    (files / "gate.yaml").write_text("rms_rad: 0.001\n", encoding="utf-8")
+    code, _, error = call("hw", "compare", record, files / "out" / "measured.h5", "--gate", files / "gate.yaml")
+    assert code == 5
+    assert error.startswith("error: gate failed (worst joint")
+
+
+def test_exit_codes_of_refusal_verification_and_abort(call, files: Path) -> None:
+    record, map_ = files / "record.h5", files / "rig.yaml"
+    code, _, error = call("hw", "check", record, "--map", map_, "--speed", "3")
+    assert code == 2
+    assert "shoulder: velocity" in error
+    options = ("--map", map_, "--port", "virtual", "--out", files / "out", "--quiet", "--faults", files / "faults.yaml")
+    (files / "faults.yaml").write_text("faults: [{kind: wrong_model, id: 2, value: 12}]\n", encoding="utf-8")
+    code, _, error = call("hw", "replay", record, *options)
+    assert code == 3
+    assert "elbow (ID 2): is model 12, the map says MX-106 (321)" in error
+    (files / "faults.yaml").write_text("faults: [{kind: drop_off, id: 2, at: 1.0}]\n", encoding="utf-8")
+    code, _, error = call("hw", "replay", record, *options)
+    assert code == 4
+    assert "missed status" in error
+    assert "robot left holding" in error
+    summary = json.loads((files / "out" / "summary.json").read_text(encoding="utf-8"))
+    assert summary["fault"] == "missed status"
+    assert not Record.load(files / "out" / "measured.h5").complete
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("hw", "check", "nowhere.h5", "--map", "{map}"), "nowhere.h5: no such record"),
+        (("hw", "check", "{map}", "--map", "{map}"), "not a readable HDF5 file"),
+        (("hw", "check", "{record}", "--map", "nowhere.yaml"), "nowhere.yaml: cannot be read"),
+        (("hw", "replay", "{record}", "--map", "{map}", "--port", "/dev/ttyNone", "--out", "{out}"), "no such port"),
+        (("hw", "scan", "--port", "/dev/ttyNone"), "no such port"),
+        (("hw", "stop", "--port", "/dev/ttyNone"), "no such port"),
+        (("hw", "calibrate", "--map", "{map}", "--port", "/dev/ttyNone", "--joint", "knee"), "has no joint knee"),
+        (
+            ("hw", "calibrate", "--map", "arm", "--port", "/dev/ttyNone"),
+            "comes with dynsim; write your own map with --out",
+        ),
+        (("hw", "replay", "{record}", "--map", "{map}", "--port", "virtual", "--out", "{map}"), "cannot be written"),
+        (("hw", "compare", "{record}", "{map}"), "not a readable HDF5 file"),
+        (("export", "{map}", "--format", "csv"), "not a readable HDF5 file"),
+    ],
+)
+def test_mistakes_are_one_clear_line(call, files: Path, arguments: tuple[str, ...], message: str) -> None:
+    names = {"map": files / "rig.yaml", "record": files / "record.h5", "out": files / "out"}
+    code, _, error = call(*(argument.format(**names) for argument in arguments))
+    assert code in (2, 3)
+    assert error.startswith("error: ")
+    assert message in error
+    assert len(error.strip().splitlines()) == 1
+
+
+def test_export_writes_beside_the_record(call, files: Path) -> None:
+    code, _, _ = call("export", files / "record.h5", "--format", "joint-trajectory", "--rate", 20)
+    assert code == 0
+    assert (files / "record.trajectory.yaml").exists()
+
+
+@pytest.mark.parametrize(("robot", "servos"), [("arm", 10), ("snake", 24)])
+def test_both_robots_replay_at_200_hz_on_the_virtual_bus(call, tmp_path: Path, robot: str, servos: int) -> None:
+    """Synthetic swings here; the scenarios' own records in tests/scenarios."""
+    from dynsim.hardware.servo_map import load_servo_map
+
+    servo_map = load_servo_map(SHIPPED / f"{robot}.yaml")
+    assert len(servo_map.servos) == servos
+    time = np.arange(0.0, 1.0, 0.01)
+    record = Record(time)
+    signals: dict[tuple[str, str], list[str]] = {}
+    for servo in servo_map.servos:
+        if servo.hold_at is None:
+            signals.setdefault((servo.kind.follows.position, servo.kind.follows.velocity), []).append(servo.label)
+    for (position, velocity), labels in signals.items():
+        amplitude = np.linspace(0.1, 0.2, len(labels))
+        record.add(position, np.outer(1 - np.cos(3 * time), amplitude), "rad", labels=tuple(labels))
+        record.add(velocity, np.outer(3 * np.sin(3 * time), amplitude), "rad/s", labels=tuple(labels))
+    record.save(tmp_path / "record.h5")
+    code, out, error = call(
+        "hw", "replay", tmp_path / "record.h5", "--map", SHIPPED / f"{robot}.yaml", "--port", "virtual", "--quiet",
+        "--rate", 200, "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert code == 0, error
+    assert "0 skipped, 0 statuses missed" in " ".join(out.split())
+    assert "torque ON, holding" in out

@@ -1,0 +1,165 @@
+"""Closing the loop: simulate, replay on virtual servos, compare; and the exports."""
+
+from __future__ import annotations
+
+import csv
+import json
+import time
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from dynsim.errors import RecordError
+from dynsim.hardware.compare import Gate, check_gate, compare_records, draw_comparison, load_gate
+from dynsim.hardware.control_table import MX_106
+from dynsim.hardware.errors import ComparisonGateFailed, ServoMapError
+from dynsim.hardware.export import export_record
+from dynsim.hardware.servo_plant import MotorLaw
+from dynsim.hardware.virtual_bus import ADAPTER_LATENCY
+from dynsim.record import Record
+
+from .conftest import swing
+
+
+def test_the_following_error_is_explained_by_the_motor_law(rig, clean_run) -> None:
+    """A critically damped loop at frequency ω = 4 rad/s lags by d/k·(1 + O(ω²)); goals are held one cycle, half on
+    average."""
+    run = clean_run
+    comparison = compare_records(rig.record, run.result.record)
+    law = MotorLaw([MX_106])
+    lag = law.damping[0] / law.stiffness[0]
+    period = 1 / run.map.bus.rate
+    assert comparison.delay == pytest.approx(lag, abs=period + ADAPTER_LATENCY)
+    assert comparison.worst.rms == pytest.approx(2.4 / np.sqrt(2) * lag, rel=0.25)
+    # What is left without the delay: second order in ω·lag, and the transient of the run-up.
+    assert max(joint.rms_delay_removed for joint in comparison.joints) < 0.35 * comparison.worst.rms
+
+
+def test_half_speed_halves_the_error_in_angle_not_the_delay(rig, clean_run) -> None:
+    full = compare_records(rig.record, clean_run.result.record)
+    half = compare_records(rig.record, rig.run(motion=rig.motion(speed=0.5)).result.record)
+    assert half.delay == pytest.approx(full.delay, abs=0.01)
+    assert half.worst.rms == pytest.approx(full.worst.rms / 2, rel=0.2)
+
+
+def test_a_known_delay_and_error_are_found() -> None:
+    t = np.linspace(0, 4, 2001)
+    simulated, measured = Record(t), Record(t)
+    simulated.add("q", np.stack([np.sin(t), 0 * t], axis=1), "rad", labels=("a", "b"))
+    measured.add("q", np.stack([np.sin(t - 0.05), 0 * t + 0.01], axis=1), "rad", labels=("a", "b"))
+    comparison = compare_records(simulated, measured)
+    assert comparison.delay == pytest.approx(0.05, abs=2e-4)
+    a, b = comparison.joints
+    assert b.rms == pytest.approx(0.01)
+    assert np.isnan(b.delay)
+    # All but the first 50 ms, for which the simulated record holds nothing to compare with.
+    assert a.rms_delay_removed < 5e-3
+    assert comparison.worst is a
+
+
+def test_the_gate_fails_with_every_bound_exceeded(rig, clean_run, tmp_path) -> None:
+    comparison = compare_records(rig.record, clean_run.result.record)
+    check_gate(comparison, Gate(rms_rad=0.2, delay_s=0.1))
+    with pytest.raises(ComparisonGateFailed, match=r"rms_rad 0\.\d+ > 0\.001, delay_s 0\.\d+ > 0\.01") as failure:
+        check_gate(comparison, Gate(rms_rad=0.001, delay_s=0.01))
+    assert failure.value.exit_code == 5
+    (tmp_path / "gate.yaml").write_text("rms: 0.1\n", encoding="utf-8")
+    with pytest.raises(ServoMapError, match="rms: unknown key; known are rms_rad"):
+        load_gate(tmp_path / "gate.yaml")
+    assert draw_comparison(comparison, tmp_path / "figures" / "comparison.png").stat().st_size > 10_000
+    assert json.dumps(comparison.summary())
+
+
+def test_records_without_common_angles_are_refused(rig) -> None:
+    other = Record([0.0, 1.0])
+    other.add("q", np.zeros((2, 1)), "rad", labels=("knee",))
+    with pytest.raises(RecordError, match="share no joint angles"):
+        compare_records(rig.record, other)
+
+
+def test_a_measured_run_is_a_record_like_a_simulated_one(clean_run, tmp_path) -> None:
+    path = clean_run.result.record.save(tmp_path / "measured.h5")
+    again = Record.load(path)
+    assert again.labels["q"] == ("shoulder", "elbow")
+    assert again.units["rho_dot"] == "rad/s"
+    for name in ("supply_voltage", "temperature", "missed", "alert", "lateness", "torque_estimate", "q_goal"):
+        assert name in again
+    assert again.summary["timing"]["cycles"] == len(again)
+    assert np.isfinite(again["supply_voltage"][-1]).all()
+
+
+def test_csv_holds_the_samples_with_units_in_the_header(tmp_path) -> None:
+    record = swing()
+    path = export_record(record, tmp_path / "a.csv", "csv")
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.reader(file))
+    assert rows[0][:4] == ["time [s]", "shoulder [rad]", "elbow [rad]", "wheel [rad]"]
+    data = np.array(rows[1:], dtype=float)
+    assert np.allclose(data[:, 1:3], record["q"], atol=1e-8)
+    assert np.allclose(data[:, 4:6], record["v"], atol=1e-8)
+
+
+def test_joint_trajectory_resampled_is_valid_yaml_in_order(tmp_path) -> None:
+    path = export_record(swing(), tmp_path / "t.yaml", "joint-trajectory", rate=50)
+    message = YAML(typ="safe").load(path)
+    assert message["joint_names"] == ["shoulder", "elbow", "wheel"]
+    times = [p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"] for p in message["points"]]
+    assert np.allclose(np.diff(times)[:-1], 0.02)
+    assert message["points"][10]["positions"][0] == pytest.approx(0.6 * np.sin(4 * 0.2), abs=1e-6)
+
+
+def test_urdf_log_is_one_json_object_per_line(tmp_path) -> None:
+    path = export_record(swing(), tmp_path / "t.jsonl", "urdf-log", rate=10)
+    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    assert lines[1]["time"] == pytest.approx(0.1)
+    assert set(lines[1]["position"]) == {"shoulder", "elbow", "wheel"}
+
+
+def test_exports_refuse_records_without_motion_and_bad_rates(tmp_path) -> None:
+    record = Record([0.0, 1.0])
+    record.add("energy", [0.0, 1.0], "J")
+    with pytest.raises(RecordError, match="no joint motion"):
+        export_record(record, tmp_path / "x.csv", "csv")
+    with pytest.raises(RecordError, match="--rate must be positive"):
+        export_record(swing(), tmp_path / "x.csv", "csv", rate=0)
+    with pytest.raises(RecordError, match="cannot write"):
+        export_record(swing(), tmp_path, "csv")
+
+
+def test_a_late_loop_skips_samples_and_sends_no_burst(rig) -> None:
+    """A hiccup of five periods: one cycle late, four skipped, goals jump ahead on the path."""
+    run = rig.prepare()
+    calls = 0
+
+    def hiccup(progress) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 150:
+            run.clock.sleep_until(run.clock.now() + 0.055)
+
+    run.replay._observer = hiccup
+    result = run.replay.run()
+    assert result.fault is None
+    assert result.timing.skipped_cycles in (4, 5)
+    starts = result.record.time
+    assert np.diff(starts).min() > 0.4 / run.map.bus.rate
+    assert result.timing.period_max == pytest.approx(0.06, abs=0.01)
+
+
+def test_a_loop_that_stays_late_aborts_within_its_bound(rig) -> None:
+    from dynsim.hardware.rules import Cause
+
+    run = rig.prepare()
+    run.replay._observer = lambda progress: run.clock.sleep_until(run.clock.now() + 0.025)
+    result = run.replay.run()
+    assert result.fault.cause == Cause.DEADLINE
+    late = (result.record["lateness"] > 1 / run.map.bus.rate).sum()
+    assert late <= run.map.safety.late_cycles + 1
+
+
+def test_no_wall_clock_enters_a_virtual_replay(rig, clean_run, monkeypatch) -> None:
+    first = clean_run.result.record
+    monkeypatch.setattr(time, "time", lambda: 0.0)
+    second = rig.run().result.record
+    assert np.array_equal(first["q"], second["q"])

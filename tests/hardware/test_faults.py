@@ -1,0 +1,267 @@
+"""Every scripted fault ends as docs/hardware.md says, in time, and nothing but the policy's own goals follows it."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dynsim.hardware.check import velocity_limit
+from dynsim.hardware.control_table import RAD_PER_TICK
+from dynsim.hardware.packet import Instruction
+from dynsim.hardware.replay import State
+from dynsim.hardware.rules import Cause, reaction_bound
+from dynsim.hardware.virtual_bus import PHYSICS_STEP
+
+from .conftest import check_goals_within_limits
+
+POLICIES = ("hold", "decelerate", "off")
+JOINTS, ANY = (1, 2), (1, 2, 7)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One fault: its script entry, whom it may strike, and how the run must end (no cause: it goes well)."""
+
+    name: str
+    entry: dict[str, Any]
+    ids: tuple[int, ...] = ()
+    causes: tuple[Cause, ...] = ()
+    scripted_onset: bool = True
+    visible_after: float = 0.0  # s from onset until a rule can see it
+
+
+CASES = [
+    Case("lost_status, now and then", {"kind": "lost_status", "probability": 0.01}, ANY),
+    Case("lost_status, for good", {"kind": "lost_status"}, ANY, (Cause.MISSED_STATUS,)),
+    Case("late_status", {"kind": "late_status", "delay": 0.005}, ANY, (Cause.MISSED_STATUS,)),
+    Case("truncated_status", {"kind": "truncated_status"}, ANY, (Cause.MISSED_STATUS,)),
+    Case("bad_crc", {"kind": "bad_crc"}, ANY, (Cause.MISSED_STATUS,)),
+    Case("noise", {"kind": "noise"}),
+    Case("echo", {"kind": "echo"}),
+    Case("duplicate_id", {"kind": "duplicate_id"}, ANY, (Cause.VERIFICATION,), scripted_onset=False),
+    Case("unplug", {"kind": "unplug"}, (), (Cause.PORT,)),
+    Case("drop_off", {"kind": "drop_off"}, ANY, (Cause.MISSED_STATUS,)),
+    Case("reboot", {"kind": "reboot"}, ANY, (Cause.MISSED_STATUS,)),
+    Case("wrong_model", {"kind": "wrong_model", "value": 12}, ANY, (Cause.VERIFICATION,), scripted_onset=False),
+    Case("wrong_firmware", {"kind": "wrong_firmware", "value": 38}, ANY, (Cause.VERIFICATION,), scripted_onset=False),
+    Case("wrong_mode", {"kind": "wrong_mode", "value": 16}, ANY, (Cause.VERIFICATION,), scripted_onset=False),
+    Case("overload", {"kind": "overload"}, ANY, (Cause.ALERT,)),
+    Case("overheat", {"kind": "overheat"}, ANY, (Cause.ALERT,)),
+    Case("watchdog_trip", {"kind": "watchdog_trip"}, ANY, (Cause.WATCHDOG, Cause.FOLLOWING_ERROR)),
+    # A joint that sticks with little error left to grow pushes until its torque rule fires instead.
+    Case("stuck", {"kind": "stuck"}, ANY, (Cause.FOLLOWING_ERROR, Cause.TORQUE)),
+    Case("backlash", {"kind": "backlash", "angle": 0.02}, JOINTS),
+    Case("offset_jump", {"kind": "offset_jump", "angle": 0.5}, JOINTS, (Cause.FOLLOWING_ERROR,)),
+    Case("voltage_sag", {"kind": "voltage_sag", "drop": 2.0}, (), (Cause.VOLTAGE,)),
+    Case(
+        "temperature_ramp", {"kind": "temperature_ramp", "heating_rate": 200.0}, ANY, (Cause.TEMPERATURE,), True, 0.1825
+    ),
+]
+
+
+def check_case(rig, case: Case, seed: int) -> None:
+    """Strike somebody at some time under some policy, all drawn from the seed, and judge the end."""
+    draw = random.Random(f"{case.name}/{seed}")
+    entry, onset, policy = dict(case.entry), draw.uniform(0.1, 1.3), draw.choice(POLICIES)
+    if case.ids:
+        entry["id"] = draw.choice(case.ids)
+    if case.scripted_onset:
+        entry["at"] = onset
+    run = rig.run(entry, seed=seed, policy=policy)
+    result = run.result
+    what = f"{case.name}, seed {seed}, {policy}: {result.fault}, {result.end_state}"
+    check_goals_within_limits(run)
+    if not case.causes:
+        assert result.fault is None, what
+        assert result.end_state == "off"
+        assert not any(servo["torque_enable"] for servo in run.line.servos.values())
+        return
+    assert result.fault is not None, what
+    assert result.fault.cause in case.causes, what
+    check_nothing_but_the_policy_after(run)
+    check_end_state(run, policy, entry, what)
+    if case.scripted_onset:
+        # A fault strikes at the first physics step after its onset.
+        check_reaction(run, run.line.torque_since + onset + PHYSICS_STEP, case, what)
+
+
+def check_nothing_but_the_policy_after(run) -> None:
+    result = run.result
+    on_the_wire = [(id_, value) for time, id_, value in run.goals() if time > result.fault_time]
+    declared = [(id_, value) for _, id_, value in result.policy_goals]
+    # What was declared last may not have reached the wire when the port died under it.
+    assert on_the_wire == declared[: len(on_the_wire)]
+    assert not [value for time, _, value in run.writes_of(64) if time > result.fault_time and value == 1]
+    if result.end_state in ("off", "not armed") and result.fault_state != State.REPLAY and run.replay.policy == "off":
+        assert not on_the_wire
+    if run.replay.policy == "hold" and result.end_state == "holding":
+        assert len({id_ for id_, _ in on_the_wire}) == len(on_the_wire), "hold speaks once to every servo"
+    if run.replay.policy == "off":
+        assert not on_the_wire
+    if run.replay.policy == "decelerate" and result.end_state == "holding":
+        check_comes_to_rest(run)
+
+
+def check_comes_to_rest(run) -> None:
+    """Steps of the decelerating goals never grow beyond rounding, and the last one is zero or a tick."""
+    troubled = run.result.fault.ids
+    for servo in run.map.servos:
+        values = [value for _, id_, value in run.result.policy_goals if id_ == servo.id]
+        if servo.id in troubled or len(values) < 3:
+            continue
+        if servo.in_position_mode:
+            allowed = velocity_limit(servo) / run.map.bus.rate / RAD_PER_TICK + 1
+            assert np.abs(np.diff(values)).max() <= allowed
+            assert abs(values[-1] - values[-2]) <= 1
+        else:
+            assert values[-1] == 0
+    last = run.result.policy_goals[-1][0]
+    assert last - run.result.fault_time <= run.map.safety.stop_time + 10 / run.map.bus.rate
+
+
+def check_end_state(run, policy: str, entry: dict[str, Any], what: str) -> None:
+    end, line = run.result.end_state, run.line
+    if run.result.fault.cause == Cause.VERIFICATION:
+        assert end == "not armed", what
+        assert not any(servo["torque_enable"] for servo in line.servos.values())
+        assert not run.goals()
+        return
+    if run.result.fault.cause == Cause.PORT:
+        assert end == "unreachable", what
+        line.advance(line.time + 2.0)
+        # Nobody can be told anything: the servos' own watchdogs stop them.
+        assert all(servo["bus_watchdog"] == -1 for servo in line.servos.values())
+        assert np.abs(line.plant.velocity).max() < 1e-3
+        return
+    assert end == ("off" if policy == "off" else "holding"), what
+    if end == "off":
+        alive = [id_ for id_ in line.ids if line.servos[id_]["torque_enable"]]
+        assert not alive, what
+        return
+    line.advance(line.time + 2.0)
+    assert np.abs(line.plant.velocity).max() < 1e-2, what
+    for id_, servo in line.servos.items():
+        if id_ == entry.get("id"):
+            continue
+        assert servo["torque_enable"], what
+        assert servo["bus_watchdog"] == 0, what
+
+
+def check_reaction(run, onset: float, case: Case, what: str) -> None:
+    """Cycles from the first that can show the fault to the one that declared it."""
+    if run.result.fault.cause == Cause.PORT:
+        # The transaction in which the port dies declares it.
+        assert run.result.fault_time - onset <= 1.5 / run.map.bus.rate, what
+        return
+    record, plan = run.result.record, run.replay.motion.plan
+    bound = reaction_bound(run.result.fault.cause, run.map, plan)
+    before = record["state"] != State.FAULT
+    if run.result.fault.cause in (Cause.FOLLOWING_ERROR, Cause.TORQUE):
+        over = over_the_threshold(run)[before]
+        run_length = len(over) if over.all() else int(np.argmin(over[::-1]))
+        assert run_length == bound, f"{what}: {run_length} cycles, bound {bound}"
+        return
+    starts = (record.time + run.replay._replay_started)[before] if run.replay._replay_started else None
+    if starts is None:
+        starts = (record.time + run.replay._origin)[before]
+    cycles = int((starts >= onset + case.visible_after).sum())
+    assert cycles <= bound, f"{what}: {cycles} cycles, bound {bound}"
+
+
+def over_the_threshold(run) -> np.ndarray:
+    """Cycles in which the servo that was blamed was beyond the limit of the rule that blamed it."""
+    record, fault = run.result.record, run.result.fault
+    column = run.map.ids.index(fault.ids[0])
+    servo = run.map.servos[column]
+    if fault.cause == Cause.TORQUE:
+        return np.abs(record["torque_estimate"][:, column]) > servo.kind.limits.torque
+    name = servo.kind.follows.position if servo.in_position_mode else servo.kind.follows.velocity
+    at = record.labels[name].index(servo.joint)
+    return np.abs(record[name + "_goal"][:, at] - record[name][:, at]) > servo.kind.following_error
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_every_fault_ends_as_specified(rig, case: Case) -> None:
+    for seed in range(1):
+        check_case(rig, case, seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_every_fault_ends_as_specified_in_100_of_100_runs(rig, case: Case) -> None:
+    for seed in range(100):
+        check_case(rig, case, seed)
+
+
+def test_without_faults_the_replay_ends_off_with_nothing_missed_or_skipped(clean_run) -> None:
+    run = clean_run
+    assert run.result.fault is None
+    assert run.result.end_state == "off"
+    assert run.result.timing.missed_statuses == 0
+    assert run.result.timing.skipped_cycles == 0
+
+
+def test_every_listed_fault_has_a_case() -> None:
+    from typing import get_args
+
+    from dynsim.hardware import virtual_faults
+
+    kinds = {
+        kind
+        for member in get_args(get_args(virtual_faults.Fault)[0])
+        for kind in get_args(member.model_fields["kind"].annotation)
+    }
+    assert kinds == {case.entry["kind"] for case in CASES}
+
+
+def test_torque_taken_away_by_another_program_is_noticed_in_turn(rig) -> None:
+    run = rig.prepare(policy="decelerate")
+
+    def take_away(progress) -> None:
+        if progress.state == State.REPLAY and run.line.servos[2]["torque_enable"] and run.clock.now() > 1.9:
+            run.line._write(2, 64, b"\0")
+
+    run.replay._observer = take_away
+    result = run.replay.run()
+    assert result.fault.cause in (Cause.TORQUE_LOST, Cause.FOLLOWING_ERROR)
+    assert result.end_state == "holding"
+    assert not run.line.servos[2]["torque_enable"], "nobody may switch it on again"
+
+
+def test_overload_integrator_shuts_a_jammed_joint_down() -> None:
+    """A joint pressed against a stop overloads after OVERLOAD_TIME; only a reboot brings it back."""
+    from dynsim.hardware.control_table import MX_106
+    from dynsim.hardware.packet import StatusError
+    from dynsim.hardware.virtual_bus import VirtualLine
+    from dynsim.hardware.virtual_faults import FaultScript
+    from dynsim.hardware.virtual_servo import ServoRegisters
+
+    script = FaultScript.model_validate({"faults": [{"kind": "stuck", "id": 1, "at": 0.0}]})
+    line = VirtualLine({1: ServoRegisters(MX_106, 1, 3)}, positions=[np.pi], script=script)
+    line._write(1, 64, b"\1")
+    line._write(1, 116, (3000).to_bytes(4, "little"))
+    line.advance(0.9)
+    assert line.servos[1]["torque_enable"] == 1
+    line.advance(1.5)
+    assert line.servos[1]["torque_enable"] == 0
+    assert line.servos[1]["hardware_error"] == 1 << 5
+    assert line._write(1, 64, b"\1") == StatusError.RESULT_FAIL
+    line._reboot(1)
+    line.advance(3.0)
+    assert line.servos[1]["hardware_error"] == 0
+    assert line._write(1, 64, b"\1") == StatusError.NONE
+
+
+def test_noise_is_never_read_as_a_state(rig, clean_run) -> None:
+    """With noise before every status, what was read is what an undisturbed run reads."""
+    clean, noisy = clean_run, rig.run({"kind": "noise"}, seed=3)
+    assert noisy.result.fault is None
+    assert noisy.result.timing.stray_bytes > 0
+    rows = min(len(clean.result.record), len(noisy.result.record))
+    difference = noisy.result.record["q"][:rows] - clean.result.record["q"][:rows]
+    assert np.nanmax(np.abs(difference)) < 0.02
+    assert Instruction.SYNC_READ in {packet.instruction for _, packet in noisy.sent}

@@ -1,0 +1,24 @@
+"""What importing the hardware layer must not pull in."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+
+@pytest.mark.parametrize(
+    ("module", "absent"),
+    [
+        # `dynsim run` mounts the commands: no serial port, no servo.
+        ("dynsim.cli", ("serial", "dynamixel_sdk", "dynsim.hardware.session", "numba", "matplotlib")),
+        ("dynsim.hardware.cli", ("serial", "dynamixel_sdk", "dynsim.hardware.session", "numba", "matplotlib")),
+        # Replaying knows nothing of how a record was made.
+        ("dynsim.hardware.session", ("numba", "dynsim.kernels", "dynsim.model", "dynsim.scenario", "matplotlib")),
+    ],
+)
+def test_imports_stay_in_their_layer(module: str, absent: tuple[str, ...]) -> None:
+    code = f"import {module}, sys; print([name for name in {absent!r} if name in sys.modules])"
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert answer.stdout.strip() == "[]"

@@ -1,0 +1,185 @@
+"""The real serial path: virtual servos in one process, client and commands in others. Nothing asserts time."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dynamixel_sdk import COMM_SUCCESS, PortHandler, Protocol2PacketHandler
+
+from dynsim.hardware.control_table import MX_106
+from dynsim.hardware.dynamixel_bus import DynamixelBus, open_serial_port
+from dynsim.hardware.errors import PortError
+from dynsim.hardware.replay import State
+from dynsim.record import Record
+
+from .conftest import MAP, swing
+
+F = MX_106.fields
+# A busy machine may not run the servos for a while: patience where a real robot would abort.
+PATIENT = MAP.replace("{baud: 1000000, rate: 100}", "{baud: 1000000, rate: 50, latency: 0.2}").replace(
+    "safety: {", "safety: {watchdog: 2.0, missed_cycles: 50, late_cycles: 1000, following_cycles: 50, "
+)
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "dynsim", *map(str, arguments)]
+
+
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(command(*arguments), capture_output=True, text=True, timeout=60, check=False)
+
+
+def wait_for(condition, timeout: float = 20.0) -> None:
+    end = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < end, "nothing happened"
+        time.sleep(0.02)
+
+
+class Servos:
+    """Virtual servos in a process of their own."""
+
+    def __init__(self, folder: Path, faults: str = "") -> None:
+        self.folder = folder
+        self.map, self.record, self.device = folder / "rig.yaml", folder / "record.h5", folder / "ttyDXL"
+        self.map.write_text(PATIENT, encoding="utf-8")
+        swing().save(self.record)
+        script = []
+        if faults:
+            (folder / "faults.yaml").write_text(faults, encoding="utf-8")
+            script = ["--faults", folder / "faults.yaml"]
+        self.process = subprocess.Popen(
+            command("hw", "virtual", "--map", self.map, "--link", self.device, *script),
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        assert "3 virtual servos at 1000000 bit/s" in self.process.stdout.readline()
+
+    def replay(self, *options: object) -> list[str]:
+        return command(
+            "hw",
+            "replay",
+            self.record,
+            "--map",
+            self.map,
+            "--port",
+            self.device,
+            "--out",
+            self.folder / "out",
+            *options,
+        )
+
+    @property
+    def log(self) -> str:
+        path = self.folder / "out" / "replay.log"
+        return path.read_text(encoding="utf-8") if path.exists() else ""
+
+    def torque(self) -> list[int]:
+        bus = DynamixelBus(open_serial_port(str(self.device), 1_000_000, exclusive=False), latency=0.2)
+        values = [bus.read(id_, F["torque_enable"]) for id_ in (1, 2, 7)]
+        bus.close()
+        return values
+
+    def close(self) -> int:
+        self.process.send_signal(signal.SIGINT)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+        return self.process.wait(timeout=20)
+
+
+@pytest.fixture
+def servos(tmp_path: Path) -> Iterator[Servos]:
+    servos = Servos(tmp_path)
+    yield servos
+    assert servos.close() == 0
+    assert not servos.device.is_symlink()
+
+
+def test_the_stock_client_library_finds_the_servos(servos: Servos) -> None:
+    port, library = PortHandler(str(servos.device)), Protocol2PacketHandler()
+    assert port.setBaudRate(1_000_000)
+    found, result = library.broadcastPing(port)
+    assert result == COMM_SUCCESS
+    assert found == {1: [321, 45], 2: [321, 45], 7: [30, 45]}
+    port.setBaudRate(57_600)
+    assert library.ping(port, 1)[1] != COMM_SUCCESS, "another bit rate is noise to the servos"
+    port.closePort()
+    scan = run("hw", "scan", "--port", servos.device, "--map", servos.map)
+    assert scan.returncode == 0, scan.stderr
+    assert "all 3 servos" in scan.stdout
+
+
+def test_without_live_a_real_port_is_a_dry_run(servos: Servos) -> None:
+    dry = subprocess.run(servos.replay(), capture_output=True, text=True, timeout=60, check=False)
+    assert dry.returncode == 0, dry.stderr
+    assert "nothing was moved" in dry.stdout
+    assert servos.torque() == [0, 0, 0]
+    assert (servos.folder / "out" / "registers.json").exists()
+
+
+def test_replay_over_a_serial_device(servos: Servos) -> None:
+    live = subprocess.run(servos.replay("--live", "--yes"), capture_output=True, text=True, timeout=60, check=False)
+    assert live.returncode == 0, live.stderr + servos.log
+    measured = Record.load(servos.folder / "out" / "measured.h5")
+    assert measured.complete
+    replayed = measured["state"] == State.REPLAY
+    assert replayed.sum() > 10
+    assert np.nanmax(measured["q"][replayed]) > 0.4, "the servos moved"
+    summary = json.loads((servos.folder / "out" / "summary.json").read_text(encoding="utf-8"))
+    assert summary["end_state"] == "off"
+    assert summary["timing"]["cycles"] == len(measured)
+    assert servos.torque() == [0, 0, 0]
+
+
+def test_a_second_replay_is_refused_and_stop_works_beside_the_first(servos: Servos) -> None:
+    first = open_serial_port(str(servos.device), 1_000_000)
+    with pytest.raises(PortError, match="in use by another process"):
+        open_serial_port(str(servos.device), 1_000_000)
+    first.closePort()
+    running = subprocess.Popen(servos.replay("--live", "--yes", "--speed", "0.1"), stderr=subprocess.PIPE, text=True)
+    wait_for(lambda: "REPLAY         enter" in servos.log)
+    second = subprocess.run(servos.replay("--live", "--yes"), capture_output=True, text=True, timeout=60, check=False)
+    assert second.returncode == 3
+    assert "in use by another process" in second.stderr
+    stop = run("hw", "stop", "--port", servos.device, "--map", servos.map)
+    _, error = running.communicate(timeout=60)
+    assert running.returncode == 4, error
+    assert servos.torque() == [0, 0, 0]
+    assert stop.returncode in (0, 3)  # the replay may have taken the answers off the line
+
+
+@pytest.mark.parametrize(("presses", "left"), [(1, [1, 1, 1]), (2, [0, 0, 0])])
+def test_ctrl_c_in_a_running_replay(servos: Servos, presses: int, left: list[int]) -> None:
+    running = subprocess.Popen(servos.replay("--live", "--yes", "--speed", "0.1"), stderr=subprocess.PIPE, text=True)
+    wait_for(lambda: "REPLAY         enter" in servos.log)
+    for press in range(presses):
+        os.kill(running.pid, signal.SIGINT)
+        if press == 0 and presses == 2:
+            wait_for(lambda: "stopped by the user" in servos.log)
+    _, error = running.communicate(timeout=60)
+    assert running.returncode == 130, error
+    assert error.startswith("error: interrupted in REPLAY")
+    assert servos.torque() == left
+
+
+def test_an_adapter_pulled_out_ends_the_replay(tmp_path: Path) -> None:
+    servos = Servos(tmp_path, "faults: [{kind: unplug, at: 2.0}]")
+    live = subprocess.run(
+        servos.replay("--live", "--yes", "--speed", "0.1"), capture_output=True, text=True, timeout=60, check=False
+    )
+    assert live.returncode == 4, live.stderr
+    assert "the port died" in live.stderr
+    assert "robot left unreachable" in live.stderr
+    assert servos.process.wait(timeout=20) == 0
+    assert servos.process.stdout is not None
+    servos.process.stdout.close()

@@ -1,0 +1,114 @@
+"""Servo maps: the shipped ones, conversions, and errors that name file, line and fix."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dynsim.hardware.calibrate import read_zero_ticks, write_zero_ticks
+from dynsim.hardware.errors import ServoMapError, VerificationFailed
+from dynsim.hardware.servo_map import load_servo_map
+
+SHIPPED = Path(__file__).parents[2] / "scenarios" / "hardware"
+
+
+def test_the_shipped_arm_map_names_ten_joints() -> None:
+    servo_map = load_servo_map(SHIPPED / "arm.yaml")
+    assert servo_map.joints == tuple(f"joint_{k}" for k in range(1, 11))
+    assert {servo.model.name for servo in servo_map.servos} == {"MX-106"}
+    assert all(servo.kind.follows.position == "q" for servo in servo_map.servos)
+
+
+def test_the_shipped_snake_map_names_joints_held_joints_and_wheels() -> None:
+    servo_map = load_servo_map(SHIPPED / "snake.yaml")
+    followed = [servo.label for servo in servo_map.servos if servo.kind.mode == "position" and servo.hold_at is None]
+    assert followed == ["theta1", "psi1", "theta2", "psi2", "theta3", "psi3", *(f"theta{k}" for k in range(4, 10))]
+    assert [servo.joint for servo in servo_map.servos if servo.hold_at == 0.0] == [f"psi{k}" for k in range(4, 9)]
+    wheels = [servo for servo in servo_map.servos if servo.kind.mode == "velocity"]
+    assert [servo.joint for servo in wheels] == [f"wheel{k}" for k in range(1, 8)]
+    assert {servo.model.name for servo in wheels} == {"MX-28"}
+
+
+@pytest.mark.parametrize("name", ["arm", "snake.yaml", "scenarios/hardware/arm.yaml"])
+def test_shipped_maps_are_found_by_name_from_anywhere(name: str, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert load_servo_map(name).path.parent == SHIPPED
+
+
+@given(st.integers(0, 4095))
+def test_ticks_and_angles_convert_both_ways(rig, tick: int) -> None:
+    for servo in rig.map.servos[:2]:
+        assert servo.to_ticks(servo.to_angle(tick)) == tick
+
+
+def test_sense_zero_and_limits(rig) -> None:
+    shoulder, elbow, wheel = rig.map.servos
+    assert shoulder.to_ticks(math.pi / 2) == 2048 + 1024
+    assert elbow.to_ticks(math.pi / 2) == 1900 - 1024
+    assert elbow.to_velocity_units(1.0) < 0 < shoulder.to_velocity_units(1.0)
+    assert shoulder.tick_limits == (2048 - 683, 2048 + 683)
+    assert wheel.position_limits == (-math.inf, math.inf)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("robot: rig", "robott: rig", r"map.yaml:1: robott: unknown key; known are robot, bus, safety, kinds, servos"),
+        ("id: 7", "id: 2", r"servos.wheel.id: 2 is also the ID of elbow"),
+        ("kind: wheel, id: 7", "kind: whel, id: 7", r"servos.wheel.kind: 'whel' is not one of joint, wheel"),
+        ("baud: 1000000", "baud: 1234", r"map.yaml:2: bus: baud 1234 is not one of 9600, 57600"),
+        ("[-60, 60]", "[60, -60]", r"limits.position_deg: 60.0 is not below -60.0"),
+        ("position_deg: [-60, 60], ", "", r"a servo in position mode needs limits.position_deg"),
+        ("sign: -1", "sign: 2", r"map.yaml:19: servos.elbow.sign"),
+        ("velocity: 3.0, torque: 6.0}", "velocity: -3.0, torque: 6.0}", r"map.yaml:9: kinds.joint.limits.velocity"),
+        ("policy: decelerate", "policy: panic", r"map.yaml:3: safety.policy"),
+        ("torque: 6.0}", "torque: 6.0, torqe: 1}", r"torqe: unknown key; known are position_deg, velocity, torque"),
+        ("kinds:", "kinds: [", r"map.yaml:\d+: not YAML"),
+        ("id: 1}", "id: 254}", r"servos.shoulder.id"),
+    ],
+)
+def test_mistakes_are_named_with_file_and_line(write_map, old: str, new: str, message: str) -> None:
+    with pytest.raises(ServoMapError, match=message):
+        load_servo_map(write_map((old, new)))
+
+
+def test_missing_empty_and_binary_files(tmp_path: Path) -> None:
+    with pytest.raises(ServoMapError, match="cannot be read"):
+        load_servo_map(tmp_path / "nowhere.yaml")
+    (tmp_path / "empty.yaml").touch()
+    with pytest.raises(ServoMapError, match="expected a mapping"):
+        load_servo_map(tmp_path / "empty.yaml")
+    (tmp_path / "binary.yaml").write_bytes(b"\x89HDF\r\n\x1a\n\xff")
+    with pytest.raises(ServoMapError, match="not a text file"):
+        load_servo_map(tmp_path / "binary.yaml")
+
+
+def test_calibration_writes_zero_ticks_and_keeps_the_rest(rig, write_map) -> None:
+    path = write_map(("id: 7}", "id: 7}  # left"))
+    run = rig.prepare()
+    ticks = read_zero_ticks(run.replay.bus, rig.map.servos[:2])
+    assert ticks == {"shoulder": rig.map.servos[0].to_ticks(0.1), "elbow": rig.map.servos[1].to_ticks(0.2)}
+    write_zero_ticks(load_servo_map(path), ticks, path)
+    again = load_servo_map(path)
+    assert [servo.zero_tick for servo in again.servos[:2]] == list(ticks.values())
+    assert "# left" in path.read_text(encoding="utf-8")
+
+
+def test_calibration_refuses_torque_movement_and_impossible_zeros(rig, write_map) -> None:
+    run = rig.prepare()
+    run.line._write(1, 64, b"\1")
+    with pytest.raises(VerificationFailed, match="torque is on"):
+        read_zero_ticks(run.replay.bus, rig.map.servos[:2])
+    run = rig.prepare()
+    run.line.plant.velocity[0] = 2.0
+    with pytest.raises(VerificationFailed, match="shoulder moves"):
+        read_zero_ticks(run.replay.bus, rig.map.servos[:2])
+    path = write_map()
+    before = path.read_text(encoding="utf-8")
+    with pytest.raises(ServoMapError, match="position mode ends at 0 and 4095"):
+        write_zero_ticks(load_servo_map(path), {"shoulder": 200}, path)
+    assert path.read_text(encoding="utf-8") == before

@@ -1,0 +1,158 @@
+"""Ctrl-C at every state: once for a controlled stop, twice for torque off that really arrives."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import numpy as np
+import pytest
+
+from dynsim.hardware.packet import Instruction
+from dynsim.hardware.replay import Progress, State, StopRequest
+from dynsim.hardware.rules import Cause
+from dynsim.hardware.session import stop_on_signals
+
+ON_THE_WAY = [State.CONNECT, State.VERIFY, State.ARM, State.MOVE_TO_START, State.SETTLE, State.REPLAY, State.DISARM]
+
+
+def interrupted(rig, state: State, signals: list[int], *, policy: str = "decelerate", after: int = 1):
+    """Run with real signals raised at the ``after``-th report from ``state``."""
+    stop = StopRequest()
+    run = rig.prepare(stop=stop, policy=policy)
+    seen = 0
+
+    def observe(progress: Progress) -> None:
+        nonlocal seen
+        if progress.state == state:
+            seen += 1
+            if seen == after:
+                for number in signals:
+                    os.kill(os.getpid(), number)
+
+    run.replay._observer = observe
+    with stop_on_signals(stop):
+        run.result = run.replay.run()
+    assert stop.count == len(signals)
+    return run
+
+
+def broadcast_torque_off(run) -> list[float]:
+    """Times of the packets that switch torque off for everybody."""
+    return [
+        time
+        for time, packet in run.sent
+        if packet.instruction == Instruction.WRITE and packet.id == 254 and packet.parameters == b"\x40\x00\x00"
+    ]
+
+
+@pytest.mark.parametrize("policy", ["hold", "decelerate", "off"])
+@pytest.mark.parametrize("state", ON_THE_WAY, ids=lambda state: state.name)
+def test_second_ctrl_c_switches_the_torque_off_at_every_state(rig, state: State, policy: str) -> None:
+    run = interrupted(rig, state, [signal.SIGINT, signal.SIGINT], policy=policy)
+    assert len(broadcast_torque_off(run)) >= 3
+    assert run.result.end_state == "off"
+    assert run.result.torque_still_on == ()
+    assert not any(servo["torque_enable"] for servo in run.line.servos.values())
+    assert not run.result.policy_goals or run.result.fault_state == State.DISARM
+
+
+@pytest.mark.parametrize("state", ON_THE_WAY, ids=lambda state: state.name)
+def test_first_ctrl_c_is_a_controlled_stop(rig, state: State) -> None:
+    run = interrupted(rig, state, [signal.SIGINT])
+    torque = [servo["torque_enable"] for servo in run.line.servos.values()]
+    if state == State.DISARM:
+        # The motion is over: disarming goes on to its end.
+        assert run.result.fault is None
+        assert not any(torque)
+        return
+    assert run.result.fault.cause == Cause.INTERRUPTED
+    assert run.result.fault_state == state
+    if state in (State.CONNECT, State.VERIFY):
+        assert run.result.end_state == "not armed"
+        assert not broadcast_torque_off(run), "a robot that is held by an earlier run must not fall"
+        assert not run.goals()
+    elif state == State.ARM:
+        assert run.result.end_state == "off"
+        assert not any(torque)
+    else:
+        assert run.result.end_state == "holding"
+        assert all(torque)
+        run.line.advance(run.line.time + 1.0)
+        assert np.abs(run.line.plant.velocity).max() < 1e-2
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_other_signals_stop_like_ctrl_c(rig, number: int) -> None:
+    run = interrupted(rig, State.REPLAY, [number], after=30)
+    assert run.result.fault.cause == Cause.INTERRUPTED
+    assert run.result.end_state == "holding"
+
+
+def test_ctrl_c_under_the_policy_off_comes_to_rest_before_it_releases(rig) -> None:
+    run = interrupted(rig, State.REPLAY, [signal.SIGINT], policy="off", after=30)
+    assert run.result.end_state == "off"
+    moved = [value for _, id_, value in run.result.policy_goals if id_ == 7]
+    assert moved[-1] == 0
+    assert min(broadcast_torque_off(run)) > run.result.policy_goals[-1][0]
+
+
+def test_second_ctrl_c_during_the_controlled_stop_releases_at_once(rig) -> None:
+    stop = StopRequest()
+    run = rig.prepare(stop=stop)
+    reports = 0
+
+    def observe(progress: Progress) -> None:
+        nonlocal reports
+        if progress.state in (State.REPLAY, State.FAULT):
+            reports += 1
+            if (progress.state, reports) == (State.REPLAY, 30):
+                stop()
+            if progress.state == State.FAULT and stop.count == 1 and reports > 36:
+                stop()
+
+    run.replay._observer = observe
+    result = run.replay.run()
+    assert result.end_state == "off"
+    assert not any(servo["torque_enable"] for servo in run.line.servos.values())
+    last_goal = max(time for time, _, _ in run.goals())
+    assert min(broadcast_torque_off(run)) > last_goal
+    assert last_goal - result.fault_time < run.map.safety.stop_time / 2
+
+
+def test_handlers_are_given_back() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    with stop_on_signals(StopRequest()):
+        assert signal.getsignal(signal.SIGINT) is not before
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_an_exception_out_of_the_blue_still_stops_the_robot(rig, error) -> None:
+    """Without the signal handlers a Ctrl-C lands in the middle of a read: the policy is carried out all the same."""
+    run = rig.prepare(policy="off")
+    read = run.replay.bus.port.readPort
+
+    def read_port(length: int) -> bytes:
+        if run.replay.state == State.REPLAY and run.clock.now() > 1.9 and run.replay.result.fault is None:
+            raise error("out of the blue")
+        return read(length)
+
+    run.replay.bus.port.readPort = read_port
+    with pytest.raises(error):
+        run.replay.run()
+    assert run.result.fault.cause == Cause.PROGRAM
+    assert run.result.end_state == "off"
+    assert not any(servo["torque_enable"] for servo in run.line.servos.values())
+
+
+def test_a_robot_found_holding_is_not_dropped_by_a_ctrl_c_while_arming(rig) -> None:
+    stop = StopRequest()
+    run = rig.prepare(stop=stop)
+    for id_ in run.map.ids:
+        run.line._write(id_, 64, b"\1")
+    run.replay._observer = lambda progress: stop() if progress.state == State.ARM else None
+    result = run.replay.run()
+    assert result.fault_state == State.ARM
+    assert result.end_state == "holding"
+    assert all(servo["torque_enable"] for servo in run.line.servos.values())

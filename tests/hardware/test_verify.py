@@ -1,0 +1,108 @@
+"""What keeps a robot from being armed."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from dynsim.hardware.control_table import OperatingMode
+from dynsim.hardware.rules import Cause
+from dynsim.hardware.virtual_bus import ServoRegisters
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("return_delay", 250, "return delay is 500 µs, planned 0 µs"),
+        ("drive_mode", 1, "drive mode is 1, must be 0"),
+        ("status_return_level", 1, "status return level is 1"),
+        ("shutdown", 0, "overheating and overload must switch the torque off"),
+        ("hardware_error", 4, "hardware error: overheating; only a restart clears it"),
+        ("operating_mode", OperatingMode.EXTENDED_POSITION, "is in mode extended_position, must be position"),
+        ("max_position", 2300, "its own limits are 0 to 2300"),
+        ("firmware", 38, "firmware 38 is older than 41"),
+    ],
+)
+def test_an_unfit_servo_is_not_armed(rig, name: str, value: int, message: str) -> None:
+    run = rig.prepare()
+    run.line.servos[1][name] = value
+    result = run.replay.run()
+    assert result.fault.cause == Cause.VERIFICATION
+    assert message in result.fault.text
+    assert "shoulder (ID 1)" in result.fault.text
+    assert result.end_state == "not armed"
+    assert not run.goals()
+
+
+def test_a_robot_outside_of_its_limits_is_not_armed(rig) -> None:
+    run = rig.prepare()
+    run.line.plant.position[0] += 2.0
+    result = run.replay.run()
+    assert "outside of its limits -1.047 to 1.047 rad; move it by hand" in result.fault.text
+
+
+def test_an_unknown_servo_on_the_bus_is_reported(rig) -> None:
+    run = rig.prepare()
+    stranger = ServoRegisters(run.line.servos[1].model, 9, 3)
+    run.line.servos[9] = stranger
+    run.line.ids.append(9)
+    result = run.replay.run()
+    assert "ID 9: MX-106 (firmware 45) is on the bus but not in the map" in result.fault.text
+
+
+def test_a_silent_servo_comes_with_a_hint_at_protocol_1(rig) -> None:
+    run = rig.prepare()
+    run.line._dead.add(2)
+    result = run.replay.run()
+    assert "elbow: ID 2: no answer" in result.fault.text
+    assert "Protocol 1 firmware does not answer" in result.fault.text
+
+
+def test_too_low_a_supply_is_reported(rig) -> None:
+    run = rig.prepare()
+    run.line.supply = 10.0
+    assert "supply is 10.0 V" in run.replay.run().fault.text
+
+
+def test_configure_writes_what_differs_and_nothing_else(rig) -> None:
+    run = rig.prepare(write_eeprom=True)
+    run.line.servos[1]["return_delay"] = 250
+    run.line.servos[7]["operating_mode"] = OperatingMode.POSITION
+    result = run.replay.run()
+    assert result.fault is None
+    assert run.line.servos[1]["return_delay"] == 0
+    assert run.line.servos[7]["operating_mode"] == OperatingMode.VELOCITY
+    written = [packet for _, packet in run.sent if packet.instruction == 3 and packet.parameters[0] < 64]
+    assert len(written) == 2
+    assert any("return_delay 250 -> 0" in line for line in run.replay.log.lines)
+
+
+def test_configure_is_refused_while_torque_is_on(rig) -> None:
+    run = rig.prepare(write_eeprom=True)
+    run.line.servos[1]["return_delay"] = 250
+    run.line._write(1, 64, b"\1")
+    result = run.replay.run()
+    assert result.fault.cause == Cause.VERIFICATION
+    assert "not available" in result.fault.text
+    assert result.end_state == "not armed"
+
+
+def test_registers_are_dumped_before_and_after_a_fault(rig, tmp_path) -> None:
+    run = rig.prepare({"kind": "overload", "id": 2, "at": 0.5}, dump_folder=tmp_path)
+    run.replay.run()
+    before = json.loads((tmp_path / "registers.json").read_text(encoding="utf-8"))
+    after = json.loads((tmp_path / "registers_after_fault.json").read_text(encoding="utf-8"))
+    assert before["elbow"]["hardware_error"] == 0
+    assert after["elbow"]["hardware_error"] == 1 << 5
+    assert before["wheel"]["model_number"] == 30
+
+
+def test_arming_sends_the_robot_nowhere(clean_run) -> None:
+    """Every goal written before torque on is where the servo stands."""
+    run = clean_run
+    for id_, position in ((1, 0.1), (2, 0.2)):
+        servo = run.map.servos[run.map.ids.index(id_)]
+        torque_on = next(time for time, who, value in run.writes_of(64) if who == id_ and value == 1)
+        first = [value for time, who, value in run.goals() if who == id_ and time <= torque_on]
+        assert first == [servo.to_ticks(position)]
