@@ -497,7 +497,7 @@ def _line(source: Any, keys: list[int | str]) -> int | None:
         if not lines or key not in lines:
             break
         line = lines[key][0] + 1
-        node = node[key]  # type: ignore[index]
+        node = node[key]
     return line
 
 

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from dynsim._version import __version__
+from dynsim.engine.dynamics import Prepared, prepare
 from dynsim.kernels import arrays as ka
 from dynsim.kernels import integrate as ki
 from dynsim.kernels.coupled import System, derivative
 from dynsim.kernels.jit import kernel
 from dynsim.scenario import load_scenario
-from dynsim.engine.dynamics import Prepared, prepare
 from dynsim.studies import mujoco_peer, pinocchio_peer
 
 Array = NDArray[np.float64]

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 mujoco = pytest.importorskip("mujoco", minversion="4.0")
 
+from dynsim.engine.dynamics import Prepared, prepare  # noqa: E402
 from dynsim.kernels import arrays as ka  # noqa: E402
 from dynsim.kernels import integrate as ki  # noqa: E402
 from dynsim.kernels.coupled import System  # noqa: E402
@@ -21,7 +22,6 @@ from dynsim.model.arrays import compile_contacts, compile_drives  # noqa: E402
 from dynsim.model.description import Inertia, Link, Robot  # noqa: E402
 from dynsim.model.model import Model  # noqa: E402
 from dynsim.scenario import load_scenario  # noqa: E402
-from dynsim.engine.dynamics import Prepared, prepare  # noqa: E402
 from dynsim.studies.bench import CASES, prepare_case  # noqa: E402
 from dynsim.studies.mujoco_peer import build_mujoco, roll_out, setpoints, state_of  # noqa: E402
 
