@@ -8,6 +8,7 @@ import numpy as np
 
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.coupled import System, derivative
+from dynsim.kernels.integrate import FINISHED, METHODS, STATUS, Run, advance, new_run
 from dynsim.kernels.jit import integers, reals
 from dynsim.model.arrays import compile_contacts, compile_drives, compile_model
 from dynsim.model.description import Contact, Inertia, Link, Motor, Quadric, Robot
@@ -150,6 +151,38 @@ class Bench:
         dy = np.zeros_like(y)
         derivative(self.system, t, reals(y), self.ws, dy)
         return dy
+
+    def simulate(
+        self,
+        y: np.ndarray,
+        times: np.ndarray,
+        method: str = "dopri5",
+        *,
+        step: float = 0.0,
+        fixed: bool = False,
+        rtol: float = 1e-6,
+        atol: float | None = None,
+    ) -> Run:
+        """Integrate to the last of ``times`` and record there; ``fixed`` holds adaptive methods at ``step`` too."""
+        n, na, c = self.sizes
+        run = new_run(
+            METHODS[method],
+            y,
+            n=n,
+            na=na,
+            c=c,
+            sample_time=times,
+            hand=(n - 1, self.robot.hand[1]),
+            end=float(times[-1]),
+            step=step,
+            step_max=step if fixed else np.inf,
+            rtol=rtol,
+            # With an absolute tolerance out of reach every step is accepted and the next one is as long as allowed.
+            atol=1e12 if fixed else rtol * 1e-2 if atol is None else atol,
+        )
+        advance(self.system, self.ws, run, 10**7)
+        assert run.count[STATUS] == FINISHED
+        return run
 
 
 def bench(

@@ -222,6 +222,12 @@ def _reason(status: int, scenario: Scenario, prepared: Prepared) -> str:
             else "look at the last state for a joint that runs away"
         )
         return f"{where}: the state is no longer finite (divergence); {advice}"
+    if status == ki.NO_FORCES:
+        names = ", ".join(contact.name for contact in prepared.contacts)
+        return (
+            f"{where}: no signs of the normal forces at {names} agree with dissipative friction (Painlevé's paradox); "
+            "lower contacts.friction, or take contacts.pulling_friction: signed"
+        )
     if status == ki.STEP_TOO_SMALL:
         return (
             f"{where}: the step size fell to {run.clock[ki.STEP]:.1e} s; try integrator.method rodas4 or a larger rtol"

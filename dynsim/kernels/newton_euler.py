@@ -48,8 +48,9 @@ COS10, COS12, COS14 = -2.75573143513906633035e-07, 2.08757232129817482790e-09, -
 def sine_cosine(joints, trig):
     """Sine and cosine of every q, into trig: (2, n); within one unit in the last place of libm's.
 
-    Free of calls and branches so that the compiler takes several joints at once: r = q − k π/2 with π/2 in three parts,
-    then the polynomials of FreeBSD's msun (k_sin.c, k_cos.c) on |r| ≤ π/4. Infinite q gives NaN.
+    Free of calls, which would push all values of a sweep out of their registers, and of branches:
+    r = q − k π/2 with π/2 in three parts, then the polynomials of FreeBSD's msun (k_sin.c, k_cos.c) on |r| ≤ π/4.
+    Infinite q gives NaN.
     """
     for i in range(joints.shape[0]):
         q = joints[i, Q]

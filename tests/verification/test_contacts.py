@@ -1,0 +1,154 @@
+"""Contacts: both solvers, the constraint itself, friction, and rows that depend on each other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from random_robots import bench, random_contacts, random_robot, surface_through
+
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.energy import FRICTION
+from dynsim.model.description import Contact, Quadric, Robot
+from dynsim.model.model import Model
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+def random_case(seed: int, most: int = 3) -> tuple[Robot, list[Contact], np.ndarray, np.ndarray, np.ndarray]:
+    """Robot, contacts, q, v and motor currents."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 13))
+    robot = random_robot(rng, n)
+    q, v, current = rng.normal(scale=2.0, size=n), rng.normal(size=n), rng.normal(size=len(robot.motors))
+    return robot, random_contacts(rng, robot, q, int(rng.integers(1, most + 1))), q, v, current
+
+
+def rows(robot: Robot, contacts: list[Contact], q: np.ndarray) -> np.ndarray:
+    """J, one normal row per contact, (c, n)."""
+    model, J = Model(robot), []
+    for contact in contacts:
+        r = model.point_position(contact.body, contact.point, q)
+        gradient = contact.surface.Q @ r + contact.surface.b
+        J.append(gradient / np.linalg.norm(gradient) @ model.point_jacobian(contact.body, contact.point, q))
+    return np.array(J)
+
+
+@given(seeds)
+def test_articulated_and_m_star_agree(seed):
+    robot, contacts, q, v, current = random_case(seed)
+    J = rows(robot, contacts, q)
+    assume(np.linalg.matrix_rank(J, tol=1e-2) == len(contacts))
+    fast, dense = bench(robot, contacts), bench(robot, contacts, solver=ka.SOLVER_M_STAR)
+    y = fast.state(q, v, current)
+    a, b = fast.derivative(y), dense.derivative(y)
+    assume(fast.ws.deficient[1] == 0)
+    # The promise of both solvers, per unit of the largest rate; rounding grows with the
+    # condition of M*, up to 1e5 here.
+    assert np.abs(a - b).max() <= 1e-10 * (1.0 + np.abs(b).max())
+    fa, fb = fast.ws.contacts[:, ka.FORCE], dense.ws.contacts[:, ka.FORCE]
+    assert np.abs(fa - fb).max() <= 1e-10 * (1.0 + np.abs(fb).max())
+    assert (fast.ws.deficient == 0).all()
+    assert (dense.ws.deficient == 0).all()
+
+
+@given(seeds)
+def test_accelerations_keep_every_contact_on_its_surface(seed):
+    """d²C/dt² = 0 along q + v t + v̇ t²/2, the level set C of the surface: J v̇ + J̇ v = 0."""
+    robot, contacts, q, v, current = random_case(seed)
+    J = rows(robot, contacts, q)
+    assume(np.linalg.matrix_rank(J, tol=1e-2) == len(contacts))
+    b, n, model, eps = bench(robot, contacts), len(q), Model(robot), 1e-4
+    vdot = b.derivative(b.state(q, v, current))[n : 2 * n]
+    assume(np.isfinite(vdot).all())
+    for contact in contacts:
+        values = []
+        for t in (-eps, 0.0, eps):
+            r = model.point_position(contact.body, contact.point, q + v * t + 0.5 * vdot * t * t)
+            values.append(0.5 * r @ contact.surface.Q @ r + contact.surface.b @ r + contact.surface.c)
+        second = (values[0] - 2.0 * values[1] + values[2]) / eps**2
+        # Second difference: truncation eps² times the fourth derivative, rounding 1e-15/eps² = 1e-7, against the
+        # accelerations that have to cancel.
+        assert abs(second) <= 1e-5 * (1.0 + np.abs(vdot).max() ** 2)
+
+
+@given(seeds)
+def test_a_contact_given_twice_shares_one_force(seed):
+    """Least norm: equal rows carry equal parts, the motion is that of one contact, and the counter tells."""
+    robot, contacts, q, v, current = random_case(seed, most=1)
+    J = rows(robot, contacts, q)
+    assume(np.abs(J).max() > 1e-2)
+    contact = replace(contacts[0], pulling_friction="signed")
+    for solver in (ka.SOLVER_ARTICULATED, ka.SOLVER_M_STAR):
+        one, two = bench(robot, [contact], solver=solver), bench(robot, [contact, contact], solver=solver)
+        n = 2 * len(q) + len(robot.motors)
+        a, b = one.derivative(one.state(q, v, current))[:n], two.derivative(two.state(q, v, current))[:n]
+        scale = 1.0 + np.abs(a).max()
+        # The singular system is solved to rounding; squares of singular values enter the least-norm solution.
+        assert np.abs(a - b).max() <= 1e-9 * scale
+        force, halves = one.ws.contacts[0, ka.FORCE], two.ws.contacts[:, ka.FORCE]
+        assert np.abs(halves - 0.5 * force).max() <= 1e-9 * (1.0 + abs(force))
+        assert one.ws.deficient[0] == 0
+        assert two.ws.deficient[0] >= 1
+
+
+def test_friction_takes_energy_where_the_surface_pushes_and_always_when_dissipative():
+    pulled = 0
+    for seed in range(60):
+        robot, contacts, q, v, current = random_case(seed, most=1)
+        if np.abs(rows(robot, contacts, q)).max() < 1e-2:
+            continue
+        for law in ("signed", "dissipative"):
+            b = bench(robot, [replace(contacts[0], pulling_friction=law)])
+            y = b.state(q, v, current)
+            power = b.derivative(y)[2 * len(q) + len(robot.motors) + FRICTION]
+            if b.ws.deficient[1]:
+                continue
+            force = b.ws.contacts[0, ka.FORCE]
+            pulled += force < 0.0
+            row = b.ws.contacts[0]
+            slip = row[ka.SLIP_VELOCITY : ka.SLIP_VELOCITY + 3] @ row[ka.TANGENT : ka.TANGENT + 3]
+            expected = contacts[0].friction * slip * (force if law == "signed" else abs(force))
+            assert power == pytest.approx(expected, rel=1e-10, abs=1e-12)  # rounding
+    assert pulled > 20
+
+
+def test_no_consistent_friction_is_said_and_not_papered_over():
+    """With large μ some states allow neither a pushing nor a pulling force (Painlevé): NaN and a count."""
+    found = 0
+    for seed in range(200):
+        robot, contacts, q, v, current = random_case(seed, most=2)
+        b = bench(robot, [replace(c, friction=5.0, pulling_friction="dissipative") for c in contacts])
+        y = b.state(q, v, current)
+        dy = b.derivative(y)
+        if b.ws.deficient[1] > 0:
+            found += 1
+            assert np.isnan(dy[len(q) : 2 * len(q)]).any()
+        elif b.ws.deficient[0] == 0:
+            force, sign = b.ws.contacts[:, ka.FORCE], b.ws.contacts[:, ka.SIGN]
+            assert (force * sign >= -1e-9 * (1.0 + np.abs(force).max())).all()
+    assert found > 0
+
+
+@pytest.mark.parametrize("kind", ["plane", "sphere", "cylinder"])
+def test_gap_is_the_distance_from_the_surface(kind):
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        foot = rng.normal(size=3)
+        surface = surface_through(rng, kind, foot)
+        gradient = surface.Q @ foot + surface.b
+        normal = gradient / np.linalg.norm(gradient)
+        for distance in (-0.1, 0.0, 1e-9, 0.3, 5.0):
+            # Rounding of the squares of some metres that the level set is made of.
+            assert surface.gap(foot + distance * normal) == pytest.approx(distance, abs=1e-13)
+
+
+def test_gap_of_a_scaled_level_set_is_the_same_length():
+    rng = np.random.default_rng(4)
+    s = surface_through(rng, "sphere", np.ones(3))
+    scaled = Quadric(7.0 * s.Q, 7.0 * s.b, 7.0 * s.c)
+    point = rng.normal(size=3)
+    assert scaled.gap(point) == pytest.approx(s.gap(point), rel=1e-13)

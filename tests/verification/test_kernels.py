@@ -1,0 +1,88 @@
+"""How the kernels are compiled: one signature each, and the same numbers as plain Python."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numba import config
+from random_robots import bench, random_contacts, random_robot
+
+from dynsim.kernels import arrays as ka
+from dynsim.kernels import articulated, coupled, energy, integrate, kinematics, newton_euler
+from dynsim.model.model import Model
+
+PLAIN_PYTHON = """
+import sys
+import numpy as np
+from random_robots import bench, random_contacts, random_robot
+
+rng = np.random.default_rng(5)
+robot = random_robot(rng, 4)
+q, v, i = rng.normal(size=4), rng.normal(size=4), rng.normal(size=len(robot.motors))
+contacts = random_contacts(rng, robot, q, 1)
+rows = []
+for solver in (0, 1):
+    b = bench(robot, contacts, solver=solver)
+    rows.append(b.derivative(b.state(q, v, i)))
+free = bench(robot)
+rows += [free.simulate(free.state(q, v, i), np.array([4e-3]), m, step=1e-3).sample[0] for m in ("rk4", "rodas4")]
+np.savez(sys.argv[1], *rows)
+"""
+
+
+def run_everything() -> None:
+    rng = np.random.default_rng(5)
+    robot = random_robot(rng, 4)
+    q = rng.normal(size=4)
+    contacts = random_contacts(rng, robot, q, 1)
+    for solver in (ka.SOLVER_ARTICULATED, ka.SOLVER_M_STAR):
+        b = bench(robot, contacts, solver=solver)
+        b.derivative(b.state(q, np.zeros(4)))
+        free = bench(robot, solver=solver)
+        free.simulate(free.state(q, np.zeros(4)), np.array([1e-3]), "rk4", step=1e-3)
+    free.simulate(free.state(q, np.zeros(4)), np.array([1e-3]), "rodas4")
+    model = Model(robot)
+    model.mass_matrix(list(q))
+    model.forward_dynamics(q, q, q)
+    model.inverse_dynamics(q[::-1], q, np.broadcast_to(1.0, 4))
+    model.point_jacobian("body_3", [0, 0, 1], q.astype(np.float32))
+    model.kinetic_energy(q, q)
+    model.potential_energy(q)
+
+
+@pytest.mark.skipif(config.DISABLE_JIT, reason="nothing is compiled")
+def test_every_public_kernel_has_one_compiled_signature():
+    run_everything()
+    for kernel in (
+        coupled.derivative,
+        integrate.advance_explicit,
+        integrate.advance_rodas4,
+        newton_euler.newton_euler,
+        newton_euler.mass_matrix,
+        articulated.forward_dynamics,
+        kinematics.point_position,
+        kinematics.point_jacobian,
+        energy.kinetic_energy,
+        energy.potential_energy,
+    ):
+        assert len(kernel.signatures) <= 1, kernel
+
+
+def test_kernels_run_as_plain_python(tmp_path):
+    """NUMBA_DISABLE_JIT=1 gives the compiled numbers to rounding (compiled code contracts a·b + c)."""
+    results = []
+    for disable in ("0", "1"):
+        out = tmp_path / f"{disable}.npz"
+        paths = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]
+        environment = {**os.environ, "NUMBA_DISABLE_JIT": disable, "PYTHONPATH": os.pathsep.join(paths)}
+        subprocess.run([sys.executable, "-c", PLAIN_PYTHON, str(out)], env=environment, check=True, timeout=300)
+        results.append(np.load(out))
+    for key in results[0].files:
+        compiled, plain = results[0][key], results[1][key]
+        # Rounding; finite differences (1e-7) in the Jacobian of rodas4 change only its error, not its order.
+        np.testing.assert_allclose(compiled, plain, rtol=0, atol=1e-9 * (1.0 + np.abs(plain).max()))
