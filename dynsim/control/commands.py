@@ -83,7 +83,7 @@ class Circle(BaseModel):
     start_s: Time = 0.0
     duration_s: Duration
     radius: Annotated[float, Field(gt=0, allow_inf_nan=False)]
-    turns: Finite = Field(1.0, description="> 0 counter-clockwise from above (plane xy) or seen against x (plane yz)")
+    turns: Finite = Field(1.0, description="plane xy: > 0 to the left; plane yz: from the top, > 0 first to the left")
     plane: Literal["xy", "yz"] = "xy"
     backward: bool = Field(False, description="plane xy: leave the start point tail first")
     turn_head: bool = Field(True, description="plane xy: the yaw follows the tangent")
@@ -95,7 +95,7 @@ class Circle(BaseModel):
         out = np.zeros((len(s), 6))
         if self.plane == "yz":
             out[:, 1] = self.radius * np.sin(angle)
-            out[:, 2] = self.radius * (1.0 - np.cos(angle))
+            out[:, 2] = self.radius * (np.cos(angle) - 1.0)
             return out
         way = -1.0 if self.backward else 1.0
         out[:, 0] = way * self.radius * np.sin(np.abs(angle))

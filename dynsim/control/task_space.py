@@ -56,6 +56,13 @@ class Switching(BaseModel):
     order: list[int] = Field([2, 3, 4, 5, 6], min_length=1, description="mode numbers, also the predictive candidates")
     period_s: Positive = Field(1.0, description="Delta T [s]")
     least_margin: Finite = Field(0.0, description="a mode with a smaller support margin [m] counts as tipping")
+    when_blocked: bool = Field(
+        False,
+        description="enter the switching state by itself when a command cannot be carried out, the target waiting",
+    )
+    release_fraction: Annotated[float, Field(gt=0, lt=1)] = Field(
+        0.6, description="when_blocked: go on when every base joint is within this part of its limit (assumed)"
+    )
     prediction_step_s: Positive = Field(0.02, description="step of the predicted period (assumed)")
 
 
@@ -90,7 +97,12 @@ class Config(Script):
     cost_angle_weight: NonNegative = Field(1.0, description="a_1 of eq 20 (assumed)")
     cost_support_weight: NonNegative = Field(1.0, description="a_2 of eq 20 [m] (assumed)")
     limit_policy: Literal["none", "saturate", "allocate"] = Field(
-        "allocate", description="allocate: a joint at its limit leaves the allocation; saturate: it is clamped"
+        "allocate",
+        description="allocate: a joint at its limit leaves the allocation, and when that is impossible the target "
+        "waits; saturate: joints are clamped; none: limits are ignored",
+    )
+    rate_limit: Positive = Field(
+        4.7, description="fastest joint rate [rad/s]: no-load speed of the MX-106 at 12 V, 45 rpm (data sheet)"
     )
     limit_rate: Positive = Field(
         20.0, description="a joint approaches its limit no faster than this [1/s] times the angle left (assumed)"
@@ -155,6 +167,8 @@ class TaskSpaceController:
     switch_ticks: int
     policy: Policy
     least_margin: float
+    when_blocked: bool
+    release_fraction: float
     source: CommandSource
 
 
@@ -189,6 +203,7 @@ def build(config: Config, plant: Plant) -> TaskSpaceController:
         shape_target=reals(shape_target),
         grounded=integers(modes.grounded),
         limit_policy=LIMIT_POLICIES[config.limit_policy],
+        rate_limit=config.rate_limit,
         limit_rate=min(config.limit_rate, 1.0 / config.period_s),
         damping_sigma=config.damping_sigma,
         damping_factor=config.damping_factor,
@@ -224,6 +239,8 @@ def build(config: Config, plant: Plant) -> TaskSpaceController:
         switch_ticks=switch_ticks,
         policy=config.switching.policy,
         least_margin=config.switching.least_margin,
+        when_blocked=config.switching.when_blocked,
+        release_fraction=config.switching.release_fraction,
         source=ScriptedSource(config.commands, config.paths, modes),
     )
 

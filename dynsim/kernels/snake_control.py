@@ -40,6 +40,7 @@ class Law(NamedTuple):
     shape_target: np.ndarray  # (m,) [rad]
     grounded: np.ndarray  # (modes, n_b + 1) 1 where a pair is on the ground
     limit_policy: int
+    rate_limit: float  # fastest joint rate [rad/s]; a command that asks for more is not carried out
     limit_rate: float  # a joint approaches its limit no faster than this rate times the remaining angle
     damping_sigma: float  # damp when the smallest singular value of M falls below it
     damping_factor: float  # at sigma = 0, in the same unit as sigma
@@ -67,6 +68,7 @@ class Work(NamedTuple):
     gradient: np.ndarray  # (n_u,) eta
     null_part: np.ndarray  # (n_u,) Q^T of the scaled gradient
     u: np.ndarray  # (n_u,) result: joint rates, wheel rates [rad/s]
+    withheld: np.ndarray  # (1,) part of the command that damping has taken away [m/s, rad/s]
     at_limit: np.ndarray  # (n_phi,) 1 where a joint was taken out of the allocation, 2 where it could not be
 
 
@@ -93,6 +95,7 @@ def new_work(model: SnakeModel) -> Work:
         gradient=np.zeros(inputs),
         null_part=np.zeros(inputs),
         u=np.zeros(inputs),
+        withheld=np.zeros(1),
         at_limit=np.zeros(joints, dtype=np.int64),
     )
 
@@ -287,6 +290,7 @@ def control_input(model, law, work, w, phi, w_target, velocity, mode, null_gain)
         rhs[count + s] = -gain[6 + s] * (phi[shape_joints[s]] - shape_target[s])
 
     sigma = smallest_singular_value(rows, lower, singular, work.solution)
+    work.withheld[0] = 0.0
     if sigma < law.damping_sigma:
         ratio = sigma / law.damping_sigma
         damping = (1.0 - ratio * ratio) * law.damping_factor**2
@@ -296,6 +300,7 @@ def control_input(model, law, work, w, phi, w_target, velocity, mode, null_gain)
         along *= damping / (sigma * sigma + damping)
         for i in range(rows):
             rhs[i] -= along * singular[i]
+        work.withheld[0] = abs(along)
 
     if null_gain != 0.0:
         cost_gradient(model, law.cost, chain, phi, grounded, work.support, work.gradient)

@@ -14,6 +14,7 @@ import numpy as np
 from dynsim.kernels.jit import kernel
 from dynsim.kernels.snake import SnakeModel, constraint_matrices, pose_of_point, walk_chain
 from dynsim.kernels.snake_control import (
+    LIMITS_ALLOCATE,
     LIMITS_NONE,
     Law,
     Work,
@@ -22,8 +23,10 @@ from dynsim.kernels.snake_control import (
     new_work,
     sigma_min,
 )
-from dynsim.kernels.snake_support import cost_value, support_polygon
+from dynsim.kernels.snake_support import cost_value, polygon_area, support_polygon
 
+# With gain K, damping that withholds this much of a command leaves a head error of WITHHELD / K [m/s, rad/s].
+WITHHELD = 1e-5
 MEASURED, ESTIMATED, FEEDFORWARD = 0, 1, 2
 
 
@@ -46,7 +49,9 @@ class State(NamedTuple):
     w_target: np.ndarray  # (6,) w_d, integrated from the commanded velocity
     w_hat: np.ndarray  # (6,) what the controller believes of w
     phi_hat: np.ndarray  # (n_phi,) what the controller believes of phi
-    counts: np.ndarray  # (3,) [row of the mode in Law.grounded, ticks run, joint-ticks clamped at a limit]
+    # (5,) [row of the mode in Law.grounded, ticks run, joint-ticks clamped at a limit, commands carried out, ticks in
+    # which the command could not be carried out and the target waited]
+    counts: np.ndarray
 
 
 class Rig(NamedTuple):
@@ -62,6 +67,7 @@ class Rig(NamedTuple):
     py: np.ndarray
     pose: np.ndarray  # (6,)
     target: np.ndarray  # (6,)
+    rate: np.ndarray  # (6,) rate of the target that is carried out
     origin: np.ndarray  # (3,)
 
 
@@ -79,6 +85,7 @@ class Trace(NamedTuple):
     cost: np.ndarray  # (R,)
     sigma: np.ndarray  # (R,)
     margin: np.ndarray  # (R,)
+    area: np.ndarray  # (R,) of the support polygon
     slip: np.ndarray  # (R,)
     at_limit: np.ndarray  # (R, n_phi)
     centre: np.ndarray  # (R, 3)
@@ -94,7 +101,7 @@ def new_state(model: SnakeModel) -> State:
         w_target=np.zeros(6),
         w_hat=np.zeros(6),
         phi_hat=np.zeros(joints),
-        counts=np.zeros(3, dtype=np.int64),
+        counts=np.zeros(5, dtype=np.int64),
     )
 
 
@@ -112,6 +119,7 @@ def new_rig(model: SnakeModel) -> Rig:
         py=np.zeros(model.base_joints),
         pose=np.zeros(6),
         target=np.zeros(6),
+        rate=np.zeros(6),
         origin=np.zeros(3),
     )
 
@@ -131,6 +139,7 @@ def new_trace(model: SnakeModel, rows: int) -> Trace:
         cost=np.zeros(rows),
         sigma=np.zeros(rows),
         margin=np.zeros(rows),
+        area=np.zeros(rows),
         slip=np.zeros(rows),
         at_limit=np.zeros((rows, joints), dtype=np.int64),
         centre=np.zeros((rows, 3)),
@@ -257,6 +266,18 @@ def believe(model, schedule, state, rig):
 
 
 @kernel
+def fits(law, work, joints):
+    """True when ``work.u`` does what was commanded and every joint keeps its limits and the fastest rate."""
+    u, at_limit = work.u, work.at_limit
+    if work.withheld[0] > WITHHELD:
+        return False
+    for j in range(joints):
+        if at_limit[j] == 2 or abs(u[j]) > law.rate_limit:
+            return False
+    return True
+
+
+@kernel
 def tick(model, law, schedule, state, velocity, rig):
     """One control period: evaluate the controller, hold its rates, move the plant and the controller's beliefs.
 
@@ -264,25 +285,43 @@ def tick(model, law, schedule, state, velocity, rig):
     that order. Those of its predicted middle (``schedule.midpoint``) make it O(period^2). The prediction is the closed
     loop itself, w~' = w~_d' - K (w~ - w~_d) ([T] eq 15).
 
-    Returns the slip of the plant [m/s]; the applied rates are in ``rig.work.u``.
+    With the allocating limit policy a command is carried out only as a whole, every joint within its limits and rate.
+    Otherwise the target waits where it is, and if not even the null-space motion fits, the robot does too.
+
+    Returns
+    -------
+    slip : float
+        Of the plant [m/s]; the applied rates are in ``rig.work.u``.
+    blocked : bool
+        The command was not carried out.
     """
     work, period, mode = rig.work, schedule.period, state.counts[0]
     phi, phi_hat, w_hat, w_target = state.phi, state.phi_hat, state.w_hat, state.w_target
-    pose, target, joints_ahead, u, error = rig.pose, rig.target, rig.phi_stage, work.u, work.error
+    pose, target, joints_ahead, u, error, rate = rig.pose, rig.target, rig.phi_stage, work.u, work.error, rig.rate
     joints = phi.shape[0]
     null_gain = law.null_gain if state.counts[1] >= schedule.null_start_tick else 0.0
     believe(model, schedule, state, rig)
-    copy(w_hat, pose)
-    copy(w_target, target)
-    copy(phi_hat, joints_ahead)
-    for evaluation in range(1 + schedule.midpoint):
-        if evaluation == 1:
-            for i in range(6):  # error is the commanded w'
-                pose[i] += 0.5 * period * error[i]
-                target[i] += 0.5 * period * velocity[i]
-            for j in range(joints):
-                joints_ahead[j] += 0.5 * period * u[j]
-        control_input(model, law, work, pose, joints_ahead, target, velocity, mode, null_gain)
+    copy(velocity, rate)
+    attempt = 0
+    while True:
+        copy(w_hat, pose)
+        copy(w_target, target)
+        copy(phi_hat, joints_ahead)
+        for evaluation in range(1 + schedule.midpoint):
+            if evaluation == 1:
+                for i in range(6):  # error is the commanded w'
+                    pose[i] += 0.5 * period * error[i]
+                    target[i] += 0.5 * period * rate[i]
+                for j in range(joints):
+                    joints_ahead[j] += 0.5 * period * u[j]
+            control_input(model, law, work, pose, joints_ahead, target, rate, mode, null_gain)
+        if law.limit_policy != LIMITS_ALLOCATE or attempt == 2 or fits(law, work, joints):
+            break
+        attempt += 1
+        if attempt == 2:
+            null_gain = 0.0
+        for i in range(6):
+            rate[i] = 0.0
     if law.limit_policy != LIMITS_NONE:  # the mechanical stop, and what is left when no allocation helps
         for j in range(joints):
             up = max(model.upper[j] - phi[j], 0.0) / period
@@ -296,10 +335,10 @@ def tick(model, law, schedule, state, velocity, rig):
     for j in range(joints):
         phi_hat[j] += period * u[j]  # feedforward; overwritten when the joints are read
     for i in range(6):
-        w_target[i] += period * velocity[i]
-        w_hat[i] += period * velocity[i]  # x, y, gamma of the estimated state; the rest is overwritten
+        w_target[i] += period * rate[i]
+        w_hat[i] += period * rate[i]  # x, y, gamma of the estimated state; the rest is overwritten
     state.counts[1] += 1
-    return slip
+    return slip, attempt > 0
 
 
 @kernel
@@ -314,6 +353,7 @@ def record_row(model, law, state, rig, r, trace):
     trace.mode[r] = mode
     trace.cost[r] = cost_value(law.cost, phi, sides, support, margin)
     trace.margin[r] = margin
+    trace.area[r] = polygon_area(support, sides)
     trace.sigma[r] = sigma_min(model, law, work, grounded)
     copy(state.base, trace.base[r])
     copy(support.centre, trace.centre[r])
@@ -324,26 +364,36 @@ def record_row(model, law, state, rig, r, trace):
 
 
 @kernel
-def run_ticks(model, law, schedule, state, velocity, stride, rig, trace):
-    """Run one control period per row of ``velocity`` in the present mode.
+def run_ticks(model, law, schedule, state, velocity, count, moving, stop, stride, rig, trace):
+    """Run control periods in the present mode.
 
     Parameters
     ----------
-    velocity : (T, 6) commanded rate of the target in each period.
+    velocity : (T, 6) commanded rates of the target, one row per period of the script; zero after its end. The script
+        goes on only when its command was carried out (``state.counts[3]`` is the place).
+    count : int, control periods to run.
+    moving : int, 1: follow the script; 0: the target waits.
+    stop : int, 1: return after a period that was blocked.
     stride : int, ticks 0, stride, 2 stride, ... of the run are recorded.
 
     Returns
     -------
     done : int
-        Periods simulated; fewer than T when the state is no longer finite.
+        Periods simulated; -1 when the state is no longer finite.
+    blocked : bool
+        The last period was blocked.
     """
     base, phi, counts, at_limit = state.base, state.phi, state.counts, rig.work.at_limit
-    for k in range(velocity.shape[0]):
-        now = counts[1]
+    command, blocked = np.zeros(6), False
+    for k in range(count):
+        now, place = counts[1], counts[3]
         r = now // stride if now % stride == 0 else -1
         if r >= 0:
             record_row(model, law, state, rig, r, trace)
-        slip = tick(model, law, schedule, state, velocity[k], rig)
+        for i in range(6):
+            command[i] = velocity[place, i] if moving and place < velocity.shape[0] else 0.0
+        slip, blocked = tick(model, law, schedule, state, command, rig)
+        counts[3 if moving and not blocked else 4] += 1
         if r >= 0:
             trace.slip[r] = slip
             copy(rig.work.u, trace.u[r])
@@ -352,12 +402,14 @@ def run_ticks(model, law, schedule, state, velocity, stride, rig, trace):
                 trace.at_limit[r, j] = at_limit[j]
             # beliefs at the beginning of the period: take back the step that the tick has added
             for i in range(6):
-                trace.w_hat[r, i] -= schedule.period * velocity[k, i]
+                trace.w_hat[r, i] -= schedule.period * rig.rate[i]
         finite = 0.0
         for i in range(3):
             finite += base[i]
         for j in range(phi.shape[0]):
             finite += phi[j]
         if not math.isfinite(finite):
-            return k
-    return velocity.shape[0]
+            return -1, blocked
+        if stop and moving and blocked:
+            return k + 1, blocked
+    return count, blocked

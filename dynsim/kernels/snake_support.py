@@ -137,6 +137,16 @@ def support_polygon(model, chain, grounded, support):
 
 
 @kernel
+def polygon_area(support, sides):
+    """Area of the support polygon [m^2]."""
+    area = 0.0
+    for s in range(sides):
+        a, b = support.contact[support.hull[s]], support.contact[support.hull[(s + 1) % sides]]
+        area += 0.5 * (a[0] * b[1] - a[1] * b[0])
+    return area
+
+
+@kernel
 def centre_slopes(model, chain, support):
     """Derivative of the projected centre of mass by each joint angle, the body of wheel pair 1 held still."""
     total = 0.0

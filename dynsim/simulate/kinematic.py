@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dynsim.control import task_space
 from dynsim.control.commands import CommandBlock
-from dynsim.control.modes import NO_REQUEST, ModeSwitcher
+from dynsim.control.modes import FIXING, NO_REQUEST, SWITCHING, ModeSwitcher
 from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.kernels.jit import reals
 from dynsim.kernels.snake import SnakeModel, new_chain, pose_of_point, posture_points
@@ -86,7 +86,7 @@ def simulate_kinematic(scenario: KinematicScenario, progress: Callable[[float], 
         period_ticks=controller.switch_ticks,
         least_margin=controller.least_margin,
         margin_now=lambda row: _margin_now(run, row),
-        predict=lambda row: _predict(run, row, block.velocity[state.counts[1]]),
+        predict=lambda row: _predict(run, row, block.velocity[min(int(state.counts[3]), ticks - 1)]),
     )
     block = controller.source.read(0, ticks, period)
     try:
@@ -120,36 +120,54 @@ def _advance(
     run: _Run, switcher: ModeSwitcher, block: CommandBlock, progress: Callable[[float], None] | None
 ) -> None:
     """Run to the end in pieces that no mode request and no switching time divides."""
-    state, schedule = run.state, run.controller.schedule
+    state, controller, period = run.state, run.controller, run.controller.schedule.period
     ticks = len(block.request)
     requests = np.flatnonzero(block.request != NO_REQUEST)
+    recovering = False
     while (now := int(state.counts[1])) < ticks:
-        state.counts[0] = switcher.at_tick(now, int(block.request[now]))
+        request = int(block.request[now])
+        # At the ends of switching periods only, so that every recovery has at least one.
+        if recovering and now >= (switcher.next_event() or 0) and _is_released(run):
+            recovering, request = False, FIXING
+        state.counts[0] = switcher.at_tick(now, request)
         later = requests[requests > now]
         ends = [ticks, now + CHUNK, *later[:1]]
         if (event := switcher.next_event()) is not None:
             ends.append(event)
-        end = int(min(ends))
-        done = run_ticks(
+        count = int(min(ends)) - now
+        done, blocked = run_ticks(
             run.model,
-            run.controller.law,
-            schedule,
+            controller.law,
+            controller.schedule,
             state,
-            block.velocity[now:end],
+            block.velocity,
+            count,
+            int(not recovering),
+            int(controller.when_blocked),
             run.stride,
             run.rig,
             run.trace,
         )
-        if done < end - now:
-            time = float(state.counts[1] * schedule.period)
+        if done < 0:
+            time = float(state.counts[1] * period)
             raise SimulationStopped(
                 f"the state is no longer finite at t = {time:g} s: the posture is singular or a gain is too high for "
                 f"the control period",
                 time=time,
                 state={"base_pose": state.base.tolist(), "phi": state.phi.tolist()},
             )
+        if blocked and not recovering and controller.when_blocked and not switcher.switching:
+            recovering = True
+            if state.counts[1] < ticks:
+                state.counts[0] = switcher.at_tick(int(state.counts[1]), SWITCHING)
         if progress is not None:
-            progress(end / ticks)
+            progress(int(state.counts[1]) / ticks)
+
+
+def _is_released(run: _Run) -> bool:
+    """True when every base joint is well within its limit again ([T] IV.C.5: until the robot becomes operable)."""
+    base = slice(run.model.head_joints, None)
+    return bool(np.all(np.abs(run.state.phi[base]) < run.controller.release_fraction * run.model.upper[base]))
 
 
 def _margin_now(run: _Run, row: int) -> float:
@@ -164,8 +182,12 @@ def _predict(run: _Run, row: int, velocity: NDArray[np.float64]) -> tuple[float,
     ticks, law = run.controller.prediction_ticks, run.controller.law
     trial, trace = _copy(run.state), new_trace(run.model, ticks + 1)
     trial.counts[0], trial.counts[1] = row, 0
+    trial.counts[3] = 0
     held = np.tile(velocity, (ticks, 1))
-    run_ticks(run.model, law, run.controller.prediction, trial, held, 1, run.rig, trace)
+    schedule = run.controller.prediction
+    done, _ = run_ticks(run.model, law, schedule, trial, held, ticks, 1, 1, 1, run.rig, trace)
+    if 0 <= done < ticks:  # blocked: the target waits for the rest of the period
+        run_ticks(run.model, law, schedule, trial, held, ticks - done, 0, 0, 1, run.rig, trace)
     record_row(run.model, law, trial, run.rig, ticks, trace)
     return float(trace.cost[-1]), float(trace.margin.min())
 
@@ -249,6 +271,7 @@ def _record(
     add("cost", trace.cost, "1", description="V of the redundancy")
     add("sigma_min", trace.sigma, "1", description="smallest singular value of B~ of the mode, unweighted")
     add("support_margin", trace.margin, "m", description="centre of mass inside the support polygon by this much")
+    add("support_area", trace.area, "m^2", description="of the support polygon")
     add("centre_of_mass", trace.centre, "m", labels=("x", "y", "z"))
     add("slip", trace.slip, "m/s", description="largest violation of a wheel row within the period")
     add("at_limit", trace.at_limit, "1", labels=names, description="1 joint out of the allocation, 2 clamped")
@@ -298,6 +321,7 @@ def _summary(
         "final_base_pose": record["base_pose"][-1].tolist(),
         "joint_limit_violation_max_rad": float(max(beyond.max(), 0.0)),
         "joints_taken_out": [n for n, at in zip(description.joint_names, (at_limit == 1).any(axis=0), strict=True) if at],
+        "waiting_s": float(run.state.counts[4] * run.controller.schedule.period),
         "clamped_joint_ticks": int(run.state.counts[2]),
         "joint_rate_max_rad_s": float(np.abs(record["phi_dot"]).max()),
         "wheel_rate_max_rad_s": float(np.abs(record["rho_dot"]).max(initial=0.0)),
@@ -308,6 +332,8 @@ def _summary(
         "modes_refused": switcher.refused,
         "sigma_min_min": float(record["sigma_min"].min()),
         "support_margin_min_m": float(record["support_margin"].min()),
+        "support_area_initial_m2": float(record["support_area"][0]),
+        "support_area_final_m2": float(record["support_area"][-1]),
         "tipping": bool((record["support_margin"] <= 0.0).any()),
         "model": start,
     }
