@@ -75,7 +75,7 @@ class Ramp(BaseModel):
 
 
 class Circle(BaseModel):
-    """Circle of the target about a point at ``radius`` to its left (turns > 0) or right, or in the vertical yz plane."""
+    """Circle of the target in world axes: on the floor plan, starting along +x, or in the vertical yz plane."""
 
     model_config = ConfigDict(extra="forbid")
 

@@ -114,9 +114,7 @@ class Config(Script):
     shape_points: dict[str, Finite] | None = Field(
         None, description="shape controllable points: joint name -> target [rad]; default the last head joint, 110 deg"
     )
-    modes: dict[int, list[int]] | None = Field(
-        None, description="mode number -> lifted wheel pairs; default Table II"
-    )
+    modes: dict[int, list[int]] | None = Field(None, description="mode number -> lifted wheel pairs; default Table II")
     fixing_mode: int = 1
     switching: Switching = Field(default_factory=Switching)
 
@@ -129,9 +127,20 @@ class Config(Script):
 class Plant(Protocol):
     """What the controller has to know of a robot."""
 
-    joint_names: tuple[str, ...]
-    initial_joints: NDArray[np.float64]
-    initial_base_pose: NDArray[np.float64]
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """In the order of phi."""
+        ...
+
+    @property
+    def initial_joints(self) -> NDArray[np.float64]:
+        """(n_phi,) [rad]."""
+        ...
+
+    @property
+    def initial_base_pose(self) -> NDArray[np.float64]:
+        """(3,) x [m], y [m], yaw [rad]."""
+        ...
 
     def arrays(self) -> SnakeModel:
         """The description as the kernels want it."""

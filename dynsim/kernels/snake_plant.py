@@ -16,7 +16,6 @@ from dynsim.kernels.snake import SnakeModel, constraint_matrices, pose_of_point,
 from dynsim.kernels.snake_control import (
     LIMITS_ALLOCATE,
     LIMITS_NONE,
-    Law,
     Work,
     control_input,
     estimate_from_joints,
@@ -269,12 +268,10 @@ def believe(model, schedule, state, rig):
 def fits(law, work, joints):
     """True when ``work.u`` does what was commanded and every joint keeps its limits and the fastest rate."""
     u, at_limit = work.u, work.at_limit
-    if work.withheld[0] > WITHHELD:
-        return False
+    whole = work.withheld[0] <= WITHHELD
     for j in range(joints):
-        if at_limit[j] == 2 or abs(u[j]) > law.rate_limit:
-            return False
-    return True
+        whole = whole and at_limit[j] != 2 and abs(u[j]) <= law.rate_limit
+    return whole
 
 
 @kernel

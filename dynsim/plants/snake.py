@@ -39,7 +39,7 @@ class Config(BaseModel):
     type: Literal["snake"] = "snake"
     level: Literal["kinematic"] = "kinematic"
     yaw_joints: int = Field(9, ge=2, le=200, description="n: yaw joints of the whole robot")
-    head_joints: int = Field(6, ge=0, description="n_h: joints of the raised head part, yaw and pitch alternating, even")
+    head_joints: int = Field(6, ge=0, description="n_h: joints of the raised head part, yaw, pitch, yaw, ..., even")
     link_length: Positive = Field(0.0905, description="l [m], between neighbouring joint axes")
     wheel_radius: Positive = Field(0.05, description="r [m]")
     wheel_gap: Positive | list[Positive] | None = Field(

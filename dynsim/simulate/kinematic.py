@@ -116,9 +116,7 @@ def _stride(rate_hz: float, period: float) -> int:
     return stride
 
 
-def _advance(
-    run: _Run, switcher: ModeSwitcher, block: CommandBlock, progress: Callable[[float], None] | None
-) -> None:
+def _advance(run: _Run, switcher: ModeSwitcher, block: CommandBlock, progress: Callable[[float], None] | None) -> None:
     """Run to the end in pieces that no mode request and no switching time divides."""
     state, controller, period = run.state, run.controller, run.controller.schedule.period
     ticks = len(block.request)
@@ -244,7 +242,9 @@ def _record(
     attitude_error = attitude_distance(w, trace.w_target)
     grounded = law.grounded[trace.mode]
     points = np.zeros((rows, 1 + model.head_joints + 2 * model.base_joints, 3))
-    posture_points(model, reals(trace.base), reals(trace.phi), run.rig.work.frame, new_chain(model), np.zeros(6), points)
+    posture_points(
+        model, reals(trace.base), reals(trace.phi), run.rig.work.frame, new_chain(model), np.zeros(6), points
+    )
     gripper = np.append(block.gripper, block.gripper[-1:])[: ticks + 1 : run.stride][:rows]
 
     names, wheels = description.joint_names, description.wheel_names
@@ -300,9 +300,7 @@ def _geometry(description: snake.SnakeDescription, controller: task_space.TaskSp
     }
 
 
-def _summary(
-    description: snake.SnakeDescription, run: _Run, switcher: ModeSwitcher, record: Record
-) -> dict[str, Any]:
+def _summary(description: snake.SnakeDescription, run: _Run, switcher: ModeSwitcher, record: Record) -> dict[str, Any]:
     phi, w, at_limit = record["phi"], record["w"], record["at_limit"]
     law = run.controller.law
     beyond = np.maximum(phi - description.upper, description.lower - phi)
@@ -320,7 +318,7 @@ def _summary(
         "final_phi_rad": phi[-1].tolist(),
         "final_base_pose": record["base_pose"][-1].tolist(),
         "joint_limit_violation_max_rad": float(max(beyond.max(), 0.0)),
-        "joints_taken_out": [n for n, at in zip(description.joint_names, (at_limit == 1).any(axis=0), strict=True) if at],
+        "joints_taken_out": [description.joint_names[j] for j in np.flatnonzero((at_limit == 1).any(axis=0))],
         "waiting_s": float(run.state.counts[4] * run.controller.schedule.period),
         "clamped_joint_ticks": int(run.state.counts[2]),
         "joint_rate_max_rad_s": float(np.abs(record["phi_dot"]).max()),
