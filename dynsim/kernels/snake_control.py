@@ -148,12 +148,12 @@ def reflect(j, reflector, beta, vector):
 
 
 @kernel
-def smallest_singular_value(count, lower, u, y):
+def smallest_singular_value(count, tolerance, lower, u, y):
     """Smallest singular value of L (count x count, lower triangular) by inverse iteration.
 
-    ``u`` is the start vector (any) and becomes the left singular vector; ``y`` is workspace. Inverse iteration on
-    L L^T converges by the square of the ratio of the two smallest singular values; when these are close, any mixture of
-    the two vectors gives the value as well.
+    ``u`` becomes the left singular vector, ``y`` is workspace, ``tolerance`` the relative change that ends the
+    iteration. It converges by the square of the ratio of the two smallest singular values: near a singularity, where
+    value and vector matter, in two or three steps; and when the two are close, any mixture of their vectors will do.
     """
     for i in range(count):
         u[i] = 1.0 / math.sqrt(count)
@@ -177,7 +177,7 @@ def smallest_singular_value(count, lower, u, y):
         norm = math.sqrt(norm)
         for i in range(count):
             u[i] /= norm
-        if abs(previous - sigma) <= 1e-6 * sigma:
+        if abs(previous - sigma) <= tolerance * sigma:
             break
     return sigma
 
@@ -201,7 +201,7 @@ def sigma_min(model, law, work, grounded):
     lower = work.lower
     count = active_rows(model, grounded, work.rows)
     k = factor_rows(work.B, work.rows, count, law.shape_joints, work.ones, work.row, lower, work.reflector, work.beta)
-    return smallest_singular_value(k, lower, work.singular, work.solution)
+    return smallest_singular_value(k, 1e-6, lower, work.singular, work.solution)
 
 
 @kernel
@@ -287,7 +287,7 @@ def control_input(model, law, work, w, phi, w_target, velocity, mode, null_gain)
     for s in range(shape_joints.shape[0]):
         rhs[count + s] = -gain[6 + s] * (phi[shape_joints[s]] - shape_target[s])
 
-    sigma = smallest_singular_value(rows, lower, singular, work.solution)
+    sigma = smallest_singular_value(rows, 1e-3, lower, singular, work.solution)
     work.withheld[0] = 0.0
     if sigma < law.damping_sigma:
         ratio = sigma / law.damping_sigma
