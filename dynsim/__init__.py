@@ -1,5 +1,54 @@
-"""dynsim: dynamic simulator of braced hyper-redundant manipulators."""
+"""dynsim: dynamic simulator of braced hyper-redundant manipulators.
+
+>>> import dynsim
+>>> scenario = dynsim.load_scenario("elbow_comparison", variant="two_elbows")
+>>> record = dynsim.simulate(scenario)
+>>> record.summary["electrical_energy_J"], record["q"].shape, record.units["q"]
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 from dynsim._version import __version__
+from dynsim.errors import DynsimError
 
-__all__ = ["__version__"]
+if TYPE_CHECKING:
+    from dynsim.model.model import Model
+    from dynsim.record import Record
+    from dynsim.scenario import Scenario, build_model, load_scenario
+    from dynsim.simulate import simulate
+    from dynsim.studies.compare import compare
+
+__all__ = [
+    "DynsimError",
+    "Model",
+    "Record",
+    "Scenario",
+    "__version__",
+    "build_model",
+    "compare",
+    "load_scenario",
+    "simulate",
+]
+
+# Loaded on first use: numba and pydantic take a second that `dynsim --help` need not wait for.
+_HOME = {
+    "Model": "dynsim.model.model",
+    "Record": "dynsim.record",
+    "Scenario": "dynsim.scenario",
+    "build_model": "dynsim.scenario",
+    "compare": "dynsim.studies.compare",
+    "load_scenario": "dynsim.scenario",
+    "simulate": "dynsim.simulate",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        # A submodule of the same name as a function (simulate) must not shadow it.
+        value = getattr(importlib.import_module(_HOME[name]), name)
+        globals()[name] = value
+        return value
+    raise AttributeError(f"module 'dynsim' has no attribute {name!r}")

@@ -1,0 +1,1 @@
+"""Controllers, one file each: ``Config`` for the scenario and ``build``."""

@@ -47,13 +47,34 @@ def is_cached() -> bool:
 def kernel(function: F) -> F:
     """Compile ``function`` on first call and keep the machine code on disk.
 
-    No ``fastmath``: NaN must stay NaN so that divergence is seen. ``error_model="numpy"``: a division by zero gives
-    inf or NaN and does not branch.
+    Of fast-math only contraction (a·b + c in one rounding) is allowed: reordering would let the compiler assume that
+    there are no NaNs, and NaN must stay NaN so that divergence is seen. ``error_model="numpy"``: a division by zero
+    gives inf or NaN and does not branch.
     """
+    return _compile(function)
+
+
+def inlined_kernel(function: F) -> F:
+    """As :func:`kernel`, for the parts of one right-hand side: merged into their caller by LLVM.
+
+    Passing the tables of a model costs about as much as a whole sweep over ten links.
+    """
+    return _compile(function, forceinline=True)
+
+
+def merged_kernel(function: F) -> F:
+    """As :func:`kernel`, for callers of the right-hand side: merged into their caller before compilation.
+
+    A compiled function carries the code of all it calls, so each extra level would compile the right-hand side again.
+    """
+    return _compile(function, inline="always")
+
+
+def _compile(function: F, **options: Any) -> F:
     previous = config.CACHE_DIR
     config.CACHE_DIR = str(cache_folder())
     try:
-        return numba.njit(cache=True, error_model="numpy")(function)
+        return numba.njit(cache=True, error_model="numpy", fastmath={"contract"}, **options)(function)
     finally:
         config.CACHE_DIR = previous
 

@@ -1,0 +1,87 @@
+"""Joint references for a hand path, on the joints that the scenario names; and their quintic splines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
+
+from dynsim.errors import UnreachableReference
+from dynsim.model.model import Model
+
+Array = NDArray[np.float64]
+
+ITERATIONS = 200
+STEP_MAX = 0.3  # [rad or m] per iteration, so that the branch of the start is kept
+
+
+def follow(model: Model, times: Array, targets: Array, joints: Sequence[str], q: Array, tolerance: float) -> Array:
+    """Positions of ``joints`` that put the hand on ``targets`` at ``times``; the others stay as in ``q``.
+
+    Damped Gauss–Newton from the previous solution: dq = Jᵀ (J Jᵀ + λ 1)⁻¹ e, with λ falling with the error, so that
+    near a solution it is Newton's method and far from one it does not jump. More than three joints move as little as
+    possible.
+
+    Parameters
+    ----------
+    times : (T,) [s]; targets : (T, 3) [m]
+    joints : names of the joints that move
+    q : (n,) configuration to start from; it selects the branch
+    tolerance : distance that counts as reached [m]
+
+    Returns
+    -------
+    array, shape (T, len(joints)) [rad or m]
+
+    Raises
+    ------
+    UnreachableReference
+        With the first time at which the hand cannot reach its target, and the distance that is left.
+    """
+    columns = [model.joint_names.index(name) for name in joints]
+    body, point = model.robot.hand
+    q = q.copy()
+    result = np.zeros((len(times), len(columns)))
+    for k, (t, target) in enumerate(zip(times, targets, strict=True)):
+        best = np.inf
+        for _ in range(ITERATIONS):
+            position, jacobian = model.point_position_and_jacobian(body, point, q)
+            error = target - position
+            distance = float(np.linalg.norm(error))
+            best = min(best, distance)
+            # Two orders below the tolerance: the references shall be smooth, not just close.
+            if distance < 1e-4 * tolerance:
+                break
+            J = jacobian[:, columns]
+            gram = J @ J.T
+            gram[np.diag_indices(3)] += 1e-12 + 0.1 * distance**2
+            step = J.T @ np.linalg.solve(gram, error)
+            q[columns] += step * min(1.0, STEP_MAX / max(float(np.abs(step).max()), 1e-300))
+        if best > tolerance:
+            raise UnreachableReference(
+                f"the hand cannot follow its path with {', '.join(joints)}: at t = {t:.3f} s it stays "
+                f"{best:.4g} m from ({target[0]:.4g}, {target[1]:.4g}, {target[2]:.4g}) m; "
+                "move the path, or let more joints follow it"
+            )
+        result[k] = q[columns]
+    return result
+
+
+def spline_coefficients(times: Array, values: Array) -> Array:
+    """Quintic spline through ``values`` at equally spaced ``times`` as (segments, columns, 6) ascending powers.
+
+    Inside a segment the polynomial is the one that the spline's value, slope and curvature at both ends determine.
+    """
+    spline = make_interp_spline(times, values, k=5)
+    h = float(times[1] - times[0])
+    y, s, c = spline(times), spline(times, 1) * h, spline(times, 2) * h**2
+    dy = y[1:] - y[:-1] - s[:-1] - 0.5 * c[:-1]
+    ds = s[1:] - s[:-1] - c[:-1]
+    dc = c[1:] - c[:-1]
+    a3 = 10.0 * dy - 4.0 * ds + 0.5 * dc
+    a4 = -15.0 * dy + 7.0 * ds - dc
+    a5 = 6.0 * dy - 3.0 * ds + 0.5 * dc
+    powers = np.stack([y[:-1], s[:-1], 0.5 * c[:-1], a3, a4, a5], axis=-1)
+    return powers / h ** np.arange(6)

@@ -1,0 +1,133 @@
+"""Continuous voltage PD on joint references ([WM] eq 56): u = k_p (q_d − q) + k_d (v_d − v)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+from scipy.interpolate import CubicSpline
+
+from dynsim.config import NonNegative, Positive, StrictConfig
+from dynsim.control.inverse_kinematics import follow, spline_coefficients
+from dynsim.errors import ModelError
+from dynsim.families import union
+from dynsim.kernels.arrays import ReferenceArrays
+from dynsim.kernels.jit import integers, reals
+from dynsim.model.model import Model
+
+PathChoice = union("path")
+
+
+class HandReference(StrictConfig):
+    """A path of the hand, turned into references of ``joints`` by inverse kinematics."""
+
+    path: PathChoice
+    joints: list[str] = Field(min_length=1, description="joints that follow the path; the others hold")
+    tolerance_m: Positive = Field(default=1e-6, description="a target further off than this is unreachable")
+
+
+class JointPath(StrictConfig):
+    """Waypoints of one joint: a cubic spline, at rest at both ends and held beyond them."""
+
+    times_s: list[float] = Field(min_length=2)
+    angles_deg: list[float] = Field(min_length=2)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len(self.times_s) != len(self.angles_deg):
+            raise ValueError(
+                f"{len(self.times_s)} times_s and {len(self.angles_deg)} angles_deg: there must be as many"
+            )
+        if np.any(np.diff(self.times_s) <= 0.0):
+            raise ValueError("times_s must increase")
+        return self
+
+
+class Config(StrictConfig):
+    """Gains for all motors or one per motor; joints without a reference hold their initial position."""
+
+    type: Literal["joint_pd"]
+    k_p_V_per_rad: NonNegative | list[NonNegative] = 500.0
+    k_d_V_s_per_rad: NonNegative | list[NonNegative] = 20.0
+    hand: HandReference | None = Field(default=None, description="a path for the hand")
+    joints: dict[str, JointPath] = Field(default={}, description="waypoints by joint name")
+    knot_spacing_s: Positive = Field(default=0.02, description="distance of the knots of the reference splines")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        both = [name for name in self.joints if self.hand is not None and name in self.hand.joints]
+        if both:
+            raise ValueError(f"{both[0]} cannot follow both the hand path and waypoints of its own")
+        return self
+
+
+@dataclass(frozen=True)
+class Control:
+    """What the controller hands to the simulation: gains per motor, reference splines, and the hand's target."""
+
+    k_p: NDArray[np.float64]
+    k_d: NDArray[np.float64]
+    reference: ReferenceArrays
+    path: PathChoice | None
+
+    def target(self, t: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Target of the hand at times t, (T, 3) [m]; None without a hand path."""
+        return None if self.path is None else self.path.position(t)
+
+
+def build(config: Config, model: Model, duration: float) -> Control:
+    """Resolve gains and references for a robot.
+
+    Raises
+    ------
+    ModelError
+        A named joint does not exist or has no motor, or there are not as many gains as motors.
+    UnreachableReference
+        The hand cannot follow its path.
+    """
+    robot = model.robot
+    driven = [motor.joint for motor in robot.motors]
+    named = [*config.joints, *(config.hand.joints if config.hand else ())]
+    for name in named:
+        if name not in driven:
+            raise ModelError(f"controller: {name!r} is no joint with a motor; those are: {', '.join(driven) or 'none'}")
+    held = np.array([robot.initial[model.joint_names.index(name)] for name in driven])
+    spline = np.full(len(driven), -1)
+    grid, coefficients = [0.0, 1.0], np.zeros((1, 0, 6))
+    if named:
+        # A quintic spline needs six knots.
+        times = np.linspace(0.0, duration, max(int(np.ceil(duration / config.knot_spacing_s)), 6) + 1)
+        columns = [_waypoints(path, times) for path in config.joints.values()]
+        if config.hand is not None:
+            targets = config.hand.path.position(times)
+            followed = follow(model, times, targets, config.hand.joints, robot.initial, config.hand.tolerance_m)
+            columns.extend(followed.T)
+        coefficients = spline_coefficients(times, np.stack(columns, axis=1))
+        grid = [0.0, float(times[1])]
+        for k, name in enumerate(named):
+            spline[driven.index(name)] = k
+    reference = ReferenceArrays(
+        spline=integers(spline), held=reals(held), grid=reals(grid), coefficients=reals(coefficients)
+    )
+    return Control(
+        k_p=_per_motor(config.k_p_V_per_rad, driven, "k_p_V_per_rad"),
+        k_d=_per_motor(config.k_d_V_s_per_rad, driven, "k_d_V_s_per_rad"),
+        reference=reference,
+        path=config.hand.path if config.hand else None,
+    )
+
+
+def _waypoints(path: JointPath, times: NDArray[np.float64]) -> NDArray[np.float64]:
+    spline = CubicSpline(path.times_s, np.deg2rad(path.angles_deg), bc_type="clamped")
+    return spline(np.clip(times, path.times_s[0], path.times_s[-1]))
+
+
+def _per_motor(gain: float | list[float], driven: list[str], key: str) -> NDArray[np.float64]:
+    if isinstance(gain, list):
+        if len(gain) != len(driven):
+            raise ModelError(f"controller: {key} has {len(gain)} values, there are {len(driven)} motors")
+        return np.array(gain)
+    return np.full(len(driven), gain)

@@ -1,0 +1,49 @@
+"""A hand path from a CSV file with the columns t_s, x_m, y_m, z_m."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+from scipy.interpolate import PchipInterpolator
+
+from dynsim.config import StrictConfig
+
+COLUMNS = ("t_s", "x_m", "y_m", "z_m")
+
+
+class Config(StrictConfig):
+    """Shape-preserving cubic through the rows of ``file``, held beyond its ends."""
+
+    type: Literal["csv"]
+    file: str = Field(description="CSV file, relative to the scenario file, with a header t_s,x_m,y_m,z_m")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _table(self.file)
+        return self
+
+    def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The curve at times t [s], shape (T, 3) [m]."""
+        table = _table(self.file)
+        return PchipInterpolator(table[:, 0], table[:, 1:])(np.clip(t, table[0, 0], table[-1, 0]))
+
+
+@lru_cache(maxsize=8)
+def _table(file: str) -> NDArray[np.float64]:
+    """Rows (t, x, y, z) of the file; ValueError names what is wrong with it."""
+    path = Path(file)
+    if not path.is_file():
+        raise ValueError(f"no such file: {path}")
+    with path.open(encoding="utf-8") as stream:
+        header = [name.strip() for name in stream.readline().split(",")]
+        if tuple(header) != COLUMNS:
+            raise ValueError(f"{path}: the first line is {','.join(header)!r}; it must be {','.join(COLUMNS)!r}")
+        table = np.loadtxt(stream, delimiter=",", ndmin=2)
+    if len(table) < 2 or not np.isfinite(table).all() or np.any(np.diff(table[:, 0]) <= 0.0):
+        raise ValueError(f"{path}: needs two rows or more, finite numbers and increasing t_s")
+    return table

@@ -1,0 +1,33 @@
+"""A smooth curve through points at given times."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+from scipy.interpolate import CubicSpline
+
+from dynsim.config import StrictConfig, Vector3
+
+
+class Config(StrictConfig):
+    """Cubic spline through ``points_m`` at ``times_s``, at rest at both ends and held beyond them."""
+
+    type: Literal["waypoints"]
+    times_s: list[float] = Field(min_length=2)
+    points_m: list[Vector3] = Field(min_length=2)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if len(self.times_s) != len(self.points_m):
+            raise ValueError(f"{len(self.times_s)} times_s and {len(self.points_m)} points_m: there must be as many")
+        if np.any(np.diff(self.times_s) <= 0.0):
+            raise ValueError("times_s must increase")
+        return self
+
+    def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The spline at times t [s], shape (T, 3) [m]."""
+        spline = CubicSpline(self.times_s, np.array(self.points_m), bc_type="clamped")
+        return spline(np.clip(t, self.times_s[0], self.times_s[-1]))

@@ -1,0 +1,161 @@
+"""What the kernels read and write: a few flat tables per concept, in SI units and the world frame W.
+
+n links (one velocity each), na motors, c contact points. A link is one joint and the body it carries; links are ordered
+so that a parent comes before its children. Spatial vectors are (angular, linear) at the world origin, so inertias and
+forces of different bodies simply add.
+
+A table is one array whose columns are named by the constants below. Few arrays matter: every array of an argument
+costs reference counting and copying in each compiled call, and one row per link stays in one or two cache lines.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+# Joint kinds. The three axis-aligned revolute joints are special cases of REVOLUTE, for speed.
+REVOLUTE_X, REVOLUTE_Y, REVOLUTE_Z, REVOLUTE, PRISMATIC = 0, 1, 2, 3, 4
+# Friction of a contact under a negative (pulling) normal force, see dynsim.kernels.contact.
+FRICTION_SIGNED, FRICTION_DISSIPATIVE = 0, 1
+# Solvers of the coupled system.
+SOLVER_ARTICULATED, SOLVER_M_STAR = 0, 1
+
+# ModelArrays.tree, int
+PARENT = 0  # index of the parent link, -1 for the world
+KIND = 1  # joint kind
+TURNED = 2  # 0 when R_PJ is the identity, so that one product can be skipped
+BRANCHES = 3  # number of children other than link i + 1
+TREE_SIZE = 4
+# ModelArrays.body
+R_PJ = 0  # 9: rotation of the joint frame at q = 0 in the parent's frame, row-major
+P_PJ = 9  # 3: origin of the joint frame in the parent's frame [m]
+AXIS = 12  # 3: joint axis in the body's frame, unit length
+MASS = 15  # [kg]
+COM = 16  # 3: centre of mass in B [m]
+INERTIA = 19  # 6: about the centre of mass, in B, xx xy xz yy yz zz [kg m^2]
+ARMATURE = 25  # reflected motor inertia J_m [kg m^2 or kg]
+DAMPING = 26  # viscous joint loss D [N m s/rad or N s/m]
+GEAR_DAMPING = 27  # viscous gear loss D_m, reflected [N m s/rad or N s/m]
+BODY_SIZE = 28
+# DriveArrays.motor
+K_M = 0  # K k [N m/A = V s/rad]
+RESISTANCE = 1  # [ohm]
+INDUCTANCE = 2  # [H]
+J_M = 3  # I_m k^2 [kg m^2]
+D_M = 4  # d_m k^2 [N m s/rad]
+K_P = 5  # [V/rad]
+K_D = 6  # [V s/rad]
+U_MAX = 7  # voltage limit [V], inf for none
+MOTOR_SIZE = 8
+# ContactArrays.link, int
+LINK = 0
+FRICTION_LAW = 1
+# ContactArrays.point
+POINT = 0  # 3: in the body's frame [m]
+QUADRIC = 3  # 10: C(r) = r.Q r/2 + b.r + c: Q xx xy xz yy yz zz, b, c
+MU = 13  # kinetic friction coefficient
+V_S = 14  # smoothing speed of the slip direction [m/s]
+POINT_SIZE = 15
+
+# Workspace.links
+R = 0  # 9: R_WB, row-major
+P = 9  # 3: p_WB [m]
+S = 12  # 6: joint axis as a motion vector at the world origin
+RIGID = 18  # 10: m; h = m c; inertia about the world origin xx xy xz yy yz zz
+V = 28  # 6: spatial velocity
+A = 34  # 6: spatial acceleration minus gravity
+F = 40  # 6: wrench through the joint
+IA = 46  # 21: articulated inertia: angular block 6, coupling 9 row-major, linear block 6
+U = 67  # 6: IA S
+D = 73  # 1 / (S.U + J_m)
+LINK_SIZE = 74
+# Workspace.joints
+Q = 0  # [rad or m]
+QD = 1  # v [rad/s or m/s]
+QDD = 2  # vdot
+BIAS = 3  # h + g, or the result of newton_euler
+APPLIED = 4  # applied generalised force
+JOINT_SIZE = 5
+# Workspace.motors
+CURRENT = 0  # [A]
+VOLTAGE = 1  # [V]
+Q_REF = 2  # [rad]
+V_REF = 3  # [rad/s]
+DIDT = 4  # [A/s]
+MOTOR_STATE_SIZE = 5
+# Workspace.contacts
+ROW = 0  # 6: the constraint's motion is ROW . V
+DIRECTION = 6  # 6: wrench of a unit constraint force
+TARGET = 12  # J vdot must equal this [m/s^2]
+RHS = 13  # right-hand side of the small system
+FORCE = 14  # normal force f_n [N]
+SIGN = 15  # sign of the normal force that DIRECTION was built for
+NORMAL = 16  # 3: surface normal in W
+TANGENT = 19  # 3: smoothed slip direction in W
+POSITION = 22  # 3: in W [m]
+SLIP_VELOCITY = 25  # 3: tangential velocity [m/s]
+GAP = 28  # signed distance from the surface [m]
+GAP_RATE = 29  # [m/s]
+CONTACT_STATE_SIZE = 30
+
+
+class ModelArrays(NamedTuple):
+    """The tree of bodies."""
+
+    tree: np.ndarray  # (n, TREE_SIZE) int
+    body: np.ndarray  # (n, BODY_SIZE)
+    gravity: np.ndarray  # (3,) in W [m/s^2]
+
+
+class DriveArrays(NamedTuple):
+    """DC motors with their circuits, and the continuous PD law that sets their voltages."""
+
+    link: np.ndarray  # (na,) int: the link whose joint the motor drives
+    motor: np.ndarray  # (na, MOTOR_SIZE)
+
+
+class ReferenceArrays(NamedTuple):
+    """Joint references q_d(t): held angles, and quintic splines on one uniform grid for the moving ones."""
+
+    spline: np.ndarray  # (na,) int: row of coefficients, -1 for a held joint
+    held: np.ndarray  # (na,) constant angle of a held joint
+    grid: np.ndarray  # (2,) time of the first knot, knot distance [s]
+    coefficients: np.ndarray  # (segments, splines, 6) ascending powers of t - t_knot
+
+
+class ContactArrays(NamedTuple):
+    """Points on bodies held to surfaces. A surface is a quadric C(r) = r.Q r / 2 + b.r + c."""
+
+    link: np.ndarray  # (c, 2) int
+    point: np.ndarray  # (c, POINT_SIZE)
+
+
+class Workspace(NamedTuple):
+    """Everything a right-hand side computes on its way; allocated once."""
+
+    links: np.ndarray  # (n, LINK_SIZE)
+    joints: np.ndarray  # (n, JOINT_SIZE)
+    motors: np.ndarray  # (na, MOTOR_STATE_SIZE)
+    contacts: np.ndarray  # (c, CONTACT_STATE_SIZE)
+    column: np.ndarray  # (n, 1 + 2c) eliminated right-hand sides: applied force, c rows, c force directions
+    small: np.ndarray  # (4, c, c) the p×p system J M^-1 F and the scratch of its solve
+    dense: np.ndarray  # (m, m + 1), m = n + c + na: M* of [WM] eq 33 and b; empty unless the solver is m_star
+    deficient: np.ndarray  # (1,) int: number of right-hand sides whose constraint forces were not unique
+
+
+def workspace(n: int, na: int, c: int, *, dense: bool) -> Workspace:
+    """Allocate a :class:`Workspace` for n links, na motors and c contacts."""
+    size = n + c + na if dense else 0
+    contacts = np.zeros((c, CONTACT_STATE_SIZE))
+    contacts[:, SIGN] = 1.0
+    return Workspace(
+        links=np.zeros((n, LINK_SIZE)),
+        joints=np.zeros((n, JOINT_SIZE)),
+        motors=np.zeros((na, MOTOR_STATE_SIZE)),
+        contacts=contacts,
+        column=np.zeros((n, 1 + 2 * c)),
+        small=np.zeros((4, c, c)),
+        dense=np.zeros((size, size + 1)),
+        deficient=np.zeros(1, dtype=np.int64),
+    )

@@ -1,0 +1,101 @@
+"""The coupled system of bodies, motors and contacts as one right-hand side dy/dt ([WM] eqs 28–35).
+
+State y, all in one vector:
+
+    q  (n,)   joint positions [rad or m]
+    v  (n,)   joint rates
+    i  (na,)  motor currents [A]
+    ledger (8,), then impulse and slip of each contact (2 c,): see dynsim.kernels.energy
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from dynsim.kernels.arrays import (
+    APPLIED,
+    CURRENT,
+    DAMPING,
+    DIDT,
+    GEAR_DAMPING,
+    INDUCTANCE,
+    K_M,
+    LINK,
+    QD,
+    QDD,
+    SOLVER_M_STAR,
+    ContactArrays,
+    DriveArrays,
+    ModelArrays,
+    Q,
+    ReferenceArrays,
+    Workspace,
+)
+from dynsim.kernels.articulated import accelerate, add_contact_forces, contact_system, eliminate_contact, factor
+from dynsim.kernels.contact import contact_rows, sign_changed
+from dynsim.kernels.drive import emf_balance, motor_voltage
+from dynsim.kernels.energy import ledger_rates
+from dynsim.kernels.jit import inlined_kernel, kernel
+from dynsim.kernels.m_star import solve_m_star
+from dynsim.kernels.newton_euler import forward_sweep
+from dynsim.kernels.rows import solve_small
+
+
+class System(NamedTuple):
+    """All constant data of a simulation."""
+
+    model: ModelArrays
+    drives: DriveArrays
+    reference: ReferenceArrays
+    contacts: ContactArrays
+    solver: int
+
+
+@inlined_kernel
+def constrained_acceleration(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
+    """vdot and contact forces of the applied forces, by the articulated solve, into ``ws.joints``, ``ws.contacts``."""
+    factor(model, ws)
+    p = ws.contacts.shape[0]
+    while p > 0:
+        for k in range(p):
+            eliminate_contact(model, ws, contacts.link[k, LINK], k)
+        contact_system(model, contacts, ws)
+        ws.deficient[0] += solve_small(ws.small, ws.contacts)
+        if not sign_changed(contacts, ws):
+            break
+    add_contact_forces(model, contacts, ws)
+    accelerate(model, ws)
+
+
+@kernel
+def derivative(system: System, t, y, ws: Workspace, dy):
+    """dy/dt of the whole coupled system at time t. y, dy: (2 n + na + 8 + 2 c,)."""
+    model, drives, contacts = system.model, system.drives, system.contacts
+    joints, motors, motor = ws.joints, ws.motors, drives.motor
+    n, na = joints.shape[0], motors.shape[0]
+    for i in range(n):
+        joints[i, Q] = y[i]
+        joints[i, QD] = y[n + i]
+        joints[i, APPLIED] = -(model.body[i, DAMPING] + model.body[i, GEAR_DAMPING]) * joints[i, QD]
+    for a in range(na):
+        motors[a, CURRENT] = y[2 * n + a]
+        joints[drives.link[a], APPLIED] += motor[a, K_M] * motors[a, CURRENT]
+
+    forward_sweep(model, ws, 1.0, 0.0, 1.0)
+    contact_rows(model, contacts, ws)
+    motor_voltage(drives, system.reference, t, ws)
+    if system.solver == SOLVER_M_STAR:
+        solve_m_star(model, drives, contacts, ws)
+        while sign_changed(contacts, ws):
+            solve_m_star(model, drives, contacts, ws)
+    else:
+        constrained_acceleration(model, contacts, ws)
+        for a in range(na):
+            motors[a, DIDT] = emf_balance(drives, ws, a) / motor[a, INDUCTANCE]
+
+    for i in range(n):
+        dy[i] = joints[i, QD]
+        dy[n + i] = joints[i, QDD]
+    for a in range(na):
+        dy[2 * n + a] = motors[a, DIDT]
+    ledger_rates(model, drives, contacts, ws, dy, 2 * n + na)

@@ -1,0 +1,626 @@
+"""Time integration of the coupled system: one step per call of a method, error control, projection, sampling.
+
+Methods, all with dense output (so that records do not force steps):
+
+- ``DOPRI5``: Dormand–Prince 5(4), adaptive, first-same-as-last; dense output of order 4 (Hairer, Nørsett, Wanner:
+  Solving Ordinary Differential Equations I, II.5–II.6);
+- ``RK4``: the classical method at a fixed step; cubic Hermite dense output;
+- ``RODAS4``: a linearly implicit (Rosenbrock) method of order 4(3), stiffly accurate, which keeps its order when the
+  inductance goes to zero (Hairer, Wanner: Solving Ordinary Differential Equations II, IV.7 and VI.4); adaptive.
+
+After each accepted step q and v are projected onto the closed contacts when they have left them by more than
+``GAP_TOLERANCE`` or ``RATE_TOLERANCE``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from dynsim.kernels.arrays import (
+    CURRENT,
+    D_M,
+    DIRECTION,
+    FORCE,
+    GAP,
+    GAP_RATE,
+    INDUCTANCE,
+    J_M,
+    K_D,
+    K_M,
+    K_P,
+    LINK,
+    QD,
+    QDD,
+    RESISTANCE,
+    RHS,
+    SLIP_VELOCITY,
+    U_MAX,
+    VOLTAGE,
+    D,
+    Q,
+    Workspace,
+)
+from dynsim.kernels.articulated import accelerate, eliminate_contact, factor
+from dynsim.kernels.contact import contact_rows
+from dynsim.kernels.coupled import System, derivative
+from dynsim.kernels.energy import kinetic_energy, magnetic_energy, potential_energy
+from dynsim.kernels.jit import kernel, merged_kernel, reals
+from dynsim.kernels.kinematics import point_position
+from dynsim.kernels.newton_euler import forward_sweep
+from dynsim.kernels.rows import solve_small
+
+DOPRI5, RK4, RODAS4 = 0, 1, 2
+METHODS = {"dopri5": DOPRI5, "rk4": RK4, "rodas4": RODAS4}
+
+# Projection: a tenth of the drift that is promised (1e-9 m), and a rate that adds less than that in a step.
+GAP_TOLERANCE = 1e-10
+RATE_TOLERANCE = 1e-8
+PROJECTION_LIMIT = 6
+
+RUNNING, FINISHED, NOT_FINITE, STEP_TOO_SMALL, NOT_PROJECTED = 0, 1, 2, 3, 4
+
+# Run.clock
+TIME, STEP, LAST_ERROR, END, RTOL, ATOL, STEP_MAX = 0, 1, 2, 3, 4, 5, 6
+CLOCK_SIZE = 7
+# Run.count, int
+STEPS, REJECTED, EVALUATIONS, PROJECTIONS, SAMPLE, STATUS, STARTED = 0, 1, 2, 3, 4, 5, 6
+COUNT_SIZE = 7
+# Run.extremes, per contact
+FORCE_MIN, FORCE_MAX, DRIFT_MAX = 0, 1, 2
+EXTREMES_SIZE = 3
+
+
+class Run(NamedTuple):
+    """The moving part of one simulation; m is the length of the state."""
+
+    method: int
+    y: np.ndarray  # (m,) state at TIME
+    y_new: np.ndarray  # (m,)
+    stage: np.ndarray  # (8, m) stage derivatives; stage[0] belongs to y
+    dense: np.ndarray  # (4, m) y(θ) = y + θ (d0 + (1−θ)(d1 + θ (d2 + (1−θ) d3)))
+    jacobian: np.ndarray  # (3 n + 1, m) finite differences along q, v, i, t (rodas4)
+    matrix: np.ndarray  # (n, n) factored stage matrix (rodas4)
+    pivot: np.ndarray  # (n,) int (rodas4)
+    gain: np.ndarray  # (na, 2) k_p and k_d where the voltage is not at its limit, else 0 (rodas4)
+    clock: np.ndarray  # (CLOCK_SIZE,)
+    count: np.ndarray  # (COUNT_SIZE,) int
+    extremes: np.ndarray  # (c, EXTREMES_SIZE)
+    hand_link: int
+    hand_point: np.ndarray  # (3,) in the body's frame
+    sample_time: np.ndarray  # (T,)
+    sample: np.ndarray  # (T, m) states
+    output: np.ndarray  # (T, output_size) see write_output
+
+
+def new_run(
+    method: int,
+    y: np.ndarray,
+    *,
+    n: int,
+    na: int,
+    c: int,
+    sample_time: np.ndarray,
+    hand: tuple[int, np.ndarray],
+    end: float,
+    step: float,
+    step_max: float,
+    rtol: float,
+    atol: float,
+) -> Run:
+    """Allocate a :class:`Run` from t = 0 at state y, (2 n + na + 8 + 2 c,)."""
+    m, rodas = len(y), method == RODAS4
+    clock = np.zeros(CLOCK_SIZE)
+    clock[[STEP, LAST_ERROR, END, RTOL, ATOL, STEP_MAX]] = step, 1e-4, end, rtol, atol, step_max
+    extremes = np.zeros((c, EXTREMES_SIZE))
+    extremes[:, FORCE_MIN], extremes[:, FORCE_MAX] = np.inf, -np.inf
+    return Run(
+        method=method,
+        y=reals(y),
+        y_new=np.zeros(m),
+        stage=np.zeros((8, m)),
+        dense=np.zeros((4, m)),
+        jacobian=np.zeros((2 * n + na + 1, m) if rodas else (0, 0)),
+        matrix=np.zeros((n, n) if rodas else (0, 0)),
+        pivot=np.zeros(n if rodas else 0, dtype=np.int64),
+        gain=np.zeros((na, 2)),
+        clock=clock,
+        count=np.zeros(COUNT_SIZE, dtype=np.int64),
+        extremes=extremes,
+        hand_link=hand[0],
+        hand_point=reals(hand[1]),
+        sample_time=reals(sample_time),
+        sample=np.zeros((len(sample_time), m)),
+        output=np.zeros((len(sample_time), output_size(n, na, c))),
+    )
+
+
+def output_size(n: int, na: int, c: int) -> int:
+    """Columns of ``Run.output``: vdot n, voltage na, torque na, hand 3, energies 3, then per contact 8."""
+    return n + 2 * na + 6 + 8 * c
+
+
+@merged_kernel
+def write_output(system: System, ws: Workspace, run: Run, row):
+    """Everything worth recording that is not a state, after ``derivative``: see :func:`output_size`.
+
+    Energies are kinetic, potential, magnetic. Per contact: f_n, the force vector (3), gap, slip velocity (3).
+    """
+    out, joints, motors, motor, state = run.output, ws.joints, ws.motors, system.drives.motor, ws.contacts
+    k = 0
+    for i in range(joints.shape[0]):
+        out[row, k] = joints[i, QDD]
+        k += 1
+    for a in range(motors.shape[0]):
+        i = system.drives.link[a]
+        out[row, k] = motors[a, VOLTAGE]
+        out[row, k + motors.shape[0]] = (
+            motor[a, K_M] * motors[a, CURRENT] - motor[a, J_M] * joints[i, QDD] - motor[a, D_M] * joints[i, QD]
+        )
+        k += 1
+    k += motors.shape[0]
+    point_position(ws, run.hand_link, run.hand_point, out[row, k : k + 3])
+    out[row, k + 3] = kinetic_energy(system.model, ws)
+    out[row, k + 4] = potential_energy(system.model, ws)
+    out[row, k + 5] = magnetic_energy(system.drives, ws)
+    k += 6
+    for c in range(state.shape[0]):
+        out[row, k] = state[c, FORCE]
+        out[row, k + 4] = state[c, GAP]
+        for s in range(3):
+            out[row, k + 1 + s] = state[c, FORCE] * state[c, DIRECTION + 3 + s]
+            out[row, k + 5 + s] = state[c, SLIP_VELOCITY + s]
+        k += 8
+
+
+@merged_kernel
+def off_surface(ws: Workspace):
+    """True when a contact has left its surface by more than the projection tolerances."""
+    state = ws.contacts
+    for k in range(state.shape[0]):
+        if abs(state[k, GAP]) > GAP_TOLERANCE or abs(state[k, GAP_RATE]) > RATE_TOLERANCE:
+            return True
+    return False
+
+
+@merged_kernel
+def project(system: System, ws: Workspace, y):
+    """One Newton step of q and v onto the contacts, weighted by the mass matrix.
+
+    dq = −M⁻¹ Jᵀ λ with J M⁻¹ Jᵀ λ = gap, and the same for v with J v: the nearest point in the kinetic metric.
+    """
+    model, contacts, state, column, small = system.model, system.contacts, ws.contacts, ws.column, ws.small
+    n, p = ws.joints.shape[0], state.shape[0]
+    for i in range(n):
+        ws.joints[i, Q] = y[i]
+        ws.joints[i, QD] = y[n + i]
+    forward_sweep(model, ws, 1.0, 0.0, 0.0)
+    contact_rows(model, contacts, ws)
+    factor(model, ws)
+    for i in range(n):
+        for k in range(2 * p + 1):
+            column[i, k] = 0.0
+    for k in range(p):
+        eliminate_contact(model, ws, contacts.link[k, LINK], k)
+    for level in range(2):
+        for k in range(p):
+            state[k, RHS] = state[k, GAP] if level == 0 else state[k, GAP_RATE]
+            for m in range(p):
+                total = 0.0
+                for i in range(n):
+                    total += column[i, 1 + k] * column[i, 1 + m] * ws.links[i, D]
+                small[0, k, m] = total
+        solve_small(small, state)
+        for i in range(n):
+            column[i, 0] = 0.0
+            for k in range(p):
+                column[i, 0] -= state[k, FORCE] * column[i, 1 + k]
+        accelerate(model, ws)
+        for i in range(n):
+            y[level * n + i] += ws.joints[i, QDD]
+
+
+@kernel
+def settle(system: System, t, y, ws: Workspace, dy, run: Run):
+    """Derivative at y, projecting y first where needed. Returns False when the contacts cannot be met."""
+    derivative(system, t, y, ws, dy)
+    run.count[EVALUATIONS] += 1
+    for _ in range(PROJECTION_LIMIT):
+        if not off_surface(ws):
+            return True
+        project(system, ws, y)
+        derivative(system, t, y, ws, dy)
+        run.count[EVALUATIONS] += 1
+        run.count[PROJECTIONS] += 1
+    return not off_surface(ws)
+
+
+@merged_kernel
+def error_norm(run: Run, size, error):
+    """Root mean square of error / (atol + rtol |y|) over positions, rates and currents, the first ``size`` states."""
+    y, y_new, atol, rtol = run.y, run.y_new, run.clock[ATOL], run.clock[RTOL]
+    total = 0.0
+    for j in range(size):
+        x = error[j] / (atol + rtol * max(abs(y[j]), abs(y_new[j])))
+        total += x * x
+    return math.sqrt(total / size)
+
+
+@merged_kernel
+def ledger_length(ws: Workspace):
+    """Number of integrals at the end of the state."""
+    return 8 + 2 * ws.contacts.shape[0]
+
+
+# Explicit methods: stage rows a_ij, with the solution as the last row, whose derivative is the next step's first stage.
+A_DOPRI5 = np.array(
+    [
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [1 / 5, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [3 / 40, 9 / 40, 0.0, 0.0, 0.0, 0.0],
+        [44 / 45, -56 / 15, 32 / 9, 0.0, 0.0, 0.0],
+        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0.0, 0.0],
+        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0.0],
+        [35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84],
+    ]
+)
+NODE_DOPRI5 = np.array([0.0, 0.2, 0.3, 0.8, 8 / 9, 1.0, 1.0])
+ERROR_DOPRI5 = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
+A_RK4 = np.array(
+    [[0.0] * 4, [0.5, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1 / 6, 1 / 3, 1 / 3, 1 / 6]]
+)
+NODE_RK4 = np.array([0.0, 0.5, 0.5, 1.0, 1.0])
+
+
+@merged_kernel
+def combine(y, h, row, stages, k, y_new):
+    """y_new = y + h Σ row_s k_s over the first ``stages`` stages."""
+    for j in range(y.shape[0]):
+        y_new[j] = y[j]
+    for s in range(stages):
+        if row[s] != 0.0:
+            w = h * row[s]
+            for j in range(y.shape[0]):
+                y_new[j] += w * k[s, j]
+
+
+@kernel
+def step_explicit(system: System, ws: Workspace, run: Run):
+    """One step of an explicit Runge–Kutta method; returns the error norm, 0 for the fixed-step method.
+
+    The last stage is the derivative at y_new; it is left in stage[6], the error estimate in stage[7].
+    """
+    t, h, y, y_new, k = run.clock[TIME], run.clock[STEP], run.y, run.y_new, run.stage
+    adaptive = run.method == DOPRI5
+    A = A_DOPRI5 if adaptive else A_RK4
+    node = NODE_DOPRI5 if adaptive else NODE_RK4
+    last = A.shape[0] - 1
+    for s in range(1, last + 1):
+        combine(y, h, A[s], s, k, y_new)
+        derivative(system, t + node[s] * h, y_new, ws, k[s if s < last else 6])
+    run.count[EVALUATIONS] += last
+    if not adaptive:
+        return 0.0
+    for j in range(y.shape[0]):
+        k[7, j] = 0.0
+    combine(k[7], h, ERROR_DOPRI5, 7, k, k[7])
+    return error_norm(run, y.shape[0] - ledger_length(ws), k[7])
+
+
+# RODAS4(3), coefficients of Hairer and Wanner: a_ij and c_ij by stage, nodes, γ_i, dense output.
+GAMMA = 0.25
+A_RODAS = np.array(
+    [
+        [0.0, 0.0, 0.0, 0.0, 0.0],
+        [1.544000000000000, 0.0, 0.0, 0.0, 0.0],
+        [0.9466785280815826, 0.2557011698983284, 0.0, 0.0, 0.0],
+        [3.314825187068521, 2.896124015972201, 0.9986419139977817, 0.0, 0.0],
+        [1.221224509226641, 6.019134481288629, 12.53708332932087, -0.6878860361058950, 0.0],
+        [1.221224509226641, 6.019134481288629, 12.53708332932087, -0.6878860361058950, 1.0],
+    ]
+)
+C_RODAS = np.array(
+    [
+        [0.0, 0.0, 0.0, 0.0, 0.0],
+        [-5.668800000000000, 0.0, 0.0, 0.0, 0.0],
+        [-2.430093356833875, -0.2063599157091915, 0.0, 0.0, 0.0],
+        [-0.1073529058151375, -9.594562251023355, -20.47028614809616, 0.0, 0.0],
+        [7.496443313967647, -10.24680431464352, -33.99990352819905, 11.70890893206160, 0.0],
+        [8.083246795921522, -7.981132988064893, -31.52159432874371, 16.31930543123136, -6.058818238834054],
+    ]
+)
+NODE_RODAS = np.array([0.0, 0.386, 0.21, 0.63, 1.0, 1.0])
+GAMMA_RODAS = np.array([0.25, -0.1043, 0.1035, -0.0362, 0.0, 0.0])
+D_RODAS = np.array(
+    [
+        [10.12623508344586, -7.487995877610167, -34.80091861555747, -7.992771707568823, 1.025137723295662],
+        [-0.6762803392806898, 6.087714651680015, 16.43084320892478, 24.76722511418386, -6.594389125716872],
+    ]
+)
+
+
+@merged_kernel
+def differentiate(system: System, ws: Workspace, run: Run):
+    """Finite differences of the right-hand side along q, v, i and t at (TIME, y), into ``run.jacobian``.
+
+    Currents enter linearly, so their differences are exact; the stiff electrical rows are not taken from here but
+    written out in :func:`step_rodas4`.
+    """
+    t, y, y_new, k = run.clock[TIME], run.y, run.y_new, run.stage
+    m, states = y.shape[0], y.shape[0] - ledger_length(ws)
+    for j in range(m):
+        y_new[j] = y[j]
+    # The workspace may still hold a sample or a rejected step.
+    derivative(system, t, y, ws, k[7])
+    for a in range(ws.motors.shape[0]):
+        follows = 1.0 if abs(ws.motors[a, VOLTAGE]) < system.drives.motor[a, U_MAX] else 0.0
+        run.gain[a, 0] = follows * system.drives.motor[a, K_P]
+        run.gain[a, 1] = follows * system.drives.motor[a, K_D]
+    for s in range(states):
+        delta = 1e-7 * max(abs(y[s]), 1.0)
+        y_new[s] = y[s] + delta
+        delta = y_new[s] - y[s]
+        derivative(system, t, y_new, ws, run.jacobian[s])
+        for j in range(m):
+            run.jacobian[s, j] = (run.jacobian[s, j] - k[0, j]) / delta
+        y_new[s] = y[s]
+    delta = 1e-6
+    derivative(system, t + delta, y_new, ws, run.jacobian[states])
+    for j in range(m):
+        run.jacobian[states, j] = (run.jacobian[states, j] - k[0, j]) / delta
+    run.count[EVALUATIONS] += states + 2
+
+
+@merged_kernel
+def factor_stage_matrix(system: System, ws: Workspace, run: Run, h):
+    """Reduced stage matrix of RODAS4 in the rates alone, LU-factored with partial pivoting, into ``run.matrix``.
+
+    With g = 1/(γ h): u_q = (r_q + u_v)/g and u_i = (r_i − (k_p u_q + (k_d + K_m) u_v)/L) / (g + R/L) are exact, which
+    leaves (g − ∂v̇/∂v − ∂v̇/∂q/g + ∂v̇/∂i (k_p/g + k_d + K_m)/L/(g + R/L)) u_v = r. A saturated motor has k_p = k_d = 0.
+    """
+    W, jacobian, motor = run.matrix, run.jacobian, system.drives.motor
+    n, na = ws.joints.shape[0], ws.motors.shape[0]
+    g = 1.0 / (GAMMA * h)
+    for i in range(n):
+        for j in range(n):
+            W[i, j] = -jacobian[n + j, n + i] - jacobian[j, n + i] / g
+        W[i, i] += g
+    for a in range(na):
+        j = system.drives.link[a]
+        slope = (run.gain[a, 0] / g + run.gain[a, 1] + motor[a, K_M]) / (
+            motor[a, INDUCTANCE] * g + motor[a, RESISTANCE]
+        )
+        for i in range(n):
+            W[i, j] += jacobian[2 * n + a, n + i] * slope
+    for k in range(n):
+        best = k
+        for i in range(k + 1, n):
+            if abs(W[i, k]) > abs(W[best, k]):
+                best = i
+        run.pivot[k] = best
+        if best != k:
+            for j in range(n):
+                W[k, j], W[best, j] = W[best, j], W[k, j]
+        for i in range(k + 1, n):
+            W[i, k] /= W[k, k]
+            for j in range(k + 1, n):
+                W[i, j] -= W[i, k] * W[k, j]
+
+
+@kernel
+def step_rodas4(system: System, ws: Workspace, run: Run):
+    """One RODAS4 step; returns the error norm. stage[1…5] are stage vectors, stage[6] the derivative at y_new.
+
+    (1/(γh) − J) u_i = f(t + α_i h, y + Σ a_ij u_j) + Σ c_ij u_j / h + γ_i h ∂f/∂t; y_new = y + Σ a_6j u_j + u_6, and
+    u_6 is the error estimate.
+    """
+    t, h, y, y_new, k = run.clock[TIME], run.clock[STEP], run.y, run.y_new, run.stage
+    n, na, m = ws.joints.shape[0], ws.motors.shape[0], run.y.shape[0]
+    states = 2 * n + na
+    differentiate(system, ws, run)
+    factor_stage_matrix(system, ws, run, h)
+    g = 1.0 / (GAMMA * h)
+    motor, jacobian, W, r = system.drives.motor, run.jacobian, run.matrix, k[7]
+    for s in range(6):
+        u = k[1 + s]
+        for j in range(m):
+            y_new[j] = y[j]
+            for q in range(s):
+                y_new[j] += A_RODAS[s, q] * k[1 + q, j]
+        derivative(system, t + NODE_RODAS[s] * h, y_new, ws, r)
+        for j in range(m):
+            r[j] += GAMMA_RODAS[s] * h * jacobian[states, j]
+            for q in range(s):
+                r[j] += C_RODAS[s, q] / h * k[1 + q, j]
+        for i in range(n):
+            u[n + i] = r[n + i]
+            for j in range(n):
+                u[n + i] += jacobian[j, n + i] * r[j] / g
+        for a in range(na):
+            j = system.drives.link[a]
+            free = r[2 * n + a] - run.gain[a, 0] / motor[a, INDUCTANCE] * r[j] / g
+            free /= g + motor[a, RESISTANCE] / motor[a, INDUCTANCE]
+            for i in range(n):
+                u[n + i] += jacobian[2 * n + a, n + i] * free
+        for i in range(n):
+            p = run.pivot[i]
+            u[n + i], u[n + p] = u[n + p], u[n + i]
+        for i in range(n):
+            for j in range(i):
+                u[n + i] -= W[i, j] * u[n + j]
+        for i in range(n - 1, -1, -1):
+            for j in range(i + 1, n):
+                u[n + i] -= W[i, j] * u[n + j]
+            u[n + i] /= W[i, i]
+        for i in range(n):
+            u[i] = (r[i] + u[n + i]) / g
+        for a in range(na):
+            j = system.drives.link[a]
+            pull = run.gain[a, 0] * u[j] + (run.gain[a, 1] + motor[a, K_M]) * u[n + j]
+            u[2 * n + a] = (r[2 * n + a] - pull / motor[a, INDUCTANCE]) / (
+                g + motor[a, RESISTANCE] / motor[a, INDUCTANCE]
+            )
+        for j in range(states, m):
+            total = r[j]
+            for q in range(states):
+                total += jacobian[q, j] * u[q]
+            u[j] = total / g
+    for j in range(m):
+        y_new[j] += k[6, j]
+        k[7, j] = k[6, j]
+    error = error_norm(run, states, k[7])
+    derivative(system, t + h, y_new, ws, k[6])
+    run.count[EVALUATIONS] += 7
+    return error
+
+
+@merged_kernel
+def fill_dense(run: Run):
+    """Coefficients of the dense output over the step from y to y_new, see ``Run.dense``."""
+    h, y, y_new, k, d = run.clock[STEP], run.y, run.y_new, run.stage, run.dense
+    for j in range(y.shape[0]):
+        d[0, j] = y_new[j] - y[j]
+        d[3, j] = 0.0
+        if run.method == RODAS4:
+            d[1, j], d[2, j] = 0.0, 0.0
+            for s in range(5):
+                d[1, j] += D_RODAS[0, s] * k[1 + s, j]
+                d[2, j] += D_RODAS[1, s] * k[1 + s, j]
+        else:
+            d[1, j] = h * k[0, j] - d[0, j]
+            d[2, j] = d[0, j] - h * k[6, j] - d[1, j]
+            if run.method == DOPRI5:
+                d[3, j] = h * (
+                    -12715105075.0 / 11282082432.0 * k[0, j]
+                    + 87487479700.0 / 32700410799.0 * k[2, j]
+                    - 10690763975.0 / 1880347072.0 * k[3, j]
+                    + 701980252875.0 / 199316789632.0 * k[4, j]
+                    - 1453857185.0 / 822651844.0 * k[5, j]
+                    + 69997945.0 / 29380423.0 * k[6, j]
+                )
+
+
+@merged_kernel
+def sample_step(system: System, ws: Workspace, run: Run):
+    """Record every sample time within the step from TIME to TIME + STEP, from the dense output.
+
+    Samples are projected like steps are, so that recorded gaps hold the promised tolerance too.
+    """
+    t, h = run.clock[TIME], run.clock[STEP]
+    last = run.count[SAMPLE]
+    # A sample at END must not be lost to the rounding of t + h.
+    until = run.clock[END] if t + h >= run.clock[END] - 1e-12 * max(1.0, run.clock[END]) else t + h
+    if last >= run.sample_time.shape[0] or run.sample_time[last] > until:
+        return
+    fill_dense(run)
+    d = run.dense
+    while last < run.sample_time.shape[0] and run.sample_time[last] <= until:
+        x = min((run.sample_time[last] - t) / h, 1.0)
+        z = 1.0 - x
+        row = run.sample[last]
+        for j in range(row.shape[0]):
+            row[j] = run.y[j] + x * (d[0, j] + z * (d[1, j] + x * (d[2, j] + z * d[3, j])))
+        settle(system, run.sample_time[last], row, ws, run.stage[7], run)
+        write_output(system, ws, run, last)
+        last += 1
+    run.count[SAMPLE] = last
+
+
+@merged_kernel
+def watch(ws: Workspace, run: Run):
+    """Extremes of normal forces and gaps at accepted steps."""
+    state, extremes = ws.contacts, run.extremes
+    for k in range(state.shape[0]):
+        extremes[k, FORCE_MIN] = min(extremes[k, FORCE_MIN], state[k, FORCE])
+        extremes[k, FORCE_MAX] = max(extremes[k, FORCE_MAX], state[k, FORCE])
+        extremes[k, DRIFT_MAX] = max(extremes[k, DRIFT_MAX], abs(state[k, GAP]))
+
+
+@merged_kernel
+def finite(values):
+    """True when no element is NaN or infinite."""
+    total = 0.0
+    for j in range(values.shape[0]):
+        total += values[j] * 0.0
+    return total == 0.0
+
+
+@merged_kernel
+def first_step(run: Run, states):
+    """Hairer's first guess of the step size: one that changes the state by a hundredth of its scale."""
+    clock, y, k = run.clock, run.y, run.stage
+    size, slope = 0.0, 0.0
+    for j in range(states):
+        scale = clock[ATOL] + clock[RTOL] * abs(y[j])
+        size += (y[j] / scale) ** 2
+        slope += (k[0, j] / scale) ** 2
+    guess = 0.01 * math.sqrt(size / slope) if size > 1e-10 and slope > 1e-10 else 1e-6
+    clock[STEP] = min(guess, clock[STEP_MAX], clock[END] - clock[TIME])
+
+
+@kernel
+def advance(system: System, ws: Workspace, run: Run, limit):
+    """Take up to ``limit`` steps towards END; run.count[STATUS] says how it ended."""
+    clock, count = run.clock, run.count
+    if count[STARTED] == 0:
+        count[STARTED] = 1
+        if not settle(system, clock[TIME], run.y, ws, run.stage[0], run):
+            count[STATUS] = NOT_PROJECTED
+        elif not finite(run.stage[0]):
+            count[STATUS] = NOT_FINITE
+        else:
+            watch(ws, run)
+            if clock[STEP] <= 0.0:
+                first_step(run, run.y.shape[0] - ledger_length(ws))
+    order = 5.0 if run.method == DOPRI5 else 4.0
+    for _ in range(limit):
+        if count[STATUS] != RUNNING:
+            return
+        t, end = clock[TIME], clock[END]
+        if end - t <= 1e-12 * max(1.0, end):
+            count[STATUS] = FINISHED
+            return
+        proposed = clock[STEP]
+        # Meet END exactly; halve the way there rather than leave a sliver for the last step.
+        remaining = end - t
+        if run.method == RK4:
+            if remaining < proposed * (1.0 + 1e-9):
+                clock[STEP] = remaining
+        elif remaining <= proposed * 1.0000001:
+            clock[STEP] = remaining
+        elif remaining < 2.0 * proposed:
+            clock[STEP] = 0.5 * remaining
+        h = clock[STEP]
+        error = step_rodas4(system, ws, run) if run.method == RODAS4 else step_explicit(system, ws, run)
+        if not (finite(run.y_new) and finite(run.stage[6])) or error != error:
+            if run.method == RK4:
+                count[STATUS] = NOT_FINITE
+                return
+            error = 1e10
+        if error > 1.0:
+            count[REJECTED] += 1
+            clock[STEP] = h * max(0.1, 0.9 * error ** (-1.0 / order))
+            if clock[STEP] < 1e-13 * max(1.0, t):
+                count[STATUS] = NOT_FINITE if error >= 1e10 else STEP_TOO_SMALL
+                return
+            continue
+        if off_surface(ws) and not settle(system, t + h, run.y_new, ws, run.stage[6], run):
+            count[STATUS] = NOT_PROJECTED
+            return
+        watch(ws, run)
+        sample_step(system, ws, run)
+        for j in range(run.y.shape[0]):
+            run.y[j] = run.y_new[j]
+            run.stage[0, j] = run.stage[6, j]
+        clock[TIME] = t + h
+        count[STEPS] += 1
+        if run.method == RK4:
+            clock[STEP] = proposed
+        else:
+            # Proportional–integral control (Hairer, Nørsett, Wanner II.4): calm where stability sets the step.
+            error = max(error, 1e-10)
+            change = 0.9 * error ** (-(1.0 / order - 0.03)) * clock[LAST_ERROR] ** 0.04
+            clock[LAST_ERROR] = max(error, 1e-4)
+            clock[STEP] = min(h * min(max(change, 0.2), 5.0), clock[STEP_MAX])

@@ -1,0 +1,193 @@
+"""From a record to the numbers of its summary: energies, tracking errors, contact forces, warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim._version import __version__
+from dynsim.model.description import Contact, Robot
+from dynsim.record import Record
+from dynsim.scenario import Scenario
+
+# Integrals that the integrator carries, in the order of the state (dynsim.kernels.energy).
+INTEGRALS = {
+    "energy_electrical": "∫ Σ u i dt, net electrical energy",
+    "energy_electrical_drawn": "∫ Σ max(u i, 0) dt, without regeneration",
+    "heat_joule": "∫ Σ R i² dt",
+    "loss_gear": "∫ Σ D_m v² dt",
+    "loss_joint": "∫ Σ D v² dt",
+    "heat_friction": "energy that contact friction takes",
+    "work_constraint": "∫ Σ f_n n·v dt, work of the normal forces",
+    "work_mechanical": "∫ Σ tau v dt, tau of [WM] eq 25",
+}
+# Where the electrical energy goes, in the order in which it is drawn and printed.
+SINKS = ("heat_joule", "loss_gear", "loss_joint", "heat_friction")
+STORES = ("energy_kinetic", "energy_potential", "energy_magnetic")
+
+RESIDUAL_LIMIT = 1e-6
+DRIFT_LIMIT_M = 1e-9
+
+
+@dataclass(frozen=True)
+class Counts:
+    """What the integrator counted."""
+
+    wall: float
+    steps: int
+    rejected: int
+    evaluations: int
+    projections: int
+    deficient: int
+    extremes: NDArray[np.float64]
+
+
+def energy_residual(record: Record) -> NDArray[np.float64]:
+    """Electrical energy and constraint work minus losses minus the change of stored energy, (T,) [J]."""
+    residual = record["energy_electrical"] + record["work_constraint"]
+    for name in SINKS:
+        residual = residual - record[name]
+    for name in STORES:
+        residual = residual - (record[name] - record[name][:1])
+    return residual
+
+
+def energy_turnover(record: Record) -> float:
+    """Energy that changed hands: the largest over time of half the sum of all terms' sizes [J]."""
+    total = np.abs(record["energy_electrical"]) + np.abs(record["work_constraint"])
+    for name in SINKS:
+        total = total + np.abs(record[name])
+    for name in STORES:
+        total = total + np.abs(record[name] - record[name][:1])
+    return float(0.5 * total.max(initial=0.0))
+
+
+def hand_error(record: Record, settle: float) -> dict[str, float | None]:
+    """Root mean square, maximum and vertical root mean square of the hand's distance from its target [m].
+
+    Counted from t = ``settle`` on; None without a target or when the run is shorter.
+    """
+    names = ("hand_error_rms_m", "hand_error_max_m", "hand_error_z_rms_m")
+    window = record.time >= settle
+    if "target_position" not in record or window.sum() < 2:
+        return dict.fromkeys(names)
+    error = (record["hand_position"] - record["target_position"])[window]
+    time = record.time[window]
+    square = (error**2).sum(axis=1)
+    values = (_mean(square, time) ** 0.5, square.max() ** 0.5, _mean(error[:, 2] ** 2, time) ** 0.5)
+    return dict(zip(names, map(float, values), strict=True))
+
+
+def negative_fraction(values: NDArray[np.float64], time: NDArray[np.float64]) -> float:
+    """Fraction of the time for which the polygon through ``values`` is below zero."""
+    if len(time) < 2:
+        return float(len(values) > 0 and values[0] < 0.0)
+    a, b = values[:-1], values[1:]
+    span = np.where(a == b, 1.0, np.abs(b - a))
+    crossing = np.maximum(-np.minimum(a, b), 0.0) / span
+    share = np.where((a < 0) & (b < 0), 1.0, np.where((a < 0) | (b < 0), crossing, 0.0))
+    return float((share * np.diff(time)).sum() / (time[-1] - time[0]))
+
+
+def summarise(
+    record: Record, scenario: Scenario, contacts: Sequence[Contact], robot: Robot, counts: Counts
+) -> dict[str, Any]:
+    """The content of ``summary.json``."""
+    duration = float(record.time[-1] - record.time[0]) if len(record) else 0.0
+
+    def final(name: str) -> float:
+        return float(record[name][-1]) if len(record) else 0.0
+
+    turnover = energy_turnover(record)
+    residual = float(np.abs(record["energy_residual"]).max(initial=0.0))
+    summary: dict[str, Any] = {
+        "scenario": scenario.name,
+        "variant": scenario.variant,
+        "dynsim_version": __version__,
+        "duration_s": duration,
+        "integration_wall_s": counts.wall,
+        "real_time_factor": duration / counts.wall if counts.wall > 0.0 else 0.0,
+        "steps": counts.steps,
+        "steps_rejected": counts.rejected,
+        "rhs_evaluations": counts.evaluations,
+        "projections": counts.projections,
+        **hand_error(record, scenario.metrics.settle_s),
+        "electrical_energy_J": final("energy_electrical"),
+        "electrical_energy_drawn_J": final("energy_electrical_drawn"),
+        "mechanical_work_J": final("work_mechanical"),
+        "joule_heat_J": final("heat_joule"),
+        "gear_loss_J": final("loss_gear"),
+        "joint_loss_J": final("loss_joint"),
+        "friction_heat_J": final("heat_friction"),
+        "energy_turnover_J": turnover,
+        "energy_residual_relative": residual / turnover if turnover > 0.0 else 0.0,
+        "constraint_drift_max_m": float(counts.extremes[:, 2].max(initial=0.0)),
+        "contacts": [_contact(record, k, contact, counts, duration) for k, contact in enumerate(contacts)],
+    }
+    summary["warnings"] = _warnings(record, scenario, contacts, robot, counts, summary)
+    return summary
+
+
+def _contact(record: Record, k: int, contact: Contact, counts: Counts, duration: float) -> dict[str, Any]:
+    force = record["contact_normal_force"][:, k]
+    extremes = counts.extremes[k] if counts.steps else np.array([0.0, 0.0, 0.0])
+    # Extremes are those of every accepted step, which are closer together than the samples, and of the samples.
+    return {
+        "name": contact.name,
+        "surface": contact.surface_name,
+        "normal_force_min_N": float(min(extremes[0], force.min(initial=np.inf))),
+        "normal_force_mean_N": float(record["contact_impulse"][-1, k] / duration) if duration > 0 else 0.0,
+        "normal_force_max_N": float(max(extremes[1], force.max(initial=-np.inf))),
+        "closed_fraction": 1.0,
+        "pulling_fraction": negative_fraction(force, record.time),
+        "slip_distance_m": float(record["contact_slip_distance"][-1, k]) if len(record) else 0.0,
+    }
+
+
+def _warnings(
+    record: Record,
+    scenario: Scenario,
+    contacts: Sequence[Contact],
+    robot: Robot,
+    counts: Counts,
+    summary: dict[str, Any],
+) -> list[str]:
+    found = []
+    for contact in summary["contacts"]:
+        if contact["pulling_fraction"] > 0.0:
+            found.append(
+                f"{contact['name']}: the {contact['surface']} pulls on this brace for "
+                f"{100 * contact['pulling_fraction']:.1f} % of the run, with up to {-contact['normal_force_min_N']:.3g} N; "
+                "a real arm would lift off there"
+            )
+    if summary["friction_heat_J"] < 0.0:
+        found.append(
+            f"friction has put {-summary['friction_heat_J']:.3g} J into the arm: f_t = μ f_n reverses with a pulling "
+            "normal force (contacts.pulling_friction: dissipative takes μ |f_n|)"
+        )
+    for a, motor in enumerate(robot.motors):
+        saturated = np.abs(record["voltage"][:, a]) >= motor.voltage_limit
+        if saturated.any():
+            found.append(
+                f"{motor.joint}: voltage at its limit of {motor.voltage_limit:g} V in {100 * saturated.mean():.1f} % of the run"
+            )
+    if summary["energy_residual_relative"] > RESIDUAL_LIMIT:
+        found.append(
+            f"the energy ledger does not close: residual {summary['energy_residual_relative']:.1e} of the turnover; "
+            "tighten integrator.rtol or the step"
+        )
+    if summary["constraint_drift_max_m"] > DRIFT_LIMIT_M:
+        found.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
+    if counts.deficient:
+        found.append(
+            f"contact rows depended on each other in {counts.deficient} evaluations: forces are the split of least norm"
+        )
+    return found
+
+
+def _mean(values: NDArray[np.float64], time: NDArray[np.float64]) -> float:
+    return float(np.trapezoid(values, time) / (time[-1] - time[0]))

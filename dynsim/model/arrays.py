@@ -1,0 +1,151 @@
+"""Compile descriptions to the arrays of the kernels, checking all that no physics can be made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dynsim.errors import ModelError
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.jit import integers, reals
+from dynsim.model.description import Contact, Link, Motor, Robot
+
+_FRICTION = {"signed": ka.FRICTION_SIGNED, "dissipative": ka.FRICTION_DISSIPATIVE}
+
+
+def compile_model(robot: Robot) -> ka.ModelArrays:
+    """Tables of the tree of bodies.
+
+    Raises
+    ------
+    ModelError
+        Duplicate names, a parent that does not come first, an impossible inertia, a joint that nothing can accelerate.
+    """
+    links = robot.links
+    if not links:
+        raise ModelError(f"{robot.name}: a robot needs at least one link")
+    index: dict[str, int] = {}
+    tree = np.zeros((len(links), ka.TREE_SIZE), dtype=np.int64)
+    body = np.zeros((len(links), ka.BODY_SIZE))
+    for i, link in enumerate(links):
+        if link.name in index or link.joint in (other.joint for other in links[:i]):
+            raise ModelError(f"{link.name}: the name of a body or joint occurs twice")
+        if link.parent is not None and link.parent not in index:
+            raise ModelError(f"{link.name}: its parent {link.parent!r} must be a body that comes before it")
+        link.inertia.check(link.name)
+        if not link.damping >= 0.0:
+            raise ModelError(f"{link.joint}: damping {link.damping}; a loss must be zero or positive")
+        norm = float(np.linalg.norm(link.axis))
+        if not abs(norm - 1.0) < 1e-9:
+            raise ModelError(f"{link.joint}: the axis {link.axis} has length {norm:.6g}; it must be a unit vector")
+        if np.abs(link.R_PJ @ link.R_PJ.T - np.eye(3)).max() > 1e-9 or np.linalg.det(link.R_PJ) < 0.0:
+            raise ModelError(f"{link.joint}: R_PJ is not a rotation")
+        parent = -1 if link.parent is None else index[link.parent]
+        index[link.name] = i
+        tree[i, ka.PARENT] = parent
+        tree[i, ka.KIND] = _joint_kind(link)
+        tree[i, ka.TURNED] = int(not np.array_equal(link.R_PJ, np.eye(3)))
+        if parent >= 0 and parent != i - 1:
+            tree[parent, ka.BRANCHES] += 1
+        tensor = link.inertia.tensor
+        body[i, ka.R_PJ : ka.R_PJ + 9] = link.R_PJ.ravel()
+        body[i, ka.P_PJ : ka.P_PJ + 3] = link.p_PJ
+        body[i, ka.AXIS : ka.AXIS + 3] = link.axis
+        body[i, ka.MASS] = link.inertia.mass
+        body[i, ka.COM : ka.COM + 3] = link.inertia.com
+        body[i, ka.INERTIA : ka.INERTIA + 6] = tensor[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+        body[i, ka.DAMPING] = link.damping
+    joints = {link.joint: i for i, link in enumerate(links)}
+    for motor in robot.motors:
+        _check_motor(motor, joints)
+        i = joints[motor.joint]
+        body[i, ka.ARMATURE] += motor.rotor_inertia * motor.gear_ratio**2
+        body[i, ka.GEAR_DAMPING] += motor.gear_damping * motor.gear_ratio**2
+    _check_movable(robot, tree, body)
+    return ka.ModelArrays(tree=integers(tree), body=reals(body), gravity=reals(robot.gravity))
+
+
+def compile_drives(robot: Robot, *, k_p: Sequence[float], k_d: Sequence[float]) -> ka.DriveArrays:
+    """Tables of the motors with the gains of the voltage PD, one per motor [V/rad, V s/rad]."""
+    joints = {link.joint: i for i, link in enumerate(robot.links)}
+    motor = np.zeros((len(robot.motors), ka.MOTOR_SIZE))
+    for a, m in enumerate(robot.motors):
+        k = m.gear_ratio
+        motor[a, ka.K_M] = m.torque_constant * k
+        motor[a, ka.RESISTANCE] = m.resistance
+        motor[a, ka.INDUCTANCE] = m.inductance
+        motor[a, ka.J_M] = m.rotor_inertia * k**2
+        motor[a, ka.D_M] = m.gear_damping * k**2
+        motor[a, ka.K_P], motor[a, ka.K_D] = k_p[a], k_d[a]
+        motor[a, ka.U_MAX] = m.voltage_limit
+    return ka.DriveArrays(link=integers([joints[m.joint] for m in robot.motors]), motor=reals(motor))
+
+
+def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArrays:
+    """Tables of the contact points.
+
+    Raises
+    ------
+    ModelError
+        Unknown body, negative friction or smoothing speed.
+    """
+    bodies = {link.name: i for i, link in enumerate(robot.links)}
+    link = np.zeros((len(contacts), 2), dtype=np.int64)
+    point = np.zeros((len(contacts), ka.POINT_SIZE))
+    for k, contact in enumerate(contacts):
+        if contact.body not in bodies:
+            raise ModelError(f"contact {contact.name}: no body {contact.body!r}; bodies: {', '.join(bodies)}")
+        if not contact.friction >= 0.0:
+            raise ModelError(f"contact {contact.name}: friction {contact.friction} must be zero or positive")
+        if not contact.slip_smoothing > 0.0:
+            raise ModelError(f"contact {contact.name}: slip smoothing {contact.slip_smoothing} m/s must be positive")
+        surface = contact.surface
+        link[k] = bodies[contact.body], _FRICTION[contact.pulling_friction]
+        point[k, ka.POINT : ka.POINT + 3] = contact.point
+        point[k, ka.QUADRIC : ka.QUADRIC + 6] = surface.Q[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+        point[k, ka.QUADRIC + 6 : ka.QUADRIC + 9] = surface.b
+        point[k, ka.QUADRIC + 9] = surface.c
+        point[k, ka.MU], point[k, ka.V_S] = contact.friction, contact.slip_smoothing
+    return ka.ContactArrays(link=integers(link), point=reals(point))
+
+
+def _joint_kind(link: Link) -> int:
+    if link.kind == "prismatic":
+        return ka.PRISMATIC
+    if link.kind != "revolute":
+        raise ModelError(f"{link.joint}: joint kind {link.kind!r}; known: revolute, prismatic")
+    for kind, axis in ((ka.REVOLUTE_X, (1, 0, 0)), (ka.REVOLUTE_Y, (0, 1, 0)), (ka.REVOLUTE_Z, (0, 0, 1))):
+        if np.array_equal(link.axis, axis):
+            return kind
+    return ka.REVOLUTE
+
+
+def _check_motor(motor: Motor, joints: dict[str, int]) -> None:
+    if motor.joint not in joints:
+        raise ModelError(f"motor: no joint {motor.joint!r}; joints: {', '.join(joints)}")
+    for quantity, unit in (("torque_constant", "N m/A"), ("resistance", "ohm"), ("gear_ratio", "1")):
+        if not getattr(motor, quantity) > 0.0:
+            raise ModelError(f"motor of {motor.joint}: {quantity} {getattr(motor, quantity)} {unit} must be positive")
+    if not motor.inductance > 0.0:
+        raise ModelError(
+            f"motor of {motor.joint}: inductance {motor.inductance} H must be positive; "
+            "for a circuit without inductance take a small one (1e-6 H) and `integrator: {method: rodas4}`"
+        )
+    for quantity in ("rotor_inertia", "gear_damping"):
+        if not getattr(motor, quantity) >= 0.0:
+            raise ModelError(f"motor of {motor.joint}: {quantity} {getattr(motor, quantity)} must be zero or positive")
+    if not motor.voltage_limit > 0.0:
+        raise ModelError(f"motor of {motor.joint}: voltage limit {motor.voltage_limit} V must be positive")
+
+
+def _check_movable(robot: Robot, tree: np.ndarray, body: np.ndarray) -> None:
+    """A joint with nothing heavy beyond it and no motor inertia has no equation of motion."""
+    carried = np.abs(body[:, ka.MASS]) + np.abs(body[:, ka.INERTIA : ka.INERTIA + 6]).sum(axis=1)
+    for i in range(len(tree) - 1, -1, -1):
+        if carried[i] + body[i, ka.ARMATURE] <= 0.0:
+            raise ModelError(
+                f"{robot.links[i].joint}: moves no mass and has no motor inertia, so it cannot be simulated"
+            )
+        if tree[i, ka.PARENT] >= 0:
+            carried[tree[i, ka.PARENT]] += carried[i]

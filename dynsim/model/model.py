@@ -1,0 +1,174 @@
+"""The rigid-body model for use from Python: one method per quantity, numpy in and out."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from dynsim.errors import ModelError
+from dynsim.kernels import arrays as ka
+from dynsim.kernels import articulated, energy, kinematics, newton_euler
+from dynsim.model.arrays import compile_model
+from dynsim.model.description import Array, Robot
+
+
+class Model:
+    """Dynamics of a :class:`~dynsim.model.description.Robot`.
+
+    ``M(q) v̇ + h(q, v) + g(q) = tau``: ``mass_matrix`` is M, ``bias_forces`` h + g. Rotor inertia, gear and joint losses
+    and contacts are not part of these (they belong to motors and scenario); ``armature`` and ``damping`` give them.
+
+    Parameters
+    ----------
+    robot : Robot
+
+    Raises
+    ------
+    ModelError
+        The description is not a physical tree of bodies.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        self.arrays = compile_model(robot)
+        self.n = len(robot.links)
+        self._workspace = ka.workspace(self.n, 0, 0, dense=False)
+        # forward_dynamics and mass_matrix are those of the bodies alone: no rotor inertia.
+        self._bodies = self.arrays._replace(body=self.arrays.body.copy())
+        self._bodies.body[:, ka.ARMATURE] = 0.0
+
+    @classmethod
+    def from_urdf(cls, path: str | os.PathLike[str]) -> Model:
+        """Read bodies and joints from a URDF file (fixed joints are merged into their parents).
+
+        Raises
+        ------
+        ModelError
+            No such file, or a joint type that is not revolute, continuous, prismatic or fixed.
+        """
+        from dynsim.model.urdf import read_urdf
+
+        return cls(read_urdf(Path(path)))
+
+    def to_urdf(self) -> str:
+        """The tree of bodies as URDF text."""
+        from dynsim.model.urdf import write_urdf
+
+        return write_urdf(self.robot)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints, in the order of q."""
+        return self.robot.joint_names
+
+    @property
+    def armature(self) -> Array:
+        """Reflected rotor inertia of each joint, J_m [kg m²], (n,)."""
+        return self.arrays.body[:, ka.ARMATURE].copy()
+
+    @property
+    def damping(self) -> Array:
+        """Viscous losses of each joint, D + D_m [N m s/rad], (n,)."""
+        return self.arrays.body[:, ka.DAMPING] + self.arrays.body[:, ka.GEAR_DAMPING]
+
+    def mass_matrix(self, q: ArrayLike) -> Array:
+        """M(q), (n, n) [kg m²] ([WM] eq 55)."""
+        self._set(q)
+        M = np.zeros((self.n, self.n))
+        newton_euler.mass_matrix(self.arrays, self._workspace, M)
+        return M
+
+    def bias_forces(self, q: ArrayLike, v: ArrayLike) -> Array:
+        """h(q, v) + g(q), (n,) [N m] ([WM] eq 54)."""
+        self._set(q, v)
+        newton_euler.newton_euler(self.arrays, self._workspace, 1.0, 0.0, 1.0)
+        return self._workspace.joints[:, ka.BIAS].copy()
+
+    def inverse_dynamics(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike) -> Array:
+        """tau = M v̇ + h + g, (n,) [N m] ([WM] eqs 42–44)."""
+        self._set(q, v)
+        self._workspace.joints[:, ka.QDD] = self._vector(vdot, "vdot")
+        newton_euler.newton_euler(self.arrays, self._workspace, 1.0, 1.0, 1.0)
+        return self._workspace.joints[:, ka.BIAS].copy()
+
+    def forward_dynamics(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
+        """v̇ = M⁻¹ (tau − h − g), (n,) [rad/s²], by the articulated sweeps."""
+        self._set(q, v)
+        self._workspace.joints[:, ka.APPLIED] = self._vector(tau, "tau")
+        articulated.forward_dynamics(self._bodies, self._workspace)
+        return self._workspace.joints[:, ka.QDD].copy()
+
+    def point_position(self, body: str | int, point: ArrayLike, q: ArrayLike) -> Array:
+        """World position of a body-fixed point, (3,) [m]."""
+        self._sweep(q)
+        out = np.zeros(3)
+        kinematics.point_position(self._workspace, self.body_index(body), self._point(point), out)
+        return out
+
+    def point_jacobian(self, body: str | int, point: ArrayLike, q: ArrayLike) -> Array:
+        """∂(world position)/∂q of a body-fixed point, (3, n) [m/rad]."""
+        return self.point_position_and_jacobian(body, point, q)[1]
+
+    def point_position_and_jacobian(self, body: str | int, point: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
+        """World position, (3,) [m], and its Jacobian, (3, n) [m/rad], from one sweep."""
+        position = self.point_position(body, point, q)
+        jacobian = np.zeros((3, self.n))
+        kinematics.point_jacobian(self.arrays, self._workspace, self.body_index(body), position, jacobian)
+        return position, jacobian
+
+    def body_pose(self, body: str | int, q: ArrayLike) -> tuple[Array, Array]:
+        """Rotation R_WB, (3, 3), and origin p_WB, (3,) [m], of a body."""
+        self._sweep(q)
+        row = self._workspace.links[self.body_index(body)]
+        return row[ka.R : ka.R + 9].reshape(3, 3).copy(), row[ka.P : ka.P + 3].copy()
+
+    def joint_positions(self, q: ArrayLike) -> Array:
+        """World origins of all bodies, then the hand, (n + 1, 3) [m]: what a posture is drawn from."""
+        hand = self.point_position(*self.robot.hand, q)
+        return np.vstack([self._workspace.links[:, ka.P : ka.P + 3], hand])
+
+    def kinetic_energy(self, q: ArrayLike, v: ArrayLike) -> float:
+        """½ vᵀ M v [J]; rotors not included."""
+        self._sweep(q, v)
+        return float(energy.kinetic_energy(self._bodies, self._workspace))
+
+    def potential_energy(self, q: ArrayLike) -> float:
+        """−Σ m g·c [J], zero with all masses at the world origin."""
+        self._sweep(q)
+        return float(energy.potential_energy(self.arrays, self._workspace))
+
+    def body_index(self, body: str | int) -> int:
+        """Index of a body by name.
+
+        Raises
+        ------
+        ModelError
+            No such body.
+        """
+        if isinstance(body, int):
+            return body
+        for i, link in enumerate(self.robot.links):
+            if link.name == body:
+                return i
+        raise ModelError(f"no body {body!r}; bodies: {', '.join(link.name for link in self.robot.links)}")
+
+    def _sweep(self, q: ArrayLike, v: ArrayLike | None = None) -> None:
+        self._set(q, v)
+        newton_euler.newton_euler(self.arrays, self._workspace, 1.0, 0.0, 1.0)
+
+    def _set(self, q: ArrayLike, v: ArrayLike | None = None) -> None:
+        self._workspace.joints[:, ka.Q] = self._vector(q, "q")
+        self._workspace.joints[:, ka.QD] = 0.0 if v is None else self._vector(v, "v")
+
+    def _vector(self, values: ArrayLike, name: str) -> Array:
+        array = np.asarray(values, dtype=np.float64)
+        if array.shape != (self.n,):
+            raise ModelError(f"{name} has shape {array.shape}; this model has {self.n} joints")
+        return array
+
+    @staticmethod
+    def _point(point: ArrayLike) -> Array:
+        return np.array(point, dtype=np.float64)

@@ -1,0 +1,33 @@
+"""Parameters of a brushed DC motor with a gear, as a scenario gives them ([WM] eqs 16–25)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dynsim.config import NonNegative, Positive, StrictConfig
+from dynsim.model.description import Motor
+
+
+class MotorParameters(StrictConfig):
+    """L di/dt = u − R i − K k v; joint torque K k i − I_m k² v̇ − d_m k² v."""
+
+    torque_constant_N_m_per_A: Positive
+    resistance_ohm: Positive
+    inductance_H: NonNegative
+    rotor_inertia_kg_m2: NonNegative
+    gear_ratio: Positive
+    gear_damping_N_m_s_per_rad: NonNegative = 0.0
+    voltage_limit_V: Positive | None = None
+
+    def motor(self, joint: str) -> Motor:
+        """The motor on the joint of that name."""
+        return Motor(
+            joint=joint,
+            torque_constant=self.torque_constant_N_m_per_A,
+            resistance=self.resistance_ohm,
+            inductance=self.inductance_H,
+            rotor_inertia=self.rotor_inertia_kg_m2,
+            gear_ratio=self.gear_ratio,
+            gear_damping=self.gear_damping_N_m_s_per_rad,
+            voltage_limit=np.inf if self.voltage_limit_V is None else self.voltage_limit_V,
+        )

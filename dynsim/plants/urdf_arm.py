@@ -1,0 +1,67 @@
+"""An arm on a fixed base whose bodies and joints come from a URDF file; motors are added by the scenario."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from dynsim.config import NonNegative, StrictConfig, Vector3
+from dynsim.errors import ModelError
+from dynsim.families import union
+from dynsim.model.description import Robot
+
+ENGINE = "dynamics"
+
+MotorChoice = union("motor")
+
+
+class HandConfig(StrictConfig):
+    """The controlled point."""
+
+    body: str
+    point_m: Vector3 = [0.0, 0.0, 0.0]
+
+
+class Config(StrictConfig):
+    """A robot from ``file`` (relative to the scenario), one motor model for all joints or one per joint."""
+
+    type: Literal["urdf_arm"]
+    file: str = Field(description="URDF file, relative to the scenario file")
+    gravity_m_s2: Vector3 = [0.0, 0.0, -9.81]
+    motor: MotorChoice | None = Field(default=None, description="motor of every joint that `motors` does not name")
+    motors: dict[str, MotorChoice] = Field(default={}, description="motors by joint name")
+    damping_N_m_s_per_rad: NonNegative | None = Field(default=None, description="joint losses; default: the URDF's")
+    initial_deg: dict[str, float] = Field(default={}, description="initial angles by joint name; others 0")
+    hand: HandConfig | None = Field(default=None, description="controlled point; default: the tip of the longest chain")
+
+
+def build(config: Config) -> Robot:
+    """The robot of the file with the scenario's motors.
+
+    Raises
+    ------
+    ModelError
+        Unreadable file, or a joint name that the file does not have.
+    """
+    from dynsim.model.urdf import read_urdf
+
+    robot = read_urdf(Path(config.file))
+    for name in [*config.motors, *config.initial_deg]:
+        if name not in robot.joint_names:
+            raise ModelError(f"{config.file}: no joint {name!r}; joints: {', '.join(robot.joint_names)}")
+    links = robot.links
+    if config.damping_N_m_s_per_rad is not None:
+        links = tuple(dataclasses.replace(link, damping=config.damping_N_m_s_per_rad) for link in links)
+    chosen = {joint: config.motors.get(joint, config.motor) for joint in robot.joint_names}
+    return dataclasses.replace(
+        robot,
+        links=links,
+        motors=tuple(motor.motor(joint) for joint, motor in chosen.items() if motor is not None),
+        hand=robot.hand if config.hand is None else (config.hand.body, np.array(config.hand.point_m)),
+        gravity=np.array(config.gravity_m_s2),
+        q0=np.array([np.deg2rad(config.initial_deg.get(joint, 0.0)) for joint in robot.joint_names]),
+    )

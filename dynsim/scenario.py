@@ -1,0 +1,526 @@
+"""Scenarios: YAML in, a validated description of one simulation out. The only importer of families.
+
+A scenario file is one mapping; ``variants`` holds, by name, what differs (mappings merge, lists and values replace,
+null removes). Overrides come on top. Every error names file, line, key and value.
+"""
+
+from __future__ import annotations
+
+import copy
+import difflib
+import io
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, Field, ValidationError
+
+from dynsim.config import NonNegative, Positive, StrictConfig, Vector3
+from dynsim.errors import ModelError, ScenarioError
+from dynsim.families import PACKAGES, member, members, union
+from dynsim.model.description import Contact, Quadric, Robot
+from dynsim.model.model import Model
+
+_CHECKOUT = Path(__file__).resolve().parent.parent / "scenarios"
+SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else Path(__file__).resolve().parent / "shipped_scenarios"
+
+# A contact point must start this close to its surface [m].
+START_TOLERANCE = 1e-6
+
+
+class ContactPoint(StrictConfig):
+    """A point fixed on a body, held to a surface."""
+
+    body: str
+    point_m: Vector3 = [0.0, 0.0, 0.0]
+    surface: str = "floor"
+    friction: NonNegative | None = Field(default=None, description="kinetic coefficient; default: that of contacts")
+    enabled: bool = True
+
+
+class Contacts(StrictConfig):
+    """Contact law and contact points."""
+
+    law: Literal["bilateral"] = Field(
+        default="bilateral", description="the point stays on the surface, f_n of any sign"
+    )
+    friction: NonNegative = 0.1
+    slip_smoothing_m_s: Positive = Field(default=1e-3, description="v_s of the slip direction v_t/√(v_t² + v_s²)")
+    pulling_friction: Literal["signed", "dissipative"] = Field(
+        default="signed", description="f_t = μ f_n as printed in the paper, or μ |f_n|"
+    )
+    points: dict[str, ContactPoint] = {}
+
+
+class Integrator(StrictConfig):
+    """Time integration."""
+
+    method: Literal["dopri5", "rk4", "rodas4"] = Field(
+        default="dopri5", description="adaptive 5(4), fixed step, or linearly implicit for stiff motors"
+    )
+    solver: Literal["articulated", "m_star"] = Field(default="articulated", description="O(n) sweeps or the dense M*")
+    rtol: float = Field(default=1e-6, ge=1e-13, le=1e-1)
+    atol: float = Field(default=1e-8, ge=1e-16, le=1e-1)
+    step_s: Positive | None = Field(default=None, description="fixed step of rk4 (default 0.001), else the first step")
+    step_max_s: Positive | None = None
+
+
+class RecordOptions(StrictConfig):
+    """What is recorded."""
+
+    rate_hz: Positive = 200.0
+    size_limit_GB: Positive = 2.0
+
+
+class Metrics(StrictConfig):
+    """How the summary is computed."""
+
+    settle_s: NonNegative = Field(default=2.0, description="tracking errors count from this time on")
+
+
+class ScenarioConfig(StrictConfig):
+    """A dynsim scenario."""
+
+    name: str = Field(default="", description="default: the name of the file")
+    variant: str = Field(default="", description="written into resolved scenarios")
+    description: str = ""
+    duration_s: Positive
+    plant: union("plant")  # type: ignore[valid-type]
+    controller: union("controller") | None = None  # type: ignore[valid-type]
+    surfaces: dict[str, union("surface")] = {}  # type: ignore[valid-type]
+    contacts: Contacts = Contacts()
+    integrator: Integrator = Integrator()
+    record: RecordOptions = RecordOptions()
+    metrics: Metrics = Metrics()
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One validated simulation.
+
+    Attributes
+    ----------
+    name, variant : str
+        The variant is "" for a scenario without variants.
+    config : ScenarioConfig
+    source : Path or None
+        The file it came from.
+    """
+
+    name: str
+    variant: str
+    config: ScenarioConfig
+    source: Path | None = None
+
+    @property
+    def duration_s(self) -> float:
+        return self.config.duration_s
+
+    @property
+    def plant(self) -> Any:
+        return self.config.plant
+
+    @property
+    def controller(self) -> Any:
+        return self.config.controller
+
+    @property
+    def integrator(self) -> Integrator:
+        return self.config.integrator
+
+    @property
+    def record(self) -> RecordOptions:
+        return self.config.record
+
+    @property
+    def metrics(self) -> Metrics:
+        return self.config.metrics
+
+    @property
+    def engine(self) -> str:
+        """What simulates the plant: the ``ENGINE`` of its module."""
+        return str(member("plant", self.plant.type).ENGINE)
+
+    @property
+    def resolved(self) -> dict[str, Any]:
+        """The scenario with every default and override written out; reading it again gives the same simulation."""
+        return self.config.model_dump(mode="json", exclude_none=True)
+
+    def robot(self) -> Robot:
+        """The tree of bodies with its motors (plants of the dynamics engine)."""
+        return member("plant", self.plant.type).build(self.plant)
+
+    def build_controller(self, model: Model) -> Any:
+        """The controller for the robot."""
+        return member("controller", self.controller.type).build(self.controller, model, self.duration_s)
+
+    def contacts(self) -> list[Contact]:
+        """All enabled contact points with their surfaces."""
+        options = self.config.contacts
+        surfaces: dict[str, Quadric] = {
+            name: member("surface", surface.type).build(surface) for name, surface in self.config.surfaces.items()
+        }
+        result = []
+        for name, point in options.points.items():
+            if not point.enabled:
+                continue
+            if point.surface not in surfaces:
+                raise ModelError(
+                    f"contact {name}: no surface {point.surface!r}{_suggest(point.surface, surfaces)}; "
+                    f"surfaces: {', '.join(surfaces) or 'none'}"
+                )
+            result.append(
+                Contact(
+                    name=name,
+                    body=point.body,
+                    point=np.array(point.point_m),
+                    surface=surfaces[point.surface],
+                    surface_name=point.surface,
+                    friction=options.friction if point.friction is None else point.friction,
+                    slip_smoothing=options.slip_smoothing_m_s,
+                    pulling_friction=options.pulling_friction,
+                )
+            )
+        return result
+
+    def check_start(self, model: Model) -> None:
+        """Raise :class:`ModelError` unless every contact point starts on its surface."""
+        for contact in self.contacts():
+            position = model.point_position(contact.body, contact.point, model.robot.initial)
+            gap = contact.surface.gap(position)
+            if not abs(gap) <= START_TOLERANCE:
+                raise ModelError(
+                    f"contact {contact.name}: its point starts {gap:+.4g} m from surface {contact.surface_name!r} "
+                    f"(limit {START_TOLERANCE:g} m), at ({position[0]:.4g}, {position[1]:.4g}, {position[2]:.4g}); "
+                    "change the initial configuration or the surface, or disable the contact"
+                )
+
+
+def build_model(scenario: Scenario) -> Model:
+    """The rigid-body model of a scenario's plant."""
+    if scenario.engine != "dynamics":
+        raise ModelError(f"plant {scenario.plant.type!r} is kinematic: it has no rigid-body model")
+    return Model(scenario.robot())
+
+
+def find_scenario(name: str | Path) -> Path:
+    """The file of that path, or the shipped scenario of that name.
+
+    Raises
+    ------
+    ScenarioError
+        Neither exists; the message lists near names.
+    """
+    path = Path(name)
+    if path.is_file():
+        return path
+    for candidate in (SHIPPED / path.name, SHIPPED / f"{path.name}.yaml"):
+        if candidate.is_file() and path.parent in (Path(), Path("scenarios")):
+            return candidate
+    shipped = shipped_scenarios()
+    raise ScenarioError(
+        f"{name}: no such file{_suggest(path.stem, [p.stem for p in shipped])}; "
+        f"shipped scenarios: {', '.join(p.stem for p in shipped)}"
+    )
+
+
+def shipped_scenarios() -> list[Path]:
+    """Scenario files that come with dynsim."""
+    return sorted(SHIPPED.glob("*.yaml"))
+
+
+def variant_names(path: str | Path) -> list[str]:
+    """Names of the variants in a scenario file, in its order; empty without variants."""
+    variants = _read(find_scenario(path)).get("variants")
+    return list(variants) if isinstance(variants, Mapping) else []
+
+
+def load_scenario(path: str | Path, variant: str | None = None, overrides: Mapping[str, Any] | None = None) -> Scenario:
+    """Read, merge and validate one variant of a scenario.
+
+    Parameters
+    ----------
+    path : file, or the name of a shipped scenario
+    variant : name; default the first variant of the file
+    overrides : values by dotted key, e.g. ``{"integrator.rtol": 1e-8, "plant.chain.0.mass_kg": 0.2}``
+
+    Raises
+    ------
+    ScenarioError
+        The message names file, line, key, value and the fix.
+    """
+    path = find_scenario(path)
+    data = _read(path)
+    variants = data.pop("variants", None) or {}
+    if not isinstance(variants, Mapping):
+        raise ScenarioError(f"{path}: variants must be a mapping of names to what differs")
+    if variant is None and variants:
+        variant = next(iter(variants))
+    if variant is not None and variants and variant not in variants:
+        raise ScenarioError(
+            f"{path}: no variant {variant!r}{_suggest(variant, variants)}; variants: {', '.join(variants)}"
+        )
+    if variant is not None and not variants and variant != data.get("variant"):
+        raise ScenarioError(f"{path}: has no variants, so there is no {variant!r}")
+    difference = (variants.get(variant) or {}) if variant is not None else {}
+    if not isinstance(difference, Mapping):
+        raise ScenarioError(f"{path}: variant {variant!r} must be a mapping of what differs")
+    merged = _merge(data, difference)
+    for key, value in (overrides or {}).items():
+        _override(merged, key, value)
+    merged = _plain(merged)
+    merged["name"] = merged.get("name") or path.stem
+    if variant is not None:
+        merged["variant"] = variant
+    _make_absolute(merged, path.parent)
+    try:
+        config = ScenarioConfig.model_validate(merged)
+    except ValidationError as error:
+        raise ScenarioError(_explain(error, path, merged, (difference, data), overrides or {})) from None
+    return Scenario(config.name, config.variant, config, path)
+
+
+def scenario_from_resolved(resolved: Mapping[str, Any]) -> Scenario:
+    """The scenario that a record's provenance holds."""
+    try:
+        config = ScenarioConfig.model_validate(resolved)
+    except ValidationError as error:
+        raise ScenarioError(f"the scenario in this record does not fit this version of dynsim: {error}") from None
+    return Scenario(config.name, config.variant, config)
+
+
+def parse_override(text: str) -> tuple[str, Any]:
+    """``a.b.c=VALUE`` as key and YAML value.
+
+    Raises
+    ------
+    ScenarioError
+        No ``=`` in the text, or a value that is not YAML.
+    """
+    key, separator, value = text.partition("=")
+    if not separator or not key.strip():
+        raise ScenarioError(f"--set {text}: must look like integrator.rtol=1e-8")
+    return key.strip(), _plain(_parse_yaml(value, f"--set {text}"))
+
+
+def to_yaml(resolved: Mapping[str, Any]) -> str:
+    """YAML text of a resolved scenario."""
+    stream = io.StringIO()
+    yaml = _yaml("safe")
+    yaml.default_flow_style = None
+    yaml.sort_base_mapping_type_on_output = False
+    yaml.dump(dict(resolved), stream)
+    return stream.getvalue()
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON schema of scenario files, for editors: ``variants`` holds the same keys, all optional."""
+    schema = ScenarioConfig.model_json_schema()
+    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    schema["properties"]["variants"] = {
+        "type": "object",
+        "description": "by name: what differs (mappings merge, lists and values replace, null removes)",
+        "additionalProperties": {"type": ["object", "null"]},
+    }
+    return schema
+
+
+def choices() -> dict[str, tuple[str, ...]]:
+    """Members of every family."""
+    return {family: members(family) for family in PACKAGES}
+
+
+def _yaml(kind: str) -> Any:
+    from ruamel.yaml import YAML
+
+    return YAML(typ=kind, pure=kind == "rt")
+
+
+def _read(path: Path) -> Any:
+    from ruamel.yaml.comments import CommentedMap
+
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"{path}: cannot be read ({error})") from error
+    data = _parse_yaml(text, str(path))
+    if data is None:
+        raise ScenarioError(f"{path}: is empty; a scenario needs at least duration_s and plant")
+    if not isinstance(data, CommentedMap):
+        raise ScenarioError(f"{path}: must be a mapping of keys to values, not a {type(data).__name__}")
+    return data
+
+
+def _parse_yaml(text: str, source: str) -> Any:
+    from ruamel.yaml.error import MarkedYAMLError, YAMLError
+
+    try:
+        return _yaml("rt").load(text)
+    except MarkedYAMLError as error:
+        line = f":{error.problem_mark.line + 1}" if error.problem_mark else ""
+        raise ScenarioError(f"{source}{line}: not YAML: {error.problem or error.context}") from None
+    except YAMLError as error:
+        raise ScenarioError(f"{source}: not YAML: {str(error).splitlines()[0]}") from None
+
+
+def _plain(value: Any) -> Any:
+    """Round-trip YAML nodes as plain Python values."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    if isinstance(value, bool) or value is None:
+        return value
+    for kind in (int, float, str):
+        if isinstance(value, kind):
+            return kind(value)
+    return str(value)
+
+
+def _merge(base: Any, difference: Any) -> Any:
+    """``difference`` laid over ``base``: mappings merge, null removes, anything else replaces."""
+    if not (isinstance(base, Mapping) and isinstance(difference, Mapping)):
+        return copy.copy(difference)
+    merged = {key: _merge(value, {}) if isinstance(value, Mapping) else value for key, value in base.items()}
+    for key, value in difference.items():
+        if value is None:
+            merged.pop(key, None)
+        else:
+            merged[key] = _merge(merged.get(key), value)
+    return merged
+
+
+def _override(data: Any, key: str, value: Any) -> None:
+    """Set the dotted ``key`` in nested mappings and lists."""
+    node, parts = data, key.split(".")
+    for depth, part in enumerate(parts):
+        last = depth == len(parts) - 1
+        if isinstance(node, list):
+            if not part.isdigit() or int(part) >= len(node):
+                raise ScenarioError(f"--set {key}: {part!r} is no index of a list of {len(node)}")
+            index: Any = int(part)
+        elif isinstance(node, Mapping):
+            index = part
+        else:
+            raise ScenarioError(f"--set {key}: {'.'.join(parts[:depth])} is a value, not a mapping")
+        if last:
+            node[index] = value
+            return
+        if isinstance(node, Mapping) and node.get(index) is None:
+            node[index] = {}  # type: ignore[index]
+        node = node[index]
+
+
+def _make_absolute(data: Any, folder: Path) -> None:
+    """Paths in keys named ``file`` are relative to the scenario."""
+    if isinstance(data, dict):
+        for key, value in data.items():
+            if key == "file" and isinstance(value, str):
+                data[key] = str((folder / value).resolve())
+            else:
+                _make_absolute(value, folder)
+    elif isinstance(data, list):
+        for item in data:
+            _make_absolute(item, folder)
+
+
+def _explain(
+    error: ValidationError, path: Path, merged: Any, sources: tuple[Any, ...], overrides: Mapping[str, Any]
+) -> str:
+    """The first problem in one line: file:line, key, value, fix."""
+    problems = error.errors()
+    # Unknown keys first: a misspelt key also makes the right one missing.
+    problem = next((p for p in problems if p["type"] == "extra_forbidden"), problems[0])
+    keys, value, found = _locate(merged, problem["loc"])
+    dotted = ".".join(str(key) for key in keys)
+    line = next((number for source in sources if (number := _line(source, keys)) is not None), None)
+    place = f"{path}:{line}" if line is not None else str(path)
+    if any(dotted == key or dotted.startswith(key + ".") or key.startswith(dotted + ".") for key in overrides):
+        place = "--set"
+    kind, message = problem["type"], problem["msg"].removeprefix("Value error, ")
+    if kind == "extra_forbidden":
+        known = _fields(problem["loc"][:-1])
+        text = f"unknown key{_suggest(str(keys[-1]), known)}"
+        if not text.endswith("?"):
+            text += f"; known here: {', '.join(known)}" if known else ""
+    elif kind == "missing":
+        text = "is missing; add it"
+    elif kind in ("union_tag_invalid", "union_tag_not_found"):
+        expected = problem["ctx"].get("expected_tags", "").replace("'", "") if "ctx" in problem else ""
+        tag = value.get("type", "") if isinstance(value, Mapping) else ""
+        dotted += ".type"
+        if tag:
+            text = f"unknown type {tag!r}{_suggest(str(tag), expected.split(', '))}; known: {expected}"
+        else:
+            text = "is missing; it says which one" + (f": {expected}" if expected else "")
+        found = False
+    else:
+        text = message[0].lower() + message[1:]
+    shown = f" = {value!r}" if found and not isinstance(value, (Mapping, list)) and kind != "extra_forbidden" else ""
+    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    return f"{place}: {dotted}{shown}: {text}{more}"
+
+
+def _locate(data: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any, bool]:
+    """Keys of a pydantic location without its union tags; the value there, and whether there is one."""
+    keys: list[int | str] = []
+    node, found = data, True
+    for part in loc:
+        if found and isinstance(node, Mapping) and part in node:
+            node = node[part]
+        elif found and isinstance(node, list) and isinstance(part, int) and part < len(node):
+            node = node[part]
+        elif isinstance(node, Mapping) and node.get("type") == part:
+            continue
+        elif found and isinstance(node, (int, float, str, list)):
+            # Branches of a union of plain types, such as "float" and "list[float]".
+            continue
+        else:
+            found = False
+        keys.append(part)
+    return keys, node, found
+
+
+def _line(source: Any, keys: list[int | str]) -> int | None:
+    """Line of the deepest of ``keys`` that a round-trip YAML mapping has; None when it has not even the first."""
+    line = None
+    node = source
+    for key in keys:
+        lines = getattr(getattr(node, "lc", None), "data", None)
+        if not lines or key not in lines:
+            break
+        line = lines[key][0] + 1
+        node = node[key]
+    return line
+
+
+def _fields(loc: tuple[int | str, ...]) -> list[str]:
+    """Keys that a scenario may have at a pydantic location."""
+    classes: list[type[BaseModel]] = [ScenarioConfig]
+    for part in loc:
+        held = [c.model_fields[part].annotation for c in classes if isinstance(part, str) and part in c.model_fields]
+        if held:
+            classes = [c for annotation in held for c in _models(annotation)]
+        else:
+            tagged = [c for c in classes if part in _literals(c)]
+            classes = tagged or classes
+    return [name for c in classes for name in c.model_fields]
+
+
+def _models(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
+        return [annotation] if issubclass(annotation, BaseModel) else []
+    return [model for argument in typing.get_args(annotation) for model in _models(argument)]
+
+
+def _literals(model: type[BaseModel]) -> tuple[Any, ...]:
+    return typing.get_args(model.model_fields["type"].annotation) if "type" in model.model_fields else ()
+
+
+def _suggest(word: str, known: Any) -> str:
+    near = difflib.get_close_matches(word, [str(k) for k in known], n=1, cutoff=0.6)
+    return f"; did you mean {near[0]!r}?" if near else ""

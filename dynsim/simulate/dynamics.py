@@ -1,0 +1,243 @@
+"""Engine of the multibody plants: integrate the coupled system and collect its record."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dynsim import metrics
+from dynsim.control.joint_pd import Control
+from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
+from dynsim.kernels import arrays as ka
+from dynsim.kernels import integrate as ki
+from dynsim.kernels.coupled import System
+from dynsim.kernels.energy import CONTACT_SIZE, LEDGER_SIZE
+from dynsim.kernels.jit import integers, reals
+from dynsim.model.arrays import compile_contacts, compile_drives
+from dynsim.model.description import Contact, Robot
+from dynsim.model.model import Model
+from dynsim.record import Record
+from dynsim.scenario import Scenario, build_model
+from dynsim.simulate import Progress
+from dynsim.simulate.provenance import provenance
+
+_SOLVERS = {"articulated": ka.SOLVER_ARTICULATED, "m_star": ka.SOLVER_M_STAR}
+# Wall time between two looks at progress and Ctrl-C [s].
+_CHUNK_S = 0.1
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A scenario compiled to kernel arrays, at its initial state."""
+
+    model: Model
+    contacts: list[Contact]
+    control: Control
+    system: System
+    run: ki.Run
+    workspace: ka.Workspace
+
+
+def prepare(scenario: Scenario) -> Prepared:
+    """Compile a scenario.
+
+    Raises
+    ------
+    ModelError, UnreachableReference
+        See :func:`dynsim.simulate.simulate`.
+    ScenarioError
+        The record would be larger than ``record.size_limit_GB``.
+    """
+    model = build_model(scenario)
+    robot, contacts = model.robot, scenario.contacts()
+    scenario.check_start(model)
+    n, na, c = model.n, len(robot.motors), len(contacts)
+    times = _sample_times(scenario, columns=2 * n + na + LEDGER_SIZE + CONTACT_SIZE * c + ki.output_size(n, na, c))
+    control = _control(scenario, model)
+    options = scenario.integrator
+    method = ki.METHODS[options.method]
+    step = options.step_s or (1e-3 if method == ki.RK4 else 0.0)
+    system = System(
+        model=model.arrays,
+        drives=compile_drives(robot, k_p=list(control.k_p), k_d=list(control.k_d)),
+        reference=control.reference,
+        contacts=compile_contacts(robot, contacts),
+        solver=_SOLVERS[options.solver],
+    )
+    y = np.zeros(2 * n + na + LEDGER_SIZE + CONTACT_SIZE * c)
+    y[:n] = robot.initial
+    run = ki.new_run(
+        method,
+        y,
+        n=n,
+        na=na,
+        c=c,
+        sample_time=times,
+        hand=(model.body_index(robot.hand[0]), robot.hand[1]),
+        end=scenario.duration_s,
+        step=step,
+        step_max=options.step_max_s or np.inf,
+        rtol=options.rtol,
+        atol=options.atol,
+    )
+    workspace = ka.workspace(n, na, c, dense=options.solver == "m_star")
+    return Prepared(model, contacts, control, system, run, workspace)
+
+
+def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
+    """See :func:`dynsim.simulate.simulate`."""
+    prepared = prepare(scenario)
+    run = prepared.run
+    # Loading or compiling the kernels is no integration time.
+    ki.advance(prepared.system, prepared.workspace, run, 0)
+    if progress is not None:
+        progress(0.0)
+    started, limit, interrupted = clock.perf_counter(), 20, False
+    try:
+        while run.count[ki.STATUS] == ki.RUNNING:
+            before = clock.perf_counter()
+            ki.advance(prepared.system, prepared.workspace, run, limit)
+            taken = clock.perf_counter() - before
+            limit = int(min(max(limit * min(_CHUNK_S / max(taken, 1e-9), 10.0), 1), 1_000_000))
+            if progress is not None:
+                progress(float(run.clock[ki.TIME]))
+    except KeyboardInterrupt:
+        interrupted = True
+    wall = clock.perf_counter() - started
+    record = _record(scenario, prepared, wall)
+    status, reached = int(run.count[ki.STATUS]), float(run.clock[ki.TIME])
+    if interrupted or status != ki.FINISHED:
+        record.complete = False
+        state = _last_state(prepared)
+        if interrupted:
+            stop: SimulationStopped = SimulationInterrupted(
+                f"interrupted at t = {reached:.3f} s of {scenario.duration_s:g} s", time=reached, state=state
+            )
+        else:
+            stop = SimulationStopped(_reason(status, scenario, prepared), time=reached, state=state)
+        record.summary["warnings"].append(f"incomplete: {stop}")
+        record.provenance["stopped"] = {"time_s": reached, "reason": str(stop), "state": state}
+        stop.record = record
+        raise stop
+    return record
+
+
+def _sample_times(scenario: Scenario, columns: int) -> np.ndarray:
+    rate, limit = scenario.record.rate_hz, scenario.record.size_limit_GB
+    count = int(np.floor(scenario.duration_s * rate * (1.0 + 1e-12))) + 1
+    size = 8e-9 * count * columns
+    if size > limit:
+        raise ScenarioError(
+            f"record.rate_hz = {rate:g}: {scenario.duration_s:g} s of {columns} columns need {size:.3g} GB, the limit "
+            f"(record.size_limit_GB) is {limit:g} GB; {rate * limit / size:.3g} Hz would fit"
+        )
+    times = np.arange(count) / rate
+    if scenario.duration_s - times[-1] > 1e-9 * scenario.duration_s:
+        times = np.append(times, scenario.duration_s)
+    return times
+
+
+def _control(scenario: Scenario, model: Model) -> Control:
+    na = len(model.robot.motors)
+    if scenario.controller is not None:
+        control = scenario.build_controller(model)
+        if not isinstance(control, Control):
+            raise ModelError(f"controller {scenario.controller.type!r} cannot drive a {scenario.plant.type!r}")
+        return control
+    # Motors without a controller have zero volts on their terminals: they brake.
+    reference = ka.ReferenceArrays(
+        spline=integers(np.full(na, -1)),
+        held=reals(np.zeros(na)),
+        grid=reals([0.0, 1.0]),
+        coefficients=reals(np.zeros((1, 0, 6))),
+    )
+    return Control(k_p=np.zeros(na), k_d=np.zeros(na), reference=reference, path=None)
+
+
+def _record(scenario: Scenario, prepared: Prepared, wall: float) -> Record:
+    """Name the columns that the kernels have written."""
+    model, run, contacts = prepared.model, prepared.run, prepared.contacts
+    robot = model.robot
+    n, na, c = model.n, len(robot.motors), len(contacts)
+    rows = int(run.count[ki.SAMPLE])
+    y, out = run.sample[:rows], run.output[:rows]
+    joints, driven = robot.joint_names, tuple(motor.joint for motor in robot.motors)
+    names = tuple(contact.name for contact in contacts)
+    record = Record(run.sample_time[:rows], provenance=provenance(scenario))
+    angle, rate = _joint_units(robot)
+    record.add("q", y[:, :n], angle, labels=joints, description="joint positions")
+    record.add("v", y[:, n : 2 * n], rate, labels=joints, description="joint rates")
+    record.add("vdot", out[:, :n], f"{rate}²", labels=joints, description="joint accelerations")
+    current, voltage = y[:, 2 * n : 2 * n + na], out[:, n : n + na]
+    record.add("current", current, "A", labels=driven, description="motor currents")
+    record.add("voltage", voltage, "V", labels=driven, description="motor terminal voltages")
+    record.add("torque", out[:, n + na : n + 2 * na], "N m", labels=driven, description="shaft torques, [WM] eq 25")
+    record.add("power", current * voltage, "W", labels=driven, description="electrical power u i")
+    k = n + 2 * na
+    record.add("hand_position", out[:, k : k + 3], "m", labels=("x", "y", "z"))
+    target = prepared.control.target(record.time)
+    if target is not None:
+        record.add("target_position", target, "m", labels=("x", "y", "z"))
+    ledger = y[:, 2 * n + na :]
+    for column, (name, text) in enumerate(metrics.INTEGRALS.items()):
+        record.add(name, ledger[:, column], "J", description=text)
+    for column, name in enumerate(("energy_kinetic", "energy_potential", "energy_magnetic")):
+        record.add(name, out[:, k + 3 + column], "J", description=f"{name.removeprefix('energy_')} energy")
+    record.add("energy_residual", metrics.energy_residual(record), "J", description="what the ledger does not explain")
+    per_contact = out[:, k + 6 :].reshape(rows, c, 8)
+    record.add("contact_normal_force", per_contact[:, :, 0], "N", labels=names, description="f_n; negative: pulling")
+    record.add("contact_force", per_contact[:, :, 1:4], "N", labels=names, description="normal and friction force, W")
+    record.add("contact_gap", per_contact[:, :, 4], "m", labels=names, description="distance from the surface")
+    record.add("contact_slip_velocity", per_contact[:, :, 5:8], "m/s", labels=names)
+    integrals = ledger[:, LEDGER_SIZE:].reshape(rows, c, CONTACT_SIZE)
+    record.add("contact_impulse", integrals[:, :, 0], "N s", labels=names, description="∫ f_n dt")
+    record.add("contact_slip_distance", integrals[:, :, 1], "m", labels=names, description="∫ |v_t| dt")
+    counts = metrics.Counts(
+        wall=wall,
+        steps=int(run.count[ki.STEPS]),
+        rejected=int(run.count[ki.REJECTED]),
+        evaluations=int(run.count[ki.EVALUATIONS]),
+        projections=int(run.count[ki.PROJECTIONS]),
+        deficient=int(prepared.workspace.deficient[0]),
+        extremes=run.extremes,
+    )
+    record.summary = metrics.summarise(record, scenario, contacts, robot, counts)
+    return record
+
+
+def _joint_units(robot: Robot) -> tuple[str, str]:
+    kinds = {link.kind for link in robot.links}
+    if kinds == {"revolute"}:
+        return "rad", "rad/s"
+    return ("m", "m/s") if kinds == {"prismatic"} else ("rad or m", "rad/s or m/s")
+
+
+def _last_state(prepared: Prepared) -> dict[str, Sequence[float]]:
+    n, na, y = prepared.model.n, len(prepared.model.robot.motors), prepared.run.y
+    return {"q": y[:n].tolist(), "v": y[n : 2 * n].tolist(), "current": y[2 * n : 2 * n + na].tolist()}
+
+
+def _reason(status: int, scenario: Scenario, prepared: Prepared) -> str:
+    run = prepared.run
+    t, method = float(run.clock[ki.TIME]), scenario.integrator.method
+    where = f"stopped at t = {t:.6g} s"
+    if status == ki.NOT_FINITE:
+        advice = (
+            f"take a smaller integrator.step_s than {run.clock[ki.STEP]:g}, or integrator.method dopri5 or rodas4"
+            if method == "rk4"
+            else "look at the last state for a joint that runs away"
+        )
+        return f"{where}: the state is no longer finite (divergence); {advice}"
+    if status == ki.STEP_TOO_SMALL:
+        return (
+            f"{where}: the step size fell to {run.clock[ki.STEP]:.1e} s; try integrator.method rodas4 or a larger rtol"
+        )
+    gaps = prepared.workspace.contacts[:, ka.GAP]
+    worst = int(np.argmax(np.abs(gaps)))
+    return (
+        f"{where}: contact {prepared.contacts[worst].name} cannot be kept on its surface (gap {gaps[worst]:+.2e} m); "
+        "the contacts contradict each other or the arm is singular here"
+    )

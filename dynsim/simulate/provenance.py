@@ -1,0 +1,47 @@
+"""What made a record: scenario, version, commit, libraries."""
+
+from __future__ import annotations
+
+import platform
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from dynsim._version import __version__
+from dynsim.scenario import Scenario
+
+LIBRARIES = ("numpy", "scipy", "numba", "h5py", "pin")
+
+
+def provenance(scenario: Scenario) -> dict[str, Any]:
+    """Everything needed to make the record again."""
+    return {
+        "scenario": scenario.resolved,
+        "engine": scenario.engine,
+        "dynsim_version": __version__,
+        "commit": commit(),
+        "libraries": {name: metadata.version(name) for name in LIBRARIES},
+        "python": platform.python_version(),
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def commit() -> str:
+    """Commit of the checkout that runs, "" when it is not one. Read from .git: starting git would cost more."""
+    git = Path(__file__).resolve().parents[2] / ".git"
+    try:
+        if git.is_file():  # a linked work tree
+            git = Path(git.read_text(encoding="utf-8").removeprefix("gitdir:").strip())
+        head = (git / "HEAD").read_text(encoding="utf-8").strip()
+        if not head.startswith("ref:"):
+            return head
+        name = head.removeprefix("ref:").strip()
+        common = git / "commondir"
+        root = (git / common.read_text(encoding="utf-8").strip()) if common.is_file() else git
+        if (root / name).is_file():
+            return (root / name).read_text(encoding="utf-8").strip()
+        packed = (root / "packed-refs").read_text(encoding="utf-8").splitlines()
+        return next((line.split()[0] for line in packed if line.endswith(" " + name)), "")
+    except OSError:
+        return ""
