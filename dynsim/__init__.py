@@ -2,7 +2,7 @@
 
 >>> import dynsim
 >>> scenario = dynsim.load_scenario("elbow_comparison", variant="two_elbows")
->>> record = dynsim.simulate(scenario)
+>>> record = dynsim.engine(scenario)
 >>> record.summary["electrical_energy_J"], record["q"].shape, record.units["q"]
 """
 
@@ -15,10 +15,10 @@ from dynsim._version import __version__
 from dynsim.errors import DynsimError
 
 if TYPE_CHECKING:
+    from dynsim.engine import simulate
     from dynsim.model.model import Model
     from dynsim.record import Record
     from dynsim.scenario import Scenario, build_model, load_scenario
-    from dynsim.simulate import simulate
     from dynsim.studies.compare import compare
 
 __all__ = [
@@ -41,7 +41,7 @@ _HOME = {
     "build_model": "dynsim.scenario",
     "compare": "dynsim.studies.compare",
     "load_scenario": "dynsim.scenario",
-    "simulate": "dynsim.simulate",
+    "simulate": "dynsim.engine",
 }
 
 

@@ -1,55 +1,32 @@
 """Where the target comes from: the operator's velocity commands and generated target paths ([T] IV.C).
 
 A source gives the rate of the target pose for each control period, mode requests and the gripper. Scripted sources are
-read in long blocks, a live one (joystick) would be read one period at a time through the same :class:`CommandSource`.
+read in long blocks; a live one (joystick) would be read one period at a time through the same interface,
+:class:`dynsim.model.snake.CommandSource`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple, Protocol
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-from dynsim.control.modes import FIXING, NO_REQUEST, SWITCHING, ModeTable
+from dynsim.config import NonNegative, Positive, StrictConfig
+from dynsim.model.snake import FIXING, SWITCHING, CommandBlock, ModeTable
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Time = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Duration = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Coordinates = tuple[float, float, float, float, float, float]
 Profile = Literal["linear", "smooth"]
 
 
-class CommandBlock(NamedTuple):
-    """Commands of T control periods.
-
-    velocity : (T, 6) mean rate of the target x, y, z [m/s], alpha, beta, gamma [rad/s] in each period
-    request : (T,) mode request at its beginning: NO_REQUEST, SWITCHING, FIXING, or row of the mode table + 1
-    gripper : (T,) 1 closed (hardened), 0 open (soft)
-    """
-
-    velocity: NDArray[np.float64]
-    request: NDArray[np.int64]
-    gripper: NDArray[np.int64]
-
-
-class CommandSource(Protocol):
-    """What a scripted list and a joystick have in common."""
-
-    def read(self, first: int, count: int, period: float) -> CommandBlock:
-        """Commands of control periods ``first`` .. ``first + count - 1``, each ``period`` seconds long."""
-        ...
-
-
-class Command(BaseModel):
+class Command(StrictConfig):
     """One entry of the operator's list; what it does not name stays as it was."""
 
-    model_config = ConfigDict(extra="forbid")
-
-    at_s: Time
-    velocity: tuple[Finite, Finite, Finite, Finite, Finite, Finite] | None = Field(
+    at_s: NonNegative
+    velocity: Coordinates | None = Field(
         None, description="rates of x, y, z [m/s], alpha, beta, gamma [rad/s]; held until the next command"
     )
     mode: int | Literal["switching", "fixing"] | None = Field(
@@ -58,15 +35,13 @@ class Command(BaseModel):
     gripper: Literal["open", "closed"] | None = None
 
 
-class Ramp(BaseModel):
+class Ramp(StrictConfig):
     """Displacement of the target in a straight line of the six coordinates."""
 
-    model_config = ConfigDict(extra="forbid")
-
     type: Literal["ramp"]
-    start_s: Time = 0.0
-    duration_s: Duration
-    displacement: tuple[Finite, Finite, Finite, Finite, Finite, Finite]
+    start_s: NonNegative = 0.0
+    duration_s: Positive
+    displacement: Coordinates
     profile: Profile = "linear"
 
     def offset(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -74,16 +49,14 @@ class Ramp(BaseModel):
         return s[:, None] * np.array(self.displacement)
 
 
-class Circle(BaseModel):
+class Circle(StrictConfig):
     """Circle of the target in world axes: on the floor plan, starting along +x, or in the vertical yz plane."""
 
-    model_config = ConfigDict(extra="forbid")
-
     type: Literal["circle"]
-    start_s: Time = 0.0
-    duration_s: Duration
-    radius: Annotated[float, Field(gt=0, allow_inf_nan=False)]
-    turns: Finite = Field(1.0, description="plane xy: > 0 to the left; plane yz: from the top, > 0 first to the left")
+    start_s: NonNegative = 0.0
+    duration_s: Positive
+    radius: Positive
+    turns: float = Field(1.0, description="plane xy: > 0 to the left; plane yz: from the top, > 0 first to the left")
     plane: Literal["xy", "yz"] = "xy"
     backward: bool = Field(False, description="plane xy: leave the start point tail first")
     turn_head: bool = Field(True, description="plane xy: the yaw follows the tangent")
@@ -105,18 +78,16 @@ class Circle(BaseModel):
         return out
 
 
-class DoorArc(BaseModel):
+class DoorArc(StrictConfig):
     """Arc of a door's knob about its hinge, the yaw kept perpendicular to the door ([T] V.D.3).
 
     The robot faces the door along +x; the hinge is ``radius`` to the left or right of the target's start.
     """
 
-    model_config = ConfigDict(extra="forbid")
-
     type: Literal["door_arc"]
-    start_s: Time = 0.0
-    duration_s: Duration
-    radius: Annotated[float, Field(gt=0, allow_inf_nan=False)] = Field(description="hinge to knob [m]")
+    start_s: NonNegative = 0.0
+    duration_s: Positive
+    radius: Positive = Field(description="hinge to knob [m]")
     angle_deg: Annotated[float, Field(gt=0, le=180)] = 60.0
     hinge: Literal["left", "right"] = "left"
     opening: Literal["pull", "push"] = "pull"
@@ -137,10 +108,8 @@ class DoorArc(BaseModel):
 Path = Annotated[Ramp | Circle | DoorArc, Field(discriminator="type")]
 
 
-class Script(BaseModel):
+class Script(StrictConfig):
     """Operator's list and target paths of a scenario; their velocities add."""
-
-    model_config = ConfigDict(extra="forbid")
 
     commands: list[Command] = Field(default_factory=list)
     paths: list[Path] = Field(default_factory=list)
@@ -162,7 +131,10 @@ class ScriptedSource:
     modes: ModeTable
 
     def read(self, first: int, count: int, period: float) -> CommandBlock:
-        """See :class:`CommandSource`. A command takes effect at the first period that begins at or after its time."""
+        """Commands of periods ``first`` to ``first + count - 1``.
+
+        A command takes effect at the first period that begins at or after its time.
+        """
         ticks = first + np.arange(count + 1)
         block = CommandBlock(np.zeros((count, 6)), np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64))
         for path in self.paths:
@@ -191,19 +163,3 @@ class ScriptedSource:
         if isinstance(mode, str):
             return SWITCHING if mode == "switching" else FIXING
         return self.modes.row(mode, "controller.commands: mode") + 1
-
-
-__all__ = [
-    "FIXING",
-    "NO_REQUEST",
-    "SWITCHING",
-    "Circle",
-    "Command",
-    "CommandBlock",
-    "CommandSource",
-    "DoorArc",
-    "Path",
-    "Ramp",
-    "Script",
-    "ScriptedSource",
-]

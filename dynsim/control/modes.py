@@ -1,137 +1,30 @@
-"""Modes: which wheel pairs are lifted, in what order modes are tried, and which one comes next ([T] IV.C.5, V.E)."""
+"""Mode table and mode switching of a scenario ([T] Table II, IV.C.5)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated
 
-import numpy as np
-from numpy.typing import NDArray
+from pydantic import Field
 
-from dynsim.errors import ModelError
-
-Policy = Literal["fixed", "cyclic", "predictive"]
+from dynsim.config import Positive, StrictConfig
+from dynsim.model.snake import Policy
 
 # [T] Table II: mode number -> lifted wheel pairs of the base part (pair 1 at its head).
-TABLE_II: dict[int, tuple[int, ...]] = {1: (3, 6), 2: (6, 7), 3: (5, 6), 4: (4, 5), 5: (3, 4), 6: (2, 3)}
-FIXING = -2
-SWITCHING = -1
-NO_REQUEST = 0
+TABLE_II: dict[int, list[int]] = {1: [3, 6], 2: [6, 7], 3: [5, 6], 4: [4, 5], 5: [3, 4], 6: [2, 3]}
 
 
-@dataclass(frozen=True)
-class ModeTable:
-    """Modes by number; row i of ``grounded`` is mode ``numbers[i]``.
+class Switching(StrictConfig):
+    """Switching state ([T] IV.C.5); it is entered by a command ``mode: switching``."""
 
-    Attributes
-    ----------
-    numbers : (modes,) mode numbers as written in the scenario
-    grounded : (modes, pairs) 1 where a wheel pair is on the ground
-    """
-
-    numbers: tuple[int, ...]
-    grounded: NDArray[np.int64]
-
-    @classmethod
-    def from_lifted(cls, lifted: Mapping[int, tuple[int, ...] | list[int]], pairs: int) -> ModeTable:
-        """Table from the lifted pairs (counted from 1) of each mode.
-
-        Raises
-        ------
-        ModelError
-            No modes, a mode number below 1, or a pair that the robot does not have.
-        """
-        if not lifted:
-            raise ModelError("controller.modes is empty: give at least one mode, e.g. {1: [3, 6]}")
-        grounded = np.ones((len(lifted), pairs), dtype=np.int64)
-        for row, (number, away) in enumerate(lifted.items()):
-            if number < 1:
-                raise ModelError(f"controller.modes: mode number {number}; modes are numbered 1, 2, ...")
-            for pair in away:
-                if not 1 <= pair <= pairs:
-                    raise ModelError(f"controller.modes: mode {number} lifts pair {pair}; the pairs are 1 to {pairs}")
-                grounded[row, pair - 1] = 0
-        return cls(tuple(lifted), grounded)
-
-    def row(self, number: int, key: str) -> int:
-        """Row of a mode number; ``key`` is the scenario key to blame when there is none."""
-        if number not in self.numbers:
-            raise ModelError(f"{key}: no mode {number}; the table has {', '.join(map(str, self.numbers))}")
-        return self.numbers.index(number)
-
-
-@dataclass
-class ModeSwitcher:
-    """Fixing and switching states: follows requests, and picks a mode at every switching time t_k = t_0 + k dT.
-
-    A mode that would tip (support margin not above ``least_margin``) is refused. When every candidate would tip the
-    present mode stays.
-
-    Attributes
-    ----------
-    policy : "fixed" ignores requests to switch; "cyclic" takes the next of ``order`` ([T]'s heuristic); "predictive"
-        takes the one with the lowest cost after a simulated period.
-    fixing_row, order : rows of the mode table.
-    period_ticks : dT in control periods.
-    margin_now : margin_now(row) -> support margin of the present posture in a mode [m].
-    predict : predict(row) -> (cost after dT, smallest support margin on the way [m]).
-    row : present mode.
-    switches, refused : counts of changes of mode and of candidates refused.
-    """
-
-    policy: Policy
-    fixing_row: int
-    order: tuple[int, ...]
-    period_ticks: int
-    least_margin: float
-    margin_now: Callable[[int], float]
-    predict: Callable[[int], tuple[float, float]]
-    row: int = 0
-    switching: bool = False
-    next_switch: int = 0
-    switches: int = 0
-    refused: int = 0
-    _place: int = 0
-
-    def __post_init__(self) -> None:
-        self.row = self.fixing_row
-
-    def at_tick(self, tick: int, request: int) -> int:
-        """Row of the mode from this tick on; ``request`` is a row + 1, NO_REQUEST, SWITCHING or FIXING."""
-        row = self.row
-        if request > 0:
-            row, self.switching = request - 1, False
-        elif request == FIXING:
-            row, self.switching = self.fixing_row, False
-        elif request == SWITCHING and not self.switching and self.policy != "fixed":
-            self.switching, self.next_switch, self._place = True, tick, 0
-        if self.switching and tick >= self.next_switch:
-            row = self._cyclic() if self.policy == "cyclic" else self._predictive()
-            self.next_switch = tick + self.period_ticks
-        self.switches += row != self.row
-        self.row = row
-        return row
-
-    def next_event(self) -> int | None:
-        """Tick of the next switching time, None in the fixing state."""
-        return self.next_switch if self.switching else None
-
-    def _cyclic(self) -> int:
-        for step in range(len(self.order)):
-            place = (self._place + step) % len(self.order)
-            if self.margin_now(self.order[place]) > self.least_margin:
-                self._place = (place + 1) % len(self.order)
-                return self.order[place]
-            self.refused += 1
-        return self.row
-
-    def _predictive(self) -> int:
-        best, lowest = self.row, np.inf
-        for row in self.order:
-            cost, margin = self.predict(row)
-            if not margin > self.least_margin:
-                self.refused += 1
-            elif cost < lowest:
-                best, lowest = row, cost
-        return best
+    policy: Policy = Field("cyclic", description="fixed: never switch; cyclic: [T]'s order; predictive: lowest cost")
+    order: list[int] = Field([2, 3, 4, 5, 6], min_length=1, description="mode numbers, also the predictive candidates")
+    period_s: Positive = Field(1.0, description="Delta T [s]")
+    least_margin: float = Field(0.0, description="a mode with a smaller support margin [m] counts as tipping")
+    when_blocked: bool = Field(
+        False,
+        description="enter the switching state by itself when a command cannot be carried out, the target waiting",
+    )
+    release_fraction: Annotated[float, Field(gt=0, lt=1)] = Field(
+        0.6, description="when_blocked: go on when every base joint is within this part of its limit (assumed)"
+    )
+    prediction_step_s: Positive = Field(0.02, description="step of the predicted period (assumed)")

@@ -6,25 +6,18 @@ Transactions on Robotics 35(1), 2019. Values that [T] does not give are marked "
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
-from dynsim.control.commands import CommandSource, Script, ScriptedSource
-from dynsim.control.modes import TABLE_II, ModeTable, Policy
+from dynsim.config import NonNegative, Positive
+from dynsim.control.commands import Script, ScriptedSource
+from dynsim.control.modes import TABLE_II, Switching
 from dynsim.errors import ModelError
 from dynsim.kernels.jit import integers, reals
-from dynsim.kernels.snake import (
-    SnakeModel,
-    active_rows,
-    constraint_matrices,
-    new_chain,
-    pose_of_point,
-    walk_chain,
-)
+from dynsim.kernels.snake import SnakeModel
 from dynsim.kernels.snake_control import (
     LIMITS_ALLOCATE,
     LIMITS_NONE,
@@ -35,41 +28,18 @@ from dynsim.kernels.snake_control import (
 )
 from dynsim.kernels.snake_plant import ESTIMATED, FEEDFORWARD, MEASURED, Schedule
 from dynsim.kernels.snake_support import COST_ANGLES, COST_SUPPORT_MIN, COST_SUPPORT_NORM, Cost
+from dynsim.model.snake import ModeTable, SnakeDescription, TaskSpaceController, conditioning
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+ENGINE = "kinematic"
 
 COSTS = {"eq19": COST_ANGLES, "eq20": COST_SUPPORT_NORM, "eq20_min": COST_SUPPORT_MIN}
 LIMIT_POLICIES = {"none": LIMITS_NONE, "saturate": LIMITS_SATURATE, "allocate": LIMITS_ALLOCATE}
 STATES = {"measured": MEASURED, "estimated": ESTIMATED, "feedforward": FEEDFORWARD}
 FORMS = {"paper": NULL_PAPER, "safe": NULL_SAFE}
-SINGULAR = 1e-9  # relative to the largest singular value: below it a rank is lost, not just small
-
-
-class Switching(BaseModel):
-    """Switching state ([T] IV.C.5); it is entered by a command ``mode: switching``."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    policy: Policy = Field("cyclic", description="fixed: never switch; cyclic: [T]'s order; predictive: lowest cost")
-    order: list[int] = Field([2, 3, 4, 5, 6], min_length=1, description="mode numbers, also the predictive candidates")
-    period_s: Positive = Field(1.0, description="Delta T [s]")
-    least_margin: Finite = Field(0.0, description="a mode with a smaller support margin [m] counts as tipping")
-    when_blocked: bool = Field(
-        False,
-        description="enter the switching state by itself when a command cannot be carried out, the target waiting",
-    )
-    release_fraction: Annotated[float, Field(gt=0, lt=1)] = Field(
-        0.6, description="when_blocked: go on when every base joint is within this part of its limit (assumed)"
-    )
-    prediction_step_s: Positive = Field(0.02, description="step of the predicted period (assumed)")
 
 
 class Config(Script):
     """The ``controller:`` section of a scenario; SI units where the key names no other."""
-
-    model_config = ConfigDict(extra="forbid")
 
     type: Literal["task_space"] = "task_space"
     period_s: Positive = Field(0.005, description="control period (assumed)")
@@ -111,7 +81,7 @@ class Config(Script):
         0.005, description="smallest singular value of B W^-1/2 below which the weakest direction is damped (assumed)"
     )
     damping_factor: NonNegative = Field(0.01, description="its damping at the singularity (assumed)")
-    shape_points: dict[str, Finite] | None = Field(
+    shape_points: dict[str, float] | None = Field(
         None, description="shape controllable points: joint name -> target [rad]; default the last head joint, 110 deg"
     )
     modes: dict[int, list[int]] | None = Field(None, description="mode number -> lifted wheel pairs; default Table II")
@@ -124,65 +94,8 @@ class Config(Script):
         return f"eq{value}" if value in (19, 20) and not isinstance(value, bool) else value
 
 
-class Plant(Protocol):
-    """What the controller has to know of a robot."""
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """In the order of phi."""
-        ...
-
-    @property
-    def initial_joints(self) -> NDArray[np.float64]:
-        """(n_phi,) [rad]."""
-        ...
-
-    @property
-    def initial_base_pose(self) -> NDArray[np.float64]:
-        """(3,) x [m], y [m], yaw [rad]."""
-        ...
-
-    def arrays(self) -> SnakeModel:
-        """The description as the kernels want it."""
-        ...
-
-
-class Conditioning(NamedTuple):
-    """Ranks of the model of one mode at one posture ([T] eqs 9-11)."""
-
-    rows: int
-    rank_A: int  # of A~, full: 6 + m
-    rank_B: int  # of B~, full: rows
-    redundancy: int  # inputs - rank of B~
-    sigma_min_A: float
-    sigma_min_B: float
-    condition_B: float
-
-
-@dataclass(frozen=True)
-class TaskSpaceController:
-    """Everything that the tick loop and the mode switcher need.
-
-    ``prediction`` is the schedule of a predicted period: coarser steps, ``prediction_ticks`` of them.
-    """
-
-    law: Law
-    schedule: Schedule
-    prediction: Schedule
-    prediction_ticks: int
-    modes: ModeTable
-    fixing_row: int
-    order: tuple[int, ...]
-    switch_ticks: int
-    policy: Policy
-    least_margin: float
-    when_blocked: bool
-    release_fraction: float
-    source: CommandSource
-
-
-def build(config: Config, plant: Plant) -> TaskSpaceController:
-    """Controller for a robot.
+def build(config: Config, plant: SnakeDescription, duration_s: float | None = None) -> TaskSpaceController:
+    """Controller for a robot; ``duration_s`` is not needed, a script ends by itself.
 
     Raises
     ------
@@ -254,37 +167,7 @@ def build(config: Config, plant: Plant) -> TaskSpaceController:
     )
 
 
-def conditioning(
-    model: SnakeModel, law: Law, row: int, base: NDArray[np.float64], phi: NDArray[np.float64]
-) -> Conditioning:
-    """Ranks and singular values of A~ and B~ ([T] eqs 10, 11) of one mode at a posture on the ground."""
-    chain, w, frame = new_chain(model), np.zeros(6), np.zeros((3, 3))
-    pose_of_point(model, reals(base), reals(phi), frame, w)
-    walk_chain(model, w, reals(phi), frame, chain)
-    all_rows, m = model.base_joints + 4 + model.wheels, len(law.shape_joints)
-    A, B = np.zeros((all_rows, 6)), np.zeros((all_rows, len(law.root_weight_inverse)))
-    constraint_matrices(model, chain, w, A, B)
-    kept = np.zeros(all_rows, dtype=np.int64)
-    kept = kept[: active_rows(model, law.grounded[row], kept)]
-    S = np.zeros((m, B.shape[1]))
-    S[np.arange(m), law.shape_joints] = 1.0
-    A_shape = np.block([[A[kept], np.zeros((len(kept), m))], [np.zeros((m, 6)), np.eye(m)]])
-    B_shape = np.vstack([B[kept], S])
-    sa, sb = np.linalg.svd(A_shape, compute_uv=False), np.linalg.svd(B_shape, compute_uv=False)
-    rank_b = int(np.sum(sb > SINGULAR * sb[0]))
-    full = len(B_shape) <= B_shape.shape[1]
-    return Conditioning(
-        rows=len(B_shape),
-        rank_A=int(np.sum(sa > SINGULAR * sa[0])),
-        rank_B=rank_b,
-        redundancy=B_shape.shape[1] - rank_b,
-        sigma_min_A=float(sa[-1]) if len(A_shape) >= A_shape.shape[1] else 0.0,
-        sigma_min_B=float(sb[-1]) if full else 0.0,
-        condition_B=float(sb[0] / sb[-1]) if full and sb[-1] > 0 else float("inf"),
-    )
-
-
-def check_controllable(model: SnakeModel, law: Law, modes: ModeTable, rows: list[int], plant: Plant) -> None:
+def check_controllable(model: SnakeModel, law: Law, modes: ModeTable, rows: list[int], plant: SnakeDescription) -> None:
     """Refuse modes in which A~ w~' = B~ u ([T] eq 9) has no solution for every w~'.
 
     The side-slip row of wheel pair 1 and the three ground-contact rows contain head joints only. Every shape
@@ -338,7 +221,7 @@ def check_controllable(model: SnakeModel, law: Law, modes: ModeTable, rows: list
         )
 
 
-def _shape_points(config: Config, plant: Plant, model: SnakeModel) -> tuple[list[int], list[float]]:
+def _shape_points(config: Config, plant: SnakeDescription, model: SnakeModel) -> tuple[list[int], list[float]]:
     names = plant.joint_names
     points = config.shape_points
     if points is None:

@@ -30,7 +30,7 @@ from dynsim.record import Record
 # Okabe and Ito's palette: distinct for colour-blind readers.
 BODY, HEAD, GROUND, LIFT, TARGET, SUPPORT = "#444444", "#D55E00", "#0072B2", "#FFFFFF", "#009E73", "#56B4E9"
 CYCLE = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999"]
-STYLE: dict[str, Any] = {
+STYLE: dict[Any, Any] = {
     "font.size": 8,
     "axes.titlesize": 8,
     "axes.labelsize": 8,

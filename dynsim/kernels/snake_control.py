@@ -250,9 +250,9 @@ def control_input(model, law, work, w, phi, w_target, velocity, mode, null_gain)
     """One evaluation of the controller: joint and wheel rates u of [T] eqs 12-14, in ``work.u``.
 
     u = B~^(W+) A~ (w~_d' - K (w~ - w~_d)) - k_eta (I - B~^(W+) B~) n, with n = eta (the paper's eq 14) or W^-1 eta
-    (safe: eta . u_ker <= 0 for every W). Near a singular B~ the part of the command along its weakest direction alone is
-    scaled by sigma^2 / (sigma^2 + lambda^2), lambda^2 = (1 - (sigma/damping_sigma)^2) damping_factor^2; the null-space
-    part is an exact projection even there.
+    (safe: eta . u_ker <= 0 for every W). Near a singular B~ the part of the command along its weakest direction alone
+    is scaled by sigma^2 / (sigma^2 + lambda^2), lambda^2 = (1 - (sigma/damping_sigma)^2) damping_factor^2; the
+    null-space part is an exact projection even there.
 
     Parameters
     ----------

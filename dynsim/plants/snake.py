@@ -6,35 +6,29 @@ Transactions on Robotics 35(1), 2019. Values that [T] does not give are marked "
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from dynsim.config import NonNegative, Positive, StrictConfig
 from dynsim.errors import ModelError
-from dynsim.kernels.jit import integers, reals
-from dynsim.kernels.snake import SnakeModel
+from dynsim.model.snake import SnakeDescription
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+ENGINE = "kinematic"
+
 DrivenSide = Literal["left", "right", "none"]
 
 
-class Limits(BaseModel):
+class Limits(StrictConfig):
     """Joint limits, symmetric about zero ([T] Table I)."""
-
-    model_config = ConfigDict(extra="forbid")
 
     yaw: Positive = Field(65.0, lt=180, description="[deg]")
     pitch: Positive = Field(113.0, lt=180, description="[deg]")
 
 
-class Config(BaseModel):
+class Config(StrictConfig):
     """The ``plant:`` section of a scenario; SI units where the key names no other."""
-
-    model_config = ConfigDict(extra="forbid")
 
     type: Literal["snake"] = "snake"
     level: Literal["kinematic"] = "kinematic"
@@ -51,89 +45,19 @@ class Config(BaseModel):
         None, description="side of the active wheel of each pair. Default (assumed): left, right, left, ..."
     )
     limits_deg: Limits = Field(default_factory=Limits)
-    gripper_length: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(
-        0.09, description="gripper tip ahead of the head point [m] ([T] IV.B)"
-    )
+    gripper_length: NonNegative = Field(0.09, description="gripper tip ahead of the head point [m] ([T] IV.B)")
     mass: Positive = Field(10.0, description="of the whole robot [kg], spread evenly over its links (assumed)")
     controlled_point: Literal["head", "gripper"] = Field(
         "head", description="head point ([T] V.A) or gripper tip ([T] V.D)"
     )
-    initial_joints: list[Finite] | None = Field(
+    initial_joints: list[float] | None = Field(
         None,
         description="theta_1, psi_1, ... [rad] at t = 0, the base's yaw joints may be left out when zero. Default: "
         "[T] V.A, where it fits",
     )
-    initial_base_pose: tuple[Finite, Finite, Finite] = Field(
+    initial_base_pose: tuple[float, float, float] = Field(
         (0.0, 0.0, 0.0), description="x [m], y [m] of wheel pair 1 and yaw [rad] of the base part"
     )
-
-
-@dataclass(frozen=True)
-class SnakeDescription:
-    """An articulated mobile robot in SI units; n_phi = head_joints + base_joints joints, base_joints + 1 wheel pairs.
-
-    Attributes
-    ----------
-    joint_names : theta1, psi1, ..., then theta of the base part.
-    pitch : (n_phi,) bool
-    lower, upper : (n_phi,) joint limits [rad]
-    half_track : (pairs,) axle middle to wheel [m]
-    driven_side : (pairs,) +1 left, -1 right, 0 passive pair
-    link_mass : (head_joints + 2 base_joints,) [kg]
-    point_offset : controlled point ahead of the head point [m]
-    initial_joints : (n_phi,) [rad]
-    initial_base_pose : (3,) x [m], y [m], yaw [rad]
-    """
-
-    head_joints: int
-    base_joints: int
-    link_length: float
-    wheel_radius: float
-    gripper_length: float
-    point_offset: float
-    joint_names: tuple[str, ...]
-    pitch: NDArray[np.bool_]
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
-    half_track: NDArray[np.float64]
-    driven_side: NDArray[np.int64]
-    link_mass: NDArray[np.float64]
-    initial_joints: NDArray[np.float64]
-    initial_base_pose: NDArray[np.float64]
-
-    @property
-    def pairs(self) -> int:
-        """Wheel pairs of the base part."""
-        return self.base_joints + 1
-
-    @property
-    def active_wheels(self) -> int:
-        """n_w."""
-        return int(np.count_nonzero(self.driven_side))
-
-    @property
-    def wheel_names(self) -> tuple[str, ...]:
-        """rho1, rho2, ... numbered like the active wheels."""
-        return tuple(f"rho{i + 1}" for i in range(self.active_wheels))
-
-    def arrays(self) -> SnakeModel:
-        """The description as the kernels want it."""
-        driven = self.driven_side != 0
-        return SnakeModel(
-            head_joints=self.head_joints,
-            base_joints=self.base_joints,
-            wheels=self.active_wheels,
-            link_length=self.link_length,
-            wheel_radius=self.wheel_radius,
-            point_offset=self.point_offset,
-            pitch=integers(self.pitch),
-            lower=reals(self.lower),
-            upper=reals(self.upper),
-            half_track=reals(self.half_track),
-            wheel=integers(np.where(driven, np.cumsum(driven) - 1, -1)),
-            side=reals(self.driven_side),
-            link_mass=reals(self.link_mass),
-        )
 
 
 def build(config: Config) -> SnakeDescription:

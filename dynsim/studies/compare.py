@@ -10,11 +10,11 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from dynsim.engine import simulate
 from dynsim.errors import ScenarioError
 from dynsim.record import Record
 from dynsim.results import write_json, write_text
 from dynsim.scenario import load_scenario, variant_names
-from dynsim.simulate import simulate
 
 # Called with the variant's name and the simulated time [s].
 VariantProgress = Callable[[str, float], None]

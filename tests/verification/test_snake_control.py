@@ -10,6 +10,7 @@ from dynsim.errors import ModelError
 from dynsim.kernels.jit import reals
 from dynsim.kernels.snake import constraint_matrices, new_chain, pose_of_point, walk_chain
 from dynsim.kernels.snake_control import control_input, new_work, sigma_min
+from dynsim.model.snake import conditioning
 from dynsim.plants import snake
 
 seeds = st.integers(0, 2**32 - 1)
@@ -131,7 +132,7 @@ def test_ranks_at_random_postures(seed, row):
     random = np.random.default_rng(seed)
     model, controller, phi = case(random)
     law = controller.law
-    found = task_space.conditioning(model, law, row, np.zeros(3), phi)
+    found = conditioning(model, law, row, np.zeros(3), phi)
     assert (found.rank_A, found.rank_B, found.redundancy) == (7, found.rows, 19 - found.rows)
     _, work = evaluate(model, law, phi, np.zeros(3), np.zeros(6), np.zeros(6), row, 0.0)
     # inverse iteration stops at a relative change of 1e-6; clustered values leave a mixture, not an error
@@ -144,7 +145,7 @@ def test_singularity_is_of_B_where_psi2_and_psi3_make_a_right_angle():
     law, model = task_space.build(task_space.Config(), plant).law, plant.arrays()
     phi = plant.initial_joints.copy()
     phi[3] = np.pi / 2 - phi[5]
-    found = task_space.conditioning(model, law, 0, np.zeros(3), phi)
+    found = conditioning(model, law, 0, np.zeros(3), phi)
     assert found.sigma_min_B < 1e-12
     assert found.rank_B == found.rows - 1
     assert found.sigma_min_A > 0.4  # 0.67 at the initial posture

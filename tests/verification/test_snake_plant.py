@@ -5,33 +5,31 @@ import os
 import subprocess
 import sys
 import textwrap
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from dynsim.control import task_space
+from dynsim.engine import simulate
+from dynsim.engine.kinematic_record import attitude, attitude_distance
 from dynsim.errors import ScenarioError
 from dynsim.kernels import snake as snake_kernels
 from dynsim.kernels import snake_control, snake_plant, snake_support
-from dynsim.plants import snake
-from dynsim.simulate.kinematic import attitude, attitude_distance, simulate_kinematic
+from dynsim.scenario import Scenario, ScenarioConfig, load_scenario
 
 GAMMA = {"type": "ramp", "start_s": 0.1, "duration_s": 1.0, "displacement": [0.02, 0.03, -0.03, 0.1, 0.1, 0.3]}
 
 
 def run(duration_s=2.0, rate_hz=100, plant=None, **controller):
-    return simulate_kinematic(
-        SimpleNamespace(
-            name="test",
-            variant="",
-            duration_s=duration_s,
-            plant=snake.Config(**(plant or {})),
-            controller=task_space.Config(**controller),
-            record=SimpleNamespace(rate_hz=rate_hz),
-            resolved={},
-        )
+    config = ScenarioConfig.model_validate(
+        {
+            "name": "test",
+            "duration_s": duration_s,
+            "plant": {"type": "snake"} | (plant or {}),
+            "controller": {"type": "task_space"} | controller,
+            "record": {"rate_hz": rate_hz},
+        }
     )
+    return simulate(Scenario("test", "", config))
 
 
 @pytest.mark.parametrize(("rates_at", "order"), [("start", 1), ("middle", 2)])
@@ -130,15 +128,10 @@ def test_kernels_run_as_plain_python():
     """NUMBA_DISABLE_JIT=1 gives the same numbers: debugging and coverage stay possible."""
     code = """
         import json
-        from types import SimpleNamespace as N
-        from dynsim.control import task_space
-        from dynsim.plants import snake
-        from dynsim.simulate.kinematic import simulate_kinematic
-        path = {"type": "ramp", "duration_s": 1.0, "displacement": [0.02, 0.03, -0.03, 0.1, 0.1, 0.3]}
-        controller = task_space.Config(paths=[path], cost="eq20_min")
-        scenario = N(name="", variant="", duration_s=0.05, plant=snake.Config(), controller=controller,
-                     record=N(rate_hz=200), resolved={})
-        print(json.dumps(simulate_kinematic(scenario)["phi"][-1].tolist()))
+        from dynsim.engine import simulate
+        from dynsim.scenario import load_scenario
+        short = {"duration_s": 0.05, "controller.cost": "eq20_min"}
+        print(json.dumps(simulate(load_scenario("snake_joint_limits", None, short))["phi"][-1].tolist()))
     """
     interpreted = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(code)],
@@ -147,10 +140,5 @@ def test_kernels_run_as_plain_python():
         text=True,
         check=True,
     )
-    compiled = run(
-        duration_s=0.05,
-        rate_hz=200,
-        cost="eq20_min",
-        paths=[{"type": "ramp", "duration_s": 1.0, "displacement": [0.02, 0.03, -0.03, 0.1, 0.1, 0.3]}],
-    )
+    compiled = simulate(load_scenario("snake_joint_limits", None, {"duration_s": 0.05, "controller.cost": "eq20_min"}))
     np.testing.assert_allclose(json.loads(interpreted.stdout), compiled["phi"][-1], atol=1e-12)

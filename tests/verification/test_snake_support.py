@@ -6,10 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from dynsim.control.modes import TABLE_II, ModeTable
+from dynsim.control.modes import TABLE_II
 from dynsim.kernels.jit import reals
 from dynsim.kernels.snake import new_chain, pose_of_point, walk_chain
 from dynsim.kernels.snake_support import Cost, cost_gradient, cost_value, new_support, polygon_area, support_polygon
+from dynsim.model.snake import ModeTable
 from dynsim.plants.snake import Config, build
 
 seeds = st.integers(0, 2**32 - 1)

@@ -34,5 +34,5 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
     ModelError, UnreachableReference
         The scenario describes no physics, or a path that the hand cannot follow.
     """
-    engine = importlib.import_module(f"dynsim.simulate.{scenario.engine}")
+    engine = importlib.import_module(f"dynsim.engine.{scenario.engine}")
     return engine.simulate(scenario, progress)

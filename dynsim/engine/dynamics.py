@@ -10,6 +10,8 @@ import numpy as np
 
 from dynsim import metrics
 from dynsim.control.joint_pd import Control
+from dynsim.engine import Progress
+from dynsim.engine.provenance import provenance
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.kernels import arrays as ka
 from dynsim.kernels import integrate as ki
@@ -21,8 +23,6 @@ from dynsim.model.description import Contact, Robot
 from dynsim.model.model import Model
 from dynsim.record import Record
 from dynsim.scenario import Scenario, build_model
-from dynsim.simulate import Progress
-from dynsim.simulate.provenance import provenance
 
 _SOLVERS = {"articulated": ka.SOLVER_ARTICULATED, "m_star": ka.SOLVER_M_STAR}
 # Wall time between two looks at progress and Ctrl-C [s].
@@ -47,7 +47,7 @@ def prepare(scenario: Scenario) -> Prepared:
     Raises
     ------
     ModelError, UnreachableReference
-        See :func:`dynsim.simulate.simulate`.
+        See :func:`dynsim.engine.simulate`.
     ScenarioError
         The record would be larger than ``record.size_limit_GB``.
     """
@@ -88,7 +88,7 @@ def prepare(scenario: Scenario) -> Prepared:
 
 
 def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
-    """See :func:`dynsim.simulate.simulate`."""
+    """See :func:`dynsim.engine.simulate`."""
     prepared = prepare(scenario)
     run = prepared.run
     # Loading or compiling the kernels is no integration time.
