@@ -6,6 +6,7 @@ target; joint angles with their limits; cost, smallest singular value, support m
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dynsim.record import Record
+from dynsim.studies.tanaka2019 import COORDINATES, TABLE_III, displacement, table_iii
 
 # Okabe and Ito's palette: distinct for colour-blind readers.
 BODY, HEAD, GROUND, LIFT, TARGET, SUPPORT = "#444444", "#D55E00", "#0072B2", "#FFFFFF", "#009E73", "#56B4E9"
@@ -67,6 +69,97 @@ def draw(record: Record, folder: Path) -> list[Path]:
             written.append(path)
         written.append(animate(record, folder / "animation.gif"))
     return written
+
+
+def draw_comparison(records: Mapping[str, Record], folder: Path) -> list[Path]:
+    """Variants over each other and their final postures; Table III of [T] where its manoeuvres were run."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    makers = {"comparison": comparison, "final_postures": final_postures}
+    written = []
+    names = {record.summary.get("scenario") for record in records.values()}
+    if names == {"snake_positioning"} and set(records) & set(TABLE_III):
+        makers["table_iii"] = positioning
+        path = folder / "table_iii.csv"
+        path.write_text("\n".join(",".join(row) for row in table_iii(records)) + "\n", encoding="utf-8")
+        written.append(path)
+    with plt.rc_context(STYLE):
+        for name, make in makers.items():
+            figure = make(records)
+            path = folder / f"{name}.png"
+            figure.savefig(path)
+            plt.close(figure)
+            written.append(path)
+    return written
+
+
+def comparison(records: Mapping[str, Record]) -> Figure:
+    """Cost, largest joint angle in parts of its limit, support margin and head error of all variants."""
+    figure, axes = plt.subplots(4, 1, figsize=(7.2, 7.0), sharex=True)
+    for name, record in records.items():
+        upper = np.array(record.provenance["snake"]["upper_rad"])
+        axes[0].plot(record.time, record["cost"], label=name)
+        axes[1].plot(record.time, np.abs(record["phi"] / upper).max(axis=1), label=name)
+        axes[2].plot(record.time, 1e3 * record["support_margin"], label=name)
+        axes[3].semilogy(record.time, np.maximum(record["position_error"], 1e-16), label=name)
+    axes[1].axhline(1.0, color="black", ls="-.", lw=0.8)
+    axes[2].axhline(0.0, color="black", ls="-.", lw=0.8)
+    axes[0].set_ylim(bottom=0)
+    for axis, label in zip(
+        axes, ("cost V", "largest |φ| / limit", "support margin [mm]", "position error [m]"), strict=True
+    ):
+        axis.set_ylabel(label)
+    axes[0].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    axes[-1].set_xlabel("t [s]")
+    return figure
+
+
+def final_postures(records: Mapping[str, Record]) -> Figure:
+    """Initial posture and the final one of every variant, top view."""
+    first = next(iter(records.values()))
+    views = {"start": _View(first, 0)} | {name: _View(r, len(r.time) - 1) for name, r in records.items()}
+    x0, x1, y0, y1 = _limits([view.outline() for view in views.values()], 0.06)
+    columns = min(4, len(views))
+    lines = -(-len(views) // columns)
+    size = 8.0 / columns
+    height = max(size * (y1 - y0) / (x1 - x0), 0.35 * size) + 0.45
+    figure, axes = plt.subplots(
+        lines, columns, figsize=(8.0, lines * height + 0.5), squeeze=False, sharex=True, sharey=True
+    )
+    for axis in axes.ravel()[len(views) :]:
+        axis.set_visible(False)
+    for axis, (name, view) in zip(axes.ravel(), views.items(), strict=False):
+        view.draw_top(axis)
+        axis.set(xlim=(x0, x1), ylim=(y0, y1), title=f"{name}, mode {view.mode}")
+        axis.set_aspect("equal", adjustable="box")
+    figure.supxlabel("x [m]", fontsize=8)
+    figure.supylabel("y [m]", fontsize=8)
+    figure.legend(handles=_legend(), loc="outside upper center", ncols=6, frameon=False)
+    return figure
+
+
+def positioning(records: Mapping[str, Record]) -> Figure:
+    """Table III of [T]: deviation from the target displacement, measured there and simulated here."""
+    moved = [name for name in TABLE_III if name in records]
+    figure, axes = plt.subplots(2, 1, figsize=(7.2, 4.4), sharex=True)
+    width = 0.8 / 3
+    for axis, part, unit in ((axes[0], range(3), "mm"), (axes[1], range(3, 6), "rad")):
+        scale = 1e3 if unit == "mm" else 1.0
+        for k, i in enumerate(part):
+            place = np.arange(len(moved)) + (k - 1) * width
+            published = [TABLE_III[m] for m in moved]
+            off = [scale * (p.mean[i] - p.target[i]) for p in published]
+            spread = [scale * p.deviation[i] for p in published]
+            name = SYMBOLS.get(COORDINATES[i], COORDINATES[i])
+            axis.bar(place, off, 0.9 * width, yerr=spread, capsize=2, color=CYCLE[k], alpha=0.6, label=f"Δ{name}, [T]")
+            ours = [scale * (displacement(records[m])[i] - TABLE_III[m].target[i]) for m in moved]
+            axis.plot(place, ours, "D", color="black", ms=3, label="simulated, no slip" if k == 2 else None)
+        axis.axhline(0.0, color="black", lw=0.6)
+        axis.set_ylabel(f"off target [{unit}]")
+        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    axes[1].set_xticks(range(len(moved)), [f"moving {SYMBOLS.get(m, m)}" for m in moved])
+    axes[1].set_xlim(-0.6, len(moved) - 0.4)
+    return figure
 
 
 def postures(record: Record, count: int = 6) -> Figure:
@@ -193,9 +286,9 @@ def redundancy(record: Record) -> Figure:
     return figure
 
 
-def animate(record: Record, path: Path, frames: int = FRAMES) -> Path:
+def animate(record: Record, path: Path, frames: int | None = None) -> Path:
     """Animated GIF: top view and side view with grounded and lifted wheels."""
-    rows = _moments(record, frames)
+    rows = _moments(record, frames or FRAMES)
     views = [_View(record, row) for row in rows]
     top = _limits([view.outline() for view in views], 0.08)
     side = _limits([np.vstack([view.side, view.side * [1, 0]]) for view in views], 0.08)

@@ -315,7 +315,7 @@ def control_input(model, law, work, w, phi, w_target, velocity, mode, null_gain)
                 row[i] = 0.0
             row[joint] = root[joint]
             # A joint that the task fixes almost alone would throw its share onto others at 1/tolerance its rate.
-            if append_row(rows, row, 1e-2 * root[joint], lower, reflector, beta):
+            if append_row(rows, row, 1e-3 * root[joint], lower, reflector, beta):
                 rhs[rows] = bound
                 rows += 1
                 at_limit[joint] = 1

@@ -335,7 +335,10 @@ def tick(model, law, schedule, state, velocity, rig):
         w_target[i] += period * rate[i]
         w_hat[i] += period * rate[i]  # x, y, gamma of the estimated state; the rest is overwritten
     state.counts[1] += 1
-    return slip, attempt > 0
+    commanded = False
+    for i in range(6):
+        commanded = commanded or velocity[i] != 0.0
+    return slip, attempt > 0 and commanded
 
 
 @kernel
