@@ -1,6 +1,28 @@
-"""Hypothesis draws the same examples in every run, and compiling kernels is not a slow example."""
+"""What all tests share: seeded examples, and records that are simulated once."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import pytest
 from hypothesis import settings
 
+from dynsim.engine import simulate
+from dynsim.record import Record
+from dynsim.scenario import load_scenario
+
+# The same examples in every run; compiling kernels is not a slow example.
 settings.register_profile("seeded", derandomize=True, deadline=None, max_examples=25)
 settings.load_profile("seeded")
+
+
+@cache
+def _simulated(name: str, variant: str | None) -> Record:
+    return simulate(load_scenario(name, variant))
+
+
+@pytest.fixture(scope="session")
+def simulated() -> Callable[[str, str | None], Record]:
+    """Record of a shipped scenario and variant, simulated once per session."""
+    return _simulated

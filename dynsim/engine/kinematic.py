@@ -1,0 +1,222 @@
+"""Engine of the kinematic snake: ticks between switching times are compiled, mode switching is not."""
+
+from __future__ import annotations
+
+import time as clock
+from dataclasses import dataclass
+from types import ModuleType
+
+import numpy as np
+
+from dynsim.engine import Progress
+from dynsim.engine.kinematic_record import make_record
+from dynsim.engine.mode_switching import ModeSwitcher
+from dynsim.engine.provenance import provenance
+from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
+from dynsim.families import member
+from dynsim.kernels.snake import SnakeModel, pose_of_point
+from dynsim.kernels.snake_plant import Rig, State, Trace, new_rig, new_state, new_trace, record_row, run_ticks
+from dynsim.model.snake import (
+    FIXING,
+    NO_REQUEST,
+    SWITCHING,
+    CommandBlock,
+    SnakeDescription,
+    TaskSpaceController,
+)
+from dynsim.record import Record
+from dynsim.scenario import Scenario
+
+CHUNK = 2000  # ticks between two looks at Ctrl-C and the progress bar; about 0.1 s
+
+
+@dataclass
+class Run:
+    """One simulation on its way: the robot, its controller, all commands, the state and what was recorded."""
+
+    description: SnakeDescription
+    model: SnakeModel
+    controller: TaskSpaceController
+    block: CommandBlock
+    state: State
+    rig: Rig
+    trace: Trace
+    stride: int
+
+
+def prepare(scenario: Scenario) -> Run:
+    """Build robot and controller and the initial state.
+
+    Raises
+    ------
+    ModelError
+        The robot cannot be controlled as configured, or the scenario has what this engine does not know.
+    ScenarioError
+        The recording rate does not divide the control rate, or the record would be too large.
+    """
+    if scenario.controller is None or getattr(_controller_module(scenario), "ENGINE", "") != "kinematic":
+        raise ModelError(f"plant {scenario.plant.type!r} (kinematic) needs controller.type: task_space")
+    if scenario.config.contacts.points:
+        raise ModelError(f"plant {scenario.plant.type!r} (kinematic) takes no contacts.points: it stands on its wheels")
+    description: SnakeDescription = member("plant", scenario.plant.type).build(scenario.plant)
+    controller: TaskSpaceController = _controller_module(scenario).build(scenario.controller, description)
+    model, period = description.arrays(), controller.schedule.period
+    ticks = round(scenario.duration_s / period)
+    if ticks < 1:
+        raise ScenarioError(f"duration_s = {scenario.duration_s:g} is shorter than controller.period_s = {period:g}")
+    stride = _stride(scenario.record.rate_hz, period)
+    rows = -(-ticks // stride) + 1
+    trace_size = 8e-9 * rows * sum(array[0].size for array in new_trace(model, 1))
+    if trace_size > scenario.record.size_limit_GB:
+        raise ScenarioError(
+            f"record.rate_hz = {scenario.record.rate_hz:g}: the record needs {trace_size:.3g} GB, the limit "
+            f"(record.size_limit_GB) is {scenario.record.size_limit_GB:g} GB"
+        )
+
+    state, rig = new_state(model), new_rig(model)
+    state.base[:], state.phi[:] = description.initial_base_pose, description.initial_joints
+    pose_of_point(model, state.base, state.phi, rig.work.frame, state.w_target)
+    state.phi_hat[:], state.w_hat[:] = state.phi, state.w_target
+    state.counts[0] = controller.fixing_row
+    block = controller.source.read(0, ticks, period)
+    return Run(description, model, controller, block, state, rig, new_trace(model, rows), stride)
+
+
+def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
+    """See :func:`dynsim.engine.simulate`; also raises what :func:`prepare` raises."""
+    run = prepare(scenario)
+    controller = run.controller
+    switcher = ModeSwitcher(
+        policy=controller.policy,
+        fixing_row=controller.fixing_row,
+        order=controller.order,
+        period_ticks=controller.switch_ticks,
+        least_margin=controller.least_margin,
+        margin_now=lambda row: _margin_now(run, row),
+        predict=lambda row: _predict(run, row),
+    )
+    _load_kernels(run)
+    stop: SimulationStopped | None = None
+    started = clock.perf_counter()
+    try:
+        _advance(run, switcher, progress)
+    except SimulationStopped as stopped:
+        stop = stopped
+    except KeyboardInterrupt:
+        reached = float(run.state.counts[1] * controller.schedule.period)
+        stop = SimulationInterrupted(
+            f"interrupted at t = {reached:.3f} s of {scenario.duration_s:g} s", time=reached, state=_named(run.state)
+        )
+    record = make_record(run, scenario, provenance(scenario), switcher, clock.perf_counter() - started)
+    if stop is not None:
+        record.complete = False
+        record.summary["warnings"].append(f"incomplete: {stop}")
+        record.provenance["stopped"] = {"time_s": stop.time, "reason": str(stop), "state": stop.state}
+        stop.record = record
+        raise stop
+    return record
+
+
+def _controller_module(scenario: Scenario) -> ModuleType:
+    return member("controller", scenario.controller.type)
+
+
+def _named(state: State) -> dict[str, list[float]]:
+    return {"base_pose": state.base.tolist(), "phi": state.phi.tolist(), "rho": state.rho.tolist()}
+
+
+def _load_kernels(run: Run) -> None:
+    """Compile or load the kernels: that is no simulation time."""
+    trial, trace = _copy(run.state), new_trace(run.model, 1)
+    run_ticks(
+        run.model, run.controller.law, run.controller.schedule, trial, run.block.velocity, 0, 1, 1, 1, run.rig, trace
+    )
+    record_row(run.model, run.controller.law, trial, run.rig, 0, trace)
+
+
+def _stride(rate_hz: float, period: float) -> int:
+    exact = 1.0 / (rate_hz * period)
+    stride = max(1, round(exact))
+    if abs(stride - exact) > 1e-6 * exact:
+        raise ScenarioError(
+            f"record.rate_hz = {rate_hz:g} does not divide the control rate of {1 / period:g} Hz "
+            f"(controller.period_s); {1 / (period * stride):g} does"
+        )
+    return stride
+
+
+def _advance(run: Run, switcher: ModeSwitcher, progress: Progress | None) -> None:
+    """Run to the end in pieces that no mode request and no switching time divides."""
+    state, controller, period = run.state, run.controller, run.controller.schedule.period
+    block, ticks = run.block, len(run.block.request)
+    requests = np.flatnonzero(block.request != NO_REQUEST)
+    recovering = False
+    while (now := int(state.counts[1])) < ticks:
+        request = int(block.request[now])
+        # At the ends of switching periods only, so that every recovery has at least one.
+        if recovering and now >= (switcher.next_event() or 0) and _is_released(run):
+            recovering, request = False, FIXING
+        state.counts[0] = switcher.at_tick(now, request)
+        later = requests[requests > now]
+        ends = [ticks, now + CHUNK, *later[:1]]
+        if (event := switcher.next_event()) is not None:
+            ends.append(event)
+        count = int(min(ends)) - now
+        done, blocked = run_ticks(
+            run.model,
+            controller.law,
+            controller.schedule,
+            state,
+            block.velocity,
+            count,
+            int(not recovering),
+            int(controller.when_blocked),
+            run.stride,
+            run.rig,
+            run.trace,
+        )
+        if done < 0:
+            time = float(state.counts[1] * period)
+            raise SimulationStopped(
+                f"the state is no longer finite at t = {time:g} s: a singular posture, or a gain too high "
+                "for the control period",
+                time=time,
+                state={"base_pose": state.base.tolist(), "phi": state.phi.tolist()},
+            )
+        if blocked and not recovering and controller.when_blocked and not switcher.switching:
+            recovering = True
+            if state.counts[1] < ticks:
+                state.counts[0] = switcher.at_tick(int(state.counts[1]), SWITCHING)
+        if progress is not None:
+            progress(float(state.counts[1] * period))
+
+
+def _is_released(run: Run) -> bool:
+    """True when every base joint is well within its limit again ([T] IV.C.5: until the robot becomes operable)."""
+    base = slice(run.model.head_joints, None)
+    return bool(np.all(np.abs(run.state.phi[base]) < run.controller.release_fraction * run.model.upper[base]))
+
+
+def _margin_now(run: Run, row: int) -> float:
+    trial, trace = _copy(run.state), new_trace(run.model, 1)
+    trial.counts[0] = row
+    record_row(run.model, run.controller.law, trial, run.rig, 0, trace)
+    return float(trace.margin[0])
+
+
+def _predict(run: Run, row: int) -> tuple[float, float]:
+    """Cost after one switching period in a mode with the present command held, and the smallest support margin."""
+    ticks, law, schedule = run.controller.prediction_ticks, run.controller.law, run.controller.prediction
+    trial, trace = _copy(run.state), new_trace(run.model, ticks + 1)
+    place = min(int(trial.counts[3]), len(run.block.velocity) - 1)
+    held = np.tile(run.block.velocity[place], (ticks, 1))
+    trial.counts[0], trial.counts[1], trial.counts[3] = row, 0, 0
+    done, _ = run_ticks(run.model, law, schedule, trial, held, ticks, 1, 1, 1, run.rig, trace)
+    if 0 <= done < ticks:  # blocked: the target waits for the rest of the period
+        run_ticks(run.model, law, schedule, trial, held, ticks - done, 0, 0, 1, run.rig, trace)
+    record_row(run.model, law, trial, run.rig, ticks, trace)
+    return float(trace.cost[-1]), float(trace.margin.min())
+
+
+def _copy(state: State) -> State:
+    return State(*(array.copy() for array in state))

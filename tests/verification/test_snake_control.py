@@ -1,0 +1,218 @@
+"""Verification of the task-space controller: eqs 12-14 against dense linear algebra, and what follows from them."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dynsim.control import task_space
+from dynsim.errors import ModelError
+from dynsim.kernels.jit import reals
+from dynsim.kernels.snake import constraint_matrices, new_chain, pose_of_point, walk_chain
+from dynsim.kernels.snake_control import control_input, new_work, sigma_min
+from dynsim.model.snake import conditioning
+from dynsim.plants import snake
+
+seeds = st.integers(0, 2**32 - 1)
+forms = st.sampled_from(["safe", "paper"])
+mode_rows = st.integers(0, 5)
+
+
+def case(random, **options):
+    """Robot of random geometry, controller of random weights, and a random posture well away from the limits."""
+    plant = snake.build(
+        snake.Config(
+            link_length=random.uniform(0.05, 0.15),
+            wheel_radius=random.uniform(0.03, 0.08),
+            wheel_gap=random.uniform(0.08, 0.2, 7).tolist(),
+            driven_side=random.choice(["left", "right"], 7).tolist(),
+            controlled_point=str(random.choice(["head", "gripper"])),
+        )
+    )
+    config = {"limit_policy": "none", "damping_sigma": 0.0} | options
+    controller = task_space.build(task_space.Config(**config), plant)
+    phi = plant.initial_joints + random.uniform(-0.3, 0.3, 12)
+    return plant.arrays(), controller, phi
+
+
+def evaluate(model, law, phi, base, deviation, velocity, row, null_gain):
+    w, work = np.zeros(6), new_work(model)
+    pose_of_point(model, reals(base), reals(phi), work.frame, w)
+    control_input(model, law, work, w, reals(phi), reals(w - deviation), reals(velocity), row, null_gain)
+    return w, work
+
+
+def dense(model, law, phi, w, row):
+    """A~, B~ and the weighted pseudo inverse, by numpy."""
+    chain = new_chain(model)
+    walk_chain(model, w, reals(phi), np.zeros((3, 3)), chain)
+    A, B = np.zeros((10 + model.wheels, 6)), np.zeros((10 + model.wheels, 12 + model.wheels))
+    constraint_matrices(model, chain, w, A, B)
+    down = law.grounded[row].astype(bool)
+    keep = np.concatenate([down, [True] * 3, down])
+    m = len(law.shape_joints)
+    S = np.zeros((m, B.shape[1]))
+    S[np.arange(m), law.shape_joints] = 1
+    A = np.block([[A[keep], np.zeros((keep.sum(), m))], [np.zeros((m, 6)), np.eye(m)]])
+    B = np.vstack([B[keep], S])
+    W_inverse = np.diag(law.root_weight_inverse**2)
+    return A, B, W_inverse @ B.T @ np.linalg.inv(B @ W_inverse @ B.T), W_inverse
+
+
+@given(seeds, mode_rows, forms)
+@settings(max_examples=40, deadline=None)
+def test_input_is_equations_12_to_14(seed, row, form):
+    random = np.random.default_rng(seed)
+    weights = {"weight_joint": random.uniform(0.2, 5, 12).tolist(), "weight_wheel": random.uniform(0.01, 1)}
+    model, controller, phi = case(random, null_form=form, **weights)
+    law, deviation, velocity = controller.law, random.normal(size=6) * 0.1, random.normal(size=6) * 0.1
+    w, work = evaluate(model, law, phi, random.normal(size=3), deviation, velocity, row, 0.1)
+    A, B, inverse, W_inverse = dense(model, law, phi, w, row)
+    rate = np.append(velocity - law.gain[:6] * deviation, -law.gain[6] * (phi[5] - law.shape_target[0]))
+    eta = np.append(2 * law.cost.diagonal * phi, np.zeros(model.wheels))
+    null = (np.eye(B.shape[1]) - inverse @ B) @ (eta if form == "paper" else W_inverse @ eta)
+    # both sides lose digits by the condition of B~, squared in the normal equations of the reference
+    scale = 1e-15 * np.linalg.cond(B @ np.sqrt(W_inverse)) ** 2 * 100
+    np.testing.assert_allclose(work.u, inverse @ A @ rate - 0.1 * null, atol=max(scale, 1e-10), rtol=max(scale, 1e-9))
+    # eq 15: the closed loop does what was commanded
+    np.testing.assert_allclose(B @ work.u, A @ rate, atol=1e-10)
+
+
+@given(seeds, mode_rows)
+@settings(max_examples=40, deadline=None)
+def test_safe_null_space_term_never_raises_the_cost(seed, row):
+    """eta . u_ker <= 0 and B~ u_ker = 0 for every W; eq 14 as printed guarantees it for equal joint weights only."""
+    random = np.random.default_rng(seed)
+    model, controller, phi = case(random, weight_joint=random.uniform(0.05, 20, 12).tolist())
+    phi[5] = controller.law.shape_target[0]
+    w, work = evaluate(model, controller.law, phi, np.zeros(3), np.zeros(6), np.zeros(6), row, 1.0)
+    _, B, _, _ = dense(model, controller.law, phi, w, row)
+    assert work.gradient @ work.u <= 1e-12
+    np.testing.assert_allclose(B @ work.u, 0.0, atol=1e-11)
+
+
+def test_printed_null_space_term_can_raise_the_cost():
+    """Unequal joint weights: a posture where eq 14 climbs (the fact behind ``null_form: safe``)."""
+    random, climbs = np.random.default_rng(3), []
+    for _ in range(200):
+        weights = (10 ** random.uniform(-1.5, 1.5, 12)).tolist()
+        model, controller, phi = case(random, null_form="paper", weight_joint=weights)
+        phi[5] = controller.law.shape_target[0]
+        _, work = evaluate(model, controller.law, phi, np.zeros(3), np.zeros(6), np.zeros(6), 0, 1.0)
+        climbs.append(work.gradient @ work.u)
+    assert max(climbs) > 0.0
+
+
+@given(seeds, mode_rows)
+@settings(max_examples=20, deadline=None)
+def test_joint_rates_do_not_depend_on_wheel_side_or_track_as_wheel_weights_vanish(seed, row):
+    random = np.random.default_rng(seed)
+    phi = np.array([0, -0.8, 0, -1.1, 0, 1.9] + [0] * 6) + random.uniform(-0.3, 0.3, 12)
+    velocity = random.normal(size=6) * 0.1
+    sides = [random.choice(["left", "right"], 7).tolist() for _ in range(2)]
+    gaps = [random.uniform(0.08, 0.2, 7).tolist() for _ in range(2)]
+    difference = []
+    for weight in (1e-2, 1e-6, 1e-8):
+        rates = []
+        for side, gap in zip(sides, gaps, strict=True):
+            plant = snake.build(snake.Config(driven_side=side, wheel_gap=gap))
+            config = task_space.Config(weight_wheel=weight, limit_policy="none", damping_sigma=0.0)
+            law = task_space.build(config, plant).law
+            rates.append(evaluate(plant.arrays(), law, phi, np.zeros(3), np.zeros(6), velocity, row, 0.1)[1].u[:12])
+        difference.append(np.abs(rates[0] - rates[1]).max())
+    # the influence is proportional to the weight: 1e-2 -> 1e-6 divides it by 1e4 (or it is rounding already)
+    assert difference[1] <= 2e-3 * difference[0] + 1e-9
+    assert difference[2] <= 1e-6
+
+
+@given(seeds, mode_rows)
+@settings(max_examples=30, deadline=None)
+def test_ranks_at_random_postures(seed, row):
+    """A~ has full column rank and B~ full row rank at random postures; the smallest singular value is reported."""
+    random = np.random.default_rng(seed)
+    model, controller, phi = case(random)
+    law = controller.law
+    found = conditioning(model, law, row, np.zeros(3), phi)
+    assert (found.rank_A, found.rank_B, found.redundancy) == (7, found.rows, 19 - found.rows)
+    _, work = evaluate(model, law, phi, np.zeros(3), np.zeros(6), np.zeros(6), row, 0.0)
+    # inverse iteration stops at a relative change of 1e-6; clustered values leave a mixture, not an error
+    assert sigma_min(model, law, work, law.grounded[row]) == pytest.approx(found.sigma_min_B, rel=1e-3)
+
+
+def test_singularity_is_of_B_where_psi2_and_psi3_make_a_right_angle():
+    """[T] does not consider singularities "because the robot in the paper has many active wheels": true of A only."""
+    plant = snake.build(snake.Config())
+    law, model = task_space.build(task_space.Config(), plant).law, plant.arrays()
+    phi = plant.initial_joints.copy()
+    phi[3] = np.pi / 2 - phi[5]
+    found = conditioning(model, law, 0, np.zeros(3), phi)
+    assert found.sigma_min_B < 1e-12
+    assert found.rank_B == found.rows - 1
+    assert found.sigma_min_A > 0.4  # 0.67 at the initial posture
+    assert found.rank_A == 7
+
+
+def test_damping_keeps_rates_finite_at_the_singularity_and_leaves_the_null_space_alone():
+    plant = snake.build(snake.Config())
+    law, model = task_space.build(task_space.Config(limit_policy="none"), plant).law, plant.arrays()
+    phi = plant.initial_joints.copy()
+    phi[3] = np.pi / 2 - phi[5]
+    phi[5] = law.shape_target[0]
+    up = np.array([0, 0, 0.05, 0, 0, 0])
+    for offset in (0.0, 1e-9, 1e-6, 1e-3):
+        phi[3] = np.pi / 2 - phi[5] + offset
+        w, work = evaluate(model, law, phi, np.zeros(3), np.zeros(6), up, 0, 0.0)
+        # the weakest direction asks for |A w'| / sigma undamped; damped at most |A w'| / (2 lambda)
+        assert np.abs(work.u[:12]).max() < 0.1 / (2 * law.damping_factor)
+    _, B, _, _ = dense(model, law, phi, w, 0)
+    _, work = evaluate(model, law, phi, np.zeros(3), np.zeros(6), np.zeros(6), 0, 1.0)
+    np.testing.assert_allclose(B @ work.u, 0.0, atol=1e-9)
+
+
+@given(seeds, mode_rows)
+@settings(max_examples=40, deadline=None)
+def test_allocation_keeps_joints_within_limits_without_head_error(seed, row):
+    """A joint at its limit is one more S row: its rate is bounded and B~ u = A~ w~' still holds exactly."""
+    random = np.random.default_rng(seed)
+    model, controller, phi = case(random, limit_policy="allocate")
+    for j in random.choice(np.arange(6, 12), 2, replace=False):
+        phi[j] = model.upper[j] * random.choice([-1, 1])
+    velocity = random.normal(size=6) * 0.05
+    w, work = evaluate(model, controller.law, phi, np.zeros(3), np.zeros(6), velocity, row, 0.1)
+    free = work.at_limit != 2
+    bound = controller.law.limit_rate * np.stack([model.lower - phi, model.upper - phi])
+    assert np.all(work.u[:12][free] >= bound[0][free] - 1e-9)
+    assert np.all(work.u[:12][free] <= bound[1][free] + 1e-9)
+    A, B, _, _ = dense(model, controller.law, phi, w, row)
+    rate = np.append(velocity, -2.0 * (phi[5] - controller.law.shape_target[0]))
+    np.testing.assert_allclose(B @ work.u, A @ rate, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("plant", "controller", "reason"),
+    [
+        # physics: with a shape controllable point n_h = 4 leaves three free head joints for four rows
+        ({"head_joints": 4, "yaw_joints": 8}, {}, r"eq 1"),
+        ({}, {"shape_points": {"psi1": -0.8, "psi2": -1.1, "psi3": 1.9}}, r"free"),
+        ({"driven_side": "none"}, {"modes": {1: [1, 2, 3, 4, 5]}, "switching": {"order": [1]}}, "eq 16"),
+        ({}, {"modes": {1: []}, "switching": {"order": [1]}, "shape_points": {"psi3": 1.9, "theta3": 0, "theta4": 0}},
+         "more rows than inputs"),
+        # psi2 and psi3 both fixed: one pitch joint for height and pitch of a head without roll
+        ({}, {"shape_points": {"psi2": -1.1, "psi3": 1.9}}, "initial posture is singular"),
+        ({}, {"shape_points": {"psi9": 0.0}}, "no joint 'psi9'"),
+        ({}, {"shape_points": {"psi3": 2.0}}, "beyond its limit"),
+        ({}, {"modes": {1: [8]}}, "pair 8"),
+        ({}, {"fixing_mode": 7}, "no mode 7"),
+        ({}, {"gain": [2.0, 2.0]}, "7 are needed"),
+        ({}, {"cost_matrix": [1.0]}, "12 are needed"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_controlled_is_refused_with_the_reason(plant, controller, reason):
+    with pytest.raises(ModelError, match=reason):
+        task_space.build(task_space.Config(**controller), snake.build(snake.Config(**plant)))
+
+
+def test_four_head_joints_are_enough_without_shape_points():
+    """[T] eq 1 itself: n_h = 4 is controllable as long as no shape controllable point is used."""
+    plant = snake.build(snake.Config(head_joints=4, yaw_joints=8))
+    assert task_space.build(task_space.Config(shape_points={}), plant).law.shape_joints.size == 0

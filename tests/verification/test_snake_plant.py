@@ -1,0 +1,144 @@
+"""Verification of the plant and the tick loop: rolling, order of the sampling error, what the controller may know."""
+
+import json
+import os
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+
+from dynsim.engine import simulate
+from dynsim.engine.kinematic_record import attitude, attitude_distance
+from dynsim.errors import ScenarioError
+from dynsim.kernels import snake as snake_kernels
+from dynsim.kernels import snake_control, snake_plant, snake_support
+from dynsim.scenario import Scenario, ScenarioConfig, load_scenario
+
+GAMMA = {"type": "ramp", "start_s": 0.1, "duration_s": 1.0, "displacement": [0.02, 0.03, -0.03, 0.1, 0.1, 0.3]}
+
+
+def run(duration_s=2.0, rate_hz=100, plant=None, **controller):
+    config = ScenarioConfig.model_validate(
+        {
+            "name": "test",
+            "duration_s": duration_s,
+            "plant": {"type": "snake"} | (plant or {}),
+            "controller": {"type": "task_space"} | controller,
+            "record": {"rate_hz": rate_hz},
+        }
+    )
+    return simulate(Scenario("test", "", config))
+
+
+@pytest.mark.parametrize(("rates_at", "order"), [("start", 1), ("middle", 2)])
+def test_head_error_falls_with_the_order_of_the_held_rates(rates_at, order):
+    errors = []
+    for period in (0.01, 0.005, 0.0025):
+        record = run(rates_at=rates_at, period_s=period, paths=[GAMMA], rate_hz=100)
+        errors.append(record.summary["position_error_max_m"])
+    ratios = np.array(errors[:-1]) / errors[1:]
+    # exact halving up to the next term of the series
+    np.testing.assert_allclose(ratios, 2.0**order, rtol=0.15)
+
+
+def test_wheels_roll_without_slip():
+    """The recorded base motion against the recorded wheel angles: X_1 . v_1 - side b yaw' = r rho_1'."""
+    record = run(paths=[GAMMA], rate_hz=200)
+    base, rho, h = record["base_pose"], record["rho"], 1 / 200
+    rate = (base[2:] - base[:-2]) / (2 * h)
+    yaw = base[1:-1, 2]
+    centre = rate[:, 0] * np.cos(yaw) + rate[:, 1] * np.sin(yaw) - 0.075 * rate[:, 2]
+    wheel = 0.05 * (rho[2:, 0] - rho[:-2, 0]) / (2 * h)
+    # central differences, and rates that are constant within a period: O(h^2) = 2.5e-5 times curvature, O(h) at kinks
+    moving = slice(30, 210)
+    np.testing.assert_allclose(centre[moving], wheel[moving], atol=1e-4)
+    side = -rate[:, 0] * np.sin(yaw) + rate[:, 1] * np.cos(yaw)
+    np.testing.assert_allclose(side[moving], 0.0, atol=1e-4)
+    assert record.summary["slip_max_m_s"] < 1e-4
+
+
+def test_substeps_of_the_plant_change_nothing_but_rounding_of_the_base():
+    """Runge-Kutta 4 over 5 ms is already converged: its error is far below that of the held rates."""
+    one, four = (run(paths=[GAMMA], plant_substeps=n) for n in (1, 4))
+    np.testing.assert_allclose(one["base_pose"], four["base_pose"], atol=1e-9)
+
+
+@pytest.mark.parametrize("state", ["measured", "estimated", "feedforward"])
+def test_states_agree_when_nothing_disturbs(state):
+    """[T] IV.C.1, IV.C.2: with ideal joints and no slip, integration and measurement tell the same."""
+    record = run(paths=[GAMMA], state=state, duration_s=4.0)
+    assert record.summary["final_position_error_m"] < 1e-6
+    assert record.summary["final_attitude_error_rad"] < 1e-6
+    np.testing.assert_allclose(record["w_estimate"], record["w"], atol=1e-6)
+
+
+def test_only_measurement_removes_an_error_that_joints_cannot_show():
+    """x, y, gamma of the estimated state are the integrated target ([T] IV.C.1): their error never shows, nor goes.
+
+    Coarse sampling with rates of the period's beginning makes such an error.
+    """
+    coarse = {"paths": [GAMMA], "period_s": 0.02, "rates_at": "start", "duration_s": 8.0, "rate_hz": 50}
+    measured = run(**coarse, state="measured").summary["final_position_error_m"]
+    estimated = run(**coarse, state="estimated").summary["final_position_error_m"]
+    assert measured < 1e-6 < 1e-4 < estimated
+
+
+def test_the_target_waits_instead_of_breaking_a_limit():
+    """Driven backward the robot jack-knifes; with the allocating policy the head stays where its target waits."""
+    back = {"type": "ramp", "start_s": 0.1, "duration_s": 6.0, "displacement": [-0.6, 0, 0, 0, 0, 0]}
+    kink = {"initial_joints": [0, -0.8, 0, -1.1, 0, 1.9, 0.2, -0.1] + [0.0] * 4}
+    summary = run(paths=[back], plant=kink, duration_s=10.0).summary
+    assert summary["waiting_s"] > 1.0
+    assert summary["joint_limit_violation_max_rad"] == 0.0
+    assert summary["clamped_joint_ticks"] == 0
+    assert summary["position_error_max_m"] < 1e-4
+    assert summary["attitude_error_max_rad"] < 1e-4
+    without = run(paths=[back], plant=kink, duration_s=10.0, limit_policy="none").summary
+    assert without["joint_limit_violation_max_rad"] > 0.1
+
+
+def test_attitude_distance_is_the_angle_of_the_relative_rotation():
+    random = np.random.default_rng(0)
+    w, v = random.uniform(-1, 1, (2, 50, 6))
+    relative = np.einsum("tij,tik->tjk", attitude(w), attitude(v))
+    angle = np.arccos(np.clip((np.trace(relative, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    np.testing.assert_allclose(attitude_distance(w, v), angle, atol=1e-12)
+    tiny = w + 1e-9 * np.eye(6)[5]
+    np.testing.assert_allclose(attitude_distance(w, tiny), 1e-9, rtol=1e-5)
+
+
+def test_a_recording_rate_that_does_not_divide_the_control_rate_is_refused():
+    with pytest.raises(ScenarioError, match="does not divide"):
+        run(rate_hz=150)
+
+
+def test_every_kernel_has_one_compiled_signature():
+    """A second one means an array of another layout or a literal slipped in: twice the compile time, silently."""
+    run(duration_s=0.05)
+    entry = [snake_plant.run_ticks, snake_plant.record_row, snake_plant.tick, snake_control.control_input]
+    entry += [snake_kernels.walk_chain, snake_kernels.constraint_matrices, snake_support.cost_gradient]
+    for kernel in entry:
+        if hasattr(kernel, "signatures"):
+            assert len(kernel.signatures) <= 1, kernel  # 0: called only from a kernel that came from the cache
+
+
+def test_kernels_run_as_plain_python():
+    """NUMBA_DISABLE_JIT=1 gives the same numbers: debugging and coverage stay possible."""
+    code = """
+        import json
+        from dynsim.engine import simulate
+        from dynsim.scenario import load_scenario
+        short = {"duration_s": 0.05, "controller.cost": "eq20_min"}
+        print(json.dumps(simulate(load_scenario("snake_joint_limits", None, short))["phi"][-1].tolist()))
+    """
+    interpreted = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    compiled = simulate(load_scenario("snake_joint_limits", None, {"duration_s": 0.05, "controller.cost": "eq20_min"}))
+    np.testing.assert_allclose(json.loads(interpreted.stdout), compiled["phi"][-1], atol=1e-12)
