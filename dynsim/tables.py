@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from rich import box
@@ -11,6 +11,9 @@ from rich.markup import escape
 from rich.table import Table
 
 Summary = Mapping[str, Any]
+
+# Room for the longest row heading.
+_HEADING_WIDTH = 34
 
 
 def _number(value: Any, scale: float = 1.0, digits: int = 4) -> str:
@@ -64,27 +67,36 @@ def print_summary(console: Console, summary: Summary) -> None:
 
 
 def print_comparison(console: Console, summaries: Mapping[str, Summary]) -> None:
-    """All variants side by side, one column each."""
-    first = next(iter(summaries.values()))
-    table = Table(title=first["scenario"], box=box.SIMPLE_HEAD, title_justify="left")
+    """All variants side by side, one column each; several tables where the terminal is too narrow for one."""
+    names = list(summaries)
+    cell = max([10, *map(len, names)]) + 2
+    across = max(1, (console.width - _HEADING_WIDTH) // cell)
+    for start in range(0, len(names), across):
+        _print_columns(console, summaries, names[start : start + across])
+    _print_warnings(console, summaries)
+
+
+def _print_columns(console: Console, summaries: Mapping[str, Summary], names: Sequence[str]) -> None:
+    table = Table(title=next(iter(summaries.values()))["scenario"], box=box.SIMPLE_HEAD, title_justify="left")
     table.add_column("", no_wrap=True)
-    for name in summaries:
+    for name in names:
         table.add_column(name, justify="right", no_wrap=True)
+    shown = [summaries[name] for name in names]
     for heading, take, show in _ROWS:
-        values = [take(summary) for summary in summaries.values()]
-        if any(value is not None for value in values):
+        if any(take(summary) is not None for summary in summaries.values()):
+            values = [take(summary) for summary in shown]
             table.add_row(escape(heading), *("–" if value is None else show(value) for value in values))
     energies = [summary.get("electrical_energy_J") or 0.0 for summary in summaries.values()]
     if min(energies) > 0.0:
-        least = min(energies)
-        table.add_row("energy, times the least", *(f"{energy / least:.3g}" for energy in energies))
+        ratios = (summary["electrical_energy_J"] / min(energies) for summary in shown)
+        table.add_row("energy, times the least", *(f"{ratio:.3g}" for ratio in ratios))
     contacts = list(dict.fromkeys(c["name"] for s in summaries.values() for c in s.get("contacts", ())))
     for contact in contacts:
-        by_variant = [next((c for c in s["contacts"] if c["name"] == contact), None) for s in summaries.values()]
-        for heading, show in _CONTACT_ROWS:
-            table.add_row(escape(_of(contact, heading)), *(show(c) if c else "–" for c in by_variant))
+        by_variant = [next((c for c in s["contacts"] if c["name"] == contact), None) for s in shown]
+        for heading, show_contact in _CONTACT_ROWS:
+            cells = (show_contact(c) if c else "–" for c in by_variant)
+            table.add_row(escape(_of(contact, heading)), *cells)
     console.print(table)
-    _print_warnings(console, summaries)
 
 
 def print_choices(console: Console) -> None:

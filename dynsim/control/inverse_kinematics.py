@@ -45,6 +45,10 @@ def follow(model: Model, times: Array, targets: Array, joints: Sequence[str], q:
     q = q.copy()
     result = np.zeros((len(times), len(columns)))
     for k, (t, target) in enumerate(zip(times, targets, strict=True)):
+        if k >= 3 and len(columns) <= 3:
+            # The parabola through the last three solutions leaves one iteration to do. Not for redundant joints: what
+            # the hand does not determine would run away along it.
+            q[columns] = 3.0 * result[k - 1] - 3.0 * result[k - 2] + result[k - 3]
         best = np.inf
         for _ in range(ITERATIONS):
             position, jacobian = model.point_position_and_jacobian(body, point, q)

@@ -68,6 +68,7 @@ class Rig(NamedTuple):
     target: np.ndarray  # (6,)
     rate: np.ndarray  # (6,) rate of the target that is carried out
     origin: np.ndarray  # (3,)
+    command: np.ndarray  # (6,) rate of the target that is asked for
 
 
 class Trace(NamedTuple):
@@ -120,6 +121,7 @@ def new_rig(model: SnakeModel) -> Rig:
         target=np.zeros(6),
         rate=np.zeros(6),
         origin=np.zeros(3),
+        command=np.zeros(6),
     )
 
 
@@ -384,7 +386,7 @@ def run_ticks(model, law, schedule, state, velocity, count, moving, stop, stride
         The last period was blocked.
     """
     base, phi, counts, at_limit = state.base, state.phi, state.counts, rig.work.at_limit
-    command, blocked = np.zeros(6), False
+    command, blocked = rig.command, False
     for k in range(count):
         now, place = counts[1], counts[3]
         r = now // stride if now % stride == 0 else -1
