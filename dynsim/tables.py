@@ -13,7 +13,7 @@ from rich.table import Table
 Summary = Mapping[str, Any]
 
 # Room for the longest row heading.
-_HEADING_WIDTH = 34
+_HEADING_WIDTH = 30
 
 
 def _number(value: Any, scale: float = 1.0, digits: int = 4) -> str:
