@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dynsim.errors import RecordError
+from dynsim.files import replacing
 
 FORMAT = "dynsim-record-1"
 
@@ -103,24 +103,15 @@ class Record:
         import h5py
 
         path = Path(path)
-        temporary = path.with_name(path.name + ".tmp")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with h5py.File(temporary, "w") as file:
-                file.attrs["format"] = FORMAT
-                file.attrs["complete"] = self.complete
-                # Long texts as data sets: HDF5 attributes end at 64 kB.
-                file["summary"] = json.dumps(self.summary)
-                file["provenance"] = json.dumps(self.provenance, default=str)
-                _write(file, "time", Signal(self.time, "s"))
-                for name, signal in self.signals.items():
-                    _write(file, f"signals/{name}", signal)
-            os.replace(temporary, path)
-        except (OSError, RuntimeError) as error:
-            # h5py reports a full disk as RuntimeError or OSError, depending on when it notices.
-            with suppress(OSError):
-                temporary.unlink(missing_ok=True)
-            raise RecordError(f"cannot write {path}: {error}; nothing was changed there") from error
+        with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+            file.attrs["format"] = FORMAT
+            file.attrs["complete"] = self.complete
+            # Long texts as data sets: HDF5 attributes end at 64 kB.
+            file["summary"] = json.dumps(self.summary)
+            file["provenance"] = json.dumps(self.provenance, default=str)
+            _write(file, "time", Signal(self.time, "s"))
+            for name, signal in self.signals.items():
+                _write(file, f"signals/{name}", signal)
         return path
 
     @classmethod

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from dynsim.errors import RecordError
+from dynsim.files import replacing
 from dynsim.record import Record
 from dynsim.scenario import to_yaml
 
@@ -21,15 +19,8 @@ def write_text(path: Path, text: str) -> Path:
     RecordError
         The file cannot be written; an older one is left as it was.
     """
-    temporary = path.with_name(path.name + ".tmp")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
-    except OSError as error:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise RecordError(f"cannot write {path}: {error}") from error
     return path
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
-from dynsim.errors import RecordError
+from dynsim.files import replacing
 from dynsim.record import Record
 
 Array = NDArray[np.float64]
@@ -85,16 +84,9 @@ def save(figure: Figure, path: Path) -> Path:
     RecordError
         The file cannot be written; an older one is left as it was.
     """
-    temporary = path.with_name(path.name + ".tmp")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary:
         # Light compression: half the time for a third more bytes.
         figure.savefig(temporary, format="png", dpi=DPI, pil_kwargs={"compress_level": 3})
-        os.replace(temporary, path)
-    except OSError as error:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise RecordError(f"cannot write {path}: {error}") from error
     return path
 
 
