@@ -43,6 +43,8 @@ def surface_distance(value, slope, curvature):
 
     Exact for the plane, the sphere and the cylinder.
     """
+    if curvature == 0.0:  # a plane; spares the root and two divisions in every right-hand side
+        return value / slope
     inner = 1.0 - 2.0 * curvature * value / (slope * slope)
     if inner <= 0.0:
         return value / slope
@@ -82,7 +84,8 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
         value = 0.5 * (qx * rx + qy * ry + qz * rz) + bx * rx + by * ry + bz * rz + point[k, QUADRIC + 9]
         nx, ny, nz = qx + bx, qy + by, qz + bz
         slope = math.sqrt(nx * nx + ny * ny + nz * nz)
-        nx, ny, nz = nx / slope, ny / slope, nz / slope
+        inverse = 1.0 / slope
+        nx, ny, nz = nx * inverse, ny * inverse, nz * inverse
         # Velocity of the point, and its acceleration at vdot = 0 (A carries −g from its root).
         wx, wy, wz = links[i, V], links[i, V + 1], links[i, V + 2]
         vx = links[i, V + 3] + wy * rz - wz * ry
@@ -97,7 +100,7 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
         scale = 1.0 / math.sqrt(tx * tx + ty * ty + tz * tz + point[k, V_S] * point[k, V_S])
         state[k, GAP] = surface_distance(value, slope, hessian_product(point, k, nx, ny, nz))
         state[k, GAP_RATE] = rate
-        state[k, TARGET] = -(nx * ax + ny * ay + nz * az) - hessian_product(point, k, vx, vy, vz) / slope
+        state[k, TARGET] = -(nx * ax + ny * ay + nz * az) - hessian_product(point, k, vx, vy, vz) * inverse
         state[k, POSITION], state[k, POSITION + 1], state[k, POSITION + 2] = rx, ry, rz
         state[k, NORMAL], state[k, NORMAL + 1], state[k, NORMAL + 2] = nx, ny, nz
         state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2] = tx, ty, tz
