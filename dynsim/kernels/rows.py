@@ -33,6 +33,14 @@ def solve_small(small, state):
     if p == 1 and small[0, 0, 0] != 0.0:
         state[0, FORCE] = state[0, RHS] / small[0, 0, 0]
         return 0
+    if p == 2:
+        a, b, c, d = small[0, 0, 0], small[0, 0, 1], small[0, 1, 0], small[0, 1, 1]
+        determinant = a * d - b * c
+        # Well conditioned: Cramer's rule loses no more than the elimination.
+        if abs(determinant) > 1e-3 * (abs(a * d) + abs(b * c)):
+            x, y = state[0, RHS] / determinant, state[1, RHS] / determinant
+            state[0, FORCE], state[1, FORCE] = d * x - b * y, a * y - c * x
+            return 0
     largest = 0.0
     for i in range(p):
         state[i, FORCE] = state[i, RHS]
