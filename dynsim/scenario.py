@@ -321,7 +321,7 @@ def to_yaml(resolved: Mapping[str, Any]) -> str:
 
 
 def json_schema() -> dict[str, Any]:
-    """JSON schema of scenario files, for editors: ``variants`` holds the same keys, all optional."""
+    """JSON schema of scenario files, for editors; of ``variants`` it says only that they are mappings."""
     schema = ScenarioConfig.model_json_schema()
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     schema["properties"]["variants"] = {

@@ -217,7 +217,7 @@ def _reason(status: int, scenario: Scenario, prepared: Prepared) -> str:
     where = f"stopped at t = {t:.6g} s"
     if status == ki.NOT_FINITE:
         advice = (
-            f"take a smaller integrator.step_s than {run.clock[ki.STEP]:g}, or integrator.method dopri5 or rodas4"
+            f"take a smaller integrator.step_s than {run.clock[ki.STEP]:g}, or an adaptive method (rk43, rodas4)"
             if method == "rk4"
             else "look at the last state for a joint that runs away"
         )

@@ -63,7 +63,7 @@ def hessian_product(point, k, x, y, z):
 
 @inlined_kernel
 def contact_rows(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
-    """Position, gap, constraint row and force direction of every contact, after ``newton_euler``.
+    """Position, gap, constraint row and force direction of every contact, after ``forward_sweep``.
 
     C(r) = r·Q r/2 + b·r + c, n = ∇C/|∇C| ([WM] eqs 3, 6, 8); a gap > 0 is off the surface. Row:
     n·r̈ = −ṙᵀ(∂²C/∂r²)ṙ / |∇C| ([WM] eqs 15, 30). Force per unit f_n: n − σ μ t with the smoothed slip direction

@@ -85,8 +85,11 @@ def derivative(system: System, t, y, ws: Workspace, dy):
     forward_sweep(model, ws, 1.0, 0.0, 1.0)
     contact_rows(model, contacts, ws)
     motor_voltage(drives, system.reference, t, ws)
+    found = ws.deficient[0]
     constrained_acceleration(model, contacts, ws)
     if system.solver == SOLVER_M_STAR:
+        # The articulated solve above stays: projection uses its factors. Its rank finding is counted once, below.
+        ws.deficient[0] = found
         passes = 1
         solve_m_star(model, drives, contacts, ws)
         while sign_changed(contacts, ws, passes):

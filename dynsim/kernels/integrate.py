@@ -80,7 +80,7 @@ class Run(NamedTuple):
     y_new: np.ndarray  # (m,)
     stage: np.ndarray  # (8, m) stage derivatives; stage[0] belongs to y
     dense: np.ndarray  # (4, m) y(θ) = y + θ (d0 + (1−θ)(d1 + θ (d2 + (1−θ) d3)))
-    jacobian: np.ndarray  # (3 n + 1, m) finite differences along q, v, i, t (rodas4)
+    jacobian: np.ndarray  # (2 n + na + 1, m) finite differences along q, v, i, t (rodas4)
     matrix: np.ndarray  # (n, n) factored stage matrix (rodas4)
     pivot: np.ndarray  # (n,) int (rodas4)
     gain: np.ndarray  # (na, 2) k_p and k_d where the voltage is not at its limit, else 0 (rodas4)

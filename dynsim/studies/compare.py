@@ -6,7 +6,7 @@ import csv
 import io
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any
 
@@ -58,12 +58,19 @@ def compare(
         # Spawned, not forked: the parent may hold threads and an open progress display.
         with ProcessPoolExecutor(min(jobs, len(names)), mp_context=get_context("spawn")) as pool:
             futures = {name: pool.submit(simulate, scenario) for name, scenario in scenarios.items()}
-            for name, future in futures.items():
-                records[name] = future.result()
-                if progress is not None:
-                    progress(name, scenarios[name].duration_s)
-                if finished is not None:
-                    finished(name, records[name])
+            try:
+                for name, future in futures.items():
+                    records[name] = future.result()
+                    if progress is not None:
+                        progress(name, scenarios[name].duration_s)
+                    if finished is not None:
+                        finished(name, records[name])
+            except BaseException:
+                # Ctrl-C or a stopped variant: nobody waits for the others.
+                pool.shutdown(wait=False, cancel_futures=True)
+                for process in active_children():
+                    process.terminate()
+                raise
         return records
     for name, scenario in scenarios.items():
         records[name] = simulate(scenario, None if progress is None else _for_variant(progress, name))
