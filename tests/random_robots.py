@@ -189,20 +189,21 @@ def bench(
     robot: Robot,
     contacts: list[Contact] | None = None,
     *,
-    solver: int = ka.SOLVER_ARTICULATED,
+    m_star: bool = False,
     held: np.ndarray | None = None,
     k_p: float = 30.0,
     k_d: float = 1.0,
 ) -> Bench:
     """Compile a robot and its contacts, with a voltage PD that holds ``held`` (zero by default)."""
     na = len(robot.motors)
+    size = len(robot.links) + na + len(contacts or [])
     contact_arrays = compile_contacts(robot, contacts or [])
     system = System(
         model=compile_model(robot),
         drives=compile_drives(robot, k_p=[k_p] * na, k_d=[k_d] * na),
         reference=held_reference(np.zeros(na) if held is None else held),
         contacts=contact_arrays,
-        solver=solver,
+        dense=np.zeros((size, size + 1)) if m_star else None,
     )
-    ws = ka.workspace(len(robot.links), na, len(contacts or []), dense=solver == ka.SOLVER_M_STAR)
+    ws = ka.workspace(len(robot.links), na, len(contacts or []))
     return Bench(robot, system, ws)

@@ -23,7 +23,6 @@ from dynsim.model.model import Model
 from dynsim.record import Record
 from dynsim.scenario import Scenario, build_model
 
-_SOLVERS = {"articulated": ka.SOLVER_ARTICULATED, "m_star": ka.SOLVER_M_STAR}
 # Wall time between two looks at progress and Ctrl-C [s].
 _CHUNK_S = 0.1
 
@@ -64,7 +63,7 @@ def prepare(scenario: Scenario) -> Prepared:
         drives=compile_drives(robot, k_p=list(control.k_p), k_d=list(control.k_d)),
         reference=control.reference,
         contacts=compile_contacts(robot, contacts),
-        solver=_SOLVERS[options.solver],
+        dense=np.zeros((n + c + na, n + c + na + 1)) if options.solver == "m_star" else None,
     )
     y = np.zeros(2 * n + na + LEDGER_SIZE + CONTACT_SIZE * c)
     y[:n] = robot.initial
@@ -82,7 +81,7 @@ def prepare(scenario: Scenario) -> Prepared:
         rtol=options.rtol,
         atol=options.atol,
     )
-    workspace = ka.workspace(n, na, c, dense=options.solver == "m_star")
+    workspace = ka.workspace(n, na, c)
     return Prepared(model, contacts, control, system, run, workspace)
 
 

@@ -5,7 +5,7 @@ so that a parent comes before its children. Spatial vectors are (angular, linear
 forces of different bodies simply add.
 
 A table is one array whose columns are named by the constants below. Few arrays matter: every array of an argument
-costs reference counting and copying in each compiled call, and one row per link stays in one or two cache lines.
+costs copying in each compiled call, and what belongs to one link lies together.
 """
 
 from __future__ import annotations
@@ -18,8 +18,6 @@ import numpy as np
 REVOLUTE_X, REVOLUTE_Y, REVOLUTE_Z, REVOLUTE, PRISMATIC = 0, 1, 2, 3, 4
 # Friction of a contact under a negative (pulling) normal force, see dynsim.kernels.contact.
 FRICTION_SIGNED, FRICTION_DISSIPATIVE = 0, 1
-# Solvers of the coupled system.
-SOLVER_ARTICULATED, SOLVER_M_STAR = 0, 1
 
 # ModelArrays.tree, int
 PARENT = 0  # index of the parent link, -1 for the world
@@ -51,6 +49,8 @@ MOTOR_SIZE = 8
 # ContactArrays.link, int
 LINK = 0
 FRICTION_LAW = 1
+CURVED = 2  # 0 for a plane: Q = 0, and then b is its unit normal
+CONTACT_LINK_SIZE = 3
 # ContactArrays.point
 POINT = 0  # 3: in the body's frame [m]
 QUADRIC = 3  # 10: C(r) = r.Q r/2 + b.r + c: Q xx xy xz yy yz zz, b, c
@@ -126,7 +126,7 @@ class ReferenceArrays(NamedTuple):
 class ContactArrays(NamedTuple):
     """Points on bodies held to surfaces. A surface is a quadric C(r) = r.Q r / 2 + b.r + c."""
 
-    link: np.ndarray  # (c, 2) int
+    link: np.ndarray  # (c, CONTACT_LINK_SIZE) int
     point: np.ndarray  # (c, POINT_SIZE)
 
 
@@ -135,28 +135,25 @@ class Workspace(NamedTuple):
 
     links: np.ndarray  # (n, LINK_SIZE)
     joints: np.ndarray  # (n, JOINT_SIZE)
-    trig: np.ndarray  # (2, n) sine and cosine of q
+    trig: np.ndarray  # (3, n or more) sine, cosine and q; padded to whole vectors of four, which have no slow remainder
     motors: np.ndarray  # (na, MOTOR_STATE_SIZE)
     contacts: np.ndarray  # (c, CONTACT_STATE_SIZE)
-    column: np.ndarray  # (n, 1 + 2c) eliminated right-hand sides: applied force, c rows, c force directions
+    column: np.ndarray  # (n, 1 + 2c) eliminated right-hand sides: applied force, then per contact its row and direction
     small: np.ndarray  # (4, c, c) the p×p system J M^-1 F and the scratch of its solve
-    dense: np.ndarray  # (m, m + 1), m = n + c + na: M* of [WM] eq 33 and b; empty unless the solver is m_star
     deficient: np.ndarray  # (2,) int: right-hand sides whose constraint forces were not unique, and that had none
 
 
-def workspace(n: int, na: int, c: int, *, dense: bool) -> Workspace:
+def workspace(n: int, na: int, c: int) -> Workspace:
     """Allocate a :class:`Workspace` for n links, na motors and c contacts."""
-    size = n + c + na if dense else 0
     contacts = np.zeros((c, CONTACT_STATE_SIZE))
     contacts[:, SIGN] = 1.0
     return Workspace(
         links=np.zeros((n, LINK_SIZE)),
         joints=np.zeros((n, JOINT_SIZE)),
-        trig=np.zeros((2, n)),
+        trig=np.zeros((3, 4 * -(-n // 4))),
         motors=np.zeros((na, MOTOR_STATE_SIZE)),
         contacts=contacts,
         column=np.zeros((n, 1 + 2 * c)),
         small=np.zeros((4, c, c)),
-        dense=np.zeros((size, size + 1)),
         deficient=np.zeros(2, dtype=np.int64),
     )

@@ -117,52 +117,44 @@ def factor(model: ModelArrays, ws: Workspace):
 
 
 @inlined_kernel
-def eliminate_contact(model: ModelArrays, ws: Workspace, link, k):
-    """Columns of the row and of the force direction of contact k on ``link``, after :func:`factor`.
-
-    Into ``ws.column[:, 1 + k]`` and ``ws.column[:, 1 + p + k]``. Only joints between the link and the world feel the
-    contact; the rest of a column stays as it is and is never read.
-    """
-    tree, links, column, state = model.tree, ws.links, ws.column, ws.contacts
-    row, direction = 1 + k, 1 + state.shape[0] + k
-    r0, r1, r2 = state[k, ROW], state[k, ROW + 1], state[k, ROW + 2]
-    r3, r4, r5 = state[k, ROW + 3], state[k, ROW + 4], state[k, ROW + 5]
-    w0, w1, w2 = state[k, DIRECTION], state[k, DIRECTION + 1], state[k, DIRECTION + 2]
-    w3, w4, w5 = state[k, DIRECTION + 3], state[k, DIRECTION + 4], state[k, DIRECTION + 5]
-    i = link
-    while i >= 0:
-        s0, s1, s2 = links[i, S], links[i, S + 1], links[i, S + 2]
-        s3, s4, s5 = links[i, S + 3], links[i, S + 4], links[i, S + 5]
-        r = ((s0 * r0 + s1 * r1) + (s2 * r2 + s3 * r3)) + (s4 * r4 + s5 * r5)
-        w = ((s0 * w0 + s1 * w1) + (s2 * w2 + s3 * w3)) + (s4 * w4 + s5 * w5)
-        column[i, row] = r
-        column[i, direction] = w
-        s0, s1, s2 = links[i, U], links[i, U + 1], links[i, U + 2]
-        s3, s4, s5 = links[i, U + 3], links[i, U + 4], links[i, U + 5]
-        r0, r1, r2, r3, r4, r5 = r0 - s0 * r, r1 - s1 * r, r2 - s2 * r, r3 - s3 * r, r4 - s4 * r, r5 - s5 * r
-        w0, w1, w2, w3, w4, w5 = w0 - s0 * w, w1 - s1 * w, w2 - s2 * w, w3 - s3 * w, w4 - s4 * w, w5 - s5 * w
-        i = tree[i, PARENT]
-
-
-@inlined_kernel
 def contact_system(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
-    """The p×p system J M⁻¹ F f = target − J M⁻¹ applied, into ``ws.small[0]`` and the RHS column.
+    """The p×p system J M⁻¹ F f = target − J M⁻¹ applied, into ``ws.small[0]`` and the RHS column, after :func:`factor`.
 
-    Entry (k, m) is Σ column_k column_m / D over the joints that both contacts feel.
+    Row and force direction of contact k leave the columns ``ws.column[:, 1 + 2 k]`` and ``ws.column[:, 2 + 2 k]``. Only
+    joints between the link and the world feel the contact; the rest of a column is zero from the start. Entry (k, m)
+    is Σ column_k column_m / D over the joints that both contacts feel.
     """
     tree, links, column, small, state = model.tree, ws.links, ws.column, ws.small, ws.contacts
-    p = state.shape[0]
-    for k in range(p):
-        for m in range(p):
+    for k in range(state.shape[0]):
+        r0, r1, r2 = state[k, ROW], state[k, ROW + 1], state[k, ROW + 2]
+        r3, r4, r5 = state[k, ROW + 3], state[k, ROW + 4], state[k, ROW + 5]
+        w0, w1, w2 = state[k, DIRECTION], state[k, DIRECTION + 1], state[k, DIRECTION + 2]
+        w3, w4, w5 = state[k, DIRECTION + 3], state[k, DIRECTION + 4], state[k, DIRECTION + 5]
+        for m in range(k):
             small[0, k, m] = 0.0
-        total = state[k, TARGET]
+            small[0, m, k] = 0.0
+        own, total = 0.0, state[k, TARGET]
         i = contacts.link[k, LINK]
         while i >= 0:
-            scaled = column[i, 1 + k] * links[i, D]
+            s0, s1, s2 = links[i, S], links[i, S + 1], links[i, S + 2]
+            s3, s4, s5 = links[i, S + 3], links[i, S + 4], links[i, S + 5]
+            r = ((s0 * r0 + s1 * r1) + (s2 * r2 + s3 * r3)) + (s4 * r4 + s5 * r5)
+            w = ((s0 * w0 + s1 * w1) + (s2 * w2 + s3 * w3)) + (s4 * w4 + s5 * w5)
+            column[i, 1 + 2 * k] = r
+            column[i, 2 + 2 * k] = w
+            d = links[i, D]
+            scaled = d * r
+            own += scaled * w
             total -= scaled * column[i, 0]
-            for m in range(p):
-                small[0, k, m] += scaled * column[i, 1 + p + m]
+            for m in range(k):
+                small[0, k, m] += scaled * column[i, 2 + 2 * m]
+                small[0, m, k] += d * w * column[i, 1 + 2 * m]
+            s0, s1, s2 = links[i, U], links[i, U + 1], links[i, U + 2]
+            s3, s4, s5 = links[i, U + 3], links[i, U + 4], links[i, U + 5]
+            r0, r1, r2, r3, r4, r5 = r0 - s0 * r, r1 - s1 * r, r2 - s2 * r, r3 - s3 * r, r4 - s4 * r, r5 - s5 * r
+            w0, w1, w2, w3, w4, w5 = w0 - s0 * w, w1 - s1 * w, w2 - s2 * w, w3 - s3 * w, w4 - s4 * w, w5 - s5 * w
             i = tree[i, PARENT]
+        small[0, k, k] = own
         state[k, RHS] = total
 
 
@@ -175,7 +167,7 @@ def add_contact_forces(model: ModelArrays, contacts: ContactArrays, ws: Workspac
         f = state[k, FORCE]
         i = contacts.link[k, LINK]
         while i >= 0:
-            column[i, 0] += f * column[i, 1 + p + k]
+            column[i, 0] += f * column[i, 2 + 2 * k]
             i = tree[i, PARENT]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from dynsim.kernels.arrays import (
+    CURVED,
     DIRECTION,
     FORCE,
     FRICTION_DISSIPATIVE,
@@ -31,20 +32,18 @@ from dynsim.kernels.arrays import (
     V,
     Workspace,
 )
-from dynsim.kernels.jit import inlined_kernel
+from dynsim.kernels.jit import inlined_kernel, kernel
 
 # Tries, beyond two per contact, to find signs of dissipative contacts that agree with their forces.
 SIGN_PASSES = 64
 
 
-@inlined_kernel
+@kernel
 def surface_distance(value, slope, curvature):
     """Signed distance along the normal from the level-set value: root of C − |∇C| s + κ s²/2 with κ = nᵀQn.
 
     Exact for the plane, the sphere and the cylinder.
     """
-    if curvature == 0.0:  # a plane; spares the root and two divisions in every right-hand side
-        return value / slope
     inner = 1.0 - 2.0 * curvature * value / (slope * slope)
     if inner <= 0.0:
         return value / slope
@@ -77,15 +76,20 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
         rx = links[i, P] + links[i, R] * x + links[i, R + 1] * y + links[i, R + 2] * z
         ry = links[i, P + 1] + links[i, R + 3] * x + links[i, R + 4] * y + links[i, R + 5] * z
         rz = links[i, P + 2] + links[i, R + 6] * x + links[i, R + 7] * y + links[i, R + 8] * z
-        bx, by, bz = point[k, QUADRIC + 6], point[k, QUADRIC + 7], point[k, QUADRIC + 8]
-        qx = point[k, QUADRIC] * rx + point[k, QUADRIC + 1] * ry + point[k, QUADRIC + 2] * rz
-        qy = point[k, QUADRIC + 1] * rx + point[k, QUADRIC + 3] * ry + point[k, QUADRIC + 4] * rz
-        qz = point[k, QUADRIC + 2] * rx + point[k, QUADRIC + 4] * ry + point[k, QUADRIC + 5] * rz
-        value = 0.5 * (qx * rx + qy * ry + qz * rz) + bx * rx + by * ry + bz * rz + point[k, QUADRIC + 9]
-        nx, ny, nz = qx + bx, qy + by, qz + bz
-        slope = math.sqrt(nx * nx + ny * ny + nz * nz)
-        inverse = 1.0 / slope
-        nx, ny, nz = nx * inverse, ny * inverse, nz * inverse
+        # ∇C and C; a plane's ∇C is its unit normal, which spares every right-hand side two roots and three divisions.
+        nx, ny, nz = point[k, QUADRIC + 6], point[k, QUADRIC + 7], point[k, QUADRIC + 8]
+        gap = nx * rx + ny * ry + nz * rz + point[k, QUADRIC + 9]
+        inverse, curved = 1.0, contacts.link[k, CURVED] != 0
+        if curved:
+            qx = point[k, QUADRIC] * rx + point[k, QUADRIC + 1] * ry + point[k, QUADRIC + 2] * rz
+            qy = point[k, QUADRIC + 1] * rx + point[k, QUADRIC + 3] * ry + point[k, QUADRIC + 4] * rz
+            qz = point[k, QUADRIC + 2] * rx + point[k, QUADRIC + 4] * ry + point[k, QUADRIC + 5] * rz
+            nx, ny, nz = nx + qx, ny + qy, nz + qz
+            slope = math.sqrt(nx * nx + ny * ny + nz * nz)
+            inverse = 1.0 / slope
+            nx, ny, nz = nx * inverse, ny * inverse, nz * inverse
+            value = gap + 0.5 * (qx * rx + qy * ry + qz * rz)
+            gap = surface_distance(value, slope, hessian_product(point, k, nx, ny, nz))
         # Velocity of the point, and its acceleration at vdot = 0 (A carries −g from its root).
         wx, wy, wz = links[i, V], links[i, V + 1], links[i, V + 2]
         vx = links[i, V + 3] + wy * rz - wz * ry
@@ -98,9 +102,10 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
         rate = nx * vx + ny * vy + nz * vz
         tx, ty, tz = vx - rate * nx, vy - rate * ny, vz - rate * nz
         scale = 1.0 / math.sqrt(tx * tx + ty * ty + tz * tz + point[k, V_S] * point[k, V_S])
-        state[k, GAP] = surface_distance(value, slope, hessian_product(point, k, nx, ny, nz))
+        state[k, GAP] = gap
         state[k, GAP_RATE] = rate
-        state[k, TARGET] = -(nx * ax + ny * ay + nz * az) - hessian_product(point, k, vx, vy, vz) * inverse
+        target = -(nx * ax + ny * ay + nz * az)
+        state[k, TARGET] = target - hessian_product(point, k, vx, vy, vz) * inverse if curved else target
         state[k, POSITION], state[k, POSITION + 1], state[k, POSITION + 2] = rx, ry, rz
         state[k, NORMAL], state[k, NORMAL + 1], state[k, NORMAL + 2] = nx, ny, nz
         state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2] = tx, ty, tz

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from dynsim.kernels.arrays import (
     APPLIED,
     CURRENT,
@@ -20,10 +22,8 @@ from dynsim.kernels.arrays import (
     GEAR_DAMPING,
     INDUCTANCE,
     K_M,
-    LINK,
     QD,
     QDD,
-    SOLVER_M_STAR,
     ContactArrays,
     DriveArrays,
     ModelArrays,
@@ -31,11 +31,11 @@ from dynsim.kernels.arrays import (
     ReferenceArrays,
     Workspace,
 )
-from dynsim.kernels.articulated import accelerate, add_contact_forces, contact_system, eliminate_contact, factor
+from dynsim.kernels.articulated import accelerate, add_contact_forces, contact_system, factor
 from dynsim.kernels.contact import contact_rows, sign_changed
 from dynsim.kernels.drive import emf_balance, motor_voltage
 from dynsim.kernels.energy import ledger_rates
-from dynsim.kernels.jit import inlined_kernel, kernel
+from dynsim.kernels.jit import inlined_kernel, internal_kernel, kernel
 from dynsim.kernels.m_star import solve_m_star
 from dynsim.kernels.newton_euler import forward_sweep
 from dynsim.kernels.rows import solve_small
@@ -48,7 +48,7 @@ class System(NamedTuple):
     drives: DriveArrays
     reference: ReferenceArrays
     contacts: ContactArrays
-    solver: int
+    dense: np.ndarray | None  # room for M* and b, see dynsim.kernels.m_star; None for the articulated solve alone
 
 
 @inlined_kernel
@@ -58,14 +58,29 @@ def constrained_acceleration(model: ModelArrays, contacts: ContactArrays, ws: Wo
     p, passes = ws.contacts.shape[0], 0
     while p > 0:
         passes += 1
-        for k in range(p):
-            eliminate_contact(model, ws, contacts.link[k, LINK], k)
         contact_system(model, contacts, ws)
         ws.deficient[0] += solve_small(ws.small, ws.contacts)
         if not sign_changed(contacts, ws, passes):
             break
     add_contact_forces(model, contacts, ws)
     accelerate(model, ws)
+
+
+@internal_kernel
+def m_star_acceleration(dense, model: ModelArrays, drives: DriveArrays, contacts: ContactArrays, ws: Workspace, found):
+    """The same unknowns by the dense M*, where ``dense`` has room for it.
+
+    The articulated solve has run before, because projection uses its factors; its rank findings (``found`` before it)
+    are not counted twice.
+    """
+    if dense is None:  # known to the compiler, which then leaves M* out of the default program
+        return
+    ws.deficient[0] = found
+    passes = 1
+    solve_m_star(dense, model, drives, contacts, ws)
+    while sign_changed(contacts, ws, passes):
+        passes += 1
+        solve_m_star(dense, model, drives, contacts, ws)
 
 
 @kernel
@@ -87,17 +102,9 @@ def derivative(system: System, t, y, ws: Workspace, dy):
     motor_voltage(drives, system.reference, t, ws)
     found = ws.deficient[0]
     constrained_acceleration(model, contacts, ws)
-    if system.solver == SOLVER_M_STAR:
-        # The articulated solve above stays: projection uses its factors. Its rank finding is counted once, below.
-        ws.deficient[0] = found
-        passes = 1
-        solve_m_star(model, drives, contacts, ws)
-        while sign_changed(contacts, ws, passes):
-            passes += 1
-            solve_m_star(model, drives, contacts, ws)
-    else:
-        for a in range(na):
-            motors[a, DIDT] = emf_balance(drives, ws, a) / motor[a, INDUCTANCE]
+    for a in range(na):
+        motors[a, DIDT] = emf_balance(drives, ws, a) / motor[a, INDUCTANCE]
+    m_star_acceleration(system.dense, model, drives, contacts, ws, found)
 
     for i in range(n):
         dy[i] = joints[i, QD]

@@ -29,7 +29,7 @@ from dynsim.kernels.arrays import (
     V,
     Workspace,
 )
-from dynsim.kernels.jit import inlined_kernel, kernel
+from dynsim.kernels.jit import inlined_kernel, internal_kernel, kernel
 from dynsim.kernels.newton_euler import body_inertia
 
 # Integrals at the end of the state vector, all in joules. MECHANICAL and DRAWN are reported, not part of the balance.
@@ -123,7 +123,7 @@ def potential_energy(model: ModelArrays, ws: Workspace):
     return total
 
 
-@kernel
+@internal_kernel
 def magnetic_energy(drives: DriveArrays, ws: Workspace):
     """½ Σ L i² [J]."""
     total = 0.0

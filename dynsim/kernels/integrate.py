@@ -47,7 +47,7 @@ from dynsim.kernels.arrays import (
 from dynsim.kernels.articulated import accelerate
 from dynsim.kernels.coupled import System, derivative
 from dynsim.kernels.energy import kinetic_energy, magnetic_energy, potential_energy
-from dynsim.kernels.jit import kernel, merged_kernel, reals
+from dynsim.kernels.jit import internal_kernel, kernel, merged_kernel, reals
 from dynsim.kernels.kinematics import point_position
 from dynsim.kernels.rows import solve_small
 
@@ -141,7 +141,7 @@ def output_size(n: int, na: int, c: int) -> int:
     return n + 2 * na + 6 + 8 * c
 
 
-@kernel
+@internal_kernel
 def write_output(system: System, ws: Workspace, run: Run, row):
     """Everything worth recording that is not a state, after ``derivative``: see :func:`output_size`.
 
@@ -174,7 +174,7 @@ def write_output(system: System, ws: Workspace, run: Run, row):
         k += 8
 
 
-@kernel
+@internal_kernel
 def off_surface(ws: Workspace):
     """True when a contact has left its surface by more than the projection tolerances."""
     state = ws.contacts
@@ -187,7 +187,7 @@ def off_surface(ws: Workspace):
     return False
 
 
-@kernel
+@internal_kernel
 def project(system: System, ws: Workspace, y):
     """One Newton step of q and v onto the contacts, weighted by the mass matrix, right after ``derivative`` at y.
 
@@ -202,12 +202,12 @@ def project(system: System, ws: Workspace, y):
             for m in range(p):
                 small[0, k, m] = 0.0
                 for i in range(n):
-                    small[0, k, m] += column[i, 1 + k] * column[i, 1 + m] * ws.links[i, D]
+                    small[0, k, m] += column[i, 1 + 2 * k] * column[i, 1 + 2 * m] * ws.links[i, D]
         solve_small(small, state)
         for i in range(n):
             column[i, 0] = 0.0
             for k in range(p):
-                column[i, 0] -= state[k, FORCE] * column[i, 1 + k]
+                column[i, 0] -= state[k, FORCE] * column[i, 1 + 2 * k]
         accelerate(system.model, ws)
         for i in range(n):
             y[level * n + i] += ws.joints[i, QDD]
@@ -228,7 +228,7 @@ def settle(system: System, t, y, ws: Workspace, dy, run: Run):
     return not off_surface(ws)
 
 
-@kernel
+@internal_kernel
 def error_norm(run: Run, size, error):
     """Root mean square of error / (atol + rtol |y|) over positions, rates and currents, the first ``size`` states."""
     y, y_new, atol, rtol = run.y, run.y_new, run.clock[ATOL], run.clock[RTOL]
@@ -269,7 +269,7 @@ NODE_RK4 = np.array([0.0, 0.5, 0.5, 1.0, 1.0])
 ERROR_RK43 = 0.03
 
 
-@kernel
+@internal_kernel
 def combine(y, h, row, stages, k, y_new):
     """y_new = y + h Σ row_s k_s over the first ``stages`` stages."""
     for j in range(y.shape[0]):
@@ -474,7 +474,7 @@ def step_rodas4(system: System, ws: Workspace, run: Run):
     return error
 
 
-@kernel
+@internal_kernel
 def fill_dense(run: Run):
     """Coefficients of the dense output over the step from y to y_new, see ``Run.dense``."""
     h, y, y_new, k, d = run.clock[STEP], run.y, run.y_new, run.stage, run.dense
@@ -526,7 +526,7 @@ def sample_step(system: System, ws: Workspace, run: Run):
     run.count[SAMPLE] = last
 
 
-@kernel
+@internal_kernel
 def watch(ws: Workspace, run: Run):
     """Extremes of normal forces and gaps at accepted steps."""
     state, extremes = ws.contacts, run.extremes
@@ -545,7 +545,7 @@ def finite(values):
     return total == 0.0
 
 
-@kernel
+@internal_kernel
 def first_step(run: Run, states):
     """Hairer's first guess of the step size: one that changes the state by a hundredth of its scale."""
     clock, y, k = run.clock, run.y, run.stage
@@ -572,7 +572,7 @@ def start(system: System, ws: Workspace, run: Run):
     run.count[STARTED] = 1
 
 
-@kernel
+@internal_kernel
 def choose_step(run: Run):
     """Trim STEP so that END is met exactly: halve the way there rather than leave a sliver for the last step."""
     clock = run.clock
@@ -586,7 +586,7 @@ def choose_step(run: Run):
         clock[STEP] = 0.5 * remaining
 
 
-@kernel
+@internal_kernel
 def rejected(ws: Workspace, run: Run, error, order):
     """True when a step of this error norm must be repeated: shrinks STEP, or sets STATUS when that is hopeless."""
     clock, count, h = run.clock, run.count, run.clock[STEP]
@@ -621,7 +621,7 @@ def accept(system: System, ws: Workspace, run: Run):
     run.count[STEPS] += 1
 
 
-@kernel
+@internal_kernel
 def next_step(run: Run, error, order, beta):
     """Proportional–integral step control (Hairer, Nørsett, Wanner II.4)."""
     clock = run.clock

@@ -15,12 +15,16 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
+import numba.extending
 import numpy as np
 from numba.core import config
 
 # Packs the scalar formulas of 3-vectors and wrenches into vector instructions (numba leaves it off): a right-hand side
 # takes 8 % less time. Global, and read when numba compiles its first function in the process.
 config.SLP_VECTORIZE = 1
+
+_OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}, "_nrt": False}
+_NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -59,14 +63,6 @@ def kernel(function: F) -> F:
     return _compile(function)
 
 
-def inlined_kernel(function: F) -> F:
-    """As :func:`kernel`, for the parts of one right-hand side: merged into their caller by LLVM.
-
-    Passing the tables of a model costs about as much as a whole sweep over ten links.
-    """
-    return _compile(function, forceinline=True)
-
-
 def merged_kernel(function: F) -> F:
     """As :func:`kernel`, for callers of the right-hand side: merged into their caller before compilation.
 
@@ -75,11 +71,27 @@ def merged_kernel(function: F) -> F:
     return _compile(function, inline="always")
 
 
+def internal_kernel(function: F) -> F:
+    """For what only kernels call: compiled as part of them. From Python it is the plain function that it was.
+
+    Unpacking the tables of a model from Python objects would take longer to compile than most of these functions.
+    """
+    return numba.extending.register_jitable(**_OPTIONS, **_NO_ENTRY)(function)
+
+
+def inlined_kernel(function: F) -> F:
+    """As :func:`internal_kernel`, for the parts of one right-hand side: merged into their caller by LLVM.
+
+    Passing the tables of a model costs about as much as a whole sweep over ten links.
+    """
+    return numba.extending.register_jitable(**_OPTIONS, **_NO_ENTRY, forceinline=True)(function)
+
+
 def _compile(function: F, **options: Any) -> F:
     previous = config.CACHE_DIR
     config.CACHE_DIR = str(cache_folder())
     try:
-        return numba.njit(cache=True, error_model="numpy", fastmath={"contract"}, _nrt=False, **options)(function)
+        return numba.njit(cache=True, **_OPTIONS, **options)(function)
     finally:
         config.CACHE_DIR = previous
 

@@ -23,14 +23,16 @@ from dynsim.kernels.arrays import (
     Workspace,
 )
 from dynsim.kernels.drive import emf_balance
-from dynsim.kernels.jit import kernel
+from dynsim.kernels.jit import internal_kernel
 from dynsim.kernels.newton_euler import mass_matrix, newton_euler
 from dynsim.kernels.rows import solve_small
 
 
-@kernel
-def solve_m_star(model: ModelArrays, drives: DriveArrays, contacts: ContactArrays, ws: Workspace):
+@internal_kernel
+def solve_m_star(K, model: ModelArrays, drives: DriveArrays, contacts: ContactArrays, ws: Workspace):
     """Fill M* and b and solve for vdot, contact forces and di/dt.
+
+    K : (n + p + na, n + p + na + 1), room for M* with b as its last column.
 
     [M + J_m, −Fᵀ, 0; J, 0, 0; 0, 0, L] [vdot; f; di/dt] = [applied; target; u − R i − K_m v]. F (force directions)
     differs from J (rows) under friction: the paper's −J_tᵀ f_t with f_t = μ f_n has moved to the left side. Call after
@@ -38,7 +40,7 @@ def solve_m_star(model: ModelArrays, drives: DriveArrays, contacts: ContactArray
     """
     n, p, na = model.tree.shape[0], contacts.link.shape[0], drives.link.shape[0]
     size = n + p + na
-    K, links, joints, state = ws.dense, ws.links, ws.joints, ws.contacts
+    links, joints, state = ws.links, ws.joints, ws.contacts
     for i in range(size):
         for j in range(size + 1):
             K[i, j] = 0.0

@@ -46,14 +46,16 @@ COS10, COS12, COS14 = -2.75573143513906633035e-07, 2.08757232129817482790e-09, -
 
 @inlined_kernel
 def sine_cosine(joints, trig):
-    """Sine and cosine of every q, into trig: (2, n); within one unit in the last place of libm's.
+    """Sine and cosine of every q, into trig: (3, ≥ n); within one unit in the last place of libm's.
 
     Free of calls, which would push all values of a sweep out of their registers, and of branches:
     r = q − k π/2 with π/2 in three parts, then the polynomials of FreeBSD's msun (k_sin.c, k_cos.c) on |r| ≤ π/4.
     Infinite q gives NaN.
     """
     for i in range(joints.shape[0]):
-        q = joints[i, Q]
+        trig[2, i] = joints[i, Q]
+    for i in range(trig.shape[1]):
+        q = trig[2, i]
         k = np.rint(q * TWO_OVER_PI)
         r = ((q - k * HALF_PI_HIGH) - k * HALF_PI_MIDDLE) - k * HALF_PI_LOW
         z = r * r

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from dynsim.kernels.arrays import FORCE, RHS
-from dynsim.kernels.jit import inlined_kernel, kernel
+from dynsim.kernels.jit import inlined_kernel, internal_kernel
 
 # A pivot below this fraction of the largest entry counts as a dependent row: far above rounding (1e-16 times a few
 # dozen operations), far below what independent elbows give (> 1e-6).
@@ -74,7 +74,7 @@ def solve_small(small, state):
     return 0
 
 
-@kernel
+@internal_kernel
 def least_norm(small, state):
     """Least-squares solution of least norm by a one-sided Jacobi singular value decomposition, W = A V."""
     p = state.shape[0]

@@ -91,7 +91,7 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArr
         Unknown body, negative friction or smoothing speed.
     """
     bodies = {link.name: i for i, link in enumerate(robot.links)}
-    link = np.zeros((len(contacts), 2), dtype=np.int64)
+    link = np.zeros((len(contacts), ka.CONTACT_LINK_SIZE), dtype=np.int64)
     point = np.zeros((len(contacts), ka.POINT_SIZE))
     for k, contact in enumerate(contacts):
         if contact.body not in bodies:
@@ -101,11 +101,13 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArr
         if not contact.slip_smoothing > 0.0:
             raise ModelError(f"contact {contact.name}: slip smoothing {contact.slip_smoothing} m/s must be positive")
         surface = contact.surface
-        link[k] = bodies[contact.body], _FRICTION[contact.pulling_friction]
+        curved = bool(surface.Q.any())
+        scale = 1.0 if curved else 1.0 / float(np.linalg.norm(surface.b))
+        link[k] = bodies[contact.body], _FRICTION[contact.pulling_friction], curved
         point[k, ka.POINT : ka.POINT + 3] = contact.point
         point[k, ka.QUADRIC : ka.QUADRIC + 6] = surface.Q[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-        point[k, ka.QUADRIC + 6 : ka.QUADRIC + 9] = surface.b
-        point[k, ka.QUADRIC + 9] = surface.c
+        point[k, ka.QUADRIC + 6 : ka.QUADRIC + 9] = scale * surface.b
+        point[k, ka.QUADRIC + 9] = scale * surface.c
         point[k, ka.MU], point[k, ka.V_S] = contact.friction, contact.slip_smoothing
     return ka.ContactArrays(link=integers(link), point=reals(point))
 

@@ -35,7 +35,7 @@ class Model:
         self.robot = robot
         self.arrays = compile_model(robot)
         self.n = len(robot.links)
-        self._workspace = ka.workspace(self.n, 0, 0, dense=False)
+        self._workspace = ka.workspace(self.n, 0, 0)
         # forward_dynamics and mass_matrix are those of the bodies alone: no rotor inertia.
         self._bodies = self.arrays._replace(body=self.arrays.body.copy())
         self._bodies.body[:, ka.ARMATURE] = 0.0

@@ -61,9 +61,7 @@ def test_accelerations_of_random_trees(seed: int, n: int) -> None:
     robot = random_tree(seed, n)
     model = Model(robot)
     nothing = ka.ReferenceArrays(integers([]), reals([]), reals([0, 1]), reals(np.zeros((1, 0, 6))))
-    system = System(
-        model.arrays, compile_drives(robot, k_p=[], k_d=[]), nothing, compile_contacts(robot, []), ka.SOLVER_ARTICULATED
-    )
+    system = System(model.arrays, compile_drives(robot, k_p=[], k_d=[]), nothing, compile_contacts(robot, []), None)
     peer = build_mujoco(system, step=1e-3, motors=False)
     # MuJoCo numbers joints depth first, dynsim in the order of the description.
     order = [mujoco.mj_name2id(peer, mujoco.mjtObj.mjOBJ_JOINT, f"joint_{i}") for i in range(n)]

@@ -42,7 +42,7 @@ def test_articulated_and_m_star_agree(seed):
     robot, contacts, q, v, current = random_case(seed)
     J = rows(robot, contacts, q)
     assume(np.linalg.matrix_rank(J, tol=1e-2) == len(contacts))
-    fast, dense = bench(robot, contacts), bench(robot, contacts, solver=ka.SOLVER_M_STAR)
+    fast, dense = bench(robot, contacts), bench(robot, contacts, m_star=True)
     y = fast.state(q, v, current)
     a, b = fast.derivative(y), dense.derivative(y)
     assume(fast.ws.deficient[1] == 0)
@@ -82,8 +82,8 @@ def test_a_contact_given_twice_shares_one_force(seed):
     J = rows(robot, contacts, q)
     assume(np.abs(J).max() > 1e-2)
     contact = replace(contacts[0], pulling_friction="signed")
-    for solver in (ka.SOLVER_ARTICULATED, ka.SOLVER_M_STAR):
-        one, two = bench(robot, [contact], solver=solver), bench(robot, [contact, contact], solver=solver)
+    for m_star in (False, True):
+        one, two = bench(robot, [contact], m_star=m_star), bench(robot, [contact, contact], m_star=m_star)
         n = 2 * len(q) + len(robot.motors)
         a, b = one.derivative(one.state(q, v, current))[:n], two.derivative(two.state(q, v, current))[:n]
         scale = 1.0 + np.abs(a).max()
@@ -152,3 +152,20 @@ def test_gap_of_a_scaled_level_set_is_the_same_length():
     scaled = Quadric(7.0 * s.Q, 7.0 * s.b, 7.0 * s.c)
     point = rng.normal(size=3)
     assert scaled.gap(point) == pytest.approx(s.gap(point), rel=1e-13)
+
+
+@given(seeds)
+def test_a_scaled_plane_is_the_same_contact(seed):
+    """The kernels take ∇C of a plane for its unit normal; a level set 7 C must not change anything."""
+    rng = np.random.default_rng(seed)
+    robot, contacts, q, v, current = random_case(seed, most=1)
+    body, point = contacts[0].body, contacts[0].point
+    plane = surface_through(rng, "plane", Model(robot).point_position(body, point, q) + rng.normal(size=3))
+    scaled = Quadric(7.0 * plane.Q, 7.0 * plane.b, 7.0 * plane.c)
+    results = []
+    for surface in (plane, scaled):
+        b = bench(robot, [replace(contacts[0], surface=surface)])
+        results.append((b.derivative(b.state(q, v, current)).copy(), b.ws.contacts.copy()))
+    for one, two in zip(*results, strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-9 * np.abs(one).max())
+    assert results[0][1][0, ka.GAP] == pytest.approx(plane.gap(Model(robot).point_position(body, point, q)), abs=1e-12)
