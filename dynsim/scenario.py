@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
-from dynsim.config import NonNegative, Positive, StrictConfig, Vector3
+from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.families import PACKAGES, member, members, union
 from dynsim.model.description import Contact, Quadric, Robot
@@ -32,11 +32,9 @@ SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else Path(__file__).resolve().parent /
 START_TOLERANCE = 1e-6
 
 
-class ContactPoint(StrictConfig):
+class ContactPoint(BodyPoint):
     """A point fixed on a body, held to a surface."""
 
-    body: str
-    point_m: Vector3 = [0.0, 0.0, 0.0]
     surface: str = "floor"
     friction: NonNegative | None = Field(default=None, description="kinetic coefficient; default: that of contacts")
     enabled: bool = True
@@ -438,10 +436,12 @@ def _explain(
     problems = error.errors()
     # Unknown keys first: a misspelt key also makes the right one missing.
     problem = next((p for p in problems if p["type"] == "extra_forbidden"), problems[0])
-    keys, value, found = _locate(merged, problem["loc"])
+    loc = (*problem["loc"], *problem.get("ctx", {}).get("key", "").split("."))
+    keys, value, found = _locate(merged, tuple(part for part in loc if part != ""))
     dotted = ".".join(str(key) for key in keys)
-    line = next((number for source in sources if (number := _line(source, keys)) is not None), None)
-    place = f"{path}:{line}" if line is not None else str(path)
+    # The source that has most of the keys; of equals the first, because the variant lies over the rest.
+    _, line = max((_line(source, keys) for source in sources), key=lambda depth_and_line: depth_and_line[0])
+    place = f"{path}:{line}" if line else str(path)
     if any(dotted == key or dotted.startswith(key + ".") or key.startswith(dotted + ".") for key in overrides):
         place = "--set"
     kind, message = problem["type"], problem["msg"].removeprefix("Value error, ")
@@ -461,6 +461,8 @@ def _explain(
         else:
             text = "is missing; it says which one" + (f": {expected}" if expected else "")
         found = False
+    elif kind in ("model_type", "dict_type", "model_attributes_type"):
+        text = "must be a mapping of keys to values"
     else:
         text = message[0].lower() + message[1:]
     shown = f" = {value!r}" if found and not isinstance(value, (Mapping, list)) and kind != "extra_forbidden" else ""
@@ -488,17 +490,17 @@ def _locate(data: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any
     return keys, node, found
 
 
-def _line(source: Any, keys: list[int | str]) -> int | None:
-    """Line of the deepest of ``keys`` that a round-trip YAML mapping has; None when it has not even the first."""
-    line = None
+def _line(source: Any, keys: list[int | str]) -> tuple[int, int]:
+    """How many of ``keys`` lead into a round-trip YAML mapping, and the line of the last of them; (0, 0) for none."""
+    depth = line = 0
     node = source
     for key in keys:
         lines = getattr(getattr(node, "lc", None), "data", None)
         if not lines or key not in lines:
             break
-        line = lines[key][0] + 1
+        depth, line = depth + 1, lines[key][0] + 1
         node = node[key]
-    return line
+    return depth, line
 
 
 def _fields(loc: tuple[int | str, ...]) -> list[str]:

@@ -50,8 +50,8 @@ class Config(StrictConfig):
     """Gains for all motors or one per motor; joints without a reference hold their initial position."""
 
     type: Literal["joint_pd"]
-    k_p_V_per_rad: NonNegative | list[NonNegative] = 500.0
-    k_d_V_s_per_rad: NonNegative | list[NonNegative] = 20.0
+    k_p_V_per_rad: NonNegative | list[NonNegative] = Field(default=500.0, description="V/m at a prismatic joint")
+    k_d_V_s_per_rad: NonNegative | list[NonNegative] = Field(default=20.0, description="V s/m at a prismatic joint")
     hand: HandReference | None = Field(default=None, description="a path for the hand")
     joints: dict[str, JointPath] = Field(default={}, description="waypoints by joint name")
     knot_spacing_s: Positive = Field(default=0.02, description="distance of the knots of the reference splines")

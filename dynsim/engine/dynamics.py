@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -158,14 +158,16 @@ def _record(scenario: Scenario, prepared: Prepared, wall: float) -> Record:
     joints, driven = robot.joint_names, tuple(motor.joint for motor in robot.motors)
     names = tuple(contact.name for contact in contacts)
     record = Record(run.sample_time[:rows], provenance=provenance(scenario))
-    angle, rate = _joint_units(robot)
+    kinds = {link.joint: link.kind for link in robot.links}
+    angle, rate, _ = _joint_units(kinds.values())
+    _, _, force = _joint_units(kinds[joint] for joint in driven)
     record.add("q", y[:, :n], angle, labels=joints, description="joint positions")
     record.add("v", y[:, n : 2 * n], rate, labels=joints, description="joint rates")
     record.add("vdot", out[:, :n], f"{rate}²", labels=joints, description="joint accelerations")
     current, voltage = y[:, 2 * n : 2 * n + na], out[:, n : n + na]
     record.add("current", current, "A", labels=driven, description="motor currents")
     record.add("voltage", voltage, "V", labels=driven, description="motor terminal voltages")
-    record.add("torque", out[:, n + na : n + 2 * na], "N m", labels=driven, description="shaft torques, [WM] eq 25")
+    record.add("torque", out[:, n + na : n + 2 * na], force, labels=driven, description="shaft torques, [WM] eq 25")
     record.add("power", current * voltage, "W", labels=driven, description="electrical power u i")
     k = n + 2 * na
     record.add("hand_position", out[:, k : k + 3], "m", labels=("x", "y", "z"))
@@ -199,11 +201,12 @@ def _record(scenario: Scenario, prepared: Prepared, wall: float) -> Record:
     return record
 
 
-def _joint_units(robot: Robot) -> tuple[str, str]:
-    kinds = {link.kind for link in robot.links}
-    if kinds == {"revolute"}:
-        return "rad", "rad/s"
-    return ("m", "m/s") if kinds == {"prismatic"} else ("rad or m", "rad/s or m/s")
+def _joint_units(kinds: Iterable[str]) -> tuple[str, str, str]:
+    """Units of position, rate and generalised force of joints of these kinds."""
+    found = set(kinds)
+    if found == {"prismatic"}:
+        return "m", "m/s", "N"
+    return ("rad or m", "rad/s or m/s", "N m or N") if "prismatic" in found else ("rad", "rad/s", "N m")
 
 
 def _last_state(prepared: Prepared) -> dict[str, Sequence[float]]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from pydantic import Field
 
-from dynsim.config import NonNegative, StrictConfig, Vector3
+from dynsim.config import BodyPoint, NonNegative, StrictConfig, Vector3
 from dynsim.errors import ModelError
 from dynsim.families import union
 from dynsim.model.description import Robot
@@ -23,13 +23,6 @@ else:
     MotorChoice = union("motor")
 
 
-class HandConfig(StrictConfig):
-    """The controlled point."""
-
-    body: str
-    point_m: Vector3 = [0.0, 0.0, 0.0]
-
-
 class Config(StrictConfig):
     """A robot from ``file`` (relative to the scenario), one motor model for all joints or one per joint."""
 
@@ -38,9 +31,14 @@ class Config(StrictConfig):
     gravity_m_s2: Vector3 = [0.0, 0.0, -9.81]
     motor: MotorChoice | None = Field(default=None, description="motor of every joint that `motors` does not name")
     motors: dict[str, MotorChoice] = Field(default={}, description="motors by joint name")
-    damping_N_m_s_per_rad: NonNegative | None = Field(default=None, description="joint losses; default: the URDF's")
+    damping_N_m_s_per_rad: NonNegative | None = Field(
+        default=None, description="loss of every revolute joint; default: the URDF's"
+    )
+    damping_N_s_per_m: NonNegative | None = Field(
+        default=None, description="loss of every prismatic joint; default: the URDF's"
+    )
     initial_deg: dict[str, float] = Field(default={}, description="initial angles by joint name; others 0")
-    hand: HandConfig | None = Field(default=None, description="controlled point; default: the tip of the longest chain")
+    hand: BodyPoint | None = Field(default=None, description="controlled point; default: the tip of the longest chain")
 
 
 def build(config: Config) -> Robot:
@@ -57,13 +55,12 @@ def build(config: Config) -> Robot:
     for name in [*config.motors, *config.initial_deg]:
         if name not in robot.joint_names:
             raise ModelError(f"{config.file}: no joint {name!r}; joints: {', '.join(robot.joint_names)}")
-    links = robot.links
-    if config.damping_N_m_s_per_rad is not None:
-        links = tuple(dataclasses.replace(link, damping=config.damping_N_m_s_per_rad) for link in links)
+    given = {"revolute": config.damping_N_m_s_per_rad, "prismatic": config.damping_N_s_per_m}
+    losses = [link.damping if given[link.kind] is None else given[link.kind] for link in robot.links]
     chosen = {joint: config.motors.get(joint, config.motor) for joint in robot.joint_names}
     return dataclasses.replace(
         robot,
-        links=links,
+        links=tuple(dataclasses.replace(link, damping=d) for link, d in zip(robot.links, losses, strict=True)),
         motors=tuple(motor.motor(joint) for joint, motor in chosen.items() if motor is not None),
         hand=robot.hand if config.hand is None else (config.hand.body, np.array(config.hand.point_m)),
         gravity=np.array(config.gravity_m_s2),
