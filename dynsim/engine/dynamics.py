@@ -18,7 +18,7 @@ from dynsim.kernels.coupled import System
 from dynsim.kernels.energy import CONTACT_SIZE, LEDGER_SIZE
 from dynsim.model.arrays import compile_contacts, compile_drives
 from dynsim.model.control import JointControl
-from dynsim.model.description import Contact, Robot
+from dynsim.model.description import Contact
 from dynsim.model.model import Model
 from dynsim.record import Record
 from dynsim.scenario import Scenario, build_model

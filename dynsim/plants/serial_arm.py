@@ -114,9 +114,8 @@ class Config(StrictConfig):
             taken = {key for entry in chain for key in _lay_under(link, entry) if key not in entry}
             for key in link:
                 if key in LinkKeys.model_fields and key not in taken:
-                    raise error_at(
-                        f"link.{key}", f"has no effect on any entry of plant.chain; set {_places(key, chain)} instead"
-                    )
+                    places = _places(key, chain)
+                    raise error_at(f"link.{key}", f"has no effect on any entry of plant.chain; set {places} instead")
         return data
 
     @field_validator("chain", mode="before")
@@ -136,9 +135,7 @@ class Config(StrictConfig):
             if len(self.initial_deg) != n:
                 raise error_at("initial_deg", f"{len(self.initial_deg)} angles, the chain has {n} joints")
             if any(link.kind == "prismatic" for link in self.chain):
-                raise error_at(
-                    "initial_deg", "only for chains of revolute joints; give initial_m and initial_deg per link"
-                )
+                raise error_at("initial_deg", "only for revolute chains; give initial_m and initial_deg per link")
         return self
 
 

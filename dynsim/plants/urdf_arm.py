@@ -56,11 +56,13 @@ def build(config: Config) -> Robot:
         if name not in robot.joint_names:
             raise ModelError(f"{config.file}: no joint {name!r}; joints: {', '.join(robot.joint_names)}")
     given = {"revolute": config.damping_N_m_s_per_rad, "prismatic": config.damping_N_s_per_m}
-    losses = [link.damping if given[link.kind] is None else given[link.kind] for link in robot.links]
+    links = tuple(
+        link if (loss := given[link.kind]) is None else dataclasses.replace(link, damping=loss) for link in robot.links
+    )
     chosen = {joint: config.motors.get(joint, config.motor) for joint in robot.joint_names}
     return dataclasses.replace(
         robot,
-        links=tuple(dataclasses.replace(link, damping=d) for link, d in zip(robot.links, losses, strict=True)),
+        links=links,
         motors=tuple(motor.motor(joint) for joint, motor in chosen.items() if motor is not None),
         hand=robot.hand if config.hand is None else (config.hand.body, np.array(config.hand.point_m)),
         gravity=np.array(config.gravity_m_s2),
