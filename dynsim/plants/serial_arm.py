@@ -109,8 +109,9 @@ class Config(StrictConfig):
     @classmethod
     def _check_shared(cls, data: Any) -> Any:
         """Refuse a key of ``link`` that no entry takes, as in a resolved scenario, where every entry has its own."""
-        link, chain = (data.get(key) for key in ("link", "chain")) if isinstance(data, dict) else (None, None)
-        if isinstance(link, dict) and isinstance(chain, list) and all(isinstance(entry, dict) for entry in chain):
+        link, chain = (data.get("link"), data.get("chain")) if isinstance(data, dict) else (None, None)
+        entries = isinstance(chain, list) and len(chain) > 0 and all(isinstance(entry, dict) for entry in chain)
+        if isinstance(link, dict) and entries:
             taken = {key for entry in chain for key in _lay_under(link, entry) if key not in entry}
             for key in link:
                 if key in LinkKeys.model_fields and key not in taken:

@@ -37,7 +37,8 @@ class Config(StrictConfig):
     damping_N_s_per_m: NonNegative | None = Field(
         default=None, description="loss of every prismatic joint; default: the URDF's"
     )
-    initial_deg: dict[str, float] = Field(default={}, description="initial angles by joint name; others 0")
+    initial_deg: dict[str, float] = Field(default={}, description="initial angles of revolute joints by name; others 0")
+    initial_m: dict[str, float] = Field(default={}, description="initial positions of prismatic joints; others 0")
     hand: BodyPoint | None = Field(default=None, description="controlled point; default: the tip of the longest chain")
 
 
@@ -47,24 +48,32 @@ def build(config: Config) -> Robot:
     Raises
     ------
     ModelError
-        Unreadable file, or a joint name that the file does not have.
+        Unreadable file, a joint name that the file does not have, or an initial position in the other kind's unit.
     """
     from dynsim.model.urdf import read_urdf
 
     robot = read_urdf(Path(config.file))
-    for name in [*config.motors, *config.initial_deg]:
-        if name not in robot.joint_names:
-            raise ModelError(f"{config.file}: no joint {name!r}; joints: {', '.join(robot.joint_names)}")
+    kinds = {link.joint: link.kind for link in robot.links}
+    for name in [*config.motors, *config.initial_deg, *config.initial_m]:
+        if name not in kinds:
+            raise ModelError(f"{config.file}: no joint {name!r}; joints: {', '.join(kinds)}")
+    for name in config.initial_deg:
+        if kinds[name] == "prismatic":
+            raise ModelError(f"plant.initial_deg: {name!r} is prismatic; give it in plant.initial_m")
+    for name in config.initial_m:
+        if kinds[name] == "revolute":
+            raise ModelError(f"plant.initial_m: {name!r} is revolute; give it in plant.initial_deg")
+    initial = {**{name: np.deg2rad(angle) for name, angle in config.initial_deg.items()}, **config.initial_m}
     given = {"revolute": config.damping_N_m_s_per_rad, "prismatic": config.damping_N_s_per_m}
     links = tuple(
         link if (loss := given[link.kind]) is None else dataclasses.replace(link, damping=loss) for link in robot.links
     )
-    chosen = {joint: config.motors.get(joint, config.motor) for joint in robot.joint_names}
+    chosen = {joint: config.motors.get(joint, config.motor) for joint in kinds}
     return dataclasses.replace(
         robot,
         links=links,
         motors=tuple(motor.motor(joint) for joint, motor in chosen.items() if motor is not None),
         hand=robot.hand if config.hand is None else (config.hand.body, np.array(config.hand.point_m)),
         gravity=np.array(config.gravity_m_s2),
-        q0=np.array([np.deg2rad(config.initial_deg.get(joint, 0.0)) for joint in robot.joint_names]),
+        q0=np.array([initial.get(joint, 0.0) for joint in kinds]),
     )
