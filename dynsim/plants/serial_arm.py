@@ -110,8 +110,7 @@ class Config(StrictConfig):
     def _check_shared(cls, data: Any) -> Any:
         """Refuse a key of ``link`` that no entry takes, as in a resolved scenario, where every entry has its own."""
         link, chain = (data.get("link"), data.get("chain")) if isinstance(data, dict) else (None, None)
-        entries = isinstance(chain, list) and len(chain) > 0 and all(isinstance(entry, dict) for entry in chain)
-        if isinstance(link, dict) and entries:
+        if isinstance(link, dict) and isinstance(chain, list) and chain and all(isinstance(e, dict) for e in chain):
             taken = {key for entry in chain for key in _lay_under(link, entry) if key not in entry}
             for key in link:
                 if key in LinkKeys.model_fields and key not in taken:
