@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,8 +18,11 @@ from dynsim.errors import DynsimError, SimulationStopped
 from dynsim.hardware.cli import export, hw
 
 if TYPE_CHECKING:
+    from rich.progress import TaskID
+
     from dynsim.record import Record
     from dynsim.scenario import Scenario
+    from dynsim.studies.compare import VariantProgress
 
 app = typer.Typer(
     name="dynsim",
@@ -90,7 +94,7 @@ def run(
     folder = out or Path("results", loaded.name, loaded.variant)
     try:
         with _progress([loaded], quiet) as report:
-            record = simulate(loaded, lambda time: report(loaded.variant, time))
+            record = simulate(loaded, partial(report, loaded.variant))
     except SimulationStopped as stop:
         if stop.record is not None:
             save_run(stop.record, folder)
@@ -165,7 +169,8 @@ def check(
         try:
             variants: Sequence[str | None] = variant_names(name) or [None]
             for variant in variants:
-                check_scenario(load_scenario(name, variant, _overrides(overrides)))
+                with console.status(f"checking {_escape(name)} {variant or ''}"):
+                    check_scenario(load_scenario(name, variant, _overrides(overrides)))
         except DynsimError as error:
             failed = True
             errors.print(f"[red]error:[/] {_escape(str(error))}")
@@ -264,13 +269,14 @@ def _drawing(draw: Any, folder: Path, quiet: bool) -> None:
 
 
 @contextmanager
-def _progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[Any]:
-    """A progress bar per scenario, with simulated time and time to go; yields ``report(variant, time)``."""
+def _progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProgress]:
+    """A progress bar per scenario, with time and time to go, and one while references take long; yields its report."""
     if quiet:
-        yield lambda variant, time: None
+        yield lambda variant, time, stage="": None
         return
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+    from dynsim.engine import REFERENCES, SIMULATION
     from dynsim.kernels.jit import is_cached
 
     if not is_cached():
@@ -278,14 +284,26 @@ def _progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[Any]:
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
-        TextColumn("{task.completed:.2f} / {task.total:g} s simulated"),
+        TextColumn("{task.completed:.2f} / {task.total:g} s {task.fields[what]}"),
         TimeElapsedColumn(),
         TextColumn("to go"),
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console, transient=not console.is_terminal) as bars:
-        tasks = {s.variant: bars.add_task(f"{s.name} {s.variant}".strip(), total=s.duration_s) for s in scenarios}
-        yield lambda variant, time: bars.update(tasks[variant], completed=time)
+
+        def add(scenario: Scenario, what: str, visible: bool) -> TaskID:
+            title = f"{scenario.name} {scenario.variant}".strip()
+            return bars.add_task(title, total=scenario.duration_s, what=what, visible=visible)
+
+        preparing = {s.variant: add(s, "of the references", False) for s in scenarios}
+        simulating = {s.variant: add(s, "simulated", True) for s in scenarios}
+
+        def report(variant: str, time: float, stage: str = SIMULATION) -> None:
+            bars.update(preparing[variant], completed=time, visible=stage == REFERENCES, refresh=stage == REFERENCES)
+            if stage == SIMULATION:
+                bars.update(simulating[variant], completed=time)
+
+        yield report
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import difflib
 import io
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -153,9 +153,9 @@ class Scenario:
         """The tree of bodies with its motors (plants of the dynamics engine)."""
         return member("plant", self.plant.type).build(self.plant)
 
-    def build_controller(self, model: Model) -> Any:
-        """The controller for the robot."""
-        return member("controller", self.controller.type).build(self.controller, model, self.duration_s)
+    def build_controller(self, model: Model, progress: Callable[[float], None] | None = None) -> Any:
+        """The controller for the robot; ``progress`` is called with the time [s] that its references have come to."""
+        return member("controller", self.controller.type).build(self.controller, model, self.duration_s, progress)
 
     def surfaces(self) -> dict[str, Quadric]:
         """All surfaces by name, whether anything touches them or not."""

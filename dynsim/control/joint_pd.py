@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -64,8 +65,10 @@ class Config(StrictConfig):
         return self
 
 
-def build(config: Config, model: Model, duration: float) -> JointControl:
-    """Resolve gains and references for a robot.
+def build(
+    config: Config, model: Model, duration: float, progress: Callable[[float], None] | None = None
+) -> JointControl:
+    """Resolve gains and references for a robot, over ``duration`` [s]; long inverse kinematics report to ``progress``.
 
     Raises
     ------
@@ -92,7 +95,8 @@ def build(config: Config, model: Model, duration: float) -> JointControl:
         columns = [_waypoints(path, times) for path in config.joints.values()]
         if config.hand is not None:
             targets = config.hand.path.position(times)
-            followed = follow(model, times, targets, config.hand.joints, robot.initial, config.hand.tolerance_m)
+            hand = config.hand
+            followed = follow(model, times, targets, hand.joints, robot.initial, hand.tolerance_m, progress)
             columns.extend(followed.T)
         coefficients = spline_coefficients(times, np.stack(columns, axis=1))
         grid = [0.0, float(times[1])]

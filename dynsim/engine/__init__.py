@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
 from types import ModuleType
+from typing import Protocol
 
 from dynsim.record import Record
 from dynsim.scenario import Scenario
 
-# Called now and then with the simulated time [s].
-Progress = Callable[[float], None]
+REFERENCES, SIMULATION = "references", "simulation"
+
+
+class Progress(Protocol):
+    """Called about ten times a second with the time [s] that a stage has come to.
+
+    The stage is ``REFERENCES`` while the controller prepares them, if that takes long; then ``SIMULATION``.
+    """
+
+    def __call__(self, time: float, stage: str = SIMULATION) -> None: ...
 
 
 def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
@@ -19,7 +27,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
     Parameters
     ----------
     scenario : Scenario
-    progress : called with the simulated time [s] about ten times a second
+    progress : called as ``progress(time)`` and ``progress(time, stage)``, see :class:`Progress`
 
     Returns
     -------

@@ -5,11 +5,12 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from dynsim import metrics
-from dynsim.engine import Progress
+from dynsim.engine import REFERENCES, Progress
 from dynsim.engine.provenance import provenance
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.kernels import arrays as ka
@@ -40,8 +41,8 @@ class Prepared:
     workspace: ka.Workspace
 
 
-def prepare(scenario: Scenario) -> Prepared:
-    """Compile a scenario.
+def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
+    """Compile a scenario; references that take long report to ``progress``.
 
     Raises
     ------
@@ -55,7 +56,7 @@ def prepare(scenario: Scenario) -> Prepared:
     scenario.check_start(model)
     n, na, c = model.n, len(robot.motors), len(contacts)
     times = _sample_times(scenario, columns=2 * n + na + LEDGER_SIZE + CONTACT_SIZE * c + ki.output_size(n, na, c))
-    control = _control(scenario, model)
+    control = _control(scenario, model, progress)
     options = scenario.integrator
     method = ki.METHODS[options.method]
     step = options.step_s or (1e-3 if method == ki.RK4 else 0.0)
@@ -88,7 +89,7 @@ def prepare(scenario: Scenario) -> Prepared:
 
 def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
     """See :func:`dynsim.engine.simulate`."""
-    prepared = prepare(scenario)
+    prepared = prepare(scenario, progress)
     run = prepared.run
     # Loading or compiling the kernels is no integration time.
     ki.advance(prepared.system, prepared.workspace, run, 0)
@@ -139,10 +140,10 @@ def _sample_times(scenario: Scenario, columns: int) -> np.ndarray:
     return times
 
 
-def _control(scenario: Scenario, model: Model) -> JointControl:
+def _control(scenario: Scenario, model: Model, progress: Progress | None) -> JointControl:
     if scenario.controller is None:
         return JointControl.short_circuit(len(model.robot.motors))
-    control = scenario.build_controller(model)
+    control = scenario.build_controller(model, None if progress is None else partial(progress, stage=REFERENCES))
     if not isinstance(control, JointControl):
         raise ModelError(f"controller {scenario.controller.type!r} cannot drive a {scenario.plant.type!r}")
     return control
