@@ -31,7 +31,7 @@ def stages() -> list[tuple[str, float]]:
 
 
 @pytest.mark.usefixtures("slow_machine")
-def test_long_references_report_their_time_before_the_x:
+def test_long_references_report_their_time_before_the_simulation_does():
     seen = stages()
     # A knot every 20 ms, and then the integration.
     references = [time for stage, time in seen if stage == "references"]
