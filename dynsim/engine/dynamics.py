@@ -19,7 +19,7 @@ from dynsim.kernels.coupled import System
 from dynsim.kernels.energy import CONTACT_SIZE, LEDGER_SIZE
 from dynsim.model.arrays import compile_contacts, compile_drives
 from dynsim.model.control import JointControl
-from dynsim.model.description import Contact
+from dynsim.model.description import Contact, Link
 from dynsim.model.model import Model
 from dynsim.record import Record
 from dynsim.scenario import Scenario, build_model
@@ -159,12 +159,12 @@ def _record(scenario: Scenario, prepared: Prepared, wall: float) -> Record:
     joints, driven = robot.joint_names, tuple(motor.joint for motor in robot.motors)
     names = tuple(contact.name for contact in contacts)
     record = Record(run.sample_time[:rows], provenance=provenance(scenario))
-    kinds = {link.joint: link.kind for link in robot.links}
-    angle, rate, _ = _joint_units(kinds.values())
-    _, _, force = _joint_units(kinds[joint] for joint in driven)
+    angle, rate, acceleration, _ = _joint_units(robot.links)
+    with_motor = set(driven)
+    *_, force = _joint_units([link for link in robot.links if link.joint in with_motor] or robot.links)
     record.add("q", y[:, :n], angle, labels=joints, description="joint positions")
     record.add("v", y[:, n : 2 * n], rate, labels=joints, description="joint rates")
-    record.add("vdot", out[:, :n], f"{rate}²", labels=joints, description="joint accelerations")
+    record.add("vdot", out[:, :n], acceleration, labels=joints, description="joint accelerations")
     current, voltage = y[:, 2 * n : 2 * n + na], out[:, n : n + na]
     record.add("current", current, "A", labels=driven, description="motor currents")
     record.add("voltage", voltage, "V", labels=driven, description="motor terminal voltages")
@@ -202,12 +202,10 @@ def _record(scenario: Scenario, prepared: Prepared, wall: float) -> Record:
     return record
 
 
-def _joint_units(kinds: Iterable[str]) -> tuple[str, str, str]:
-    """Units of position, rate and generalised force of joints of these kinds."""
-    found = set(kinds)
-    if found == {"prismatic"}:
-        return "m", "m/s", "N"
-    return ("rad or m", "rad/s or m/s", "N m or N") if "prismatic" in found else ("rad", "rad/s", "N m")
+def _joint_units(links: Iterable[Link]) -> Sequence[str]:
+    """Units of position, velocity, acceleration and force of joints; "rad or m" when there are both kinds."""
+    units = sorted({link.units for link in links}, reverse=True)
+    return [" or ".join(kinds) for kinds in zip(*units, strict=True)]
 
 
 def _last_state(prepared: Prepared) -> dict[str, Sequence[float]]:

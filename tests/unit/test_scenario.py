@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from dynsim.engine import check
@@ -147,28 +146,6 @@ def test_each_kind_of_joint_takes_the_shared_loss_of_its_own_unit(tmp_path: Path
         ),
     )
     assert [link.damping for link in build_model(load_scenario(path)).robot.links] == [3.0, 0.5, 7.0]
-
-
-SLIDE = """<robot name="r"><link name="base"/>
-<link name="car"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<link name="arm"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<joint name="slide" type="prismatic"><parent link="base"/><child link="car"/><axis xyz="1 0 0"/>
-<limit lower="-1" upper="1" effort="20" velocity="0.5"/></joint>
-<joint name="hinge" type="continuous"><parent link="car"/><child link="arm"/><axis xyz="0 1 0"/></joint></robot>"""
-
-
-def test_joints_of_a_urdf_start_and_lose_in_the_units_of_their_kind(tmp_path: Path):
-    (tmp_path / "slide.urdf").write_text(SLIDE)
-    text = (
-        "duration_s: 1\nplant:\n  type: urdf_arm\n  file: slide.urdf\n  initial_deg: {hinge: 90}\n"
-        "  initial_m: {slide: 0.2}\n  damping_N_m_s_per_rad: 0.5\n  damping_N_s_per_m: 3\n"
-    )
-    robot = build_model(load_scenario(write(tmp_path, text))).robot
-    assert robot.initial == pytest.approx([0.2, np.pi / 2])
-    assert [link.damping for link in robot.links] == [3.0, 0.5]
-    for key, joint in (("initial_deg", "slide"), ("initial_m", "hinge")):
-        with pytest.raises(ModelError, match=rf"plant.{key}: '{joint}' is"):
-            build_model(load_scenario(write(tmp_path, text), overrides={f"plant.{key}.{joint}": 1}))
 
 
 @pytest.mark.parametrize(
