@@ -211,8 +211,8 @@ def _passed_limits(record: Record, robot: Robot) -> list[str]:
             if over.size:
                 amount, first = beyond[over].max(), record.time[over[0]]
                 found.append(
-                    f"{link.joint}: passes its {what} limit of {limit:.4g} {unit} by up to {amount:.3g} {unit}, first at "
-                    f"t = {first:.4g} s; limits of joints are not enforced"
+                    f"{link.joint}: passes its {what} limit of {limit:.4g} {unit} by up to {amount:.3g} {unit}, "
+                    f"first at t = {first:.4g} s; limits of joints are not enforced"
                 )
     return found
 
