@@ -14,7 +14,7 @@ import typer
 from rich.console import Console
 
 from dynsim._version import __version__
-from dynsim.errors import DynsimError, SimulationStopped
+from dynsim.errors import DynsimError, SimulationInterrupted, SimulationStopped
 from dynsim.hardware.cli import export, hw
 
 if TYPE_CHECKING:
@@ -27,15 +27,19 @@ if TYPE_CHECKING:
 app = typer.Typer(
     name="dynsim",
     help="Dynamic simulator of braced hyper-redundant manipulators: energy, tracking, contact and motors.",
+    epilog="Example: dynsim run single_pendulum",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
-console = Console()
-errors = Console(stderr=True, soft_wrap=True, highlight=False)
+# emoji: rich would turn the ":b:" of a path or key into a picture.
+console = Console(emoji=False)
+errors = Console(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
-ScenarioArgument = Annotated[str, typer.Argument(help="Scenario file, or the name of a shipped one.")]
+ScenarioArgument = Annotated[
+    str, typer.Argument(metavar="SCENARIO", help="Scenario file, or the name of a shipped one.")
+]
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="a.b.c=VALUE", help="Override a value; may be repeated.")
 ]
@@ -44,15 +48,12 @@ FiguresOption = Annotated[bool, typer.Option("--no-figures", help="Do not draw f
 
 
 def main() -> None:
-    """Entry point: errors become one line and an exit code."""
+    """Entry point: errors become one line and an exit code. Ctrl-C where nothing can be saved is typer's: 130."""
     try:
-        app(standalone_mode=True)
+        app()
     except DynsimError as error:
         errors.print(f"[red]error:[/] {_escape(str(error))}")
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        errors.print("interrupted")
-        sys.exit(130)
 
 
 def _escape(text: str) -> str:
@@ -87,11 +88,13 @@ def run(
 ) -> None:
     """Simulate one scenario and write its record, summary and figures."""
     from dynsim.engine import simulate
+    from dynsim.files import check_writable
     from dynsim.results import save_run
     from dynsim.scenario import load_scenario
 
     loaded = load_scenario(scenario, variant, _overrides(overrides))
     folder = out or Path("results", loaded.name, loaded.variant)
+    check_writable(folder)
     try:
         with _progress([loaded], quiet) as report:
             record = simulate(loaded, partial(report, loaded.variant))
@@ -120,6 +123,7 @@ def compare(
     quiet: QuietOption = False,
 ) -> None:
     """Simulate all variants of a scenario and compare them in a table and in figures."""
+    from dynsim.files import check_writable
     from dynsim.results import save_run
     from dynsim.scenario import load_scenario, variant_names
     from dynsim.studies.compare import compare as compare_variants
@@ -128,6 +132,7 @@ def compare(
     given = _overrides(overrides)
     loaded = [load_scenario(scenario, name, given) for name in variant_names(scenario)]
     folder = out or Path("results", loaded[0].name if loaded else "")
+    check_writable(folder)
     try:
         with _progress(loaded, quiet) as report:
             records = compare_variants(
@@ -155,9 +160,11 @@ def compare(
         console.print(f"Written to {folder}", highlight=False, soft_wrap=True)
 
 
-@app.command(epilog="Example: dynsim check scenarios/*.yaml")
+@app.command(epilog="Example: dynsim check elbow_comparison six_axis_arm")
 def check(
-    scenarios: Annotated[list[str], typer.Argument(help="Scenario files, or names of shipped ones.")],
+    scenarios: Annotated[
+        list[str], typer.Argument(metavar="SCENARIO...", help="Scenario files, or names of shipped ones.")
+    ],
     overrides: SetOption = None,
 ) -> None:
     """Validate scenarios without running them: schema, model, contacts at the start, reachable references."""
@@ -171,6 +178,8 @@ def check(
             for variant in variants:
                 with console.status(f"checking {_escape(name)} {variant or ''}"):
                     check_scenario(load_scenario(name, variant, _overrides(overrides)))
+        except SimulationInterrupted:
+            raise
         except DynsimError as error:
             failed = True
             errors.print(f"[red]error:[/] {_escape(str(error))}")
@@ -191,7 +200,7 @@ def list_() -> None:
 
 @app.command(epilog="Example: dynsim plot results/elbow_comparison/two_elbows/record.h5")
 def plot(
-    records: Annotated[list[Path], typer.Argument(help="Records (HDF5).")],
+    records: Annotated[list[Path], typer.Argument(metavar="RECORD...", help="Records (HDF5).")],
     out: Annotated[
         Path | None, typer.Option(help="Folder for the figures; default: figures/ beside each record.")
     ] = None,
@@ -235,7 +244,9 @@ def schema() -> None:
 
 # These load serial ports and servos only when called.
 app.add_typer(hw, name="hw")
-app.command(epilog="Example: dynsim export record.h5 --format joint-trajectory --rate 100")(export)
+app.command(
+    epilog="Example: dynsim export results/elbow_comparison/two_elbows/record.h5 --format joint-trajectory --rate 100"
+)(export)
 
 
 def _overrides(given: list[str] | None) -> dict[str, Any]:

@@ -10,6 +10,23 @@ from pathlib import Path
 from dynsim.errors import RecordError
 
 
+def check_writable(folder: Path) -> None:
+    """Find out before a long simulation whether its files can be written to a folder; creates nothing.
+
+    Raises
+    ------
+    RecordError
+        A file is in the way, or there is no permission.
+    """
+    existing = folder.absolute()
+    while not existing.exists():
+        existing = existing.parent
+    if not existing.is_dir():
+        raise RecordError(f"cannot write to {folder}: {existing} is a file, not a folder")
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise RecordError(f"cannot write to {folder}: no permission to write in {existing}")
+
+
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary name beside ``path`` to write to; renamed to ``path`` when the block ends well.
@@ -24,8 +41,8 @@ def replacing(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
         os.replace(temporary, path)
-    except (OSError, RuntimeError) as error:
-        # h5py reports a full disk as RuntimeError or OSError, depending on when it notices.
+    except OSError as error:
+        raise RecordError(f"cannot write {path}: {error.strerror or error}; nothing was changed there") from error
+    finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-        raise RecordError(f"cannot write {path}: {error}; nothing was changed there") from error

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig
 from dynsim.errors import ModelError, ScenarioError
@@ -95,6 +95,14 @@ class ScenarioConfig(StrictConfig):
     integrator: Integrator = Integrator()
     record: RecordOptions = RecordOptions()
     metrics: Metrics = Metrics()
+
+    @field_validator("name", "variant")
+    @classmethod
+    def _check_folder(cls, value: str) -> str:
+        """Both name folders of the results: neither may lead out of them."""
+        if value in (".", "..") or any(sign in value for sign in "/\\\0"):
+            raise ValueError("names a folder of the results, so it must not have slashes or be dots")
+        return value
 
 
 @dataclass(frozen=True)
@@ -214,11 +222,13 @@ def find_scenario(name: str | Path) -> Path:
     Raises
     ------
     ScenarioError
-        Neither exists; the message lists near names.
+        Neither exists, with near names in the message; or a folder.
     """
     path = Path(name)
     if path.is_file():
         return path
+    if path.is_dir():
+        raise ScenarioError(f"{name}: is a folder; a scenario is a YAML file")
     for candidate in (SHIPPED / path.name, SHIPPED / f"{path.name}.yaml"):
         if candidate.is_file() and path.parent in (Path(), Path("scenarios")):
             return candidate
@@ -305,7 +315,7 @@ def parse_override(text: str) -> tuple[str, Any]:
     key, separator, value = text.partition("=")
     if not separator or not key.strip():
         raise ScenarioError(f"--set {text}: must look like integrator.rtol=1e-8")
-    return key.strip(), _plain(_parse_yaml(value, f"--set {text}"))
+    return key.strip(), _plain(_parse_yaml(value, f"--set {key.strip()}"))
 
 
 def to_yaml(resolved: Mapping[str, Any]) -> str:
@@ -346,8 +356,13 @@ def _read(path: Path) -> Any:
 
     try:
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ScenarioError(f"{path}: cannot be read ({error})") from error
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        raise ScenarioError(
+            f"{path}:{line}: byte 0x{error.object[error.start]:02x} is not UTF-8; save it as UTF-8"
+        ) from error
     data = _parse_yaml(text, str(path))
     if data is None:
         raise ScenarioError(f"{path}: is empty; a scenario needs at least duration_s and plant")
@@ -446,7 +461,7 @@ def _explain(
         place = "--set"
     kind, message = problem["type"], problem["msg"].removeprefix("Value error, ")
     if kind == "extra_forbidden":
-        known = _fields(problem["loc"][:-1])
+        known = _fields(problem["loc"][:-1]) + (["variants"] if len(keys) == 1 else [])
         text = f"unknown key{_suggest(str(keys[-1]), known)}"
         if not text.endswith("?"):
             text += f"; known here: {', '.join(known)}" if known else ""

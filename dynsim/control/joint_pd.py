@@ -21,6 +21,9 @@ from dynsim.model.model import Model
 
 PathChoice: Any = union("path")
 
+# Of the reference splines: half a gigabyte for each joint.
+SEGMENTS_MAX = 10_000_000
+
 
 class HandReference(StrictConfig):
     """A path of the hand, turned into references of ``joints`` by inverse kinematics."""
@@ -90,8 +93,14 @@ def build(
     spline = np.full(len(driven), -1)
     grid, coefficients = [0.0, 1.0], np.zeros((1, 0, 6))
     if named:
+        segments = duration / config.knot_spacing_s
+        if segments > SEGMENTS_MAX:
+            raise ModelError(
+                f"controller.knot_spacing_s = {config.knot_spacing_s:g}: {segments:.3g} knots in {duration:g} s, "
+                f"at most {SEGMENTS_MAX:g} are made; {duration / SEGMENTS_MAX:.3g} would fit"
+            )
         # A quintic spline needs six knots.
-        times = np.linspace(0.0, duration, max(int(np.ceil(duration / config.knot_spacing_s)), 6) + 1)
+        times = np.linspace(0.0, duration, max(int(np.ceil(segments)), 6) + 1)
         columns = [_waypoints(path, times) for path in config.joints.values()]
         if config.hand is not None:
             targets = config.hand.path.position(times)

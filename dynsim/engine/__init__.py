@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import ModuleType
 from typing import Protocol
 
+from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, UnreachableReference
 from dynsim.record import Record
 from dynsim.scenario import Scenario
 
@@ -43,7 +46,8 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
     ModelError, UnreachableReference
         The scenario describes no physics, or a path that the hand cannot follow.
     """
-    return _module(scenario).simulate(scenario, progress)
+    with _named(scenario):
+        return _module(scenario).simulate(scenario, progress)
 
 
 def check(scenario: Scenario) -> None:
@@ -53,7 +57,20 @@ def check(scenario: Scenario) -> None:
     ------
     ModelError, UnreachableReference, ScenarioError
     """
-    _module(scenario).prepare(scenario)
+    with _named(scenario):
+        _module(scenario).prepare(scenario)
+
+
+@contextmanager
+def _named(scenario: Scenario) -> Iterator[None]:
+    """Say in errors which scenario and variant they are about; those of reading it name file and line themselves."""
+    name = f"{scenario.source or scenario.name}{f' ({scenario.variant})' if scenario.variant else ''}"
+    try:
+        yield
+    except (ModelError, ScenarioError, UnreachableReference) as error:
+        raise type(error)(f"{name}: {error}") from error
+    except KeyboardInterrupt:
+        raise SimulationInterrupted(f"{name}: interrupted before there was anything to save") from None
 
 
 def _module(scenario: Scenario) -> ModuleType:

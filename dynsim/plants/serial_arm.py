@@ -1,4 +1,4 @@
-"""A serial chain of cylindrical links on a fixed base, with a motor at every joint ([WM] section IV)."""
+"""A serial chain of links on a fixed base; each joint may have a motor ([WM] section IV)."""
 
 from __future__ import annotations
 

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import dynsim.record
 from dynsim.errors import RecordError
 from dynsim.record import Record
 
@@ -46,10 +45,11 @@ def test_full_disk_leaves_the_old_record(record: Record, tmp_path: Path, monkeyp
     path = record.save(tmp_path / "record.h5")
     before = path.read_bytes()
 
-    def fail(*_):
+    def fail(self: Path, data: bytes) -> None:
+        self.write_text("half")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(dynsim.record, "_write", fail)
+    monkeypatch.setattr(Path, "write_bytes", fail)
     with pytest.raises(RecordError, match="No space left"):
         record.save(path)
     assert path.read_bytes() == before

@@ -78,6 +78,9 @@ def test_null_removes_a_key(tmp_path: Path):
         (MINIMAL.replace("axis: y", "axis: w"), ["plant.chain.0.axis"]),
         (MINIMAL.replace("duration_s: 1", "duration_s: .nan"), ["duration_s", "finite"]),
         (MINIMAL + "integrator: {step_s: 0}\n", ["integrator.step_s = 0"]),
+        (MINIMAL + "varaints: {}\n", ["case.yaml:3", "did you mean 'variants'"]),
+        (MINIMAL + "name: a/b\n", ["case.yaml:3: name = 'a/b': names a folder"]),
+        (MINIMAL + "variants:\n  ..: {}\n", ["variant = '..': names a folder"]),
         (SHARED.replace("mass_kg", "mas_kg"), ["case.yaml:4: plant.link.mas_kg: unknown key; did you mean 'mass_kg'?"]),
         (SHARED.replace("0.2", "heavy"), ["case.yaml:4: plant.link.mass_kg = 'heavy'", "number"]),
         (SHARED.replace("[{axis: y}]", "[]"), ["case.yaml:5: plant.chain: list should have at least 1 item"]),
@@ -159,12 +162,27 @@ def test_each_kind_of_joint_takes_the_shared_loss_of_its_own_unit(tmp_path: Path
         ({"controller.hand.joints": ["joint_99"]}, ModelError, "joint_99"),
         ({"controller.k_p_V_per_rad": [1, 2]}, ModelError, "2 values, there are 10 motors"),
         ({"record.rate_hz": 1e7}, ScenarioError, "record.rate_hz"),
+        ({"controller.knot_spacing_s": 1e-10}, ModelError, "controller.knot_spacing_s = 1e-10: 1e+11 knots in 10 s"),
     ],
 )
 def test_what_no_simulation_can_be_made_of_is_refused_by_check(overrides, error, expected):
     with pytest.raises(error) as caught:
         check(load_scenario("elbow_comparison", overrides=overrides))
     assert expected in str(caught.value)
+    # Which of several scenarios and variants it was.
+    assert str(caught.value).startswith(f"{find_scenario('elbow_comparison')} (two_elbows): ")
+
+
+def test_a_file_that_is_not_utf_8_is_named_with_its_line(tmp_path: Path):
+    path = tmp_path / "case.yaml"
+    path.write_bytes("duration_s: 1\nname: café\n".encode("latin-1"))
+    with pytest.raises(ScenarioError, match=r"case.yaml:2: byte 0xe9 is not UTF-8; save it as UTF-8"):
+        load_scenario(path)
+
+
+def test_a_folder_is_no_scenario(tmp_path: Path):
+    with pytest.raises(ScenarioError, match="is a folder; a scenario is a YAML file"):
+        load_scenario(tmp_path)
 
 
 def test_a_record_of_10_GB_is_refused_with_a_rate_that_fits():
