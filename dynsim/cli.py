@@ -223,7 +223,7 @@ def bench(
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures as JSON.")] = None,
 ) -> None:
     """Time right-hand sides and the whole job beside Pinocchio and MuJoCo (where installed)."""
-    from dynsim.results import write_json
+    from dynsim.files import write_json
     from dynsim.studies.bench import format_table, run_bench
 
     with console.status("measuring"):

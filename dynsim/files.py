@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from dynsim.errors import RecordError
 
@@ -46,3 +48,21 @@ def replacing(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> Path:
+    """Write a text file under a temporary name, then rename.
+
+    Raises
+    ------
+    RecordError
+        The file cannot be written; an older one is left as it was.
+    """
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return path
+
+
+def write_json(path: Path, data: Any) -> Path:
+    """Write JSON, see :func:`write_text`."""
+    return write_text(path, json.dumps(data, indent=2, ensure_ascii=False) + "\n")

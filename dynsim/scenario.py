@@ -1,4 +1,4 @@
-"""Scenarios: YAML in, a validated description of one simulation out. The only importer of families.
+"""Scenarios: YAML in, a validated description of one simulation out. Builds the members of families that it names.
 
 A scenario file is one mapping; ``variants`` holds, by name, what differs (mappings merge, lists and values replace,
 null removes). Overrides come on top. Every error names file, line, key and value.

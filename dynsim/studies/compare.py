@@ -13,8 +13,8 @@ from typing import Any, Protocol
 
 from dynsim.engine import SIMULATION, simulate
 from dynsim.errors import ScenarioError
+from dynsim.files import write_json, write_text
 from dynsim.record import Record
-from dynsim.results import write_json, write_text
 from dynsim.scenario import load_scenario, variant_names
 
 
