@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -208,12 +209,14 @@ def plot(
     """Draw the figures of records; two or more are also laid over each other."""
     from dynsim.record import Record
 
-    loaded = {str(path): Record.load(path) for path in records}
-    for path, record in loaded.items():
-        folder = out or Path(path).parent / "figures"
-        _draw(record, folder if len(loaded) == 1 or out is None else folder / _label(path, record), quiet=False)
-    if len(loaded) > 1:
-        labelled = {_label(path, record): record for path, record in loaded.items()}
+    labelled: dict[str, Record] = {}
+    for path in records:
+        record = Record.load(path)
+        label = _label(path, record, labelled)
+        labelled[label] = record
+        folder = path.parent / "figures" if out is None else out if len(records) == 1 else out / label
+        _draw(record, folder, quiet=False)
+    if len(labelled) > 1:
         _draw_comparison(labelled, out or Path("figures"), quiet=False)
 
 
@@ -255,8 +258,10 @@ def _overrides(given: list[str] | None) -> dict[str, Any]:
     return dict(parse_override(text) for text in given or ())
 
 
-def _label(path: str, record: Record) -> str:
-    return record.summary.get("variant") or Path(path).parent.name or Path(path).stem
+def _label(path: Path, record: Record, taken: Container[str]) -> str:
+    """A name for a record among others: its variant, numbered where another has the same."""
+    name = record.summary.get("variant") or path.parent.name or path.stem
+    return next(label for k in itertools.count(1) if (label := name if k == 1 else f"{name}_{k}") not in taken)
 
 
 def _draw(record: Record, folder: Path, quiet: bool) -> None:

@@ -37,7 +37,17 @@ LIMIT_SLACK = 1e-6
 
 @dataclass(frozen=True)
 class Counts:
-    """What the integrator counted."""
+    """What the integrator counted.
+
+    Attributes
+    ----------
+    wall : wall time of the integration [s]
+    steps, rejected : accepted and repeated steps
+    evaluations : right-hand sides, those for samples and projections included
+    projections : corrections onto the contact surfaces
+    deficient : right-hand sides whose constraint forces were not unique
+    extremes : (c, 3) smallest and largest normal force [N] and largest distance from the surface [m] of each contact
+    """
 
     wall: float
     steps: int

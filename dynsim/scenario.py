@@ -125,26 +125,32 @@ class Scenario:
 
     @property
     def duration_s(self) -> float:
+        """Simulated time [s]."""
         return self.config.duration_s
 
     @property
     def plant(self) -> Any:
+        """Configuration of the machine, the ``Config`` of its module."""
         return self.config.plant
 
     @property
     def controller(self) -> Any:
+        """Configuration of the controller, None without one."""
         return self.config.controller
 
     @property
     def integrator(self) -> Integrator:
+        """Method, solver and tolerances."""
         return self.config.integrator
 
     @property
     def record(self) -> RecordOptions:
+        """Rate [Hz] and size limit [GB] of the record."""
         return self.config.record
 
     @property
     def metrics(self) -> Metrics:
+        """How the summary is computed."""
         return self.config.metrics
 
     @property
@@ -296,11 +302,18 @@ def load_scenario(path: str | Path, variant: str | None = None, overrides: Mappi
 
 
 def scenario_from_resolved(resolved: Mapping[str, Any]) -> Scenario:
-    """The scenario that a record's provenance holds."""
+    """The scenario that a record's provenance holds.
+
+    Raises
+    ------
+    ScenarioError
+        It was written by a version of dynsim with other keys.
+    """
     try:
         config = ScenarioConfig.model_validate(resolved)
     except ValidationError as error:
-        raise ScenarioError(f"the scenario in this record does not fit this version of dynsim: {error}") from None
+        problem = _explain(error, "the scenario in this record", resolved, (), {})
+        raise ScenarioError(f"{problem}; it was written by another version of dynsim") from None
     return Scenario(config.name, config.variant, config)
 
 
@@ -445,7 +458,7 @@ def _make_absolute(data: Any, folder: Path) -> None:
 
 
 def _explain(
-    error: ValidationError, path: Path, merged: Any, sources: tuple[Any, ...], overrides: Mapping[str, Any]
+    error: ValidationError, path: Path | str, merged: Any, sources: tuple[Any, ...], overrides: Mapping[str, Any]
 ) -> str:
     """The first problem in one line: file:line, key, value, fix."""
     problems = error.errors()
@@ -455,7 +468,8 @@ def _explain(
     keys, value, found = _locate(merged, tuple(part for part in loc if part != ""))
     dotted = ".".join(str(key) for key in keys)
     # The source that has most of the keys; of equals the first, because the variant lies over the rest.
-    _, line = max((_line(source, keys) for source in sources), key=lambda depth_and_line: depth_and_line[0])
+    found_in = [_line(source, keys) for source in sources]
+    _, line = max(found_in, key=lambda depth_and_line: depth_and_line[0], default=(0, 0))
     place = f"{path}:{line}" if line else str(path)
     if any(dotted == key or dotted.startswith(key + ".") or key.startswith(dotted + ".") for key in overrides):
         place = "--set"

@@ -178,7 +178,7 @@ def _record(scenario: Scenario, prepared: Prepared, wall: float) -> Record:
     ledger = y[:, 2 * n + na :]
     for column, (name, text) in enumerate(metrics.INTEGRALS.items()):
         record.add(name, ledger[:, column], "J", description=text)
-    for column, name in enumerate(("energy_kinetic", "energy_potential", "energy_magnetic")):
+    for column, name in enumerate(metrics.STORES):
         record.add(name, out[:, k + 3 + column], "J", description=f"{name.removeprefix('energy_')} energy")
     record.add("energy_residual", metrics.energy_residual(record), "J", description="what the ledger does not explain")
     per_contact = out[:, k + 6 :].reshape(rows, c, 8)

@@ -183,4 +183,5 @@ class Robot:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints, in the order of q."""
         return tuple(link.joint for link in self.links)

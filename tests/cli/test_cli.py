@@ -100,6 +100,16 @@ def test_bad_input_is_one_clear_line_and_exit_code_2(tmp_path: Path, arguments: 
     assert not (tmp_path / "results").exists()
 
 
+def test_plot_keeps_apart_records_of_the_same_variant(tmp_path: Path):
+    for name in ("a", "b"):
+        assert dynsim("run", "elbow_comparison", "--no-figures", "--out", name, *SHORT, folder=tmp_path).returncode == 0
+    result = dynsim("plot", "a/record.h5", "b/record.h5", "--out", "figures", folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    folders = {path.name for path in (tmp_path / "figures").iterdir() if path.is_dir()}
+    assert folders == {"two_elbows", "two_elbows_2"}
+    assert (tmp_path / "figures" / "compare_energy.png").is_file()
+
+
 def test_divergence_stops_with_code_3_and_keeps_what_there_is(tmp_path: Path):
     # RK4 is unstable beyond 1.4 ms for this arm.
     result = dynsim(

@@ -56,6 +56,15 @@ def test_resolved_scenario_reads_back_as_itself(tmp_path: Path):
     assert scenario_from_resolved(scenario.resolved).resolved == scenario.resolved
 
 
+def test_a_scenario_of_another_version_is_refused_in_one_line():
+    resolved = load_scenario("elbow_comparison").resolved
+    resolved["integrator"]["newer"] = 1
+    with pytest.raises(ScenarioError) as caught:
+        scenario_from_resolved(resolved)
+    assert str(caught.value).startswith("the scenario in this record: integrator.newer: unknown key")
+    assert "\n" not in str(caught.value)
+
+
 def test_null_removes_a_key(tmp_path: Path):
     path = write(tmp_path, MINIMAL + "integrator: {rtol: 1e-9}\nvariants: {a: {integrator: {rtol: null}}, b: {}}\n")
     assert load_scenario(path, "a").integrator.rtol == 1e-6
