@@ -30,7 +30,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
     Parameters
     ----------
     scenario : Scenario
-    progress : called as ``progress(time)`` and ``progress(time, stage)``, see :class:`Progress`
+    progress : called with time [s] and stage, see :class:`Progress`
 
     Returns
     -------

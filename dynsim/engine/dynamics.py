@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from dynsim import metrics
-from dynsim.engine import REFERENCES, Progress
+from dynsim.engine import REFERENCES, SIMULATION, Progress
 from dynsim.engine.provenance import provenance
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.kernels import arrays as ka
@@ -94,7 +94,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
     # Loading or compiling the kernels is no integration time.
     ki.advance(prepared.system, prepared.workspace, run, 0)
     if progress is not None:
-        progress(0.0)
+        progress(0.0, SIMULATION)
     started, limit, interrupted = clock.perf_counter(), 20, False
     try:
         while run.count[ki.STATUS] == ki.RUNNING:
@@ -103,7 +103,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
             taken = clock.perf_counter() - before
             limit = int(min(max(limit * min(_CHUNK_S / max(taken, 1e-9), 10.0), 1), 1_000_000))
             if progress is not None:
-                progress(float(run.clock[ki.TIME]))
+                progress(float(run.clock[ki.TIME]), SIMULATION)
     except KeyboardInterrupt:
         interrupted = True
     wall = clock.perf_counter() - started
