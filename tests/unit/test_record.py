@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dynsim.errors import RecordError
+from dynsim.files import check_writable
 from dynsim.record import Record
 
 
@@ -71,3 +72,15 @@ def test_what_is_no_record_is_refused(tmp_path: Path):
     (tmp_path / "text.h5").write_text("hello")
     with pytest.raises(RecordError, match="not a readable HDF5"):
         Record.load(tmp_path / "text.h5")
+
+
+def test_a_folder_that_cannot_be_written_is_found_without_making_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    check_writable(tmp_path / "new" / "deep")
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RecordError, match="is a file, not a folder"):
+        check_writable(tmp_path / "file" / "deep")
+    # Root may write everywhere, so the answer is given here.
+    monkeypatch.setattr("os.access", lambda *_: False)
+    with pytest.raises(RecordError, match=f"no permission to write in {tmp_path}"):
+        check_writable(tmp_path / "new")
