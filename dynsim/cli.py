@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,25 +15,32 @@ import typer
 from rich.console import Console
 
 from dynsim._version import __version__
-from dynsim.errors import DynsimError, SimulationStopped
+from dynsim.errors import DynsimError, SimulationInterrupted, SimulationStopped
 from dynsim.hardware.cli import export, hw
 
 if TYPE_CHECKING:
+    from rich.progress import TaskID
+
     from dynsim.record import Record
     from dynsim.scenario import Scenario
+    from dynsim.studies.compare import VariantProgress
 
 app = typer.Typer(
     name="dynsim",
     help="Dynamic simulator of braced hyper-redundant manipulators: energy, tracking, contact and motors.",
+    epilog="Example: dynsim run single_pendulum",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
-console = Console()
-errors = Console(stderr=True, soft_wrap=True, highlight=False)
+# emoji: rich would turn the ":b:" of a path or key into a picture.
+console = Console(emoji=False)
+errors = Console(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
-ScenarioArgument = Annotated[str, typer.Argument(help="Scenario file, or the name of a shipped one.")]
+ScenarioArgument = Annotated[
+    str, typer.Argument(metavar="SCENARIO", help="Scenario file, or the name of a shipped one.")
+]
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="a.b.c=VALUE", help="Override a value; may be repeated.")
 ]
@@ -40,15 +49,12 @@ FiguresOption = Annotated[bool, typer.Option("--no-figures", help="Do not draw f
 
 
 def main() -> None:
-    """Entry point: errors become one line and an exit code."""
+    """Entry point: errors become one line and an exit code. Ctrl-C where nothing can be saved is typer's: 130."""
     try:
-        app(standalone_mode=True)
+        app()
     except DynsimError as error:
         errors.print(f"[red]error:[/] {_escape(str(error))}")
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        errors.print("interrupted")
-        sys.exit(130)
 
 
 def _escape(text: str) -> str:
@@ -83,14 +89,16 @@ def run(
 ) -> None:
     """Simulate one scenario and write its record, summary and figures."""
     from dynsim.engine import simulate
+    from dynsim.files import check_writable
     from dynsim.results import save_run
     from dynsim.scenario import load_scenario
 
     loaded = load_scenario(scenario, variant, _overrides(overrides))
     folder = out or Path("results", loaded.name, loaded.variant)
+    check_writable(folder)
     try:
         with _progress([loaded], quiet) as report:
-            record = simulate(loaded, lambda time: report(loaded.variant, time))
+            record = simulate(loaded, partial(report, loaded.variant))
     except SimulationStopped as stop:
         if stop.record is not None:
             save_run(stop.record, folder)
@@ -116,6 +124,7 @@ def compare(
     quiet: QuietOption = False,
 ) -> None:
     """Simulate all variants of a scenario and compare them in a table and in figures."""
+    from dynsim.files import check_writable
     from dynsim.results import save_run
     from dynsim.scenario import load_scenario, variant_names
     from dynsim.studies.compare import compare as compare_variants
@@ -124,6 +133,7 @@ def compare(
     given = _overrides(overrides)
     loaded = [load_scenario(scenario, name, given) for name in variant_names(scenario)]
     folder = out or Path("results", loaded[0].name if loaded else "")
+    check_writable(folder)
     try:
         with _progress(loaded, quiet) as report:
             records = compare_variants(
@@ -151,9 +161,11 @@ def compare(
         console.print(f"Written to {folder}", highlight=False, soft_wrap=True)
 
 
-@app.command(epilog="Example: dynsim check scenarios/*.yaml")
+@app.command(epilog="Example: dynsim check elbow_comparison six_axis_arm")
 def check(
-    scenarios: Annotated[list[str], typer.Argument(help="Scenario files, or names of shipped ones.")],
+    scenarios: Annotated[
+        list[str], typer.Argument(metavar="SCENARIO...", help="Scenario files, or names of shipped ones.")
+    ],
     overrides: SetOption = None,
 ) -> None:
     """Validate scenarios without running them: schema, model, contacts at the start, reachable references."""
@@ -165,7 +177,10 @@ def check(
         try:
             variants: Sequence[str | None] = variant_names(name) or [None]
             for variant in variants:
-                check_scenario(load_scenario(name, variant, _overrides(overrides)))
+                with console.status(f"checking {_escape(name)} {variant or ''}"):
+                    check_scenario(load_scenario(name, variant, _overrides(overrides)))
+        except SimulationInterrupted:
+            raise
         except DynsimError as error:
             failed = True
             errors.print(f"[red]error:[/] {_escape(str(error))}")
@@ -186,7 +201,7 @@ def list_() -> None:
 
 @app.command(epilog="Example: dynsim plot results/elbow_comparison/two_elbows/record.h5")
 def plot(
-    records: Annotated[list[Path], typer.Argument(help="Records (HDF5).")],
+    records: Annotated[list[Path], typer.Argument(metavar="RECORD...", help="Records (HDF5).")],
     out: Annotated[
         Path | None, typer.Option(help="Folder for the figures; default: figures/ beside each record.")
     ] = None,
@@ -194,12 +209,14 @@ def plot(
     """Draw the figures of records; two or more are also laid over each other."""
     from dynsim.record import Record
 
-    loaded = {str(path): Record.load(path) for path in records}
-    for path, record in loaded.items():
-        folder = out or Path(path).parent / "figures"
-        _draw(record, folder if len(loaded) == 1 or out is None else folder / _label(path, record), quiet=False)
-    if len(loaded) > 1:
-        labelled = {_label(path, record): record for path, record in loaded.items()}
+    labelled: dict[str, Record] = {}
+    for path in records:
+        record = Record.load(path)
+        label = _label(path, record, labelled)
+        labelled[label] = record
+        folder = path.parent / "figures" if out is None else out if len(records) == 1 else out / label
+        _draw(record, folder, quiet=False)
+    if len(labelled) > 1:
         _draw_comparison(labelled, out or Path("figures"), quiet=False)
 
 
@@ -209,7 +226,7 @@ def bench(
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures as JSON.")] = None,
 ) -> None:
     """Time right-hand sides and the whole job beside Pinocchio and MuJoCo (where installed)."""
-    from dynsim.results import write_json
+    from dynsim.files import write_json
     from dynsim.studies.bench import format_table, run_bench
 
     with console.status("measuring"):
@@ -230,7 +247,9 @@ def schema() -> None:
 
 # These load serial ports and servos only when called.
 app.add_typer(hw, name="hw")
-app.command(epilog="Example: dynsim export record.h5 --format joint-trajectory --rate 100")(export)
+app.command(
+    epilog="Example: dynsim export results/elbow_comparison/two_elbows/record.h5 --format joint-trajectory --rate 100"
+)(export)
 
 
 def _overrides(given: list[str] | None) -> dict[str, Any]:
@@ -239,8 +258,10 @@ def _overrides(given: list[str] | None) -> dict[str, Any]:
     return dict(parse_override(text) for text in given or ())
 
 
-def _label(path: str, record: Record) -> str:
-    return record.summary.get("variant") or Path(path).parent.name or Path(path).stem
+def _label(path: Path, record: Record, taken: Container[str]) -> str:
+    """A name for a record among others: its variant, numbered where another has the same."""
+    name = record.summary.get("variant") or path.parent.name or path.stem
+    return next(label for k in itertools.count(1) if (label := name if k == 1 else f"{name}_{k}") not in taken)
 
 
 def _draw(record: Record, folder: Path, quiet: bool) -> None:
@@ -264,13 +285,14 @@ def _drawing(draw: Any, folder: Path, quiet: bool) -> None:
 
 
 @contextmanager
-def _progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[Any]:
-    """A progress bar per scenario, with simulated time and time to go; yields ``report(variant, time)``."""
+def _progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProgress]:
+    """A progress bar per scenario, with time and time to go, and one while references take long; yields its report."""
     if quiet:
-        yield lambda variant, time: None
+        yield lambda variant, time, stage="": None
         return
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+    from dynsim.engine import REFERENCES, SIMULATION
     from dynsim.kernels.jit import is_cached
 
     if not is_cached():
@@ -278,14 +300,26 @@ def _progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[Any]:
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
-        TextColumn("{task.completed:.2f} / {task.total:g} s simulated"),
+        TextColumn("{task.completed:.2f} / {task.total:g} s {task.fields[what]}"),
         TimeElapsedColumn(),
         TextColumn("to go"),
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console, transient=not console.is_terminal) as bars:
-        tasks = {s.variant: bars.add_task(f"{s.name} {s.variant}".strip(), total=s.duration_s) for s in scenarios}
-        yield lambda variant, time: bars.update(tasks[variant], completed=time)
+
+        def add(scenario: Scenario, what: str, visible: bool) -> TaskID:
+            title = f"{scenario.name} {scenario.variant}".strip()
+            return bars.add_task(title, total=scenario.duration_s, what=what, visible=visible)
+
+        preparing = {s.variant: add(s, "of the references", False) for s in scenarios}
+        simulating = {s.variant: add(s, "simulated", True) for s in scenarios}
+
+        def report(variant: str, time: float, stage: str = SIMULATION) -> None:
+            bars.update(preparing[variant], completed=time, visible=stage == REFERENCES, refresh=stage == REFERENCES)
+            if stage == SIMULATION:
+                bars.update(simulating[variant], completed=time)
+
+        yield report
 
 
 if __name__ == "__main__":

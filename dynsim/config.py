@@ -7,6 +7,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
+from pydantic_core import PydanticCustomError
 
 Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
 Positive = Annotated[float, Field(gt=0)]
@@ -17,6 +18,18 @@ class StrictConfig(BaseModel):
     """A mapping of a scenario file; unknown keys are errors, numbers must be finite."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True)
+
+
+class BodyPoint(StrictConfig):
+    """A point fixed on a body."""
+
+    body: str = Field(description="name of the body")
+    point_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="in the body's frame")
+
+
+def error_at(key: str, message: str) -> PydanticCustomError:
+    """An error for a validator of a whole mapping to raise about one dotted ``key`` within it."""
+    return PydanticCustomError("value_error", "{message}", {"message": message, "key": key})
 
 
 def unit_vector(values: list[float], name: str) -> NDArray[np.float64]:

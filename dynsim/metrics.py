@@ -31,11 +31,23 @@ STORES = ("energy_kinetic", "energy_potential", "energy_magnetic")
 
 RESIDUAL_LIMIT = 1e-6
 DRIFT_LIMIT_M = 1e-9
+# Limits in files are rounded: a joint that starts at 1.5707963 = 90° is not beyond it.
+LIMIT_SLACK = 1e-6
 
 
 @dataclass(frozen=True)
 class Counts:
-    """What the integrator counted."""
+    """What the integrator counted.
+
+    Attributes
+    ----------
+    wall : wall time of the integration [s]
+    steps, rejected : accepted and repeated steps
+    evaluations : right-hand sides, those for samples and projections included
+    projections : corrections onto the contact surfaces
+    deficient : right-hand sides whose constraint forces were not unique
+    extremes : (c, 3) smallest and largest normal force [N] and largest distance from the surface [m] of each contact
+    """
 
     wall: float
     steps: int
@@ -176,6 +188,7 @@ def _warnings(
                 f"{motor.joint}: voltage at its limit of {motor.voltage_limit:g} V for "
                 f"{100 * saturated.mean():.1f} % of the run"
             )
+    found.extend(_passed_limits(record, robot))
     if summary["energy_residual_relative"] > RESIDUAL_LIMIT:
         found.append(
             f"the energy ledger does not close: residual {summary['energy_residual_relative']:.1e} of the turnover; "
@@ -187,6 +200,30 @@ def _warnings(
         found.append(
             f"contact rows depended on each other in {counts.deficient} evaluations: forces are the split of least norm"
         )
+    return found
+
+
+def _passed_limits(record: Record, robot: Robot) -> list[str]:
+    """Limits of joints that samples of the record lie beyond; the simulation does not enforce them."""
+    torque = dict(zip(record.labels["torque"], record["torque"].T, strict=True))
+    found = []
+    for link, q, v in zip(robot.links, record["q"].T, record["v"].T, strict=True):
+        if np.isinf((link.lower, link.upper, link.velocity_limit, link.effort_limit)).all():
+            continue
+        position, velocity, _, force = link.units
+        for what, limit, unit, beyond in (
+            ("lower position", link.lower, position, link.lower - q),
+            ("upper position", link.upper, position, q - link.upper),
+            ("velocity", link.velocity_limit, velocity, np.abs(v) - link.velocity_limit),
+            ("effort", link.effort_limit, force, np.abs(torque.get(link.joint, np.zeros_like(q))) - link.effort_limit),
+        ):
+            over = np.flatnonzero(beyond > LIMIT_SLACK)
+            if over.size:
+                amount, first = beyond[over].max(), record.time[over[0]]
+                found.append(
+                    f"{link.joint}: passes its {what} limit of {limit:.4g} {unit} by up to {amount:.3g} {unit}, "
+                    f"first at t = {first:.4g} s; limits of joints are not enforced"
+                )
     return found
 
 

@@ -5,6 +5,7 @@ A record knows nothing of the engine that made it: simulated and measured runs l
 
 from __future__ import annotations
 
+import io
 import json
 import os
 from collections.abc import Iterator, Mapping
@@ -103,7 +104,9 @@ class Record:
         import h5py
 
         path = Path(path)
-        with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+        # Made in memory: HDF5 crashes the process when the disk is full while it closes a file.
+        image = io.BytesIO()
+        with h5py.File(image, "w") as file:
             file.attrs["format"] = FORMAT
             file.attrs["complete"] = self.complete
             # Long texts as data sets: HDF5 attributes end at 64 kB.
@@ -112,6 +115,8 @@ class Record:
             _write(file, "time", Signal(self.time, "s"))
             for name, signal in self.signals.items():
                 _write(file, f"signals/{name}", signal)
+        with replacing(path) as temporary:
+            temporary.write_bytes(image.getbuffer())
         return path
 
     @classmethod
@@ -142,6 +147,8 @@ class Record:
                     )
         except OSError as error:
             raise RecordError(f"{path}: not a readable HDF5 file ({error})") from error
+        except (KeyError, ValueError) as error:
+            raise RecordError(f"{path}: a dynsim record that lacks parts ({error})") from error
         return record
 
 

@@ -1,4 +1,4 @@
-"""Scenarios: YAML in, a validated description of one simulation out. The only importer of families.
+"""Scenarios: YAML in, a validated description of one simulation out. Builds the members of families that it names.
 
 A scenario file is one mapping; ``variants`` holds, by name, what differs (mappings merge, lists and values replace,
 null removes). Overrides come on top. Every error names file, line, key and value.
@@ -11,15 +11,15 @@ import difflib
 import io
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError, field_validator
 
-from dynsim.config import NonNegative, Positive, StrictConfig, Vector3
+from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.families import PACKAGES, member, members, union
 from dynsim.model.description import Contact, Quadric, Robot
@@ -32,11 +32,9 @@ SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else Path(__file__).resolve().parent /
 START_TOLERANCE = 1e-6
 
 
-class ContactPoint(StrictConfig):
+class ContactPoint(BodyPoint):
     """A point fixed on a body, held to a surface."""
 
-    body: str
-    point_m: Vector3 = [0.0, 0.0, 0.0]
     surface: str = "floor"
     friction: NonNegative | None = Field(default=None, description="kinetic coefficient; default: that of contacts")
     enabled: bool = True
@@ -98,6 +96,14 @@ class ScenarioConfig(StrictConfig):
     record: RecordOptions = RecordOptions()
     metrics: Metrics = Metrics()
 
+    @field_validator("name", "variant")
+    @classmethod
+    def _check_folder(cls, value: str) -> str:
+        """Both name folders of the results: neither may lead out of them."""
+        if value in (".", "..") or any(sign in value for sign in "/\\\0"):
+            raise ValueError("names a folder of the results, so it must not have slashes or be dots")
+        return value
+
 
 @dataclass(frozen=True)
 class Scenario:
@@ -119,26 +125,32 @@ class Scenario:
 
     @property
     def duration_s(self) -> float:
+        """Simulated time [s]."""
         return self.config.duration_s
 
     @property
     def plant(self) -> Any:
+        """Configuration of the machine, the ``Config`` of its module."""
         return self.config.plant
 
     @property
     def controller(self) -> Any:
+        """Configuration of the controller, None without one."""
         return self.config.controller
 
     @property
     def integrator(self) -> Integrator:
+        """Method, solver and tolerances."""
         return self.config.integrator
 
     @property
     def record(self) -> RecordOptions:
+        """Rate [Hz] and size limit [GB] of the record."""
         return self.config.record
 
     @property
     def metrics(self) -> Metrics:
+        """How the summary is computed."""
         return self.config.metrics
 
     @property
@@ -155,9 +167,9 @@ class Scenario:
         """The tree of bodies with its motors (plants of the dynamics engine)."""
         return member("plant", self.plant.type).build(self.plant)
 
-    def build_controller(self, model: Model) -> Any:
-        """The controller for the robot."""
-        return member("controller", self.controller.type).build(self.controller, model, self.duration_s)
+    def build_controller(self, model: Model, progress: Callable[[float], None] | None = None) -> Any:
+        """The controller for the robot; ``progress`` is called with the time [s] that its references have come to."""
+        return member("controller", self.controller.type).build(self.controller, model, self.duration_s, progress)
 
     def surfaces(self) -> dict[str, Quadric]:
         """All surfaces by name, whether anything touches them or not."""
@@ -216,11 +228,13 @@ def find_scenario(name: str | Path) -> Path:
     Raises
     ------
     ScenarioError
-        Neither exists; the message lists near names.
+        Neither exists, with near names in the message; or a folder.
     """
     path = Path(name)
     if path.is_file():
         return path
+    if path.is_dir():
+        raise ScenarioError(f"{name}: is a folder; a scenario is a YAML file")
     for candidate in (SHIPPED / path.name, SHIPPED / f"{path.name}.yaml"):
         if candidate.is_file() and path.parent in (Path(), Path("scenarios")):
             return candidate
@@ -288,11 +302,18 @@ def load_scenario(path: str | Path, variant: str | None = None, overrides: Mappi
 
 
 def scenario_from_resolved(resolved: Mapping[str, Any]) -> Scenario:
-    """The scenario that a record's provenance holds."""
+    """The scenario that a record's provenance holds.
+
+    Raises
+    ------
+    ScenarioError
+        It was written by a version of dynsim with other keys.
+    """
     try:
         config = ScenarioConfig.model_validate(resolved)
     except ValidationError as error:
-        raise ScenarioError(f"the scenario in this record does not fit this version of dynsim: {error}") from None
+        problem = _explain(error, "the scenario in this record", resolved, (), {})
+        raise ScenarioError(f"{problem}; it was written by another version of dynsim") from None
     return Scenario(config.name, config.variant, config)
 
 
@@ -307,7 +328,7 @@ def parse_override(text: str) -> tuple[str, Any]:
     key, separator, value = text.partition("=")
     if not separator or not key.strip():
         raise ScenarioError(f"--set {text}: must look like integrator.rtol=1e-8")
-    return key.strip(), _plain(_parse_yaml(value, f"--set {text}"))
+    return key.strip(), _plain(_parse_yaml(value, f"--set {key.strip()}"))
 
 
 def to_yaml(resolved: Mapping[str, Any]) -> str:
@@ -348,8 +369,13 @@ def _read(path: Path) -> Any:
 
     try:
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ScenarioError(f"{path}: cannot be read ({error})") from error
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        raise ScenarioError(
+            f"{path}:{line}: byte 0x{error.object[error.start]:02x} is not UTF-8; save it as UTF-8"
+        ) from error
     data = _parse_yaml(text, str(path))
     if data is None:
         raise ScenarioError(f"{path}: is empty; a scenario needs at least duration_s and plant")
@@ -432,21 +458,24 @@ def _make_absolute(data: Any, folder: Path) -> None:
 
 
 def _explain(
-    error: ValidationError, path: Path, merged: Any, sources: tuple[Any, ...], overrides: Mapping[str, Any]
+    error: ValidationError, path: Path | str, merged: Any, sources: tuple[Any, ...], overrides: Mapping[str, Any]
 ) -> str:
     """The first problem in one line: file:line, key, value, fix."""
     problems = error.errors()
     # Unknown keys first: a misspelt key also makes the right one missing.
     problem = next((p for p in problems if p["type"] == "extra_forbidden"), problems[0])
-    keys, value, found = _locate(merged, problem["loc"])
+    loc = (*problem["loc"], *problem.get("ctx", {}).get("key", "").split("."))
+    keys, value, found = _locate(merged, tuple(part for part in loc if part != ""))
     dotted = ".".join(str(key) for key in keys)
-    line = next((number for source in sources if (number := _line(source, keys)) is not None), None)
-    place = f"{path}:{line}" if line is not None else str(path)
+    # The source that has most of the keys; of equals the first, because the variant lies over the rest.
+    found_in = [_line(source, keys) for source in sources]
+    _, line = max(found_in, key=lambda depth_and_line: depth_and_line[0], default=(0, 0))
+    place = f"{path}:{line}" if line else str(path)
     if any(dotted == key or dotted.startswith(key + ".") or key.startswith(dotted + ".") for key in overrides):
         place = "--set"
     kind, message = problem["type"], problem["msg"].removeprefix("Value error, ")
     if kind == "extra_forbidden":
-        known = _fields(problem["loc"][:-1])
+        known = _fields(problem["loc"][:-1]) + (["variants"] if len(keys) == 1 else [])
         text = f"unknown key{_suggest(str(keys[-1]), known)}"
         if not text.endswith("?"):
             text += f"; known here: {', '.join(known)}" if known else ""
@@ -461,6 +490,8 @@ def _explain(
         else:
             text = "is missing; it says which one" + (f": {expected}" if expected else "")
         found = False
+    elif kind in ("model_type", "dict_type", "model_attributes_type"):
+        text = "must be a mapping of keys to values"
     else:
         text = message[0].lower() + message[1:]
     shown = f" = {value!r}" if found and not isinstance(value, (Mapping, list)) and kind != "extra_forbidden" else ""
@@ -488,17 +519,17 @@ def _locate(data: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any
     return keys, node, found
 
 
-def _line(source: Any, keys: list[int | str]) -> int | None:
-    """Line of the deepest of ``keys`` that a round-trip YAML mapping has; None when it has not even the first."""
-    line = None
+def _line(source: Any, keys: list[int | str]) -> tuple[int, int]:
+    """How many of ``keys`` lead into a round-trip YAML mapping, and the line of the last of them; (0, 0) for none."""
+    depth = line = 0
     node = source
     for key in keys:
         lines = getattr(getattr(node, "lc", None), "data", None)
         if not lines or key not in lines:
             break
-        line = lines[key][0] + 1
+        depth, line = depth + 1, lines[key][0] + 1
         node = node[key]
-    return line
+    return depth, line
 
 
 def _fields(loc: tuple[int | str, ...]) -> list[str]:

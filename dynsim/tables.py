@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -110,7 +111,8 @@ def print_choices(console: Console) -> None:
     table.add_column("what")
     for path in shipped_scenarios():
         description = load_scenario(path).config.description
-        table.add_row(path.stem, ", ".join(variant_names(path)), escape(description.split(". ")[0]))
+        sentence = re.split(r"(?<!et al)\.\s", description, maxsplit=1)[0].strip().removesuffix(".")
+        table.add_row(path.stem, ", ".join(variant_names(path)), escape(sentence))
     console.print(table)
     for family, names in choices().items():
         table = Table(title=f"{family}s", box=box.SIMPLE_HEAD, show_header=False, title_justify="left")

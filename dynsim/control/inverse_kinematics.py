@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import time as clock
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +17,19 @@ Array = NDArray[np.float64]
 
 ITERATIONS = 200
 STEP_MAX = 0.3  # [rad or m] per iteration, so that the branch of the start is kept
+# Wall time before the first report of progress, and between two [s]: most paths are done before anyone asks.
+QUIET_S, REPORT_S = 1.0, 0.1
 
 
-def follow(model: Model, times: Array, targets: Array, joints: Sequence[str], q: Array, tolerance: float) -> Array:
+def follow(
+    model: Model,
+    times: Array,
+    targets: Array,
+    joints: Sequence[str],
+    q: Array,
+    tolerance: float,
+    progress: Callable[[float], None] | None = None,
+) -> Array:
     """Positions of ``joints`` that put the hand on ``targets`` at ``times``; the others stay as in ``q``.
 
     Damped Gauss–Newton from the previous solution: dq = Jᵀ (J Jᵀ + λ 1)⁻¹ e, with λ falling with the error, so that
@@ -30,6 +42,7 @@ def follow(model: Model, times: Array, targets: Array, joints: Sequence[str], q:
     joints : names of the joints that move
     q : (n,) configuration to start from; it selects the branch
     tolerance : distance that counts as reached [m]
+    progress : called now and then with the time on the path [s], when it takes longer than a second
 
     Returns
     -------
@@ -41,10 +54,14 @@ def follow(model: Model, times: Array, targets: Array, joints: Sequence[str], q:
         With the first time at which the hand cannot reach its target, and the distance that is left.
     """
     columns = [model.joint_names.index(name) for name in joints]
-    body, point = model.robot.hand
-    q = q.copy()
+    body, point = model.body_index(model.robot.hand[0]), model.robot.hand[1]
+    q, identity = q.copy(), np.eye(3)
     result = np.zeros((len(times), len(columns)))
+    due = clock.perf_counter() + QUIET_S
     for k, (t, target) in enumerate(zip(times, targets, strict=True)):
+        if progress is not None and clock.perf_counter() >= due:
+            progress(float(t))
+            due = clock.perf_counter() + REPORT_S
         if k >= 3 and len(columns) <= 3:
             # The parabola through the last three solutions leaves one iteration to do. Not for redundant joints: what
             # the hand does not determine would run away along it.
@@ -53,15 +70,13 @@ def follow(model: Model, times: Array, targets: Array, joints: Sequence[str], q:
         for _ in range(ITERATIONS):
             position, jacobian = model.point_position_and_jacobian(body, point, q)
             error = target - position
-            distance = float(np.linalg.norm(error))
+            distance = math.sqrt(error @ error)
             best = min(best, distance)
             # Two orders below the tolerance: the references shall be smooth, not just close.
             if distance < 1e-4 * tolerance:
                 break
             J = jacobian[:, columns]
-            gram = J @ J.T
-            gram[np.diag_indices(3)] += 1e-12 + 0.1 * distance**2
-            step = J.T @ np.linalg.solve(gram, error)
+            step = J.T @ np.linalg.solve(J @ J.T + (1e-12 + 0.1 * distance**2) * identity, error)
             q[columns] += step * min(1.0, STEP_MAX / max(float(np.abs(step).max()), 1e-300))
         if best > tolerance:
             raise UnreachableReference(

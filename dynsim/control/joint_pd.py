@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -19,6 +20,9 @@ from dynsim.model.control import JointControl
 from dynsim.model.model import Model
 
 PathChoice: Any = union("path")
+
+# Of the reference splines: half a gigabyte for each joint.
+SEGMENTS_MAX = 10_000_000
 
 
 class HandReference(StrictConfig):
@@ -50,8 +54,8 @@ class Config(StrictConfig):
     """Gains for all motors or one per motor; joints without a reference hold their initial position."""
 
     type: Literal["joint_pd"]
-    k_p_V_per_rad: NonNegative | list[NonNegative] = 500.0
-    k_d_V_s_per_rad: NonNegative | list[NonNegative] = 20.0
+    k_p_V_per_rad: NonNegative | list[NonNegative] = Field(default=500.0, description="V/m at a prismatic joint")
+    k_d_V_s_per_rad: NonNegative | list[NonNegative] = Field(default=20.0, description="V s/m at a prismatic joint")
     hand: HandReference | None = Field(default=None, description="a path for the hand")
     joints: dict[str, JointPath] = Field(default={}, description="waypoints by joint name")
     knot_spacing_s: Positive = Field(default=0.02, description="distance of the knots of the reference splines")
@@ -64,8 +68,10 @@ class Config(StrictConfig):
         return self
 
 
-def build(config: Config, model: Model, duration: float) -> JointControl:
-    """Resolve gains and references for a robot.
+def build(
+    config: Config, model: Model, duration: float, progress: Callable[[float], None] | None = None
+) -> JointControl:
+    """Resolve gains and references for a robot, over ``duration`` [s]; long inverse kinematics report to ``progress``.
 
     Raises
     ------
@@ -87,12 +93,19 @@ def build(config: Config, model: Model, duration: float) -> JointControl:
     spline = np.full(len(driven), -1)
     grid, coefficients = [0.0, 1.0], np.zeros((1, 0, 6))
     if named:
+        segments = duration / config.knot_spacing_s
+        if segments > SEGMENTS_MAX:
+            raise ModelError(
+                f"controller.knot_spacing_s = {config.knot_spacing_s:g}: {segments:.3g} knots in {duration:g} s, "
+                f"at most {SEGMENTS_MAX:g} are made; {duration / SEGMENTS_MAX:.3g} would fit"
+            )
         # A quintic spline needs six knots.
-        times = np.linspace(0.0, duration, max(int(np.ceil(duration / config.knot_spacing_s)), 6) + 1)
+        times = np.linspace(0.0, duration, max(int(np.ceil(segments)), 6) + 1)
         columns = [_waypoints(path, times) for path in config.joints.values()]
         if config.hand is not None:
             targets = config.hand.path.position(times)
-            followed = follow(model, times, targets, config.hand.joints, robot.initial, config.hand.tolerance_m)
+            hand = config.hand
+            followed = follow(model, times, targets, hand.joints, robot.initial, hand.tolerance_m, progress)
             columns.extend(followed.T)
         coefficients = spline_coefficients(times, np.stack(columns, axis=1))
         grid = [0.0, float(times[1])]

@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import ModuleType
+from typing import Protocol
 
+from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, UnreachableReference
 from dynsim.record import Record
 from dynsim.scenario import Scenario
 
-# Called now and then with the simulated time [s].
-Progress = Callable[[float], None]
+REFERENCES, SIMULATION = "references", "simulation"
+
+
+class Progress(Protocol):
+    """Called about ten times a second with the time [s] that a stage has come to.
+
+    The stage is ``REFERENCES`` while the controller prepares them, if that takes long; then ``SIMULATION``.
+    """
+
+    def __call__(self, time: float, stage: str = SIMULATION) -> None: ...
 
 
 def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
@@ -19,7 +30,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
     Parameters
     ----------
     scenario : Scenario
-    progress : called with the simulated time [s] about ten times a second
+    progress : called with time [s] and stage, see :class:`Progress`
 
     Returns
     -------
@@ -35,7 +46,8 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
     ModelError, UnreachableReference
         The scenario describes no physics, or a path that the hand cannot follow.
     """
-    return _module(scenario).simulate(scenario, progress)
+    with _named(scenario):
+        return _module(scenario).simulate(scenario, progress)
 
 
 def check(scenario: Scenario) -> None:
@@ -45,7 +57,20 @@ def check(scenario: Scenario) -> None:
     ------
     ModelError, UnreachableReference, ScenarioError
     """
-    _module(scenario).prepare(scenario)
+    with _named(scenario):
+        _module(scenario).prepare(scenario)
+
+
+@contextmanager
+def _named(scenario: Scenario) -> Iterator[None]:
+    """Say in errors which scenario and variant they are about; those of reading it name file and line themselves."""
+    name = f"{scenario.source or scenario.name}{f' ({scenario.variant})' if scenario.variant else ''}"
+    try:
+        yield
+    except (ModelError, ScenarioError, UnreachableReference) as error:
+        raise type(error)(f"{name}: {error}") from error
+    except KeyboardInterrupt:
+        raise SimulationInterrupted(f"{name}: interrupted before there was anything to save") from None
 
 
 def _module(scenario: Scenario) -> ModuleType:

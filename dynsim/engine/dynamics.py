@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from dynsim import metrics
-from dynsim.engine import Progress
+from dynsim.engine import REFERENCES, SIMULATION, Progress
 from dynsim.engine.provenance import provenance
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.kernels import arrays as ka
@@ -18,7 +19,7 @@ from dynsim.kernels.coupled import System
 from dynsim.kernels.energy import CONTACT_SIZE, LEDGER_SIZE
 from dynsim.model.arrays import compile_contacts, compile_drives
 from dynsim.model.control import JointControl
-from dynsim.model.description import Contact, Robot
+from dynsim.model.description import Contact, Link
 from dynsim.model.model import Model
 from dynsim.record import Record
 from dynsim.scenario import Scenario, build_model
@@ -39,8 +40,8 @@ class Prepared:
     workspace: ka.Workspace
 
 
-def prepare(scenario: Scenario) -> Prepared:
-    """Compile a scenario.
+def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
+    """Compile a scenario; references that take long report to ``progress``.
 
     Raises
     ------
@@ -54,7 +55,7 @@ def prepare(scenario: Scenario) -> Prepared:
     scenario.check_start(model)
     n, na, c = model.n, len(robot.motors), len(contacts)
     times = _sample_times(scenario, columns=2 * n + na + LEDGER_SIZE + CONTACT_SIZE * c + ki.output_size(n, na, c))
-    control = _control(scenario, model)
+    control = _control(scenario, model, progress)
     options = scenario.integrator
     method = ki.METHODS[options.method]
     step = options.step_s or (1e-3 if method == ki.RK4 else 0.0)
@@ -87,12 +88,12 @@ def prepare(scenario: Scenario) -> Prepared:
 
 def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
     """See :func:`dynsim.engine.simulate`."""
-    prepared = prepare(scenario)
+    prepared = prepare(scenario, progress)
     run = prepared.run
     # Loading or compiling the kernels is no integration time.
     ki.advance(prepared.system, prepared.workspace, run, 0)
     if progress is not None:
-        progress(0.0)
+        progress(0.0, SIMULATION)
     started, limit, interrupted = clock.perf_counter(), 20, False
     try:
         while run.count[ki.STATUS] == ki.RUNNING:
@@ -101,7 +102,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
             taken = clock.perf_counter() - before
             limit = int(min(max(limit * min(_CHUNK_S / max(taken, 1e-9), 10.0), 1), 1_000_000))
             if progress is not None:
-                progress(float(run.clock[ki.TIME]))
+                progress(float(run.clock[ki.TIME]), SIMULATION)
     except KeyboardInterrupt:
         interrupted = True
     wall = clock.perf_counter() - started
@@ -138,10 +139,10 @@ def _sample_times(scenario: Scenario, columns: int) -> np.ndarray:
     return times
 
 
-def _control(scenario: Scenario, model: Model) -> JointControl:
+def _control(scenario: Scenario, model: Model, progress: Progress | None) -> JointControl:
     if scenario.controller is None:
         return JointControl.short_circuit(len(model.robot.motors))
-    control = scenario.build_controller(model)
+    control = scenario.build_controller(model, None if progress is None else partial(progress, stage=REFERENCES))
     if not isinstance(control, JointControl):
         raise ModelError(f"controller {scenario.controller.type!r} cannot drive a {scenario.plant.type!r}")
     return control
@@ -157,14 +158,16 @@ def _record(scenario: Scenario, prepared: Prepared, wall: float) -> Record:
     joints, driven = robot.joint_names, tuple(motor.joint for motor in robot.motors)
     names = tuple(contact.name for contact in contacts)
     record = Record(run.sample_time[:rows], provenance=provenance(scenario))
-    angle, rate = _joint_units(robot)
+    angle, rate, acceleration, _ = _joint_units(robot.links)
+    with_motor = set(driven)
+    *_, force = _joint_units([link for link in robot.links if link.joint in with_motor] or robot.links)
     record.add("q", y[:, :n], angle, labels=joints, description="joint positions")
     record.add("v", y[:, n : 2 * n], rate, labels=joints, description="joint rates")
-    record.add("vdot", out[:, :n], f"{rate}²", labels=joints, description="joint accelerations")
+    record.add("vdot", out[:, :n], acceleration, labels=joints, description="joint accelerations")
     current, voltage = y[:, 2 * n : 2 * n + na], out[:, n : n + na]
     record.add("current", current, "A", labels=driven, description="motor currents")
     record.add("voltage", voltage, "V", labels=driven, description="motor terminal voltages")
-    record.add("torque", out[:, n + na : n + 2 * na], "N m", labels=driven, description="shaft torques, [WM] eq 25")
+    record.add("torque", out[:, n + na : n + 2 * na], force, labels=driven, description="shaft torques, [WM] eq 25")
     record.add("power", current * voltage, "W", labels=driven, description="electrical power u i")
     k = n + 2 * na
     record.add("hand_position", out[:, k : k + 3], "m", labels=("x", "y", "z"))
@@ -174,7 +177,7 @@ def _record(scenario: Scenario, prepared: Prepared, wall: float) -> Record:
     ledger = y[:, 2 * n + na :]
     for column, (name, text) in enumerate(metrics.INTEGRALS.items()):
         record.add(name, ledger[:, column], "J", description=text)
-    for column, name in enumerate(("energy_kinetic", "energy_potential", "energy_magnetic")):
+    for column, name in enumerate(metrics.STORES):
         record.add(name, out[:, k + 3 + column], "J", description=f"{name.removeprefix('energy_')} energy")
     record.add("energy_residual", metrics.energy_residual(record), "J", description="what the ledger does not explain")
     per_contact = out[:, k + 6 :].reshape(rows, c, 8)
@@ -198,11 +201,10 @@ def _record(scenario: Scenario, prepared: Prepared, wall: float) -> Record:
     return record
 
 
-def _joint_units(robot: Robot) -> tuple[str, str]:
-    kinds = {link.kind for link in robot.links}
-    if kinds == {"revolute"}:
-        return "rad", "rad/s"
-    return ("m", "m/s") if kinds == {"prismatic"} else ("rad or m", "rad/s or m/s")
+def _joint_units(links: Iterable[Link]) -> Sequence[str]:
+    """Units of position, velocity, acceleration and force of joints; "rad or m" when there are both kinds."""
+    units = sorted({link.units for link in links}, reverse=True)
+    return [" or ".join(kinds) for kinds in zip(*units, strict=True)]
 
 
 def _last_state(prepared: Prepared) -> dict[str, Sequence[float]]:

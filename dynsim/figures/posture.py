@@ -77,6 +77,7 @@ class SidePlane:
 
     @property
     def label(self) -> str:
+        """Label of the plane's horizontal axis."""
         azimuth = np.degrees(np.arctan2(self.direction[1], self.direction[0]))
         return f"distance from the base, azimuth {azimuth:.0f}° [m]"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
@@ -14,13 +13,14 @@ from rich.console import Console
 from rich.table import Table
 
 from dynsim.errors import DynsimError
+from dynsim.files import write_json
 
 hw = typer.Typer(
     no_args_is_help=True,
     help="Replay a record on Dynamixel servos (or virtual ones). A software stop is no safety device: fit a power cut.",
 )
 # Paths must survive copy and paste: long lines are left to the terminal. Without markup: "[rad]" is a unit, no style.
-console = Console(soft_wrap=True, highlight=False, markup=False)
+console = Console(soft_wrap=True, highlight=False, markup=False, emoji=False)
 
 
 class Policy(StrEnum):
@@ -308,8 +308,7 @@ def compare(
     console.print(table)
     console.print(f"delay {comparison.delay * 1e3:.1f} ms, worst joint {comparison.worst.joint}")
     folder = out or measured.parent
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "comparison.json").write_text(json.dumps(comparison.summary(), indent=1) + "\n", encoding="utf-8")
+    write_json(folder / "comparison.json", comparison.summary())
     console.print(f"figure: {draw_comparison(comparison, folder / 'comparison.png')}")
     if bounds:
         check_gate(comparison, bounds)

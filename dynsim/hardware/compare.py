@@ -12,6 +12,7 @@ from pydantic import Field
 from scipy.optimize import minimize_scalar
 
 from dynsim.errors import RecordError
+from dynsim.files import replacing
 from dynsim.hardware.errors import ComparisonGateFailed
 from dynsim.hardware.replay import State
 from dynsim.hardware.servo_map import StrictModel, read_yaml
@@ -252,6 +253,6 @@ def draw_comparison(comparison: Comparison, path: Path) -> Path:
     errors.set_xlabel("record time [s]")
     for axes in (angles, errors):
         axes.grid(alpha=0.3)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=140)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=140)
     return path

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.errors import RecordError
+from dynsim.files import replacing
 from dynsim.hardware.trajectory import Path as JointPath
 from dynsim.record import Record
 
@@ -47,11 +48,8 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
         knots = [_within(path_between, instant) for instant in time]
         position, velocity = np.array([q for q, _ in knots]), np.array([v for _, v in knots])
     writer = {"csv": _write_csv, "joint-trajectory": _write_joint_trajectory, "urdf-log": _write_urdf_log}[format_]
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        writer(path, joints, time, position, velocity)
-    except OSError as error:
-        raise RecordError(f"cannot write {path}: {error.strerror}") from error
+    with replacing(path) as temporary:
+        writer(temporary, joints, time, position, velocity)
     return path
 
 

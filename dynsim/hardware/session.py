@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dynsim.files import write_json
 from dynsim.hardware.bus import NoAnswer, RequestRefused
 from dynsim.hardware.check import CheckedMotion
 from dynsim.hardware.clock import Clock, VirtualClock, WallClock
@@ -132,7 +132,7 @@ def run_replay(
         result = replay.run()
     try:
         result.record.save(folder / "measured.h5")
-        (folder / "summary.json").write_text(json.dumps(result.record.summary, indent=1) + "\n", encoding="utf-8")
+        write_json(folder / "summary.json", result.record.summary)
     finally:
         # What happened to the robot matters more than a full disk.
         raise_for(result, folder)

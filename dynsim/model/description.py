@@ -73,6 +73,8 @@ class Link:
     R_PJ, p_PJ : (3, 3), (3,) placement of the joint in the parent's frame [m]
     damping : float
         Viscous loss D of the joint [N m s/rad or N s/m].
+    lower, upper, velocity_limit, effort_limit : float
+        Limits of the joint [rad or m; rad/s or m/s; N m or N]. Nothing enforces them: a run that passes one warns.
     """
 
     name: str
@@ -86,6 +88,13 @@ class Link:
     damping: float = 0.0
     lower: float = -np.inf
     upper: float = np.inf
+    velocity_limit: float = np.inf
+    effort_limit: float = np.inf
+
+    @property
+    def units(self) -> tuple[str, str, str, str]:
+        """Units of position, velocity, acceleration and force of the joint."""
+        return ("m", "m/s", "m/s²", "N") if self.kind == "prismatic" else ("rad", "rad/s", "rad/s²", "N m")
 
 
 @dataclass(frozen=True)
@@ -174,4 +183,5 @@ class Robot:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints, in the order of q."""
         return tuple(link.joint for link in self.links)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from pydantic import Field, field_validator
 
 from dynsim.config import NonNegative, Positive, StrictConfig
 from dynsim.model.description import Motor
@@ -13,11 +16,19 @@ class MotorParameters(StrictConfig):
 
     torque_constant_N_m_per_A: Positive
     resistance_ohm: Positive
-    inductance_H: NonNegative
+    inductance_H: Positive
     rotor_inertia_kg_m2: NonNegative
-    gear_ratio: Positive
-    gear_damping_N_m_s_per_rad: NonNegative = 0.0
+    gear_ratio: Positive = Field(description="motor turns per joint turn; at a prismatic joint rad of the motor per m")
+    gear_damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="on the motor side")
     voltage_limit_V: Positive | None = None
+
+    @field_validator("inductance_H", mode="before")
+    @classmethod
+    def _not_zero(cls, value: Any) -> Any:
+        """L = 0 is a circuit many know from textbooks: say what to take instead."""
+        if value == 0:
+            raise ValueError("must be positive; for none take 1e-6 with integrator.method: rodas4")
+        return value
 
     def motor(self, joint: str) -> Motor:
         """The motor on the joint of that name."""

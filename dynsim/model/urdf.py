@@ -69,7 +69,7 @@ def read_urdf(path: Path) -> Robot:
             if parent is None or any(link.name == parent for link in links):
                 break
         moving.remove(joint)
-        lower, upper = _limits(joint)
+        lower, upper = _position_limits(joint)
         inertia, placement = model.inertias[j], model.jointPlacements[j]
         tensor = np.array(inertia.inertia)
         links.append(
@@ -85,6 +85,8 @@ def read_urdf(path: Path) -> Robot:
                 damping=_number(joint, "dynamics", "damping"),
                 lower=lower,
                 upper=upper,
+                velocity_limit=_size_limit(joint, "velocity"),
+                effort_limit=_size_limit(joint, "effort"),
             )
         )
     rubbing = [str(joint.get("name")) for joint in joints if _number(joint, "dynamics", "friction") != 0.0]
@@ -111,14 +113,16 @@ def write_urdf(robot: Robot) -> str:
         moments = {f"i{'xyz'[i]}{'xyz'[j]}": _text(link.inertia.tensor[i, j]) for i in range(3) for j in range(i, 3)}
         ElementTree.SubElement(inertial, "inertia", moments)
     for link in robot.links:
+        limits = (link.lower, link.upper, link.effort_limit, link.velocity_limit)
         endless = link.kind == "revolute" and math.isinf(link.lower) and math.isinf(link.upper)
         joint = ElementTree.SubElement(root, "joint", name=link.joint, type="continuous" if endless else link.kind)
         _connect(joint, link.parent or base, link.name, link.p_PJ, link.R_PJ)
         ElementTree.SubElement(joint, "axis", xyz=_text(link.axis))
-        if not endless:
-            lower, upper = (_text(min(max(x, -_UNLIMITED), _UNLIMITED)) for x in (link.lower, link.upper))
-            unlimited = _text(_UNLIMITED)
-            ElementTree.SubElement(joint, "limit", lower=lower, upper=upper, effort=unlimited, velocity=unlimited)
+        if not (endless and all(map(math.isinf, limits))):
+            # A continuous joint has no lower and upper.
+            texts = [_text(min(max(limit, -_UNLIMITED), _UNLIMITED)) for limit in limits]
+            given = dict(zip(("lower", "upper", "effort", "velocity"), texts, strict=True))
+            ElementTree.SubElement(joint, "limit", dict(list(given.items())[2:]) if endless else given)
         if link.damping:
             ElementTree.SubElement(joint, "dynamics", damping=_text(link.damping), friction="0.0")
     if HAND not in taken:
@@ -210,11 +214,17 @@ def _number(joint: ElementTree.Element, tag: str, attribute: str) -> float:
     return 0.0 if element is None else float(element.get(attribute, "0"))
 
 
-def _limits(joint: ElementTree.Element) -> tuple[float, float]:
+def _position_limits(joint: ElementTree.Element) -> tuple[float, float]:
     if joint.get("type") == "continuous":
         return -math.inf, math.inf
     lower, upper = _number(joint, "limit", "lower"), _number(joint, "limit", "upper")
     return (-math.inf if lower <= -_UNLIMITED else lower), (math.inf if upper >= _UNLIMITED else upper)
+
+
+def _size_limit(joint: ElementTree.Element, attribute: str) -> float:
+    """Limit of velocity or effort. Zero stands in files whose author knew none: a joint so limited could not move."""
+    limit = _number(joint, "limit", attribute)
+    return limit if 0.0 < limit < _UNLIMITED else math.inf
 
 
 def _axis(path: Path, joint: ElementTree.Element) -> Array:

@@ -14,7 +14,7 @@ class Config(MotorParameters):
     type: Literal["wang_minami"]
     torque_constant_N_m_per_A: Positive = 0.203
     resistance_ohm: Positive = 1.1
-    inductance_H: NonNegative = 0.0017
+    inductance_H: Positive = 0.0017
     rotor_inertia_kg_m2: NonNegative = 1.64e-4
     gear_ratio: Positive = 3.0
     gear_damping_N_m_s_per_rad: NonNegative = 0.01

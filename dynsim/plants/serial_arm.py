@@ -1,13 +1,13 @@
-"""A serial chain of cylindrical links on a fixed base, with a motor at every joint ([WM] section IV)."""
+"""A serial chain of links on a fixed base; each joint may have a motor ([WM] section IV)."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from dynsim.config import NonNegative, Positive, StrictConfig, Vector3, unit_vector
+from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig, Vector3, error_at, unit_vector
 from dynsim.families import union
 from dynsim.model.description import Inertia, Link, Motor, Robot, vector
 from dynsim.model.motor_parameters import MotorParameters
@@ -21,36 +21,62 @@ else:
 AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
 
 
-class LinkConfig(StrictConfig):
-    """One joint and the link it carries, or ``count`` equal ones. The link lies along its own +z from the joint."""
+class LinkKeys(StrictConfig):
+    """Keys of one joint and the link it carries. The link lies along its own +z from the joint."""
 
-    count: int = Field(default=1, ge=1, le=100_000)
+    count: int = Field(default=1, ge=1, le=100_000, description="so many equal links")
     kind: Literal["revolute", "prismatic"] = "revolute"
-    axis: Literal["x", "y", "z"] | Vector3 = "y"
+    axis: Literal["x", "y", "z"] | Vector3 = Field(default="y", description="joint axis in the link's frame")
     length_m: NonNegative = 0.3
-    radius_m: Positive = 0.01
+    radius_m: Positive = Field(default=0.01, description="of the solid cylinder that gives the inertia")
     mass_kg: NonNegative = 0.1
     com_m: Vector3 | None = Field(default=None, description="default: the middle of the link")
     inertia_kg_m2: list[float] | None = Field(
         default=None, min_length=6, max_length=6, description="xx xy xz yy yz zz about the com; default: solid cylinder"
     )
-    damping_N_m_s_per_rad: NonNegative = 0.0
+    damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="viscous loss of a revolute joint")
+    damping_N_s_per_m: NonNegative = Field(default=0.0, description="viscous loss of a prismatic joint")
     motor: MotorChoice | None = Field(default=None, description="motor of the joint; none: the joint swings free")
-    initial_deg: float = 0.0
-    initial_m: float = 0.0
+    initial_deg: float = Field(default=0.0, description="initial angle of a revolute joint")
+    initial_m: float = Field(default=0.0, description="initial position of a prismatic joint")
+
+
+# Keys that only one kind of joint has → their counterpart for the other kind.
+ONLY_REVOLUTE = {"damping_N_m_s_per_rad": "damping_N_s_per_m", "initial_deg": "initial_m"}
+ONLY_PRISMATIC = {angular: linear for linear, angular in ONLY_REVOLUTE.items()}
+
+
+def _of_other_kind(kind: object) -> dict[str, str]:
+    """Keys that a joint of this kind does not have → what it has instead."""
+    return ONLY_REVOLUTE if kind == "prismatic" else ONLY_PRISMATIC
+
+
+class LinkConfig(LinkKeys):
+    """One joint and the link it carries, or ``count`` equal ones."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if self.kind == "prismatic" and self.initial_deg != 0.0:
-            raise ValueError("a prismatic joint starts at initial_m, not initial_deg")
-        if self.kind == "revolute" and self.initial_m != 0.0:
-            raise ValueError("a revolute joint starts at initial_deg, not initial_m")
+        for key, instead in _of_other_kind(self.kind).items():
+            if getattr(self, key) != 0.0:
+                raise error_at(key, f"a {self.kind} joint has {instead} instead")
         return self
 
+    @property
+    def damping(self) -> float:
+        """Viscous loss D of the joint [N m s/rad, or N s/m when prismatic]."""
+        return self.damping_N_s_per_m if self.kind == "prismatic" else self.damping_N_m_s_per_rad
+
+    @property
+    def initial(self) -> float:
+        """Initial position [rad, or m when prismatic]."""
+        return self.initial_m if self.kind == "prismatic" else float(np.deg2rad(self.initial_deg))
+
     def unit_axis(self) -> np.ndarray:
+        """Joint axis, (3,), of length one."""
         return unit_vector(AXES[self.axis] if isinstance(self.axis, str) else self.axis, "axis")
 
     def inertia(self) -> Inertia:
+        """Mass properties of one link."""
         solid = Inertia.solid_cylinder(self.mass_kg, self.radius_m, self.length_m)
         com = solid.com if self.com_m is None else np.array(self.com_m)
         tensor = solid.tensor
@@ -67,45 +93,63 @@ class BaseConfig(StrictConfig):
     yaw_deg: float = 0.0
 
 
-class HandConfig(StrictConfig):
-    """The controlled point."""
-
-    body: str
-    point_m: Vector3 = [0.0, 0.0, 0.0]
-
-
 class Config(StrictConfig):
     """A serial chain: ``chain`` lists its links from the base on; ``link`` gives what all of them share."""
 
     type: Literal["serial_arm"]
     base: BaseConfig = BaseConfig()
     gravity_m_s2: Vector3 = [0.0, 0.0, -9.81]
-    link: dict[str, Any] = Field(default={}, description="defaults for every entry of chain")
+    # Not written into resolved scenarios: there every entry of the chain has it all.
+    link: LinkKeys | None = Field(default=None, exclude=True, description="defaults for every entry of chain")
     chain: list[LinkConfig] = Field(min_length=1, description="links from the base to the hand")
     initial_deg: list[float] | None = Field(default=None, description="initial angles of all joints")
-    hand: HandConfig | None = Field(default=None, description="controlled point; default: the end of the last link")
+    hand: BodyPoint | None = Field(default=None, description="controlled point; default: the end of the last link")
 
     @model_validator(mode="before")
     @classmethod
-    def _share(cls, data: Any) -> Any:
-        """Lay ``link`` under every entry of ``chain``."""
-        if isinstance(data, dict) and isinstance(data.get("link"), dict) and isinstance(data.get("chain"), list):
-            chain = [{**data["link"], **entry} if isinstance(entry, dict) else entry for entry in data["chain"]]
-            # What was laid under is kept out of ``link``, so that a resolved scenario can be read again.
-            return {**data, "chain": chain, "link": {}}
+    def _check_shared(cls, data: Any) -> Any:
+        """Refuse a key of ``link`` that no entry takes, as in a resolved scenario, where every entry has its own."""
+        link, chain = (data.get("link"), data.get("chain")) if isinstance(data, dict) else (None, None)
+        if isinstance(link, dict) and isinstance(chain, list) and chain and all(isinstance(e, dict) for e in chain):
+            taken = {key for entry in chain for key in _lay_under(link, entry) if key not in entry}
+            for key in link:
+                if key in LinkKeys.model_fields and key not in taken:
+                    places = _places(key, chain)
+                    raise error_at(f"link.{key}", f"has no effect on any entry of plant.chain; set {places} instead")
         return data
+
+    @field_validator("chain", mode="before")
+    @classmethod
+    def _share(cls, chain: Any, info: ValidationInfo) -> Any:
+        """Lay ``link`` under every entry; a ``link`` that is not valid has its own error and is not here."""
+        link = info.data.get("link")
+        if link is None or not isinstance(chain, list):
+            return chain
+        shared = {key: getattr(link, key) for key in link.model_fields_set}
+        return [_lay_under(shared, entry) if isinstance(entry, dict) else entry for entry in chain]
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         n = sum(link.count for link in self.chain)
         if self.initial_deg is not None:
             if len(self.initial_deg) != n:
-                raise ValueError(f"initial_deg has {len(self.initial_deg)} angles, the chain has {n} joints")
+                raise error_at("initial_deg", f"{len(self.initial_deg)} angles, the chain has {n} joints")
             if any(link.kind == "prismatic" for link in self.chain):
-                raise ValueError(
-                    "initial_deg is for chains of revolute joints; give initial_m and initial_deg per link"
-                )
+                raise error_at("initial_deg", "only for revolute chains; give initial_m and initial_deg per link")
         return self
+
+
+def _lay_under(shared: dict[str, Any], entry: dict[str, Any]) -> dict[str, Any]:
+    """An entry of the chain with the shared keys that it lacks and that its kind of joint has."""
+    merged = {**shared, **entry}
+    foreign = _of_other_kind(merged.get("kind"))
+    return {key: value for key, value in merged.items() if key in entry or key not in foreign}
+
+
+def _places(key: str, chain: list[dict[str, Any]]) -> str:
+    """Where entries of the chain give a key, else its counterpart for their kind of joint."""
+    owners = [f"plant.chain.{i}.{key}" for i, entry in enumerate(chain) if key in entry]
+    return ", ".join(owners) or {**ONLY_REVOLUTE, **ONLY_PRISMATIC}[key]
 
 
 def build(config: Config) -> Robot:
@@ -133,12 +177,12 @@ def build(config: Config) -> Robot:
                     inertia=group.inertia(),
                     R_PJ=turn if first else np.eye(3),
                     p_PJ=np.array(config.base.position_m) if first else vector(0.0, 0.0, reach),
-                    damping=group.damping_N_m_s_per_rad,
+                    damping=group.damping,
                 )
             )
             if group.motor is not None:
                 motors.append(group.motor.motor(f"joint_{number}"))
-            initial.append(group.initial_m if group.kind == "prismatic" else np.deg2rad(group.initial_deg))
+            initial.append(group.initial)
             reach = group.length_m
     if config.initial_deg is not None:
         initial = list(np.deg2rad(config.initial_deg))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from pydantic import Field
 
-from dynsim.config import NonNegative, StrictConfig, Vector3
+from dynsim.config import BodyPoint, NonNegative, StrictConfig, Vector3
 from dynsim.errors import ModelError
 from dynsim.families import union
 from dynsim.model.description import Robot
@@ -23,13 +23,6 @@ else:
     MotorChoice = union("motor")
 
 
-class HandConfig(StrictConfig):
-    """The controlled point."""
-
-    body: str
-    point_m: Vector3 = [0.0, 0.0, 0.0]
-
-
 class Config(StrictConfig):
     """A robot from ``file`` (relative to the scenario), one motor model for all joints or one per joint."""
 
@@ -38,9 +31,15 @@ class Config(StrictConfig):
     gravity_m_s2: Vector3 = [0.0, 0.0, -9.81]
     motor: MotorChoice | None = Field(default=None, description="motor of every joint that `motors` does not name")
     motors: dict[str, MotorChoice] = Field(default={}, description="motors by joint name")
-    damping_N_m_s_per_rad: NonNegative | None = Field(default=None, description="joint losses; default: the URDF's")
-    initial_deg: dict[str, float] = Field(default={}, description="initial angles by joint name; others 0")
-    hand: HandConfig | None = Field(default=None, description="controlled point; default: the tip of the longest chain")
+    damping_N_m_s_per_rad: NonNegative | None = Field(
+        default=None, description="loss of every revolute joint; default: the URDF's"
+    )
+    damping_N_s_per_m: NonNegative | None = Field(
+        default=None, description="loss of every prismatic joint; default: the URDF's"
+    )
+    initial_deg: dict[str, float] = Field(default={}, description="initial angles of revolute joints by name; others 0")
+    initial_m: dict[str, float] = Field(default={}, description="initial positions of prismatic joints; others 0")
+    hand: BodyPoint | None = Field(default=None, description="controlled point; default: the tip of the longest chain")
 
 
 def build(config: Config) -> Robot:
@@ -49,23 +48,32 @@ def build(config: Config) -> Robot:
     Raises
     ------
     ModelError
-        Unreadable file, or a joint name that the file does not have.
+        Unreadable file, a joint name that the file does not have, or an initial position in the other kind's unit.
     """
     from dynsim.model.urdf import read_urdf
 
     robot = read_urdf(Path(config.file))
-    for name in [*config.motors, *config.initial_deg]:
-        if name not in robot.joint_names:
-            raise ModelError(f"{config.file}: no joint {name!r}; joints: {', '.join(robot.joint_names)}")
-    links = robot.links
-    if config.damping_N_m_s_per_rad is not None:
-        links = tuple(dataclasses.replace(link, damping=config.damping_N_m_s_per_rad) for link in links)
-    chosen = {joint: config.motors.get(joint, config.motor) for joint in robot.joint_names}
+    kinds = {link.joint: link.kind for link in robot.links}
+    for name in [*config.motors, *config.initial_deg, *config.initial_m]:
+        if name not in kinds:
+            raise ModelError(f"{config.file}: no joint {name!r}; joints: {', '.join(kinds)}")
+    for name in config.initial_deg:
+        if kinds[name] == "prismatic":
+            raise ModelError(f"plant.initial_deg: {name!r} is prismatic; give it in plant.initial_m")
+    for name in config.initial_m:
+        if kinds[name] == "revolute":
+            raise ModelError(f"plant.initial_m: {name!r} is revolute; give it in plant.initial_deg")
+    initial = {**{name: np.deg2rad(angle) for name, angle in config.initial_deg.items()}, **config.initial_m}
+    given = {"revolute": config.damping_N_m_s_per_rad, "prismatic": config.damping_N_s_per_m}
+    links = tuple(
+        link if (loss := given[link.kind]) is None else dataclasses.replace(link, damping=loss) for link in robot.links
+    )
+    chosen = {joint: config.motors.get(joint, config.motor) for joint in kinds}
     return dataclasses.replace(
         robot,
         links=links,
         motors=tuple(motor.motor(joint) for joint, motor in chosen.items() if motor is not None),
         hand=robot.hand if config.hand is None else (config.hand.body, np.array(config.hand.point_m)),
         gravity=np.array(config.gravity_m_s2),
-        q0=np.array([np.deg2rad(config.initial_deg.get(joint, 0.0)) for joint in robot.joint_names]),
+        q0=np.array([initial.get(joint, 0.0) for joint in kinds]),
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dynsim._version import __version__
-from dynsim.results import write_json
+from dynsim.files import write_json
 from dynsim.studies.compare import compare
 
 SCENARIO = "elbow_comparison"

@@ -6,18 +6,22 @@ import csv
 import io
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from multiprocessing import active_children, get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from dynsim.engine import simulate
+from dynsim.engine import SIMULATION, simulate
 from dynsim.errors import ScenarioError
+from dynsim.files import write_json, write_text
 from dynsim.record import Record
-from dynsim.results import write_json, write_text
 from dynsim.scenario import load_scenario, variant_names
 
-# Called with the variant's name and the simulated time [s].
-VariantProgress = Callable[[str, float], None]
+
+class VariantProgress(Protocol):
+    """A :class:`dynsim.engine.Progress` that also gets the variant's name."""
+
+    def __call__(self, variant: str, time: float, stage: str = SIMULATION) -> None: ...
 
 
 def compare(
@@ -35,7 +39,7 @@ def compare(
     path : scenario file or name of a shipped one
     overrides : values by dotted key, for all variants
     jobs : processes; one runs the variants here, one after the other
-    progress : called with variant and simulated time (with several processes: only at a variant's end)
+    progress : see :class:`VariantProgress` (with several processes it is called only at a variant's end)
     finished : called with variant and record as soon as a variant is done, so that it can be saved
 
     Returns
@@ -73,14 +77,10 @@ def compare(
                 raise
         return records
     for name, scenario in scenarios.items():
-        records[name] = simulate(scenario, None if progress is None else _for_variant(progress, name))
+        records[name] = simulate(scenario, None if progress is None else partial(progress, name))
         if finished is not None:
             finished(name, records[name])
     return records
-
-
-def _for_variant(progress: VariantProgress, name: str) -> Callable[[float], None]:
-    return lambda time: progress(name, time)
 
 
 def save_comparison(records: Mapping[str, Record], folder: Path) -> None:

@@ -7,17 +7,19 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
+import h5py
 import pytest
 
-from dynsim.record import Record
+from dynsim.record import FORMAT, Record
 
 SHORT = ["--set", "duration_s=0.2", "--set", "metrics.settle_s=0.05"]
 
 
-def dynsim(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+def dynsim(*arguments: str, folder: Path, **options: Any) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "dynsim", *arguments], cwd=folder, capture_output=True, text=True, timeout=300
+        [sys.executable, "-m", "dynsim", *arguments], cwd=folder, capture_output=True, text=True, timeout=300, **options
     )
 
 
@@ -71,9 +73,24 @@ def test_compare_prints_the_table_and_writes_the_comparison(tmp_path: Path):
         (["check", "elbow_comparison", "--set", "duraton_s=1"], "did you mean 'duration_s'"),
         (["plot", "missing.h5"], "no such record"),
         (["run", "elbow_comparison", "--set", "record.rate_hz=1e7"], "GB"),
+        (["run", "."], "is a folder"),
+        (
+            ["run", "elbow_comparison", "--set", "plant.initial_deg.1=40"],
+            "(two_elbows): contact elbow_4: its point starts",
+        ),
+        (["check", "elbow_comparison", "--set", "controller.hand.path.radius_m=0.6"], "at t = 0.000 s it stays 0.34 m"),
+        (
+            ["check", "six_axis_arm", "--set", "plant.motor.inductance_H=0"],
+            "plant.motor.inductance_H = 0: must be positive",
+        ),
+        (["check", "elbow_comparison", "--set", "a:b"], "--set a:b: must look like"),
+        (["plot", "other.h5"], "lacks parts"),
+        (["run", "single_pendulum", "--out", "other.h5"], "is a file, not a folder"),
     ],
 )
 def test_bad_input_is_one_clear_line_and_exit_code_2(tmp_path: Path, arguments: list[str], expected: str):
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file.attrs["format"] = FORMAT
     result = dynsim(*arguments, folder=tmp_path)
     assert result.returncode == 2
     assert "Traceback" not in result.stderr
@@ -81,6 +98,16 @@ def test_bad_input_is_one_clear_line_and_exit_code_2(tmp_path: Path, arguments: 
     assert len(lines) == 1
     assert expected in lines[0]
     assert not (tmp_path / "results").exists()
+
+
+def test_plot_keeps_apart_records_of_the_same_variant(tmp_path: Path):
+    for name in ("a", "b"):
+        assert dynsim("run", "elbow_comparison", "--no-figures", "--out", name, *SHORT, folder=tmp_path).returncode == 0
+    result = dynsim("plot", "a/record.h5", "b/record.h5", "--out", "figures", folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    folders = {path.name for path in (tmp_path / "figures").iterdir() if path.is_dir()}
+    assert folders == {"two_elbows", "two_elbows_2"}
+    assert (tmp_path / "figures" / "compare_energy.png").is_file()
 
 
 def test_divergence_stops_with_code_3_and_keeps_what_there_is(tmp_path: Path):
@@ -113,9 +140,40 @@ def test_ctrl_c_saves_what_was_simulated(tmp_path: Path):
     assert "incomplete" in record.summary["warnings"][-1]
 
 
+def test_ctrl_c_before_the_first_step_says_that_nothing_is_saved(tmp_path: Path):
+    # Many knots: the inverse kinematics take minutes.
+    arguments = ["elbow_comparison", "--set", "duration_s=50000", "--set", "record.rate_hz=1"]
+    for command in ("run", "check"):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "dynsim", command, *arguments],
+            cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        time.sleep(8.0)
+        os.kill(process.pid, signal.SIGINT)
+        _, stderr = process.communicate(timeout=120)
+        assert process.returncode == 130, stderr
+        assert "(two_elbows): interrupted before there was anything to save" in stderr
+    assert not (tmp_path / "results").exists()
+
+
+def test_a_full_disk_is_one_line_and_leaves_no_half_file(tmp_path: Path):
+    resource = pytest.importorskip("resource", reason="limits of file sizes are POSIX")
+    # A limit on the size of files stands for the full disk: writing fails half-way through the record.
+    result = dynsim(
+        "run", "single_pendulum", "--no-figures", "--out", "full", folder=tmp_path,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000)),
+    )  # fmt: skip
+    assert result.returncode == 2, result.stderr
+    assert result.stderr.splitlines() == [
+        "error: cannot write full/record.h5: File too large; nothing was changed there"
+    ]
+    assert [path.name for path in (tmp_path / "full").iterdir()] == ["scenario.yaml"]
+
+
 def test_list_check_schema_and_version(tmp_path: Path):
     for arguments, expected in (
         (["list"], "wang_minami"),
+        (["list"], "Tanaka et al. 2019"),
         (["check", "elbow_comparison", "single_pendulum"], "ok (4 variants)"),
         (["schema"], "duration_s"),
         (["--version"], "."),

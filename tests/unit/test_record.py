@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import dynsim.record
 from dynsim.errors import RecordError
+from dynsim.files import check_writable
 from dynsim.record import Record
 
 
@@ -46,10 +46,11 @@ def test_full_disk_leaves_the_old_record(record: Record, tmp_path: Path, monkeyp
     path = record.save(tmp_path / "record.h5")
     before = path.read_bytes()
 
-    def fail(*_):
+    def fail(self: Path, data: bytes) -> None:
+        self.write_text("half")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(dynsim.record, "_write", fail)
+    monkeypatch.setattr(Path, "write_bytes", fail)
     with pytest.raises(RecordError, match="No space left"):
         record.save(path)
     assert path.read_bytes() == before
@@ -71,3 +72,15 @@ def test_what_is_no_record_is_refused(tmp_path: Path):
     (tmp_path / "text.h5").write_text("hello")
     with pytest.raises(RecordError, match="not a readable HDF5"):
         Record.load(tmp_path / "text.h5")
+
+
+def test_a_folder_that_cannot_be_written_is_found_without_making_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    check_writable(tmp_path / "new" / "deep")
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RecordError, match="is a file, not a folder"):
+        check_writable(tmp_path / "file" / "deep")
+    # Root may write everywhere, so the answer is given here.
+    monkeypatch.setattr("os.access", lambda *_: False)
+    with pytest.raises(RecordError, match=f"no permission to write in {tmp_path}"):
+        check_writable(tmp_path / "new")

@@ -18,6 +18,7 @@ from dynsim.scenario import (
 )
 
 MINIMAL = "duration_s: 1\nplant: {type: serial_arm, chain: [{axis: y}]}\n"
+SHARED = "duration_s: 1\nplant:\n  type: serial_arm\n  link: {mass_kg: 0.2}\n  chain: [{axis: y}]\n"
 
 
 def write(folder: Path, text: str) -> Path:
@@ -55,6 +56,15 @@ def test_resolved_scenario_reads_back_as_itself(tmp_path: Path):
     assert scenario_from_resolved(scenario.resolved).resolved == scenario.resolved
 
 
+def test_a_scenario_of_another_version_is_refused_in_one_line():
+    resolved = load_scenario("elbow_comparison").resolved
+    resolved["integrator"]["newer"] = 1
+    with pytest.raises(ScenarioError) as caught:
+        scenario_from_resolved(resolved)
+    assert str(caught.value).startswith("the scenario in this record: integrator.newer: unknown key")
+    assert "\n" not in str(caught.value)
+
+
 def test_null_removes_a_key(tmp_path: Path):
     path = write(tmp_path, MINIMAL + "integrator: {rtol: 1e-9}\nvariants: {a: {integrator: {rtol: null}}, b: {}}\n")
     assert load_scenario(path, "a").integrator.rtol == 1e-6
@@ -77,6 +87,33 @@ def test_null_removes_a_key(tmp_path: Path):
         (MINIMAL.replace("axis: y", "axis: w"), ["plant.chain.0.axis"]),
         (MINIMAL.replace("duration_s: 1", "duration_s: .nan"), ["duration_s", "finite"]),
         (MINIMAL + "integrator: {step_s: 0}\n", ["integrator.step_s = 0"]),
+        (MINIMAL + "varaints: {}\n", ["case.yaml:3", "did you mean 'variants'"]),
+        (MINIMAL + "name: a/b\n", ["case.yaml:3: name = 'a/b': names a folder"]),
+        (MINIMAL + "variants:\n  ..: {}\n", ["variant = '..': names a folder"]),
+        (SHARED.replace("mass_kg", "mas_kg"), ["case.yaml:4: plant.link.mas_kg: unknown key; did you mean 'mass_kg'?"]),
+        (SHARED.replace("0.2", "heavy"), ["case.yaml:4: plant.link.mass_kg = 'heavy'", "number"]),
+        (SHARED.replace("[{axis: y}]", "[]"), ["case.yaml:5: plant.chain: list should have at least 1 item"]),
+        (SHARED.replace("{mass_kg: 0.2}", "3"), ["case.yaml:4: plant.link = 3: must be a mapping"]),
+        (
+            SHARED.replace("mass_kg: 0.2", "motor: {type: wang_minami, inductance_H: 0}"),
+            ["case.yaml:4: plant.link.motor.inductance_H = 0: must be positive", "1e-6", "rodas4"],
+        ),
+        (
+            SHARED.replace("mass_kg: 0.2", "motor: {type: wang_minami, inductance_H: -1}"),
+            ["case.yaml:4: plant.link.motor.inductance_H = -1: input should be greater than 0"],
+        ),
+        (
+            SHARED.replace("axis: y", "mass_kg: 1"),
+            ["case.yaml:4: plant.link.mass_kg = 0.2: has no effect", "set plant.chain.0.mass_kg instead"],
+        ),
+        (
+            SHARED.replace("mass_kg", "damping_N_s_per_m"),
+            ["case.yaml:4: plant.link.damping_N_s_per_m = 0.2: has no effect", "set damping_N_m_s_per_rad instead"],
+        ),
+        (
+            MINIMAL.replace("axis: y", "kind: prismatic, damping_N_m_s_per_rad: 1"),
+            ["case.yaml:2: plant.chain.0.damping_N_m_s_per_rad = 1: a prismatic joint has damping_N_s_per_m"],
+        ),
     ],
 )
 def test_errors_are_one_line_that_names_the_place(tmp_path: Path, text: str, expected: list[str]):
@@ -94,10 +131,38 @@ def test_error_in_a_variant_names_the_variants_line(tmp_path: Path):
         load_scenario(write(tmp_path, text), "bad")
 
 
+def test_error_beside_a_variant_names_the_line_that_has_the_key(tmp_path: Path):
+    text = SHARED.replace("mass_kg", "mas_kg") + "variants:\n  a: {plant: {base: {yaw_deg: 1}}}\n"
+    with pytest.raises(ScenarioError, match=r"case.yaml:4: plant.link.mas_kg"):
+        load_scenario(write(tmp_path, text), "a")
+
+
+def test_shared_keys_of_a_resolved_scenario_are_refused_with_the_keys_to_set(tmp_path: Path):
+    path = write(tmp_path, to_yaml(load_scenario("elbow_comparison").resolved))
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(path, overrides={"plant.link.mass_kg": 0.5})
+    assert str(caught.value) == (
+        "--set: plant.link.mass_kg = 0.5: has no effect on any entry of plant.chain; "
+        "set plant.chain.0.mass_kg, plant.chain.1.mass_kg instead"
+    )
+    # What the entries do not have still reaches them.
+    com = build_model(load_scenario(path, overrides={"plant.link.com_m": [0, 0, 0.1]})).robot.links[3].inertia.com
+    assert list(com) == [0, 0, 0.1]
+
+
+def test_each_kind_of_joint_takes_the_shared_loss_of_its_own_unit(tmp_path: Path):
+    path = write(
+        tmp_path,
+        SHARED.replace("mass_kg: 0.2", "damping_N_m_s_per_rad: 0.5, damping_N_s_per_m: 3").replace(
+            "{axis: y}", "{kind: prismatic}, {axis: y}, {kind: prismatic, damping_N_s_per_m: 7}"
+        ),
+    )
+    assert [link.damping for link in build_model(load_scenario(path)).robot.links] == [3.0, 0.5, 7.0]
+
+
 @pytest.mark.parametrize(
     ("overrides", "error", "expected"),
     [
-        ({"plant.link.motor.inductance_H": 0}, ModelError, "inductance 0.0 H must be positive"),
         ({"plant.initial_deg.1": 40}, ModelError, "starts +0.03698 m from surface 'floor'"),
         ({"contacts.points.elbow_4.surface": "flor"}, ModelError, "did you mean 'floor'"),
         ({"contacts.points.elbow_4.body": "link_44"}, ModelError, "link_44"),
@@ -106,12 +171,27 @@ def test_error_in_a_variant_names_the_variants_line(tmp_path: Path):
         ({"controller.hand.joints": ["joint_99"]}, ModelError, "joint_99"),
         ({"controller.k_p_V_per_rad": [1, 2]}, ModelError, "2 values, there are 10 motors"),
         ({"record.rate_hz": 1e7}, ScenarioError, "record.rate_hz"),
+        ({"controller.knot_spacing_s": 1e-10}, ModelError, "controller.knot_spacing_s = 1e-10: 1e+11 knots in 10 s"),
     ],
 )
 def test_what_no_simulation_can_be_made_of_is_refused_by_check(overrides, error, expected):
     with pytest.raises(error) as caught:
         check(load_scenario("elbow_comparison", overrides=overrides))
     assert expected in str(caught.value)
+    # Which of several scenarios and variants it was.
+    assert str(caught.value).startswith(f"{find_scenario('elbow_comparison')} (two_elbows): ")
+
+
+def test_a_file_that_is_not_utf_8_is_named_with_its_line(tmp_path: Path):
+    path = tmp_path / "case.yaml"
+    path.write_bytes("duration_s: 1\nname: café\n".encode("latin-1"))
+    with pytest.raises(ScenarioError, match=r"case.yaml:2: byte 0xe9 is not UTF-8; save it as UTF-8"):
+        load_scenario(path)
+
+
+def test_a_folder_is_no_scenario(tmp_path: Path):
+    with pytest.raises(ScenarioError, match="is a folder; a scenario is a YAML file"):
+        load_scenario(tmp_path)
 
 
 def test_a_record_of_10_GB_is_refused_with_a_rate_that_fits():

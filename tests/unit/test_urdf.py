@@ -59,6 +59,8 @@ def random_robot(seed: int, n: int) -> Robot:
                 damping=float(rng.integers(0, 2) * rng.uniform()),
                 lower=-1.5 if limited else -np.inf,
                 upper=2.5 if limited else np.inf,
+                velocity_limit=3.5 if rng.random() < 0.5 else np.inf,
+                effort_limit=40.0 if rng.random() < 0.5 else np.inf,
             )
         )
     return Robot("random tree", tuple(links), (), (f"body_{rng.integers(n)}", rng.normal(size=3)))
@@ -73,7 +75,9 @@ def test_round_trip_keeps_the_dynamics(seed: int, n: int, tmp_path_factory: pyte
     again = read_urdf(path)
     assert again.name == robot.name
     for link, copy in zip(robot.links, again.links, strict=True):
-        for name in ("name", "joint", "parent", "kind", "damping", "lower", "upper"):
+        for name in (
+            "name", "joint", "parent", "kind", "damping", "lower", "upper", "velocity_limit", "effort_limit",
+        ):  # fmt: skip
             assert getattr(copy, name) == getattr(link, name)
     assert again.hand[0] == robot.hand[0]
 
@@ -135,6 +139,7 @@ def test_shipped_arm_is_read_as_written() -> None:
     assert robot.links[-1].inertia.mass == pytest.approx(1.25)
     assert robot.links[1].damping == 12.0
     assert (robot.links[1].lower, robot.links[1].upper) == (-2.26893, 2.26893)
+    assert (robot.links[0].effort_limit, robot.links[0].velocity_limit) == (220.0, 3.4907)
     assert robot.motors == ()
 
 

@@ -37,9 +37,11 @@ class Config(StrictConfig):
 def _table(file: str) -> NDArray[np.float64]:
     """Rows (t, x, y, z) of the file; ValueError names what is wrong with it."""
     path = Path(file)
-    if not path.is_file():
-        raise ValueError(f"no such file: {path}")
-    with path.open(encoding="utf-8") as stream:
+    try:
+        stream = path.open(encoding="utf-8")
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
+    with stream:
         header = [name.strip() for name in stream.readline().split(",")]
         if tuple(header) != COLUMNS:
             raise ValueError(f"{path}: the first line is {','.join(header)!r}; it must be {','.join(COLUMNS)!r}")
