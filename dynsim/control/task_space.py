@@ -137,7 +137,7 @@ def build(config: Config, plant: SnakeDescription, duration_s: float | None = No
             distance_floor=1e-3,
         ),
     )
-    check_controllable(model, law, modes, sorted({fixing_row, *order}), plant)
+    check_controllable(model, law, modes, fixing_row, plant)
 
     switch_ticks = max(1, round(config.switching.period_s / config.period_s))
     prediction_ticks = max(1, round(config.switching.period_s / config.switching.prediction_step_s))
@@ -167,8 +167,10 @@ def build(config: Config, plant: SnakeDescription, duration_s: float | None = No
     )
 
 
-def check_controllable(model: SnakeModel, law: Law, modes: ModeTable, rows: list[int], plant: SnakeDescription) -> None:
-    """Refuse modes in which A~ w~' = B~ u ([T] eq 9) has no solution for every w~'.
+def check_controllable(
+    model: SnakeModel, law: Law, modes: ModeTable, fixing_row: int, plant: SnakeDescription
+) -> None:
+    """Refuse a table with a mode in which A~ w~' = B~ u ([T] eq 9) has no solution for every w~'.
 
     The side-slip row of wheel pair 1 and the three ground-contact rows contain head joints only. Every shape
     controllable point of the head part takes one of these joints away, so n_h >= 4 ([T] eq 1) becomes
@@ -183,7 +185,7 @@ def check_controllable(model: SnakeModel, law: Law, modes: ModeTable, rows: list
     n_h, n_b, names = model.head_joints, model.base_joints, plant.joint_names
     head_shape = [names[j] for j in law.shape_joints if j < n_h]
     random = np.random.default_rng(0)
-    for row in rows:
+    for row in range(len(modes.numbers)):
         mode, down = f"mode {modes.numbers[row]}", modes.grounded[row]
         lifted = int(np.sum(down == 0))
         lifted_active = int(np.sum((down == 0) & (model.wheel >= 0)))
@@ -213,10 +215,10 @@ def check_controllable(model: SnakeModel, law: Law, modes: ModeTable, rows: list
                 f"{mode}: rank of A is {rank_a} of {6 + len(law.shape_joints)}, rank of B is {rank_b} of "
                 f"{found[0].rows} at random postures: the controlled variables are not independent"
             )
-    start = conditioning(model, law, rows[0], plant.initial_base_pose, plant.initial_joints)
+    start = conditioning(model, law, fixing_row, plant.initial_base_pose, plant.initial_joints)
     if start.rank_B < start.rows or start.rank_A < 6 + len(law.shape_joints):
         raise ModelError(
-            f"mode {modes.numbers[rows[0]]}: the initial posture is singular (rank of A {start.rank_A}, rank of B "
+            f"mode {modes.numbers[fixing_row]}: the initial posture is singular (rank of A {start.rank_A}, rank of B "
             f"{start.rank_B} of {start.rows}): change plant.initial_joints or the shape points"
         )
 

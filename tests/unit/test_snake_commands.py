@@ -120,19 +120,63 @@ def test_cyclic_order_and_return_to_the_fixing_state():
     assert modes.switches == 6
 
 
+def refused(modes):
+    return [(r.tick, r.row, r.margin) for r in modes.refusals if not r.taken]
+
+
 def test_a_mode_that_would_tip_is_passed_over():
     modes = switcher("cyclic", margins={2: -0.01})
     assert drive(modes, 30, {0: SWITCHING}) == [1] * 10 + [3] * 10 + [1] * 10
-    assert modes.refused == 1
-    nothing_stands = switcher("cyclic", margins=dict.fromkeys((1, 2, 3), -1.0))
-    assert drive(nothing_stands, 5, {0: SWITCHING}) == [0] * 5
+    assert refused(modes) == [(10, 2, -0.01)]
+
+
+@pytest.mark.parametrize("policy", ["cyclic", "predictive"])
+def test_the_present_mode_stays_when_every_candidate_tips(policy):
+    modes = switcher(policy, margins={1: -3.0, 2: -1.0, 3: -2.0})
+    assert drive(modes, 12, {0: SWITCHING}) == [0] * 12
+    assert refused(modes) == [(t, row, m) for t in (0, 10) for row, m in ((1, -3.0), (2, -1.0), (3, -2.0))]
+    assert modes.switches == 0
+
+
+@pytest.mark.parametrize("policy", ["cyclic", "predictive"])
+def test_when_the_present_mode_tips_too_the_least_tipping_one_is_taken(policy):
+    modes = switcher(policy, margins={0: -2.0, 1: -3.0, 2: -1.0, 3: -2.5})
+    assert drive(modes, 3, {0: SWITCHING}) == [2] * 3
+    assert [r.row for r in modes.refusals if r.taken] == [2]
+    assert [row for _, row, _ in refused(modes)] == [1, 3]
 
 
 def test_prediction_takes_the_lowest_cost_that_stands():
     assert drive(switcher("predictive", costs={1: 4.0, 2: 1.0, 3: 3.0}), 3, {0: SWITCHING}) == [2] * 3
     tipping = switcher("predictive", costs={1: 4.0, 2: 1.0, 3: 3.0}, margins={2: 0.0})
     assert drive(tipping, 3, {0: SWITCHING}) == [3] * 3
-    assert tipping.refused == 1
+    assert refused(tipping) == [(0, 2, 0.0)]
+
+
+def test_a_mode_asked_for_by_number_is_refused_when_it_would_tip():
+    modes = switcher("fixed", margins={2: -0.02})
+    assert drive(modes, 8, {2: 2, 4: 3, 6: 4}) == [0, 0, 1, 1, 1, 1, 3, 3]  # request = row + 1
+    assert refused(modes) == [(4, 2, -0.02)]
+
+
+def test_the_return_to_the_fixing_mode_is_refused_when_it_would_tip():
+    """The switching state ends all the same: the operator wants no more changes."""
+    modes = switcher("cyclic", margins={0: -0.02})
+    assert drive(modes, 30, {0: SWITCHING, 12: FIXING}) == [1] * 10 + [2] * 20
+    assert refused(modes) == [(12, 0, -0.02)]
+    assert modes.next_event() is None
+
+
+def test_a_request_is_carried_out_when_the_present_mode_tips_more():
+    modes = switcher("fixed", margins={0: -0.05, 1: -0.02, 2: -0.03})
+    assert drive(modes, 6, {1: 2, 3: 3}) == [0, 1, 1, 1, 1, 1]
+    assert [(r.tick, r.row, r.taken) for r in modes.refusals] == [(1, 1, True), (3, 2, False)]
+
+
+def test_asking_for_the_present_mode_is_no_change():
+    modes = switcher("fixed", margins={0: -0.05})
+    assert drive(modes, 3, {1: 1, 2: FIXING}) == [0] * 3
+    assert modes.refusals == []
 
 
 def test_fixed_policy_ignores_requests_to_switch_but_obeys_a_mode_number():

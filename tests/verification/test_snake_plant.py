@@ -99,6 +99,54 @@ def test_the_target_waits_instead_of_breaking_a_limit():
     assert without["joint_limit_violation_max_rad"] > 0.1
 
 
+# Head stretched out to the left, base curled to the left: lifting its middle leaves the centre of mass outside.
+CURLED = {"initial_joints": [0.6, -0.2, 0.6, -0.2, 0.9, 0.4] + [1.1] * 6}
+HELD = {"shape_points": {"psi3": 0.4}, "null_gain": 0.0}
+
+
+@pytest.mark.parametrize("request_mode", [3, 4])
+def test_a_mode_that_would_tip_the_robot_is_refused(request_mode):
+    """Modes 3 and 4 lift pairs 4 to 6 of the curled base; the robot keeps mode 1, says so, and does not tip."""
+    record = run(plant=CURLED, commands=[{"at_s": 0.5, "mode": request_mode}], **HELD)
+    (refusal,) = record.summary["refusals"]
+    assert (refusal["time_s"], refusal["mode"], refusal["taken"]) == (0.5, request_mode, False)
+    assert refusal["support_margin_m"] < -0.03
+    assert set(record["mode"]) == {1}
+    assert record.summary["modes_refused"] == 1
+    assert not record.summary["tipping"]
+    (warning,) = record.summary["warnings"]
+    assert f"mode {request_mode} was refused" in warning
+    assert "t = 0.500 s" in warning
+    assert f"{1e3 * refusal['support_margin_m']:.1f} mm" in warning
+
+
+@pytest.mark.parametrize("policy", ["cyclic", "predictive"])
+def test_switching_passes_over_modes_that_would_tip(policy):
+    commands = [{"at_s": 0.0, "mode": "switching"}]
+    record = run(6.0, plant=CURLED, commands=commands, switching={"policy": policy}, **HELD)
+    refused = {refusal["mode"] for refusal in record.summary["refusals"]}
+    assert {3, 4} <= refused
+    assert refused.isdisjoint(record["mode"])
+    assert not record.summary["tipping"]
+    assert record.summary["modes_refused"] == len(record.summary["refusals"])
+
+
+def test_the_return_to_the_fixing_mode_is_tested_too():
+    """The robot starts in a fixing mode that tips, leaves it by request, and is not let back."""
+    commands = [{"at_s": 0.2, "mode": 1}, {"at_s": 0.6, "mode": "fixing"}]
+    record = run(1.0, plant=CURLED, commands=commands, fixing_mode=4, **HELD)
+    assert record["mode"][np.searchsorted(record.time, [0.1, 0.4, 0.9])].tolist() == [4, 1, 1]
+    assert [(r["time_s"], r["mode"]) for r in record.summary["refusals"]] == [(0.6, 4)]
+    assert record.summary["tipping"]  # at the start
+
+
+def test_least_margin_refuses_what_would_only_just_stand():
+    commands = [{"at_s": 0.2, "mode": 5}, {"at_s": 0.4, "mode": 6}]  # margins of 14.7 and 66 mm
+    for least, modes in ((0.0, {1, 5, 6}), (0.02, {1, 6}), (0.08, {1})):
+        record = run(0.6, plant=CURLED, commands=commands, switching={"least_margin": least}, **HELD)
+        assert set(record["mode"]) == modes
+
+
 def test_attitude_distance_is_the_angle_of_the_relative_rotation():
     random = np.random.default_rng(0)
     w, v = random.uniform(-1, 1, (2, 50, 6))
