@@ -1,8 +1,6 @@
 """Where the target comes from: the operator's velocity commands and generated target paths ([T] IV.C).
 
-A source gives the rate of the target pose for each control period, mode requests and the gripper. Scripted sources are
-read in long blocks; a live one (joystick) would be read one period at a time through the same interface,
-:class:`dynsim.model.snake.CommandSource`.
+A script is a :class:`dynsim.model.snake.CommandSource` that knows its future; a joystick is one that does not.
 """
 
 from __future__ import annotations
@@ -16,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from dynsim.config import NonNegative, Positive, StrictConfig
-from dynsim.model.snake import FIXING, SWITCHING, CommandBlock, ModeTable
+from dynsim.model.snake import FIXING, SWITCHING, CommandBlock, Feedback
 
 Coordinates = tuple[float, float, float, float, float, float]
 Profile = Literal["linear", "smooth"]
@@ -128,10 +126,9 @@ class ScriptedSource:
 
     commands: Sequence[Command]
     paths: Sequence[Ramp | Circle | DoorArc]
-    modes: ModeTable
 
-    def read(self, first: int, count: int, period: float) -> CommandBlock:
-        """Commands of periods ``first`` to ``first + count - 1``.
+    def read(self, first: int, count: int, period: float, feedback: Feedback | None = None) -> CommandBlock:
+        """Commands of periods ``first`` to ``first + count - 1``; a script does not look at the robot.
 
         A command takes effect at the first period that begins at or after its time.
         """
@@ -151,15 +148,11 @@ class ScriptedSource:
             gripper = gripper if command.gripper is None else int(command.gripper == "closed")
             pieces.append((tick, held, gripper))
             if command.mode is not None and 0 <= tick - first < count:
-                block.request[tick - first] = self._request(command.mode)
+                states = {"switching": SWITCHING, "fixing": FIXING}
+                block.request[tick - first] = states[command.mode] if isinstance(command.mode, str) else command.mode
         for i, (tick, velocity, closed) in enumerate(pieces):
             end = pieces[i + 1][0] if i + 1 < len(pieces) else first + count
             part = slice(max(tick - first, 0), max(end - first, 0))
             block.velocity[part] += velocity
             block.gripper[part] = closed
         return block
-
-    def _request(self, mode: int | str) -> int:
-        if isinstance(mode, str):
-            return SWITCHING if mode == "switching" else FIXING
-        return self.modes.row(mode, "controller.commands: mode") + 1

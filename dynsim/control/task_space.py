@@ -163,13 +163,11 @@ def build(config: Config, plant: SnakeDescription, duration_s: float | None = No
         least_margin=config.switching.least_margin,
         when_blocked=config.switching.when_blocked,
         release_fraction=config.switching.release_fraction,
-        source=ScriptedSource(config.commands, config.paths, modes),
+        source=ScriptedSource(config.commands, config.paths),
     )
 
 
-def check_controllable(
-    model: SnakeModel, law: Law, modes: ModeTable, fixing_row: int, plant: SnakeDescription
-) -> None:
+def check_controllable(model: SnakeModel, law: Law, modes: ModeTable, fixing_row: int, plant: SnakeDescription) -> None:
     """Refuse a table with a mode in which A~ w~' = B~ u ([T] eq 9) has no solution for every w~'.
 
     The side-slip row of wheel pair 1 and the three ground-contact rows contain head joints only. Every shape

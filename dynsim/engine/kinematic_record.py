@@ -55,7 +55,7 @@ def make_record(
     run : after its last tick; the state at the end becomes the last sample.
     wall : time that the ticks took [s].
     """
-    description, block, state, law = run.description, run.block, run.state, run.controller.law
+    description, state, law = run.description, run.state, run.controller.law
     model, period, ticks = run.model, run.controller.schedule.period, int(run.state.counts[1])
     rows = -(-ticks // run.stride) + 1
     trace = Trace(*(array[:rows] for array in run.trace))
@@ -76,7 +76,7 @@ def make_record(
     posture_points(
         model, reals(trace.base), reals(trace.phi), run.rig.work.frame, new_chain(model), np.zeros(6), points
     )
-    gripper = block.gripper[np.minimum(np.rint(time / period).astype(int), len(block.gripper) - 1)]
+    gripper = run.gripper[np.minimum(np.rint(time / period).astype(int), run.ticks - 1)]
 
     names, wheels = description.joint_names, description.wheel_names
     pairs = tuple(f"pair{i + 1}" for i in range(description.pairs))

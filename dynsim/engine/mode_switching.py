@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from dynsim.model.snake import FIXING, SWITCHING, Policy
+from dynsim.model.snake import FIXING, SWITCHING, ModeTable, Policy
 
 
 class Refusal(NamedTuple):
@@ -29,7 +29,7 @@ class ModeSwitcher:
     ----------
     policy : "fixed" ignores requests to switch; "cyclic" takes the next of ``order`` ([T]'s heuristic); "predictive"
         takes the one with the lowest cost after a simulated period.
-    fixing_row, order : rows of the mode table.
+    modes : table of the modes; ``fixing_row``, ``order`` and ``row`` are rows of it.
     period_ticks : dT in control periods.
     margin_now : margin_now(row) -> support margin of the present posture in a mode [m].
     predict : predict(row) -> (cost after dT, smallest support margin on the way [m]).
@@ -39,6 +39,7 @@ class ModeSwitcher:
     """
 
     policy: Policy
+    modes: ModeTable
     fixing_row: int
     order: tuple[int, ...]
     period_ticks: int
@@ -56,13 +57,14 @@ class ModeSwitcher:
         self.row = self.fixing_row
 
     def at_tick(self, tick: int, request: int) -> int:
-        """Row of the mode from this tick on; ``request`` is a row + 1, NO_REQUEST, SWITCHING or FIXING.
+        """Row of the mode from this tick on; ``request`` is a mode number, NO_REQUEST, SWITCHING or FIXING.
 
         A request for one mode ends the switching state, whether the mode is taken or refused.
         """
         row = self.row
         if request > 0 or request == FIXING:
-            row, self.switching = self._asked(tick, request - 1 if request > 0 else self.fixing_row), False
+            row = self.fixing_row if request == FIXING else self.modes.row(request, "mode request")
+            row, self.switching = self._asked(tick, row), False
         elif request == SWITCHING and not self.switching and self.policy != "fixed":
             self.switching, self.next_switch, self._place = True, tick, 0
         if self.switching and tick >= self.next_switch:

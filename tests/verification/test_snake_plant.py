@@ -9,17 +9,18 @@ import textwrap
 import numpy as np
 import pytest
 
-from dynsim.engine import simulate
+from dynsim.engine import kinematic, simulate
 from dynsim.engine.kinematic_record import attitude, attitude_distance
-from dynsim.errors import ScenarioError
+from dynsim.errors import ModelError, ScenarioError
 from dynsim.kernels import snake as snake_kernels
 from dynsim.kernels import snake_control, snake_plant, snake_support
+from dynsim.model.snake import NO_REQUEST, SWITCHING, CommandBlock
 from dynsim.scenario import Scenario, ScenarioConfig, load_scenario
 
 GAMMA = {"type": "ramp", "start_s": 0.1, "duration_s": 1.0, "displacement": [0.02, 0.03, -0.03, 0.1, 0.1, 0.3]}
 
 
-def run(duration_s=2.0, rate_hz=100, plant=None, **controller):
+def scenario(duration_s=2.0, rate_hz=100, plant=None, **controller):
     config = ScenarioConfig.model_validate(
         {
             "name": "test",
@@ -29,7 +30,11 @@ def run(duration_s=2.0, rate_hz=100, plant=None, **controller):
             "record": {"rate_hz": rate_hz},
         }
     )
-    return simulate(Scenario("test", "", config))
+    return Scenario("test", "", config)
+
+
+def run(*args, **settings):
+    return simulate(scenario(*args, **settings))
 
 
 @pytest.mark.parametrize(("rates_at", "order"), [("start", 1), ("middle", 2)])
@@ -147,6 +152,93 @@ def test_least_margin_refuses_what_would_only_just_stand():
         assert set(record["mode"]) == modes
 
 
+class Operator:
+    """Live: drives ahead until the head has moved 40 mm, then to the left while the base lags, then switches modes.
+
+    Every decision is taken on what the feedback shows; what was commanded is kept.
+    """
+
+    def __init__(self, periods=1):
+        self.periods, self.reads, self.said = periods, 0, []
+
+    def read(self, first, count, period, feedback):
+        self.start = feedback.w if first == 0 else self.start
+        assert feedback.time == pytest.approx(first * period)
+        velocity, request, closed = np.zeros(6), NO_REQUEST, 0
+        if feedback.w[0] < self.start[0] + 0.04:
+            velocity[0] = 0.1
+        elif feedback.w[1] < 0.03:
+            velocity[1], closed = 0.04, 1
+        elif feedback.mode == 1 and abs(feedback.phi[6]) > 0.05:
+            request, closed = SWITCHING, 1
+        known = min(self.periods, count)
+        block = CommandBlock(np.tile(velocity, (known, 1)), np.zeros(known, dtype=int), np.full(known, closed))
+        block.request[0] = request
+        self.reads += 1
+        self.said.append((first, velocity, request, closed))
+        return block
+
+    def script(self, period):
+        """The equivalent script: what was said, as if it had been known beforehand."""
+        mode = {SWITCHING: {"mode": "switching"}, NO_REQUEST: {}}
+        return [
+            {"at_s": first * period, "velocity": velocity.tolist(), "gripper": ("open", "closed")[closed]}
+            | mode[request]
+            for first, velocity, request, closed in self.said
+        ]
+
+
+@pytest.mark.parametrize("periods", [1, 7])
+def test_a_live_source_gives_what_its_script_gives(periods):
+    """Asked period by period, or in small blocks, and reacting to the robot; the script is written down afterwards."""
+    operator = Operator(periods)
+    live = kinematic.simulate(scenario(5.0, switching={"period_s": 0.5}), source=operator)
+    assert operator.reads == -(-1000 // periods)
+    # each coordinate stops when a read shows that it is there: a block late, and the head error
+    assert live["w"][-1, :2] - live["w"][0, :2] == pytest.approx([0.04, 0.03], abs=0.1 * 0.005 * periods + 1e-6)
+    assert {1, 2, 3} <= set(live["mode"])
+    script = run(5.0, switching={"period_s": 0.5}, commands=operator.script(0.005))
+    for name in live.signals:
+        np.testing.assert_array_equal(live[name], script[name], err_msg=name)
+
+
+def test_a_live_source_sees_that_its_target_waits_and_what_it_said_then_is_lost():
+    """A script's path waits with its target; a joystick says anew what it wants."""
+
+    class Backward:
+        waited = 0
+
+        def read(self, first, count, period, feedback):
+            self.waited += feedback.waiting
+            speed = 0.1 if feedback.waiting else -0.1
+            return CommandBlock(np.array([[speed, 0, 0, 0, 0, 0]]), [NO_REQUEST], [0])
+
+    kink = {"initial_joints": [0, -0.8, 0, -1.1, 0, 1.9, 0.2, -0.1] + [0.0] * 4}
+    source = Backward()
+    record = kinematic.simulate(scenario(8.0, plant=kink), source=source)
+    # the last period is not reported any more
+    assert source.waited == pytest.approx(record.summary["waiting_s"] / 0.005, abs=1)
+    assert source.waited > 10
+
+
+@pytest.mark.parametrize(
+    ("block", "reason"),
+    [
+        (CommandBlock(np.zeros((0, 6)), [], []), r"T from 1 to 400"),
+        (CommandBlock(np.zeros((401, 6)), [0] * 401, [0] * 401), r"T from 1 to 400"),
+        (CommandBlock(np.zeros((1, 3)), [0], [0]), r"velocity \(1, 3\)"),
+        (CommandBlock(np.zeros((1, 6)), [9], [0]), "no mode 9"),
+    ],
+)
+def test_commands_that_make_no_sense_are_refused(block, reason):
+    class Source:
+        def read(self, first, count, period, feedback):
+            return block
+
+    with pytest.raises(ModelError, match=reason):
+        kinematic.simulate(scenario(), source=Source())
+
+
 def test_attitude_distance_is_the_angle_of_the_relative_rotation():
     random = np.random.default_rng(0)
     w, v = random.uniform(-1, 1, (2, 50, 6))
@@ -176,7 +268,7 @@ def test_kernels_run_as_plain_python():
     """NUMBA_DISABLE_JIT=1 gives the same numbers: debugging and coverage stay possible."""
     code = """
         import json
-        from dynsim.engine import simulate
+        from dynsim.engine import kinematic, simulate
         from dynsim.scenario import load_scenario
         short = {"duration_s": 0.05, "controller.cost": "eq20_min"}
         print(json.dumps(simulate(load_scenario("snake_joint_limits", None, short))["phi"][-1].tolist()))
