@@ -59,7 +59,7 @@ class Config(Script):
     weight_joint: Positive | list[Positive] = Field(1.0, description="W: one for all joints, or one per joint")
     weight_wheel: Positive = Field(0.01, description="W of the active wheels; small, or the joint rates chatter")
     cost: Literal["eq19", "eq20", "eq20_min"] = Field(
-        "eq19", description="eq20: 1/norm of the signed distances, as printed; eq20_min: 1/smallest distance"
+        "eq19", description="eq20: 1/norm of the signed distances, as printed; eq20_min: 1/smallest distance, smoothed"
     )
     cost_matrix: list[NonNegative] | None = Field(
         None, description="diagonal of K_V; default [T] V.B: head yaw 15, head pitch 0.015, base 9.6, 4.8, 2.4, ..."
@@ -135,6 +135,7 @@ def build(config: Config, plant: SnakeDescription, duration_s: float | None = No
             angle_weight=config.cost_angle_weight,
             support_weight=config.cost_support_weight,
             distance_floor=1e-3,
+            smoothing=1e-3,
         ),
     )
     check_controllable(model, law, modes, fixing_row, plant)

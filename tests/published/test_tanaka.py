@@ -114,6 +114,14 @@ class TestJointLimitAvoidance:
         cost = simulated("snake_joint_limits", variant)["cost"]
         assert np.diff(cost).max() <= 0.0
 
+    @pytest.mark.parametrize(("variant", "bound"), [("eq20", 0.0), ("eq20_min", 1e-7)])
+    def test_cost_20_never_rises_within_a_mode(self, simulated, variant, bound):
+        """A new mode has another support polygon and so another V; between switches it falls. With 1/min d the robot
+        once stands still at its limits, and what moves V then is only the head error of 1e-7 m that is taken away."""
+        record = simulated("snake_joint_limits", variant)
+        same = np.diff(record["mode"]) == 0
+        assert np.diff(record["cost"])[same].max() <= bound
+
     def test_joint_angles_fall(self, simulated):
         """ "Although the angle of the base part was in the neighborhood of the joint angle limit, the angle decreased
         with time." """
