@@ -9,9 +9,11 @@ import pytest
 
 from dynsim.control import task_space
 from dynsim.control.modes import TABLE_II
+from dynsim.engine import simulate
 from dynsim.kernels.snake import pose_of_point
 from dynsim.model.snake import conditioning
 from dynsim.plants import snake
+from dynsim.scenario import load_scenario
 
 SCENARIOS = {
     "snake_positioning": ["x", "y", "z", "alpha", "beta", "gamma"],
@@ -76,6 +78,24 @@ def test_table_iii_without_slip_and_sag(simulated, variant, target):
     assert summary["joint_limit_violation_max_rad"] == 0.0
     assert summary["joints_taken_out"] == []
     assert summary["mode_switches"] == 0
+
+
+@pytest.mark.parametrize("state", ["estimated", "feedforward"])
+@pytest.mark.parametrize("moved", ["y", "alpha", "gamma"])
+def test_table_iii_with_estimated_and_with_feedforward_state(state, moved):
+    """IV.C.1 and IV.C.2: without slip and sag what is integrated stays true. "The actual joint angle of the robot is
+    not used at all" in feedforward; estimated z, alpha, beta come from the joints, x, y from its velocity."""
+    record = simulate(load_scenario("snake_positioning", moved, {"controller.state": state}))
+    # nothing measures what the held rates leave in x, y, gamma: the errors of the run stay, second order in 5 ms
+    assert record.summary["final_position_error_m"] < 1e-6
+    assert record.summary["final_attitude_error_rad"] < 1e-6
+    np.testing.assert_array_equal(record["w_estimate"][0], record["w"][0])
+    belief, integrated, posture = record["w_estimate"], [0, 1, 5], slice(2, 5)
+    np.testing.assert_allclose(belief[:, integrated], record["w_target"][:, integrated], atol=1e-12)
+    # the joints of an ideal plant do what they are told, so integrating the rates gives the joints
+    np.testing.assert_allclose(belief[:, posture], record["w"][:, posture], atol=1e-9)
+    measured = simulate(load_scenario("snake_positioning", moved))
+    assert np.any(record["phi"][-1] != measured["phi"][-1])  # it did not look where the measured state does
 
 
 @pytest.mark.parametrize(("name", "variant"), [(n, v) for n, vs in SCENARIOS.items() for v in vs])

@@ -79,6 +79,21 @@ def test_states_agree_when_nothing_disturbs(state):
     np.testing.assert_allclose(record["w_estimate"], record["w"], atol=1e-6)
 
 
+@pytest.mark.parametrize("state", ["measured", "estimated", "feedforward"])
+def test_what_is_integrated_is_never_corrected(state):
+    """From the zigzag joints are clamped and the head goes off by millimetres: only the measured state notices."""
+    overrides = {"controller.state": state, "duration_s": 2.0}
+    record = simulate(load_scenario("snake_joint_limits", "saturate", overrides))
+    assert record.summary["clamped_joint_ticks"] > 0
+    # without the last sample: no control period begins there, and nothing is measured
+    off = np.abs(record["w_estimate"] - record["w"])[:-1].max(axis=0)
+    if state == "measured":
+        assert off.max() == 0.0
+    else:
+        assert off[[0, 1]].max() > 1e-3
+        np.testing.assert_allclose(off[2:5], 0.0, atol=1e-9)
+
+
 def test_only_measurement_removes_an_error_that_joints_cannot_show():
     """x, y, gamma of the estimated state are the integrated target ([T] IV.C.1): their error never shows, nor goes.
 
