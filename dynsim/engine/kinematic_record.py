@@ -216,11 +216,13 @@ def _refusal_warnings(refusals: list[dict[str, Any]], least_margin: float) -> li
     for mode, taken in dict.fromkeys((refusal["mode"], refusal["taken"]) for refusal in refusals):
         same = [refusal for refusal in refusals if (refusal["mode"], refusal["taken"]) == (mode, taken)]
         margin = same[0]["support_margin_m"]
-        held = "fewer than three wheels on the ground" if margin is None else f"support margin {1e3 * margin:.1f} mm"
+        held = (
+            "fewer than three wheels on the ground" if margin is None else f"a support margin of {1e3 * margin:.1f} mm"
+        )
+        what = "taken, as no other stands better," if taken else "refused"
         times = f" ({len(same)} times in all)" if len(same) > 1 else ""
-        what = "was taken although it tips: no other mode tips less" if taken else "was refused: the robot would tip"
         found.append(
-            f"mode {mode} {what}; t = {same[0]['time_s']:.3f} s{times}, {held}, more than {1e3 * least_margin:g} mm is "
-            "needed"
+            f"mode {mode} was {what} at t = {same[0]['time_s']:.3f} s{times}: {held}, more than "
+            f"{1e3 * least_margin:g} mm is needed"
         )
     return found

@@ -19,6 +19,7 @@ SCENARIOS = {
     "snake_positioning": ["x", "y", "z", "alpha", "beta", "gamma"],
     "snake_joint_limits": ["cyclic", "predictive", "fixed", "eq20", "eq20_min"],
     "snake_circle": ["forward", "backward", "backward_switching", "vertical"],
+    "snake_circle_backward": [None],
     "snake_door_arc": ["pull", "pull_switching", "pull_predictive", "push"],
     "snake_operator": [None],
 }
@@ -205,3 +206,14 @@ class TestDoor:
         forward, backward = (simulated("snake_circle", v).summary for v in ("forward", "backward"))
         assert forward["waiting_s"] == 0.0
         assert backward["waiting_s"] > 20.0
+
+    def test_the_backward_circle_is_completed_with_modes_that_lift_pair_1(self, simulated):
+        """Not by the modes of Table II, and not by the real robot: IV.C.5, "the robot cannot ... lift ... the wheel of
+        the head of the base part because of a lack of torque"."""
+        record = simulated("snake_circle_backward", None)
+        assert record["w"][-1, 5] == pytest.approx(-2 * np.pi, abs=1e-3)
+        # the path waited less than the 29 s that are left after its end, so it has come to its end
+        assert 0.0 < record.summary["waiting_s"] < 29.0
+        assert {7, 8, 9} & set(record["mode"])
+        assert record.summary["modes_refused"] > 0
+        assert not record.summary["tipping"]
