@@ -16,11 +16,11 @@ def robots(draw):
         Config(
             yaw_joints=n_b + n_h // 2,
             head_joints=n_h,
-            link_length=draw(size),
-            wheel_radius=draw(size),
-            wheel_gap=draw(st.lists(size, min_size=n_b + 1, max_size=n_b + 1)),
+            link_length_m=draw(size),
+            wheel_radius_m=draw(size),
+            wheel_gap_m=draw(st.lists(size, min_size=n_b + 1, max_size=n_b + 1)),
             driven_side=sides,
-            gripper_length=draw(size),
+            gripper_length_m=draw(size),
             controlled_point=draw(st.sampled_from(["head", "gripper"])),
         )
     )

@@ -53,7 +53,7 @@ class Circle(StrictConfig):
     type: Literal["circle"]
     start_s: NonNegative = 0.0
     duration_s: Positive
-    radius: Positive
+    radius_m: Positive
     turns: float = Field(1.0, description="plane xy: > 0 to the left; plane yz: from the top, > 0 first to the left")
     plane: Literal["xy", "yz"] = "xy"
     backward: bool = Field(False, description="plane xy: leave the start point tail first")
@@ -65,12 +65,12 @@ class Circle(StrictConfig):
         angle = 2.0 * np.pi * self.turns * s
         out = np.zeros((len(s), 6))
         if self.plane == "yz":
-            out[:, 1] = self.radius * np.sin(angle)
-            out[:, 2] = self.radius * (np.cos(angle) - 1.0)
+            out[:, 1] = self.radius_m * np.sin(angle)
+            out[:, 2] = self.radius_m * (np.cos(angle) - 1.0)
             return out
         way = -1.0 if self.backward else 1.0
-        out[:, 0] = way * self.radius * np.sin(np.abs(angle))
-        out[:, 1] = self.radius * np.sign(self.turns) * (1.0 - np.cos(angle))
+        out[:, 0] = way * self.radius_m * np.sin(np.abs(angle))
+        out[:, 1] = self.radius_m * np.sign(self.turns) * (1.0 - np.cos(angle))
         if self.turn_head:
             out[:, 5] = way * angle
         return out
@@ -79,13 +79,13 @@ class Circle(StrictConfig):
 class DoorArc(StrictConfig):
     """Arc of a door's knob about its hinge, the yaw kept perpendicular to the door ([T] V.D.3).
 
-    The robot faces the door along +x; the hinge is ``radius`` to the left or right of the target's start.
+    The robot faces the door along +x; the hinge is ``radius_m`` to the left or right of the target's start.
     """
 
     type: Literal["door_arc"]
     start_s: NonNegative = 0.0
     duration_s: Positive
-    radius: Positive = Field(description="hinge to knob [m]")
+    radius_m: Positive = Field(description="hinge to knob [m]")
     angle_deg: Annotated[float, Field(gt=0, le=180)] = 60.0
     hinge: Literal["left", "right"] = "left"
     opening: Literal["pull", "push"] = "pull"
@@ -97,8 +97,8 @@ class DoorArc(StrictConfig):
         left = 1.0 if self.hinge == "left" else -1.0
         away = 1.0 if self.opening == "push" else -1.0
         out = np.zeros((len(s), 6))
-        out[:, 0] = away * self.radius * np.sin(angle)
-        out[:, 1] = left * self.radius * (1.0 - np.cos(angle))
+        out[:, 0] = away * self.radius_m * np.sin(angle)
+        out[:, 1] = left * self.radius_m * (1.0 - np.cos(angle))
         out[:, 5] = left * away * angle
         return out
 

@@ -65,23 +65,23 @@ class Config(Script):
         None, description="diagonal of K_V; default [T] V.B: head yaw 15, head pitch 0.015, base 9.6, 4.8, 2.4, ..."
     )
     cost_angle_weight: NonNegative = Field(1.0, description="a_1 of eq 20 (assumed)")
-    cost_support_weight: NonNegative = Field(1.0, description="a_2 of eq 20 [m] (assumed)")
+    cost_support_weight_m: NonNegative = Field(1.0, description="a_2 of eq 20 [m] (assumed)")
     limit_policy: Literal["none", "saturate", "allocate"] = Field(
         "allocate",
         description="allocate: a joint at its limit leaves the allocation, and when that is impossible the target "
         "waits; saturate: joints are clamped; none: limits are ignored",
     )
-    rate_limit: Positive = Field(
+    rate_limit_rad_s: Positive = Field(
         4.7, description="fastest joint rate [rad/s]: no-load speed of the MX-106 at 12 V, 45 rpm (data sheet)"
     )
-    limit_rate: Positive = Field(
+    limit_rate_per_s: Positive = Field(
         20.0, description="a joint approaches its limit no faster than this [1/s] times the angle left (assumed)"
     )
     damping_sigma: NonNegative = Field(
         0.005, description="smallest singular value of B W^-1/2 below which the weakest direction is damped (assumed)"
     )
     damping_factor: NonNegative = Field(0.01, description="its damping at the singularity (assumed)")
-    shape_points: dict[str, float] | None = Field(
+    shape_points_rad: dict[str, float] | None = Field(
         None, description="shape controllable points: joint name -> target [rad]; default the last head joint, 110 deg"
     )
     modes: dict[int, list[int]] | None = Field(None, description="mode number -> lifted wheel pairs; default Table II")
@@ -125,15 +125,15 @@ def build(config: Config, plant: SnakeDescription, duration_s: float | None = No
         shape_target=reals(shape_target),
         grounded=integers(modes.grounded),
         limit_policy=LIMIT_POLICIES[config.limit_policy],
-        rate_limit=config.rate_limit,
-        limit_rate=min(config.limit_rate, 1.0 / config.period_s),
+        rate_limit=config.rate_limit_rad_s,
+        limit_rate=min(config.limit_rate_per_s, 1.0 / config.period_s),
         damping_sigma=config.damping_sigma,
         damping_factor=config.damping_factor,
         cost=Cost(
             kind=COSTS[config.cost],
             diagonal=reals(_per_entry("cost_matrix", diagonal, joints)),
             angle_weight=config.cost_angle_weight,
-            support_weight=config.cost_support_weight,
+            support_weight=config.cost_support_weight_m,
             distance_floor=1e-3,
             smoothing=1e-3,
         ),
@@ -161,7 +161,7 @@ def build(config: Config, plant: SnakeDescription, duration_s: float | None = No
         order=order,
         switch_ticks=switch_ticks,
         policy=config.switching.policy,
-        least_margin=config.switching.least_margin,
+        least_margin=config.switching.least_margin_m,
         when_blocked=config.switching.when_blocked,
         release_fraction=config.switching.release_fraction,
         source=ScriptedSource(config.commands, config.paths),
@@ -218,22 +218,22 @@ def check_controllable(model: SnakeModel, law: Law, modes: ModeTable, fixing_row
     if start.rank_B < start.rows or start.rank_A < 6 + len(law.shape_joints):
         raise ModelError(
             f"mode {modes.numbers[fixing_row]}: the initial posture is singular (rank of A {start.rank_A}, rank of B "
-            f"{start.rank_B} of {start.rows}): change plant.initial_joints or the shape points"
+            f"{start.rank_B} of {start.rows}): change plant.initial_joints_rad or the shape points"
         )
 
 
 def _shape_points(config: Config, plant: SnakeDescription, model: SnakeModel) -> tuple[list[int], list[float]]:
     names = plant.joint_names
-    points = config.shape_points
+    points = config.shape_points_rad
     if points is None:
         points = {names[model.head_joints - 1]: float(np.deg2rad(110.0))}  # [T] IV.C.3
     for name, target in points.items():
         if name not in names:
-            raise ModelError(f"controller.shape_points: no joint {name!r}; the joints are {', '.join(names)}")
+            raise ModelError(f"controller.shape_points_rad: no joint {name!r}; the joints are {', '.join(names)}")
         j = names.index(name)
         if not model.lower[j] <= target <= model.upper[j]:
             raise ModelError(
-                f"controller.shape_points: {name} = {target:.4f} rad is beyond its limit of {model.upper[j]:.4f} rad"
+                f"controller.shape_points_rad: {name} = {target:.4f} is beyond its limit of {model.upper[j]:.4f} rad"
             )
     return [names.index(name) for name in points], list(points.values())
 

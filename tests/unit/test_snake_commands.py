@@ -14,10 +14,10 @@ MODES = ModeTable.from_lifted(TABLE_II, 7)
 PATHS = [
     Ramp(type="ramp", start_s=0.33, duration_s=1.0, displacement=(0.2, -0.1, 0, 0, 0.3, 0)),
     Ramp(type="ramp", start_s=0.33, duration_s=1.0, displacement=(0.2, -0.1, 0, 0, 0.3, 0), profile="smooth"),
-    Circle(type="circle", duration_s=2.0, radius=0.3, turns=0.7),
-    Circle(type="circle", duration_s=2.0, radius=0.3, turns=-0.7, backward=True),
-    Circle(type="circle", duration_s=2.0, radius=0.3, turns=1.0, plane="yz"),
-    DoorArc(type="door_arc", duration_s=2.0, radius=0.4, angle_deg=40, hinge="right", opening="push"),
+    Circle(type="circle", duration_s=2.0, radius_m=0.3, turns=0.7),
+    Circle(type="circle", duration_s=2.0, radius_m=0.3, turns=-0.7, backward=True),
+    Circle(type="circle", duration_s=2.0, radius_m=0.3, turns=1.0, plane="yz"),
+    DoorArc(type="door_arc", duration_s=2.0, radius_m=0.4, angle_deg=40, hinge="right", opening="push"),
 ]
 
 
@@ -36,7 +36,7 @@ def test_velocities_integrate_to_the_path_exactly(path):
 @pytest.mark.parametrize(("turns", "backward"), [(1, False), (-1, False), (1, True), (-1, True)])
 def test_circle_keeps_the_head_tangent(turns, backward):
     s = np.linspace(0, 1, 2001)
-    offset = Circle(type="circle", duration_s=1, radius=0.5, turns=turns, backward=backward).offset(s)
+    offset = Circle(type="circle", duration_s=1, radius_m=0.5, turns=turns, backward=backward).offset(s)
     rate = np.gradient(offset, s, axis=0)
     along = np.stack([np.cos(offset[:, 5]), np.sin(offset[:, 5])], axis=1) * (-1 if backward else 1)
     speed = np.linalg.norm(rate[:, :2], axis=1)
@@ -47,7 +47,7 @@ def test_circle_keeps_the_head_tangent(turns, backward):
 
 @pytest.mark.parametrize(("hinge", "opening"), [(h, o) for h in ("left", "right") for o in ("pull", "push")])
 def test_door_arc_is_a_rigid_turn_about_the_hinge(hinge, opening):
-    offset = DoorArc(type="door_arc", duration_s=1, radius=0.4, hinge=hinge, opening=opening).offset(
+    offset = DoorArc(type="door_arc", duration_s=1, radius_m=0.4, hinge=hinge, opening=opening).offset(
         np.linspace(0, 1, 9)
     )
     pivot = np.array([0.0, 0.4 if hinge == "left" else -0.4])

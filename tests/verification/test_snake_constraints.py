@@ -120,9 +120,9 @@ def test_pose_from_the_base_and_chain_from_the_pose_agree(robot, seed):
         ({"head_joints": 5}, "even"),
         ({"yaw_joints": 3, "head_joints": 6}, "no base part"),
         ({"yaw_joints": 4, "head_joints": 6, "driven_side": "none"}, "eq 16"),
-        ({"wheel_gap": [0.1, 0.2]}, "7 wheel pairs"),
-        ({"initial_joints": [1.2, 0, 0, 0, 0, 0]}, "beyond its limit"),
-        ({"initial_joints": [0.0]}, "initial_joints has 1"),
+        ({"wheel_gap_m": [0.1, 0.2]}, "7 wheel pairs"),
+        ({"initial_joints_rad": [1.2, 0, 0, 0, 0, 0]}, "beyond its limit"),
+        ({"initial_joints_rad": [0.0]}, "initial_joints_rad has 1"),
     ],
 )
 def test_impossible_robots_are_refused_with_the_reason(settings, reason):

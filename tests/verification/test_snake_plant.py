@@ -108,7 +108,7 @@ def test_only_measurement_removes_an_error_that_joints_cannot_show():
 def test_the_target_waits_instead_of_breaking_a_limit():
     """Driven backward the robot jack-knifes; with the allocating policy the head stays where its target waits."""
     back = {"type": "ramp", "start_s": 0.1, "duration_s": 6.0, "displacement": [-0.6, 0, 0, 0, 0, 0]}
-    kink = {"initial_joints": [0, -0.8, 0, -1.1, 0, 1.9, 0.2, -0.1] + [0.0] * 4}
+    kink = {"initial_joints_rad": [0, -0.8, 0, -1.1, 0, 1.9, 0.2, -0.1] + [0.0] * 4}
     summary = run(paths=[back], plant=kink, duration_s=10.0).summary
     assert summary["waiting_s"] > 1.0
     assert summary["joint_limit_violation_max_rad"] == 0.0
@@ -120,8 +120,8 @@ def test_the_target_waits_instead_of_breaking_a_limit():
 
 
 # Head stretched out to the left, base curled to the left: lifting its middle leaves the centre of mass outside.
-CURLED = {"initial_joints": [0.6, -0.2, 0.6, -0.2, 0.9, 0.4] + [1.1] * 6}
-HELD = {"shape_points": {"psi3": 0.4}, "null_gain": 0.0}
+CURLED = {"initial_joints_rad": [0.6, -0.2, 0.6, -0.2, 0.9, 0.4] + [1.1] * 6}
+HELD = {"shape_points_rad": {"psi3": 0.4}, "null_gain": 0.0}
 
 
 @pytest.mark.parametrize("request_mode", [3, 4])
@@ -163,7 +163,7 @@ def test_the_return_to_the_fixing_mode_is_tested_too():
 def test_least_margin_refuses_what_would_only_just_stand():
     commands = [{"at_s": 0.2, "mode": 5}, {"at_s": 0.4, "mode": 6}]  # margins of 14.7 and 66 mm
     for least, modes in ((0.0, {1, 5, 6}), (0.02, {1, 6}), (0.08, {1})):
-        record = run(0.6, plant=CURLED, commands=commands, switching={"least_margin": least}, **HELD)
+        record = run(0.6, plant=CURLED, commands=commands, switching={"least_margin_m": least}, **HELD)
         assert set(record["mode"]) == modes
 
 
@@ -228,7 +228,7 @@ def test_a_live_source_sees_that_its_target_waits_and_what_it_said_then_is_lost(
             speed = 0.1 if feedback.waiting else -0.1
             return CommandBlock(np.array([[speed, 0, 0, 0, 0, 0]]), [NO_REQUEST], [0])
 
-    kink = {"initial_joints": [0, -0.8, 0, -1.1, 0, 1.9, 0.2, -0.1] + [0.0] * 4}
+    kink = {"initial_joints_rad": [0, -0.8, 0, -1.1, 0, 1.9, 0.2, -0.1] + [0.0] * 4}
     source = Backward()
     record = kinematic.simulate(scenario(8.0, plant=kink), source=source)
     # the last period is not reported any more
