@@ -137,8 +137,9 @@ def postures(record: Record, count: int = 6) -> Figure:
             if axis is not axes[0, 0] and axis is not axes[1, 0]:
                 axis.tick_params(labelleft=False)
             axis.tick_params(axis="x", labelrotation=45)
-    axes[0, 0].set(ylabel="y [m]")
-    axes[1, 0].set(ylabel="height [m]")
+    for axis, name in ((axes[0, 0], "y [m]"), (axes[1, 0], "height [m]")):
+        axis.set_ylabel(name)
+        axis.locator_params(axis="y", nbins=3)
     figure.supxlabel("above: x [m]; below: along the heading of the base part [m]", fontsize=8)
     figure.legend(handles=legend(), loc="outside upper center", ncols=6, frameon=False)
     return figure
@@ -146,32 +147,22 @@ def postures(record: Record, count: int = 6) -> Figure:
 
 def overview(record: Record, count: int = 7) -> Figure:
     """Top view of the whole run in one picture: postures over time, path of the controlled point and its target."""
-    figure, axis = plt.subplots(figsize=(5.2, 4.2))
     rows = moments(record, count)
-    colour = plt.get_cmap("viridis")
+    x0, x1, y0, y1 = limits([*record["posture"][rows][:, :, :2], record["w"][:, :2]], 0.06)
+    width = 5.0
+    figure, axis = plt.subplots(figsize=(width + 1.4, max(width * (y1 - y0) / (x1 - x0), 1.0) + 0.9))
+    shades = plt.cm.ScalarMappable(plt.Normalize(0.0, record.time[-1]), plt.get_cmap("viridis"))
     for row in rows:
-        shade = colour(0.9 * record.time[row] / max(record.time[-1], 1e-9))
-        points = record["posture"][row]
+        points, shade = record["posture"][row], shades.to_rgba(record.time[row])
         axis.plot(points[:, 0], points[:, 1], "-", color=shade, lw=2.2, solid_capstyle="round")
         axis.plot(*points[0, :2], "o", color=shade, ms=4)
-        # Runs that return put several labels on one spot: spread them over the directions.
-        turn = 2 * np.pi * list(rows).index(row) / len(rows)
-        axis.annotate(
-            f"{record.time[row]:.0f} s",
-            points[0, :2],
-            xytext=(14 * np.cos(turn), 14 * np.sin(turn)),
-            textcoords="offset points",
-            ha="center",
-            va="center",
-            color=shade,
-            fontsize=7,
-        )
     axis.plot(*record["w"][:, :2].T, color=HEAD, lw=1.0, label="controlled point")
     axis.plot(*record["w_target"][:, :2].T, "--", color=TARGET, lw=1.0, label="target")
     axis.plot(*record["base_pose"][:, :2].T, color=GROUND, lw=0.8, label="wheel pair 1")
-    axis.set_aspect("equal", adjustable="datalim")
-    axis.set(xlabel="x [m]", ylabel="y [m]")
-    axis.legend(loc="best", frameon=False)
+    axis.set(xlabel="x [m]", ylabel="y [m]", xlim=(x0, x1), ylim=(y0, y1))
+    axis.set_aspect("equal", adjustable="box")
+    figure.colorbar(shades, ax=axis, label="posture at t [s]")
+    figure.legend(loc="outside upper center", ncols=3, frameon=False)
     return figure
 
 
@@ -184,6 +175,12 @@ def tracking(record: Record) -> Figure:
         axis.plot(record.time, record["w_target"][:, i], "--", color=HEAD, lw=0.9, label="target")
         relax(axis, 1e-3)
         axis.set_ylabel(f"{SYMBOLS.get(name, name)} [{'m' if i < 3 else 'rad'}]")
+        if record["gripper"].any():
+            closed = axis.get_xaxis_transform()
+            axis.fill_between(
+                record.time, 0, 1, where=record["gripper"] > 0, transform=closed, color="#EEEEEE", lw=0, zorder=0,
+                label="gripper closed",
+            )  # fmt: skip
     axes[0, 0].legend(frameon=False)
     tiny = 1e-16  # an error of exactly zero has no place on a logarithmic axis
     axes[3, 0].semilogy(record.time, np.maximum(record["position_error"], tiny), color=BODY)
