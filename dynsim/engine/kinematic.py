@@ -277,7 +277,9 @@ def _predict(run: Run, row: int) -> tuple[float, float]:
     held = np.tile(run.block.velocity[place], (ticks, 1))
     trial.counts[0], trial.counts[1], trial.counts[3] = row, 0, 0
     done, _ = run_ticks(run.model, law, schedule, trial, held, ticks, 1, 1, 1, run.rig, trace)
-    if 0 <= done < ticks:  # blocked: the target waits for the rest of the period
+    if done < 0:
+        return np.inf, -np.inf  # no longer finite: no mode to take
+    if done < ticks:  # blocked: the target waits for the rest of the period
         run_ticks(run.model, law, schedule, trial, held, ticks - done, 0, 0, 1, run.rig, trace)
     record_row(run.model, law, trial, run.rig, ticks, trace)
     return float(trace.cost[-1]), float(trace.margin.min())

@@ -164,7 +164,7 @@ def _summary(run: Run, scenario: Scenario, switcher: ModeSwitcher, record: Recor
             {
                 "time_s": refusal.tick * period,
                 "mode": run.controller.modes.numbers[refusal.row],
-                # JSON has no infinity: None where fewer than three wheels would be left
+                # JSON has no infinity: None where the predicted state is no longer finite
                 "support_margin_m": refusal.margin if np.isfinite(refusal.margin) else None,
                 "taken": refusal.taken,
             }
@@ -216,13 +216,9 @@ def _refusal_warnings(refusals: list[dict[str, Any]], least_margin: float) -> li
     for mode, taken in dict.fromkeys((refusal["mode"], refusal["taken"]) for refusal in refusals):
         same = [refusal for refusal in refusals if (refusal["mode"], refusal["taken"]) == (mode, taken)]
         margin = same[0]["support_margin_m"]
-        held = (
-            "fewer than three wheels on the ground" if margin is None else f"a support margin of {1e3 * margin:.1f} mm"
-        )
+        needed = f"a support margin of more than {1e3 * least_margin:g} mm is needed, it has"
+        why = "its prediction diverges" if margin is None else f"{needed} {1e3 * margin:.1f} mm"
         what = "taken, as no other stands better," if taken else "refused"
         times = f" ({len(same)} times in all)" if len(same) > 1 else ""
-        found.append(
-            f"mode {mode} was {what} at t = {same[0]['time_s']:.3f} s{times}: {held}, more than "
-            f"{1e3 * least_margin:g} mm is needed"
-        )
+        found.append(f"mode {mode} was {what} at t = {same[0]['time_s']:.3f} s{times}: {why}")
     return found

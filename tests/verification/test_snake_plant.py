@@ -151,6 +151,21 @@ def test_switching_passes_over_modes_that_would_tip(policy):
     assert record.summary["modes_refused"] == len(record.summary["refusals"])
 
 
+def test_a_mode_whose_prediction_diverges_is_refused():
+    """The null space is switched off in the run, not in the prediction: there its gain is absurd."""
+    record = run(
+        0.2,
+        commands=[{"at_s": 0.1, "mode": "switching"}],
+        switching={"policy": "predictive", "order": [2]},
+        null_gain=1e300,
+        null_start_s=1.0,
+        limit_policy="none",
+    )
+    assert record.summary["refusals"] == [{"time_s": 0.1, "mode": 2, "support_margin_m": None, "taken": False}]
+    assert "its prediction diverges" in record.summary["warnings"][0]
+    assert set(record["mode"]) == {1}
+
+
 def test_the_return_to_the_fixing_mode_is_tested_too():
     """The robot starts in a fixing mode that tips, leaves it by request, and is not let back."""
     commands = [{"at_s": 0.2, "mode": 1}, {"at_s": 0.6, "mode": "fixing"}]
