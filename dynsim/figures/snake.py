@@ -25,11 +25,11 @@ from dynsim.figures.snake_view import (
     TARGET,
     View,
     greek,
-    legend,
     limits,
     mode_chart,
     moments,
     posture_grid,
+    posture_strip,
     relax,
 )
 from dynsim.record import Record
@@ -44,13 +44,14 @@ def draw(record: Record, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     with plt.rc_context(STYLE):
-        for name, make in (
-            ("postures", postures),
-            ("overview", overview),
-            ("tracking", tracking),
-            ("joints", joints),
-            ("redundancy", redundancy),
-        ):
+        makers: dict[str, Callable[[Record], Figure]] = {
+            "postures": postures,
+            "overview": overview,
+            "tracking": tracking,
+            "joints": joints,
+            "redundancy": redundancy,
+        }
+        for name, make in (makers | tanaka2019.figures_of_run(record)).items():
             figure = make(record)
             path = folder / f"{name}.png"
             figure.savefig(path)
@@ -115,34 +116,9 @@ def strips(records: Mapping[str, Record], count: int = 6) -> Figure:
 
 
 def postures(record: Record, count: int = 6) -> Figure:
-    """Strip of postures: top view above, side view along the base's heading below."""
-    rows = moments(record, count)
-    views = [View(record, row) for row in rows]
-    top = limits([view.outline() for view in views], 0.08)
-    side = limits([np.vstack([view.side, view.side * [1, 0]]) for view in views], 0.08)
-    tall, low = top[3] - top[2], side[3] - side[2]
-    width = 9.0
-    column = width / len(rows)
-    height = column * (tall / (top[1] - top[0]) + low / (side[1] - side[0])) + 1.1
-    figure, axes = plt.subplots(
-        2, len(rows), figsize=(width, max(height, 2.6)), squeeze=False, height_ratios=[tall, max(low, 0.35 * tall)]
-    )
-    for view, above, below in zip(views, *axes, strict=True):
-        view.draw_top(above)
-        view.draw_side(below)
-        above.set(xlim=top[:2], ylim=top[2:], title=f"t = {view.time:.1f} s, mode {view.mode}")
-        below.set(xlim=side[:2], ylim=(min(side[2], -0.02), side[3]))
-        for axis in (above, below):
-            axis.set_aspect("equal", adjustable="box")
-            if axis is not axes[0, 0] and axis is not axes[1, 0]:
-                axis.tick_params(labelleft=False)
-            axis.tick_params(axis="x", labelrotation=45)
-    for axis, name in ((axes[0, 0], "y [m]"), (axes[1, 0], "height [m]")):
-        axis.set_ylabel(name)
-        axis.locator_params(axis="y", nbins=3)
-    figure.supxlabel("above: x [m]; below: along the heading of the base part [m]", fontsize=8)
-    figure.legend(handles=legend(), loc="outside upper center", ncols=6, frameon=False)
-    return figure
+    """Postures over time: top view above, side view along the base's heading below."""
+    views = [View(record, row) for row in moments(record, count)]
+    return posture_strip([(view, f"t = {view.time:.1f} s, mode {view.mode}") for view in views])
 
 
 def overview(record: Record, count: int = 7) -> Figure:

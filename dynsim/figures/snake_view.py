@@ -157,6 +157,36 @@ def posture_grid(lines: Mapping[str, Sequence[tuple[View, str]]], note: str = ""
     return figure
 
 
+def posture_strip(line: Sequence[tuple[View, str]]) -> Figure:
+    """Postures with their titles: top view above, side view along the base's heading below."""
+    views = [view for view, _ in line]
+    top = limits([view.outline() for view in views], 0.08)
+    side = limits([np.vstack([view.side, view.side * [1, 0]]) for view in views], 0.08)
+    tall, low = top[3] - top[2], side[3] - side[2]
+    width = 9.0
+    column = width / len(views)
+    height = column * (tall / (top[1] - top[0]) + low / (side[1] - side[0])) + 1.1
+    figure, axes = plt.subplots(
+        2, len(views), figsize=(width, max(height, 2.6)), squeeze=False, height_ratios=[tall, max(low, 0.35 * tall)]
+    )
+    for (view, title), above, below in zip(line, *axes, strict=True):
+        view.draw_top(above)
+        view.draw_side(below)
+        above.set(xlim=top[:2], ylim=top[2:], title=title)
+        below.set(xlim=side[:2], ylim=(min(side[2], -0.02), side[3]))
+        for axis in (above, below):
+            axis.set_aspect("equal", adjustable="box")
+            if axis is not axes[0, 0] and axis is not axes[1, 0]:
+                axis.tick_params(labelleft=False)
+            axis.tick_params(axis="x", labelrotation=45)
+    for axis, name in ((axes[0, 0], "y [m]"), (axes[1, 0], "height [m]")):
+        axis.set_ylabel(name)
+        axis.locator_params(axis="y", nbins=3)
+    figure.supxlabel("above: x [m]; below: along the heading of the base part [m]", fontsize=8)
+    figure.legend(handles=legend(), loc="outside upper center", ncols=6, frameon=False)
+    return figure
+
+
 def mode_chart(axis: Axes, record: Record, title: str = "mode") -> None:
     """Grounded (filled) and lifted (white) wheel pairs over time, with the mode numbers."""
     grounded, time, mode = record["grounded"], record.time, record["mode"]

@@ -25,6 +25,7 @@ from dynsim.figures.snake_view import (
     greek,
     mode_chart,
     posture_grid,
+    posture_strip,
     relax,
 )
 from dynsim.record import Record
@@ -58,6 +59,11 @@ def figures(scenario: str, records: Mapping[str, Record]) -> dict[str, Maker]:
     if scenario == "snake_door_arc" and "pull_switching" in records:
         found["fig_14"] = lambda r: door(r["pull_switching"])
     return found
+
+
+def figures_of_run(record: Record) -> dict[str, Callable[[Record], Figure]]:
+    """Makers of the figures beside [T] that one run is enough for."""
+    return {"fig_13": picking_up} if record.summary["scenario"] == "snake_operator" and record["gripper"].any() else {}
 
 
 def write_tables(scenario: str, records: Mapping[str, Record], folder: Path) -> list[Path]:
@@ -206,3 +212,12 @@ def door(record: Record) -> Figure:
         titled.append((view, f"({'abcdefghijklmnop'[place]}) {what}\n{view.time:.1f} s, {opened:.1f}°"))
     lines = {" " * start: titled[start : start + 3] for start in range(0, len(titled), 3)}
     return posture_grid(lines, "; green: arc of the knob; in the titles: time, angle of the door")
+
+
+def picking_up(record: Record) -> Figure:
+    """Fig 13: reaching, grasping, after picking up (there is no object in the simulation)."""
+    closed = np.flatnonzero(record["gripper"])
+    height = record["w"][closed, 2]
+    lifted = closed[np.argmax(height > height.max() - 1e-4)]  # the first time; later ones differ by rounding
+    shown = ((closed[0] // 2, "1: reaching"), (closed[0], "2: grasping"), (lifted, "3: after picking up"))
+    return posture_strip([(View(record, int(row)), f"{what}, t = {record.time[row]:.1f} s") for row, what in shown])

@@ -85,6 +85,12 @@ def test_the_door_of_figure_14(simulated, tmp_path):
     assert opened["pull"] < 20 < 25 == opened["pull_switching"]
 
 
+def test_the_pick_up_of_figure_13(simulated, tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "FRAMES", 2)
+    written = figures.draw(simulated("snake_operator", None), tmp_path)
+    assert "fig_13.png" in {path.name for path in written}
+
+
 def test_variants_that_the_paper_does_not_have_get_no_tables(record):
     assert tables("snake_joint_limits", {"a": record}) == {}
     assert tables("snake_positioning", {"a": record}) == {}
