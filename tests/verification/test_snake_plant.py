@@ -64,6 +64,26 @@ def test_wheels_roll_without_slip():
     assert record.summary["slip_max_m_s"] < 1e-4
 
 
+def test_motion_does_not_depend_on_wheel_side_or_track_as_wheel_weights_vanish():
+    """A whole run with mode switching: other sides and gaps turn the wheels otherwise, the robot moves the same.
+
+    The margin is a matter of the track, so no mode may be refused and the cost is that of the angles.
+    """
+    other = {"driven_side": ["right", "right", "left", "left", "right", "left", "left"], "wheel_gap_m": 0.1}
+    commands = [{"at_s": 0.3, "mode": "switching"}]
+    difference = []
+    for weight in (1e-2, 1e-4, 1e-6):
+        settings = {"weight_wheel": weight, "paths": [GAMMA], "commands": commands, "switching": {"period_s": 0.3}}
+        records = [run(plant=plant, **settings) for plant in ({}, other)]
+        assert records[0].summary["mode_switches"] > 3
+        assert np.abs(records[0]["rho"] - records[1]["rho"]).max() > 0.1
+        motions = [np.hstack([record["phi"], record["base_pose"]]) for record in records]
+        difference.append(np.abs(motions[0] - motions[1]).max())
+    # proportional to the weight: a hundredth each time (a factor of two is left for the second order)
+    assert difference[1] < 2e-2 * difference[0]
+    assert difference[2] < 2e-2 * difference[1]
+
+
 def test_substeps_of_the_plant_change_nothing_but_rounding_of_the_base():
     """Runge-Kutta 4 over 5 ms is already converged: its error is far below that of the held rates."""
     one, four = (run(paths=[GAMMA], plant_substeps=n) for n in (1, 4))
