@@ -1,8 +1,6 @@
 """Where the target comes from: the operator's velocity commands and generated target paths ([T] IV.C).
 
-A source gives the rate of the target pose for each control period, mode requests and the gripper. Scripted sources are
-read in long blocks; a live one (joystick) would be read one period at a time through the same interface,
-:class:`dynsim.model.snake.CommandSource`.
+A script is a :class:`dynsim.model.snake.CommandSource` that knows its future; a joystick is one that does not.
 """
 
 from __future__ import annotations
@@ -16,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from dynsim.config import NonNegative, Positive, StrictConfig
-from dynsim.model.snake import FIXING, SWITCHING, CommandBlock, ModeTable
+from dynsim.model.snake import FIXING, SWITCHING, CommandBlock, Feedback
 
 Coordinates = tuple[float, float, float, float, float, float]
 Profile = Literal["linear", "smooth"]
@@ -55,7 +53,7 @@ class Circle(StrictConfig):
     type: Literal["circle"]
     start_s: NonNegative = 0.0
     duration_s: Positive
-    radius: Positive
+    radius_m: Positive
     turns: float = Field(1.0, description="plane xy: > 0 to the left; plane yz: from the top, > 0 first to the left")
     plane: Literal["xy", "yz"] = "xy"
     backward: bool = Field(False, description="plane xy: leave the start point tail first")
@@ -67,12 +65,12 @@ class Circle(StrictConfig):
         angle = 2.0 * np.pi * self.turns * s
         out = np.zeros((len(s), 6))
         if self.plane == "yz":
-            out[:, 1] = self.radius * np.sin(angle)
-            out[:, 2] = self.radius * (np.cos(angle) - 1.0)
+            out[:, 1] = self.radius_m * np.sin(angle)
+            out[:, 2] = self.radius_m * (np.cos(angle) - 1.0)
             return out
         way = -1.0 if self.backward else 1.0
-        out[:, 0] = way * self.radius * np.sin(np.abs(angle))
-        out[:, 1] = self.radius * np.sign(self.turns) * (1.0 - np.cos(angle))
+        out[:, 0] = way * self.radius_m * np.sin(np.abs(angle))
+        out[:, 1] = self.radius_m * np.sign(self.turns) * (1.0 - np.cos(angle))
         if self.turn_head:
             out[:, 5] = way * angle
         return out
@@ -81,13 +79,13 @@ class Circle(StrictConfig):
 class DoorArc(StrictConfig):
     """Arc of a door's knob about its hinge, the yaw kept perpendicular to the door ([T] V.D.3).
 
-    The robot faces the door along +x; the hinge is ``radius`` to the left or right of the target's start.
+    The robot faces the door along +x; the hinge is ``radius_m`` to the left or right of the target's start.
     """
 
     type: Literal["door_arc"]
     start_s: NonNegative = 0.0
     duration_s: Positive
-    radius: Positive = Field(description="hinge to knob [m]")
+    radius_m: Positive = Field(description="hinge to knob [m]")
     angle_deg: Annotated[float, Field(gt=0, le=180)] = 60.0
     hinge: Literal["left", "right"] = "left"
     opening: Literal["pull", "push"] = "pull"
@@ -99,8 +97,8 @@ class DoorArc(StrictConfig):
         left = 1.0 if self.hinge == "left" else -1.0
         away = 1.0 if self.opening == "push" else -1.0
         out = np.zeros((len(s), 6))
-        out[:, 0] = away * self.radius * np.sin(angle)
-        out[:, 1] = left * self.radius * (1.0 - np.cos(angle))
+        out[:, 0] = away * self.radius_m * np.sin(angle)
+        out[:, 1] = left * self.radius_m * (1.0 - np.cos(angle))
         out[:, 5] = left * away * angle
         return out
 
@@ -128,10 +126,9 @@ class ScriptedSource:
 
     commands: Sequence[Command]
     paths: Sequence[Ramp | Circle | DoorArc]
-    modes: ModeTable
 
-    def read(self, first: int, count: int, period: float) -> CommandBlock:
-        """Commands of periods ``first`` to ``first + count - 1``.
+    def read(self, first: int, count: int, period: float, feedback: Feedback | None = None) -> CommandBlock:
+        """Commands of periods ``first`` to ``first + count - 1``; a script does not look at the robot.
 
         A command takes effect at the first period that begins at or after its time.
         """
@@ -151,15 +148,11 @@ class ScriptedSource:
             gripper = gripper if command.gripper is None else int(command.gripper == "closed")
             pieces.append((tick, held, gripper))
             if command.mode is not None and 0 <= tick - first < count:
-                block.request[tick - first] = self._request(command.mode)
+                states = {"switching": SWITCHING, "fixing": FIXING}
+                block.request[tick - first] = states[command.mode] if isinstance(command.mode, str) else command.mode
         for i, (tick, velocity, closed) in enumerate(pieces):
             end = pieces[i + 1][0] if i + 1 < len(pieces) else first + count
             part = slice(max(tick - first, 0), max(end - first, 0))
             block.velocity[part] += velocity
             block.gripper[part] = closed
         return block
-
-    def _request(self, mode: int | str) -> int:
-        if isinstance(mode, str):
-            return SWITCHING if mode == "switching" else FIXING
-        return self.modes.row(mode, "controller.commands: mode") + 1

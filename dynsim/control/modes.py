@@ -19,7 +19,7 @@ class Switching(StrictConfig):
     policy: Policy = Field("cyclic", description="fixed: never switch; cyclic: [T]'s order; predictive: lowest cost")
     order: list[int] = Field([2, 3, 4, 5, 6], min_length=1, description="mode numbers, also the predictive candidates")
     period_s: Positive = Field(1.0, description="Delta T [s]")
-    least_margin: float = Field(0.0, description="a mode with a smaller support margin [m] counts as tipping")
+    least_margin_m: float = Field(0.0, description="a mode whose support margin is not above it counts as tipping")
     when_blocked: bool = Field(
         False,
         description="enter the switching state by itself when a command cannot be carried out, the target waiting",

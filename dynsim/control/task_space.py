@@ -59,29 +59,29 @@ class Config(Script):
     weight_joint: Positive | list[Positive] = Field(1.0, description="W: one for all joints, or one per joint")
     weight_wheel: Positive = Field(0.01, description="W of the active wheels; small, or the joint rates chatter")
     cost: Literal["eq19", "eq20", "eq20_min"] = Field(
-        "eq19", description="eq20: 1/norm of the signed distances, as printed; eq20_min: 1/smallest distance"
+        "eq19", description="eq20: 1/norm of the signed distances, as printed; eq20_min: 1/smallest distance, smoothed"
     )
     cost_matrix: list[NonNegative] | None = Field(
         None, description="diagonal of K_V; default [T] V.B: head yaw 15, head pitch 0.015, base 9.6, 4.8, 2.4, ..."
     )
     cost_angle_weight: NonNegative = Field(1.0, description="a_1 of eq 20 (assumed)")
-    cost_support_weight: NonNegative = Field(1.0, description="a_2 of eq 20 [m] (assumed)")
+    cost_support_weight_m: NonNegative = Field(1.0, description="a_2 of eq 20 [m] (assumed)")
     limit_policy: Literal["none", "saturate", "allocate"] = Field(
         "allocate",
         description="allocate: a joint at its limit leaves the allocation, and when that is impossible the target "
         "waits; saturate: joints are clamped; none: limits are ignored",
     )
-    rate_limit: Positive = Field(
+    rate_limit_rad_s: Positive = Field(
         4.7, description="fastest joint rate [rad/s]: no-load speed of the MX-106 at 12 V, 45 rpm (data sheet)"
     )
-    limit_rate: Positive = Field(
+    limit_rate_per_s: Positive = Field(
         20.0, description="a joint approaches its limit no faster than this [1/s] times the angle left (assumed)"
     )
     damping_sigma: NonNegative = Field(
         0.005, description="smallest singular value of B W^-1/2 below which the weakest direction is damped (assumed)"
     )
     damping_factor: NonNegative = Field(0.01, description="its damping at the singularity (assumed)")
-    shape_points: dict[str, float] | None = Field(
+    shape_points_rad: dict[str, float] | None = Field(
         None, description="shape controllable points: joint name -> target [rad]; default the last head joint, 110 deg"
     )
     modes: dict[int, list[int]] | None = Field(None, description="mode number -> lifted wheel pairs; default Table II")
@@ -125,19 +125,20 @@ def build(config: Config, plant: SnakeDescription, duration_s: float | None = No
         shape_target=reals(shape_target),
         grounded=integers(modes.grounded),
         limit_policy=LIMIT_POLICIES[config.limit_policy],
-        rate_limit=config.rate_limit,
-        limit_rate=min(config.limit_rate, 1.0 / config.period_s),
+        rate_limit=config.rate_limit_rad_s,
+        limit_rate=min(config.limit_rate_per_s, 1.0 / config.period_s),
         damping_sigma=config.damping_sigma,
         damping_factor=config.damping_factor,
         cost=Cost(
             kind=COSTS[config.cost],
             diagonal=reals(_per_entry("cost_matrix", diagonal, joints)),
             angle_weight=config.cost_angle_weight,
-            support_weight=config.cost_support_weight,
+            support_weight=config.cost_support_weight_m,
             distance_floor=1e-3,
+            smoothing=1e-3,
         ),
     )
-    check_controllable(model, law, modes, sorted({fixing_row, *order}), plant)
+    check_controllable(model, law, modes, fixing_row, plant)
 
     switch_ticks = max(1, round(config.switching.period_s / config.period_s))
     prediction_ticks = max(1, round(config.switching.period_s / config.switching.prediction_step_s))
@@ -160,15 +161,15 @@ def build(config: Config, plant: SnakeDescription, duration_s: float | None = No
         order=order,
         switch_ticks=switch_ticks,
         policy=config.switching.policy,
-        least_margin=config.switching.least_margin,
+        least_margin=config.switching.least_margin_m,
         when_blocked=config.switching.when_blocked,
         release_fraction=config.switching.release_fraction,
-        source=ScriptedSource(config.commands, config.paths, modes),
+        source=ScriptedSource(config.commands, config.paths),
     )
 
 
-def check_controllable(model: SnakeModel, law: Law, modes: ModeTable, rows: list[int], plant: SnakeDescription) -> None:
-    """Refuse modes in which A~ w~' = B~ u ([T] eq 9) has no solution for every w~'.
+def check_controllable(model: SnakeModel, law: Law, modes: ModeTable, fixing_row: int, plant: SnakeDescription) -> None:
+    """Refuse a table with a mode in which A~ w~' = B~ u ([T] eq 9) has no solution for every w~'.
 
     The side-slip row of wheel pair 1 and the three ground-contact rows contain head joints only. Every shape
     controllable point of the head part takes one of these joints away, so n_h >= 4 ([T] eq 1) becomes
@@ -183,7 +184,7 @@ def check_controllable(model: SnakeModel, law: Law, modes: ModeTable, rows: list
     n_h, n_b, names = model.head_joints, model.base_joints, plant.joint_names
     head_shape = [names[j] for j in law.shape_joints if j < n_h]
     random = np.random.default_rng(0)
-    for row in rows:
+    for row in range(len(modes.numbers)):
         mode, down = f"mode {modes.numbers[row]}", modes.grounded[row]
         lifted = int(np.sum(down == 0))
         lifted_active = int(np.sum((down == 0) & (model.wheel >= 0)))
@@ -213,26 +214,26 @@ def check_controllable(model: SnakeModel, law: Law, modes: ModeTable, rows: list
                 f"{mode}: rank of A is {rank_a} of {6 + len(law.shape_joints)}, rank of B is {rank_b} of "
                 f"{found[0].rows} at random postures: the controlled variables are not independent"
             )
-    start = conditioning(model, law, rows[0], plant.initial_base_pose, plant.initial_joints)
+    start = conditioning(model, law, fixing_row, plant.initial_base_pose, plant.initial_joints)
     if start.rank_B < start.rows or start.rank_A < 6 + len(law.shape_joints):
         raise ModelError(
-            f"mode {modes.numbers[rows[0]]}: the initial posture is singular (rank of A {start.rank_A}, rank of B "
-            f"{start.rank_B} of {start.rows}): change plant.initial_joints or the shape points"
+            f"mode {modes.numbers[fixing_row]}: the initial posture is singular (rank of A {start.rank_A}, rank of B "
+            f"{start.rank_B} of {start.rows}): change plant.initial_joints_rad or the shape points"
         )
 
 
 def _shape_points(config: Config, plant: SnakeDescription, model: SnakeModel) -> tuple[list[int], list[float]]:
     names = plant.joint_names
-    points = config.shape_points
+    points = config.shape_points_rad
     if points is None:
         points = {names[model.head_joints - 1]: float(np.deg2rad(110.0))}  # [T] IV.C.3
     for name, target in points.items():
         if name not in names:
-            raise ModelError(f"controller.shape_points: no joint {name!r}; the joints are {', '.join(names)}")
+            raise ModelError(f"controller.shape_points_rad: no joint {name!r}; the joints are {', '.join(names)}")
         j = names.index(name)
         if not model.lower[j] <= target <= model.upper[j]:
             raise ModelError(
-                f"controller.shape_points: {name} = {target:.4f} rad is beyond its limit of {model.upper[j]:.4f} rad"
+                f"controller.shape_points_rad: {name} = {target:.4f} is beyond its limit of {model.upper[j]:.4f} rad"
             )
     return [names.index(name) for name in points], list(points.values())
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from types import ModuleType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynsim.engine import Progress
 from dynsim.engine.kinematic_record import make_record
@@ -14,6 +15,7 @@ from dynsim.engine.mode_switching import ModeSwitcher
 from dynsim.engine.provenance import provenance
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.families import member
+from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.snake import SnakeModel, pose_of_point
 from dynsim.kernels.snake_plant import Rig, State, Trace, new_rig, new_state, new_trace, record_row, run_ticks
 from dynsim.model.snake import (
@@ -21,6 +23,8 @@ from dynsim.model.snake import (
     NO_REQUEST,
     SWITCHING,
     CommandBlock,
+    CommandSource,
+    Feedback,
     SnakeDescription,
     TaskSpaceController,
 )
@@ -32,25 +36,32 @@ CHUNK = 2000  # ticks between two looks at Ctrl-C and the progress bar; about 0.
 
 @dataclass
 class Run:
-    """One simulation on its way: the robot, its controller, all commands, the state and what was recorded."""
+    """One simulation on its way: the robot, its controller, the commands known now, the state, what was recorded."""
 
     description: SnakeDescription
     model: SnakeModel
     controller: TaskSpaceController
-    block: CommandBlock
+    source: CommandSource
+    ticks: int  # control periods of the whole run
+    block: CommandBlock  # commands from tick ``block_start`` on
+    block_start: int
+    gripper: NDArray[np.int64]  # (ticks,) as far as it was read
     state: State
     rig: Rig
     trace: Trace
     stride: int
 
 
-def prepare(scenario: Scenario) -> Run:
-    """Build robot and controller and the initial state.
+def prepare(scenario: Scenario, source: CommandSource | None = None) -> Run:
+    """Build robot and controller and the initial state, and read the first commands.
+
+    ``source`` replaces the commands and paths of the scenario.
 
     Raises
     ------
     ModelError
-        The robot cannot be controlled as configured, or the scenario has what this engine does not know.
+        The robot cannot be controlled as configured, the scenario has what this engine does not know, or a command
+        asks for a mode that does not exist.
     ScenarioError
         The recording rate does not divide the control rate, or the record would be too large.
     """
@@ -78,16 +89,35 @@ def prepare(scenario: Scenario) -> Run:
     pose_of_point(model, state.base, state.phi, rig.work.frame, state.w_target)
     state.phi_hat[:], state.w_hat[:] = state.phi, state.w_target
     state.counts[0] = controller.fixing_row
-    block = controller.source.read(0, ticks, period)
-    return Run(description, model, controller, block, state, rig, new_trace(model, rows), stride)
+    run = Run(
+        description=description,
+        model=model,
+        controller=controller,
+        source=controller.source if source is None else source,
+        ticks=ticks,
+        block=CommandBlock(np.zeros((0, 6)), integers([]), integers([])),
+        block_start=0,
+        gripper=np.zeros(ticks, dtype=np.int64),
+        state=state,
+        rig=rig,
+        trace=new_trace(model, rows),
+        stride=stride,
+    )
+    _read_commands(run, waiting=False)
+    return run
 
 
-def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
-    """See :func:`dynsim.engine.simulate`; also raises what :func:`prepare` raises."""
-    run = prepare(scenario)
+def simulate(scenario: Scenario, progress: Progress | None = None, source: CommandSource | None = None) -> Record:
+    """See :func:`dynsim.engine.simulate`; also raises what :func:`prepare` raises.
+
+    A live ``source`` (joystick) replaces the commands and paths of the scenario. It is asked in every control period,
+    with what the robot has done; to run in real time it waits in ``read`` until the period has come.
+    """
+    run = prepare(scenario, source)
     controller = run.controller
     switcher = ModeSwitcher(
         policy=controller.policy,
+        modes=controller.modes,
         fixing_row=controller.fixing_row,
         order=controller.order,
         period_ticks=controller.switch_ticks,
@@ -145,20 +175,55 @@ def _stride(rate_hz: float, period: float) -> int:
     return stride
 
 
+def _read_commands(run: Run, waiting: bool) -> None:
+    """Ask the source for the commands from the present tick on; it answers as far as it knows them.
+
+    Velocities that had to wait in the block before this one and were not carried out there are dropped: a script is
+    one block and loses none, a joystick says anew what it wants.
+    """
+    state, period, first = run.state, run.controller.schedule.period, int(run.state.counts[1])
+    w = np.zeros(6)
+    pose_of_point(run.model, state.base, state.phi, run.rig.work.frame, w)
+    feedback = Feedback(
+        time=first * period,
+        w=w,
+        w_target=state.w_target.copy(),
+        base_pose=state.base.copy(),
+        phi=state.phi.copy(),
+        mode=run.controller.modes.numbers[state.counts[0]],
+        waiting=waiting,
+    )
+    block = run.source.read(first, run.ticks - first, period, feedback)
+    block = CommandBlock(reals(block.velocity), integers(block.request), integers(block.gripper))
+    known = len(block.request)
+    if not 1 <= known <= run.ticks - first or block.velocity.shape != (known, 6) or block.gripper.shape != (known,):
+        raise ModelError(
+            f"command source at t = {feedback.time:g} s: velocity {block.velocity.shape}, request "
+            f"{block.request.shape}, gripper {block.gripper.shape}; give (T, 6), (T,), (T,) with T from 1 to "
+            f"{run.ticks - first}"
+        )
+    for number in set(block.request[block.request > 0].tolist()):
+        run.controller.modes.row(number, "controller.commands: mode")
+    run.block, run.block_start = block, first
+    run.gripper[first : first + known] = block.gripper
+    state.counts[3] = 0
+
+
 def _advance(run: Run, switcher: ModeSwitcher, progress: Progress | None) -> None:
-    """Run to the end in pieces that no mode request and no switching time divides."""
+    """Run to the end in pieces that no mode request, no switching time and no end of known commands divides."""
     state, controller, period = run.state, run.controller, run.controller.schedule.period
-    block, ticks = run.block, len(run.block.request)
-    requests = np.flatnonzero(block.request != NO_REQUEST)
-    recovering = False
-    while (now := int(state.counts[1])) < ticks:
-        request = int(block.request[now])
+    recovering = blocked = False
+    while (now := int(state.counts[1])) < run.ticks:
+        if now == run.block_start + len(run.block.request):
+            _read_commands(run, waiting=blocked or recovering)
+        ahead = run.block.request[now - run.block_start :]
+        request = int(ahead[0])
         # At the ends of switching periods only, so that every recovery has at least one.
         if recovering and now >= (switcher.next_event() or 0) and _is_released(run):
             recovering, request = False, FIXING
         state.counts[0] = switcher.at_tick(now, request)
-        later = requests[requests > now]
-        ends = [ticks, now + CHUNK, *later[:1]]
+        later = 1 + np.flatnonzero(ahead[1:] != NO_REQUEST)
+        ends = [now + len(ahead), now + CHUNK, *(now + later[:1])]
         if (event := switcher.next_event()) is not None:
             ends.append(event)
         count = int(min(ends)) - now
@@ -167,7 +232,7 @@ def _advance(run: Run, switcher: ModeSwitcher, progress: Progress | None) -> Non
             controller.law,
             controller.schedule,
             state,
-            block.velocity,
+            run.block.velocity,
             count,
             int(not recovering),
             int(controller.when_blocked),
@@ -185,7 +250,7 @@ def _advance(run: Run, switcher: ModeSwitcher, progress: Progress | None) -> Non
             )
         if blocked and not recovering and controller.when_blocked and not switcher.switching:
             recovering = True
-            if state.counts[1] < ticks:
+            if state.counts[1] < run.ticks:
                 state.counts[0] = switcher.at_tick(int(state.counts[1]), SWITCHING)
         if progress is not None:
             progress(float(state.counts[1] * period))
@@ -212,7 +277,9 @@ def _predict(run: Run, row: int) -> tuple[float, float]:
     held = np.tile(run.block.velocity[place], (ticks, 1))
     trial.counts[0], trial.counts[1], trial.counts[3] = row, 0, 0
     done, _ = run_ticks(run.model, law, schedule, trial, held, ticks, 1, 1, 1, run.rig, trace)
-    if 0 <= done < ticks:  # blocked: the target waits for the rest of the period
+    if done < 0:
+        return np.inf, -np.inf  # no longer finite: no mode to take
+    if done < ticks:  # blocked: the target waits for the rest of the period
         run_ticks(run.model, law, schedule, trial, held, ticks - done, 0, 0, 1, run.rig, trace)
     record_row(run.model, law, trial, run.rig, ticks, trace)
     return float(trace.cost[-1]), float(trace.margin.min())

@@ -55,7 +55,7 @@ def make_record(
     run : after its last tick; the state at the end becomes the last sample.
     wall : time that the ticks took [s].
     """
-    description, block, state, law = run.description, run.block, run.state, run.controller.law
+    description, state, law = run.description, run.state, run.controller.law
     model, period, ticks = run.model, run.controller.schedule.period, int(run.state.counts[1])
     rows = -(-ticks // run.stride) + 1
     trace = Trace(*(array[:rows] for array in run.trace))
@@ -76,7 +76,7 @@ def make_record(
     posture_points(
         model, reals(trace.base), reals(trace.phi), run.rig.work.frame, new_chain(model), np.zeros(6), points
     )
-    gripper = block.gripper[np.minimum(np.rint(time / period).astype(int), len(block.gripper) - 1)]
+    gripper = run.gripper[np.minimum(np.rint(time / period).astype(int), run.ticks - 1)]
 
     names, wheels = description.joint_names, description.wheel_names
     pairs = tuple(f"pair{i + 1}" for i in range(description.pairs))
@@ -159,7 +159,17 @@ def _summary(run: Run, scenario: Scenario, switcher: ModeSwitcher, record: Recor
         "cost_initial": float(record["cost"][0]),
         "cost_final": float(record["cost"][-1]),
         "mode_switches": switcher.switches,
-        "modes_refused": switcher.refused,
+        "modes_refused": sum(not refusal.taken for refusal in switcher.refusals),
+        "refusals": [
+            {
+                "time_s": refusal.tick * period,
+                "mode": run.controller.modes.numbers[refusal.row],
+                # JSON has no infinity: None where the predicted state is no longer finite
+                "support_margin_m": refusal.margin if np.isfinite(refusal.margin) else None,
+                "taken": refusal.taken,
+            }
+            for refusal in switcher.refusals
+        ],
         "sigma_min_min": float(record["sigma_min"].min()),
         "support_margin_min_m": float(record["support_margin"].min()),
         "support_area_initial_m2": float(record["support_area"][0]),
@@ -197,6 +207,18 @@ def _warnings(run: Run, record: Record, summary: dict[str, Any]) -> list[str]:
     if summary["tipping"]:
         share = 100.0 * float((record["support_margin"] <= 0.0).mean())
         found.append(f"the robot tips: its centre of mass is outside the support polygon for {share:.1f} % of the run")
-    if summary["modes_refused"]:
-        found.append(f"{summary['modes_refused']} times a mode was not chosen because the robot would have tipped")
+    return found + _refusal_warnings(summary["refusals"], run.controller.least_margin)
+
+
+def _refusal_warnings(refusals: list[dict[str, Any]], least_margin: float) -> list[str]:
+    """One line for every mode that was refused, and one for every mode that was taken although it tips."""
+    found = []
+    for mode, taken in dict.fromkeys((refusal["mode"], refusal["taken"]) for refusal in refusals):
+        same = [refusal for refusal in refusals if (refusal["mode"], refusal["taken"]) == (mode, taken)]
+        margin = same[0]["support_margin_m"]
+        needed = f"a support margin of more than {1e3 * least_margin:g} mm is needed, it has"
+        why = "its prediction diverges" if margin is None else f"{needed} {1e3 * margin:.1f} mm"
+        what = "taken, as no other stands better," if taken else "refused"
+        times = f" ({len(same)} times in all)" if len(same) > 1 else ""
+        found.append(f"mode {mode} was {what} at t = {same[0]['time_s']:.3f} s{times}: {why}")
     return found

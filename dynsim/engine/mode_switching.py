@@ -3,33 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
-import numpy as np
+from dynsim.model.snake import FIXING, SWITCHING, ModeTable, Policy
 
-from dynsim.model.snake import FIXING, SWITCHING, Policy
+
+class Refusal(NamedTuple):
+    """A mode that was asked for, or was a candidate, and would tip."""
+
+    tick: int
+    row: int
+    margin: float  # its support margin [m]
+    taken: bool  # all the same, because the present mode would tip more
 
 
 @dataclass
 class ModeSwitcher:
     """Fixing and switching states: follows requests, and picks a mode at every switching time t_k = t_0 + k dT.
 
-    A mode that would tip (support margin not above ``least_margin``) is refused. When every candidate would tip the
-    present mode stays.
+    Every change of mode is tested. A mode tips when its support margin is not above ``least_margin``; such a mode is
+    not taken and the present one stays. Only when the present mode tips as well, the one that tips least is taken.
 
     Attributes
     ----------
     policy : "fixed" ignores requests to switch; "cyclic" takes the next of ``order`` ([T]'s heuristic); "predictive"
         takes the one with the lowest cost after a simulated period.
-    fixing_row, order : rows of the mode table.
+    modes : table of the modes; ``fixing_row``, ``order`` and ``row`` are rows of it.
     period_ticks : dT in control periods.
     margin_now : margin_now(row) -> support margin of the present posture in a mode [m].
     predict : predict(row) -> (cost after dT, smallest support margin on the way [m]).
     row : present mode.
-    switches, refused : counts of changes of mode and of candidates refused.
+    switches : changes of mode.
+    refusals : modes that would tip, in the order they were met.
     """
 
     policy: Policy
+    modes: ModeTable
     fixing_row: int
     order: tuple[int, ...]
     period_ticks: int
@@ -40,23 +50,25 @@ class ModeSwitcher:
     switching: bool = False
     next_switch: int = 0
     switches: int = 0
-    refused: int = 0
+    refusals: list[Refusal] = field(default_factory=list)
     _place: int = 0
 
     def __post_init__(self) -> None:
         self.row = self.fixing_row
 
     def at_tick(self, tick: int, request: int) -> int:
-        """Row of the mode from this tick on; ``request`` is a row + 1, NO_REQUEST, SWITCHING or FIXING."""
+        """Row of the mode from this tick on; ``request`` is a mode number, NO_REQUEST, SWITCHING or FIXING.
+
+        A request for one mode ends the switching state, whether the mode is taken or refused.
+        """
         row = self.row
-        if request > 0:
-            row, self.switching = request - 1, False
-        elif request == FIXING:
-            row, self.switching = self.fixing_row, False
+        if request > 0 or request == FIXING:
+            row = self.fixing_row if request == FIXING else self.modes.row(request, "mode request")
+            row, self.switching = self._asked(tick, row), False
         elif request == SWITCHING and not self.switching and self.policy != "fixed":
             self.switching, self.next_switch, self._place = True, tick, 0
         if self.switching and tick >= self.next_switch:
-            row = self._cyclic() if self.policy == "cyclic" else self._predictive()
+            row = self._cyclic(tick) if self.policy == "cyclic" else self._predictive(tick)
             self.next_switch = tick + self.period_ticks
         self.switches += row != self.row
         self.row = row
@@ -66,21 +78,40 @@ class ModeSwitcher:
         """Tick of the next switching time, None in the fixing state."""
         return self.next_switch if self.switching else None
 
-    def _cyclic(self) -> int:
+    def _asked(self, tick: int, row: int) -> int:
+        if row == self.row or (margin := self.margin_now(row)) > self.least_margin:
+            return row
+        return self._least_tipping(tick, {row: margin}, self.margin_now)
+
+    def _cyclic(self, tick: int) -> int:
+        tipping: dict[int, float] = {}
         for step in range(len(self.order)):
             place = (self._place + step) % len(self.order)
-            if self.margin_now(self.order[place]) > self.least_margin:
+            row = self.order[place]
+            margin = self.margin_now(row)
+            if margin > self.least_margin:
+                self._refuse(tick, tipping)
                 self._place = (place + 1) % len(self.order)
-                return self.order[place]
-            self.refused += 1
-        return self.row
+                return row
+            tipping[row] = margin
+        return self._least_tipping(tick, tipping, self.margin_now)
 
-    def _predictive(self) -> int:
-        best, lowest = self.row, np.inf
-        for row in self.order:
-            cost, margin = self.predict(row)
-            if not margin > self.least_margin:
-                self.refused += 1
-            elif cost < lowest:
-                best, lowest = row, cost
-        return best
+    def _predictive(self, tick: int) -> int:
+        found = {row: self.predict(row) for row in self.order}
+        tipping = {row: margin for row, (_, margin) in found.items() if not margin > self.least_margin}
+        standing = {row: cost for row, (cost, _) in found.items() if row not in tipping}
+        if standing:
+            self._refuse(tick, tipping)
+            return min(standing, key=lambda row: standing[row])
+        return self._least_tipping(tick, tipping, lambda row: found[row][1] if row in found else self.predict(row)[1])
+
+    def _least_tipping(self, tick: int, tipping: dict[int, float], margin_of: Callable[[int], float]) -> int:
+        """The present mode if it stands, else the one with the largest margin; every candidate here would tip."""
+        present = margin_of(self.row)
+        best = max(tipping, key=lambda row: tipping[row])
+        taken = best if present <= self.least_margin and tipping[best] > present else self.row
+        self._refuse(tick, tipping, taken)
+        return taken
+
+    def _refuse(self, tick: int, tipping: dict[int, float], taken: int = -1) -> None:
+        self.refusals += [Refusal(tick, row, margin, row == taken) for row, margin in tipping.items()]

@@ -152,19 +152,22 @@ def smallest_singular_value(count, tolerance, lower, u, y):
     """Smallest singular value of L (count x count, lower triangular) by inverse iteration.
 
     ``u`` becomes the left singular vector, ``y`` is workspace, ``tolerance`` the relative change that ends the
-    iteration. It converges by the square of the ratio of the two smallest singular values: near a singularity, where
-    value and vector matter, in two or three steps; and when the two are close, any mixture of their vectors will do.
+    iteration. The first vector has entries of one size; their signs are chosen one by one such that y grows (Cline,
+    Moler, Stewart, Wilkinson 1979). A fixed one is orthogonal to the wanted vector at some postures, and the iteration
+    then ends at the second smallest value. It converges by the square of the ratio of the two smallest singular
+    values: near a singularity, where value and vector matter, in two or three steps; and when the two are close, any
+    mixture of their vectors will do.
     """
-    for i in range(count):
-        u[i] = 1.0 / math.sqrt(count)
     sigma = math.inf
-    for _ in range(60):
+    for iteration in range(60):
         norm = 0.0
         for i in range(count):
-            s = u[i]
+            s = 0.0
             for j in range(i):
-                s -= lower[i, j] * y[j]
-            y[i] = s / lower[i, i]
+                s += lower[i, j] * y[j]
+            if iteration == 0:
+                u[i] = -math.copysign(1.0 / math.sqrt(count), s)
+            y[i] = (u[i] - s) / lower[i, i]
             norm += y[i] * y[i]
         previous, sigma = sigma, 1.0 / math.sqrt(norm)
         norm = 0.0

@@ -48,8 +48,8 @@ class State(NamedTuple):
     w_target: np.ndarray  # (6,) w_d, integrated from the commanded velocity
     w_hat: np.ndarray  # (6,) what the controller believes of w
     phi_hat: np.ndarray  # (n_phi,) what the controller believes of phi
-    # (5,) [row of the mode in Law.grounded, ticks run, joint-ticks clamped at a limit, commands carried out, ticks in
-    # which the command could not be carried out and the target waited]
+    # (5,) [row of the mode in Law.grounded, ticks run, joint-ticks clamped at a limit, commands carried out of the
+    # present block, ticks in which the command could not be carried out and the target waited]
     counts: np.ndarray
 
 
@@ -371,8 +371,8 @@ def run_ticks(model, law, schedule, state, velocity, count, moving, stop, stride
 
     Parameters
     ----------
-    velocity : (T, 6) commanded rates of the target, one row per period of the script; zero after its end. The script
-        goes on only when its command was carried out (``state.counts[3]`` is the place).
+    velocity : (T, 6) commanded rates of the target, a block of one row per period; zero after its end. The next row is
+        taken only when the last one was carried out (``state.counts[3]`` is the place).
     count : int, control periods to run.
     moving : int, 1: follow the script; 0: the target waits.
     stop : int, 1: return after a period that was blocked.

@@ -16,7 +16,7 @@ from dynsim.kernels.snake import SnakeModel
 
 COST_ANGLES = 0  # eq 19
 COST_SUPPORT_NORM = 1  # eq 20 as printed: 1 / norm of the distances to all sides
-COST_SUPPORT_MIN = 2  # eq 20 with the distance to the nearest side
+COST_SUPPORT_MIN = 2  # eq 20 with the distance to the nearest side, smoothed
 
 
 class Cost(NamedTuple):
@@ -27,6 +27,7 @@ class Cost(NamedTuple):
     angle_weight: float  # a_1
     support_weight: float  # a_2 [m]
     distance_floor: float  # [m] distances below it count as it, so that V stays finite when the robot tips
+    smoothing: float  # [m] sides whose distances differ by less than about this count together as the nearest
 
 
 class Support(NamedTuple):
@@ -37,9 +38,11 @@ class Support(NamedTuple):
     order: np.ndarray  # (2 (n_b + 1),) sorting workspace
     hull: np.ndarray  # (2 (n_b + 1) + 1,) contacts on the hull, counter-clockwise
     distance: np.ndarray  # (2 (n_b + 1),) signed distance of the centre of mass from each side, inside > 0 [m]
+    length: np.ndarray  # (2 (n_b + 1),) of each side [m]
     centre: np.ndarray  # (3,) centre of mass [m]
     centre_slope: np.ndarray  # (n_phi, 2) of its projection, body of wheel pair 1 held [m/rad]
     slope: np.ndarray  # (n_phi,) of one distance [m/rad]
+    length_slope: np.ndarray  # (n_phi,) of the length of that side [m/rad]
 
 
 def new_support(model: SnakeModel) -> Support:
@@ -51,8 +54,10 @@ def new_support(model: SnakeModel) -> Support:
         np.zeros(contacts, dtype=np.int64),
         np.zeros(contacts + 1, dtype=np.int64),
         np.zeros(contacts),
+        np.zeros(contacts),
         np.zeros(3),
         np.zeros((joints, 2)),
+        np.zeros(joints),
         np.zeros(joints),
     )
 
@@ -130,7 +135,8 @@ def support_polygon(model, chain, grounded, support):
     for s in range(sides):
         a = support.contact[support.hull[s]]
         b = support.contact[support.hull[(s + 1) % sides]]
-        d = cross(a[0], a[1], b[0], b[1], gx, gy) / math.hypot(b[0] - a[0], b[1] - a[1])
+        support.length[s] = math.hypot(b[0] - a[0], b[1] - a[1])
+        d = cross(a[0], a[1], b[0], b[1], gx, gy) / support.length[s]
         support.distance[s] = d
         margin = min(margin, d)
     return sides, margin
@@ -177,12 +183,13 @@ def centre_slopes(model, chain, support):
 
 @kernel
 def distance_slope(model, chain, support, side, sides):
-    """Derivative of one distance d_side by every joint angle, into ``support.slope`` [m/rad]."""
+    """Derivatives of one distance d_side and of that side's length by every joint angle, into ``support.slope`` and
+    ``support.length_slope`` [m/rad]."""
     ia, ib = support.hull[side], support.hull[(side + 1) % sides]
     a, b = support.contact[ia], support.contact[ib]
     ex, ey = b[0] - a[0], b[1] - a[1]
     gx, gy = support.centre[0] - a[0], support.centre[1] - a[1]
-    length, d = math.hypot(ex, ey), support.distance[side]
+    length, d = support.length[side], support.distance[side]
     for j in range(model.head_joints + model.base_joints):
         dax, day, dbx, dby = 0.0, 0.0, 0.0, 0.0
         i = j - model.head_joints
@@ -195,7 +202,37 @@ def distance_slope(model, chain, support, side, sides):
         dgx, dgy = support.centre_slope[j, 0] - dax, support.centre_slope[j, 1] - day
         dex, dey = dbx - dax, dby - day
         numerator = dex * gy + ex * dgy - dey * gx - ey * dgx
-        support.slope[j] = (numerator - d * (ex * dex + ey * dey) / length) / length
+        support.length_slope[j] = (ex * dex + ey * dey) / length
+        support.slope[j] = (numerator - d * support.length_slope[j]) / length
+
+
+@kernel
+def nearness(support, side, smoothing, margin):
+    """exp(-(d_side - margin) / s): one for the nearest side, next to nothing for sides that are s and more farther."""
+    return math.exp(-(support.distance[side] - margin) / smoothing)
+
+
+@kernel
+def smooth_margin(support, sides, smoothing, margin):
+    """Smoothed smallest distance: margin - s ln sum_i (L_i / L) exp(-(d_i - margin) / s), L = sum of the lengths L_i.
+
+    The gradient of the minimum itself jumps where two sides are equally near, and a robot that follows it is thrown
+    to and fro between them. Weighted by length, a side that is split by a new corner of the hull counts as before.
+
+    Returns
+    -------
+    distance : float
+        Not below ``margin`` [m].
+    total : float
+        sum_i L_i exp(...) [m].
+    perimeter : float
+        L [m].
+    """
+    total, perimeter = 0.0, 0.0
+    for s in range(sides):
+        total += support.length[s] * nearness(support, s, smoothing, margin)
+        perimeter += support.length[s]
+    return margin - smoothing * math.log(total / perimeter), total, perimeter
 
 
 @kernel
@@ -208,6 +245,8 @@ def cost_value(cost, phi, sides, support, margin):
         return V
     V *= cost.angle_weight
     if cost.kind == COST_SUPPORT_MIN:
+        if sides > 0:
+            margin = smooth_margin(support, sides, cost.smoothing, margin)[0]
         return V + cost.support_weight / max(margin, cost.distance_floor)
     total = 0.0
     for s in range(sides):
@@ -232,19 +271,21 @@ def cost_gradient(model, cost, chain, phi, grounded, support, gradient):
     if sides == 0:
         return
     centre_slopes(model, chain, support)
-    nearest, total = 0, 0.0
+    if cost.kind == COST_SUPPORT_MIN:
+        near, total, perimeter = smooth_margin(support, sides, cost.smoothing, margin)
+        factor = -cost.support_weight / max(near, cost.distance_floor) ** 2
+        for s in range(sides):
+            distance_slope(model, chain, support, s, sides)
+            share = nearness(support, s, cost.smoothing, margin) / total
+            by_distance, by_length = share * support.length[s], cost.smoothing * (1.0 / perimeter - share)
+            for j in range(phi.shape[0]):
+                gradient[j] += factor * (by_distance * support.slope[j] + by_length * support.length_slope[j])
+        return
+    total = 0.0
     for s in range(sides):
         total += support.distance[s] ** 2
-        if support.distance[s] < support.distance[nearest]:
-            nearest = s
     norm = max(math.sqrt(total), cost.distance_floor)
     for s in range(sides):
-        if cost.kind == COST_SUPPORT_NORM:
-            factor = -cost.support_weight * support.distance[s] / norm**3
-        elif s == nearest:
-            factor = -cost.support_weight / max(margin, cost.distance_floor) ** 2
-        else:
-            continue
         distance_slope(model, chain, support, s, sides)
         for j in range(phi.shape[0]):
-            gradient[j] += factor * support.slope[j]
+            gradient[j] -= cost.support_weight * support.distance[s] / norm**3 * support.slope[j]

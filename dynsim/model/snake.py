@@ -24,7 +24,7 @@ from dynsim.kernels.snake_plant import Schedule
 
 Policy = Literal["fixed", "cyclic", "predictive"]
 
-# Mode requests of an operator; k > 0 asks for row k - 1 of the mode table.
+# Mode requests of an operator; a positive one is the number of a mode.
 NO_REQUEST, SWITCHING, FIXING = 0, -1, -2
 # A singular value below this part of the largest one is a lost rank, not just a small value.
 SINGULAR = 1e-9
@@ -143,7 +143,7 @@ class CommandBlock(NamedTuple):
     """Commands of T control periods.
 
     velocity : (T, 6) mean rate of the target x, y, z [m/s], alpha, beta, gamma [rad/s] in each period
-    request : (T,) mode request at its beginning: NO_REQUEST, SWITCHING, FIXING, or row of the mode table + 1
+    request : (T,) mode request at its beginning: NO_REQUEST, SWITCHING, FIXING, or a mode number
     gripper : (T,) 1 closed (hardened), 0 open (soft)
     """
 
@@ -152,11 +152,40 @@ class CommandBlock(NamedTuple):
     gripper: NDArray[np.int64]
 
 
+class Feedback(NamedTuple):
+    """What an operator sees of the robot at the beginning of a control period.
+
+    time : [s]
+    w, w_target : (6,) pose of the controlled point, and its target [m, rad]
+    base_pose : (3,) x [m], y [m], yaw [rad]
+    phi : (n_phi,) [rad]
+    mode : number of the present mode
+    waiting : the last command was not carried out, the target waits
+    """
+
+    time: float
+    w: NDArray[np.float64]
+    w_target: NDArray[np.float64]
+    base_pose: NDArray[np.float64]
+    phi: NDArray[np.float64]
+    mode: int
+    waiting: bool
+
+
 class CommandSource(Protocol):
     """What a scripted list and a joystick have in common."""
 
-    def read(self, first: int, count: int, period: float) -> CommandBlock:
-        """Commands of control periods ``first`` .. ``first + count - 1``, each ``period`` seconds long."""
+    def read(self, first: int, count: int, period: float, feedback: Feedback) -> CommandBlock:
+        """Commands from control period ``first`` on, as far as they are known now: of 1 to ``count`` periods.
+
+        The engine asks again when they are used up. A script answers with ``count``, a joystick with one.
+
+        Parameters
+        ----------
+        first, count : the present period (from 0) and how many are left
+        period : their length [s]
+        feedback : state at the beginning of period ``first``
+        """
         ...
 
 

@@ -34,9 +34,9 @@ class Config(StrictConfig):
     level: Literal["kinematic"] = "kinematic"
     yaw_joints: int = Field(9, ge=2, le=200, description="n: yaw joints of the whole robot")
     head_joints: int = Field(6, ge=0, description="n_h: joints of the raised head part, yaw, pitch, yaw, ..., even")
-    link_length: Positive = Field(0.0905, description="l [m], between neighbouring joint axes")
-    wheel_radius: Positive = Field(0.05, description="r [m]")
-    wheel_gap: Positive | list[Positive] | None = Field(
+    link_length_m: Positive = Field(0.0905, description="l [m], between neighbouring joint axes")
+    wheel_radius_m: Positive = Field(0.05, description="r [m]")
+    wheel_gap_m: Positive | list[Positive] | None = Field(
         None,
         description="distance between the wheels of a pair [m]: one for all, or one per pair of the base part. "
         "Default (assumed): 0.15 m for pairs 1, 3, 5, which carry batteries, and 0.12 m for the others",
@@ -45,12 +45,12 @@ class Config(StrictConfig):
         None, description="side of the active wheel of each pair. Default (assumed): left, right, left, ..."
     )
     limits_deg: Limits = Field(default_factory=Limits)
-    gripper_length: NonNegative = Field(0.09, description="gripper tip ahead of the head point [m] ([T] IV.B)")
-    mass: Positive = Field(10.0, description="of the whole robot [kg], spread evenly over its links (assumed)")
+    gripper_length_m: NonNegative = Field(0.09, description="gripper tip ahead of the head point [m] ([T] IV.B)")
+    mass_kg: Positive = Field(10.0, description="of the whole robot [kg], spread evenly over its links (assumed)")
     controlled_point: Literal["head", "gripper"] = Field(
         "head", description="head point ([T] V.A) or gripper tip ([T] V.D)"
     )
-    initial_joints: list[float] | None = Field(
+    initial_joints_rad: list[float] | None = Field(
         None,
         description="theta_1, psi_1, ... [rad] at t = 0, the base's yaw joints may be left out when zero. Default: "
         "[T] V.A, where it fits",
@@ -83,10 +83,10 @@ def build(config: Config) -> SnakeDescription:
         raise ModelError(f"plant: yaw_joints = {n} and head_joints = {n_h} leave no base part (n_b = {n_b})")
     pairs, joints = n_b + 1, n_h + n_b
 
-    gap = config.wheel_gap
+    gap = config.wheel_gap_m
     if gap is None:
         gap = [0.15 if i in (0, 2, 4) else 0.12 for i in range(pairs)]
-    gaps = _per_pair("wheel_gap", gap, pairs)
+    gaps = _per_pair("wheel_gap_m", gap, pairs)
     side = config.driven_side
     if side is None:
         side = ["left" if i % 2 == 0 else "right" for i in range(pairs)]
@@ -103,37 +103,37 @@ def build(config: Config) -> SnakeDescription:
     names = tuple(f"{'psi' if j % 2 else 'theta'}{j // 2 + 1}" for j in range(n_h))
     names += tuple(f"theta{n_h // 2 + i + 1}" for i in range(n_b))
 
-    given = config.initial_joints
+    given = config.initial_joints_rad
     if given is None:
         # [T] V.A; a head part of another length starts with a similar S that keeps the head level
         given = [0.0, -0.8, 0.0, -1.1, 0.0, 1.9] if n_h == 6 else [0.0, 0.0] * (n_h // 2 - 2) + [0.0, -0.8, 0.0, 0.8]
     if len(given) not in (n_h, joints):
         raise ModelError(
-            f"plant.initial_joints has {len(given)} angles; give n_h = {n_h} (base straight) or all {joints}: "
+            f"plant.initial_joints_rad has {len(given)} angles; give n_h = {n_h} (base straight) or all {joints}: "
             f"{', '.join(names)}"
         )
     initial = np.concatenate([given, np.zeros(joints - len(given))])
     for name, angle, limit in zip(names, initial, upper, strict=True):
         if abs(angle) > limit:
             raise ModelError(
-                f"plant.initial_joints: {name} = {angle:.4f} rad is beyond its limit of {limit:.4f} rad "
+                f"plant.initial_joints_rad: {name} = {angle:.4f} rad is beyond its limit of {limit:.4f} rad "
                 f"({np.rad2deg(limit):g} deg, plant.limits_deg)"
             )
     links = n_h + 2 * n_b
     return SnakeDescription(
         head_joints=n_h,
         base_joints=n_b,
-        link_length=config.link_length,
-        wheel_radius=config.wheel_radius,
-        gripper_length=config.gripper_length,
-        point_offset=config.gripper_length if config.controlled_point == "gripper" else 0.0,
+        link_length=config.link_length_m,
+        wheel_radius=config.wheel_radius_m,
+        gripper_length=config.gripper_length_m,
+        point_offset=config.gripper_length_m if config.controlled_point == "gripper" else 0.0,
         joint_names=names,
         pitch=pitch,
         lower=-upper,
         upper=upper,
         half_track=np.array(gaps) / 2.0,
         driven_side=driven_side,
-        link_mass=np.full(links, config.mass / links),
+        link_mass=np.full(links, config.mass_kg / links),
         initial_joints=initial,
         initial_base_pose=np.array(config.initial_base_pose),
     )

@@ -14,15 +14,15 @@ MODES = ModeTable.from_lifted(TABLE_II, 7)
 PATHS = [
     Ramp(type="ramp", start_s=0.33, duration_s=1.0, displacement=(0.2, -0.1, 0, 0, 0.3, 0)),
     Ramp(type="ramp", start_s=0.33, duration_s=1.0, displacement=(0.2, -0.1, 0, 0, 0.3, 0), profile="smooth"),
-    Circle(type="circle", duration_s=2.0, radius=0.3, turns=0.7),
-    Circle(type="circle", duration_s=2.0, radius=0.3, turns=-0.7, backward=True),
-    Circle(type="circle", duration_s=2.0, radius=0.3, turns=1.0, plane="yz"),
-    DoorArc(type="door_arc", duration_s=2.0, radius=0.4, angle_deg=40, hinge="right", opening="push"),
+    Circle(type="circle", duration_s=2.0, radius_m=0.3, turns=0.7),
+    Circle(type="circle", duration_s=2.0, radius_m=0.3, turns=-0.7, backward=True),
+    Circle(type="circle", duration_s=2.0, radius_m=0.3, turns=1.0, plane="yz"),
+    DoorArc(type="door_arc", duration_s=2.0, radius_m=0.4, angle_deg=40, hinge="right", opening="push"),
 ]
 
 
 def source(*commands, paths=()):
-    return ScriptedSource([Command(**c) for c in commands], list(paths), MODES)
+    return ScriptedSource([Command(**c) for c in commands], list(paths))
 
 
 @pytest.mark.parametrize("path", PATHS)
@@ -36,7 +36,7 @@ def test_velocities_integrate_to_the_path_exactly(path):
 @pytest.mark.parametrize(("turns", "backward"), [(1, False), (-1, False), (1, True), (-1, True)])
 def test_circle_keeps_the_head_tangent(turns, backward):
     s = np.linspace(0, 1, 2001)
-    offset = Circle(type="circle", duration_s=1, radius=0.5, turns=turns, backward=backward).offset(s)
+    offset = Circle(type="circle", duration_s=1, radius_m=0.5, turns=turns, backward=backward).offset(s)
     rate = np.gradient(offset, s, axis=0)
     along = np.stack([np.cos(offset[:, 5]), np.sin(offset[:, 5])], axis=1) * (-1 if backward else 1)
     speed = np.linalg.norm(rate[:, :2], axis=1)
@@ -47,7 +47,7 @@ def test_circle_keeps_the_head_tangent(turns, backward):
 
 @pytest.mark.parametrize(("hinge", "opening"), [(h, o) for h in ("left", "right") for o in ("pull", "push")])
 def test_door_arc_is_a_rigid_turn_about_the_hinge(hinge, opening):
-    offset = DoorArc(type="door_arc", duration_s=1, radius=0.4, hinge=hinge, opening=opening).offset(
+    offset = DoorArc(type="door_arc", duration_s=1, radius_m=0.4, hinge=hinge, opening=opening).offset(
         np.linspace(0, 1, 9)
     )
     pivot = np.array([0.0, 0.4 if hinge == "left" else -0.4])
@@ -68,13 +68,13 @@ def test_command_list():
     np.testing.assert_array_equal(np.flatnonzero(block.velocity[:, 0]), np.arange(10, 30))
     np.testing.assert_array_equal(np.flatnonzero(block.gripper), np.arange(20, 100))
     assert block.request[30] == SWITCHING
-    assert MODES.numbers[block.request[40] - 1] == 3
+    assert block.request[40] == 3
     assert block.request[50] == FIXING
     assert np.count_nonzero(block.request) == 3
 
 
 def test_reading_piece_by_piece_is_reading_at_once():
-    """What a joystick will do: one period at a time through the same interface."""
+    """The answer does not depend on how far it is asked for."""
     commands = (
         {"at_s": 0.1, "velocity": (0.1, 0, 0, 0, 0, 0)},
         {"at_s": 0.31, "mode": "switching", "gripper": "closed"},
@@ -88,8 +88,6 @@ def test_reading_piece_by_piece_is_reading_at_once():
 def test_bad_scripts_are_refused():
     with pytest.raises(ValidationError, match="order of their at_s"):
         Script(commands=[{"at_s": 2.0}, {"at_s": 1.0}])
-    with pytest.raises(ModelError, match="no mode 9"):
-        source({"at_s": 0.0, "mode": 9}).read(0, 1, 0.01)
     with pytest.raises(ModelError, match="pair 8"):
         ModeTable.from_lifted({1: [8]}, 7)
     with pytest.raises(ModelError, match="empty"):
@@ -100,6 +98,7 @@ def switcher(policy, margins=None, costs=None, order=(1, 2, 3)):
     margins, costs = margins or {}, costs or {}
     return ModeSwitcher(
         policy=policy,
+        modes=MODES,
         fixing_row=0,
         order=order,
         period_ticks=10,
@@ -120,19 +119,63 @@ def test_cyclic_order_and_return_to_the_fixing_state():
     assert modes.switches == 6
 
 
+def refused(modes):
+    return [(r.tick, r.row, r.margin) for r in modes.refusals if not r.taken]
+
+
 def test_a_mode_that_would_tip_is_passed_over():
     modes = switcher("cyclic", margins={2: -0.01})
     assert drive(modes, 30, {0: SWITCHING}) == [1] * 10 + [3] * 10 + [1] * 10
-    assert modes.refused == 1
-    nothing_stands = switcher("cyclic", margins=dict.fromkeys((1, 2, 3), -1.0))
-    assert drive(nothing_stands, 5, {0: SWITCHING}) == [0] * 5
+    assert refused(modes) == [(10, 2, -0.01)]
+
+
+@pytest.mark.parametrize("policy", ["cyclic", "predictive"])
+def test_the_present_mode_stays_when_every_candidate_tips(policy):
+    modes = switcher(policy, margins={1: -3.0, 2: -1.0, 3: -2.0})
+    assert drive(modes, 12, {0: SWITCHING}) == [0] * 12
+    assert refused(modes) == [(t, row, m) for t in (0, 10) for row, m in ((1, -3.0), (2, -1.0), (3, -2.0))]
+    assert modes.switches == 0
+
+
+@pytest.mark.parametrize("policy", ["cyclic", "predictive"])
+def test_when_the_present_mode_tips_too_the_least_tipping_one_is_taken(policy):
+    modes = switcher(policy, margins={0: -2.0, 1: -3.0, 2: -1.0, 3: -2.5})
+    assert drive(modes, 3, {0: SWITCHING}) == [2] * 3
+    assert [r.row for r in modes.refusals if r.taken] == [2]
+    assert [row for _, row, _ in refused(modes)] == [1, 3]
 
 
 def test_prediction_takes_the_lowest_cost_that_stands():
     assert drive(switcher("predictive", costs={1: 4.0, 2: 1.0, 3: 3.0}), 3, {0: SWITCHING}) == [2] * 3
     tipping = switcher("predictive", costs={1: 4.0, 2: 1.0, 3: 3.0}, margins={2: 0.0})
     assert drive(tipping, 3, {0: SWITCHING}) == [3] * 3
-    assert tipping.refused == 1
+    assert refused(tipping) == [(0, 2, 0.0)]
+
+
+def test_a_mode_asked_for_by_number_is_refused_when_it_would_tip():
+    modes = switcher("fixed", margins={2: -0.02})
+    assert drive(modes, 8, {2: 2, 4: 3, 6: 4}) == [0, 0, 1, 1, 1, 1, 3, 3]  # request = row + 1
+    assert refused(modes) == [(4, 2, -0.02)]
+
+
+def test_the_return_to_the_fixing_mode_is_refused_when_it_would_tip():
+    """The switching state ends all the same: the operator wants no more changes."""
+    modes = switcher("cyclic", margins={0: -0.02})
+    assert drive(modes, 30, {0: SWITCHING, 12: FIXING}) == [1] * 10 + [2] * 20
+    assert refused(modes) == [(12, 0, -0.02)]
+    assert modes.next_event() is None
+
+
+def test_a_request_is_carried_out_when_the_present_mode_tips_more():
+    modes = switcher("fixed", margins={0: -0.05, 1: -0.02, 2: -0.03})
+    assert drive(modes, 6, {1: 2, 3: 3}) == [0, 1, 1, 1, 1, 1]
+    assert [(r.tick, r.row, r.taken) for r in modes.refusals] == [(1, 1, True), (3, 2, False)]
+
+
+def test_asking_for_the_present_mode_is_no_change():
+    modes = switcher("fixed", margins={0: -0.05})
+    assert drive(modes, 3, {1: 1, 2: FIXING}) == [0] * 3
+    assert modes.refusals == []
 
 
 def test_fixed_policy_ignores_requests_to_switch_but_obeys_a_mode_number():

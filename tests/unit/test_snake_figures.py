@@ -1,5 +1,7 @@
 """Figures of a snake run: files are written and readable (what they look like is for eyes)."""
 
+import csv
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -8,7 +10,7 @@ from dynsim.engine import simulate
 from dynsim.figures import snake as figures
 from dynsim.record import Record
 from dynsim.scenario import load_scenario
-from dynsim.studies.tanaka2019 import TABLE_III, table_iii
+from dynsim.studies.tanaka2019 import TABLE_III, table_iii, tables
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +33,7 @@ def test_draw_writes_every_figure_from_a_record_on_disk(record, tmp_path, monkey
 
 def test_comparison(record, tmp_path):
     written = figures.draw_comparison({"a": record, "b": record}, tmp_path)
-    assert [path.name for path in written] == ["comparison.png", "final_postures.png"]
+    assert [path.name for path in written] == ["comparison.png", "postures.png"]
     assert all(path.stat().st_size > 10_000 for path in written)
 
 
@@ -43,3 +45,53 @@ def test_table_iii_sets_measured_and_simulated_side_by_side(simulated, tmp_path)
     assert float(rows[8][3]) == pytest.approx(0.1, abs=1e-6)
     written = figures.draw_comparison(records, tmp_path)
     assert {"table_iii.csv", "table_iii.png"} <= {path.name for path in written}
+
+
+JOINT_LIMITS = ("fixed", "cyclic", "predictive", "eq20", "eq20_min")
+
+
+def test_what_the_paper_says_of_figures_8_to_10_and_16_beside_what_was_simulated(simulated, tmp_path):
+    records = {variant: simulated("snake_joint_limits", variant) for variant in JOINT_LIMITS}
+    written = figures.draw_comparison(records, tmp_path)
+    expected = {"joint_limits.csv", "policies.csv", "fig_9.png", "fig_10.png", "fig_8_and_16.png", "policies.png"}
+    assert expected <= {path.name for path in written}
+    rows = list(csv.reader((tmp_path / "joint_limits.csv").read_text().splitlines()))
+    assert {len(row) for row in rows} == {5}
+    by_what = {(row[1], row[3]): row for row in rows}
+    error = by_what["position error of the head, largest [mm]", "cyclic"]
+    assert error[2] == "about 30"
+    assert float(error[4]) < 1e-3
+    # the wheels of every mode that was used are those of Table II
+    wheels = by_what["lifted pairs of every mode that was used", "cyclic"]
+    assert wheels[4].replace("mode ", "") == wheels[2].replace("mode ", "")
+    area = [float(by_what["area of the support polygon [m^2], end", v][4]) for v in ("cyclic", "eq20_min")]
+    assert area[1] > area[0]
+
+
+def test_policies_side_by_side(simulated):
+    records = {variant: simulated("snake_joint_limits", variant) for variant in JOINT_LIMITS}
+    rows = {row[0]: row[1:] for row in tables("snake_joint_limits", records)["policies"]}
+    assert rows[""] == ["fixed", "cyclic", "predictive"]
+    assert rows["mode switches"] == [str(records[p].summary["mode_switches"]) for p in rows[""]]
+    assert rows["modes"][:2] == ["1", "1" + " 2 3 4 5 6" * 4]
+
+
+def test_the_door_of_figure_14(simulated, tmp_path):
+    records = {variant: simulated("snake_door_arc", variant) for variant in ("pull", "pull_switching")}
+    written = figures.draw_comparison(records, tmp_path)
+    assert {"door.csv", "fig_14.png"} <= {path.name for path in written}
+    rows = list(csv.reader((tmp_path / "door.csv").read_text().splitlines()))
+    opened = {row[3]: float(row[4]) for row in rows if row[1] == "opened to [deg]"}
+    assert opened["pull"] < 20 < 25 == opened["pull_switching"]
+
+
+def test_the_pick_up_of_figure_13(simulated, tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "FRAMES", 2)
+    written = figures.draw(simulated("snake_operator", None), tmp_path)
+    assert "fig_13.png" in {path.name for path in written}
+
+
+def test_variants_that_the_paper_does_not_have_get_no_tables(record):
+    assert tables("snake_joint_limits", {"a": record}) == {}
+    assert tables("snake_positioning", {"a": record}) == {}
+    assert tables("mine", {"cyclic": record}) == {}

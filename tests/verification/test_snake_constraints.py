@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_snakes import robots
 
 from dynsim.errors import ModelError
 from dynsim.kernels.jit import integers, reals
@@ -14,27 +15,6 @@ from dynsim.kernels.snake import active_rows, constraint_matrices, new_chain, po
 from dynsim.plants.snake import Config, build
 
 seeds = st.integers(0, 2**32 - 1)
-
-
-@st.composite
-def robots(draw):
-    n_h = draw(st.sampled_from([4, 6, 8]))
-    n_b = draw(st.integers(2, 7))
-    side = st.sampled_from(["left", "right", "none"])
-    sides = draw(st.lists(side, min_size=n_b + 1, max_size=n_b + 1))
-    size = st.floats(0.02, 0.4)
-    return build(
-        Config(
-            yaw_joints=n_b + n_h // 2,
-            head_joints=n_h,
-            link_length=draw(size),
-            wheel_radius=draw(size),
-            wheel_gap=draw(st.lists(size, min_size=n_b + 1, max_size=n_b + 1)),
-            driven_side=sides,
-            gripper_length=draw(size),
-            controlled_point=draw(st.sampled_from(["head", "gripper"])),
-        )
-    )
 
 
 def rotation(axis, angle):
@@ -140,9 +120,9 @@ def test_pose_from_the_base_and_chain_from_the_pose_agree(robot, seed):
         ({"head_joints": 5}, "even"),
         ({"yaw_joints": 3, "head_joints": 6}, "no base part"),
         ({"yaw_joints": 4, "head_joints": 6, "driven_side": "none"}, "eq 16"),
-        ({"wheel_gap": [0.1, 0.2]}, "7 wheel pairs"),
-        ({"initial_joints": [1.2, 0, 0, 0, 0, 0]}, "beyond its limit"),
-        ({"initial_joints": [0.0]}, "initial_joints has 1"),
+        ({"wheel_gap_m": [0.1, 0.2]}, "7 wheel pairs"),
+        ({"initial_joints_rad": [1.2, 0, 0, 0, 0, 0]}, "beyond its limit"),
+        ({"initial_joints_rad": [0.0]}, "initial_joints_rad has 1"),
     ],
 )
 def test_impossible_robots_are_refused_with_the_reason(settings, reason):

@@ -22,9 +22,9 @@ def case(random, **options):
     """Robot of random geometry, controller of random weights, and a random posture well away from the limits."""
     plant = snake.build(
         snake.Config(
-            link_length=random.uniform(0.05, 0.15),
-            wheel_radius=random.uniform(0.03, 0.08),
-            wheel_gap=random.uniform(0.08, 0.2, 7).tolist(),
+            link_length_m=random.uniform(0.05, 0.15),
+            wheel_radius_m=random.uniform(0.03, 0.08),
+            wheel_gap_m=random.uniform(0.08, 0.2, 7).tolist(),
             driven_side=random.choice(["left", "right"], 7).tolist(),
             controlled_point=str(random.choice(["head", "gripper"])),
         )
@@ -115,7 +115,7 @@ def test_joint_rates_do_not_depend_on_wheel_side_or_track_as_wheel_weights_vanis
     for weight in (1e-2, 1e-6, 1e-8):
         rates = []
         for side, gap in zip(sides, gaps, strict=True):
-            plant = snake.build(snake.Config(driven_side=side, wheel_gap=gap))
+            plant = snake.build(snake.Config(driven_side=side, wheel_gap_m=gap))
             config = task_space.Config(weight_wheel=weight, limit_policy="none", damping_sigma=0.0)
             law = task_space.build(config, plant).law
             rates.append(evaluate(plant.arrays(), law, phi, np.zeros(3), np.zeros(6), velocity, row, 0.1)[1].u[:12])
@@ -137,6 +137,21 @@ def test_ranks_at_random_postures(seed, row):
     _, work = evaluate(model, law, phi, np.zeros(3), np.zeros(6), np.zeros(6), row, 0.0)
     # inverse iteration stops at a relative change of 1e-6; clustered values leave a mixture, not an error
     assert sigma_min(model, law, work, law.grounded[row]) == pytest.approx(found.sigma_min_B, rel=1e-3)
+
+
+def test_smallest_singular_value_of_every_sample(simulated):
+    """Along a motion the smallest singular vector turns and is orthogonal to any fixed one somewhere: no sample may
+    show the second smallest value instead. Singular values by numpy."""
+    record = simulated("snake_operator", None)
+    plant = snake.build(snake.Config(controlled_point="gripper"))
+    controller = task_space.build(task_space.Config(), plant)
+    model, numbers = plant.arrays(), controller.modes.numbers
+    dense = [
+        conditioning(model, controller.law, numbers.index(mode), base, phi).sigma_min_B
+        for mode, base, phi in zip(record["mode"], record["base_pose"], record["phi"], strict=True)
+    ]
+    # The iteration ends at a relative change of 1e-6; where the two smallest are within 3 %, it is then 1e-3 off.
+    np.testing.assert_allclose(record["sigma_min"], dense, rtol=5e-3)
 
 
 def test_singularity_is_of_B_where_psi2_and_psi3_make_a_right_angle():
@@ -193,14 +208,15 @@ def test_allocation_keeps_joints_within_limits_without_head_error(seed, row):
     [
         # physics: with a shape controllable point n_h = 4 leaves three free head joints for four rows
         ({"head_joints": 4, "yaw_joints": 8}, {}, r"eq 1"),
-        ({}, {"shape_points": {"psi1": -0.8, "psi2": -1.1, "psi3": 1.9}}, r"free"),
+        ({}, {"shape_points_rad": {"psi1": -0.8, "psi2": -1.1, "psi3": 1.9}}, r"free"),
         ({"driven_side": "none"}, {"modes": {1: [1, 2, 3, 4, 5]}, "switching": {"order": [1]}}, "eq 16"),
-        ({}, {"modes": {1: []}, "switching": {"order": [1]}, "shape_points": {"psi3": 1.9, "theta3": 0, "theta4": 0}},
+        ({}, {"modes": {1: []}, "switching": {"order": [1]},
+              "shape_points_rad": {"psi3": 1.9, "theta3": 0, "theta4": 0}},
          "more rows than inputs"),
         # psi2 and psi3 both fixed: one pitch joint for height and pitch of a head without roll
-        ({}, {"shape_points": {"psi2": -1.1, "psi3": 1.9}}, "initial posture is singular"),
-        ({}, {"shape_points": {"psi9": 0.0}}, "no joint 'psi9'"),
-        ({}, {"shape_points": {"psi3": 2.0}}, "beyond its limit"),
+        ({}, {"shape_points_rad": {"psi2": -1.1, "psi3": 1.9}}, "initial posture is singular"),
+        ({}, {"shape_points_rad": {"psi9": 0.0}}, "no joint 'psi9'"),
+        ({}, {"shape_points_rad": {"psi3": 2.0}}, "beyond its limit"),
         ({}, {"modes": {1: [8]}}, "pair 8"),
         ({}, {"fixing_mode": 7}, "no mode 7"),
         ({}, {"gain": [2.0, 2.0]}, "7 are needed"),
@@ -215,4 +231,4 @@ def test_what_cannot_be_controlled_is_refused_with_the_reason(plant, controller,
 def test_four_head_joints_are_enough_without_shape_points():
     """[T] eq 1 itself: n_h = 4 is controllable as long as no shape controllable point is used."""
     plant = snake.build(snake.Config(head_joints=4, yaw_joints=8))
-    assert task_space.build(task_space.Config(shape_points={}), plant).law.shape_joints.size == 0
+    assert task_space.build(task_space.Config(shape_points_rad={}), plant).law.shape_joints.size == 0

@@ -9,17 +9,18 @@ import textwrap
 import numpy as np
 import pytest
 
-from dynsim.engine import simulate
+from dynsim.engine import kinematic, simulate
 from dynsim.engine.kinematic_record import attitude, attitude_distance
-from dynsim.errors import ScenarioError
+from dynsim.errors import ModelError, ScenarioError
 from dynsim.kernels import snake as snake_kernels
 from dynsim.kernels import snake_control, snake_plant, snake_support
+from dynsim.model.snake import NO_REQUEST, SWITCHING, CommandBlock
 from dynsim.scenario import Scenario, ScenarioConfig, load_scenario
 
 GAMMA = {"type": "ramp", "start_s": 0.1, "duration_s": 1.0, "displacement": [0.02, 0.03, -0.03, 0.1, 0.1, 0.3]}
 
 
-def run(duration_s=2.0, rate_hz=100, plant=None, **controller):
+def scenario(duration_s=2.0, rate_hz=100, plant=None, **controller):
     config = ScenarioConfig.model_validate(
         {
             "name": "test",
@@ -29,7 +30,11 @@ def run(duration_s=2.0, rate_hz=100, plant=None, **controller):
             "record": {"rate_hz": rate_hz},
         }
     )
-    return simulate(Scenario("test", "", config))
+    return Scenario("test", "", config)
+
+
+def run(*args, **settings):
+    return simulate(scenario(*args, **settings))
 
 
 @pytest.mark.parametrize(("rates_at", "order"), [("start", 1), ("middle", 2)])
@@ -59,6 +64,26 @@ def test_wheels_roll_without_slip():
     assert record.summary["slip_max_m_s"] < 1e-4
 
 
+def test_motion_does_not_depend_on_wheel_side_or_track_as_wheel_weights_vanish():
+    """A whole run with mode switching: other sides and gaps turn the wheels otherwise, the robot moves the same.
+
+    The margin is a matter of the track, so no mode may be refused and the cost is that of the angles.
+    """
+    other = {"driven_side": ["right", "right", "left", "left", "right", "left", "left"], "wheel_gap_m": 0.1}
+    commands = [{"at_s": 0.3, "mode": "switching"}]
+    difference = []
+    for weight in (1e-2, 1e-4, 1e-6):
+        settings = {"weight_wheel": weight, "paths": [GAMMA], "commands": commands, "switching": {"period_s": 0.3}}
+        records = [run(plant=plant, **settings) for plant in ({}, other)]
+        assert records[0].summary["mode_switches"] > 3
+        assert np.abs(records[0]["rho"] - records[1]["rho"]).max() > 0.1
+        motions = [np.hstack([record["phi"], record["base_pose"]]) for record in records]
+        difference.append(np.abs(motions[0] - motions[1]).max())
+    # proportional to the weight: a hundredth each time (a factor of two is left for the second order)
+    assert difference[1] < 2e-2 * difference[0]
+    assert difference[2] < 2e-2 * difference[1]
+
+
 def test_substeps_of_the_plant_change_nothing_but_rounding_of_the_base():
     """Runge-Kutta 4 over 5 ms is already converged: its error is far below that of the held rates."""
     one, four = (run(paths=[GAMMA], plant_substeps=n) for n in (1, 4))
@@ -72,6 +97,21 @@ def test_states_agree_when_nothing_disturbs(state):
     assert record.summary["final_position_error_m"] < 1e-6
     assert record.summary["final_attitude_error_rad"] < 1e-6
     np.testing.assert_allclose(record["w_estimate"], record["w"], atol=1e-6)
+
+
+@pytest.mark.parametrize("state", ["measured", "estimated", "feedforward"])
+def test_what_is_integrated_is_never_corrected(state):
+    """From the zigzag joints are clamped and the head goes off by millimetres: only the measured state notices."""
+    overrides = {"controller.state": state, "duration_s": 2.0}
+    record = simulate(load_scenario("snake_joint_limits", "saturate", overrides))
+    assert record.summary["clamped_joint_ticks"] > 0
+    # without the last sample: no control period begins there, and nothing is measured
+    off = np.abs(record["w_estimate"] - record["w"])[:-1].max(axis=0)
+    if state == "measured":
+        assert off.max() == 0.0
+    else:
+        assert off[[0, 1]].max() > 1e-3
+        np.testing.assert_allclose(off[2:5], 0.0, atol=1e-9)
 
 
 def test_only_measurement_removes_an_error_that_joints_cannot_show():
@@ -88,7 +128,7 @@ def test_only_measurement_removes_an_error_that_joints_cannot_show():
 def test_the_target_waits_instead_of_breaking_a_limit():
     """Driven backward the robot jack-knifes; with the allocating policy the head stays where its target waits."""
     back = {"type": "ramp", "start_s": 0.1, "duration_s": 6.0, "displacement": [-0.6, 0, 0, 0, 0, 0]}
-    kink = {"initial_joints": [0, -0.8, 0, -1.1, 0, 1.9, 0.2, -0.1] + [0.0] * 4}
+    kink = {"initial_joints_rad": [0, -0.8, 0, -1.1, 0, 1.9, 0.2, -0.1] + [0.0] * 4}
     summary = run(paths=[back], plant=kink, duration_s=10.0).summary
     assert summary["waiting_s"] > 1.0
     assert summary["joint_limit_violation_max_rad"] == 0.0
@@ -97,6 +137,156 @@ def test_the_target_waits_instead_of_breaking_a_limit():
     assert summary["attitude_error_max_rad"] < 1e-4
     without = run(paths=[back], plant=kink, duration_s=10.0, limit_policy="none").summary
     assert without["joint_limit_violation_max_rad"] > 0.1
+
+
+# Head stretched out to the left, base curled to the left: lifting its middle leaves the centre of mass outside.
+CURLED = {"initial_joints_rad": [0.6, -0.2, 0.6, -0.2, 0.9, 0.4] + [1.1] * 6}
+HELD = {"shape_points_rad": {"psi3": 0.4}, "null_gain": 0.0}
+
+
+@pytest.mark.parametrize("request_mode", [3, 4])
+def test_a_mode_that_would_tip_the_robot_is_refused(request_mode):
+    """Modes 3 and 4 lift pairs 4 to 6 of the curled base; the robot keeps mode 1, says so, and does not tip."""
+    record = run(plant=CURLED, commands=[{"at_s": 0.5, "mode": request_mode}], **HELD)
+    (refusal,) = record.summary["refusals"]
+    assert (refusal["time_s"], refusal["mode"], refusal["taken"]) == (0.5, request_mode, False)
+    assert refusal["support_margin_m"] < -0.03
+    assert set(record["mode"]) == {1}
+    assert record.summary["modes_refused"] == 1
+    assert not record.summary["tipping"]
+    (warning,) = record.summary["warnings"]
+    assert f"mode {request_mode} was refused" in warning
+    assert "t = 0.500 s" in warning
+    assert f"{1e3 * refusal['support_margin_m']:.1f} mm" in warning
+
+
+@pytest.mark.parametrize("policy", ["cyclic", "predictive"])
+def test_switching_passes_over_modes_that_would_tip(policy):
+    commands = [{"at_s": 0.0, "mode": "switching"}]
+    record = run(6.0, plant=CURLED, commands=commands, switching={"policy": policy}, **HELD)
+    refused = {refusal["mode"] for refusal in record.summary["refusals"]}
+    assert {3, 4} <= refused
+    assert refused.isdisjoint(record["mode"])
+    assert not record.summary["tipping"]
+    assert record.summary["modes_refused"] == len(record.summary["refusals"])
+
+
+def test_a_mode_whose_prediction_diverges_is_refused():
+    """The null space is switched off in the run, not in the prediction: there its gain is absurd."""
+    record = run(
+        0.2,
+        commands=[{"at_s": 0.1, "mode": "switching"}],
+        switching={"policy": "predictive", "order": [2]},
+        null_gain=1e300,
+        null_start_s=1.0,
+        limit_policy="none",
+    )
+    assert record.summary["refusals"] == [{"time_s": 0.1, "mode": 2, "support_margin_m": None, "taken": False}]
+    assert "its prediction diverges" in record.summary["warnings"][0]
+    assert set(record["mode"]) == {1}
+
+
+def test_the_return_to_the_fixing_mode_is_tested_too():
+    """The robot starts in a fixing mode that tips, leaves it by request, and is not let back."""
+    commands = [{"at_s": 0.2, "mode": 1}, {"at_s": 0.6, "mode": "fixing"}]
+    record = run(1.0, plant=CURLED, commands=commands, fixing_mode=4, **HELD)
+    assert record["mode"][np.searchsorted(record.time, [0.1, 0.4, 0.9])].tolist() == [4, 1, 1]
+    assert [(r["time_s"], r["mode"]) for r in record.summary["refusals"]] == [(0.6, 4)]
+    assert record.summary["tipping"]  # at the start
+
+
+def test_least_margin_refuses_what_would_only_just_stand():
+    commands = [{"at_s": 0.2, "mode": 5}, {"at_s": 0.4, "mode": 6}]  # margins of 14.7 and 66 mm
+    for least, modes in ((0.0, {1, 5, 6}), (0.02, {1, 6}), (0.08, {1})):
+        record = run(0.6, plant=CURLED, commands=commands, switching={"least_margin_m": least}, **HELD)
+        assert set(record["mode"]) == modes
+
+
+class Operator:
+    """Live: drives ahead until the head has moved 40 mm, then to the left while the base lags, then switches modes.
+
+    Every decision is taken on what the feedback shows; what was commanded is kept.
+    """
+
+    def __init__(self, periods=1):
+        self.periods, self.reads, self.said = periods, 0, []
+
+    def read(self, first, count, period, feedback):
+        self.start = feedback.w if first == 0 else self.start
+        assert feedback.time == pytest.approx(first * period)
+        velocity, request, closed = np.zeros(6), NO_REQUEST, 0
+        if feedback.w[0] < self.start[0] + 0.04:
+            velocity[0] = 0.1
+        elif feedback.w[1] < 0.03:
+            velocity[1], closed = 0.04, 1
+        elif feedback.mode == 1 and abs(feedback.phi[6]) > 0.05:
+            request, closed = SWITCHING, 1
+        known = min(self.periods, count)
+        block = CommandBlock(np.tile(velocity, (known, 1)), np.zeros(known, dtype=int), np.full(known, closed))
+        block.request[0] = request
+        self.reads += 1
+        self.said.append((first, velocity, request, closed))
+        return block
+
+    def script(self, period):
+        """The equivalent script: what was said, as if it had been known beforehand."""
+        mode = {SWITCHING: {"mode": "switching"}, NO_REQUEST: {}}
+        return [
+            {"at_s": first * period, "velocity": velocity.tolist(), "gripper": ("open", "closed")[closed]}
+            | mode[request]
+            for first, velocity, request, closed in self.said
+        ]
+
+
+@pytest.mark.parametrize("periods", [1, 7])
+def test_a_live_source_gives_what_its_script_gives(periods):
+    """Asked period by period, or in small blocks, and reacting to the robot; the script is written down afterwards."""
+    operator = Operator(periods)
+    live = kinematic.simulate(scenario(5.0, switching={"period_s": 0.5}), source=operator)
+    assert operator.reads == -(-1000 // periods)
+    # each coordinate stops when a read shows that it is there: a block late, and the head error
+    assert live["w"][-1, :2] - live["w"][0, :2] == pytest.approx([0.04, 0.03], abs=0.1 * 0.005 * periods + 1e-6)
+    assert {1, 2, 3} <= set(live["mode"])
+    script = run(5.0, switching={"period_s": 0.5}, commands=operator.script(0.005))
+    for name in live.signals:
+        np.testing.assert_array_equal(live[name], script[name], err_msg=name)
+
+
+def test_a_live_source_sees_that_its_target_waits_and_what_it_said_then_is_lost():
+    """A script's path waits with its target; a joystick says anew what it wants."""
+
+    class Backward:
+        waited = 0
+
+        def read(self, first, count, period, feedback):
+            self.waited += feedback.waiting
+            speed = 0.1 if feedback.waiting else -0.1
+            return CommandBlock(np.array([[speed, 0, 0, 0, 0, 0]]), [NO_REQUEST], [0])
+
+    kink = {"initial_joints_rad": [0, -0.8, 0, -1.1, 0, 1.9, 0.2, -0.1] + [0.0] * 4}
+    source = Backward()
+    record = kinematic.simulate(scenario(8.0, plant=kink), source=source)
+    # the last period is not reported any more
+    assert source.waited == pytest.approx(record.summary["waiting_s"] / 0.005, abs=1)
+    assert source.waited > 10
+
+
+@pytest.mark.parametrize(
+    ("block", "reason"),
+    [
+        (CommandBlock(np.zeros((0, 6)), [], []), r"T from 1 to 400"),
+        (CommandBlock(np.zeros((401, 6)), [0] * 401, [0] * 401), r"T from 1 to 400"),
+        (CommandBlock(np.zeros((1, 3)), [0], [0]), r"velocity \(1, 3\)"),
+        (CommandBlock(np.zeros((1, 6)), [9], [0]), "no mode 9"),
+    ],
+)
+def test_commands_that_make_no_sense_are_refused(block, reason):
+    class Source:
+        def read(self, first, count, period, feedback):
+            return block
+
+    with pytest.raises(ModelError, match=reason):
+        kinematic.simulate(scenario(), source=Source())
 
 
 def test_attitude_distance_is_the_angle_of_the_relative_rotation():
@@ -128,7 +318,7 @@ def test_kernels_run_as_plain_python():
     """NUMBA_DISABLE_JIT=1 gives the same numbers: debugging and coverage stay possible."""
     code = """
         import json
-        from dynsim.engine import simulate
+        from dynsim.engine import kinematic, simulate
         from dynsim.scenario import load_scenario
         short = {"duration_s": 0.05, "controller.cost": "eq20_min"}
         print(json.dumps(simulate(load_scenario("snake_joint_limits", None, short))["phi"][-1].tolist()))

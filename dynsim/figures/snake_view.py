@@ -1,0 +1,246 @@
+"""What all snake figures share: colours, one posture in top and side view, the chart of modes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.collections import PatchCollection, PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch, Polygon
+from numpy.typing import NDArray
+
+from dynsim.record import Record
+
+# Okabe and Ito's palette: distinct for colour-blind readers.
+BODY, HEAD, GROUND, LIFT, TARGET, SUPPORT = "#444444", "#D55E00", "#0072B2", "#FFFFFF", "#009E73", "#56B4E9"
+CYCLE = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999"]
+STYLE: dict[Any, Any] = {
+    "font.size": 8,
+    "axes.titlesize": 8,
+    "axes.labelsize": 8,
+    "legend.fontsize": 7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.prop_cycle": plt.cycler(color=CYCLE),
+    "lines.linewidth": 1.1,
+    "axes.xmargin": 0.0,
+    "savefig.dpi": 200,
+    "figure.constrained_layout.use": True,
+}
+SYMBOLS = {"alpha": "α", "beta": "β", "gamma": "γ"}
+
+
+class View:
+    """One posture, ready to be drawn."""
+
+    def __init__(self, record: Record, row: int) -> None:
+        geometry = record.provenance["snake"]
+        self.row, self.time, self.mode = row, float(record.time[row]), int(record["mode"][row])
+        self.points: NDArray[np.float64] = record["posture"][row]
+        self.path: NDArray[np.float64] = record["w"][:, :2]
+        self.centre = record["centre_of_mass"][row]
+        self.grounded = record["grounded"][row].astype(bool)
+        self.radius = geometry["wheel_radius_m"]
+        half = np.array(geometry["half_track_m"])
+        n_h = geometry["head_joints"]
+        self.axles = self.points[n_h::2]
+        x, y, yaw = record["base_pose"][row]
+        headings = yaw + np.concatenate([[0.0], np.cumsum(record["phi"][row, n_h:])])
+        self.along = np.stack([np.cos(headings), np.sin(headings)], axis=1)
+        self.across = np.stack([-np.sin(headings), np.cos(headings)], axis=1) * half[:, None]
+        self.driven = np.array(geometry["driven_side"])
+        # Side view: along the heading of the base part, from wheel pair 1.
+        forward = np.array([np.cos(yaw), np.sin(yaw)])
+        self.side = np.stack([(self.points[:, :2] - [x, y]) @ forward, self.points[:, 2]], axis=1)
+
+    def outline(self) -> NDArray[np.float64]:
+        """Everything that a top view must show, (k, 2)."""
+        wheels = [self.axles[:, :2] + s * self.across + f * self.radius * self.along for s in (-1, 1) for f in (-1, 1)]
+        return np.vstack([self.points[:, :2], *wheels])
+
+    def support(self) -> NDArray[np.float64]:
+        """Corners of the support polygon, (k, 2)."""
+        from scipy.spatial import ConvexHull, QhullError
+
+        down = self.grounded
+        feet = np.vstack([self.axles[down, :2] + s * self.across[down] for s in (-1, 1)])
+        try:
+            return feet[ConvexHull(feet).vertices]
+        except (QhullError, ValueError):
+            return feet  # fewer than three contacts: no polygon
+
+    def draw_top(self, axis: Axes) -> list[Artist]:
+        drawn: list[Artist] = [
+            axis.add_patch(Polygon(self.support(), color=SUPPORT, alpha=0.25, lw=0, zorder=1)),
+            *axis.plot(*self.points[:, :2].T, "-", color=BODY, lw=1.8, zorder=3, solid_capstyle="round"),
+            *axis.plot(*self.points[0, :2], "o", color=HEAD, ms=4, zorder=5),
+            *axis.plot(*self.centre[:2], "x", color="black", ms=4, mew=1.0, zorder=6),
+        ]
+        for down in (True, False):
+            corners = []
+            for i in np.flatnonzero(self.grounded == down):
+                length = self.radius * self.along[i]
+                width = 0.24 * self.radius * self.across[i] / np.linalg.norm(self.across[i])
+                for s in (-1, 1):
+                    middle = self.axles[i, :2] + s * self.across[i]
+                    corners.append([middle + f * length + g * width for f, g in ((1, 1), (1, -1), (-1, -1), (-1, 1))])
+            face = GROUND if down else LIFT
+            wheels = PolyCollection(corners, facecolors=face, edgecolors=GROUND, linewidths=0.7, zorder=4)
+            drawn.append(axis.add_collection(wheels, autolim=False))
+        return drawn
+
+    def draw_side(self, axis: Axes) -> list[Artist]:
+        drawn: list[Artist] = [
+            axis.axhline(0.0, color="#BBBBBB", lw=0.8, zorder=0),
+            *axis.plot(*self.side.T, "-", color=BODY, lw=1.8, zorder=3, solid_capstyle="round"),
+            *axis.plot(*self.side[0], "o", color=HEAD, ms=4, zorder=5),
+        ]
+        n_h = len(self.points) - 2 * len(self.axles) + 1
+        for down in (True, False):
+            # A lifted pair is drawn a little above the ground: the model has no height for it ([T] II.A).
+            raised = 0.0 if down else 0.35 * self.radius
+            wheels = [
+                Circle((self.side[n_h + 2 * i, 0], self.side[n_h + 2 * i, 1] + raised), self.radius)
+                for i in np.flatnonzero(self.grounded == down)
+            ]
+            face = GROUND if down else LIFT
+            collection = PatchCollection(wheels, facecolors=face, edgecolors=GROUND, linewidths=0.7, zorder=2)
+            drawn.append(axis.add_collection(collection, autolim=False))
+        return drawn
+
+
+def posture_grid(lines: Mapping[str, Sequence[tuple[View, str]]], note: str = "", one_scale: bool = True) -> Figure:
+    """Top views, each with its title, and the path of the point in green; every line of the grid has a label.
+
+    ``one_scale``: all lines show the same area, else each the one it needs.
+    """
+    columns = max(map(len, lines.values()))
+    clouds = [[view.outline() for view, _ in line] for line in lines.values()]
+    pooled = [cloud for line in clouds for cloud in line]
+    boxes = [limits(pooled if one_scale else line, 0.06) for line in clouds]
+    size = 8.6 / columns
+    heights = [max(size * (y1 - y0) / (x1 - x0), 0.25 * size) for x0, x1, y0, y1 in boxes]
+    titles = 1 + max(title.count("\n") for line in lines.values() for _, title in line)
+    figure, axes = plt.subplots(
+        len(lines),
+        columns,
+        figsize=(9.0, sum(heights) + len(lines) * (0.3 + 0.14 * titles) + 0.5),
+        squeeze=False,
+        sharex="all" if one_scale else "row",
+        sharey="row",
+        height_ratios=heights,
+    )
+    for (label, line), (x0, x1, y0, y1), row in zip(lines.items(), boxes, axes, strict=True):
+        row[0].set_ylabel(label, rotation=0, ha="right", va="center")
+        row[0].locator_params(axis="y", nbins=3)
+        for axis in row[len(line) :]:
+            axis.set_visible(False)
+        for axis, (view, title) in zip(row, line, strict=False):
+            axis.plot(*view.path.T, color=TARGET, lw=1.0, zorder=2)
+            view.draw_top(axis)
+            axis.set(xlim=(x0, x1), ylim=(y0, y1))
+            axis.set_title(title, fontsize=7)
+            axis.set_aspect("equal", adjustable="box")
+    figure.supxlabel("x [m]" + note, fontsize=8)
+    figure.supylabel("y [m]", fontsize=8)
+    figure.legend(handles=legend(), loc="outside upper center", ncols=6, frameon=False)
+    return figure
+
+
+def posture_strip(line: Sequence[tuple[View, str]]) -> Figure:
+    """Postures with their titles: top view above, side view along the base's heading below."""
+    views = [view for view, _ in line]
+    top = limits([view.outline() for view in views], 0.08)
+    side = limits([np.vstack([view.side, view.side * [1, 0]]) for view in views], 0.08)
+    tall, low = top[3] - top[2], side[3] - side[2]
+    width = 9.0
+    column = width / len(views)
+    height = column * (tall / (top[1] - top[0]) + low / (side[1] - side[0])) + 1.1
+    figure, axes = plt.subplots(
+        2, len(views), figsize=(width, max(height, 2.6)), squeeze=False, height_ratios=[tall, max(low, 0.35 * tall)]
+    )
+    for (view, title), above, below in zip(line, *axes, strict=True):
+        view.draw_top(above)
+        view.draw_side(below)
+        above.set(xlim=top[:2], ylim=top[2:], title=title)
+        below.set(xlim=side[:2], ylim=(min(side[2], -0.02), side[3]))
+        for axis in (above, below):
+            axis.set_aspect("equal", adjustable="box")
+            if axis is not axes[0, 0] and axis is not axes[1, 0]:
+                axis.tick_params(labelleft=False)
+            axis.tick_params(axis="x", labelrotation=45)
+    for axis, name in ((axes[0, 0], "y [m]"), (axes[1, 0], "height [m]")):
+        axis.set_ylabel(name)
+        axis.locator_params(axis="y", nbins=3)
+    figure.supxlabel("above: x [m]; below: along the heading of the base part [m]", fontsize=8)
+    figure.legend(handles=legend(), loc="outside upper center", ncols=6, frameon=False)
+    return figure
+
+
+def mode_chart(axis: Axes, record: Record, title: str = "mode") -> None:
+    """Grounded (filled) and lifted (white) wheel pairs over time, with the mode numbers."""
+    grounded, time, mode = record["grounded"], record.time, record["mode"]
+    starts = np.flatnonzero(np.diff(mode, prepend=mode[0] - 1))
+    ends = np.append(starts[1:], len(time) - 1)
+    for start, end in zip(starts, ends, strict=True):
+        for i in range(grounded.shape[1]):
+            axis.broken_barh(
+                [(time[start], time[end] - time[start])],
+                (i + 0.6, 0.8),
+                facecolors=GROUND if grounded[start, i] else LIFT,
+                edgecolors="white",
+                linewidth=0.4,
+            )
+        if len(starts) <= 30:
+            axis.text((time[start] + time[end]) / 2, 0.2, str(mode[start]), ha="center", va="center", fontsize=7)
+    axis.set_ylim(grounded.shape[1] + 0.6, -0.2)
+    axis.set_yticks(range(1, grounded.shape[1] + 1))
+    axis.set_ylabel("wheel pair")
+    axis.set_title(f"{title}, and the wheel pairs on the ground (blue) or lifted (white)", loc="left")
+
+
+def moments(record: Record, count: int) -> NDArray[np.int64]:
+    """Rows of ``count`` evenly spread samples, first and last among them."""
+    return np.unique(np.linspace(0, len(record.time) - 1, min(count, len(record.time))).round().astype(np.int64))
+
+
+def limits(clouds: list[NDArray[np.float64]], margin: float) -> tuple[float, float, float, float]:
+    """x and y limits that hold all points, with a margin."""
+    points = np.vstack(clouds)
+    (x0, y0), (x1, y1) = points.min(axis=0) - margin, points.max(axis=0) + margin
+    return float(x0), float(x1), float(y0), float(y1)
+
+
+def relax(axis: Axes, least: float) -> None:
+    """Do not blow a constant up to rounding noise."""
+    low, high = axis.get_ylim()
+    if high - low < 2 * least:
+        middle = (low + high) / 2
+        axis.set_ylim(middle - least, middle + least)
+
+
+def greek(name: str) -> str:
+    """Joint name with its Greek letter."""
+    return name.replace("theta", "θ").replace("psi", "ψ")
+
+
+def legend() -> list[Any]:
+    """Handles for what a view shows."""
+    return [
+        Line2D([], [], color=HEAD, marker="o", ls="", ms=4, label="controlled point"),
+        Line2D([], [], color=BODY, lw=1.8, label="body"),
+        Patch(facecolor=GROUND, edgecolor=GROUND, label="wheel on the ground"),
+        Patch(facecolor=LIFT, edgecolor=GROUND, label="wheel lifted"),
+        Patch(facecolor=SUPPORT, alpha=0.25, label="support polygon"),
+        Line2D([], [], color="black", marker="x", ls="", ms=4, label="centre of mass"),
+    ]
