@@ -152,9 +152,7 @@ def build(config: Config, plant: SnakeDescription, duration_s: float | None = No
     return TaskSpaceController(
         law=law,
         schedule=schedule,
-        prediction=schedule._replace(
-            period=switch_ticks * config.period_s / prediction_ticks, midpoint=0, substeps=1, null_start_tick=0
-        ),
+        prediction=schedule._replace(period=switch_ticks * config.period_s / prediction_ticks, midpoint=0, substeps=1),
         prediction_ticks=prediction_ticks,
         modes=modes,
         fixing_row=fixing_row,

@@ -271,7 +271,10 @@ def _margin_now(run: Run, row: int) -> float:
 
 def _predict(run: Run, row: int) -> tuple[float, float]:
     """Cost after one switching period in a mode with the present command held, and the smallest support margin."""
-    ticks, law, schedule = run.controller.prediction_ticks, run.controller.law, run.controller.prediction
+    ticks, law, real = run.controller.prediction_ticks, run.controller.law, run.controller.schedule
+    schedule = run.controller.prediction
+    waits = (real.null_start_tick - int(run.state.counts[1])) * real.period  # until the null space comes on [s]
+    schedule = schedule._replace(null_start_tick=round(waits / schedule.period))
     trial, trace = _copy(run.state), new_trace(run.model, ticks + 1)
     place = min(int(trial.counts[3]), len(run.block.velocity) - 1)
     held = np.tile(run.block.velocity[place], (ticks, 1))

@@ -32,6 +32,7 @@ from dynsim.figures.snake_view import (
     posture_strip,
     relax,
 )
+from dynsim.files import replacing
 from dynsim.record import Record
 from dynsim.studies.tanaka2019 import used_limit
 
@@ -54,7 +55,8 @@ def draw(record: Record, folder: Path) -> list[Path]:
         for name, make in (makers | tanaka2019.figures_of_run(record)).items():
             figure = make(record)
             path = folder / f"{name}.png"
-            figure.savefig(path)
+            with replacing(path) as temporary:
+                figure.savefig(temporary, format="png")
             plt.close(figure)
             written.append(path)
         written.append(animate(record, folder / "animation.gif"))
@@ -78,7 +80,8 @@ def draw_comparison(records: Mapping[str, Record], folder: Path) -> list[Path]:
         for name, make in makers.items():
             figure = make(records)
             path = folder / f"{name}.png"
-            figure.savefig(path)
+            with replacing(path) as temporary:
+                figure.savefig(temporary, format="png")
             plt.close(figure)
             written.append(path)
     return written
@@ -242,6 +245,7 @@ def animate(record: Record, path: Path, frames: int | None = None) -> Path:
             images.append(image.convert("RGB").quantize(32, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE))
             for artist in drawn[:-1]:
                 artist.remove()
-        images[0].save(path, save_all=True, append_images=images[1:], duration=100, loop=0)
+        with replacing(path) as temporary:
+            images[0].save(temporary, format="GIF", save_all=True, append_images=images[1:], duration=100, loop=0)
         plt.close(figure)
     return path

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path as FilePath
 
+from dynsim.files import write_json
 from dynsim.hardware.bus import Bus, NoAnswer, RequestRefused
 from dynsim.hardware.check import CheckedMotion
 from dynsim.hardware.control_table import (
@@ -53,7 +53,7 @@ def dump_registers(bus: Bus, servo_map: ServoMap, path: FilePath) -> None:
             contents[servo.joint] = snapshot(bus, servo)
         except (NoAnswer, RequestRefused) as error:
             contents[servo.joint] = str(error)
-    path.write_text(json.dumps(contents, indent=1) + "\n", encoding="utf-8")
+    write_json(path, contents)
 
 
 def configure(bus: Bus, servo_map: ServoMap, report: Callable[[str], None]) -> None:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.jit import kernel
+from dynsim.kernels.jit import internal_kernel, kernel
 
 
 class SnakeModel(NamedTuple):
@@ -69,13 +69,13 @@ def new_chain(model: SnakeModel) -> Chain:
     )
 
 
-@kernel
+@internal_kernel
 def wrap_angle(angle):
     """Angle in [-pi, pi)."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
-@kernel
+@internal_kernel
 def turn(axis_is_pitch, angle, R):
     """R := R Ry(angle) or R Rz(angle), in place; R is (3, 3) with rows = frame axes x, y, z in the world."""
     c, s = math.cos(angle), math.sin(angle)
@@ -91,7 +91,7 @@ def turn(axis_is_pitch, angle, R):
             R[1, i] = c * y - s * x
 
 
-@kernel
+@internal_kernel
 def head_frame(w, R):
     """Frame axes (rows of R) of attitude Rz(gamma) Ry(beta) Rx(alpha); w = (x, y, z, alpha, beta, gamma)."""
     ca, sa = math.cos(w[3]), math.sin(w[3])
@@ -168,7 +168,7 @@ def walk_chain(model, w, phi, R, chain):
                 chain.pair_z[pair, i] = R[2, i]
 
 
-@kernel
+@internal_kernel
 def velocity_row(model, chain, w, pair, a, A, B, row):
     """Rows a . v_pair = A w' - B u of the velocity of an axle's middle along the direction a."""
     p = chain.pair_position[pair]
@@ -189,7 +189,7 @@ def velocity_row(model, chain, w, pair, a, A, B, row):
         B[row, j] = -(e[0] * mx + e[1] * my + e[2] * mz)
 
 
-@kernel
+@internal_kernel
 def add_rotation(model, chain, pair, factor, a, A, B, row):
     """Add factor a . omega_pair = A w' - B u of the body that carries a wheel pair to a row."""
     ax, ay, az = factor * a[0], factor * a[1], factor * a[2]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.jit import kernel
+from dynsim.kernels.jit import internal_kernel, kernel
 from dynsim.kernels.snake import (
     Chain,
     SnakeModel,
@@ -100,7 +100,7 @@ def new_work(model: SnakeModel) -> Work:
     )
 
 
-@kernel
+@internal_kernel
 def append_row(k, row, tolerance, lower, reflector, beta):
     """Extend M = L Q^T by one row (destroyed); row k of L and reflector k are written.
 
@@ -136,7 +136,7 @@ def append_row(k, row, tolerance, lower, reflector, beta):
     return True
 
 
-@kernel
+@internal_kernel
 def reflect(j, reflector, beta, vector):
     """Apply reflection j to a vector in place."""
     s = 0.0
@@ -147,7 +147,7 @@ def reflect(j, reflector, beta, vector):
         vector[i] -= s * reflector[j, i]
 
 
-@kernel
+@internal_kernel
 def smallest_singular_value(count, tolerance, lower, u, y):
     """Smallest singular value of L (count x count, lower triangular) by inverse iteration.
 
@@ -185,7 +185,7 @@ def smallest_singular_value(count, tolerance, lower, u, y):
     return sigma
 
 
-@kernel
+@internal_kernel
 def factor_rows(B, rows, count, shape_joints, scale, row, lower, reflector, beta):
     """L Q^T = B~ diag(scale) of a mode: rows ``rows[:count]`` of B, then S; returns the number of rows."""
     total = count + shape_joints.shape[0]
@@ -207,7 +207,7 @@ def sigma_min(model, law, work, grounded):
     return smallest_singular_value(k, 1e-6, lower, work.singular, work.solution)
 
 
-@kernel
+@internal_kernel
 def solve_input(law, work, rows, null_gain):
     """u = W^(-1/2) (Q L^-1 rhs - k_eta (I - Q Q^T) W^(1/2) n), n = eta (eq 14) or W^-1 eta (safe form)."""
     y, u, g, rhs = work.solution, work.u, work.null_part, work.rhs
@@ -234,7 +234,7 @@ def solve_input(law, work, rows, null_gain):
         u[i] = root[i] * y[i]
 
 
-@kernel
+@internal_kernel
 def worst_limit_violation(model, law, work, phi):
     """Joint whose rate breaks its bound most, and that bound; (-1, 0) when all rates are allowed."""
     u, at_limit, upper, lower, rate = work.u, work.at_limit, model.upper, model.lower, law.limit_rate
@@ -328,7 +328,7 @@ def control_input(model, law, work, w, phi, w_target, velocity, mode, null_gain)
     return sigma
 
 
-@kernel
+@internal_kernel
 def estimate_from_joints(model, phi, frame, base, w_hat, w):
     """[T] IV.C.1: z, alpha, beta from the joints of the head part with the base level; x, y, gamma as integrated.
 

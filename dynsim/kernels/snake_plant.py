@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.jit import kernel
+from dynsim.kernels.jit import internal_kernel, kernel
 from dynsim.kernels.snake import SnakeModel, constraint_matrices, pose_of_point, walk_chain
 from dynsim.kernels.snake_control import (
     LIMITS_ALLOCATE,
@@ -147,14 +147,14 @@ def new_trace(model: SnakeModel, rows: int) -> Trace:
     )
 
 
-@kernel
+@internal_kernel
 def copy(source, target):
     """target[:] = source; numba's slice assignment would compile its whole error formatting."""
     for i in range(source.shape[0]):
         target[i] = source[i]
 
 
-@kernel
+@internal_kernel
 def base_velocity(model, grounded, yaw, phi, u, rig):
     """Velocity of the base part that the grounded wheels allow, into ``rig.base_rate``.
 
@@ -224,7 +224,7 @@ def base_velocity(model, grounded, yaw, phi, u, rig):
     return slip
 
 
-@kernel
+@internal_kernel
 def advance_plant(model, grounded, period, substeps, state, u, rig):
     """Hold u for one control period: joints and wheels exactly, base pose by classical Runge-Kutta 4.
 
@@ -254,7 +254,7 @@ def advance_plant(model, grounded, period, substeps, state, u, rig):
     return slip
 
 
-@kernel
+@internal_kernel
 def believe(model, schedule, state, rig):
     """What the controller takes for w and phi ([T] IV.C.1 and IV.C.2), into ``state.w_hat`` and ``state.phi_hat``."""
     if schedule.state_source != FEEDFORWARD:
@@ -266,7 +266,7 @@ def believe(model, schedule, state, rig):
         estimate_from_joints(model, state.phi_hat, rig.work.frame, rig.origin, state.w_hat, rig.pose)
 
 
-@kernel
+@internal_kernel
 def fits(law, work, joints):
     """True when ``work.u`` does what was commanded and every joint keeps its limits and the fastest rate."""
     u, at_limit = work.u, work.at_limit
@@ -276,7 +276,7 @@ def fits(law, work, joints):
     return whole
 
 
-@kernel
+@internal_kernel
 def tick(model, law, schedule, state, velocity, rig):
     """One control period: evaluate the controller, hold its rates, move the plant and the controller's beliefs.
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.jit import kernel
+from dynsim.kernels.jit import internal_kernel, kernel
 from dynsim.kernels.snake import SnakeModel
 
 COST_ANGLES = 0  # eq 19
@@ -62,13 +62,13 @@ def new_support(model: SnakeModel) -> Support:
     )
 
 
-@kernel
+@internal_kernel
 def cross(ox, oy, ax, ay, bx, by):
     """(a - o) x (b - o), positive when o, a, b turn left."""
     return (ax - ox) * (by - oy) - (ay - oy) * (bx - ox)
 
 
-@kernel
+@internal_kernel
 def convex_hull(points, count, order, hull):
     """Counter-clockwise hull of the first ``count`` points (monotone chain); returns its number of corners."""
     for i in range(count):
@@ -152,7 +152,7 @@ def polygon_area(support, sides):
     return area
 
 
-@kernel
+@internal_kernel
 def centre_slopes(model, chain, support):
     """Derivative of the projected centre of mass by each joint angle, the body of wheel pair 1 held still."""
     total = 0.0
@@ -181,7 +181,7 @@ def centre_slopes(model, chain, support):
             mass, mx, my, mz = mass + m, mx + m * c[0], my + m * c[1], mz + m * c[2]
 
 
-@kernel
+@internal_kernel
 def distance_slope(model, chain, support, side, sides):
     """Derivatives of one distance d_side and of that side's length by every joint angle, into ``support.slope`` and
     ``support.length_slope`` [m/rad]."""
@@ -206,7 +206,7 @@ def distance_slope(model, chain, support, side, sides):
         support.slope[j] = (numerator - d * support.length_slope[j]) / length
 
 
-@kernel
+@internal_kernel
 def nearness(support, side, smoothing, margin):
     """exp(-(d_side - margin) / s): one for the nearest side, next to nothing for sides that are s and more farther."""
     return math.exp(-(support.distance[side] - margin) / smoothing)

@@ -143,12 +143,15 @@ def test_ctrl_c_saves_what_was_simulated(tmp_path: Path):
 def test_ctrl_c_before_the_first_step_says_that_nothing_is_saved(tmp_path: Path):
     # Many knots: the inverse kinematics take minutes.
     arguments = ["elbow_comparison", "--set", "duration_s=50000", "--set", "record.rate_hz=1"]
-    for command in ("run", "check"):
-        process = subprocess.Popen(
+    processes = [
+        subprocess.Popen(
             [sys.executable, "-m", "dynsim", command, *arguments],
             cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        time.sleep(8.0)
+        )
+        for command in ("run", "check")
+    ]  # fmt: skip
+    time.sleep(10.0)
+    for process in processes:
         os.kill(process.pid, signal.SIGINT)
         _, stderr = process.communicate(timeout=120)
         assert process.returncode == 130, stderr

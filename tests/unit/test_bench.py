@@ -49,7 +49,7 @@ def test_without_mujoco(small: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
     result = bench.run_bench(quick=True)
     assert "not installed" in result["unavailable"]["mujoco"]
-    rows = [line for line in text(result).splitlines() if line.strip().startswith("MuJoCo")]
+    rows = [line for line in text(result).splitlines() if line.strip().startswith("MuJoCo ")]
     # Two each: times, the job of the one case, ratios of times, ratios of the job.
     assert len(rows) == 8
     assert all("–" in row for row in rows)
