@@ -11,8 +11,9 @@ import numpy as np
 
 from dynsim import metrics
 from dynsim.engine import REFERENCES, SIMULATION, Progress
+from dynsim.engine.outcome import check_size, raise_stopped
 from dynsim.engine.provenance import provenance
-from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
+from dynsim.errors import ModelError, SimulationInterrupted, SimulationStopped
 from dynsim.kernels import arrays as ka
 from dynsim.kernels import integrate as ki
 from dynsim.kernels.coupled import System
@@ -109,7 +110,6 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
     record = _record(scenario, prepared, wall)
     status, reached = int(run.count[ki.STATUS]), float(run.clock[ki.TIME])
     if interrupted or status != ki.FINISHED:
-        record.complete = False
         state = _last_state(prepared)
         if interrupted:
             stop: SimulationStopped = SimulationInterrupted(
@@ -117,22 +117,14 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
             )
         else:
             stop = SimulationStopped(_reason(status, scenario, prepared), time=reached, state=state)
-        record.summary["warnings"].append(f"incomplete: {stop}")
-        record.provenance["stopped"] = {"time_s": reached, "reason": str(stop), "state": state}
-        stop.record = record
-        raise stop
+        raise_stopped(stop, record)
     return record
 
 
 def _sample_times(scenario: Scenario, columns: int) -> np.ndarray:
-    rate, limit = scenario.record.rate_hz, scenario.record.size_limit_GB
+    rate = scenario.record.rate_hz
     count = int(np.floor(scenario.duration_s * rate * (1.0 + 1e-12))) + 1
-    size = 8e-9 * count * columns
-    if size > limit:
-        raise ScenarioError(
-            f"record.rate_hz = {rate:g}: {scenario.duration_s:g} s of {columns} columns need {size:.3g} GB, the limit "
-            f"(record.size_limit_GB) is {limit:g} GB; {rate * limit / size:.3g} Hz would fit"
-        )
+    check_size(scenario, count, columns)
     times = np.arange(count) / rate
     if scenario.duration_s - times[-1] > 1e-9 * scenario.duration_s:
         times = np.append(times, scenario.duration_s)

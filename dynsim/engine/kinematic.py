@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import time as clock
-from dataclasses import dataclass
 from types import ModuleType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynsim.engine import Progress
 from dynsim.engine.kinematic_record import make_record
+from dynsim.engine.kinematic_run import Run
 from dynsim.engine.mode_switching import ModeSwitcher
+from dynsim.engine.outcome import check_size, raise_stopped
 from dynsim.engine.provenance import provenance
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.families import member
 from dynsim.kernels.jit import integers, reals
-from dynsim.kernels.snake import SnakeModel, pose_of_point
-from dynsim.kernels.snake_plant import Rig, State, Trace, new_rig, new_state, new_trace, record_row, run_ticks
+from dynsim.kernels.snake import pose_of_point
+from dynsim.kernels.snake_plant import State, new_rig, new_state, new_trace, record_row, run_ticks
 from dynsim.model.snake import (
     FIXING,
     NO_REQUEST,
@@ -32,24 +32,6 @@ from dynsim.record import Record
 from dynsim.scenario import Scenario
 
 CHUNK = 2000  # ticks between two looks at Ctrl-C and the progress bar; about 0.1 s
-
-
-@dataclass
-class Run:
-    """One simulation on its way: the robot, its controller, the commands known now, the state, what was recorded."""
-
-    description: SnakeDescription
-    model: SnakeModel
-    controller: TaskSpaceController
-    source: CommandSource
-    ticks: int  # control periods of the whole run
-    block: CommandBlock  # commands from tick ``block_start`` on
-    block_start: int
-    gripper: NDArray[np.int64]  # (ticks,) as far as it was read
-    state: State
-    rig: Rig
-    trace: Trace
-    stride: int
 
 
 def prepare(scenario: Scenario, source: CommandSource | None = None) -> Run:
@@ -77,12 +59,7 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> Run:
         raise ScenarioError(f"duration_s = {scenario.duration_s:g} is shorter than controller.period_s = {period:g}")
     stride = _stride(scenario.record.rate_hz, period)
     rows = -(-ticks // stride) + 1
-    trace_size = 8e-9 * rows * sum(array[0].size for array in new_trace(model, 1))
-    if trace_size > scenario.record.size_limit_GB:
-        raise ScenarioError(
-            f"record.rate_hz = {scenario.record.rate_hz:g}: the record needs {trace_size:.3g} GB, the limit "
-            f"(record.size_limit_GB) is {scenario.record.size_limit_GB:g} GB"
-        )
+    check_size(scenario, rows, sum(array[0].size for array in new_trace(model, 1)))
 
     state, rig = new_state(model), new_rig(model)
     state.base[:], state.phi[:] = description.initial_base_pose, description.initial_joints
@@ -139,11 +116,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None, source: Comma
         )
     record = make_record(run, scenario, provenance(scenario), switcher, clock.perf_counter() - started)
     if stop is not None:
-        record.complete = False
-        record.summary["warnings"].append(f"incomplete: {stop}")
-        record.provenance["stopped"] = {"time_s": stop.time, "reason": str(stop), "state": stop.state}
-        stop.record = record
-        raise stop
+        raise_stopped(stop, record)
     return record
 
 

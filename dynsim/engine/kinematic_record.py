@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynsim._version import __version__
+from dynsim.engine.kinematic_run import Run
+from dynsim.engine.mode_switching import ModeSwitcher
 from dynsim.kernels.jit import reals
 from dynsim.kernels.snake import new_chain, posture_points
 from dynsim.kernels.snake_plant import Trace, record_row
 from dynsim.model.snake import SnakeDescription, TaskSpaceController, conditioning
 from dynsim.record import Record
-
-if TYPE_CHECKING:
-    from dynsim.engine.kinematic import Run
-    from dynsim.engine.mode_switching import ModeSwitcher
-    from dynsim.scenario import Scenario
+from dynsim.scenario import Scenario
 
 COORDINATES = ("x", "y", "z", "alpha", "beta", "gamma")
 

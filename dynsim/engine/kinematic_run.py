@@ -1,0 +1,30 @@
+"""State of one simulation of the kinematic snake."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.kernels.snake import SnakeModel
+from dynsim.kernels.snake_plant import Rig, State, Trace
+from dynsim.model.snake import CommandBlock, CommandSource, SnakeDescription, TaskSpaceController
+
+
+@dataclass
+class Run:
+    """One simulation on its way: the robot, its controller, the commands known now, the state, what was recorded."""
+
+    description: SnakeDescription
+    model: SnakeModel
+    controller: TaskSpaceController
+    source: CommandSource
+    ticks: int  # control periods of the whole run
+    block: CommandBlock  # commands from tick ``block_start`` on
+    block_start: int
+    gripper: NDArray[np.int64]  # (ticks,) as far as it was read
+    state: State
+    rig: Rig
+    trace: Trace
+    stride: int

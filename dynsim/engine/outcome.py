@@ -1,0 +1,35 @@
+"""What both engines say about a record: too large to be made, or not complete."""
+
+from __future__ import annotations
+
+from typing import NoReturn
+
+from dynsim.errors import ScenarioError, SimulationStopped
+from dynsim.record import Record
+from dynsim.scenario import Scenario
+
+
+def check_size(scenario: Scenario, rows: int, columns: int) -> None:
+    """Refuse a record of more than ``record.size_limit_GB``.
+
+    Raises
+    ------
+    ScenarioError
+        With the recording rate that would fit.
+    """
+    rate, limit = scenario.record.rate_hz, scenario.record.size_limit_GB
+    size = 8e-9 * rows * columns
+    if size > limit:
+        raise ScenarioError(
+            f"record.rate_hz = {rate:g}: {scenario.duration_s:g} s of {columns} columns need {size:.3g} GB, the limit "
+            f"(record.size_limit_GB) is {limit:g} GB; {rate * limit / size:.3g} Hz would fit"
+        )
+
+
+def raise_stopped(stop: SimulationStopped, record: Record) -> NoReturn:
+    """Mark the record as incomplete, say why in its summary and provenance, and raise ``stop`` with it."""
+    record.complete = False
+    record.summary["warnings"].append(f"incomplete: {stop}")
+    record.provenance["stopped"] = {"time_s": stop.time, "reason": str(stop), "state": stop.state}
+    stop.record = record
+    raise stop
