@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim._version import __version__
+from dynsim.kernels.integrate import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, PULLING
 from dynsim.model.description import Contact, Robot
 from dynsim.record import Record
 from dynsim.scenario import Scenario
@@ -46,7 +47,7 @@ class Counts:
     evaluations : right-hand sides, those for samples and projections included
     projections : corrections onto the contact surfaces
     deficient : right-hand sides whose constraint forces were not unique
-    extremes : (c, 3) smallest and largest normal force [N] and largest distance from the surface [m] of each contact
+    extremes : (c, 5) over all steps, see dynsim.kernels.integrate: FORCE_MIN, FORCE_MAX, DRIFT_MAX, PULLING, LAST_FORCE
     """
 
     wall: float
@@ -137,7 +138,7 @@ def summarise(
         "friction_heat_J": final("heat_friction"),
         "energy_turnover_J": turnover,
         "energy_residual_relative": residual / turnover if turnover > 0.0 else 0.0,
-        "constraint_drift_max_m": float(counts.extremes[:, 2].max(initial=0.0)),
+        "constraint_drift_max_m": float(counts.extremes[:, DRIFT_MAX].max(initial=0.0)),
         "contacts": [_contact(record, k, contact, counts, duration) for k, contact in enumerate(contacts)],
     }
     summary["warnings"] = _warnings(record, scenario, contacts, robot, counts, summary)
@@ -146,16 +147,16 @@ def summarise(
 
 def _contact(record: Record, k: int, contact: Contact, counts: Counts, duration: float) -> dict[str, Any]:
     force = record["contact_normal_force"][:, k]
-    extremes = counts.extremes[k] if counts.steps else np.array([0.0, 0.0, 0.0])
+    extremes = counts.extremes[k] if counts.steps else np.zeros(EXTREMES_SIZE)
     # Extremes are those of every accepted step, which are closer together than the samples, and of the samples.
     return {
         "name": contact.name,
         "surface": contact.surface_name,
-        "normal_force_min_N": float(min(extremes[0], force.min(initial=np.inf))),
+        "normal_force_min_N": float(min(extremes[FORCE_MIN], force.min(initial=np.inf))),
         "normal_force_mean_N": float(record["contact_impulse"][-1, k] / duration) if duration > 0 else 0.0,
-        "normal_force_max_N": float(max(extremes[1], force.max(initial=-np.inf))),
+        "normal_force_max_N": float(max(extremes[FORCE_MAX], force.max(initial=-np.inf))),
         "closed_fraction": 1.0,
-        "pulling_fraction": negative_fraction(force, record.time),
+        "pulling_fraction": min(float(extremes[PULLING]) / duration, 1.0) if duration > 0.0 else 0.0,
         "slip_distance_m": float(record["contact_slip_distance"][-1, k]) if len(record) else 0.0,
     }
 
@@ -170,7 +171,7 @@ def _warnings(
 ) -> list[str]:
     found = []
     for contact in summary["contacts"]:
-        if contact["pulling_fraction"] > 0.0:
+        if contact["normal_force_min_N"] < 0.0:
             found.append(
                 f"{contact['name']}: the {contact['surface']} pulls on this brace for "
                 f"{100 * contact['pulling_fraction']:.1f} % of the run, with up to "

@@ -17,7 +17,7 @@ from dynsim.control.commands import Script, ScriptedSource
 from dynsim.control.modes import TABLE_II, Switching
 from dynsim.errors import ModelError
 from dynsim.kernels.jit import integers, reals
-from dynsim.kernels.snake import SnakeModel
+from dynsim.kernels.snake import SnakeModel, pose_of_point
 from dynsim.kernels.snake_control import (
     LIMITS_ALLOCATE,
     LIMITS_NONE,
@@ -25,6 +25,8 @@ from dynsim.kernels.snake_control import (
     NULL_PAPER,
     NULL_SAFE,
     Law,
+    control_input,
+    new_work,
 )
 from dynsim.kernels.snake_plant import ESTIMATED, FEEDFORWARD, MEASURED, Schedule
 from dynsim.kernels.snake_support import COST_ANGLES, COST_SUPPORT_MIN, COST_SUPPORT_NORM, Cost
@@ -78,9 +80,13 @@ class Config(Script):
         20.0, description="a joint approaches its limit no faster than this [1/s] times the angle left (assumed)"
     )
     damping_sigma: NonNegative = Field(
-        0.005, description="smallest singular value of B W^-1/2 below which the weakest direction is damped (assumed)"
+        0.2,
+        description="part of the smallest singular value of B W^-1/2 in the reference posture (head raised, base "
+        "straight) below which the weakest direction is damped (assumed)",
     )
-    damping_factor: NonNegative = Field(0.01, description="its damping at the singularity (assumed)")
+    damping_factor: NonNegative = Field(
+        0.4, description="its damping at the singularity, in parts of the same singular value (assumed)"
+    )
     shape_points_rad: dict[str, float] | None = Field(
         None, description="shape controllable points: joint name -> target [rad]; default the last head joint, 110 deg"
     )
@@ -139,6 +145,8 @@ def build(config: Config, plant: SnakeDescription, duration_s: float | None = No
         ),
     )
     check_controllable(model, law, modes, fixing_row, plant)
+    scale = reference_sigma(model, law, fixing_row, plant)
+    law = law._replace(damping_sigma=config.damping_sigma * scale, damping_factor=config.damping_factor * scale)
 
     switch_ticks = max(1, round(config.switching.period_s / config.period_s))
     prediction_ticks = max(1, round(config.switching.period_s / config.switching.prediction_step_s))
@@ -164,6 +172,16 @@ def build(config: Config, plant: SnakeDescription, duration_s: float | None = No
         release_fraction=config.switching.release_fraction,
         source=ScriptedSource(config.commands, config.paths),
     )
+
+
+def reference_sigma(model: SnakeModel, law: Law, row: int, plant: SnakeDescription) -> float:
+    """Smallest singular value of B~ W^(-1/2) with the head raised and the base straight.
+
+    It falls with the length of the chain, the links and the weights; damping is measured by it, not in metres.
+    """
+    work, pose, joints = new_work(model), np.zeros(6), reals(plant.reference_joints)
+    pose_of_point(model, np.zeros(3), joints, work.frame, pose)
+    return float(control_input(model, law, work, pose, joints, pose, np.zeros(6), row, 0.0))
 
 
 def check_controllable(model: SnakeModel, law: Law, modes: ModeTable, fixing_row: int, plant: SnakeDescription) -> None:

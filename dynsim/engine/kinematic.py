@@ -99,7 +99,6 @@ def simulate(scenario: Scenario, progress: Progress | None = None, source: Comma
         order=controller.order,
         period_ticks=controller.switch_ticks,
         least_margin=controller.least_margin,
-        margin_now=lambda row: _margin_now(run, row),
         predict=lambda row: _predict(run, row),
     )
     _load_kernels(run)
@@ -233,13 +232,6 @@ def _is_released(run: Run) -> bool:
     """True when every base joint is well within its limit again ([T] IV.C.5: until the robot becomes operable)."""
     base = slice(run.model.head_joints, None)
     return bool(np.all(np.abs(run.state.phi[base]) < run.controller.release_fraction * run.model.upper[base]))
-
-
-def _margin_now(run: Run, row: int) -> float:
-    trial, trace = _copy(run.state), new_trace(run.model, 1)
-    trial.counts[0] = row
-    record_row(run.model, run.controller.law, trial, run.rig, 0, trace)
-    return float(trace.margin[0])
 
 
 def _predict(run: Run, row: int) -> tuple[float, float]:

@@ -17,6 +17,9 @@ from dynsim.model.snake import SnakeDescription, TaskSpaceController, conditioni
 from dynsim.record import Record
 from dynsim.scenario import Scenario
 
+# Why the target waited, in the order of the counters of dynsim.kernels.snake_plant.State; the last is the rest: after
+# an obstacle, until switching has brought the joints below switching.release_fraction of their limits.
+OBSTACLES = ("joint limit", "rate limit", "singular posture", "attitude at beta = 90 deg", "release of the joints")
 COORDINATES = ("x", "y", "z", "alpha", "beta", "gamma")
 
 
@@ -150,6 +153,15 @@ def _summary(run: Run, scenario: Scenario, switcher: ModeSwitcher, record: Recor
         "joint_limit_violation_max_rad": float(max(beyond.max(), 0.0)),
         "joints_taken_out": [description.joint_names[j] for j in np.flatnonzero((at_limit == 1).any(axis=0))],
         "waiting_s": float(run.state.counts[4] * period),
+        "waiting_for_s": {
+            name: float(ticks * period)
+            for name, ticks in zip(
+                OBSTACLES, [*run.state.counts[7:], run.state.counts[4] - run.state.counts[7:].sum()], strict=True
+            )
+            if ticks
+        },
+        "slowed_s": float(run.state.counts[5] * period),
+        "null_space_reduced_s": float(run.state.counts[6] * period),
         "clamped_joint_ticks": int(run.state.counts[2]),
         "joint_rate_max_rad_s": float(np.abs(record["phi_dot"]).max()),
         "wheel_rate_max_rad_s": float(np.abs(record["rho_dot"]).max(initial=0.0)),
@@ -186,11 +198,19 @@ def _warnings(run: Run, record: Record, summary: dict[str, Any]) -> list[str]:
     found = []
     if summary["waiting_s"] > 0.0:
         share = 100.0 * summary["waiting_s"] / max(summary["duration_s"], 1e-9)
+        why = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in summary["waiting_for_s"].items())
+        found.append(f"the target waited for {summary['waiting_s']:.2f} s ({share:.0f} % of the run): {why}")
+    if summary["slowed_s"] > 0.0:
         found.append(
-            f"the target waited for {summary['waiting_s']:.2f} s ({share:.0f} % of the run): the command would have "
-            "broken a joint limit, a rate limit, or come too close to a singularity"
+            f"feedback and shape points were slowed down for {summary['slowed_s']:.2f} s: they asked for more than the "
+            "limits of joints and rates allow"
         )
-    if summary["joint_limit_violation_max_rad"] > 0.0:
+    if summary["null_space_reduced_s"] > 0.0:
+        found.append(
+            f"the null-space motion was reduced for {summary['null_space_reduced_s']:.2f} s to keep the rate limit: "
+            "the cost falls slower there (controller.null_gain)"
+        )
+    if summary["joint_limit_violation_max_rad"] > 1e-9:  # less is rounding
         beyond = np.maximum(record["phi"] - run.description.upper, run.description.lower - record["phi"]).max(axis=0)
         worst = int(beyond.argmax())
         found.append(
@@ -205,6 +225,13 @@ def _warnings(run: Run, record: Record, summary: dict[str, Any]) -> list[str]:
     if summary["tipping"]:
         share = 100.0 * float((record["support_margin"] <= 0.0).mean())
         found.append(f"the robot tips: its centre of mass is outside the support polygon for {share:.1f} % of the run")
+    least, margin = run.controller.least_margin, record["support_margin"]
+    if least > 0.0 and not summary["tipping"] and margin.min() <= least:
+        worst = int(margin.argmin())
+        found.append(
+            f"the support margin falls to {1e3 * margin[worst]:.1f} mm at t = {record.time[worst]:.2f} s, below "
+            f"switching.least_margin_m ({1e3 * least:g} mm): it is tested when a mode is chosen, not within it"
+        )
     return found + _refusal_warnings(summary["refusals"], run.controller.least_margin)
 
 

@@ -22,8 +22,10 @@ class Refusal(NamedTuple):
 class ModeSwitcher:
     """Fixing and switching states: follows requests, and picks a mode at every switching time t_k = t_0 + k dT.
 
-    Every change of mode is tested. A mode tips when its support margin is not above ``least_margin``; such a mode is
-    not taken and the present one stays. Only when the present mode tips as well, the one that tips least is taken.
+    Every change of mode is tested by simulating the mode for one period with the present command. It tips when its
+    support margin is anywhere not above ``least_margin``; such a mode is
+    not taken and the present one stays. Only when the present mode tips as well, the one that stands best is taken, the
+    fixing mode among them.
 
     Attributes
     ----------
@@ -31,7 +33,6 @@ class ModeSwitcher:
         takes the one with the lowest cost after a simulated period.
     modes : table of the modes; ``fixing_row``, ``order`` and ``row`` are rows of it.
     period_ticks : dT in control periods.
-    margin_now : margin_now(row) -> support margin of the present posture in a mode [m].
     predict : predict(row) -> (cost after dT, smallest support margin on the way [m]).
     row : present mode.
     switches : changes of mode.
@@ -44,7 +45,6 @@ class ModeSwitcher:
     order: tuple[int, ...]
     period_ticks: int
     least_margin: float
-    margin_now: Callable[[int], float]
     predict: Callable[[int], tuple[float, float]]
     row: int = 0
     switching: bool = False
@@ -79,22 +79,22 @@ class ModeSwitcher:
         return self.next_switch if self.switching else None
 
     def _asked(self, tick: int, row: int) -> int:
-        if row == self.row or (margin := self.margin_now(row)) > self.least_margin:
+        if row == self.row or (margin := self.predict(row)[1]) > self.least_margin:
             return row
-        return self._least_tipping(tick, {row: margin}, self.margin_now)
+        return self._least_tipping(tick, {row: margin})
 
     def _cyclic(self, tick: int) -> int:
         tipping: dict[int, float] = {}
         for step in range(len(self.order)):
             place = (self._place + step) % len(self.order)
             row = self.order[place]
-            margin = self.margin_now(row)
+            margin = self.predict(row)[1]
             if margin > self.least_margin:
                 self._refuse(tick, tipping)
                 self._place = (place + 1) % len(self.order)
                 return row
             tipping[row] = margin
-        return self._least_tipping(tick, tipping, self.margin_now)
+        return self._least_tipping(tick, tipping)
 
     def _predictive(self, tick: int) -> int:
         found = {row: self.predict(row) for row in self.order}
@@ -103,13 +103,16 @@ class ModeSwitcher:
         if standing:
             self._refuse(tick, tipping)
             return min(standing, key=lambda row: standing[row])
-        return self._least_tipping(tick, tipping, lambda row: found[row][1] if row in found else self.predict(row)[1])
+        return self._least_tipping(tick, tipping)
 
-    def _least_tipping(self, tick: int, tipping: dict[int, float], margin_of: Callable[[int], float]) -> int:
-        """The present mode if it stands, else the one with the largest margin; every candidate here would tip."""
-        present = margin_of(self.row)
-        best = max(tipping, key=lambda row: tipping[row])
-        taken = best if present <= self.least_margin and tipping[best] > present else self.row
+    def _least_tipping(self, tick: int, tipping: dict[int, float]) -> int:
+        """Every candidate would tip: the present mode if it stands, else the one of all that stands best.
+
+        The fixing mode is among those: it need not be in the order.
+        """
+        margins = {row: self.predict(row)[1] for row in (self.row, self.fixing_row)} | tipping
+        best = max(margins, key=lambda row: margins[row])
+        taken = self.row if margins[self.row] > self.least_margin else best
         self._refuse(tick, tipping, taken)
         return taken
 

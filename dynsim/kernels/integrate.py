@@ -69,7 +69,8 @@ STEPS, REJECTED, EVALUATIONS, PROJECTIONS, SAMPLE, STATUS, STARTED = 0, 1, 2, 3,
 COUNT_SIZE = 7
 # Run.extremes, per contact
 FORCE_MIN, FORCE_MAX, DRIFT_MAX = 0, 1, 2
-EXTREMES_SIZE = 3
+PULLING, LAST_FORCE = 3, 4  # time with a negative normal force [s]; normal force at the last accepted step [N]
+EXTREMES_SIZE = 5
 
 
 class Run(NamedTuple):
@@ -527,10 +528,15 @@ def sample_step(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
-def watch(ws: Workspace, run: Run):
-    """Extremes of normal forces and gaps at accepted steps."""
+def watch(ws: Workspace, run: Run, h):
+    """Extremes of normal forces and gaps at accepted steps; time of pulling, the force linear within the last step."""
     state, extremes = ws.contacts, run.extremes
     for k in range(state.shape[0]):
+        low = min(extremes[k, LAST_FORCE], state[k, FORCE])
+        high = max(extremes[k, LAST_FORCE], state[k, FORCE])
+        if low < 0.0 and h > 0.0:
+            extremes[k, PULLING] += h if high <= 0.0 else h * low / (low - high)
+        extremes[k, LAST_FORCE] = state[k, FORCE]
         extremes[k, FORCE_MIN] = min(extremes[k, FORCE_MIN], state[k, FORCE])
         extremes[k, FORCE_MAX] = max(extremes[k, FORCE_MAX], state[k, FORCE])
         extremes[k, DRIFT_MAX] = max(extremes[k, DRIFT_MAX], abs(state[k, GAP]))
@@ -566,7 +572,7 @@ def start(system: System, ws: Workspace, run: Run):
     elif not finite(run.stage[0]):
         run.count[STATUS] = NO_FORCES if ws.deficient[1] > 0 else NOT_FINITE
     else:
-        watch(ws, run)
+        watch(ws, run, 0.0)
         if run.clock[STEP] <= 0.0:
             first_step(run, run.y.shape[0] - ledger_length(ws))
     run.count[STARTED] = 1
@@ -612,7 +618,7 @@ def accept(system: System, ws: Workspace, run: Run):
     if off_surface(ws) and not settle(system, t + h, run.y_new, ws, run.stage[6], run):
         run.count[STATUS] = NOT_PROJECTED
         return
-    watch(ws, run)
+    watch(ws, run, h)
     sample_step(system, ws, run)
     for j in range(run.y.shape[0]):
         run.y[j] = run.y_new[j]

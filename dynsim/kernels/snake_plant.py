@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.kernels.jit import internal_kernel, kernel
-from dynsim.kernels.snake import SnakeModel, constraint_matrices, pose_of_point, walk_chain
+from dynsim.kernels.snake import SnakeModel, constraint_matrices, pose_of_point, walk_chain, wrap_angle
 from dynsim.kernels.snake_control import (
     LIMITS_ALLOCATE,
     LIMITS_NONE,
@@ -27,6 +27,12 @@ from dynsim.kernels.snake_support import cost_value, polygon_area, support_polyg
 # With gain K, damping that withholds this much of a command leaves a head error of WITHHELD / K [m/s, rad/s].
 WITHHELD = 1e-5
 MEASURED, ESTIMATED, FEEDFORWARD = 0, 1, 2
+# Why a command cannot be carried out.
+NO_OBSTACLE, JOINT_LIMIT, RATE_LIMIT, SINGULAR, ATTITUDE = 0, 1, 2, 3, 4
+# A target is not turned further than this towards beta = +-90 deg [rad].
+BETA_LIMIT = 0.5 * math.pi - 0.02
+# Steps in which a null-space motion that is too fast is reduced, the last of them to nothing.
+NULL_REDUCTIONS = 4
 
 
 class Schedule(NamedTuple):
@@ -48,8 +54,9 @@ class State(NamedTuple):
     w_target: np.ndarray  # (6,) w_d, integrated from the commanded velocity
     w_hat: np.ndarray  # (6,) what the controller believes of w
     phi_hat: np.ndarray  # (n_phi,) what the controller believes of phi
-    # (5,) [row of the mode in Law.grounded, ticks run, joint-ticks clamped at a limit, commands carried out of the
-    # present block, ticks in which the command could not be carried out and the target waited]
+    # (11,) [row of the mode in Law.grounded, ticks run, joint-ticks clamped at a limit, commands carried out of the
+    # present block, ticks in which the command could not be carried out and the target waited, ticks slowed
+    # down, ticks with less null-space motion, then ticks that waited for JOINT_LIMIT, RATE_LIMIT, SINGULAR, ATTITUDE]
     counts: np.ndarray
 
 
@@ -101,7 +108,7 @@ def new_state(model: SnakeModel) -> State:
         w_target=np.zeros(6),
         w_hat=np.zeros(6),
         phi_hat=np.zeros(joints),
-        counts=np.zeros(5, dtype=np.int64),
+        counts=np.zeros(11, dtype=np.int64),
     )
 
 
@@ -267,13 +274,35 @@ def believe(model, schedule, state, rig):
 
 
 @internal_kernel
-def fits(law, work, joints):
-    """True when ``work.u`` does what was commanded and every joint keeps its limits and the fastest rate."""
-    u, at_limit = work.u, work.at_limit
-    whole = work.withheld[0] <= WITHHELD
+def obstacle(law, work, joints):
+    """Why ``work.u`` cannot be carried out: SINGULAR, JOINT_LIMIT, RATE_LIMIT or NO_OBSTACLE."""
+    if work.withheld[0] > WITHHELD:
+        return SINGULAR
+    found = NO_OBSTACLE
     for j in range(joints):
-        whole = whole and at_limit[j] != 2 and abs(u[j]) <= law.rate_limit
-    return whole
+        if work.at_limit[j] == 2:
+            return JOINT_LIMIT
+        if abs(work.u[j]) > law.rate_limit:
+            found = RATE_LIMIT
+    return found
+
+
+@internal_kernel
+def slow_down(model, law, u, phi):
+    """Scale all rates alike such that no joint passes its rate or comes too fast to its limit.
+
+    The constraints are homogeneous in the rates, so the wheels still roll without slip. Returns True when it had to.
+    """
+    factor = 1.0
+    for j in range(phi.shape[0]):
+        room = law.limit_rate * max(model.upper[j] - phi[j] if u[j] > 0.0 else phi[j] - model.lower[j], 0.0)
+        # what allocation has put on its bound is there to rounding
+        allowed = min(law.rate_limit, room + 1e-9)
+        if abs(u[j]) > allowed:
+            factor = min(factor, allowed / abs(u[j]))
+    for j in range(u.shape[0]):
+        u[j] *= factor
+    return factor < 1.0
 
 
 @internal_kernel
@@ -284,8 +313,10 @@ def tick(model, law, schedule, state, velocity, rig):
     that order. Those of its predicted middle (``schedule.midpoint``) make it O(period^2). The prediction is the closed
     loop itself, w~' = w~_d' - K (w~ - w~_d) ([T] eq 15).
 
-    With the allocating limit policy a command is carried out only as a whole, every joint within its limits and rate.
-    Otherwise the target waits where it is, and if not even the null-space motion fits, the robot does too.
+    With the allocating limit policy a command is carried out only as a whole, every joint within its limits and rate;
+    a null-space motion that is too fast is reduced. Otherwise the target waits where it is, and what is left to do
+    (errors, shape points) is slowed down until it fits. A target that would turn over beta = +-90 deg, where the rates
+    of alpha and gamma have no bound, waits too.
 
     Returns
     -------
@@ -298,10 +329,17 @@ def tick(model, law, schedule, state, velocity, rig):
     phi, phi_hat, w_hat, w_target = state.phi, state.phi_hat, state.w_hat, state.w_target
     pose, target, joints_ahead, u, error, rate = rig.pose, rig.target, rig.phi_stage, work.u, work.error, rig.rate
     joints = phi.shape[0]
-    null_gain = law.null_gain if state.counts[1] >= schedule.null_start_tick else 0.0
+    full_gain = law.null_gain if state.counts[1] >= schedule.null_start_tick else 0.0
+    null_gain = full_gain
+    allocate = law.limit_policy == LIMITS_ALLOCATE
     believe(model, schedule, state, rig)
     copy(velocity, rate)
-    attempt = 0
+    reason, waits, reductions, slowed = NO_OBSTACLE, False, 0, False
+    beta = wrap_angle(w_target[4])
+    if allocate and abs(beta) > BETA_LIMIT and beta * velocity[4] > 0.0:
+        reason, waits = ATTITUDE, True
+        for i in range(6):
+            rate[i] = 0.0
     while True:
         copy(w_hat, pose)
         copy(w_target, target)
@@ -314,13 +352,28 @@ def tick(model, law, schedule, state, velocity, rig):
                 for j in range(joints):
                     joints_ahead[j] += 0.5 * period * u[j]
             control_input(model, law, work, pose, joints_ahead, target, rate, mode, null_gain)
-        if law.limit_policy != LIMITS_ALLOCATE or attempt == 2 or fits(law, work, joints):
+        if not allocate:
             break
-        attempt += 1
-        if attempt == 2:
-            null_gain = 0.0
-        for i in range(6):
-            rate[i] = 0.0
+        found = obstacle(law, work, joints)
+        if found == NO_OBSTACLE:
+            break
+        if found == RATE_LIMIT and reductions < NULL_REDUCTIONS and null_gain != 0.0:
+            fastest = 0.0
+            for j in range(joints):
+                fastest = max(fastest, abs(u[j]))
+            reductions += 1
+            null_gain *= 0.0 if reductions == NULL_REDUCTIONS else 0.9 * law.rate_limit / fastest
+        elif not waits:
+            reason, waits, null_gain, reductions = found, True, full_gain, 0
+            for i in range(6):
+                rate[i] = 0.0
+        elif null_gain != 0.0:
+            null_gain, reductions = 0.0, NULL_REDUCTIONS
+        else:
+            slowed = slow_down(model, law, u, phi)
+            break
+    state.counts[5] += int(slowed)
+    state.counts[6] += int(reductions > 0)
     if law.limit_policy != LIMITS_NONE:  # the mechanical stop, and what is left when no allocation helps
         for j in range(joints):
             up = max(model.upper[j] - phi[j], 0.0) / period
@@ -340,7 +393,9 @@ def tick(model, law, schedule, state, velocity, rig):
     commanded = False
     for i in range(6):
         commanded = commanded or velocity[i] != 0.0
-    return slip, attempt > 0 and commanded
+    if waits and commanded:
+        state.counts[6 + reason] += 1
+    return slip, waits and commanded
 
 
 @kernel

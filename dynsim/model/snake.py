@@ -53,6 +53,7 @@ class SnakeDescription:
     wheel_radius: float
     gripper_length: float
     point_offset: float
+    reference_joints: NDArray[np.float64]  # (n_phi,) head raised, base straight: where damping takes its scale
     joint_names: tuple[str, ...]
     pitch: NDArray[np.bool_]
     lower: NDArray[np.float64]

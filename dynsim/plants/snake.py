@@ -103,10 +103,9 @@ def build(config: Config) -> SnakeDescription:
     names = tuple(f"{'psi' if j % 2 else 'theta'}{j // 2 + 1}" for j in range(n_h))
     names += tuple(f"theta{n_h // 2 + i + 1}" for i in range(n_b))
 
-    given = config.initial_joints_rad
-    if given is None:
-        # [T] V.A; a head part of another length starts with a similar S that keeps the head level
-        given = [0.0, -0.8, 0.0, -1.1, 0.0, 1.9] if n_h == 6 else [0.0, 0.0] * (n_h // 2 - 2) + [0.0, -0.8, 0.0, 0.8]
+    # [T] V.A; a head part of another length starts with a similar S that keeps the head level
+    raised = [0.0, -0.8, 0.0, -1.1, 0.0, 1.9] if n_h == 6 else [0.0, 0.0] * (n_h // 2 - 2) + [0.0, -0.8, 0.0, 0.8]
+    given = raised if config.initial_joints_rad is None else config.initial_joints_rad
     if len(given) not in (n_h, joints):
         raise ModelError(
             f"plant.initial_joints_rad has {len(given)} angles; give n_h = {n_h} (base straight) or all {joints}: "
@@ -127,6 +126,7 @@ def build(config: Config) -> SnakeDescription:
         wheel_radius=config.wheel_radius_m,
         gripper_length=config.gripper_length_m,
         point_offset=config.gripper_length_m if config.controlled_point == "gripper" else 0.0,
+        reference_joints=np.concatenate([raised, np.zeros(n_b)]),
         joint_names=names,
         pitch=pitch,
         lower=-upper,

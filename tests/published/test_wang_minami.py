@@ -82,3 +82,14 @@ def test_other_solver_and_method_give_the_same_answer(records, settings):
     default = records["two_elbows"]
     assert np.abs(other["q"] - default["q"]).max() < 1e-5
     assert other.summary["electrical_energy_J"] == pytest.approx(default.summary["electrical_energy_J"], rel=1e-5)
+
+
+def test_pulling_does_not_depend_on_how_often_it_is_recorded():
+    """Pulling times and forces are those of all steps: a brace that pulls between samples is reported."""
+    found = []
+    for rate in (20.0, 1000.0):
+        scenario = dynsim.load_scenario("elbow_comparison_vertical", "elbow_4", overrides={"record.rate_hz": rate})
+        summary = dynsim.simulate(scenario).summary
+        assert any("pulls on this brace" in warning for warning in summary["warnings"])
+        found.append(summary["contacts"][0]["pulling_fraction"])
+    assert 0.0 < found[0] == found[1] < 0.01

@@ -103,7 +103,6 @@ def switcher(policy, margins=None, costs=None, order=(1, 2, 3)):
         order=order,
         period_ticks=10,
         least_margin=0.0,
-        margin_now=lambda row: margins.get(row, 1.0),
         predict=lambda row: (costs.get(row, 5.0), margins.get(row, 1.0)),
     )
 
@@ -143,6 +142,14 @@ def test_when_the_present_mode_tips_too_the_least_tipping_one_is_taken(policy):
     assert drive(modes, 3, {0: SWITCHING}) == [2] * 3
     assert [r.row for r in modes.refusals if r.taken] == [2]
     assert [row for _, row, _ in refused(modes)] == [1, 3]
+
+
+@pytest.mark.parametrize("policy", ["cyclic", "predictive"])
+def test_the_fixing_mode_is_the_way_out_when_present_and_order_tip(policy):
+    modes = switcher(policy, margins={1: -0.1}, order=(1,))
+    modes.row = 1
+    assert drive(modes, 3, {0: SWITCHING}) == [0] * 3
+    assert refused(modes) == [(0, 1, -0.1)]
 
 
 def test_prediction_takes_the_lowest_cost_that_stands():

@@ -172,7 +172,7 @@ def test_switching_passes_over_modes_that_would_tip(policy):
 
 
 def test_a_mode_whose_prediction_diverges_is_refused():
-    """The null space is switched off in the run, not in the prediction: there its gain is absurd."""
+    """The null space, with an absurd gain, comes on within the predicted period but after the end of the run."""
     record = run(
         0.2,
         commands=[{"at_s": 0.1, "mode": "switching"}],
@@ -332,3 +332,57 @@ def test_kernels_run_as_plain_python():
     )
     compiled = simulate(load_scenario("snake_joint_limits", None, {"duration_s": 0.05, "controller.cost": "eq20_min"}))
     np.testing.assert_allclose(json.loads(interpreted.stdout), compiled["phi"][-1], atol=1e-12)
+
+
+FORWARD = {"type": "ramp", "start_s": 0.2, "duration_s": 1.0, "displacement": [0.1, 0, 0, 0, 0, 0]}
+
+
+@pytest.mark.parametrize(
+    "plant",
+    [{"yaw_joints": 30}, {"yaw_joints": 60}, {"link_length_m": 0.01, "wheel_radius_m": 0.005, "wheel_gap_m": 0.012}],
+)
+def test_damping_is_measured_by_the_robot_and_does_not_stop_long_or_small_ones(plant):
+    """The smallest singular value falls with the number and the length of the links: no singularity."""
+    scale = plant.get("link_length_m", 0.09) / 0.09
+    path = FORWARD | {"displacement": [0.1 * scale, 0, 0, 0, 0, 0]}
+    record = run(2.0, plant=plant, paths=[path])
+    assert record.summary["waiting_s"] == 0.0
+    assert record.summary["displacement"][0] == pytest.approx(0.1 * scale, abs=1e-6)
+
+
+def test_a_target_is_not_turned_over_the_singular_attitude():
+    """At beta = -90 deg A loses rank ([T] eq 15 needs it): the target waits before it and the head stays on it."""
+    plant = {"initial_joints_rad": [0, 0.2, 0, -1.0, 0, 1.9]}  # nose up by 63 deg
+    path = {"type": "ramp", "start_s": 0.2, "duration_s": 2.0, "displacement": [0, 0, 0, 0, -0.65, 0]}
+    for state in ("measured", "feedforward"):
+        summary = run(3.0, plant=plant, paths=[path], state=state).summary
+        assert list(summary["waiting_for_s"]) == ["attitude at beta = 90 deg"]
+        assert summary["attitude_error_max_rad"] < 1e-6
+        assert summary["joint_rate_max_rad_s"] < 1.0
+        assert "attitude at beta = 90 deg" in summary["warnings"][0]
+
+
+def test_feedback_and_shape_points_keep_the_rate_limit():
+    """psi3 starts a radian from its target; at gain 20 it asks for more than 20 rad/s."""
+    record = run(2.0, plant={"initial_joints_rad": [0, -0.3, 0, -0.6, 0, 0.9]}, gain=20.0)
+    summary = record.summary
+    # the recorded rates are those that were applied
+    assert summary["joint_rate_max_rad_s"] <= 4.7 * (1.0 + 1e-12)
+    assert summary["slowed_s"] > 0.0
+    assert any("slowed down" in warning for warning in summary["warnings"])
+    assert record["phi"][-1, 5] == pytest.approx(np.deg2rad(110.0), abs=1e-6)
+
+
+def test_a_null_space_motion_that_is_too_fast_is_reduced_and_not_dropped():
+    """With ten times the gain the cost ends lower, not higher; V still never rises within a mode."""
+    final = {}
+    for gain in (0.1, 1.0):
+        limits = load_scenario("snake_joint_limits", "cyclic", overrides={"controller.null_gain": gain})
+        record = simulate(limits)
+        final[gain] = record.summary["cost_final"]
+        assert record.summary["joint_rate_max_rad_s"] <= 4.7 * (1.0 + 1e-12)
+        same = np.diff(record["mode"]) == 0
+        # rounding, and the removal of head errors while a joint stands at its limit
+        assert np.diff(record["cost"])[same].max() < 1e-6
+    assert record.summary["null_space_reduced_s"] > 0.0
+    assert final[1.0] < final[0.1]
