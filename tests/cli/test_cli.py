@@ -61,6 +61,7 @@ def test_compare_prints_the_table_and_writes_the_comparison(tmp_path: Path):
     rows = (folder / "comparison.csv").read_text().splitlines()
     assert len(rows) == 5
     assert rows[0].startswith("variant,") or ",variant," in rows[0]
+    assert {"elbow_4.closed_fraction", "elbow_4.slip_distance_m"} <= set(rows[0].split(","))
 
 
 @pytest.mark.parametrize(

@@ -66,6 +66,6 @@ def test_eighty_columns_hold_the_times(monkeypatch):
         report(scenario.variant, 9998.99, REFERENCES)
         report(scenario.variant, 9998.99)
     text = "9998.99 / 9999 s {} 0:00:00 to go -:--:--"
-    lines = [" ".join(line.split()) for line in shown.getvalue().splitlines()]
+    lines = shown.getvalue().splitlines()
     for stage in ("references", "simulated"):
-        assert any(line.startswith("a_variant_with_quite_…") and line.endswith(text.format(stage)) for line in lines)
+        assert any("a_variant_with_quite_…" in line and line.endswith(text.format(stage)) for line in lines)
