@@ -38,6 +38,9 @@ app = typer.Typer(
 console = Console(emoji=False)
 errors = Console(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
+# Of a progress bar.
+_TITLE_WIDTH = 22
+
 ScenarioArgument = Annotated[
     str, typer.Argument(metavar="SCENARIO", help="Scenario file, or the name of a shipped one.")
 ]
@@ -55,6 +58,9 @@ def main() -> None:
     except DynsimError as error:
         errors.print(f"[red]error:[/] {_escape(str(error))}")
         sys.exit(error.exit_code)
+    except MemoryError as error:
+        errors.print(f"[red]error:[/] not enough memory: {_escape(str(error))}".removesuffix(": "))
+        sys.exit(2)
 
 
 def _escape(text: str) -> str:
@@ -134,31 +140,40 @@ def compare(
     loaded = [load_scenario(scenario, name, given) for name in variant_names(scenario)]
     folder = out or Path("results", loaded[0].name if loaded else "")
     check_writable(folder)
-    try:
-        with _progress(loaded, quiet) as report:
-            records = compare_variants(
-                scenario,
-                overrides=given,
-                jobs=jobs,
-                progress=report,
-                finished=lambda name, record: save_run(record, folder / name),
-            )
-    except SimulationStopped as stop:
+    records: dict[str, Record] = {}
+
+    def finished(name: str, record: Record) -> None:
+        save_run(record, folder / name)
+        records[name] = record
+
+    def stopped(name: str, stop: SimulationStopped) -> None:
         if stop.record is not None:
-            name = stop.record.summary["variant"]
             save_run(stop.record, folder / name)
             errors.print(f"what was simulated of {name} until then is in {folder / name}, marked incomplete")
-        raise
-    save_comparison(records, folder)
-    if not no_figures:
-        for name, record in records.items():
-            _draw(record, folder / name / "figures", quiet)
-        _draw_comparison(records, folder, quiet)
-    if not quiet:
-        from dynsim.tables import print_comparison
 
-        print_comparison(console, {name: record.summary for name, record in records.items()})
-        console.print(f"Written to {folder}", highlight=False, soft_wrap=True)
+    failure: SimulationStopped | None = None
+    try:
+        with _progress(loaded, quiet) as report:
+            compare_variants(scenario, overrides=given, jobs=jobs, progress=report, finished=finished, stopped=stopped)
+    except SimulationInterrupted:
+        raise
+    except SimulationStopped as stop:
+        failure = stop
+    # In the order of the file, whichever was ready first.
+    records = {s.variant: records[s.variant] for s in loaded if s.variant in records}
+    if records:
+        save_comparison(records, folder)
+        if not no_figures:
+            for name, record in records.items():
+                _draw(record, folder / name / "figures", quiet)
+            _draw_comparison(records, folder, quiet)
+        if not quiet:
+            from dynsim.tables import print_comparison
+
+            print_comparison(console, {name: record.summary for name, record in records.items()})
+            console.print(f"Written to {folder}", highlight=False, soft_wrap=True)
+    if failure is not None:
+        raise failure
 
 
 @app.command(epilog="Example: dynsim check elbow_comparison six_axis_arm")
@@ -253,9 +268,9 @@ app.command(
 
 
 def _overrides(given: list[str] | None) -> dict[str, Any]:
-    from dynsim.scenario import parse_override
+    from dynsim.scenario import SetOptions, parse_override
 
-    return dict(parse_override(text) for text in given or ())
+    return SetOptions(parse_override(text) for text in given or ())
 
 
 def _label(path: Path, record: Record, taken: Container[str]) -> str:
@@ -291,27 +306,30 @@ def _progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantPro
         yield lambda variant, time, stage="": None
         return
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.table import Column
 
     from dynsim.engine import REFERENCES, SIMULATION
     from dynsim.kernels.jit import is_cached
 
     if not is_cached():
         console.print("Compiling the kernels: once after an installation or an edit, about half a minute.")
+    # In 80 columns all fits up to 9999 s: the bar gives way, the times do not.
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         TextColumn("{task.completed:.2f} / {task.total:g} s {task.fields[what]}"),
-        TimeElapsedColumn(),
+        TimeElapsedColumn(table_column=Column(no_wrap=True)),
         TextColumn("to go"),
-        TimeRemainingColumn(),
+        TimeRemainingColumn(table_column=Column(no_wrap=True)),
     )
     with Progress(*columns, console=console, transient=not console.is_terminal) as bars:
 
         def add(scenario: Scenario, what: str, visible: bool) -> TaskID:
-            title = f"{scenario.name} {scenario.variant}".strip()
-            return bars.add_task(title, total=scenario.duration_s, what=what, visible=visible)
+            title = scenario.variant or scenario.name
+            title = title if len(title) <= _TITLE_WIDTH else title[: _TITLE_WIDTH - 1] + "…"
+            return bars.add_task(_escape(title), total=scenario.duration_s, what=what, visible=visible)
 
-        preparing = {s.variant: add(s, "of the references", False) for s in scenarios}
+        preparing = {s.variant: add(s, "references", False) for s in scenarios}
         simulating = {s.variant: add(s, "simulated", True) for s in scenarios}
 
         def report(variant: str, time: float, stage: str = SIMULATION) -> None:

@@ -65,4 +65,9 @@ def write_text(path: Path, text: str) -> Path:
 
 def write_json(path: Path, data: Any) -> Path:
     """Write JSON, see :func:`write_text`."""
-    return write_text(path, json.dumps(data, indent=2, ensure_ascii=False) + "\n")
+    return write_text(path, json_text(data))
+
+
+def json_text(data: Any) -> str:
+    """JSON as dynsim writes it."""
+    return json.dumps(data, indent=2, ensure_ascii=False) + "\n"

@@ -101,9 +101,15 @@ class Record:
         RecordError
             The file cannot be written (no space, no permission); an older file at ``path`` is left as it was.
         """
+        path = Path(path)
+        with replacing(path) as temporary:
+            temporary.write_bytes(self.to_hdf5())
+        return path
+
+    def to_hdf5(self) -> memoryview:
+        """The bytes of the file that :meth:`save` writes."""
         import h5py
 
-        path = Path(path)
         # Made in memory: HDF5 crashes the process when the disk is full while it closes a file.
         image = io.BytesIO()
         with h5py.File(image, "w") as file:
@@ -115,9 +121,7 @@ class Record:
             _write(file, "time", Signal(self.time, "s"))
             for name, signal in self.signals.items():
                 _write(file, f"signals/{name}", signal)
-        with replacing(path) as temporary:
-            temporary.write_bytes(image.getbuffer())
-        return path
+        return image.getbuffer()
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Record:

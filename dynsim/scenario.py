@@ -288,7 +288,7 @@ def load_scenario(path: str | Path, variant: str | None = None, overrides: Mappi
         raise ScenarioError(f"{path}: variant {variant!r} must be a mapping of what differs")
     merged = _merge(data, difference)
     for key, value in (overrides or {}).items():
-        _override(merged, key, value)
+        _override(merged, key, value, _origin(overrides))
     merged = _plain(merged)
     merged["name"] = merged.get("name") or path.stem
     if variant is not None:
@@ -315,6 +315,14 @@ def scenario_from_resolved(resolved: Mapping[str, Any]) -> Scenario:
         problem = _explain(error, "the scenario in this record", resolved, (), {})
         raise ScenarioError(f"{problem}; it was written by another version of dynsim") from None
     return Scenario(config.name, config.variant, config)
+
+
+class SetOptions(dict[str, Any]):
+    """Overrides that were given as ``--set`` on the command line: errors call them so."""
+
+
+def _origin(overrides: Mapping[str, Any] | None) -> str:
+    return "--set" if isinstance(overrides, SetOptions) else "overrides"
 
 
 def parse_override(text: str) -> tuple[str, Any]:
@@ -380,7 +388,8 @@ def _read(path: Path) -> Any:
     if data is None:
         raise ScenarioError(f"{path}: is empty; a scenario needs at least duration_s and plant")
     if not isinstance(data, CommentedMap):
-        raise ScenarioError(f"{path}: must be a mapping of keys to values, not a {type(data).__name__}")
+        kind = "list" if isinstance(data, list) else "single value"
+        raise ScenarioError(f"{path}: must be a mapping of keys to values, not a {kind}")
     return data
 
 
@@ -423,19 +432,19 @@ def _merge(base: Any, difference: Any) -> Any:
     return merged
 
 
-def _override(data: Any, key: str, value: Any) -> None:
+def _override(data: Any, key: str, value: Any, origin: str) -> None:
     """Set the dotted ``key`` in nested mappings and lists."""
     node, parts = data, key.split(".")
     for depth, part in enumerate(parts):
         last = depth == len(parts) - 1
         if isinstance(node, list):
             if not part.isdigit() or int(part) >= len(node):
-                raise ScenarioError(f"--set {key}: {part!r} is no index of a list of {len(node)}")
+                raise ScenarioError(f"{origin} {key}: {part!r} is no index of a list of {len(node)}")
             index: Any = int(part)
         elif isinstance(node, Mapping):
             index = part
         else:
-            raise ScenarioError(f"--set {key}: {'.'.join(parts[:depth])} is a value, not a mapping")
+            raise ScenarioError(f"{origin} {key}: {'.'.join(parts[:depth])} is a value, not a mapping")
         if last:
             node[index] = value
             return
@@ -472,7 +481,7 @@ def _explain(
     _, line = max(found_in, key=lambda depth_and_line: depth_and_line[0], default=(0, 0))
     place = f"{path}:{line}" if line else str(path)
     if any(dotted == key or dotted.startswith(key + ".") or key.startswith(dotted + ".") for key in overrides):
-        place = "--set"
+        place = _origin(overrides)
     kind, message = problem["type"], problem["msg"].removeprefix("Value error, ")
     if kind == "extra_forbidden":
         known = _fields(problem["loc"][:-1]) + (["variants"] if len(keys) == 1 else [])

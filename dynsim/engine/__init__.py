@@ -64,11 +64,16 @@ def check(scenario: Scenario) -> None:
 @contextmanager
 def _named(scenario: Scenario) -> Iterator[None]:
     """Say in errors which scenario and variant they are about; those of reading it name file and line themselves."""
+    if not isinstance(scenario, Scenario):
+        raise ScenarioError(f"needs a Scenario, not {scenario!r}; load_scenario(name or file) gives one")
     name = f"{scenario.source or scenario.name}{f' ({scenario.variant})' if scenario.variant else ''}"
     try:
         yield
     except (ModelError, ScenarioError, UnreachableReference) as error:
         raise type(error)(f"{name}: {error}") from error
+    except MemoryError as error:
+        reason = f"not enough memory ({error})" if str(error) else "not enough memory"
+        raise ScenarioError(f"{name}: {reason}; a lower record.rate_hz or duration_s needs less") from error
     except KeyboardInterrupt:
         raise SimulationInterrupted(f"{name}: interrupted before there was anything to save") from None
 

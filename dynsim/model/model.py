@@ -171,4 +171,7 @@ class Model:
 
     @staticmethod
     def _point(point: ArrayLike) -> Array:
-        return np.array(point, dtype=np.float64)
+        array = np.array(point, dtype=np.float64)
+        if array.shape != (3,):
+            raise ModelError(f"point has shape {array.shape}; it must be (3,): x, y, z in the body's frame [m]")
+        return array

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor
+import signal
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
 from functools import partial
 from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any, Protocol
 
 from dynsim.engine import SIMULATION, simulate
-from dynsim.errors import ScenarioError
+from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.files import write_json, write_text
 from dynsim.record import Record
-from dynsim.scenario import load_scenario, variant_names
+from dynsim.scenario import Scenario, load_scenario, variant_names
+
+# In a worker process: set when it shall stop and hand back what it has.
+_interrupt: Any = None
 
 
 class VariantProgress(Protocol):
@@ -31,8 +36,9 @@ def compare(
     jobs: int = 1,
     progress: VariantProgress | None = None,
     finished: Callable[[str, Record], None] | None = None,
+    stopped: Callable[[str, SimulationStopped], None] | None = None,
 ) -> dict[str, Record]:
-    """Simulate every variant of a scenario.
+    """Simulate every variant of a scenario. A variant that stops does not keep the others from running; Ctrl-C does.
 
     Parameters
     ----------
@@ -41,6 +47,7 @@ def compare(
     jobs : processes; one runs the variants here, one after the other
     progress : see :class:`VariantProgress` (with several processes it is called only at a variant's end)
     finished : called with variant and record as soon as a variant is done, so that it can be saved
+    stopped : called with variant and exception as soon as a variant stops or is interrupted
 
     Returns
     -------
@@ -51,36 +58,128 @@ def compare(
     ScenarioError
         The file has no variants, or one of them is not valid; all are checked before the first runs.
     SimulationStopped, SimulationInterrupted
-        From the first variant that stops.
+        A variant stopped (after the others have run) or Ctrl-C. Names all that stopped; holds the record of the first.
     """
     names = variant_names(path)
     if not names:
         raise ScenarioError(f"{path}: has no variants to compare; use `dynsim run`")
     scenarios = {name: load_scenario(path, name, overrides) for name in names}
-    records = {}
-    if jobs > 1:
-        # Spawned, not forked: the parent may hold threads and an open progress display.
-        with ProcessPoolExecutor(min(jobs, len(names)), mp_context=get_context("spawn")) as pool:
-            futures = {name: pool.submit(simulate, scenario) for name, scenario in scenarios.items()}
-            try:
-                for name, future in futures.items():
-                    records[name] = future.result()
-                    if progress is not None:
-                        progress(name, scenarios[name].duration_s)
-                    if finished is not None:
-                        finished(name, records[name])
-            except BaseException:
-                # Ctrl-C or a stopped variant: nobody waits for the others.
-                pool.shutdown(wait=False, cancel_futures=True)
-                for process in active_children():
-                    process.terminate()
-                raise
-        return records
-    for name, scenario in scenarios.items():
-        records[name] = simulate(scenario, None if progress is None else partial(progress, name))
+    records: dict[str, Record] = {}
+    stops: dict[str, SimulationStopped] = {}
+
+    def take(name: str, result: Callable[[], Record]) -> None:
+        try:
+            record = result()
+        except SimulationStopped as stop:
+            if stopped is not None:
+                stopped(name, stop)
+            stops[name] = stop
+            return
         if finished is not None:
-            finished(name, records[name])
-    return records
+            finished(name, record)
+        records[name] = record
+
+    if jobs > 1:
+
+        def take_late(name: str, result: Callable[[], Record]) -> None:
+            take(name, result)
+            if progress is not None and name in records:
+                progress(name, scenarios[name].duration_s)
+
+        interrupted = _run_in_processes(scenarios, jobs, take_late)
+    else:
+        interrupted = False
+        for name, scenario in scenarios.items():
+            take(name, partial(simulate, scenario, None if progress is None else partial(progress, name)))
+            if isinstance(stops.get(name), SimulationInterrupted):
+                interrupted = True
+                break
+    if stops or interrupted:
+        raise _summed_up(path, {name: stops[name] for name in names if name in stops}, interrupted)
+    return {name: records[name] for name in names}
+
+
+def _summed_up(path: str | Path, stops: Mapping[str, SimulationStopped], interrupted: bool) -> SimulationStopped:
+    """One exception for all variants that stopped."""
+    first = next(iter(stops.values()), SimulationStopped(f"{path}: interrupted"))
+    # Without a record the message names the variant already.
+    texts = [str(stop) if stop.record is None else f"{name}: {stop}" for name, stop in stops.items()] or [str(first)]
+    kind = SimulationInterrupted if interrupted else SimulationStopped
+    summed_up = kind("; ".join(texts), time=first.time, state=first.state)
+    summed_up.record = next((stop.record for stop in stops.values() if stop.record is not None), None)
+    return summed_up
+
+
+def _run_in_processes(
+    scenarios: Mapping[str, Scenario], jobs: int, take: Callable[[str, Callable[[], Record]], None]
+) -> bool:
+    """Hand every result to ``take`` as it comes; True if Ctrl-C made the workers stop early."""
+    # Spawned, not forked: the parent may hold threads and an open progress display.
+    context = get_context("spawn")
+    interrupt = context.Event()
+    waiting: dict[Future[Record], str] = {}
+
+    def collect() -> None:
+        while waiting:
+            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                take(waiting[future], future.result)
+                del waiting[future]
+
+    workers = min(jobs, len(scenarios))
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker, initargs=(interrupt,)) as pool:
+        try:
+            try:
+                with _sigint_held():
+                    for name, scenario in scenarios.items():
+                        waiting[pool.submit(_simulate, scenario)] = name
+                collect()
+            except KeyboardInterrupt:
+                interrupt.set()
+                for future in [future for future in waiting if future.cancel()]:
+                    del waiting[future]
+                collect()
+                return True
+        except BaseException:
+            # A result that cannot be saved, or a second Ctrl-C: nobody waits for the others.
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in active_children():
+                process.terminate()
+            raise
+    return False
+
+
+@contextmanager
+def _sigint_held() -> Iterator[None]:
+    """Processes started here do not get the Ctrl-C of the terminal, not even while they start; this one gets it after.
+
+    Only the parent reacts to it, wherever it was sent, and tells the workers.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _start_worker(interrupt: Any) -> None:
+    global _interrupt
+    _interrupt = interrupt
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _simulate(scenario: Scenario) -> Record:
+    """In a worker: stop where Ctrl-C would have stopped it here, with what there is."""
+
+    def look(time: float, stage: str = SIMULATION) -> None:
+        if _interrupt.is_set():
+            raise KeyboardInterrupt
+
+    if _interrupt.is_set():
+        raise SimulationInterrupted(f"{scenario.name} ({scenario.variant}): interrupted before it was started")
+    return simulate(scenario, look)
 
 
 def save_comparison(records: Mapping[str, Record], folder: Path) -> None:
@@ -90,13 +189,16 @@ def save_comparison(records: Mapping[str, Record], folder: Path) -> None:
     columns = ["variant"] + [key for key, value in next(iter(summaries.values())).items() if _is_scalar(value)]
     columns = list(dict.fromkeys(columns))
     contacts = list(dict.fromkeys(c["name"] for s in summaries.values() for c in s.get("contacts", ())))
-    contact_keys = ("normal_force_min_N", "normal_force_mean_N", "normal_force_max_N", "pulling_fraction")
+    contact_keys = (
+        "normal_force_min_N", "normal_force_mean_N", "normal_force_max_N", "closed_fraction", "pulling_fraction",
+        "slip_distance_m",
+    )  # fmt: skip
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow([*columns, *(f"{name}.{key}" for name in contacts for key in contact_keys)])
     for name, summary in summaries.items():
         by_name = {c["name"]: c for c in summary.get("contacts", ())}
-        row = [name if key == "variant" else summary[key] for key in columns]
+        row = [name if key == "variant" else summary.get(key, "") for key in columns]
         row += [by_name.get(contact, {}).get(key, "") for contact in contacts for key in contact_keys]
         writer.writerow(row)
     write_text(folder / "comparison.csv", stream.getvalue())

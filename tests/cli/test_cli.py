@@ -14,6 +14,7 @@ import pytest
 
 from dynsim.cli import main
 from dynsim.record import FORMAT, Record
+from dynsim.scenario import SHIPPED
 
 SHORT = ["--set", "duration_s=0.2", "--set", "metrics.settle_s=0.05"]
 
@@ -60,6 +61,7 @@ def test_compare_prints_the_table_and_writes_the_comparison(tmp_path: Path):
     rows = (folder / "comparison.csv").read_text().splitlines()
     assert len(rows) == 5
     assert rows[0].startswith("variant,") or ",variant," in rows[0]
+    assert {"elbow_4.closed_fraction", "elbow_4.slip_distance_m"} <= set(rows[0].split(","))
 
 
 @pytest.mark.parametrize(
@@ -146,6 +148,48 @@ def test_ctrl_c_saves_what_was_simulated(tmp_path: Path):
     assert "incomplete" in record.summary["warnings"][-1]
 
 
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="process groups are POSIX")
+def test_ctrl_c_saves_all_variants_that_run_in_processes(tmp_path: Path):
+    # Two run, two wait. One signal goes to the parent alone, the other, as a terminal sends it, to all.
+    processes = {
+        kill: subprocess.Popen(
+            [sys.executable, "-m", "dynsim", "compare", "elbow_comparison", "--jobs", "2", "--no-figures",
+             "--set", "duration_s=5000", "--set", "controller.knot_spacing_s=10",
+             "--set", "controller.hand.path.period_s=5000", "--set", "record.rate_hz=10", "--out", kill.__name__],
+            cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        )
+        for kill in (os.kill, os.killpg)
+    }  # fmt: skip
+    time.sleep(12.0)
+    for kill, process in processes.items():
+        kill(process.pid, signal.SIGINT)
+        _, stderr = process.communicate(timeout=120)
+        assert process.returncode == 130, stderr
+        *saved, error = stderr.splitlines()
+        assert sorted(line.split()[4] for line in saved) == ["elbow_7", "two_elbows"]
+        assert error.startswith("error: two_elbows: interrupted at t = ")
+        assert {path.name for path in (tmp_path / kill.__name__).iterdir()} == {"elbow_7", "two_elbows"}
+        for name in ("elbow_7", "two_elbows"):
+            assert not Record.load(tmp_path / kill.__name__ / name / "record.h5").complete
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_a_variant_that_stops_does_not_keep_the_others_from_the_comparison(tmp_path: Path, jobs: str):
+    text = (SHIPPED / "elbow_comparison.yaml").read_text().partition("\nvariants:")[0]
+    # RK4 is unstable beyond 1.4 ms for this arm.
+    variants = "variants: {one: {}, bad: {integrator: {method: rk4, step_s: 0.01}}, two: {contacts: {friction: 0.2}}}"
+    (tmp_path / "three.yaml").write_text(f"{text}\n{variants}\n")
+    arguments = ["three.yaml", "--no-figures", "--jobs", jobs, "--out", "out", "--set", "duration_s=2.5"]
+    result = dynsim("compare", *arguments, folder=tmp_path)
+    assert result.returncode == 3, result.stderr
+    saved, error = result.stderr.splitlines()
+    assert saved == "what was simulated of bad until then is in out/bad, marked incomplete"
+    assert error.startswith("error: bad: stopped at t = ")
+    assert list(json.loads((tmp_path / "out" / "comparison.json").read_text())["variants"]) == ["one", "two"]
+    assert "electrical energy" in result.stdout
+    assert not Record.load(tmp_path / "out" / "bad" / "record.h5").complete
+
+
 def test_ctrl_c_before_the_first_step_says_that_nothing_is_saved(tmp_path: Path):
     # Many knots: the inverse kinematics take minutes.
     arguments = ["elbow_comparison", "--set", "duration_s=50000", "--set", "record.rate_hz=1"]
@@ -176,7 +220,7 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(tmp_path: Path):
     assert result.stderr.splitlines() == [
         "error: cannot write full/record.h5: File too large; nothing was changed there"
     ]
-    assert [path.name for path in (tmp_path / "full").iterdir()] == ["scenario.yaml"]
+    assert list((tmp_path / "full").iterdir()) == []
 
 
 def test_list_check_schema_and_version(tmp_path: Path):

@@ -1,6 +1,7 @@
 """What takes long says how far it is; quiet mode says nothing."""
 
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,7 @@ from rich.console import Console
 
 from dynsim import cli
 from dynsim.control import inverse_kinematics
-from dynsim.engine import simulate
+from dynsim.engine import REFERENCES, simulate
 from dynsim.scenario import load_scenario
 
 SHORT = {"duration_s": 0.2}
@@ -52,5 +53,19 @@ def test_the_terminal_shows_it_unless_quiet(monkeypatch, tmp_path: Path, quiet):
     monkeypatch.setattr(cli, "console", Console(file=shown, force_terminal=True, width=120))
     arguments = ["run", "elbow_comparison", "--no-figures", "--set", "duration_s=0.2", "--out", str(tmp_path)]
     cli.app([*arguments, *(["-q"] if quiet else [])], standalone_mode=False)
-    assert ("of the references" in shown.getvalue()) is not quiet
+    assert ("s references" in shown.getvalue()) is not quiet
     assert ("simulated" in shown.getvalue()) is not quiet
+
+
+def test_eighty_columns_hold_the_times(monkeypatch):
+    shown = io.StringIO()
+    monkeypatch.setattr(cli, "console", Console(file=shown, width=80, force_terminal=True, color_system=None))
+    scenario = load_scenario("elbow_comparison", overrides={"duration_s": 9999})
+    scenario = replace(scenario, variant="a_variant_with_quite_a_long_name")
+    with cli._progress([scenario], quiet=False) as report:
+        report(scenario.variant, 9998.99, REFERENCES)
+        report(scenario.variant, 9998.99)
+    text = "9998.99 / 9999 s {} 0:00:00 to go -:--:--"
+    lines = shown.getvalue().splitlines()
+    for stage in ("references", "simulated"):
+        assert any("a_variant_with_quite_…" in line and line.endswith(text.format(stage)) for line in lines)

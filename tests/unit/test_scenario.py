@@ -1,12 +1,15 @@
 """Scenario files: merging, errors that name file, line, key, value and fix, and round trips."""
 
+import re
 from pathlib import Path
 
 import pytest
 
+import dynsim
 from dynsim.engine import check
-from dynsim.errors import ModelError, ScenarioError, UnreachableReference
+from dynsim.errors import DynsimError, ModelError, ScenarioError, UnreachableReference
 from dynsim.scenario import (
+    SetOptions,
     build_model,
     find_scenario,
     json_schema,
@@ -142,7 +145,7 @@ def test_shared_keys_of_a_resolved_scenario_are_refused_with_the_keys_to_set(tmp
     with pytest.raises(ScenarioError) as caught:
         load_scenario(path, overrides={"plant.link.mass_kg": 0.5})
     assert str(caught.value) == (
-        "--set: plant.link.mass_kg = 0.5: has no effect on any entry of plant.chain; "
+        "overrides: plant.link.mass_kg = 0.5: has no effect on any entry of plant.chain; "
         "set plant.chain.0.mass_kg, plant.chain.1.mass_kg instead"
     )
     # What the entries do not have still reaches them.
@@ -215,3 +218,49 @@ def test_schema_knows_every_family():
     text = str(json_schema())
     for word in ("serial_arm", "joint_pd", "wang_minami", "circle", "cylinder", "variants"):
         assert word in text
+
+
+def test_overrides_are_called_as_they_were_given():
+    with pytest.raises(ScenarioError, match=r"^overrides duration_s\.x: duration_s is a value"):
+        load_scenario("single_pendulum", overrides={"duration_s.x": 1})
+    with pytest.raises(ScenarioError, match=r"^--set: duration_s = -1: "):
+        load_scenario("single_pendulum", overrides=SetOptions({"duration_s": -1}))
+
+
+def test_a_list_is_no_scenario(tmp_path: Path):
+    (tmp_path / "list.yaml").write_text("- 1\n")
+    with pytest.raises(ScenarioError, match="must be a mapping of keys to values, not a list"):
+        load_scenario(tmp_path / "list.yaml")
+
+
+@pytest.mark.parametrize(
+    ("row", "expected"), [("1, a, 0, 0", "'1, a, 0, 0' is not 4 numbers"), ("1, 0, 0", "3 values; there must be 4")]
+)
+def test_a_bad_row_of_a_csv_path_is_named_with_its_line(tmp_path: Path, row: str, expected: str):
+    file = tmp_path / "path.csv"
+    file.write_text(f"t_s, x_m, y_m, z_m\n0, 1, 0, 0\n\n{row}\n")
+    with pytest.raises(ScenarioError, match=re.escape(f"{file}:4: {expected}")):
+        load_scenario("elbow_comparison", overrides={"controller.hand.path": {"type": "csv", "file": str(file)}})
+
+
+def test_a_record_that_does_not_fit_into_memory_is_an_error_of_the_scenario():
+    overrides = {"duration_s": 1e6, "record.rate_hz": 1e9, "record.size_limit_GB": 1e12}
+    with pytest.raises(ScenarioError, match="not enough memory"):
+        check(load_scenario("single_pendulum", overrides=overrides))
+
+
+def test_a_name_is_no_scenario():
+    with pytest.raises(DynsimError, match="load_scenario"):
+        dynsim.simulate("single_pendulum")  # type: ignore[arg-type]
+
+
+def test_what_is_public_is_listed():
+    assert set(dynsim.__all__) <= set(dir(dynsim))
+
+
+@pytest.mark.parametrize("point", [[0.1, 0.2], [0.1, 0.2, 0.3, 0.4]])
+def test_a_point_has_three_coordinates(point: list[float]):
+    model = build_model(load_scenario("single_pendulum"))
+    for method in (model.point_position, model.point_jacobian):
+        with pytest.raises(ModelError, match="point has shape"):
+            method(0, point, [0.0])

@@ -45,7 +45,19 @@ def _table(file: str) -> NDArray[np.float64]:
         header = [name.strip() for name in stream.readline().split(",")]
         if tuple(header) != COLUMNS:
             raise ValueError(f"{path}: the first line is {','.join(header)!r}; it must be {','.join(COLUMNS)!r}")
-        table = np.loadtxt(stream, delimiter=",", ndmin=2)
+        lines = ((number, line.strip()) for number, line in enumerate(stream, 2))
+        rows = [_row(line, f"{path}:{number}") for number, line in lines if line and not line.startswith("#")]
+    table = np.array(rows)
     if len(table) < 2 or not np.isfinite(table).all() or np.any(np.diff(table[:, 0]) <= 0.0):
         raise ValueError(f"{path}: needs two rows or more, finite numbers and increasing t_s")
     return table
+
+
+def _row(line: str, place: str) -> list[float]:
+    cells = [cell.strip() for cell in line.partition("#")[0].split(",")]
+    if len(cells) != len(COLUMNS):
+        raise ValueError(f"{place}: {len(cells)} values; there must be {len(COLUMNS)}: {','.join(COLUMNS)}")
+    try:
+        return [float(cell) for cell in cells]
+    except ValueError:
+        raise ValueError(f"{place}: {line!r} is not {len(COLUMNS)} numbers") from None
