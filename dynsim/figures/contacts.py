@@ -27,9 +27,7 @@ def forces(record: Record) -> Figure | None:
     chosen = _most_interesting(names, [record])
     note = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} contacts (lowest forces)"
     figure = style.new_figure(1.0 + 1.5 * len(chosen), style.title(record, f"normal contact forces{note}"))
-    rows = style.time_rows(
-        figure, [_series(record, name) for name in chosen], style.settle_time(record)
-    )
+    rows = style.time_rows(figure, [_series(record, name) for name in chosen], style.settle_time(record))
     for name, panels in zip(chosen, rows, strict=True):
         force = _force(record, name)
         for axes in panels:
