@@ -16,7 +16,7 @@ from dynsim.record import Record
 # More rows than this do not fit a page.
 ROWS = 8
 # More samples than this are not drawn as dots.
-DOTS = 80
+DOTS = 150
 
 
 def forces(record: Record) -> Figure | None:
@@ -122,7 +122,7 @@ def _draw_samples(axes: Axes, record: Record, name: str, colour: str) -> None:
     """A dot at each sample of the transient, while they are few enough to be told apart."""
     inside = record.time <= axes.get_xlim()[1]
     if inside.sum() <= DOTS:
-        axes.plot(record.time[inside], _force(record, name)[inside], ".", color=colour, markersize=3.5)
+        axes.plot(record.time[inside], _force(record, name)[inside], ".", color=colour, markersize=2.5)
 
 
 def _note_sampling(panels: Sequence[Axes], records: Sequence[Record]) -> None:
@@ -131,7 +131,7 @@ def _note_sampling(panels: Sequence[Axes], records: Sequence[Record]) -> None:
     if not steps:
         return
     note = f"sampled every {style.number(1e3 * max(steps), 3)} ms"
-    if len(panels) > 1:
+    if any(line.get_marker() == "." for line in panels[0].get_lines()):
         note += " (dots)"
     gap = "\n" if len(panels) > 1 else "; "
     panels[0].set_xlabel(f"{panels[0].get_xlabel()}\n{note}{gap}dashed: extremes of all steps")

@@ -378,9 +378,9 @@ def _space_view(
     for artist in axes.get_children():
         artist.set_clip_on(False)
         artist.set_in_layout(False)
-    axes.set_xlabel("x [m]", labelpad=1)
-    axes.set_ylabel("y [m]", labelpad=1)
-    axes.set_zlabel("z [m]", labelpad=3)
+    axes.set_xlabel("x [m]", labelpad=-2)
+    axes.set_ylabel("y [m]", labelpad=-3)
+    axes.set_zlabel("z [m]", labelpad=-3)
     axes.tick_params(pad=-1)
     for axis, a, b, share in zip(
         (axes.xaxis, axes.yaxis, axes.zaxis), low, high, (high - low) / (high - low).max(), strict=True
