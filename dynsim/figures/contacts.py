@@ -15,6 +15,8 @@ from dynsim.record import Record
 
 # More rows than this do not fit a page.
 ROWS = 8
+# More samples than this are not drawn as dots.
+DOTS = 150
 
 
 def forces(record: Record) -> Figure | None:
@@ -25,19 +27,21 @@ def forces(record: Record) -> Figure | None:
     chosen = _most_interesting(names, [record])
     note = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} contacts (lowest forces)"
     figure = style.new_figure(1.0 + 1.5 * len(chosen), style.title(record, f"normal contact forces{note}"))
-    rows = style.time_rows(
-        figure, [[(record.time, _force(record, name))] for name in chosen], style.settle_time(record)
-    )
+    rows = style.time_rows(figure, [_series(record, name) for name in chosen], style.settle_time(record))
     for name, panels in zip(chosen, rows, strict=True):
         force = _force(record, name)
         for axes in panels:
             style.line(axes, record.time, force, color=style.BLUE, label=pulling_label(record, name))
+            _draw_extremes(axes, record, name, style.BLUE)
             axes.fill_between(
                 *_thin_negative(record.time, force), 0.0, color=style.PULLING, alpha=0.3, linewidth=0, label="_pulling"
             )
             _mark_pulling(axes)
+        if len(panels) > 1:
+            _draw_samples(panels[0], record, name, style.BLUE)
         panels[0].set_ylabel(f"{name}\n$f_n$ [N]")
         style.legend_above(panels[-1])
+    _note_sampling(rows[-1], [record])
     return figure
 
 
@@ -49,18 +53,26 @@ def forces_comparison(records: Mapping[str, Record]) -> Figure | None:
     chosen = _most_interesting(names, list(records.values()))
     having = {name: {v: r for v, r in records.items() if name in contact_names([r])} for name in chosen}
     title = style.comparison_title(list(records.values()), "normal contact forces")
-    figure = style.new_figure(1.1 + 1.7 * len(chosen), title)
-    series = [[(r.time, _force(r, name)) for r in having[name].values()] for name in chosen]
+    # A legend has an entry for each variant and one for the shading.
+    more = sum(-(-(len(having[name]) + 1) // 2) - 1 for name in chosen) * style.LEGEND_ROW / 72.0
+    figure = style.new_figure(1.1 + 1.7 * len(chosen) + more, title)
+    series = [[one for r in having[name].values() for one in _series(r, name)] for name in chosen]
     settle = max(style.settle_time(record) for record in records.values())
     styles = style.variant_styles(list(records))
-    for name, panels in zip(chosen, style.time_rows(figure, series, settle), strict=True):
+    rows = style.time_rows(figure, series, settle)
+    for name, panels in zip(chosen, rows, strict=True):
         for axes in panels:
             for variant, record in having[name].items():
-                label = f"{variant}: pulling {_percent(record, name)}"
+                label = f"{variant}: pulling {_share(record, name)}{_within(record, name)}"
                 style.line(axes, record.time, _force(record, name), label=label, **styles[variant])
+                _draw_extremes(axes, record, name, str(styles[variant]["color"]))
             _mark_pulling(axes)
+        if len(panels) > 1:
+            for variant, record in having[name].items():
+                _draw_samples(panels[0], record, name, str(styles[variant]["color"]))
         panels[0].set_ylabel(f"{name}\n$f_n$ [N]")
-        style.legend_above(panels[-1], columns=2 if len(having[name]) > 2 else 3)
+        style.legend_above(panels[-1], columns=2)
+    _note_sampling(rows[-1], list(records.values()))
     return figure
 
 
@@ -74,18 +86,55 @@ def contact_names(records: Sequence[Record]) -> list[str]:
 
 def pulling_label(record: Record, name: str) -> str:
     """Share of the run in which the contact pulls, and the extremes of its force."""
-    label = f"{name}: pulling {_percent(record, name)}"
+    return f"{name}: pulling {_share(record, name)} of the run{_within(record, name)}"
+
+
+def _share(record: Record, name: str) -> str:
+    return f"{100.0 * metrics.negative_fraction(_force(record, name), record.time):.1f} %"
+
+
+def _within(record: Record, name: str) -> str:
+    extremes = _extremes(record, name)
+    return f"; all steps {style.number(extremes[0], 3)} … {style.number(extremes[1], 3)} N" if extremes.size else ""
+
+
+def _extremes(record: Record, name: str) -> Array:
+    """Lowest and highest force of all integration steps [N], which see peaks between the samples; empty if unknown."""
     for contact in record.summary.get("contacts", ()):
         if contact["name"] == name:
-            # Of all integration steps, which see peaks between the samples.
-            low, high = contact["normal_force_min_N"], contact["normal_force_max_N"]
-            label += f"; all steps within {style.number(low, 3)} … {style.number(high, 3)} N"
-    return label
+            values = np.array([contact["normal_force_min_N"], contact["normal_force_max_N"]], dtype=np.float64)
+            return values if np.isfinite(values).all() else np.empty(0)
+    return np.empty(0)
 
 
-def _percent(record: Record, name: str) -> str:
-    share = metrics.negative_fraction(_force(record, name), record.time)
-    return f"{100.0 * share:.1f} % of the run"
+def _series(record: Record, name: str) -> list[style.Series]:
+    """What must find room: the samples, and the extremes, which most often fall into the first milliseconds."""
+    extremes = _extremes(record, name)
+    return [(record.time, _force(record, name)), *([(record.time[[0, 0]], extremes)] if extremes.size else [])]
+
+
+def _draw_extremes(axes: Axes, record: Record, name: str, colour: str) -> None:
+    for value in _extremes(record, name):
+        axes.axhline(value, color=colour, linestyle=(0, (5, 3)), linewidth=0.7)
+
+
+def _draw_samples(axes: Axes, record: Record, name: str, colour: str) -> None:
+    """A dot at each sample of the transient, while they are few enough to be told apart."""
+    inside = record.time <= axes.get_xlim()[1]
+    if inside.sum() <= DOTS:
+        axes.plot(record.time[inside], _force(record, name)[inside], ".", color=colour, markersize=2.5)
+
+
+def _note_sampling(panels: Sequence[Axes], records: Sequence[Record]) -> None:
+    """Under the first panel: how often the curves are sampled, and what the dashed lines are."""
+    steps = [float(np.median(np.diff(record.time))) for record in records if len(record) > 1]
+    if not steps:
+        return
+    note = f"sampled every {style.number(1e3 * max(steps), 3)} ms"
+    if any(line.get_marker() == "." for line in panels[0].get_lines()):
+        note += " (dots)"
+    gap = "\n" if len(panels) > 1 else "; "
+    panels[0].set_xlabel(f"{panels[0].get_xlabel()}\n{note}{gap}dashed: extremes of all steps")
 
 
 def _force(record: Record, name: str) -> Array:

@@ -28,6 +28,8 @@ TERMS = {
 LOG_RATIO = 8.0
 # A term with more than this share of the turnover hides the others: they get a panel of their own.
 DOMINANT = 0.8
+# Less than this share of the largest term is rounding.
+NOTHING = 1e-9
 
 
 def has_motors(record: Record) -> bool:
@@ -111,6 +113,7 @@ def ledger(record: Record) -> Figure | None:
 def _stack(axes: Axes, time: Array, terms: Mapping[str, Array], supplied: Array) -> None:
     """Positive terms upward and negative ones downward from zero: both together make up what was supplied."""
     kept = np.unique(np.linspace(0, len(time) - 1, min(len(time), style.LINE_POINTS // 4)).astype(int))
+    largest = max(float(np.abs(values[-1])) for values in (*terms.values(), supplied))
     for clip in (np.maximum, np.minimum):
         base = np.zeros(len(kept))
         for name, values in terms.items():
@@ -119,12 +122,12 @@ def _stack(axes: Axes, time: Array, terms: Mapping[str, Array], supplied: Array)
                 continue
             text, colour = TERMS[name]
             known = axes.get_legend_handles_labels()[1]
-            label = f"{text}: {_joules(values)}"
+            label = f"{text}: {_joules(values, largest)}"
             axes.fill_between(
                 time[kept], base, base + part, color=colour, linewidth=0.3, label=None if label in known else label
             )
             base = base + part
-    label = f"sum = electrical energy: {_joules(supplied)}" if np.any(supplied) else "electrical energy: none"
+    label = f"sum = electrical energy: {_joules(supplied, largest)}" if np.any(supplied) else "electrical energy: none"
     axes.plot(time[kept], supplied[kept], color=style.BLACK, linewidth=1.1, label=label)
 
 
@@ -171,5 +174,7 @@ def _bars(axes: Axes, names: list[str], values: Array, colours: list[str]) -> No
     axes.set_title("electrical energy of the run, net [J]")
 
 
-def _joules(values: Array) -> str:
-    return f"{style.number(float(values[-1]))} J"
+def _joules(values: Array, largest: float = 0.0) -> str:
+    """The last value; 0 if it is rounding beside the largest of its ledger."""
+    last = float(values[-1])
+    return f"{style.number(0.0 if abs(last) < NOTHING * largest else last)} J"

@@ -16,6 +16,15 @@ from dynsim.record import Record
 
 PLANES = ((0, 1), (0, 2), (1, 2))
 MILLI = 1e3
+# Where a hand starts: the same mark for all variants, so that the legend shows what is drawn.
+START: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "o",
+    "markerfacecolor": "white",
+    "markeredgecolor": style.BLACK,
+    "markersize": 4,
+    "zorder": 4,
+}
 
 
 def path(record: Record) -> Figure | None:
@@ -116,7 +125,7 @@ def _planes(figure: Figure, records: list[Record]) -> list[Axes]:
 def _draw_path(axes: Axes, record: Record, plane: tuple[int, int], label: str, **options: Any) -> None:
     position = style.sparse(record["hand_position"][:, plane])
     axes.plot(*position.T, label=label, **options)
-    axes.plot(*position[0], "o", color=options["color"], markersize=4, zorder=4)
+    axes.plot(*position[0], **START)
 
 
 def _draw_target(axes: Axes, record: Record, plane: tuple[int, int]) -> None:
@@ -145,7 +154,7 @@ def edge_on(points: Array) -> Array:
 
 def _legend_below(figure: Figure, axes: Axes) -> None:
     handles, labels = axes.get_legend_handles_labels()
-    start = axes.plot([], [], "o", color=style.GREY, markersize=4)
+    start = axes.plot([], [], **START)
     handles, labels = [*handles, *start], [*labels, "start of the hand"]
     if "target" in labels:
         handles += axes.plot([], [], "x", color=style.BLACK, markersize=5)

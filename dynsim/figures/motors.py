@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -12,6 +11,9 @@ from dynsim.record import Record
 
 # Up to ALL motors a line each; beyond that the LARGEST few and the envelope of all.
 ALL, LARGEST = 12, 6
+# Six colours that are told apart; the second six motors from the base are dashed.
+COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, style.BLACK)
+DASHES = ("-", (0, (4, 1.5)))
 
 
 def motors(record: Record) -> Figure | None:
@@ -54,8 +56,8 @@ def _draw(axes: Axes, record: Record, name: str, shown: np.ndarray) -> None:
             linewidth=0,
             label=f"all {len(labels)} motors",
         )
-    # From base to tip along one map of colours: neighbours look alike, the order is visible.
-    colours = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.92, max(len(shown), 2)))
-    for colour, k in zip(colours, shown, strict=False):
-        style.line(axes, record.time, values[:, k], color=colour, label=labels[k], lw=1.1)
+    for place, k in enumerate(shown):
+        row, colour = divmod(place, len(COLOURS))
+        look = {"color": COLOURS[colour], "linestyle": DASHES[row], "lw": 1.1}
+        style.line(axes, record.time, values[:, k], label=labels[k], **look)
     axes.axhline(0.0, color=style.GREY, linewidth=0.6)

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection  # type: ignore[import-untyped]
 
@@ -24,9 +25,15 @@ from dynsim.scenario import build_model, scenario_from_resolved
 
 # Postures drawn faintly, evenly over the run, besides the last one.
 FAINT = 6
+# An axis of the 3D view shorter than this share of the longest has two ticks.
+SHORT_AXIS = 0.45
 # Joints are dots up to this many.
 DOTS = 40
 ARM_COLOUR = "#444444"
+# Text at the contacts: size and height of its two lines [point].
+LABEL_SIZE, LABEL_HEIGHT = 7.0, 19.0
+# Width of a side view in a figure of one column, and of two [point].
+FULL, HALF = 440.0, 205.0
 
 
 @dataclass(frozen=True)
@@ -94,15 +101,20 @@ def posture(record: Record) -> Figure | None:
     plane = _side_plane(record, drawn)
     low, high = _bounds([record], drawn)
     wide = np.hypot(high[0] - low[0], high[1] - low[1]) > 2.2 * (high[2] - low[2])
-    height = 5.6 if wide else 4.0
+    extent = _extent(plane, drawn, [record])
+    size = extent[1] - extent[0]
+    # What the side view needs at the width that it has, and the labels of its axis, title and legend.
+    height = 5.6 if wide else 1.15 + float(np.clip(HALF / 72.0 * size[1] / size[0], 1.5, 3.4))
+    scale = (FULL if wide else min(HALF, 72.0 * (height - 1.15) * size[0] / size[1])) / size[0]
+    extent = _with_labels(extent, _labels(record, body, plane, scale), scale)
     figure = style.new_figure(height, style.title(record, f"posture at {record.time[-1]:.4g} s, and before (faint)"))
     # Side by side, the labels of the 3D view need some room to their right.
     grid = figure.add_gridspec(2, 1, height_ratios=[1.25, 1.0]) if wide else figure.add_gridspec(1, 2, wspace=0.15)
     space: Any = figure.add_subplot(grid[0], projection="3d")
     side = figure.add_subplot(grid[1])
-    _space_view(space, record, body, drawn, (low, high), zoom=1.65 if wide else 0.95)
-    _side_view(side, record, body, drawn, plane, colour=ARM_COLOUR)
-    _frame_side(side, plane, drawn, [record], [] if body is None else list(body.surfaces.values()))
+    _space_view(space, record, body, drawn, (low, high), zoom=1.65 if wide else 1.15)
+    _side_view(side, record, body, drawn, plane, scale, colour=ARM_COLOUR)
+    _frame_side(side, plane, extent, [] if body is None else list(body.surfaces.values()))
     if note:
         side.set_title(note, color=style.PULLING)
     _legend(figure, [side])
@@ -125,19 +137,72 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     columns = 2 if len(shown) > 1 else 1
     lines = -(-len(shown) // columns)
     low, high = _extent(plane, everything, some)
+    scale = (FULL if columns == 1 else HALF) / (high[0] - low[0])
+    scale = min(scale, 72.0 * 3.2 / (high[1] - low[1]))
+    labels = [label for name, body in shown.items() for label in _labels(records[name], body, plane, scale)]
+    low, high = _with_labels((low, high), labels, scale)
     height = 0.9 + lines * (0.3 + np.clip(3.2 * (high[1] - low[1]) / (high[0] - low[0]), 0.8, 3.2))
     figure = style.new_figure(height, style.comparison_title(some, "postures at the end, and before (faint)"))
     grid = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
     styles = style.variant_styles(list(records))
     for axes, (name, body) in zip(grid.ravel(), shown.items(), strict=False):
-        _side_view(axes, records[name], body, drawn[name], plane, colour=str(styles[name]["color"]), path=style.GREY)
-        _frame_side(axes, plane, everything, some, list(body.surfaces.values()))
+        colour = str(styles[name]["color"])
+        _side_view(axes, records[name], body, drawn[name], plane, scale, colour=colour, path=style.GREY)
+        _frame_side(axes, plane, (low, high), list(body.surfaces.values()))
         axes.set_title(name, color=styles[name]["color"], fontweight="bold")
         axes.label_outer()
     for axes in grid.ravel()[len(shown) :]:
         axes.set_axis_off()
     _legend(figure, list(grid.ravel()))
     return figure
+
+
+@dataclass(frozen=True)
+class Label:
+    """What is written at a contact: at (x, z) [m] in the side plane, ``level`` labels away from it."""
+
+    text: str
+    x: float
+    z: float
+    below: bool
+    level: int
+
+    @property
+    def offset(self) -> float:
+        """Distance of the text from the contact [point]."""
+        return 7.0 + LABEL_HEIGHT * self.level
+
+
+def _labels(record: Record, body: Body | None, plane: SidePlane, scale: float) -> list[Label]:
+    """Names and forces of the contacts, on the far side of the surface, where there is no arm.
+
+    Labels that would overprint each other at ``scale`` [point/m] are moved away from the surface.
+    """
+    found: list[Label] = []
+    ends: dict[tuple[bool, int], float] = {}
+    points = [(contact, position, plane.project(position), f) for contact, position, f in _contact_points(record, body)]
+    for contact, position, at, force in sorted(points, key=lambda one: float(one[2][0])):
+        below = bool((contact.surface.Q @ position + contact.surface.b)[2] >= 0.0)
+        text = f"{contact.name}\n{style.number(force, 3)} N"
+        half = 0.5 * LABEL_SIZE * 0.65 * max(len(line) for line in text.splitlines())
+        level, place = 0, float(at[0]) * scale
+        while place - half < ends.get((below, level), -np.inf):
+            level += 1
+        ends[below, level] = place + half + 2.0
+        found.append(Label(text, float(at[0]), float(at[1]), below, level))
+    return found
+
+
+def _with_labels(extent: tuple[Array, Array], labels: Sequence[Label], scale: float) -> tuple[Array, Array]:
+    """The extent with room for the labels."""
+    low, high = extent[0].copy(), extent[1].copy()
+    for label in labels:
+        room = (label.offset + LABEL_HEIGHT + 3.0) / scale
+        if label.below:
+            low[1] = min(low[1], label.z - room)
+        else:
+            high[1] = max(high[1], label.z + room)
+    return low, high
 
 
 def _body(record: Record) -> tuple[Body | None, str]:
@@ -203,8 +268,7 @@ def _extent(plane: SidePlane, drawn: Sequence[Array], records: Sequence[Record])
     span = float((high - low).max() or 1.0)
     # An upright arm would leave no width for the axis.
     extra = np.maximum(np.array([0.3, 0.05]) * span - 0.5 * (high - low), 0.0) + 0.05 * span
-    # Below there must be room for what is written at the contacts.
-    return low - extra - np.array([0.0, 0.05 * span]), high + extra
+    return low - extra, high + extra
 
 
 def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
@@ -216,11 +280,9 @@ def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
     figure.legend(known.values(), known.keys(), loc="outside lower center", ncols=len(known))
 
 
-def _frame_side(
-    axes: Axes, plane: SidePlane, drawn: Sequence[Array], records: Sequence[Record], surfaces: Sequence[Quadric]
-) -> None:
+def _frame_side(axes: Axes, plane: SidePlane, extent: tuple[Array, Array], surfaces: Sequence[Quadric]) -> None:
     """Limits, labels, and where surfaces are: grey inside (C < 0), a line where the plane cuts them."""
-    low, high = _extent(plane, drawn, records)
+    low, high = extent
     axes.set_aspect("equal", adjustable="box")
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
@@ -241,6 +303,7 @@ def _side_view(
     body: Body | None,
     drawn: Sequence[Array],
     plane: SidePlane,
+    scale: float,
     *,
     colour: str,
     path: str = style.BLUE,
@@ -264,19 +327,20 @@ def _side_view(
         target = edge_on(plane.project(record["target_position"]))
         axes.plot(*target.T, color=style.BLACK, linestyle=(0, (3, 2)), lw=0.9, zorder=5, label="target")
     axes.plot(*plane.project(style.sparse(record["hand_position"])).T, color=path, lw=1.0, zorder=4, label="hand path")
-    for contact, position, force in _contact_points(record, body):
-        name, at = contact.name, plane.project(position)
-        below = bool((contact.surface.Q @ position + contact.surface.b)[2] >= 0.0)
-        axes.plot(*at, zorder=6, linestyle="none", **_contact_mark(force))
+    for _, position, force in _contact_points(record, body):
+        axes.plot(*plane.project(position), zorder=6, linestyle="none", **_contact_mark(force))
+    for label in _labels(record, body, plane, scale):
         axes.annotate(
-            f"{name}\n{style.number(force, 3)} N",
-            tuple(at),
-            # On the far side of the surface, where there is no arm.
-            xytext=(0, -7 if below else 7),
+            label.text,
+            (label.x, label.z),
+            xytext=(0, -label.offset if label.below else label.offset),
             textcoords="offset points",
             ha="center",
-            va="top" if below else "bottom",
-            fontsize=7,
+            va="top" if label.below else "bottom",
+            fontsize=LABEL_SIZE,
+            linespacing=1.1,
+            # A label further away says with a line where it belongs.
+            arrowprops={"arrowstyle": "-", "color": style.GREY, "lw": 0.5, "shrinkB": 4} if label.level else None,
         )
 
 
@@ -314,12 +378,17 @@ def _space_view(
     for artist in axes.get_children():
         artist.set_clip_on(False)
         artist.set_in_layout(False)
-    axes.set_xlabel("x [m]", labelpad=-5)
-    axes.set_ylabel("y [m]", labelpad=-2)
-    axes.set_zlabel("z [m]", labelpad=-6)
-    axes.tick_params(pad=-2)
-    for name, share in zip("xyz", (high - low) / (high - low).max(), strict=True):
-        axes.locator_params(axis=name, nbins=2 + int(4 * share))
+    axes.set_xlabel("x [m]", labelpad=-2)
+    axes.set_ylabel("y [m]", labelpad=-3)
+    axes.set_zlabel("z [m]", labelpad=-3)
+    axes.tick_params(pad=-1)
+    for axis, a, b, share in zip(
+        (axes.xaxis, axes.yaxis, axes.zaxis), low, high, (high - low) / (high - low).max(), strict=True
+    ):
+        ticks = MaxNLocator(2 + int(3 * share), steps=[1, 2, 5, 10]).tick_values(a, b)
+        ticks = ticks[(ticks >= a) & (ticks <= b)]
+        # On a short axis only the outer ones have room.
+        axis.set_ticks(ticks[[0, -1]] if share < SHORT_AXIS and len(ticks) > 2 else ticks)
     axes.view_init(elev=22, azim=-70)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))

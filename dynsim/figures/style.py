@@ -61,6 +61,8 @@ _LOOK: Any = {
 }
 # Lines of more points than this are thinned: a figure is some 1200 pixels wide.
 LINE_POINTS = 4000
+# Height of a row of a legend [point].
+LEGEND_ROW = 12.5
 
 
 def look() -> AbstractContextManager[None]:
@@ -136,11 +138,12 @@ def log_axis(axes: Axes) -> None:
 
 
 def legend_above(axes: Axes, columns: int = 3) -> None:
-    """The legend over the axes, where it hides nothing."""
+    """The legend over the axes, where it hides nothing; room is kept for as many rows as it has."""
+    rows = -(-len(axes.get_legend_handles_labels()[1]) // columns)
     legend = axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.0)
     # It may reach over the panel to its left; the empty title keeps the room above.
     legend.set_in_layout(False)
-    axes.set_title(" ")
+    axes.set_title(" ", pad=6.0 + LEGEND_ROW * max(rows - 1, 0))
 
 
 def settle_time(record: Record) -> float:

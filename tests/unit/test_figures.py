@@ -170,6 +170,17 @@ def test_contact_figure_states_the_pulling_fraction(braced: Record) -> None:
     np.testing.assert_array_equal(lines[0].get_ydata(), braced["contact_normal_force"][:, 1])
 
 
+def test_contact_figures_show_the_extremes_of_all_steps(braced: Record) -> None:
+    for figure in (drawn(contacts.forces(braced)), drawn(contacts.forces_comparison({"a": braced}))):
+        columns = len(figure.axes) // 2
+        for contact, axes in zip(braced.summary["contacts"], figure.axes[::columns], strict=True):
+            low, high = contact["normal_force_min_N"], contact["normal_force_max_N"]
+            levels = [line.get_ydata()[0] for line in axes.get_lines() if len(line.get_xdata()) == 2]
+            assert {low, high} <= set(levels)
+            assert axes.get_ylim()[0] < low < high < axes.get_ylim()[1]
+        assert "sampled every 5 ms" in figure.axes[-columns].get_xlabel()
+
+
 def test_pulling_area_ends_where_the_force_crosses_zero() -> None:
     time, force = contacts._thin_negative(np.array([0.0, 1.0, 2.0]), np.array([1.0, -1.0, 3.0]))
     np.testing.assert_allclose(time, [0.0, 0.5, 1.0, 1.25, 2.0], rtol=1e-15)
@@ -278,6 +289,16 @@ def test_side_view_shows_the_arm_and_which_contact_pulls(braced: Record) -> None
     # The arm stands in the plane x = y: seen from the side, all its 0.3 m links have their true length at the start.
     first = np.array(side.collections[0].get_segments())
     np.testing.assert_allclose(np.linalg.norm(first[1:, 1] - first[1:, 0], axis=1)[1:], 0.3, rtol=1e-9)
+
+
+def test_labels_of_contacts_do_not_overprint_each_other(braced: Record) -> None:
+    body, _ = posture._body(braced)
+    plane = posture.SidePlane(np.zeros(3), np.array([1.0, 0.0, 0.0]))
+    assert [label.level for label in posture._labels(braced, body, plane, 1000.0)] == [0, 0]
+    close = posture._labels(braced, body, plane, 10.0)
+    assert [label.level for label in close] == [0, 1]
+    low, _ = posture._with_labels((np.zeros(2), np.ones(2)), close, 10.0)
+    assert low[1] < close[1].z - (close[1].offset + posture.LABEL_HEIGHT) / 10.0
 
 
 def test_side_plane_of_an_arm_along_minus_y() -> None:
