@@ -95,17 +95,6 @@ def hand_error(record: Record, settle: float) -> dict[str, float | None]:
     return dict(zip(names, map(float, values), strict=True))
 
 
-def negative_fraction(values: NDArray[np.float64], time: NDArray[np.float64]) -> float:
-    """Fraction of the time for which the polygon through ``values`` is below zero."""
-    if len(time) < 2:
-        return float(len(values) > 0 and values[0] < 0.0)
-    a, b = values[:-1], values[1:]
-    span = np.where(a == b, 1.0, np.abs(b - a))
-    crossing = np.maximum(-np.minimum(a, b), 0.0) / span
-    share = np.where((a < 0) & (b < 0), 1.0, np.where((a < 0) | (b < 0), crossing, 0.0))
-    return float((share * np.diff(time)).sum() / (time[-1] - time[0]))
-
-
 def summarise(
     record: Record, scenario: Scenario, contacts: Sequence[Contact], robot: Robot, counts: Counts
 ) -> dict[str, Any]:

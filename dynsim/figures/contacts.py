@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dynsim import metrics
 from dynsim.figures import style
 from dynsim.figures.style import Array
 from dynsim.record import Record
@@ -90,7 +90,8 @@ def pulling_label(record: Record, name: str) -> str:
 
 
 def _share(record: Record, name: str) -> str:
-    return f"{100.0 * metrics.negative_fraction(_force(record, name), record.time):.1f} %"
+    contact = _summary(record, name)
+    return f"{100.0 * contact['pulling_fraction']:.1f} %" if contact else "unknown part"
 
 
 def _within(record: Record, name: str) -> str:
@@ -100,11 +101,16 @@ def _within(record: Record, name: str) -> str:
 
 def _extremes(record: Record, name: str) -> Array:
     """Lowest and highest force of all integration steps [N], which see peaks between the samples; empty if unknown."""
-    for contact in record.summary.get("contacts", ()):
-        if contact["name"] == name:
-            values = np.array([contact["normal_force_min_N"], contact["normal_force_max_N"]], dtype=np.float64)
-            return values if np.isfinite(values).all() else np.empty(0)
-    return np.empty(0)
+    contact = _summary(record, name)
+    if not contact:
+        return np.empty(0)
+    values = np.array([contact["normal_force_min_N"], contact["normal_force_max_N"]], dtype=np.float64)
+    return values if np.isfinite(values).all() else np.empty(0)
+
+
+def _summary(record: Record, name: str) -> dict[str, Any]:
+    """The contact's part of the summary: over all integration steps, not over the samples. Empty if there is none."""
+    return next((contact for contact in record.summary.get("contacts", ()) if contact["name"] == name), {})
 
 
 def _series(record: Record, name: str) -> list[style.Series]:
