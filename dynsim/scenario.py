@@ -488,6 +488,11 @@ def _explain(
         text = f"unknown key{_suggest(str(keys[-1]), known)}"
         if not text.endswith("?"):
             text += f"; known here: {', '.join(known)}" if known else ""
+    elif kind == "missing" and isinstance(problem["loc"][-1], int) and isinstance(value, list):
+        # One problem for every entry that a list of fixed length lacks.
+        lacking = [p for p in problems if p["type"] == kind and p["loc"][:-1] == problem["loc"][:-1]]
+        text = f"has {len(value)} entries, {len(value) + len(lacking)} are needed"
+        problems = [p for p in problems if p is problem or p not in lacking]
     elif kind == "missing":
         text = "is missing; add it"
     elif kind in ("union_tag_invalid", "union_tag_not_found"):
@@ -513,6 +518,8 @@ def _locate(data: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any
     keys: list[int | str] = []
     node, found = data, True
     for part in loc:
+        if isinstance(node, list) and isinstance(part, str) and part.isdigit():
+            part = int(part)  # of a dotted key
         in_mapping = isinstance(node, Mapping) and part in node
         in_list = isinstance(node, list) and isinstance(part, int) and part < len(node)
         if found and (in_mapping or in_list):

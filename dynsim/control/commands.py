@@ -5,19 +5,22 @@ A script is a :class:`dynsim.model.snake.CommandSource` that knows its future; a
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from dynsim.config import NonNegative, Positive, StrictConfig
 from dynsim.model.snake import FIXING, SWITCHING, CommandBlock, Feedback
 
 Coordinates = tuple[float, float, float, float, float, float]
 Profile = Literal["linear", "smooth"]
+
+STATES = {"switching": SWITCHING, "fixing": FIXING}
 
 
 class Command(StrictConfig):
@@ -31,6 +34,17 @@ class Command(StrictConfig):
         None, description="fix a mode by its number, or enter the switching or the fixing state"
     )
     gripper: Literal["open", "closed"] | None = None
+
+    @field_validator("mode", mode="before")
+    @classmethod
+    def _state_or_number(cls, value: Any) -> Any:
+        """A state or a whole number; whether the table has the number is for the controller to say."""
+        text = value if isinstance(value, str) else ""
+        if value is None or text in STATES or (isinstance(value, int) and not isinstance(value, bool)):
+            return value
+        near = difflib.get_close_matches(text, STATES, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ValueError(f"no such mode{hint}; known: {', '.join(STATES)}, or the number of a mode")
 
 
 class Ramp(StrictConfig):
@@ -148,8 +162,7 @@ class ScriptedSource:
             gripper = gripper if command.gripper is None else int(command.gripper == "closed")
             pieces.append((tick, held, gripper))
             if command.mode is not None and 0 <= tick - first < count:
-                states = {"switching": SWITCHING, "fixing": FIXING}
-                block.request[tick - first] = states[command.mode] if isinstance(command.mode, str) else command.mode
+                block.request[tick - first] = STATES[command.mode] if isinstance(command.mode, str) else command.mode
         for i, (tick, velocity, closed) in enumerate(pieces):
             end = pieces[i + 1][0] if i + 1 < len(pieces) else first + count
             part = slice(max(tick - first, 0), max(end - first, 0))

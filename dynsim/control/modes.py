@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, StrictInt
 
 from dynsim.config import Positive, StrictConfig
 from dynsim.model.snake import Policy
@@ -17,7 +17,9 @@ class Switching(StrictConfig):
     """Switching state ([T] IV.C.5); it is entered by a command ``mode: switching``."""
 
     policy: Policy = Field("cyclic", description="fixed: never switch; cyclic: [T]'s order; predictive: lowest cost")
-    order: list[int] = Field([2, 3, 4, 5, 6], min_length=1, description="mode numbers, also the predictive candidates")
+    order: list[StrictInt] = Field(
+        [2, 3, 4, 5, 6], min_length=1, description="mode numbers, also the predictive candidates"
+    )
     period_s: Positive = Field(1.0, description="Delta T [s]")
     least_margin_m: float = Field(0.0, description="a mode whose support margin is not above it counts as tipping")
     when_blocked: bool = Field(

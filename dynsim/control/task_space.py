@@ -10,9 +10,10 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator
+from pydantic import Field, StrictInt, field_validator, model_validator
 
-from dynsim.config import NonNegative, Positive
+from dynsim.config import NonNegative, Positive, error_at
+from dynsim.control.commands import STATES as MODE_STATES
 from dynsim.control.commands import Script, ScriptedSource
 from dynsim.control.modes import TABLE_II, Switching
 from dynsim.errors import ModelError
@@ -91,13 +92,23 @@ class Config(Script):
         None, description="shape controllable points: joint name -> target [rad]; default the last head joint, 110 deg"
     )
     modes: dict[int, list[int]] | None = Field(None, description="mode number -> lifted wheel pairs; default Table II")
-    fixing_mode: int = 1
+    fixing_mode: StrictInt = 1
     switching: Switching = Field(default_factory=Switching)
 
     @field_validator("cost", mode="before")
     @classmethod
     def _cost_by_number(cls, value: Any) -> Any:
         return f"eq{value}" if value in (19, 20) and not isinstance(value, bool) else value
+
+    @model_validator(mode="after")
+    def _known_modes(self) -> Config:
+        """Every mode that a command asks for is in the table, also after the end of the run."""
+        table = TABLE_II if self.modes is None else self.modes
+        for i, command in enumerate(self.commands):
+            if isinstance(command.mode, int) and command.mode not in table:
+                known = ", ".join(map(str, [*MODE_STATES, *table]))
+                raise error_at(f"commands.{i}.mode", f"no mode {command.mode}; known: {known}")
+        return self
 
 
 def build(config: Config, plant: SnakeDescription, duration_s: float | None = None) -> TaskSpaceController:
@@ -112,7 +123,14 @@ def build(config: Config, plant: SnakeDescription, duration_s: float | None = No
     model = plant.arrays()
     joints, inputs = len(plant.joint_names), len(plant.joint_names) + model.wheels
     shape_joints, shape_target = _shape_points(config, plant, model)
-    modes = ModeTable.from_lifted(config.modes if config.modes is not None else TABLE_II, model.base_joints + 1)
+    needed = max(pair for lifted in TABLE_II.values() for pair in lifted)
+    if config.modes is None and plant.pairs < needed:
+        raise ModelError(
+            f"controller.modes is not given, and the default table ([T] Table II) needs {needed} wheel pairs; this "
+            f"robot has {plant.pairs}: write its own controller.modes, e.g. {{1: []}}, and controller.switching.order, "
+            "e.g. [1]"
+        )
+    modes = ModeTable.from_lifted(TABLE_II if config.modes is None else config.modes, plant.pairs)
     fixing_row = modes.row(config.fixing_mode, "controller.fixing_mode")
     order = tuple(modes.row(number, "controller.switching.order") for number in config.switching.order)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -20,13 +21,17 @@ from dynsim.figures.snake_view import (
     BODY,
     GROUND,
     HEAD,
+    NUMBERED,
     STYLE,
     SYMBOLS,
     TARGET,
     View,
+    error_axis,
     greek,
     limits,
     mode_chart,
+    mode_starts,
+    mode_steps,
     moments,
     posture_grid,
     posture_strip,
@@ -37,6 +42,8 @@ from dynsim.record import Record
 from dynsim.studies.tanaka2019 import used_limit
 
 FRAMES = 50
+# Postures over time in grey: the lines beside them have the colours.
+SHADES = LinearSegmentedColormap.from_list("shades", ["#CFCFCF", "#000000"])
 
 
 def draw(record: Record, folder: Path) -> list[Path]:
@@ -95,6 +102,7 @@ def comparison(records: Mapping[str, Record]) -> Figure:
         axes[1].plot(record.time, used_limit(record), label=name)
         axes[2].plot(record.time, 1e3 * record["support_margin"], label=name)
         axes[3].semilogy(record.time, np.maximum(record["position_error"], 1e-16), label=name)
+    error_axis(axes[3], *(record["position_error"] for record in records.values()))
     axes[1].axhline(1.0, color="black", ls="-.", lw=0.8)
     axes[2].axhline(0.0, color="black", ls="-.", lw=0.8)
     axes[0].set_ylim(bottom=0)
@@ -130,11 +138,11 @@ def overview(record: Record, count: int = 7) -> Figure:
     x0, x1, y0, y1 = limits([*record["posture"][rows][:, :, :2], record["w"][:, :2]], 0.06)
     width = 5.0
     figure, axis = plt.subplots(figsize=(width + 1.4, max(width * (y1 - y0) / (x1 - x0), 1.0) + 0.9))
-    shades = plt.cm.ScalarMappable(plt.Normalize(0.0, record.time[-1]), plt.get_cmap("viridis"))
+    shades = plt.cm.ScalarMappable(plt.Normalize(0.0, record.time[-1]), SHADES)
     for row in rows:
         points, shade = record["posture"][row], shades.to_rgba(record.time[row])
-        axis.plot(points[:, 0], points[:, 1], "-", color=shade, lw=2.2, solid_capstyle="round")
-        axis.plot(*points[0, :2], "o", color=shade, ms=4)
+        axis.plot(points[:, 0], points[:, 1], "-", color=shade, lw=4.0, solid_capstyle="round")
+        axis.plot(*points[0, :2], "o", color=shade, ms=6)
     axis.plot(*record["w"][:, :2].T, color=HEAD, lw=1.0, label="controlled point")
     axis.plot(*record["w_target"][:, :2].T, "--", color=TARGET, lw=1.0, label="target")
     axis.plot(*record["base_pose"][:, :2].T, color=GROUND, lw=0.8, label="wheel pair 1")
@@ -166,7 +174,8 @@ def tracking(record: Record) -> Figure:
     axes[3, 0].set_ylabel("position error [m]")
     axes[3, 1].semilogy(record.time, np.maximum(record["attitude_error"], tiny), color=BODY)
     axes[3, 1].set_ylabel("attitude error [rad]")
-    for axis in axes[3]:
+    for axis, name in zip(axes[3], ("position_error", "attitude_error"), strict=True):
+        error_axis(axis, record[name])
         axis.set_xlabel("t [s]")
     return figure
 
@@ -198,19 +207,26 @@ def joints(record: Record) -> Figure:
 
 def redundancy(record: Record) -> Figure:
     """Modes (grounded wheels), cost, smallest singular value and support margin over time."""
-    figure, axes = plt.subplots(4, 1, figsize=(7.2, 6.4), sharex=True, height_ratios=[1.3, 1, 1, 1])
-    mode_chart(axes[0], record)
-    axes[1].plot(record.time, record["cost"], color=GROUND)
-    axes[1].set_ylabel("cost V")
-    axes[1].set_ylim(bottom=0)
-    axes[2].plot(record.time, record["sigma_min"], color=GROUND)
-    axes[2].set_ylabel("σ_min of B̃")
-    axes[2].set_ylim(bottom=0)
-    axes[3].plot(record.time, 1e3 * record["support_margin"], color=GROUND)
-    axes[3].axhline(0.0, color=HEAD, ls="-.", lw=0.8)
-    axes[3].set_ylabel("support margin [mm]")
-    axes[3].set_ylim(bottom=min(0.0, 1e3 * float(record["support_margin"].min())) - 4)
-    axes[3].set_xlabel("t [s]      (margin below zero: the robot tips)")
+    many = len(mode_starts(record)) > NUMBERED  # then the numbers have axes of their own
+    ratios = [1.3, *([0.8] if many else []), 1, 1, 1]
+    figure, axes = plt.subplots(
+        len(ratios), 1, figsize=(7.2, 6.4 + 1.1 * many), sharex=True, height_ratios=ratios, squeeze=False
+    )
+    cost, sigma, margin = axes[-3:, 0]
+    mode_chart(axes[0, 0], record)
+    if many:
+        mode_steps(axes[1, 0], record)
+    cost.plot(record.time, record["cost"], color=GROUND)
+    cost.set_ylabel("cost V")
+    cost.set_ylim(bottom=0)
+    sigma.plot(record.time, record["sigma_min"], color=GROUND)
+    sigma.set_ylabel("σ_min of B̃")
+    sigma.set_ylim(bottom=0)
+    margin.plot(record.time, 1e3 * record["support_margin"], color=GROUND)
+    margin.axhline(0.0, color=HEAD, ls="-.", lw=0.8)
+    margin.set_ylabel("support margin [mm]")
+    margin.set_ylim(bottom=min(0.0, 1e3 * float(record["support_margin"].min())) - 4)
+    margin.set_xlabel("t [s]      (margin below zero: the robot tips)")
     return figure
 
 

@@ -17,6 +17,7 @@ from matplotlib.collections import PatchCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
+from matplotlib.ticker import Locator
 from numpy.typing import NDArray
 
 from dynsim.record import Record
@@ -38,6 +39,32 @@ STYLE: dict[Any, Any] = {
     "figure.constrained_layout.use": True,
 }
 SYMBOLS = {"alpha": "α", "beta": "β", "gamma": "γ"}
+
+
+# Beyond this many modes their numbers do not fit above the bars of a chart.
+NUMBERED = 30
+# A top view is at least this high, in parts of its width: a straight robot is a thin line.
+LEAST_HEIGHT = 0.3
+
+
+class SparseTicks(Locator):
+    """Multiples of 1, 2 or 5 times a power of ten, as many as have room for their labels on a vertical axis."""
+
+    LABEL, APART = 6.5, 8.5  # height of a label, distance of two ticks [points]
+
+    def __init__(self, axes: Axes) -> None:
+        self.axes = axes
+
+    def __call__(self) -> Any:
+        return self.tick_values(*sorted(self.axes.get_ylim()))
+
+    def tick_values(self, vmin: float, vmax: float) -> Any:
+        """Ticks between the two values, on axes of the present height."""
+        points = 72.0 * self.axes.bbox.height / self.axes.figure.dpi
+        least = self.APART * (vmax - vmin) / max(points, 1.0)
+        power = 10.0 ** np.floor(np.log10(least))
+        step = next(m * power for m in (1, 2, 5, 10) if m * power >= least * (1 - 1e-9))
+        return step * np.arange(np.ceil(vmin / step - 1e-9), np.floor(vmax / step + 1e-9) + 1)
 
 
 class View:
@@ -127,9 +154,9 @@ def posture_grid(lines: Mapping[str, Sequence[tuple[View, str]]], note: str = ""
     columns = max(map(len, lines.values()))
     clouds = [[view.outline() for view, _ in line] for line in lines.values()]
     pooled = [cloud for line in clouds for cloud in line]
-    boxes = [limits(pooled if one_scale else line, 0.06) for line in clouds]
+    boxes = [_not_flat(limits(pooled if one_scale else line, 0.06)) for line in clouds]
     size = 8.6 / columns
-    heights = [max(size * (y1 - y0) / (x1 - x0), 0.25 * size) for x0, x1, y0, y1 in boxes]
+    heights = [size * (y1 - y0) / (x1 - x0) for x0, x1, y0, y1 in boxes]
     titles = 1 + max(title.count("\n") for line in lines.values() for _, title in line)
     figure, axes = plt.subplots(
         len(lines),
@@ -140,11 +167,14 @@ def posture_grid(lines: Mapping[str, Sequence[tuple[View, str]]], note: str = ""
         sharey="row",
         height_ratios=heights,
     )
-    for (label, line), (x0, x1, y0, y1), row in zip(lines.items(), boxes, axes, strict=True):
+    for place, ((label, line), (x0, x1, y0, y1)) in enumerate(zip(lines.items(), boxes, strict=True)):
+        row = axes[place]
         row[0].set_ylabel(label, rotation=0, ha="right", va="center")
-        row[0].locator_params(axis="y", nbins=3)
-        for axis in row[len(line) :]:
-            axis.set_visible(False)
+        _sparse_ticks(row[0])
+        for column in range(len(line), columns):
+            row[column].set_visible(False)
+            if place > 0:
+                axes[place - 1, column].tick_params(labelbottom=True)  # the lowest one there
         for axis, (view, title) in zip(row, line, strict=False):
             axis.plot(*view.path.T, color=TARGET, lw=1.0, zorder=2)
             view.draw_top(axis)
@@ -160,7 +190,7 @@ def posture_grid(lines: Mapping[str, Sequence[tuple[View, str]]], note: str = ""
 def posture_strip(line: Sequence[tuple[View, str]]) -> Figure:
     """Postures with their titles: top view above, side view along the base's heading below."""
     views = [view for view, _ in line]
-    top = limits([view.outline() for view in views], 0.08)
+    top = _not_flat(limits([view.outline() for view in views], 0.08))
     side = limits([np.vstack([view.side, view.side * [1, 0]]) for view in views], 0.08)
     tall, low = top[3] - top[2], side[3] - side[2]
     width = 9.0
@@ -181,32 +211,59 @@ def posture_strip(line: Sequence[tuple[View, str]]) -> Figure:
             axis.tick_params(axis="x", labelrotation=45)
     for axis, name in ((axes[0, 0], "y [m]"), (axes[1, 0], "height [m]")):
         axis.set_ylabel(name)
-        axis.locator_params(axis="y", nbins=3)
+        _sparse_ticks(axis)
     figure.supxlabel("above: x [m]; below: along the heading of the base part [m]", fontsize=8)
     figure.legend(handles=legend(), loc="outside upper center", ncols=6, frameon=False)
     return figure
 
 
+def mode_starts(record: Record) -> NDArray[np.int64]:
+    """Rows at which a mode begins, the first one among them."""
+    mode = record["mode"]
+    return np.flatnonzero(np.diff(mode, prepend=mode[0] - 1))
+
+
 def mode_chart(axis: Axes, record: Record, title: str = "mode") -> None:
-    """Grounded (filled) and lifted (white) wheel pairs over time, with the mode numbers."""
+    """Grounded (filled) and lifted (white) wheel pairs over time, with the mode numbers where these have room."""
     grounded, time, mode = record["grounded"], record.time, record["mode"]
-    starts = np.flatnonzero(np.diff(mode, prepend=mode[0] - 1))
-    ends = np.append(starts[1:], len(time) - 1)
-    for start, end in zip(starts, ends, strict=True):
-        for i in range(grounded.shape[1]):
-            axis.broken_barh(
-                [(time[start], time[end] - time[start])],
-                (i + 0.6, 0.8),
-                facecolors=GROUND if grounded[start, i] else LIFT,
-                edgecolors="white",
-                linewidth=0.4,
-            )
-        if len(starts) <= 30:
+    starts, last, pairs = mode_starts(record), len(time) - 1, grounded.shape[1]
+    numbered = len(starts) <= NUMBERED
+    for i in range(pairs):
+        # A bar ends where the pair is lifted, and at every change of mode while these can be told apart.
+        begins = starts if numbered else np.flatnonzero(np.diff(grounded[:, i], prepend=grounded[0, i] - 1))
+        ends = np.append(begins[1:], last)
+        bars = [(time[a], time[b] - time[a]) for a, b in zip(begins, ends, strict=True) if grounded[a, i]]
+        edge = {"edgecolors": "white", "linewidth": 0.4} if numbered else {"linewidth": 0.0}
+        axis.broken_barh(bars, (i + 0.6, 0.8), facecolors=GROUND, **edge)
+    if numbered:
+        for start, end in zip(starts, np.append(starts[1:], last), strict=True):
             axis.text((time[start] + time[end]) / 2, 0.2, str(mode[start]), ha="center", va="center", fontsize=7)
-    axis.set_ylim(grounded.shape[1] + 0.6, -0.2)
-    axis.set_yticks(range(1, grounded.shape[1] + 1))
+    axis.set_xlim(time[0], time[-1])
+    axis.set_ylim(pairs + 0.6, -0.2 if numbered else 0.4)
+    axis.set_yticks(range(1, pairs + 1))
     axis.set_ylabel("wheel pair")
-    axis.set_title(f"{title}, and the wheel pairs on the ground (blue) or lifted (white)", loc="left")
+    # without numbers above the bars the title does not promise them
+    title = f"{title}, and the " if numbered else title.removesuffix("mode")
+    axis.set_title(f"{title}wheel pairs on the ground (blue) or lifted (white)", loc="left")
+
+
+def mode_steps(axis: Axes, record: Record) -> None:
+    """Mode numbers over time as steps."""
+    axis.step(record.time, record["mode"], where="post", color=GROUND, lw=0.7)
+    shown = np.unique(record["mode"])
+    axis.set(ylabel="mode", ylim=(shown[0] - 0.5, shown[-1] + 0.5))
+    if len(shown) <= 12:
+        axis.set_yticks(shown)
+
+
+def error_axis(axis: Axes, *errors: NDArray[np.float64]) -> None:
+    """Lower limit of a logarithmic axis: what is rounding (a first sample that is exact) does not stretch it."""
+    values = np.concatenate(errors)
+    values = values[values > 1e-15]
+    if len(values):
+        axis.set_ylim(10.0 ** np.floor(np.log10(np.percentile(values, 2))), 3.0 * values.max())
+    else:
+        axis.set_ylim(1e-16, 1e-14)
 
 
 def moments(record: Record, count: int) -> NDArray[np.int64]:
@@ -219,6 +276,18 @@ def limits(clouds: list[NDArray[np.float64]], margin: float) -> tuple[float, flo
     points = np.vstack(clouds)
     (x0, y0), (x1, y1) = points.min(axis=0) - margin, points.max(axis=0) + margin
     return float(x0), float(x1), float(y0), float(y1)
+
+
+def _not_flat(box: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    """The same limits, higher where they would be a strip too thin for its ticks."""
+    x0, x1, y0, y1 = box
+    more = max(0.0, LEAST_HEIGHT * (x1 - x0) - (y1 - y0)) / 2
+    return x0, x1, y0 - more, y1 + more
+
+
+def _sparse_ticks(axis: Axes) -> None:
+    axis.yaxis.set_major_locator(SparseTicks(axis))
+    axis.tick_params(axis="y", labelsize=SparseTicks.LABEL)
 
 
 def relax(axis: Axes, least: float) -> None:

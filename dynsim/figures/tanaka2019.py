@@ -41,6 +41,8 @@ from dynsim.studies.tanaka2019 import (
     used_limit,
 )
 
+STOPPED = "joint at its limit"
+
 Maker = Callable[[Mapping[str, Record]], Figure]
 
 
@@ -199,7 +201,7 @@ def door(record: Record) -> Figure:
     changes = mode_sequence(record)
     # a stop ends with the first mode that is not the fixing one, a recovery with the return to it
     stops = [
-        (t, "joint at its limit" if mode != fixing else "after switching modes")
+        (t, STOPPED if mode != fixing else "after switching modes")
         for (_, before), (t, mode) in pairwise(changes)
         if (before == fixing) != (mode == fixing)
     ]
@@ -208,6 +210,8 @@ def door(record: Record) -> Figure:
     titled = []
     for place, (time, what) in enumerate(shown):
         view = _view_at(record, time)
+        if what == STOPPED:
+            view = View(record, max(view.row - 1, 0))  # before the change that ends the stop
         opened = abs(np.rad2deg(record["w"][view.row, 5] - record["w"][0, 5]))
         titled.append((view, f"({'abcdefghijklmnop'[place]}) {what}\n{view.time:.1f} s, {opened:.1f}°"))
     lines = {" " * start: titled[start : start + 3] for start in range(0, len(titled), 3)}

@@ -123,8 +123,12 @@ def _largest_base_angle(record: Record) -> str:
 def _straightening(record: Record) -> str:
     """Base joints in the order in which they fall below half of their first angle for good, with the time [s]."""
     angle, names = np.abs(base_joints(record)), record.labels["phi"][-base_joints(record).shape[1] :]
-    last = [np.flatnonzero(column > 0.5 * column[0])[-1] for column in angle.T]
-    return ", ".join(f"{names[j]} {record.time[last[j]]:.1f}" for j in np.argsort(last, kind="stable"))
+    rows, said = len(angle), []
+    # first row of the rest of the run in which the joint stays below; the number of rows: none
+    below = [int(np.append(-1, np.flatnonzero(column > 0.5 * column[0]))[-1]) + 1 for column in angle.T]
+    for j in np.argsort(below, kind="stable"):
+        said.append(f"{names[j]} " + (f"{record.time[below[j]]:.1f}" if below[j] < rows else "never"))
+    return ", ".join(said)
 
 
 def _same_wheels(record: Record) -> str:

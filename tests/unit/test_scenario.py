@@ -185,6 +185,56 @@ def test_what_no_simulation_can_be_made_of_is_refused_by_check(overrides, error,
     assert str(caught.value).startswith(f"{find_scenario('elbow_comparison')} (two_elbows): ")
 
 
+KNOWN = "known: switching, fixing, 1, 2, 3, 4, 5, 6"
+
+
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        ({"mode": 9}, f"mode = 9: no mode 9; {KNOWN}"),
+        ({"mode": 0}, f"mode = 0: no mode 0; {KNOWN}"),
+        ({"mode": -1}, f"mode = -1: no mode -1; {KNOWN}"),  # inside the engine -1 and -2 are the states
+        ({"mode": -2}, f"mode = -2: no mode -2; {KNOWN}"),
+        ({"mode": -7}, f"mode = -7: no mode -7; {KNOWN}"),
+        ({"at_s": 1e6, "mode": 44}, f"mode = 44: no mode 44; {KNOWN}"),  # after the end of the run
+        ({"mode": True}, "mode = True: no such mode; known: switching, fixing, or the number of a mode"),
+        ({"mode": 3.0}, "mode = 3.0: no such mode"),
+        ({"mode": [1]}, "mode: no such mode"),
+        ({"mode": "swithcing"}, "mode = 'swithcing': no such mode; did you mean 'switching'?; known: switching"),
+        ({"velocity": [0.1, 0, 0, 0, 0]}, "velocity: has 5 entries, 6 are needed"),
+        ({"velocity": [0.1, 0]}, "velocity: has 2 entries, 6 are needed"),
+        ({"velocity": [0, 0, 0, 0, 0, 0, 0]}, "at most 6 items"),
+    ],
+)
+def test_commands_that_no_snake_can_carry_out(command, expected):
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario("snake_operator", overrides={"controller.commands": [{"at_s": 1.0}, {"at_s": 2.0} | command]})
+    assert str(caught.value).startswith("--set: controller.commands.1.")
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert "more)" not in str(caught.value)
+
+
+def test_an_unknown_mode_in_a_file_is_named_with_its_line(tmp_path: Path):
+    text = "duration_s: 1\nplant: {type: snake}\ncontroller:\n  type: task_space\n  commands:\n    - at_s: 0\n"
+    with pytest.raises(ScenarioError, match=r"case.yaml:7: controller.commands.0.mode = -1: no mode -1; known: "):
+        load_scenario(write(tmp_path, text + "      mode: -1\n"))
+
+
+@pytest.mark.parametrize("key", ["controller.fixing_mode", "controller.switching.order.0"])
+def test_true_is_no_mode_number(key):
+    with pytest.raises(ScenarioError, match=f"{key} = True: input should be a valid integer"):
+        load_scenario("snake_operator", overrides={"controller.switching.order": [2], key: True})
+
+
+def test_a_robot_too_short_for_the_default_modes_is_told_to_bring_its_own():
+    short = {"plant.yaw_joints": 4}
+    with pytest.raises(ModelError, match=r"controller.modes is not given.* needs 7 wheel pairs; this robot has 2"):
+        check(load_scenario("snake_operator", overrides=short))
+    own = {"controller.modes": {"1": []}, "controller.switching.order": [1]}
+    check(load_scenario("snake_operator", overrides=short | own))
+
+
 def test_a_file_that_is_not_utf_8_is_named_with_its_line(tmp_path: Path):
     path = tmp_path / "case.yaml"
     path.write_bytes("duration_s: 1\nname: café\n".encode("latin-1"))

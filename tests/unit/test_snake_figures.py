@@ -2,12 +2,14 @@
 
 import csv
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from PIL import Image
 
 from dynsim.engine import simulate
 from dynsim.figures import snake as figures
+from dynsim.figures import tanaka2019
 from dynsim.record import Record
 from dynsim.scenario import load_scenario
 from dynsim.studies.tanaka2019 import TABLE_III, table_iii, tables
@@ -35,6 +37,64 @@ def test_comparison(record, tmp_path):
     written = figures.draw_comparison({"a": record, "b": record}, tmp_path)
     assert [path.name for path in written] == ["comparison.png", "postures.png"]
     assert all(path.stat().st_size > 10_000 for path in written)
+
+
+def apart(figure, axis):
+    """Distances of the y tick labels that are seen, in parts of their height."""
+    figure.draw_without_rendering()
+    boxes = [t.get_window_extent() for t in axis.get_yticklabels() if t.get_text() and t.get_visible()]
+    return np.diff([box.y0 for box in boxes]) / max(box.height for box in boxes)
+
+
+def test_tick_labels_of_a_straight_robot_do_not_overlap(record):
+    straight = simulate(load_scenario("snake_positioning", "x", {"duration_s": 0.5, "record.rate_hz": 50}))
+    for figure in (figures.postures(straight), figures.strips({"x": straight, "bent": record})):
+        left = [axis for axis in figure.axes if axis.get_subplotspec().is_first_col()]
+        for axis in left:
+            distances = apart(figure, axis)
+            assert len(distances) >= 1
+            assert distances.min() > 1.0
+        plt.close(figure)
+
+
+def switching_all_the_time(every):
+    """A run with a change of mode every so many seconds."""
+    commands = [{"at_s": every * k, "mode": 2 + k % 5} for k in range(int(3.0 / every))]
+    changes = {"duration_s": 3.0, "record.rate_hz": 50, "controller.commands": commands}
+    return simulate(load_scenario("snake_joint_limits", "fixed", changes))
+
+
+@pytest.mark.parametrize(("every", "numbered"), [(0.5, True), (0.06, False)])
+def test_modes_are_numbers_above_the_chart_or_steps_below_it(every, numbered):
+    record = switching_all_the_time(every)
+    figure = figures.redundancy(record)
+    chart = figure.axes[0]
+    assert bool(chart.texts) == numbered
+    assert chart.get_title(loc="left").startswith("mode, and the wheel pairs" if numbered else "wheel pairs")
+    steps = [axis for axis in figure.axes if axis.get_ylabel() == "mode"]
+    assert len(steps) == (not numbered)
+    for axis in steps:
+        np.testing.assert_array_equal(axis.lines[0].get_ydata(), record["mode"])
+    widths = {float(w) for bars in chart.collections for w in np.atleast_1d(bars.get_linewidth())}
+    assert widths == ({0.4} if numbered else {0.0})
+    plt.close(figure)
+
+
+def test_an_exact_first_sample_does_not_stretch_the_error_axis(record):
+    assert record["position_error"][0] < 1e-15
+    figure = figures.tracking(record)
+    errors = next(axis for axis in figure.axes if axis.get_ylabel() == "position error [m]")
+    low, high = errors.get_ylim()
+    assert low >= 1e-15
+    assert record["position_error"].max() < high
+    plt.close(figure)
+
+
+def test_a_joint_that_is_never_straightened_has_no_time(simulated):
+    rows = tables("snake_joint_limits", {v: simulated("snake_joint_limits", v) for v in JOINT_LIMITS})["joint_limits"]
+    (fixed,) = [row[4] for row in rows if row[1] == "the same without switching"]
+    assert fixed.endswith("theta4 never, theta8 never")
+    assert "22.0" not in fixed
 
 
 def test_table_iii_sets_measured_and_simulated_side_by_side(simulated, tmp_path):
@@ -78,6 +138,11 @@ def test_policies_side_by_side(simulated):
 
 def test_the_door_of_figure_14(simulated, tmp_path):
     records = {variant: simulated("snake_door_arc", variant) for variant in ("pull", "pull_switching")}
+    figure = tanaka2019.door(records["pull_switching"])
+    panels = {axis.get_title().split("\n")[0]: axis for axis in figure.axes if axis.get_visible()}
+    figure.draw_without_rendering()
+    assert any(text.get_visible() and text.get_text() for text in panels["(c) joint at its limit"].get_xticklabels())
+    plt.close(figure)
     written = figures.draw_comparison(records, tmp_path)
     assert {"door.csv", "fig_14.png"} <= {path.name for path in written}
     rows = list(csv.reader((tmp_path / "door.csv").read_text().splitlines()))
