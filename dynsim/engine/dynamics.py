@@ -13,20 +13,22 @@ from dynsim import metrics
 from dynsim.engine import REFERENCES, SIMULATION, Progress
 from dynsim.engine.outcome import check_size, raise_stopped
 from dynsim.engine.provenance import provenance
-from dynsim.errors import ModelError, SimulationInterrupted, SimulationStopped
+from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.kernels import arrays as ka
 from dynsim.kernels import integrate as ki
 from dynsim.kernels.coupled import System
 from dynsim.kernels.energy import CONTACT_SIZE, LEDGER_SIZE
 from dynsim.model.arrays import compile_contacts, compile_drives
 from dynsim.model.control import JointControl
-from dynsim.model.description import Contact, Link
+from dynsim.model.description import Contact, Link, Robot
 from dynsim.model.model import Model
 from dynsim.record import Record
 from dynsim.scenario import Scenario, build_model
 
 # Wall time between two looks at progress and Ctrl-C [s].
 _CHUNK_S = 0.1
+# Steps that an explicit method may be held to by the electrical poles alone: a quarter of an hour for ten joints.
+STEPS_LIMIT = 2e8
 
 
 @dataclass(frozen=True)
@@ -49,13 +51,14 @@ def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
     ModelError, UnreachableReference
         See :func:`dynsim.engine.simulate`.
     ScenarioError
-        The record would be larger than ``record.size_limit_GB``.
+        The record would be larger than ``record.size_limit_GB``, or the explicit method would need too many steps.
     """
     model = build_model(scenario)
     robot, contacts = model.robot, scenario.contacts()
     scenario.check_start(model)
     n, na, c = model.n, len(robot.motors), len(contacts)
     times = _sample_times(scenario, columns=2 * n + na + LEDGER_SIZE + CONTACT_SIZE * c + ki.output_size(n, na, c))
+    _check_stiffness(scenario, robot)
     control = _control(scenario, model, progress)
     options = scenario.integrator
     method = ki.METHODS[options.method]
@@ -129,6 +132,22 @@ def _sample_times(scenario: Scenario, columns: int) -> np.ndarray:
     if scenario.duration_s - times[-1] > 1e-9 * scenario.duration_s:
         times = np.append(times, scenario.duration_s)
     return times
+
+
+def _check_stiffness(scenario: Scenario, robot: Robot) -> None:
+    """Refuse an explicit method where the circuits' own poles R/L already ask for too many steps."""
+    method, duration = scenario.integrator.method, scenario.duration_s
+    if method not in ("rk43", "dopri5") or not robot.motors:
+        return
+    motor = max(robot.motors, key=lambda motor: motor.resistance / motor.inductance)
+    pole = motor.resistance / motor.inductance
+    # Explicit methods of these orders are stable up to |h pole| of about 3.
+    steps = duration * pole / 3.0
+    if steps > STEPS_LIMIT:
+        raise ScenarioError(
+            f"{motor.joint}: R/L = {pole:.2g} 1/s holds integrator.method {method} to about {steps:.1g} steps for "
+            f"{duration:g} s; take integrator.method: rodas4, or a larger inductance than {motor.inductance:g} H"
+        )
 
 
 def _control(scenario: Scenario, model: Model, progress: Progress | None) -> JointControl:
@@ -230,4 +249,5 @@ def _reason(status: int, scenario: Scenario, prepared: Prepared) -> str:
     return (
         f"{where}: contact {prepared.contacts[worst].name} cannot be kept on its surface (gap {gaps[worst]:+.2e} m); "
         "the contacts contradict each other or the arm is singular here"
+        + (", or integrator.step_s is too long (try integrator.method: rk43)" if method == "rk4" else "")
     )

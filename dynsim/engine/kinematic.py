@@ -174,7 +174,7 @@ def _read_commands(run: Run, waiting: bool) -> None:
             f"{block.request.shape}, gripper {block.gripper.shape}; give (T, 6), (T,), (T,) with T from 1 to "
             f"{run.ticks - first}"
         )
-    for number in set(block.request[block.request > 0].tolist()):
+    for number in set(block.request.tolist()) - {NO_REQUEST, SWITCHING, FIXING}:
         run.controller.modes.row(number, "controller.commands: mode")
     run.block, run.block_start = block, first
     run.gripper[first : first + known] = block.gripper

@@ -87,6 +87,10 @@ def test_compare_prints_the_table_and_writes_the_comparison(tmp_path: Path):
             "plant.motor.inductance_H = 0: must be positive",
         ),
         (["check", "elbow_comparison", "--set", "a:b"], "--set a:b: must look like"),
+        (
+            ["check", "elbow_comparison", "--set", "plant.link.motor.inductance_H=1e-9"],
+            "take integrator.method: rodas4",
+        ),
         (["plot", "other.h5"], "lacks parts"),
         (["run", "single_pendulum", "--out", "other.h5"], "is a file, not a folder"),
     ],
