@@ -8,6 +8,7 @@ import pytest
 from dynsim.errors import RecordError
 from dynsim.files import check_writable
 from dynsim.record import Record
+from dynsim.results import save_run
 
 
 @pytest.fixture
@@ -84,3 +85,22 @@ def test_a_folder_that_cannot_be_written_is_found_without_making_one(tmp_path: P
     monkeypatch.setattr("os.access", lambda *_: False)
     with pytest.raises(RecordError, match=f"no permission to write in {tmp_path}"):
         check_writable(tmp_path / "new")
+
+
+def test_files_of_a_run_are_replaced_all_or_none(record: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    save_run(record, tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert set(before) == {"record.h5", "summary.json", "scenario.yaml"}
+    record.provenance["scenario"] = {"name": "y"}
+    record.summary = {"energy": 2.5}
+    write_text = Path.write_text
+
+    def fail(self: Path, text: str, **options: str) -> int:
+        if self.name.startswith("scenario"):
+            raise OSError(28, "No space left on device")
+        return write_text(self, text, **options)
+
+    monkeypatch.setattr(Path, "write_text", fail)
+    with pytest.raises(RecordError, match="No space left"):
+        save_run(record, tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
