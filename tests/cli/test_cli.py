@@ -25,6 +25,11 @@ def dynsim(*arguments: str, folder: Path, **options: Any) -> subprocess.Complete
     )
 
 
+def heed_ctrl_c() -> None:
+    """Where the tests run in the background, SIGINT is ignored and would be in their children too."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def test_run_writes_everything_that_is_promised(tmp_path: Path):
     result = dynsim("run", "elbow_comparison", "--variant", "elbow_7", "--no-figures", *SHORT, folder=tmp_path)
     assert result.returncode == 0, result.stderr
@@ -141,7 +146,7 @@ def test_ctrl_c_saves_what_was_simulated(tmp_path: Path):
         [sys.executable, "-m", "dynsim", "run", "elbow_comparison", "--no-figures", "--set", "duration_s=5000",
          "--set", "controller.knot_spacing_s=10", "--set", "controller.hand.path.period_s=5000",
          "--set", "record.rate_hz=10"],
-        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed_ctrl_c,
     )  # fmt: skip
     time.sleep(8.0)
     os.kill(process.pid, signal.SIGINT)
@@ -160,7 +165,7 @@ def test_ctrl_c_saves_all_variants_that_run_in_processes(tmp_path: Path):
             [sys.executable, "-m", "dynsim", "compare", "elbow_comparison", "--jobs", "2", "--no-figures",
              "--set", "duration_s=5000", "--set", "controller.knot_spacing_s=10",
              "--set", "controller.hand.path.period_s=5000", "--set", "record.rate_hz=10", "--out", kill.__name__],
-            cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+            cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed_ctrl_c, start_new_session=True,
         )
         for kill in (os.kill, os.killpg)
     }  # fmt: skip
@@ -200,7 +205,7 @@ def test_ctrl_c_before_the_first_step_says_that_nothing_is_saved(tmp_path: Path)
     processes = [
         subprocess.Popen(
             [sys.executable, "-m", "dynsim", command, *arguments],
-            cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed_ctrl_c,
         )
         for command in ("run", "check")
     ]  # fmt: skip

@@ -209,7 +209,7 @@ KNOWN = "known: switching, fixing, 1, 2, 3, 4, 5, 6"
 def test_commands_that_no_snake_can_carry_out(command, expected):
     with pytest.raises(ScenarioError) as caught:
         load_scenario("snake_operator", overrides={"controller.commands": [{"at_s": 1.0}, {"at_s": 2.0} | command]})
-    assert str(caught.value).startswith("--set: controller.commands.1.")
+    assert str(caught.value).startswith("overrides: controller.commands.1.")
     assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
     assert "more)" not in str(caught.value)
