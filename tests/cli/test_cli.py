@@ -165,7 +165,8 @@ def test_ctrl_c_saves_all_variants_that_run_in_processes(tmp_path: Path):
             [sys.executable, "-m", "dynsim", "compare", "elbow_comparison", "--jobs", "2", "--no-figures",
              "--set", "duration_s=5000", "--set", "controller.knot_spacing_s=10",
              "--set", "controller.hand.path.period_s=5000", "--set", "record.rate_hz=10", "--out", kill.__name__],
-            cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed_ctrl_c, start_new_session=True,
+            cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            preexec_fn=heed_ctrl_c, start_new_session=True,
         )
         for kill in (os.kill, os.killpg)
     }  # fmt: skip
