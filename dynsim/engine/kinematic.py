@@ -17,7 +17,17 @@ from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, Simu
 from dynsim.families import member
 from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.snake import pose_of_point
-from dynsim.kernels.snake_plant import State, new_rig, new_state, new_trace, record_row, run_ticks
+from dynsim.kernels.snake_plant import (
+    MODE,
+    PLACE,
+    TICKS,
+    State,
+    new_rig,
+    new_state,
+    new_trace,
+    record_row,
+    run_ticks,
+)
 from dynsim.model.snake import (
     FIXING,
     NO_REQUEST,
@@ -65,7 +75,7 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> Run:
     state.base[:], state.phi[:] = description.initial_base_pose, description.initial_joints
     pose_of_point(model, state.base, state.phi, rig.work.frame, state.w_target)
     state.phi_hat[:], state.w_hat[:] = state.phi, state.w_target
-    state.counts[0] = controller.fixing_row
+    state.counts[MODE] = controller.fixing_row
     run = Run(
         description=description,
         model=model,
@@ -109,7 +119,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None, source: Comma
     except SimulationStopped as stopped:
         stop = stopped
     except KeyboardInterrupt:
-        reached = float(run.state.counts[1] * controller.schedule.period)
+        reached = float(run.state.counts[TICKS] * controller.schedule.period)
         stop = SimulationInterrupted(
             f"interrupted at t = {reached:.3f} s of {scenario.duration_s:g} s", time=reached, state=_named(run.state)
         )
@@ -153,7 +163,7 @@ def _read_commands(run: Run, waiting: bool) -> None:
     Velocities that had to wait in the block before this one and were not carried out there are dropped: a script is
     one block and loses none, a joystick says anew what it wants.
     """
-    state, period, first = run.state, run.controller.schedule.period, int(run.state.counts[1])
+    state, period, first = run.state, run.controller.schedule.period, int(run.state.counts[TICKS])
     w = np.zeros(6)
     pose_of_point(run.model, state.base, state.phi, run.rig.work.frame, w)
     feedback = Feedback(
@@ -162,7 +172,7 @@ def _read_commands(run: Run, waiting: bool) -> None:
         w_target=state.w_target.copy(),
         base_pose=state.base.copy(),
         phi=state.phi.copy(),
-        mode=run.controller.modes.numbers[state.counts[0]],
+        mode=run.controller.modes.numbers[state.counts[MODE]],
         waiting=waiting,
     )
     block = run.source.read(first, run.ticks - first, period, feedback)
@@ -178,14 +188,14 @@ def _read_commands(run: Run, waiting: bool) -> None:
         run.controller.modes.row(number, "controller.commands: mode")
     run.block, run.block_start = block, first
     run.gripper[first : first + known] = block.gripper
-    state.counts[3] = 0
+    state.counts[PLACE] = 0
 
 
 def _advance(run: Run, switcher: ModeSwitcher, progress: Progress | None) -> None:
     """Run to the end in pieces that no mode request, no switching time and no end of known commands divides."""
     state, controller, period = run.state, run.controller, run.controller.schedule.period
     recovering = blocked = False
-    while (now := int(state.counts[1])) < run.ticks:
+    while (now := int(state.counts[TICKS])) < run.ticks:
         if now == run.block_start + len(run.block.request):
             _read_commands(run, waiting=blocked or recovering)
         ahead = run.block.request[now - run.block_start :]
@@ -193,7 +203,7 @@ def _advance(run: Run, switcher: ModeSwitcher, progress: Progress | None) -> Non
         # At the ends of switching periods only, so that every recovery has at least one.
         if recovering and now >= (switcher.next_event() or 0) and _is_released(run):
             recovering, request = False, FIXING
-        state.counts[0] = switcher.at_tick(now, request)
+        state.counts[MODE] = switcher.at_tick(now, request)
         later = 1 + np.flatnonzero(ahead[1:] != NO_REQUEST)
         ends = [now + len(ahead), now + CHUNK, *(now + later[:1])]
         if (event := switcher.next_event()) is not None:
@@ -213,7 +223,7 @@ def _advance(run: Run, switcher: ModeSwitcher, progress: Progress | None) -> Non
             run.trace,
         )
         if done < 0:
-            time = float(state.counts[1] * period)
+            time = float(state.counts[TICKS] * period)
             raise SimulationStopped(
                 f"the state is no longer finite at t = {time:g} s: a singular posture, or a gain too high "
                 "for the control period",
@@ -222,10 +232,10 @@ def _advance(run: Run, switcher: ModeSwitcher, progress: Progress | None) -> Non
             )
         if blocked and not recovering and controller.when_blocked and not switcher.switching:
             recovering = True
-            if state.counts[1] < run.ticks:
-                state.counts[0] = switcher.at_tick(int(state.counts[1]), SWITCHING)
+            if state.counts[TICKS] < run.ticks:
+                state.counts[MODE] = switcher.at_tick(int(state.counts[TICKS]), SWITCHING)
         if progress is not None:
-            progress(float(state.counts[1] * period))
+            progress(float(state.counts[TICKS] * period))
 
 
 def _is_released(run: Run) -> bool:
@@ -238,12 +248,12 @@ def _predict(run: Run, row: int) -> tuple[float, float]:
     """Cost after one switching period in a mode with the present command held, and the smallest support margin."""
     ticks, law, real = run.controller.prediction_ticks, run.controller.law, run.controller.schedule
     schedule = run.controller.prediction
-    waits = (real.null_start_tick - int(run.state.counts[1])) * real.period  # until the null space comes on [s]
+    waits = (real.null_start_tick - int(run.state.counts[TICKS])) * real.period  # until the null space comes on [s]
     schedule = schedule._replace(null_start_tick=round(waits / schedule.period))
     trial, trace = _copy(run.state), new_trace(run.model, ticks + 1)
-    place = min(int(trial.counts[3]), len(run.block.velocity) - 1)
+    place = min(int(trial.counts[PLACE]), len(run.block.velocity) - 1)
     held = np.tile(run.block.velocity[place], (ticks, 1))
-    trial.counts[0], trial.counts[1], trial.counts[3] = row, 0, 0
+    trial.counts[MODE], trial.counts[TICKS], trial.counts[PLACE] = row, 0, 0
     done, _ = run_ticks(run.model, law, schedule, trial, held, ticks, 1, 1, 1, run.rig, trace)
     if done < 0:
         return np.inf, -np.inf  # no longer finite: no mode to take

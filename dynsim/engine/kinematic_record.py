@@ -12,7 +12,16 @@ from dynsim.engine.kinematic_run import Run
 from dynsim.engine.mode_switching import ModeSwitcher
 from dynsim.kernels.jit import reals
 from dynsim.kernels.snake import new_chain, posture_points
-from dynsim.kernels.snake_plant import Trace, record_row
+from dynsim.kernels.snake_plant import (
+    CLAMPED,
+    NULL_REDUCED,
+    SLOWED,
+    TICKS,
+    WAITED,
+    WAITED_FOR,
+    Trace,
+    record_row,
+)
 from dynsim.model.snake import SnakeDescription, TaskSpaceController, conditioning
 from dynsim.record import Record
 from dynsim.scenario import Scenario
@@ -57,7 +66,7 @@ def make_record(
     wall : time that the ticks took [s].
     """
     description, state, law = run.description, run.state, run.controller.law
-    model, period, ticks = run.model, run.controller.schedule.period, int(run.state.counts[1])
+    model, period, ticks = run.model, run.controller.schedule.period, int(run.state.counts[TICKS])
     rows = -(-ticks // run.stride) + 1
     trace = Trace(*(array[:rows] for array in run.trace))
     record_row(model, law, state, run.rig, rows - 1, trace)
@@ -129,8 +138,16 @@ def _geometry(description: SnakeDescription, controller: TaskSpaceController) ->
     }
 
 
+def _waiting_for(counts: NDArray[np.int64], period: float) -> dict[str, float]:
+    """Why the target waited, and how long [s]; reasons that did not occur are left out."""
+    known = counts[WAITED_FOR + 1 :]
+    ticks = [*known, counts[WAITED] - known.sum()]
+    return {name: float(count * period) for name, count in zip(OBSTACLES, ticks, strict=True) if count}
+
+
 def _summary(run: Run, scenario: Scenario, switcher: ModeSwitcher, record: Record, wall: float) -> dict[str, Any]:
     description, law, period = run.description, run.controller.law, run.controller.schedule.period
+    counts = run.state.counts
     phi, w, at_limit = record["phi"], record["w"], record["at_limit"]
     beyond = np.maximum(phi - description.upper, description.lower - phi)
     duration = float(record.time[-1])
@@ -141,7 +158,7 @@ def _summary(run: Run, scenario: Scenario, switcher: ModeSwitcher, record: Recor
         "duration_s": duration,
         "integration_wall_s": wall,
         "real_time_factor": duration / wall if wall > 0.0 else 0.0,
-        "steps": int(run.state.counts[1]),
+        "steps": int(counts[TICKS]),
         "final_position_error_m": float(record["position_error"][-1]),
         "final_attitude_error_rad": float(record["attitude_error"][-1]),
         "position_error_max_m": float(record["position_error"].max()),
@@ -152,17 +169,11 @@ def _summary(run: Run, scenario: Scenario, switcher: ModeSwitcher, record: Recor
         "final_base_pose": record["base_pose"][-1].tolist(),
         "joint_limit_violation_max_rad": float(max(beyond.max(), 0.0)),
         "joints_taken_out": [description.joint_names[j] for j in np.flatnonzero((at_limit == 1).any(axis=0))],
-        "waiting_s": float(run.state.counts[4] * period),
-        "waiting_for_s": {
-            name: float(ticks * period)
-            for name, ticks in zip(
-                OBSTACLES, [*run.state.counts[7:], run.state.counts[4] - run.state.counts[7:].sum()], strict=True
-            )
-            if ticks
-        },
-        "slowed_s": float(run.state.counts[5] * period),
-        "null_space_reduced_s": float(run.state.counts[6] * period),
-        "clamped_joint_ticks": int(run.state.counts[2]),
+        "waiting_s": float(counts[WAITED] * period),
+        "waiting_for_s": _waiting_for(counts, period),
+        "slowed_s": float(counts[SLOWED] * period),
+        "null_space_reduced_s": float(counts[NULL_REDUCED] * period),
+        "clamped_joint_ticks": int(counts[CLAMPED]),
         "joint_rate_max_rad_s": float(np.abs(record["phi_dot"]).max()),
         "wheel_rate_max_rad_s": float(np.abs(record["rho_dot"]).max(initial=0.0)),
         "slip_max_m_s": float(record["slip"].max()),

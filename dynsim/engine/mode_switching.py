@@ -23,9 +23,8 @@ class ModeSwitcher:
     """Fixing and switching states: follows requests, and picks a mode at every switching time t_k = t_0 + k dT.
 
     Every change of mode is tested by simulating the mode for one period with the present command. It tips when its
-    support margin is anywhere not above ``least_margin``; such a mode is
-    not taken and the present one stays. Only when the present mode tips as well, the one that stands best is taken, the
-    fixing mode among them.
+    support margin is anywhere not above ``least_margin``; such a mode is not taken and the present one stays. Only
+    when the present mode tips as well, the one that stands best is taken, the fixing mode among them.
 
     Attributes
     ----------
@@ -110,7 +109,8 @@ class ModeSwitcher:
 
         The fixing mode is among those: it need not be in the order.
         """
-        margins = {row: self.predict(row)[1] for row in (self.row, self.fixing_row)} | tipping
+        rows = (self.row, self.fixing_row, *tipping)
+        margins = {row: tipping[row] if row in tipping else self.predict(row)[1] for row in rows}
         best = max(margins, key=lambda row: margins[row])
         taken = self.row if margins[self.row] > self.least_margin else best
         self._refuse(tick, tipping, taken)

@@ -60,12 +60,7 @@ def draw(record: Record, folder: Path) -> list[Path]:
             "redundancy": redundancy,
         }
         for name, make in (makers | tanaka2019.figures_of_run(record)).items():
-            figure = make(record)
-            path = folder / f"{name}.png"
-            with replacing(path) as temporary:
-                figure.savefig(temporary, format="png")
-            plt.close(figure)
-            written.append(path)
+            written.append(_save(make(record), folder / f"{name}.png"))
         written.append(animate(record, folder / "animation.gif"))
     return written
 
@@ -85,13 +80,15 @@ def draw_comparison(records: Mapping[str, Record], folder: Path) -> list[Path]:
         written += tanaka2019.write_tables(scenario, records, folder)
     with plt.rc_context(STYLE):
         for name, make in makers.items():
-            figure = make(records)
-            path = folder / f"{name}.png"
-            with replacing(path) as temporary:
-                figure.savefig(temporary, format="png")
-            plt.close(figure)
-            written.append(path)
+            written.append(_save(make(records), folder / f"{name}.png"))
     return written
+
+
+def _save(figure: Figure, path: Path) -> Path:
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png")
+    plt.close(figure)
+    return path
 
 
 def comparison(records: Mapping[str, Record]) -> Figure:

@@ -29,6 +29,16 @@ WITHHELD = 1e-5
 MEASURED, ESTIMATED, FEEDFORWARD = 0, 1, 2
 # Why a command cannot be carried out.
 NO_OBSTACLE, JOINT_LIMIT, RATE_LIMIT, SINGULAR, ATTITUDE = 0, 1, 2, 3, 4
+# State.counts
+MODE = 0  # row of the mode in Law.grounded
+TICKS = 1  # run
+CLAMPED = 2  # joint-ticks clamped at a limit
+PLACE = 3  # commands carried out of the present block
+WAITED = 4  # ticks in which the command could not be carried out and the target waited
+SLOWED = 5  # ticks slowed down
+NULL_REDUCED = 6  # ticks with less null-space motion
+WAITED_FOR = 6  # + JOINT_LIMIT … ATTITUDE: ticks that waited for it
+COUNTS_SIZE = WAITED_FOR + ATTITUDE + 1
 # A target is not turned further than this towards beta = +-90 deg [rad].
 BETA_LIMIT = 0.5 * math.pi - 0.02
 # Steps in which a null-space motion that is too fast is reduced, the last of them to nothing.
@@ -54,10 +64,7 @@ class State(NamedTuple):
     w_target: np.ndarray  # (6,) w_d, integrated from the commanded velocity
     w_hat: np.ndarray  # (6,) what the controller believes of w
     phi_hat: np.ndarray  # (n_phi,) what the controller believes of phi
-    # (11,) [row of the mode in Law.grounded, ticks run, joint-ticks clamped at a limit, commands carried out of the
-    # present block, ticks in which the command could not be carried out and the target waited, ticks slowed
-    # down, ticks with less null-space motion, then ticks that waited for JOINT_LIMIT, RATE_LIMIT, SINGULAR, ATTITUDE]
-    counts: np.ndarray
+    counts: np.ndarray  # (COUNTS_SIZE,) int
 
 
 class Rig(NamedTuple):
@@ -108,7 +115,7 @@ def new_state(model: SnakeModel) -> State:
         w_target=np.zeros(6),
         w_hat=np.zeros(6),
         phi_hat=np.zeros(joints),
-        counts=np.zeros(11, dtype=np.int64),
+        counts=np.zeros(COUNTS_SIZE, dtype=np.int64),
     )
 
 
@@ -325,11 +332,11 @@ def tick(model, law, schedule, state, velocity, rig):
     blocked : bool
         The command was not carried out.
     """
-    work, period, mode = rig.work, schedule.period, state.counts[0]
+    work, period, mode = rig.work, schedule.period, state.counts[MODE]
     phi, phi_hat, w_hat, w_target = state.phi, state.phi_hat, state.w_hat, state.w_target
     pose, target, joints_ahead, u, error, rate = rig.pose, rig.target, rig.phi_stage, work.u, work.error, rig.rate
     joints = phi.shape[0]
-    full_gain = law.null_gain if state.counts[1] >= schedule.null_start_tick else 0.0
+    full_gain = law.null_gain if state.counts[TICKS] >= schedule.null_start_tick else 0.0
     null_gain = full_gain
     allocate = law.limit_policy == LIMITS_ALLOCATE
     believe(model, schedule, state, rig)
@@ -372,8 +379,8 @@ def tick(model, law, schedule, state, velocity, rig):
         else:
             slowed = slow_down(model, law, u, phi)
             break
-    state.counts[5] += int(slowed)
-    state.counts[6] += int(reductions > 0)
+    state.counts[SLOWED] += int(slowed)
+    state.counts[NULL_REDUCED] += int(reductions > 0)
     if law.limit_policy != LIMITS_NONE:  # the mechanical stop, and what is left when no allocation helps
         for j in range(joints):
             up = max(model.upper[j] - phi[j], 0.0) / period
@@ -381,7 +388,7 @@ def tick(model, law, schedule, state, velocity, rig):
             if u[j] > up or u[j] < down:
                 # rounding of an allocated bound is no event
                 if u[j] > up + 1e-9 or u[j] < down - 1e-9:
-                    state.counts[2] += 1
+                    state.counts[CLAMPED] += 1
                 u[j] = up if u[j] > up else down
     slip = advance_plant(model, law.grounded[mode], period, schedule.substeps, state, u, rig)
     for j in range(joints):
@@ -389,19 +396,19 @@ def tick(model, law, schedule, state, velocity, rig):
     for i in range(6):
         w_target[i] += period * rate[i]
         w_hat[i] += period * rate[i]  # x, y, gamma of the estimated state; the rest is overwritten
-    state.counts[1] += 1
+    state.counts[TICKS] += 1
     commanded = False
     for i in range(6):
         commanded = commanded or velocity[i] != 0.0
     if waits and commanded:
-        state.counts[6 + reason] += 1
+        state.counts[WAITED_FOR + reason] += 1
     return slip, waits and commanded
 
 
 @kernel
 def record_row(model, law, state, rig, r, trace):
     """Write the state, and what follows from it, to row r of the trace."""
-    work, chain, support, pose, mode = rig.work, rig.work.chain, rig.work.support, rig.pose, state.counts[0]
+    work, chain, support, pose, mode = rig.work, rig.work.chain, rig.work.support, rig.pose, state.counts[MODE]
     phi, rho, grounded = state.phi, state.rho, law.grounded[mode]
     pose_of_point(model, state.base, phi, work.frame, pose)
     walk_chain(model, pose, phi, work.frame, chain)
@@ -427,7 +434,7 @@ def run_ticks(model, law, schedule, state, velocity, count, moving, stop, stride
     Parameters
     ----------
     velocity : (T, 6) commanded rates of the target, a block of one row per period; zero after its end. The next row is
-        taken only when the last one was carried out (``state.counts[3]`` is the place).
+        taken only when the last one was carried out (``state.counts[PLACE]`` is the place).
     count : int, control periods to run.
     moving : int, 1: follow the script; 0: the target waits.
     stop : int, 1: return after a period that was blocked.
@@ -443,14 +450,14 @@ def run_ticks(model, law, schedule, state, velocity, count, moving, stop, stride
     base, phi, counts, at_limit = state.base, state.phi, state.counts, rig.work.at_limit
     command, blocked = rig.command, False
     for k in range(count):
-        now, place = counts[1], counts[3]
+        now, place = counts[TICKS], counts[PLACE]
         r = now // stride if now % stride == 0 else -1
         if r >= 0:
             record_row(model, law, state, rig, r, trace)
         for i in range(6):
             command[i] = velocity[place, i] if moving and place < velocity.shape[0] else 0.0
         slip, blocked = tick(model, law, schedule, state, command, rig)
-        counts[3 if moving and not blocked else 4] += 1
+        counts[PLACE if moving and not blocked else WAITED] += 1
         if r >= 0:
             trace.slip[r] = slip
             copy(rig.work.u, trace.u[r])
