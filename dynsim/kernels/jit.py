@@ -1,23 +1,36 @@
 """The one place that compiles: ``@kernel`` on plain module-level functions.
 
-``cache=True`` of numba checks only the file that holds the function: an edit in a callee elsewhere silently runs old
-machine code. So the cache lives in a folder named by a hash of all kernel sources and the numba version.
+Two habits of numba are mended here, because results must not depend on what a process has done before:
+
+- it keeps every callee twice, as a library of its own and as a copy in its caller, see :class:`_OwnCallees`;
+- its cache checks only the file that holds the function (an edit in a callee elsewhere silently runs old machine code)
+  and believes whatever bytes it finds, see :class:`_KernelCache`.
 """
 
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
+import pickle
+import stat
 import tempfile
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
+import llvmlite
 import numba
 import numba.extending
 import numpy as np
-from numba.core import config
+from llvmlite.binding import Linkage
+from numba.core import config, serialize
+from numba.core.caching import _Cache
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler, CompileResult
+
+_log = logging.getLogger(__name__)
 
 # Packs the scalar formulas of 3-vectors and wrenches into vector instructions (numba leaves it off): a right-hand side
 # takes 8 % less time. Global, and read when numba compiles its first function in the process.
@@ -29,27 +42,129 @@ _NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": Tru
 F = TypeVar("F", bound=Callable[..., Any])
 
 
+class _OwnCallees(JITCodeLibrary):
+    """Machine code that calls only what it brings along.
+
+    numba links a copy of every callee into its caller, optimised again there, and leaves all copies under one name:
+    which of them runs is then a matter of what the process has loaded before, and so are the last bits of a result.
+    Made internal, the copies of a library are its own, in the process that compiles and in all that load it.
+    """
+
+    def _optimize_final_module(self) -> None:
+        for function in self._final_module.functions:
+            if function.linkage == Linkage.linkonce_odr and not function.is_declaration:
+                function.linkage = Linkage.internal
+        super()._optimize_final_module()
+
+
+class _Compiler(Compiler):
+    """numba's compiler, into :class:`_OwnCallees`."""
+
+    def compile_extra(self, func: Callable[..., Any]) -> Any:
+        self.state.library = _OwnCallees(self.state.targetctx.codegen(), func.__qualname__)
+        self.state.library.enable_object_caching()
+        return super().compile_extra(func)
+
+
+class _KernelCache(_Cache):
+    """Machine code on disk, a file for each function and signature: SHA-256 of the rest, then numba's own pickle.
+
+    A file that is damaged or cannot be written costs a compilation, never the run: LLVM aborts the process on broken
+    machine code, so nothing is handed to it before its digest is right.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+
+    @property
+    def cache_path(self) -> str:
+        return str(cache_folder())
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        target_context.refresh()
+        path = self._path(sig, target_context.codegen())
+        try:
+            content = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            _log.warning("%s: cannot be read (%s); compiling it anew", path, error.strerror)
+            return None
+        digest, payload = content[:_DIGEST_SIZE], content[_DIGEST_SIZE:]
+        if hashlib.sha256(payload).digest() != digest:
+            _log.warning("%s: damaged machine code; compiling it anew", path)
+            return None
+        return CompileResult._rebuild(target_context, *pickle.loads(payload))
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        if data.library.has_dynamic_globals:
+            raise ValueError(f"{self._function.__qualname__}: holds addresses of this process and cannot be kept")
+        path = self._path(sig, data.codegen)
+        payload = serialize.dumps(data._reduce())
+        try:
+            with tempfile.NamedTemporaryFile(
+                dir=path.parent, prefix=f"{path.name}.", suffix=".tmp", delete=False
+            ) as file:
+                try:
+                    file.write(hashlib.sha256(payload).digest())
+                    file.write(payload)
+                    file.close()
+                    os.replace(file.name, path)
+                except BaseException:
+                    os.unlink(file.name)
+                    raise
+        except OSError as error:
+            _log.warning("%s: cannot be kept (%s); the next run compiles it again", path, error.strerror)
+
+    def _path(self, sig: Any, codegen: Any) -> Path:
+        """Named by what may differ for the same sources: processor, signature, and a function of another package."""
+        source = Path(self._function.__code__.co_filename)
+        content = b"" if source.parent == Path(__file__).parent else source.read_bytes()
+        key = repr((sig, codegen.magic_tuple())).encode() + content
+        name = f"{self._function.__module__}.{self._function.__qualname__}"
+        return cache_folder() / f"{name}-{hashlib.sha256(key).hexdigest()[:16]}{_SUFFIX}"
+
+    def enable(self) -> None: ...
+
+    def disable(self) -> None: ...
+
+    def flush(self) -> None: ...
+
+
+_SUFFIX = ".kernel"
+_DIGEST_SIZE = hashlib.sha256().digest_size
+
+
 @lru_cache(maxsize=1)
 def cache_folder() -> Path:
-    """Folder of the compiled kernels: user-writable, named by what would make its content stale."""
-    digest = hashlib.sha256(f"{numba.__version__} {np.__version__}".encode())
+    """Folder of the compiled kernels: this user's own and writable, named by what would make its content stale.
+
+    Loading machine code runs it, so a folder that belongs to somebody else, or that others can write to, is not used.
+    """
+    digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__} {np.__version__}".encode())
     for source in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(source.read_bytes())
-    base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     name = Path("dynsim", digest.hexdigest()[:16])
-    for root in (Path(base).expanduser(), Path(tempfile.gettempdir(), f"cache-{os.getuid()}")):
+    roots = [os.environ.get(variable) for variable in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")]
+    home = next((root for root in roots if root), "~/.cache")
+    for root in (Path(os.path.expanduser(home)), Path(tempfile.gettempdir(), f"cache-{os.getuid()}")):
+        folder = root / name
         try:
-            (root / name).mkdir(parents=True, exist_ok=True)
+            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            status = folder.lstat()
         except OSError:
             continue
-        if os.access(root / name, os.W_OK):
-            return root / name
+        writable_by_others = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+        if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or writable_by_others:
+            _log.warning("%s: not used for compiled kernels, because others own it or can write to it", folder)
+        elif os.access(folder, os.W_OK | os.X_OK):
+            return folder
     return Path(tempfile.mkdtemp(prefix="dynsim-"))
 
 
 def is_cached() -> bool:
     """True when compiled kernels of these sources are on disk (a first run compiles them)."""
-    return any(cache_folder().rglob("*.nbi"))
+    return any(cache_folder().glob(f"*{_SUFFIX}"))
 
 
 def kernel(function: F) -> F:
@@ -88,12 +203,10 @@ def inlined_kernel(function: F) -> F:
 
 
 def _compile(function: F, **options: Any) -> F:
-    previous = config.CACHE_DIR
-    config.CACHE_DIR = str(cache_folder())
-    try:
-        return numba.njit(cache=True, **_OPTIONS, **options)(function)
-    finally:
-        config.CACHE_DIR = previous
+    compiled = numba.njit(pipeline_class=_Compiler, **_OPTIONS, **options)(function)
+    if not config.DISABLE_JIT:
+        compiled._cache = _KernelCache(function)
+    return compiled
 
 
 def reals(values: Any) -> np.ndarray:

@@ -1,0 +1,154 @@
+"""The same version gives the same numbers, whatever a process has compiled, loaded or found in its cache before."""
+
+from __future__ import annotations
+
+import logging
+import os
+import pickle
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from llvmlite.binding import ObjectFileRef
+
+import dynsim
+from dynsim.kernels import jit
+from dynsim.kernels.newton_euler import newton_euler
+
+SHORT = {"duration_s": 0.3}
+
+HASH_OF_RUN = """
+import hashlib, sys
+import numpy as np
+import dynsim
+from dynsim.engine.dynamics import prepare
+from dynsim.kernels.coupled import derivative
+
+scenario = dynsim.load_scenario("elbow_comparison", overrides={"duration_s": 0.3})
+if "derivative" in sys.argv:
+    prepared = prepare(scenario)
+    derivative(prepared.system, 0.0, prepared.run.y.copy(), prepared.workspace, np.zeros_like(prepared.run.y))
+if "model" in sys.argv:
+    model = dynsim.build_model(scenario)
+    model.mass_matrix(model.robot.initial)
+    model.kinetic_energy(model.robot.initial, model.robot.initial)
+    model.potential_energy(model.robot.initial)
+record = dynsim.simulate(scenario)
+digest = hashlib.sha256()
+for name in record:
+    digest.update(np.ascontiguousarray(record[name]).tobytes())
+print(digest.hexdigest())
+"""
+
+
+def _hash_of_run(*used_before: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", HASH_OF_RUN, *used_before], capture_output=True, text=True, check=True, timeout=300
+    )
+    return done.stdout.strip()
+
+
+def test_numbers_do_not_depend_on_what_was_used_before() -> None:
+    # The first process may have to compile; the second then loads the drivers alone.
+    assert len({_hash_of_run("derivative"), _hash_of_run(), _hash_of_run("model", "derivative")}) == 1
+
+
+def _weak_functions(machine_code: bytes) -> int:
+    """Functions of an ELF object that another one of the same name, loaded earlier, would replace."""
+    table = next(
+        section.data() for section in ObjectFileRef.from_data(machine_code).sections() if section.name() == b".symtab"
+    )
+    symbols = struct.iter_unpack("<IBBHQQ", table)
+    return sum(1 for _, info, _, section, _, _ in symbols if info >> 4 == 2 and info & 15 == 2 and section != 0)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads ELF objects")
+def test_no_function_can_be_replaced_by_one_loaded_earlier() -> None:
+    dynsim.simulate(dynsim.load_scenario("elbow_comparison", overrides=SHORT))
+    files = list(jit.cache_folder().glob("dynsim.kernels.*.kernel"))
+    drivers = [file for file in files if ".advance_explicit-" in file.name]
+    assert drivers, files
+    for file in files:
+        library = pickle.loads(file.read_bytes()[32:])[0]
+        assert _weak_functions(library[2][0]) == 0, file.name
+
+
+@pytest.fixture
+def kernel_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache folder of its own."""
+    monkeypatch.setattr(jit, "cache_folder", lambda: tmp_path)
+    return tmp_path
+
+
+def _double() -> int:
+    """3 doubled, by a kernel that is not loaded yet."""
+
+    @jit.kernel
+    def double(x):  # type: ignore[no-untyped-def]
+        return 2 * x
+
+    return int(double(3))
+
+
+@pytest.mark.parametrize("damage", ["machine code", "digest", "cut", "empty"])
+def test_damaged_machine_code_is_compiled_anew(
+    kernel_files: Path, damage: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert _double() == 6
+    (file,) = kernel_files.iterdir()
+    whole = file.read_bytes()
+    middle = len(whole) // 2
+    file.write_bytes(
+        {
+            "machine code": whole[:middle] + bytes(64) + whole[middle + 64 :],
+            "digest": bytes([whole[0] ^ 1]) + whole[1:],
+            "cut": whole[:middle],
+            "empty": b"",
+        }[damage]
+    )
+    with caplog.at_level(logging.WARNING, "dynsim"):
+        assert _double() == 6
+    assert [record.message for record in caplog.records] == [f"{file}: damaged machine code; compiling it anew"]
+    assert len(file.read_bytes()) == len(whole)
+    caplog.clear()
+    assert _double() == 6
+    assert not caplog.records
+
+
+def test_machine_code_that_cannot_be_kept_costs_no_run(kernel_files: Path, monkeypatch, caplog) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with caplog.at_level(logging.WARNING, "dynsim"):
+        assert _double() == 6
+    assert "No space left on device" in caplog.text
+    assert list(kernel_files.iterdir()) == []
+
+
+def test_folders_of_others_are_not_used(tmp_path: Path, monkeypatch, caplog) -> None:
+    mine = jit.cache_folder.__wrapped__
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "first"))
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path / "second"))
+    folder = mine()
+    assert folder.is_relative_to(tmp_path / "first")
+    folder.chmod(0o777)
+    with caplog.at_level(logging.WARNING, "dynsim"):
+        assert mine().is_relative_to(tmp_path / "second")
+    assert str(folder) in caplog.text
+    folder.chmod(0o700)
+    folder.rename(folder.with_name("elsewhere"))
+    folder.symlink_to(folder.with_name("elsewhere"))
+    assert mine().is_relative_to(tmp_path / "second")
+    # Somebody else's: this process becomes somebody else.
+    folder.unlink()
+    mine()
+    monkeypatch.setattr(os, "getuid", lambda: folder.stat().st_uid + 1)
+    assert not mine().is_relative_to(tmp_path / "first")
+
+
+def test_every_kernel_is_compiled_by_the_one_place_that_knows_how() -> None:
+    assert isinstance(newton_euler._cache, jit._KernelCache)  # type: ignore[attr-defined]
