@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
-from dynsim.config import NonNegative, Positive, StrictConfig
-from dynsim.model.description import Motor
+from dynsim.config import NonNegative, Positive, StrictConfig, Vector3, error_at
+from dynsim.model.description import Link, Motor
 
 
 class MotorParameters(StrictConfig):
@@ -21,6 +23,12 @@ class MotorParameters(StrictConfig):
     gear_ratio: Positive = Field(description="motor turns per joint turn; at a prismatic joint rad of the motor per m")
     gear_damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="on the motor side")
     voltage_limit_V: Positive | None = None
+    mass_kg: NonNegative = Field(
+        default=0.0, description="of motor and gear, a point mass on the link before the joint"
+    )
+    mass_point_m: Vector3 | None = Field(
+        default=None, description="where, in that link's frame; default: at the motor's joint"
+    )
 
     @field_validator("inductance_H", mode="before")
     @classmethod
@@ -29,6 +37,12 @@ class MotorParameters(StrictConfig):
         if value == 0:
             raise ValueError("must be positive; for none take 1e-6 with integrator.method: rodas4")
         return value
+
+    @model_validator(mode="after")
+    def _check_mass(self) -> Self:
+        if self.mass_point_m is not None and self.mass_kg == 0.0:
+            raise error_at("mass_point_m", "has no effect without mass_kg")
+        return self
 
     def motor(self, joint: str) -> Motor:
         """The motor on the joint of that name."""
@@ -42,3 +56,20 @@ class MotorParameters(StrictConfig):
             gear_damping=self.gear_damping_N_m_s_per_rad,
             voltage_limit=np.inf if self.voltage_limit_V is None else self.voltage_limit_V,
         )
+
+
+def with_motor_masses(links: Sequence[Link], motors: Mapping[str, MotorParameters]) -> tuple[Link, ...]:
+    """The links with the masses of the motors, by joint, that sit on them: each on the parent of its joint.
+
+    A motor on the base moves nothing, so its mass does not count.
+    """
+    inertia = {link.name: link.inertia for link in links}
+    for link in links:
+        motor = motors.get(link.joint)
+        if motor is not None and motor.mass_kg > 0.0 and link.parent is not None:
+            point = link.p_PJ if motor.mass_point_m is None else np.array(motor.mass_point_m)
+            inertia[link.parent] = inertia[link.parent].with_point(motor.mass_kg, point)
+    return tuple(
+        link if inertia[link.name] is link.inertia else dataclasses.replace(link, inertia=inertia[link.name])
+        for link in links
+    )

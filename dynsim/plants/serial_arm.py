@@ -10,7 +10,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig, Vector3, error_at, unit_vector
 from dynsim.families import union
 from dynsim.model.description import Inertia, Link, Motor, Robot, vector
-from dynsim.model.motor_parameters import MotorParameters
+from dynsim.model.motor_parameters import MotorParameters, with_motor_masses
 
 ENGINE = "dynamics"
 
@@ -28,7 +28,9 @@ class LinkKeys(StrictConfig):
     kind: Literal["revolute", "prismatic"] = "revolute"
     axis: Literal["x", "y", "z"] | Vector3 = Field(default="y", description="joint axis in the link's frame")
     length_m: NonNegative = 0.3
-    radius_m: Positive = Field(default=0.01, description="of the solid cylinder that gives the inertia")
+    radius_m: Positive = Field(
+        default=0.01, description="of the solid cylinder that gives the inertia; a link deeper below a surface sinks"
+    )
     mass_kg: NonNegative = 0.1
     com_m: Vector3 | None = Field(default=None, description="default: the middle of the link")
     inertia_kg_m2: list[float] | None = Field(
@@ -161,6 +163,7 @@ def build(config: Config) -> Robot:
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
     links: list[Link] = []
     motors: list[Motor] = []
+    chosen: dict[str, MotorParameters] = {}
     initial: list[float] = []
     reach = 0.0
     for group in config.chain:
@@ -178,9 +181,12 @@ def build(config: Config) -> Robot:
                     R_PJ=turn if first else np.eye(3),
                     p_PJ=np.array(config.base.position_m) if first else vector(0.0, 0.0, reach),
                     damping=group.damping,
+                    radius=group.radius_m,
+                    tip=vector(0.0, 0.0, group.length_m),
                 )
             )
             if group.motor is not None:
+                chosen[f"joint_{number}"] = group.motor
                 motors.append(group.motor.motor(f"joint_{number}"))
             initial.append(group.initial)
             reach = group.length_m
@@ -191,7 +197,7 @@ def build(config: Config) -> Robot:
         hand = (config.hand.body, np.array(config.hand.point_m))
     return Robot(
         name="serial_arm",
-        links=tuple(links),
+        links=with_motor_masses(links, chosen),
         motors=tuple(motors),
         hand=hand,
         gravity=np.array(config.gravity_m_s2),
