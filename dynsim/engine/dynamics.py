@@ -189,7 +189,7 @@ def _check_references(scenario: Scenario, robot: Robot, contacts: Sequence[Conta
     for times, q in control.positions(robot.initial, driven):
         for link, R, p in poses(robot, q, held):
             for contact in held.get(link.name, ()):
-                position = p + R @ contact.point
+                position = (p + contact.point @ R).T
                 gap = contact.surface.gaps(position)
                 k = int(np.abs(gap).argmax())
                 if abs(gap[k]) > tolerance:

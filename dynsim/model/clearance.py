@@ -32,10 +32,10 @@ class Sinking:
 
 
 def poses(robot: Robot, q: Array, bodies: Collection[str] | None = None) -> Iterator[tuple[Link, Array, Array]]:
-    """R_WB, (T, 3, 3), and p_WB, (T, 3) [m], of each body in turn at joint positions q, (T, n).
+    """R_WB, (3, 3, T), and p_WB, (3, T) [m], of each body in turn at joint positions q, (T, n).
 
-    Vectorised over the samples, so that thousands of them cost milliseconds. ``bodies``: only these and those that
-    carry them.
+    Vectorised over the samples, which lie together in memory: thousands of them cost a millisecond. ``bodies``: only
+    these and those that carry them.
     """
     links = {link.name: link for link in robot.links}
     wanted = set(links if bodies is None else bodies)
@@ -52,23 +52,20 @@ def poses(robot: Robot, q: Array, bodies: Collection[str] | None = None) -> Iter
         if link.name not in wanted:
             continue
         if link.parent is None:
-            R, p = np.broadcast_to(link.R_PJ, (count, 3, 3)), np.broadcast_to(link.p_PJ, (count, 3))
+            R, p = np.repeat(link.R_PJ[:, :, None], count, axis=2), np.repeat(link.p_PJ[:, None], count, axis=1)
         else:
             R_WP, p_WP = known[link.parent]
-            R, p = _times(R_WP, link.R_PJ), p_WP + R_WP @ link.p_PJ
+            R, p = link.R_PJ.T @ R_WP, p_WP + link.p_PJ @ R_WP
             waiting[link.parent] -= 1
             if not waiting[link.parent]:
                 del known[link.parent]
         if link.kind == "prismatic":
-            p = p + q[:, i, None] * (R @ link.axis)
+            p = p + q[:, i] * (link.axis @ R)
         else:
             x, y, z = link.axis
             K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-            R = (
-                R
-                + np.sin(q[:, i])[:, None, None] * _times(R, K)
-                + (1.0 - np.cos(q[:, i]))[:, None, None] * _times(R, K @ K)
-            )
+            # R (1 + sin q K + (1 − cos q) K²); a product from the right is K'ᵀ from the left on the middle axis.
+            R = R + np.sin(q[:, i]) * (K.T @ R) + (1.0 - np.cos(q[:, i])) * ((K @ K).T @ R)
         if waiting[link.name]:
             known[link.name] = R, p
         yield link, R, p
@@ -92,9 +89,9 @@ def sinking(robot: Robot, surfaces: Mapping[str, Quadric], q: Array) -> list[Sin
         tips[robot.hand[0]].append(robot.hand[1])
     for link, R, p in poses(robot, q):
         for name, surface in surfaces.items():
-            gap = surface.gaps(p)
+            gap = surface.gaps(p.T)
             for tip in tips[link.name]:
-                gap = np.minimum(gap, _segment_gap(surface, p, R @ tip))
+                gap = np.minimum(gap, _segment_gap(surface, p.T, (tip @ R).T))
             beyond = np.flatnonzero(-gap > link.radius + SLACK)
             if beyond.size:
                 found.append(Sinking(link.name, name, float(-gap.min()), link.radius, int(beyond[0])))
@@ -102,7 +99,7 @@ def sinking(robot: Robot, surfaces: Mapping[str, Quadric], q: Array) -> list[Sin
 
 
 def _segment_gap(surface: Quadric, start: Array, along: Array) -> Array:
-    """Least signed distance of the lines from ``start`` to ``start + along``, without that of their beginning.
+    """Least signed distance of the lines from ``start`` to ``start + along``, (T, 3), without that of their beginning.
 
     Exact for plane, sphere and cylinder, whose distance grows with C: along a line C is a parabola.
     """
@@ -114,8 +111,3 @@ def _segment_gap(surface: Quadric, start: Array, along: Array) -> Array:
         lowest = np.clip(-slope / np.where(bowl, curvature, 1.0), 0.0, 1.0) * bowl
         gap = np.minimum(gap, surface.gaps(start + lowest[:, None] * along))
     return gap
-
-
-def _times(R: Array, B: Array) -> Array:
-    """R B for each of many R, (T, 3, 3), as one matrix product."""
-    return (R.reshape(-1, 3) @ B).reshape(-1, 3, 3)

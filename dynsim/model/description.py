@@ -157,12 +157,12 @@ class Quadric:
 
     def gaps(self, positions: Array) -> Array:
         """:meth:`gap` of many points, (T, 3) → (T,) [m]; where ∇C vanishes, as in the middle of a sphere, too."""
+        if not self.Q.any():
+            return np.asarray((positions @ self.b + self.c) / np.linalg.norm(self.b))
         Qr = positions @ self.Q
         gradient = Qr + self.b
         value = np.sum((0.5 * Qr + self.b) * positions, axis=1) + self.c
         square = np.sum(gradient * gradient, axis=1)
-        if not self.Q.any():
-            return np.asarray(value / np.sqrt(square))
         steepest = float(np.abs(np.linalg.eigvalsh(self.Q)).max())
         bent = np.sum((gradient @ self.Q) * gradient, axis=1)
         curvature = np.where(square > 0.0, bent / np.where(square > 0.0, square, 1.0), -steepest * np.sign(value))

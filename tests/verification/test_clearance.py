@@ -32,8 +32,8 @@ def test_poses_of_many_samples_are_those_of_the_model(seed):
         seen.append(link.name)
         for k in range(5):
             rotation, origin = model.body_pose(link.name, q[k])
-            np.testing.assert_allclose(R[k], rotation, atol=1e-12)
-            np.testing.assert_allclose(p[k], origin, atol=1e-11)
+            np.testing.assert_allclose(R[:, :, k], rotation, atol=1e-12)
+            np.testing.assert_allclose(p[:, k], origin, atol=1e-11)
     assert seen == [link.name for link in robot.links]
 
 
