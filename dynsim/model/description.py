@@ -6,7 +6,7 @@ moves with the joint; at q = 0 it is the joint frame J, placed in the parent's b
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,6 +125,9 @@ class Motor:
     resistance : R [Ω]; inductance : L [H]; rotor_inertia : I_m [kg m²]
     gear_ratio : k; gear_damping : d_m on the motor side [N m s/rad]
     voltage_limit : [V], inf for none
+    mass : [kg] of a point on the link before the joint; on the base it moves nothing
+    mass_point : (3,) or None
+        Where, in that link's frame [m]; None: at the joint.
     """
 
     joint: str
@@ -135,6 +138,8 @@ class Motor:
     gear_ratio: float
     gear_damping: float = 0.0
     voltage_limit: float = np.inf
+    mass: float = 0.0
+    mass_point: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -218,6 +223,21 @@ class Robot:
     def initial(self) -> Array:
         """Initial configuration, (n,)."""
         return np.zeros(len(self.links)) if self.q0 is None else np.asarray(self.q0, dtype=np.float64)
+
+    def with_motors_mounted(self) -> Robot:
+        """The robot whose motors weigh nothing any more: their masses are part of the links that they sit on."""
+        links = {link.joint: link for link in self.links}
+        inertia = {link.name: link.inertia for link in self.links}
+        for motor in self.motors:
+            link = links.get(motor.joint)
+            if motor.mass > 0.0 and link is not None and link.parent in inertia:
+                point = link.p_PJ if motor.mass_point is None else motor.mass_point
+                inertia[link.parent] = inertia[link.parent].with_point(motor.mass, point)
+        return replace(
+            self,
+            links=tuple(replace(link, inertia=inertia[link.name]) for link in self.links),
+            motors=tuple(replace(motor, mass=0.0, mass_point=None) for motor in self.motors),
+        )
 
     @property
     def joint_names(self) -> tuple[str, ...]:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from dynsim.config import NonNegative, Positive, StrictConfig, Vector3, error_at
-from dynsim.model.description import Link, Motor
+from dynsim.model.description import Motor
 
 
 class MotorParameters(StrictConfig):
@@ -55,21 +53,6 @@ class MotorParameters(StrictConfig):
             gear_ratio=self.gear_ratio,
             gear_damping=self.gear_damping_N_m_s_per_rad,
             voltage_limit=np.inf if self.voltage_limit_V is None else self.voltage_limit_V,
+            mass=self.mass_kg,
+            mass_point=None if self.mass_point_m is None else np.array(self.mass_point_m),
         )
-
-
-def with_motor_masses(links: Sequence[Link], motors: Mapping[str, MotorParameters]) -> tuple[Link, ...]:
-    """The links with the masses of the motors, by joint, that sit on them: each on the parent of its joint.
-
-    A motor on the base moves nothing, so its mass does not count.
-    """
-    inertia = {link.name: link.inertia for link in links}
-    for link in links:
-        motor = motors.get(link.joint)
-        if motor is not None and motor.mass_kg > 0.0 and link.parent is not None:
-            point = link.p_PJ if motor.mass_point_m is None else np.array(motor.mass_point_m)
-            inertia[link.parent] = inertia[link.parent].with_point(motor.mass_kg, point)
-    return tuple(
-        link if inertia[link.name] is link.inertia else dataclasses.replace(link, inertia=inertia[link.name])
-        for link in links
-    )

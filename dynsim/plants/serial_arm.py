@@ -10,7 +10,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig, Vector3, error_at, unit_vector
 from dynsim.families import union
 from dynsim.model.description import Inertia, Link, Motor, Robot, vector
-from dynsim.model.motor_parameters import MotorParameters, with_motor_masses
+from dynsim.model.motor_parameters import MotorParameters
 
 ENGINE = "dynamics"
 
@@ -163,7 +163,6 @@ def build(config: Config) -> Robot:
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
     links: list[Link] = []
     motors: list[Motor] = []
-    chosen: dict[str, MotorParameters] = {}
     initial: list[float] = []
     reach = 0.0
     for group in config.chain:
@@ -186,7 +185,6 @@ def build(config: Config) -> Robot:
                 )
             )
             if group.motor is not None:
-                chosen[f"joint_{number}"] = group.motor
                 motors.append(group.motor.motor(f"joint_{number}"))
             initial.append(group.initial)
             reach = group.length_m
@@ -197,7 +195,7 @@ def build(config: Config) -> Robot:
         hand = (config.hand.body, np.array(config.hand.point_m))
     return Robot(
         name="serial_arm",
-        links=with_motor_masses(links, chosen),
+        links=tuple(links),
         motors=tuple(motors),
         hand=hand,
         gravity=np.array(config.gravity_m_s2),

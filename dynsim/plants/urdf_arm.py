@@ -13,7 +13,7 @@ from dynsim.config import BodyPoint, NonNegative, StrictConfig, Vector3
 from dynsim.errors import ModelError
 from dynsim.families import union
 from dynsim.model.description import Robot
-from dynsim.model.motor_parameters import MotorParameters, with_motor_masses
+from dynsim.model.motor_parameters import MotorParameters
 
 ENGINE = "dynamics"
 
@@ -71,7 +71,7 @@ def build(config: Config) -> Robot:
     chosen = {joint: config.motors.get(joint, config.motor) for joint in kinds}
     return dataclasses.replace(
         robot,
-        links=with_motor_masses(links, {joint: motor for joint, motor in chosen.items() if motor is not None}),
+        links=links,
         motors=tuple(motor.motor(joint) for joint, motor in chosen.items() if motor is not None),
         hand=robot.hand if config.hand is None else (config.hand.body, np.array(config.hand.point_m)),
         gravity=np.array(config.gravity_m_s2),
