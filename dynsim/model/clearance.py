@@ -87,14 +87,17 @@ def sinking(robot: Robot, surfaces: Mapping[str, Quadric], q: Array) -> list[Sin
             tips[link.parent].append(link.p_PJ)
     if robot.hand[0] in open_ended:
         tips[robot.hand[0]].append(robot.hand[1])
-    for link, R, p in poses(robot, q):
-        for name, surface in surfaces.items():
-            gap = surface.gaps(p.T)
-            for tip in tips[link.name]:
-                gap = np.minimum(gap, _segment_gap(surface, p.T, (tip @ R).T))
-            beyond = np.flatnonzero(-gap > link.radius + SLACK)
-            if beyond.size:
-                found.append(Sinking(link.name, name, float(-gap.min()), link.radius, int(beyond[0])))
+    # Of a run that diverged the last samples may be beyond what squares of floats can hold.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for link, R, p in poses(robot, q):
+            for name, surface in surfaces.items():
+                gap = surface.gaps(p.T)
+                for tip in tips[link.name]:
+                    gap = np.minimum(gap, _segment_gap(surface, p.T, (tip @ R).T))
+                depth = np.where(np.isfinite(gap), -gap, -np.inf)
+                beyond = np.flatnonzero(depth > link.radius + SLACK)
+                if beyond.size:
+                    found.append(Sinking(link.name, name, float(depth.max()), link.radius, int(beyond[0])))
     return found
 
 

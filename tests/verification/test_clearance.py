@@ -158,6 +158,26 @@ def test_a_urdf_body_has_no_radius_and_reaches_to_its_joints_and_the_hand(tmp_pa
     assert {entry["body"] for entry in summary["sinking"] if entry["since_s"] == 0.0} == above
 
 
+def test_a_run_that_diverged_has_finite_depths():
+    """The last samples of a slide that ran away, beyond 1e154 m, whose squares overflow."""
+    scenario = scenario_from_resolved(
+        {
+            "name": "away",
+            "duration_s": 1,
+            "plant": {"type": "serial_arm", "chain": [{"kind": "prismatic", "axis": "z"}]},
+            "surfaces": {
+                "floor": {"type": "plane", "normal": [1, 1, 1]},
+                "ball": {"type": "sphere", "center_m": [0, 0, 1], "radius_m": 0.5},
+            },
+        }
+    )
+    q = np.array([[0.0], [-3.0], [-1e200], [1e308], [-np.inf], [np.nan]])
+    found = {s.surface: s for s in sinking(scenario.robot(), scenario.surfaces(), q)}
+    assert set(found) == {"floor"}
+    assert found["floor"].sample == 1
+    assert found["floor"].depth == pytest.approx(1e200 / np.sqrt(3.0))
+
+
 TEARING = {"controller.joints": {"joint_3": {"times_s": [0, 2], "angles_deg": [90, 80]}}}
 
 
