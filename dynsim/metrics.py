@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dynsim._version import __version__
 from dynsim.kernels.integrate import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, PULLING
+from dynsim.model.clearance import Sinking, sinking
 from dynsim.model.description import Contact, Robot
 from dynsim.record import Record
 from dynsim.scenario import Scenario
@@ -18,13 +19,14 @@ from dynsim.scenario import Scenario
 # Integrals that the integrator carries, in the order of the state (dynsim.kernels.energy).
 INTEGRALS = {
     "energy_electrical": "∫ Σ u i dt, net electrical energy",
-    "energy_electrical_drawn": "∫ Σ max(u i, 0) dt, without regeneration",
+    "energy_electrical_drawn": "∫ Σ max(u i, 0) dt, a supply for each motor that takes nothing back",
     "heat_joule": "∫ Σ R i² dt",
     "loss_gear": "∫ Σ D_m v² dt",
     "loss_joint": "∫ Σ D v² dt",
     "heat_friction": "energy that contact friction takes",
     "work_constraint": "∫ Σ f_n n·v dt, work of the normal forces",
     "work_mechanical": "∫ Σ tau v dt, tau of [WM] eq 25",
+    "energy_electrical_supply": "∫ max(Σ u i, 0) dt, one supply for all motors that takes nothing back",
 }
 # Where the electrical energy goes, in the order in which it is drawn and printed.
 SINKS = ("heat_joule", "loss_gear", "loss_joint", "heat_friction")
@@ -79,6 +81,23 @@ def energy_turnover(record: Record) -> float:
     return float(0.5 * total.max(initial=0.0))
 
 
+def residual_floor(record: Record, robot: Robot, tolerance: float) -> float:
+    """Least denominator of the relative residual [J]: ``tolerance`` times the energy that the arm can have about it.
+
+    That is the largest of kinetic energy, magnetic energy, change of potential energy, and gravity's lever: the sum
+    over all bodies of weight times the length of the arm from the first joint to their centre of mass. Below it the
+    integration resolves nothing: an arm that hangs at rest would report the ratio of two roundings.
+    """
+    stores = [record[name] - (record[name][:1] if name == "energy_potential" else 0.0) for name in STORES]
+    reach: dict[str, float] = {}
+    lever = 0.0
+    for link in robot.links:
+        reach[link.name] = 0.0 if link.parent is None else reach[link.parent] + float(np.linalg.norm(link.p_PJ))
+        lever += link.inertia.mass * (reach[link.name] + float(np.linalg.norm(link.inertia.com)))
+    lever *= float(np.linalg.norm(robot.gravity))
+    return tolerance * max(lever, *(float(np.abs(store).max(initial=0.0)) for store in stores))
+
+
 def hand_error(record: Record, settle: float) -> dict[str, float | None]:
     """Root mean square, maximum and vertical root mean square of the hand's distance from its target [m].
 
@@ -106,6 +125,8 @@ def summarise(
 
     turnover = energy_turnover(record)
     residual = float(np.abs(record["energy_residual"]).max(initial=0.0))
+    denominator = max(turnover, residual_floor(record, robot, scenario.integrator.rtol))
+    sunk = sinking(robot, scenario.surfaces(), record["q"])
     summary: dict[str, Any] = {
         "scenario": scenario.name,
         "variant": scenario.variant,
@@ -119,6 +140,7 @@ def summarise(
         "projections": counts.projections,
         **hand_error(record, scenario.metrics.settle_s),
         "electrical_energy_J": final("energy_electrical"),
+        "electrical_energy_supply_J": final("energy_electrical_supply"),
         "electrical_energy_drawn_J": final("energy_electrical_drawn"),
         "mechanical_work_J": final("work_mechanical"),
         "joule_heat_J": final("heat_joule"),
@@ -126,11 +148,15 @@ def summarise(
         "joint_loss_J": final("loss_joint"),
         "friction_heat_J": final("heat_friction"),
         "energy_turnover_J": turnover,
-        "energy_residual_relative": residual / turnover if turnover > 0.0 else 0.0,
+        "energy_residual_relative": residual / denominator if denominator > 0.0 else 0.0,
         "constraint_drift_max_m": float(counts.extremes[:, DRIFT_MAX].max(initial=0.0)),
         "contacts": [_contact(record, k, contact, counts, duration) for k, contact in enumerate(contacts)],
+        "sinking": [
+            {"body": s.body, "surface": s.surface, "depth_m": s.depth, "since_s": float(record.time[s.sample])}
+            for s in sunk
+        ],
     }
-    summary["warnings"] = _warnings(record, scenario, contacts, robot, counts, summary)
+    summary["warnings"] = _warnings(record, scenario, contacts, robot, counts, summary) + _sunk(record, sunk)
     return summary
 
 
@@ -189,6 +215,21 @@ def _warnings(
     if counts.deficient:
         found.append(
             f"contact rows depended on each other in {counts.deficient} evaluations: forces are the split of least norm"
+        )
+    return found
+
+
+def _sunk(record: Record, sunk: Sequence[Sinking]) -> list[str]:
+    """One warning per surface: the bodies that samples of the record show below it, and the one that is deepest."""
+    found = []
+    for surface in dict.fromkeys(s.surface for s in sunk):
+        below = [s for s in sunk if s.surface == surface]
+        deepest = max(below, key=lambda s: s.depth)
+        names = ", ".join(s.body for s in below)
+        found.append(
+            f"{names} {'passes' if len(below) == 1 else 'pass'} below {surface} by more than the link's radius: "
+            f"{deepest.body}, of {1e3 * deepest.radius:g} mm, by up to {1e3 * deepest.depth:.3g} mm in the samples, "
+            f"first at t = {record.time[min(s.sample for s in below)]:.4g} s; surfaces hold only the points of contacts"
         )
     return found
 

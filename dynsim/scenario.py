@@ -51,6 +51,9 @@ class Contacts(StrictConfig):
     pulling_friction: Literal["signed", "dissipative"] = Field(
         default="signed", description="f_t = μ f_n as printed in the paper, or μ |f_n|"
     )
+    reference_tolerance_m: Positive = Field(
+        default=2e-3, description="references that take a contact point further off its surface than this are refused"
+    )
     points: dict[str, ContactPoint] = {}
 
 

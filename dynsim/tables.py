@@ -21,10 +21,17 @@ def _number(value: Any, scale: float = 1.0, digits: int = 4) -> str:
     return "–" if value is None else f"{value * scale:.{digits}g}"
 
 
+def _deepest(summary: Summary) -> str | None:
+    """How deep the body that sank deepest lay below a surface [mm]; None where no body did."""
+    sunk = max(summary.get("sinking", ()), key=lambda entry: entry["depth_m"], default=None)
+    return None if sunk is None else f"[bold red]{_number(sunk['depth_m'], 1e3, 3)}[/]"
+
+
 # Heading, and how to take it from a summary. A row is left out when no run has it.
 _ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = (
     ("electrical energy [J]", lambda s: s.get("electrical_energy_J"), _number),
-    ("  drawn from supply [J]", lambda s: s.get("electrical_energy_drawn_J"), _number),
+    ("  from one supply [J]", lambda s: s.get("electrical_energy_supply_J"), _number),
+    ("  from a supply each [J]", lambda s: s.get("electrical_energy_drawn_J"), _number),
     ("mechanical work [J]", lambda s: s.get("mechanical_work_J"), _number),
     ("Joule heat [J]", lambda s: s.get("joule_heat_J"), _number),
     ("friction heat [J]", lambda s: s.get("friction_heat_J"), _number),
@@ -43,6 +50,7 @@ _ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = 
     ("cost, initial", lambda s: s.get("cost_initial"), _number),
     ("cost, final", lambda s: s.get("cost_final"), _number),
     ("mode switches", lambda s: s.get("mode_switches"), lambda v: str(v)),
+    ("deepest below a surface [mm]", _deepest, str),
     ("ledger residual, relative", lambda s: s.get("energy_residual_relative"), lambda v: f"{v:.1e}"),
     ("constraint drift [m]", lambda s: s.get("constraint_drift_max_m"), lambda v: f"{v:.1e}"),
     ("integration [s]", lambda s: s.get("integration_wall_s"), lambda v: f"{v:.3f}"),

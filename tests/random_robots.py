@@ -8,6 +8,7 @@ import numpy as np
 
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.coupled import System, derivative
+from dynsim.kernels.energy import CONTACT_SIZE, LEDGER_SIZE
 from dynsim.kernels.integrate import FINISHED, METHODS, STATUS, Run, advance, new_run
 from dynsim.kernels.jit import integers, reals
 from dynsim.model.arrays import compile_contacts, compile_drives, compile_model
@@ -138,9 +139,9 @@ class Bench:
         return len(self.robot.links), len(self.robot.motors), len(self.system.contacts.link)
 
     def state(self, q: np.ndarray, v: np.ndarray, current: np.ndarray | None = None) -> np.ndarray:
-        """State vector with empty ledger, (2 n + na + 8 + 2 c,)."""
+        """State vector with empty ledger, (2 n + na + LEDGER_SIZE + CONTACT_SIZE c,)."""
         n, na, c = self.sizes
-        y = np.zeros(2 * n + na + 8 + 2 * c)
+        y = np.zeros(2 * n + na + LEDGER_SIZE + CONTACT_SIZE * c)
         y[:n], y[n : 2 * n] = q, v
         if current is not None:
             y[2 * n : 2 * n + na] = current

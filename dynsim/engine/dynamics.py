@@ -19,6 +19,7 @@ from dynsim.kernels import integrate as ki
 from dynsim.kernels.coupled import System
 from dynsim.kernels.energy import CONTACT_SIZE, LEDGER_SIZE
 from dynsim.model.arrays import compile_contacts, compile_drives
+from dynsim.model.clearance import poses
 from dynsim.model.control import JointControl
 from dynsim.model.description import Contact, Link, Robot
 from dynsim.model.model import Model
@@ -60,6 +61,7 @@ def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
     times = _sample_times(scenario, columns=2 * n + na + LEDGER_SIZE + CONTACT_SIZE * c + ki.output_size(n, na, c))
     _check_stiffness(scenario, robot)
     control = _control(scenario, model, progress)
+    _check_references(scenario, robot, contacts, control)
     options = scenario.integrator
     method = ki.METHODS[options.method]
     step = options.step_s or (1e-3 if method == ki.RK4 else 0.0)
@@ -157,6 +159,55 @@ def _control(scenario: Scenario, model: Model, progress: Progress | None) -> Joi
     if not isinstance(control, JointControl):
         raise ModelError(f"controller {scenario.controller.type!r} cannot drive a {scenario.plant.type!r}")
     return control
+
+
+def _check_references(scenario: Scenario, robot: Robot, contacts: Sequence[Contact], control: JointControl) -> None:
+    """Refuse references that, followed exactly, would take a contact point off the surface that holds it."""
+    links = {link.name: link for link in robot.links}
+    motor_of = {motor.joint: a for a, motor in enumerate(robot.motors)}
+    held: dict[str, list[Contact]] = {}
+    for contact in contacts:
+        chain, body = [], contact.body
+        while True:
+            chain.append(motor_of.get(links[body].joint, -1))
+            parent = links[body].parent
+            if parent is None:
+                break
+            body = parent
+        # A joint that follows nothing gives way, so the references do not say where the point is. Where no reference
+        # moves, the point stays where it starts, which has its own check.
+        follows = all(a >= 0 and control.k_p[a] > 0.0 for a in chain)
+        if follows and any(control.reference.spline[a] >= 0 for a in chain):
+            held.setdefault(contact.body, []).append(contact)
+    if not held:
+        return
+    tolerance = scenario.config.contacts.reference_tolerance_m
+    joints = {link.joint: i for i, link in enumerate(robot.links)}
+    driven = np.array([joints[motor.joint] for motor in robot.motors])
+    worst: dict[str, tuple[float, float, np.ndarray]] = {}
+    first: dict[str, float] = {}
+    for times, q in control.positions(robot.initial, driven):
+        for link, R, p in poses(robot, q, held):
+            for contact in held.get(link.name, ()):
+                position = (p + contact.point @ R).T
+                gap = contact.surface.gaps(position)
+                k = int(np.abs(gap).argmax())
+                if abs(gap[k]) > tolerance:
+                    first.setdefault(contact.name, float(times[np.abs(gap) > tolerance][0]))
+                    if abs(gap[k]) > abs(worst.get(contact.name, (0.0,))[0]):
+                        worst[contact.name] = float(gap[k]), float(times[k]), position[k]
+    if not worst:
+        return
+    name, (gap_max, time, place) = max(worst.items(), key=lambda item: abs(item[1][0]))
+    surface = next(contact.surface_name for contact in contacts if contact.name == name)
+    others = ", ".join(other for other in worst if other != name)
+    raise ModelError(
+        f"contact {name}: the references of the joints take its point {gap_max:+.4g} m off surface {surface!r} at "
+        f"t = {time:.3f} s, at ({place[0]:.4g}, {place[1]:.4g}, {place[2]:.4g}) m, and beyond "
+        f"contacts.reference_tolerance_m = {tolerance:g} m from t = {first[name]:.3f} s on"
+        f"{f' (also {others})' if others else ''}; "
+        "let the joints before the contact hold, change their path, or disable the contact"
+    )
 
 
 def _record(scenario: Scenario, prepared: Prepared, wall: float) -> Record:

@@ -5,7 +5,7 @@ State y, all in one vector:
     q  (n,)   joint positions [rad or m]
     v  (n,)   joint rates
     i  (na,)  motor currents [A]
-    ledger (8,), then impulse and slip of each contact (2 c,): see dynsim.kernels.energy
+    ledger (LEDGER_SIZE,), then impulse and slip of each contact (2 c,): see dynsim.kernels.energy
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def m_star_acceleration(dense, model: ModelArrays, drives: DriveArrays, contacts
 
 @kernel
 def derivative(system: System, t, y, ws: Workspace, dy):
-    """dy/dt of the whole coupled system at time t. y, dy: (2 n + na + 8 + 2 c,)."""
+    """dy/dt of the whole coupled system at time t. y, dy: (2 n + na + LEDGER_SIZE + CONTACT_SIZE c,)."""
     model, drives, contacts = system.model, system.drives, system.contacts
     joints, motors, motor = ws.joints, ws.motors, drives.motor
     n, na = joints.shape[0], motors.shape[0]

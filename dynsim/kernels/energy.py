@@ -32,9 +32,10 @@ from dynsim.kernels.arrays import (
 from dynsim.kernels.jit import inlined_kernel, internal_kernel, kernel
 from dynsim.kernels.newton_euler import body_inertia
 
-# Integrals at the end of the state vector, all in joules. MECHANICAL and DRAWN are reported, not part of the balance.
-ELECTRICAL, DRAWN, JOULE, GEAR, JOINT, FRICTION, CONSTRAINT, MECHANICAL = 0, 1, 2, 3, 4, 5, 6, 7
-LEDGER_SIZE = 8
+# Integrals at the end of the state vector, all in joules. DRAWN, MECHANICAL and SUPPLY are reported, not part of the
+# balance.
+ELECTRICAL, DRAWN, JOULE, GEAR, JOINT, FRICTION, CONSTRAINT, MECHANICAL, SUPPLY = 0, 1, 2, 3, 4, 5, 6, 7, 8
+LEDGER_SIZE = 9
 # Per contact: impulse of the normal force [N s], slip distance [m].
 IMPULSE, SLIP = 0, 1
 CONTACT_SIZE = 2
@@ -44,9 +45,9 @@ CONTACT_SIZE = 2
 def ledger_rates(model: ModelArrays, drives: DriveArrays, contacts: ContactArrays, ws: Workspace, out, start):
     """Rates of all integrals, into out[start:], LEDGER_SIZE + CONTACT_SIZE c of them [W; N, m/s].
 
-    Electrical Σ u i; drawn Σ max(u i, 0); Joule Σ R i²; gear Σ D_m v²; joint Σ D v²; friction −Σ f_n (d − n)·v, d the
-    force direction; constraint Σ f_n n·v (zero on the constraint); mechanical Σ tau v with
-    tau = K_m i − J_m vdot − D_m v ([WM] eq 25).
+    Electrical Σ u i; drawn Σ max(u i, 0), a supply for each motor; supply max(Σ u i, 0), one for all; Joule Σ R i²;
+    gear Σ D_m v²; joint Σ D v²; friction −Σ f_n (d − n)·v, d the force direction; constraint Σ f_n n·v (zero on the
+    constraint); mechanical Σ tau v with tau = K_m i − J_m vdot − D_m v ([WM] eq 25).
     """
     joints, motors, motor, state = ws.joints, ws.motors, drives.motor, ws.contacts
     electrical, drawn, joule, mechanical = 0.0, 0.0, 0.0, 0.0
@@ -82,6 +83,7 @@ def ledger_rates(model: ModelArrays, drives: DriveArrays, contacts: ContactArray
     out[start + FRICTION] = friction
     out[start + CONSTRAINT] = constraint
     out[start + MECHANICAL] = mechanical
+    out[start + SUPPLY] = max(electrical, 0.0)
 
 
 @kernel

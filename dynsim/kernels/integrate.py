@@ -46,7 +46,7 @@ from dynsim.kernels.arrays import (
 )
 from dynsim.kernels.articulated import accelerate
 from dynsim.kernels.coupled import System, derivative
-from dynsim.kernels.energy import kinetic_energy, magnetic_energy, potential_energy
+from dynsim.kernels.energy import CONTACT_SIZE, LEDGER_SIZE, kinetic_energy, magnetic_energy, potential_energy
 from dynsim.kernels.jit import internal_kernel, kernel, merged_kernel, reals
 from dynsim.kernels.kinematics import point_position
 from dynsim.kernels.rows import solve_small
@@ -110,7 +110,7 @@ def new_run(
     rtol: float,
     atol: float,
 ) -> Run:
-    """Allocate a :class:`Run` from t = 0 at state y, (2 n + na + 8 + 2 c,)."""
+    """Allocate a :class:`Run` from t = 0 at state y, (2 n + na + LEDGER_SIZE + CONTACT_SIZE c,)."""
     m, rodas = len(y), method == RODAS4
     clock = np.zeros(CLOCK_SIZE)
     clock[[STEP, LAST_ERROR, END, RTOL, ATOL, STEP_MAX]] = step, 1e-4, end, rtol, atol, step_max
@@ -243,7 +243,7 @@ def error_norm(run: Run, size, error):
 @merged_kernel
 def ledger_length(ws: Workspace):
     """Number of integrals at the end of the state."""
-    return 8 + 2 * ws.contacts.shape[0]
+    return LEDGER_SIZE + CONTACT_SIZE * ws.contacts.shape[0]
 
 
 # Explicit methods: stage rows a_ij, with the solution as the last row, whose derivative is the next step's first stage.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -10,6 +11,10 @@ from numpy.typing import NDArray
 
 from dynsim.kernels.arrays import ReferenceArrays
 from dynsim.kernels.jit import integers, reals
+
+# Samples in a segment of the reference splines, and segments that are looked at together.
+_PER_SEGMENT = 4
+_PIECE = 4096
 
 
 class HandPath(Protocol):
@@ -38,6 +43,29 @@ class JointControl:
             coefficients=reals(np.zeros((1, 0, 6))),
         )
         return cls(np.zeros(motors), np.zeros(motors), reference, None)
+
+    def positions(self, q: NDArray[np.float64], links: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.float64], ...]]:
+        """Times, (T,) [s], and the joint positions, (T, n), of the references, in pieces of some thousand samples.
+
+        Taken at the knots and at three times between two of them.
+
+        Parameters
+        ----------
+        q : (n,) positions of all joints at the start; those without a moving reference stay there
+        links : (na,) index of the joint of each motor
+        """
+        reference = self.reference
+        begin, spacing = reference.grid
+        segments, columns = len(reference.coefficients), reference.spline[reference.spline >= 0]
+        moved = links[reference.spline >= 0]
+        x = spacing * np.arange(_PER_SEGMENT + 1) / _PER_SEGMENT
+        powers = x[:, None] ** np.arange(6)
+        for first in range(0, segments, _PIECE):
+            piece = reference.coefficients[first : first + _PIECE, columns]
+            times = begin + spacing * np.arange(first, first + len(piece))[:, None] + x
+            positions = np.tile(q, (times.size, 1))
+            positions[:, moved] = np.einsum("scp,xp->sxc", piece, powers).reshape(times.size, len(columns))
+            yield times.ravel(), positions
 
     def target(self, t: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Target of the hand at times t, (T, 3) [m]; None without a path."""

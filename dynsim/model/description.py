@@ -6,7 +6,7 @@ moves with the joint; at q = 0 it is the joint frame J, placed in the parent's b
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,18 @@ class Inertia:
         side = mass * (3.0 * radius**2 + length**2) / 12.0
         return cls(mass, vector(0.0, 0.0, 0.5 * length), np.diag([side, side, 0.5 * mass * radius**2]))
 
+    def with_point(self, mass: float, point: Array) -> Inertia:
+        """The body with a point mass [kg] at ``point`` in B [m] fixed to it."""
+        total = self.mass + mass
+        if total == 0.0:
+            return self
+        com = (self.mass * self.com + mass * point) / total
+        tensor = self.tensor.copy()
+        for part, place in ((self.mass, self.com), (mass, point)):
+            d = place - com
+            tensor += part * (d @ d * np.eye(3) - np.outer(d, d))
+        return Inertia(total, com, tensor)
+
     def check(self, name: str) -> None:
         """Raise :class:`ModelError` unless a real body can have these mass properties."""
         if not (np.isfinite(self.mass) and self.mass >= 0.0):
@@ -75,6 +87,9 @@ class Link:
         Viscous loss D of the joint [N m s/rad or N s/m].
     lower, upper, velocity_limit, effort_limit : float
         Limits of the joint [rad or m; rad/s or m/s; N m or N]. Nothing enforces them: a run that passes one warns.
+    radius : of a cylinder about the body's axis [m], zero when unknown: deeper than that below a surface, a run warns
+    tip : (3,) or None
+        Other end of the axis in B [m], the first is the joint; None: the joints that the body carries, and the hand.
     """
 
     name: str
@@ -90,6 +105,8 @@ class Link:
     upper: float = np.inf
     velocity_limit: float = np.inf
     effort_limit: float = np.inf
+    radius: float = 0.0
+    tip: Array | None = None
 
     @property
     def units(self) -> tuple[str, str, str, str]:
@@ -108,6 +125,9 @@ class Motor:
     resistance : R [Ω]; inductance : L [H]; rotor_inertia : I_m [kg m²]
     gear_ratio : k; gear_damping : d_m on the motor side [N m s/rad]
     voltage_limit : [V], inf for none
+    mass : [kg] of a point on the link before the joint; on the base it moves nothing
+    mass_point : (3,) or None
+        Where, in that link's frame [m]; None: at the joint.
     """
 
     joint: str
@@ -118,6 +138,8 @@ class Motor:
     gear_ratio: float
     gear_damping: float = 0.0
     voltage_limit: float = np.inf
+    mass: float = 0.0
+    mass_point: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -137,6 +159,27 @@ class Quadric:
         normal = gradient / slope
         value = float(0.5 * position @ self.Q @ position + self.b @ position + self.c)
         return float(surface_distance(value, slope, float(normal @ self.Q @ normal)))
+
+    def gaps(self, positions: Array) -> Array:
+        """:meth:`gap` of many points, (T, 3) → (T,) [m]; where ∇C vanishes, as in the middle of a sphere, too."""
+        if not self.Q.any():
+            return np.asarray((positions @ self.b + self.c) / np.linalg.norm(self.b))
+        Qr = positions @ self.Q
+        gradient = Qr + self.b
+        value = np.sum((0.5 * Qr + self.b) * positions, axis=1) + self.c
+        square = np.sum(gradient * gradient, axis=1)
+        steepest = float(np.abs(np.linalg.eigvalsh(self.Q)).max())
+        bent = np.sum((gradient @ self.Q) * gradient, axis=1)
+        curvature = np.where(square > 0.0, bent / np.where(square > 0.0, square, 1.0), -steepest * np.sign(value))
+        inner = square - 2.0 * curvature * value
+        slope = np.sqrt(square)
+        return np.asarray(
+            np.where(
+                inner > 0.0,
+                2.0 * value / (slope + np.sqrt(np.maximum(inner, 1e-300))),
+                value / np.maximum(slope, 1e-300),
+            )
+        )
 
 
 @dataclass(frozen=True)
@@ -180,6 +223,21 @@ class Robot:
     def initial(self) -> Array:
         """Initial configuration, (n,)."""
         return np.zeros(len(self.links)) if self.q0 is None else np.asarray(self.q0, dtype=np.float64)
+
+    def with_motors_mounted(self) -> Robot:
+        """The robot whose motors weigh nothing any more: their masses are part of the links that they sit on."""
+        links = {link.joint: link for link in self.links}
+        inertia = {link.name: link.inertia for link in self.links}
+        for motor in self.motors:
+            link = links.get(motor.joint)
+            if motor.mass > 0.0 and link is not None and link.parent in inertia:
+                point = link.p_PJ if motor.mass_point is None else motor.mass_point
+                inertia[link.parent] = inertia[link.parent].with_point(motor.mass, point)
+        return replace(
+            self,
+            links=tuple(replace(link, inertia=inertia[link.name]) for link in self.links),
+            motors=tuple(replace(motor, mass=0.0, mass_point=None) for motor in self.motors),
+        )
 
     @property
     def joint_names(self) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ class Model:
 
     ``M(q) v̇ + h(q, v) + g(q) = tau``: ``mass_matrix`` is M, ``bias_forces`` h + g. Rotor inertia, gear and joint losses
     and contacts are not part of these (they belong to motors and scenario); ``armature`` and ``damping`` give them.
+    The masses of motors are: they sit on the links (:meth:`Robot.with_motors_mounted`).
 
     Parameters
     ----------
@@ -32,6 +33,7 @@ class Model:
     """
 
     def __init__(self, robot: Robot) -> None:
+        robot = robot.with_motors_mounted() if any(motor.mass for motor in robot.motors) else robot
         self.robot = robot
         self.arrays = compile_model(robot)
         self.n = len(robot.links)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
-from dynsim.config import NonNegative, Positive, StrictConfig
+from dynsim.config import NonNegative, Positive, StrictConfig, Vector3, error_at
 from dynsim.model.description import Motor
 
 
@@ -21,6 +21,12 @@ class MotorParameters(StrictConfig):
     gear_ratio: Positive = Field(description="motor turns per joint turn; at a prismatic joint rad of the motor per m")
     gear_damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="on the motor side")
     voltage_limit_V: Positive | None = None
+    mass_kg: NonNegative = Field(
+        default=0.0, description="of motor and gear, a point mass on the link before the joint"
+    )
+    mass_point_m: Vector3 | None = Field(
+        default=None, description="where, in that link's frame; default: at the motor's joint"
+    )
 
     @field_validator("inductance_H", mode="before")
     @classmethod
@@ -29,6 +35,12 @@ class MotorParameters(StrictConfig):
         if value == 0:
             raise ValueError("must be positive; for none take 1e-6 with integrator.method: rodas4")
         return value
+
+    @model_validator(mode="after")
+    def _check_mass(self) -> Self:
+        if self.mass_point_m is not None and self.mass_kg == 0.0:
+            raise error_at("mass_point_m", "has no effect without mass_kg")
+        return self
 
     def motor(self, joint: str) -> Motor:
         """The motor on the joint of that name."""
@@ -41,4 +53,6 @@ class MotorParameters(StrictConfig):
             gear_ratio=self.gear_ratio,
             gear_damping=self.gear_damping_N_m_s_per_rad,
             voltage_limit=np.inf if self.voltage_limit_V is None else self.voltage_limit_V,
+            mass=self.mass_kg,
+            mass_point=None if self.mass_point_m is None else np.array(self.mass_point_m),
         )

@@ -28,7 +28,9 @@ class LinkKeys(StrictConfig):
     kind: Literal["revolute", "prismatic"] = "revolute"
     axis: Literal["x", "y", "z"] | Vector3 = Field(default="y", description="joint axis in the link's frame")
     length_m: NonNegative = 0.3
-    radius_m: Positive = Field(default=0.01, description="of the solid cylinder that gives the inertia")
+    radius_m: Positive = Field(
+        default=0.01, description="of the solid cylinder that gives the inertia; a link deeper below a surface sinks"
+    )
     mass_kg: NonNegative = 0.1
     com_m: Vector3 | None = Field(default=None, description="default: the middle of the link")
     inertia_kg_m2: list[float] | None = Field(
@@ -178,6 +180,8 @@ def build(config: Config) -> Robot:
                     R_PJ=turn if first else np.eye(3),
                     p_PJ=np.array(config.base.position_m) if first else vector(0.0, 0.0, reach),
                     damping=group.damping,
+                    radius=group.radius_m,
+                    tip=vector(0.0, 0.0, group.length_m),
                 )
             )
             if group.motor is not None:

@@ -39,8 +39,8 @@ def test_run_writes_everything_that_is_promised(tmp_path: Path):
     promised = {
         "scenario", "variant", "dynsim_version", "duration_s", "integration_wall_s", "real_time_factor", "steps",
         "rhs_evaluations", "hand_error_rms_m", "hand_error_max_m", "hand_error_z_rms_m", "electrical_energy_J",
-        "electrical_energy_drawn_J", "mechanical_work_J", "joule_heat_J", "energy_residual_relative",
-        "constraint_drift_max_m", "contacts", "warnings",
+        "electrical_energy_supply_J", "electrical_energy_drawn_J", "mechanical_work_J", "joule_heat_J",
+        "energy_residual_relative", "constraint_drift_max_m", "contacts", "sinking", "warnings",
     }  # fmt: skip
     assert promised <= set(summary)
     in_contacts = {

@@ -1,0 +1,116 @@
+"""Distances from surfaces along samples of the joint positions: of points on bodies, and of the bodies' axes."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from dynsim.model.description import Array, Link, Quadric, Robot
+
+# Depth beyond its radius that does not count as passing below a surface [m]: what a contact may be off at the start.
+SLACK = 1e-6
+
+
+@dataclass(frozen=True)
+class Sinking:
+    """A body whose axis lay below a surface by more than its radius.
+
+    Attributes
+    ----------
+    depth : largest depth of the axis below the surface, over the samples [m]
+    radius : of the body [m]
+    sample : index of the first sample at which it lay deeper than its radius
+    """
+
+    body: str
+    surface: str
+    depth: float
+    radius: float
+    sample: int
+
+
+def poses(robot: Robot, q: Array, bodies: Collection[str] | None = None) -> Iterator[tuple[Link, Array, Array]]:
+    """R_WB, (3, 3, T), and p_WB, (3, T) [m], of each body in turn at joint positions q, (T, n).
+
+    Vectorised over the samples, which lie together in memory: thousands of them cost a millisecond. ``bodies``: only
+    these and those that carry them.
+    """
+    links = {link.name: link for link in robot.links}
+    wanted = set(links if bodies is None else bodies)
+    for link in reversed(robot.links):
+        if link.name in wanted and link.parent is not None:
+            wanted.add(link.parent)
+    waiting = dict.fromkeys(wanted, 0)
+    for name in wanted:
+        if (parent := links[name].parent) is not None:
+            waiting[parent] += 1
+    count = len(q)
+    known: dict[str, tuple[Array, Array]] = {}
+    for i, link in enumerate(robot.links):
+        if link.name not in wanted:
+            continue
+        if link.parent is None:
+            R, p = np.repeat(link.R_PJ[:, :, None], count, axis=2), np.repeat(link.p_PJ[:, None], count, axis=1)
+        else:
+            R_WP, p_WP = known[link.parent]
+            R, p = link.R_PJ.T @ R_WP, p_WP + link.p_PJ @ R_WP
+            waiting[link.parent] -= 1
+            if not waiting[link.parent]:
+                del known[link.parent]
+        if link.kind == "prismatic":
+            p = p + q[:, i] * (link.axis @ R)
+        else:
+            x, y, z = link.axis
+            K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+            # R (1 + sin q K + (1 − cos q) K²); a product from the right is K'ᵀ from the left on the middle axis.
+            R = R + np.sin(q[:, i]) * (K.T @ R) + (1.0 - np.cos(q[:, i])) * ((K @ K).T @ R)
+        if waiting[link.name]:
+            known[link.name] = R, p
+        yield link, R, p
+
+
+def sinking(robot: Robot, surfaces: Mapping[str, Quadric], q: Array) -> list[Sinking]:
+    """Bodies whose axes lie below a surface by more than their radius, at samples q, (T, n).
+
+    The axis of a body is the straight line from its joint to :attr:`Link.tip`; without one the lines to the joints that
+    it carries, and to the hand. A body of unknown radius has radius zero.
+    """
+    found: list[Sinking] = []
+    if not surfaces or not len(q):
+        return found
+    tips: dict[str, list[Array]] = {link.name: [] if link.tip is None else [link.tip] for link in robot.links}
+    open_ended = {link.name for link in robot.links if link.tip is None}
+    for link in robot.links:
+        if link.parent in open_ended:
+            tips[link.parent].append(link.p_PJ)
+    if robot.hand[0] in open_ended:
+        tips[robot.hand[0]].append(robot.hand[1])
+    # Of a run that diverged the last samples may be beyond what squares of floats can hold.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for link, R, p in poses(robot, q):
+            for name, surface in surfaces.items():
+                gap = surface.gaps(p.T)
+                for tip in tips[link.name]:
+                    gap = np.minimum(gap, _segment_gap(surface, p.T, (tip @ R).T))
+                depth = np.where(np.isfinite(gap), -gap, -np.inf)
+                beyond = np.flatnonzero(depth > link.radius + SLACK)
+                if beyond.size:
+                    found.append(Sinking(link.name, name, float(depth.max()), link.radius, int(beyond[0])))
+    return found
+
+
+def _segment_gap(surface: Quadric, start: Array, along: Array) -> Array:
+    """Least signed distance of the lines from ``start`` to ``start + along``, (T, 3), without that of their beginning.
+
+    Exact for plane, sphere and cylinder, whose distance grows with C: along a line C is a parabola.
+    """
+    gap = surface.gaps(start + along)
+    if surface.Q.any():
+        slope = np.sum((start @ surface.Q + surface.b) * along, axis=1)
+        curvature = np.sum((along @ surface.Q) * along, axis=1)
+        bowl = curvature > 0.0
+        lowest = np.clip(-slope / np.where(bowl, curvature, 1.0), 0.0, 1.0) * bowl
+        gap = np.minimum(gap, surface.gaps(start + lowest[:, None] * along))
+    return gap
