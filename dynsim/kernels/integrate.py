@@ -264,10 +264,31 @@ A_RK4 = np.array(
     [[0.0] * 4, [0.5, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1 / 6, 1 / 3, 1 / 3, 1 / 6]]
 )
 NODE_RK4 = np.array([0.0, 0.5, 0.5, 1.0, 1.0])
-# Weight of h (f(y_new) − k_4), the error estimate of RK43. The fourth stage and the derivative at y_new meet the same
-# third-order conditions, so moving any weight between them gives an embedded solution of order 3; this one keeps the
-# global error of the published arm a hundredth of rtol while stability, not accuracy, sets its step.
-ERROR_RK43 = 0.03
+# Weights of h (f(y_new) − k_4), the error estimate of RK43. The fourth stage and the derivative at y_new meet the same
+# third-order conditions, so moving any weight between them gives an embedded solution of order 3. All the weight that
+# the fourth stage has (1/6) makes the error of undamped motions about rtol. Where stability sets the step, the estimate
+# is the transient of modes that die out within some steps; a small weight keeps it from shortening steps for nothing.
+WEIGHT_ACCURACY = 1 / 6
+WEIGHT_STABILITY = 0.03
+
+
+@internal_kernel
+def weight_rk43(run: Run, size):
+    """Weight of the error estimate of RK43, by what sets the step: accuracy or stability.
+
+    z = |h (f(y_new) − k_4)| / |y_new − Y_4|, Y_4 the state of the fourth stage at the same time, is |h λ| of the modes
+    that the two differ in (Hairer, Wanner: Solving Ordinary Differential Equations II, IV.2, eq 2.25): the method is
+    stable up to z of 2.8, and smooth motions have small ones. The weight falls from 1/6 at z = 0 to 0.03 from z = √½ on, a quarter of that.
+    """
+    h, y, y_new, k, atol, rtol = run.clock[STEP], run.y, run.y_new, run.stage, run.clock[ATOL], run.clock[RTOL]
+    slope, change = 0.0, 0.0
+    for j in range(size):
+        scale = 1.0 / (atol + rtol * max(abs(y[j]), abs(y_new[j])))
+        df, dy = h * (k[6, j] - k[3, j]) * scale, (y_new[j] - y[j] - h * k[2, j]) * scale
+        slope += df * df
+        change += dy * dy
+    remote = max(1.0 - 2.0 * slope / change, 0.0) if change > 0.0 else 1.0
+    return WEIGHT_STABILITY + (WEIGHT_ACCURACY - WEIGHT_STABILITY) * remote * remote
 
 
 @internal_kernel
@@ -299,8 +320,9 @@ def step_explicit(system: System, ws: Workspace, run: Run):
     if run.method == RK4:
         return 0.0
     if run.method == RK43:
+        weight = weight_rk43(run, y.shape[0] - ledger_length(ws))
         for j in range(y.shape[0]):
-            k[7, j] = ERROR_RK43 * h * (k[6, j] - k[3, j])
+            k[7, j] = weight * h * (k[6, j] - k[3, j])
     else:
         for j in range(y.shape[0]):
             k[7, j] = 0.0
