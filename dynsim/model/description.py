@@ -72,10 +72,11 @@ class Inertia:
         """
         if not (np.isfinite(self.mass) and self.mass >= 0.0):
             raise ModelError(f"{name}: mass {self.mass} kg; a mass must be zero or positive")
-        slack = 1e-9 * float(abs(self.tensor).max()) + 1e-12 * self.mass
-        if not np.allclose(self.tensor, self.tensor.T, rtol=0, atol=slack):
+        small = 1e-12 * self.mass
+        if not np.allclose(self.tensor, self.tensor.T, rtol=0, atol=1e-9 * abs(self.tensor).max() + small):
             raise ModelError(f"{name}: the inertia tensor is not symmetric")
         moments = np.linalg.eigvalsh(self.tensor)
+        slack = 1e-9 * float(abs(moments).max()) + small
         if moments[0] < -slack or moments[0] + moments[1] < moments[2] - slack:
             raise ModelError(
                 f"{name}: principal moments of inertia {moments} kg m² are not those of a body "

@@ -252,6 +252,13 @@ def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...])
     rubbing = [joint.name for joint in tree.joints.values() if joint.friction != 0.0 and joint.kind in MOVING]
     if rubbing:
         warnings.warn(f"{tree.path}: Coulomb friction of joints is not simulated ({', '.join(rubbing)})", stacklevel=3)
+    loaded: set[str | None] = set()
+    for link in reversed(links):
+        if link.name in loaded or link.inertia.mass > 0.0 or link.inertia.tensor.any():
+            loaded |= {link.name, link.parent}
+    empty = [link.joint for link in links if link.name not in loaded and (link.parent in loaded or not link.parent)]
+    if empty:
+        warnings.warn(f"{tree.path}: nothing beyond these joints has a mass ({', '.join(empty)})", stacklevel=3)
     moving = [tree.links[name] for name, place in places.items() if place.body is not None]
     bare = [link.name for link in moving if link.inertia is None and link.shaped]
     if bare:
@@ -281,8 +288,7 @@ def _compare_with_pinocchio(tree: UrdfTree) -> None:
         model = pinocchio.buildModelFromXML(tree.text)
     except (ValueError, RuntimeError) as error:
         raise ModelError(f"{tree.path}: not a valid URDF model: {' '.join(str(error).split())}") from error
-    data = model.createData()
-    pinocchio.computeJointJacobians(model, data, pinocchio.neutral(model))
+    neutral = pinocchio.neutral(model)
     places = _places(tree)
     links = _links(tree, places)
     ours, theirs = {link.joint for link in links}, set(list(model.names)[1:])
@@ -295,15 +301,15 @@ def _compare_with_pinocchio(tree: UrdfTree) -> None:
         joint, j = tree.joints[link.joint], model.getJointId(link.joint)
         inertia, placement = model.inertias[j], model.jointPlacements[j]
         # Motion of the body per unit rate in its own frame: (0, a) of a revolute joint, (a, 0) of a prismatic one.
-        jacobian = pinocchio.getJointJacobian(model, data, j, pinocchio.LOCAL).reshape(6, -1)
-        column = jacobian[:, model.joints[j].idx_v]
+        in_joint = model.joints[j].createData()
+        model.joints[j].calc(in_joint, neutral)
         zero, revolute = np.zeros(3), link.kind == "revolute"
         parent = "universe" if link.parent is None else joint_of[link.parent]
         if model.names[model.parents[j]] != parent:
             raise _difference(tree, link, "parent joint", parent, model.names[model.parents[j]])
         length = max(1.0, float(np.abs(link.p_PJ).max()), float(np.abs(link.inertia.com).max()))
         pairs: list[tuple[str, Any, Any, float]] = [
-            ("joint motion", np.concatenate([zero, link.axis] if revolute else [link.axis, zero]), column, 1.0),
+            ("joint motion", np.concatenate([zero, link.axis] if revolute else [link.axis, zero]), in_joint.S, 1.0),
             ("rotation of the joint", link.R_PJ, placement.rotation, 1.0),
             ("position of the joint", link.p_PJ, placement.translation, length),
             ("mass", link.inertia.mass, inertia.mass, link.inertia.mass),
