@@ -335,7 +335,7 @@ class _Reader:
         """Unit axis in the joint's frame; that of a joint without one is not looked at."""
         stated = self.child(element, "axis")
         default = (1.0, 0.0, 0.0)
-        axis = np.array(default) if stated is None else self.numbers(stated, "xyz", 3, who, default)
+        axis = np.array(default) if stated is None else self.numbers(stated, "xyz", 3, who)
         if kind not in MOVING:
             return np.array(default)
         length = float(np.linalg.norm(axis))
@@ -386,6 +386,10 @@ class _Reader:
         if not name:
             raise self.error(element.line, f"<{element.tag}> has no name; give it one")
         self.check_expanded(element, "name", f"<{element.tag}>")
+        if not name.isprintable():
+            raise self.error(
+                element.line, f"{element.tag} {_shown(name)}: the name has control characters; remove them"
+            )
         if name in others:
             raise self.error(
                 element.line,
@@ -446,7 +450,7 @@ class _Reader:
                 return np.array(default)
             raise self.error(element.line, f"{who}: <{element.tag}> has no {key}; add it, like {key}={_EXAMPLE[count]}")
         self.check_expanded(element, key, who)
-        words = [word for word in re.split(r"[ \t\r\n]+", text) if word]
+        words = _words(text)
         stated = f"{who}: <{element.tag} {key}={_shown(text)}>"
         if len(words) != count:
             raise self.error(
@@ -507,24 +511,31 @@ def _near(word: str, known: tuple[str, ...]) -> str:
 def _plain_text(root: _Element, name: str) -> str:
     """What physics depends on, with the numbers as the file has them, in UTF-8 without anything else.
 
-    For Pinocchio, whose parser knows no other encoding.
+    For Pinocchio, whose parser knows no other encoding and drops the whole inertia over a space beside a number.
     """
 
     def written(element: _Element, tags: tuple[str, ...]) -> str:
-        known = _ATTRIBUTES.get(element.tag, ("name", "type"))
-        attributes = "".join(f" {key}={quoteattr(value)}" for key, value in element.attributes.items() if key in known)
+        attributes = ""
+        for key, value in element.attributes.items():
+            if key in ("name", "type", "link", "joint"):
+                attributes += f" {key}={quoteattr(value)}"
+            elif key in _ATTRIBUTES.get(element.tag, ()):
+                attributes += f" {key}={quoteattr(' '.join(_words(value)))}"
+        # Pinocchio refuses dynamics without a loss, which the specification allows.
+        if element.tag == "dynamics" and not attributes:
+            return ""
         inside = "".join(
             written(child, _CHILDREN.get(child.tag, ())) for child in element.children if child.tag in tags
         )
-        # Pinocchio refuses dynamics without a loss, which the specification allows.
-        return (
-            ""
-            if element.tag == "dynamics" and not attributes
-            else f"<{element.tag}{attributes}>{inside}</{element.tag}>"
-        )
+        return f"<{element.tag}{attributes}>{inside}</{element.tag}>"
 
     inside = "".join(written(child, _CHILDREN[child.tag]) for child in root.children if child.tag in ("link", "joint"))
     return f"<robot name={quoteattr(name)}>{inside}</robot>"
+
+
+def _words(text: str) -> list[str]:
+    """What stands between white space, of XML's kinds only."""
+    return [word for word in re.split(r"[ \t\r\n]+", text) if word]
 
 
 def _shown(text: str) -> str:

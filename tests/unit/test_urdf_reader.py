@@ -97,6 +97,7 @@ def test_the_good_file_is_read(tmp_path: Path) -> None:
         ('<origin xyz="0 0 0.1"', '<origin xzy="0 0 0.1"', 11, ["unknown attribute xzy", "known: xyz, rpy"]),
         ("<origin xyz=\"0 0 0.1\"", "<orign xyz=\"0 0 0.1\"", 11, ["<orign>", "did you mean <origin>?"]),
         ('"0 1 0"', '"0 1 y"', 13, ["hinge", "0 1 y"]),
+        ('axis xyz="0 1 0"', "axis", 13, ["<axis> has no xyz"]),
         ('"0 1 0"', '"0 0 0"', 13, ["axis", "no direction"]),
         (' velocity="2"', "", 14, ["<limit> has no velocity"]),
         ('velocity="2"', 'velocity="-2"', 14, ["negative"]),
@@ -116,6 +117,8 @@ def test_the_good_file_is_read(tmp_path: Path) -> None:
         ("</robot>", LOOP.format("two", "base", "arm") + "</robot>", 17, ["'two'", "line 10", "kinematic loop"]),
         ("</robot>", LOOP.format("two", "arm", "base") + "</robot>", 10, ["'hinge'", "kinematic loop"]),
         ("</robot>", '<link name="loose"/></robot>', 17, ["one root link", "'loose'"]),
+        ('name="arm"', 'name="a&#10;m"', 3, ["control characters"]),
+        ('name="arm"', 'name="a\u202em"', 3, ["control characters"]),
         # Not plain URDF.
         ("4.00", "${m}", 6, ["xacro", "run `xacro "]),
         ("4.00", "$(arg m)", 6, ["xacro"]),
@@ -144,6 +147,14 @@ def test_what_the_specification_lets_a_file_leave_out_has_its_value(tmp_path: Pa
     (tmp_path / "short.urdf").write_text(text)
     link = read_urdf(tmp_path / "short.urdf").links[0]
     assert (link.axis.tolist(), link.p_PJ.tolist(), link.lower, link.damping) == ([1, 0, 0], [0, 0, 0], 0.0, 0.0)
+
+
+def test_white_space_beside_a_number_is_no_reason_to_lose_a_mass(tmp_path: Path) -> None:
+    """Pinocchio's parser drops the whole inertia over it, and says so only on the terminal."""
+    text = GOOD.replace('"4.00"', '" 4.00\n"').replace('ixx="0.1"', 'ixx=" 0.1"').replace('"0 0 0.25"', '"0\t0  0.25 "')
+    (tmp_path / "spaced.urdf").write_text(text)
+    inertia = read_urdf(tmp_path / "spaced.urdf").links[0].inertia
+    assert (inertia.mass, inertia.com.tolist(), inertia.tensor[0, 0]) == (4.0, [0.0, 0.0, 0.25], 0.1)
 
 
 def test_extensions_of_programs_are_passed_over(tmp_path: Path) -> None:
