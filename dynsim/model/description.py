@@ -230,7 +230,7 @@ class Robot:
         frame = next((frame for frame in self.frames if frame.name == name), None)
         if frame is None:
             names = [*bodies, *(frame.name for frame in self.frames if frame.body is not None)]
-            near = difflib.get_close_matches(name, names, n=1)
+            near = difflib.get_close_matches(name[:100], names, n=1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
             fixed = f"; frames: {', '.join(names[len(bodies) :])}" if len(names) > len(bodies) else ""
             raise ModelError(f"no body {name!r}{hint}; bodies: {', '.join(bodies)}{fixed}")

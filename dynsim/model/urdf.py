@@ -111,7 +111,8 @@ def write_urdf(robot: Robot) -> str:
             ElementTree.SubElement(joint, "dynamics", damping=_text(link.damping), friction="0.0")
     if HAND not in taken:
         body, point = robot.hand
-        frames.append(Frame(HAND, body, np.eye(3), point))
+        turned = (f.R for f in robot.frames if f.name == HAND and f.body == body and np.array_equal(f.p, point))
+        frames.append(Frame(HAND, body, next(turned, np.eye(3)), point))
     joints = set(robot.joint_names)
     for frame in frames:
         if frame.name == base:
@@ -119,7 +120,6 @@ def write_urdf(robot: Robot) -> str:
         name = f"{frame.name}_frame"
         while name in joints:
             name += "_"
-        joints.add(name)
         ElementTree.SubElement(root, "link", name=frame.name)
         joint = ElementTree.SubElement(root, "joint", name=name, type="fixed")
         _connect(joint, frame.body or base, frame.name, frame.p, frame.R)

@@ -24,13 +24,13 @@ from dynsim.model.description import Array, Inertia
 
 # The largest robots in use have some 100 links and 1 MB of text. Pinocchio walks the tree by recursion: some 5000 links
 # in a chain overflow its stack.
-BYTES_MAX, ELEMENTS_MAX, DEPTH_MAX, LINKS_MAX = 16_000_000, 200_000, 100, 2000
+BYTES_MAX, ELEMENTS_MAX, DEPTH_MAX, LINKS_MAX = 16_000_000, 100_000, 100, 2000
+ATTRIBUTES_MAX, NAME_LENGTH_MAX, _NUMBER_LENGTH_MAX = 100, 200, 400
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 # Numbers whose magnitude stands for "no limit" [rad, m, N m …]: URDF demands some number for most limits.
 UNLIMITED = 1e9
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
-_NUMBER_LENGTH_MAX = 400
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 # Child elements that physics depends on, by parent, and their attributes. Other elements and, on limits and losses,
 # other attributes are extensions of single programs; they are ignored unless they look like one of these misspelt.
@@ -193,6 +193,8 @@ class _Reader:
                 raise self.error(line, f"more than {ELEMENTS_MAX} elements; simplify the model")
             if len(open_elements) >= DEPTH_MAX:
                 raise self.error(line, f"elements are nested more than {DEPTH_MAX} deep; URDF needs fewer than ten")
+            if len(attributes) > ATTRIBUTES_MAX:
+                raise self.error(line, f"<{_cut(tag)}> has more than {ATTRIBUTES_MAX} attributes; simplify the model")
             element = _Element(tag, attributes, line)
             (open_elements[-1].children if open_elements else roots).append(element)
             open_elements.append(element)
@@ -390,6 +392,8 @@ class _Reader:
             raise self.error(
                 element.line, f"{element.tag} {_shown(name)}: the name has control characters; remove them"
             )
+        if len(name) > NAME_LENGTH_MAX:
+            raise self.error(element.line, f"{element.tag} {_shown(name)}: a name has at most {NAME_LENGTH_MAX} signs")
         if name in others:
             raise self.error(
                 element.line,

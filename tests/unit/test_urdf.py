@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -268,12 +269,36 @@ def test_frames_behind_fixed_joints_are_names_of_places() -> None:
         ({"elbow": 0.0}, "no joint 'elbow'; did you mean 'elbow_pitch'"),
         ({"tool_frame": 0.0}, r"urdf:\d+: lock: joint 'tool_frame' is fixed"),
         ({"elbow_pitch": float("nan")}, "elbow_pitch = nan"),
-        (dict.fromkeys(read_urdf(ARM).joint_names, 0.0), "no moving joint"),
     ],
 )
 def test_wrong_locks(lock: dict[str, float], words: str) -> None:
     with pytest.raises(ModelError, match=words):
         read_urdf(ARM, lock)
+    with pytest.raises(ModelError, match="no moving joint"):
+        read_urdf(ARM, dict.fromkeys(read_urdf(ARM).joint_names, 0.0))
+
+
+def test_writing_keeps_the_hand_and_does_not_name_joints_twice(tmp_path: Path) -> None:
+    """A controlled point of the scenario is not where the file had its hand; a moving joint has a frame's name."""
+    path = tmp_path / "robot.urdf"
+    frame = (
+        '<link name="{0}"/><joint name="mount_{0}" type="fixed"><origin xyz="0 0 0.5" rpy="0 1 0"/><parent link="tip"/>'
+    )
+    frames = "".join(f'{frame.format(name)}<child link="{name}"/></joint>' for name in ("hand", "tool"))
+    hinge = joint("continuous", name="tool_frame")
+    path.write_text(f'<robot name="r">{BASE}{TIP}{hinge}{frames}</robot>')
+    robot = read_urdf(path)
+    path.write_text(write_urdf(robot))
+    for before, after in zip(robot.frames, read_urdf(path).frames, strict=True):
+        if before.name == "hand":
+            np.testing.assert_allclose(after.R, before.R, rtol=0, atol=ROUNDING)
+    robot = dataclasses.replace(robot, hand=("tip", np.array([0.1, 0.0, 0.2])))
+    path.write_text(write_urdf(robot))
+    again = read_urdf(path)
+    assert (again.hand[0], again.hand[1].tolist()) == ("tip", [0.1, 0.0, 0.2])
+    assert {frame.name: frame.p.tolist() for frame in again.frames} == {
+        "base": [0, 0, 0], "tool": [0, 0, 0.5], "hand": [0.1, 0, 0.2]
+    }  # fmt: skip
 
 
 def test_locks_beyond_the_limits_are_said() -> None:
@@ -320,6 +345,11 @@ def test_hand_is_the_tip_of_the_deepest_chain(tmp_path: Path) -> None:
         return body, point.tolist()
 
     assert hand("") == ("tip", [0, 0, 0])
+    # Of equals the first link of the file counts, whatever the order of its joints.
+    twins = f'<link name="left">{INERTIAL}</link><link name="right">{INERTIAL}</link>' + "".join(
+        joint("continuous", name=f"to_{side}", child=side).replace('"base"', '"tip"') for side in ("right", "left")
+    )
+    assert hand(twins) == ("left", [0, 0, 0])
     assert hand(tool.format(0.5, "tip", '<child link="tool"/>')) == ("tip", [0, 0, 0.5])
     assert hand(finger + tool.format(0.5, "tip", '<child link="tool"/>')) == ("finger", [0, 0, 0])
     assert hand(finger + tool.format(0.5, "tip", '<child link="hand"/>').replace("tool", "hand")) == (

@@ -119,6 +119,7 @@ def test_the_good_file_is_read(tmp_path: Path) -> None:
         ("</robot>", '<link name="loose"/></robot>', 17, ["one root link", "'loose'"]),
         ('name="arm"', 'name="a&#10;m"', 3, ["control characters"]),
         ('name="arm"', 'name="a\u202em"', 3, ["control characters"]),
+        ('name="arm"', f'name="{"m" * 201}"', 3, ["at most 200"]),
         # Not plain URDF.
         ("4.00", "${m}", 6, ["xacro", "run `xacro "]),
         ("4.00", "$(arg m)", 6, ["xacro"]),
@@ -193,7 +194,8 @@ def test_encodings(encoding: str, tmp_path: Path) -> None:
         (b'<?xml version="1.0" encoding="klingon"?><robot/>', "encoding"),
         (b'<?xml version="1.0" encoding="big5"?><robot/>', "encoding"),
         (b"<robot>" + b"<a>" * 1000, "nested more than 100 deep"),
-        (b"<robot>" + b"<a/>" * 300_000 + b"</robot>", "more than 200000 elements"),
+        (b"<robot>" + b"<a/>" * 300_000 + b"</robot>", "more than 100000 elements"),
+        (b"<robot " + b" ".join(b"a%d='1'" % i for i in range(101)) + b"/>", "more than 100 attributes"),
         (b"<robot name='" + b"x" * 17_000_000 + b"'/>", "larger than 16 MB"),
         (b"<robot>" + b"".join(b'<link name="l%d"/>' % i for i in range(3000)) + b"</robot>", "more than 2000 links"),
         (
@@ -201,7 +203,7 @@ def test_encodings(encoding: str, tmp_path: Path) -> None:
             "DOCTYPE",
         ),
     ],
-    ids=range(15),
+    ids=range(16),
 )
 def test_files_that_are_no_robots(data: bytes, words: str, tmp_path: Path) -> None:
     (tmp_path / "bad.urdf").write_bytes(data)
