@@ -29,6 +29,8 @@ ATTRIBUTES_MAX, NAME_LENGTH_MAX, _NUMBER_LENGTH_MAX = 100, 200, 400
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 # Numbers whose magnitude stands for "no limit" [rad, m, N m …]: URDF demands some number for most limits.
 UNLIMITED = 1e9
+# No robot has such numbers, and with larger ones products overflow.
+_MAGNITUDE_MAX = 1e15
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -469,10 +471,10 @@ class _Reader:
                 )
             value = float(word)
             vanished = value == 0.0 and re.search("[1-9]", re.split("[eE]", word)[0])
-            if vanished or not math.isfinite(value):
-                raise self.error(
-                    element.line, f"{stated} is out of the range of numbers, not a finite number; check its exponent"
-                )
+            # Limits may be as large as numbers go: that stands for none.
+            largest = math.inf if element.tag == "limit" else _MAGNITUDE_MAX
+            if vanished or not math.isfinite(value) or abs(value) > largest:
+                raise self.error(element.line, f"{stated} is out of the range of numbers; check its exponent")
             values.append(value)
         return np.array(values)
 

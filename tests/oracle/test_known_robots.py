@@ -6,6 +6,7 @@ The package has no LBR iiwa; the xArm 7 is its arm of that build, seven joints a
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass, field
 from importlib.metadata import files
 from pathlib import Path
@@ -18,10 +19,17 @@ import pytest
 from dynsim.engine import simulate
 from dynsim.errors import ModelError
 from dynsim.model.model import Model
+from dynsim.model.urdf import read_urdf
+from dynsim.model.urdf_reader import read_tree
 from dynsim.scenario import build_model, load_scenario
 
 # Masses of 1 to 100 kg at distances of up to 2 m: sums of some hundred products, each rounded to 1e-16.
 ROUNDING = 1e-11
+
+
+def packaged() -> list[Path]:
+    """All URDF files of the package."""
+    return sorted(Path(str(f.locate())) for f in files("example-robot-data") or () if f.suffix == ".urdf")
 
 
 @dataclass(frozen=True)
@@ -39,8 +47,7 @@ class Known:
     @property
     def path(self) -> Path:
         """Where the package has the file."""
-        found = next(f for f in files("example-robot-data") or () if str(f).endswith(f"/{self.file}"))
-        return Path(str(found.locate()))
+        return next(path for path in packaged() if path.name == self.file)
 
     @property
     def lock(self) -> dict[str, float]:
@@ -150,6 +157,36 @@ def test_coupled_joints_are_refused_until_they_are_locked(name: str) -> None:
         key = "lock_m" if joint in known.lock_m else "lock_deg"
         with pytest.raises(ModelError, match=rf"urdf:\d+: joint '{joint}' mimics .* plant.{key}: {{{joint}: 0.0}}"):
             Model.from_urdf(known.path, rest)
+
+
+# What is refused of the package, and why.
+REFUSED = {
+    "quadrotor_base.urdf": "no moving joint",
+    "iris_simple.urdf": "no moving joint",
+    "ur3.urdf": "has no <link>",
+    "romeo_laas_small.urdf": r"urdf:235: link 'LShoulderYaw_link', .* principal moments of inertia",
+    "romeo_small.urdf": r"urdf:547: link 'RShoulderYawLink', .* principal moments of inertia",
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*(moments of inertia that no body can have|has a mass)")
+def test_every_other_robot_of_the_package_is_read_as_pinocchio_reads_it() -> None:
+    """Some 60 files of many makers: reading compares with Pinocchio. iCub has moments of −5e-20 kg m² by rounding."""
+    read, refused = 0, {}
+    for path in packaged():
+        try:
+            joints = read_tree(path).joints.values()
+            coupled = [joint for joint in joints if joint.mimics and joint.kind != "fixed"]
+            lock = {joint.name: max(joint.lower, min(0.0, joint.upper)) for joint in coupled}
+            read_urdf(path, lock)
+        except ModelError as error:
+            refused[path.name] = str(error)
+        else:
+            read += 1
+    assert refused.keys() == REFUSED.keys(), refused
+    for name, message in refused.items():
+        assert re.search(REFUSED[name], message)
+    assert read > 60
 
 
 def test_it_runs_with_a_brace(known: Known, tmp_path: Path) -> None:

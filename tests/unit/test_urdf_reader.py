@@ -74,6 +74,7 @@ def test_the_good_file_is_read(tmp_path: Path) -> None:
         ("4.00", "4.00\u00a0", 6, ["link 'arm'", "0–9"]),
         ("4.00", "inf", 6, ["inf"]),
         ("4.00", "1e999", 6, ["out of the range"]),
+        ("4.00", "1e300", 6, ["out of the range"]),
         ("4.00", "1e-999", 6, ["out of the range"]),
         ("4.00", "9" * 5000, 6, ["link 'arm'", "..."]),
         ("4.00", "-4", 6, ["negative"]),
