@@ -23,8 +23,8 @@ class StrictConfig(BaseModel):
 class BodyPoint(StrictConfig):
     """A point fixed on a body."""
 
-    body: str = Field(description="name of the body")
-    point_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="in the body's frame")
+    body: str = Field(description="name of the body, or of a frame fixed on one")
+    point_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="in that body's or frame's axes, from its origin")
 
 
 def error_at(key: str, message: str) -> PydanticCustomError:

@@ -56,6 +56,13 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         body[i, ka.COM : ka.COM + 3] = link.inertia.com
         body[i, ka.INERTIA : ka.INERTIA + 6] = tensor[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
         body[i, ka.DAMPING] = link.damping
+    names = set(index)
+    for frame in robot.frames:
+        if frame.name in names:
+            raise ModelError(f"{frame.name}: the name of a body or frame occurs twice")
+        if frame.body is not None and frame.body not in index:
+            raise ModelError(f"frame {frame.name}: no body {frame.body!r}")
+        names.add(frame.name)
     joints = {link.joint: i for i, link in enumerate(links)}
     for motor in robot.motors:
         _check_motor(motor, joints)
@@ -90,12 +97,13 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArr
     ModelError
         Unknown body, negative friction or smoothing speed.
     """
-    bodies = {link.name: i for i, link in enumerate(robot.links)}
     link = np.zeros((len(contacts), ka.CONTACT_LINK_SIZE), dtype=np.int64)
     point = np.zeros((len(contacts), ka.POINT_SIZE))
     for k, contact in enumerate(contacts):
-        if contact.body not in bodies:
-            raise ModelError(f"contact {contact.name}: no body {contact.body!r}; bodies: {', '.join(bodies)}")
+        try:
+            body, on_body = robot.attach(contact.body, contact.point)
+        except ModelError as error:
+            raise ModelError(f"contact {contact.name}: {error}") from None
         if not contact.friction >= 0.0:
             raise ModelError(f"contact {contact.name}: friction {contact.friction} must be zero or positive")
         if not contact.slip_smoothing > 0.0:
@@ -103,8 +111,8 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArr
         surface = contact.surface
         curved = bool(surface.Q.any())
         scale = 1.0 if curved else 1.0 / float(np.linalg.norm(surface.b))
-        link[k] = bodies[contact.body], _FRICTION[contact.pulling_friction], curved
-        point[k, ka.POINT : ka.POINT + 3] = contact.point
+        link[k] = body, _FRICTION[contact.pulling_friction], curved
+        point[k, ka.POINT : ka.POINT + 3] = on_body
         point[k, ka.QUADRIC : ka.QUADRIC + 6] = surface.Q[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
         point[k, ka.QUADRIC + 6 : ka.QUADRIC + 9] = scale * surface.b
         point[k, ka.QUADRIC + 9] = scale * surface.c

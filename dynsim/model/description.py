@@ -6,6 +6,8 @@ moves with the joint; at q = 0 it is the joint frame J, placed in the parent's b
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -43,26 +45,38 @@ class Inertia:
         side = mass * (3.0 * radius**2 + length**2) / 12.0
         return cls(mass, vector(0.0, 0.0, 0.5 * length), np.diag([side, side, 0.5 * mass * radius**2]))
 
-    def with_point(self, mass: float, point: Array) -> Inertia:
-        """The body with a point mass [kg] at ``point`` in B [m] fixed to it."""
-        total = self.mass + mass
-        if total == 0.0:
-            return self
-        com = (self.mass * self.com + mass * point) / total
-        tensor = self.tensor.copy()
-        for part, place in ((self.mass, self.com), (mass, point)):
-            d = place - com
-            tensor += part * (d @ d * np.eye(3) - np.outer(d, d))
-        return Inertia(total, com, tensor)
+    def placed(self, R: Array, p: Array) -> Inertia:
+        """The same body seen from a frame in which B has rotation R and origin p [m]."""
+        tensor = R @ self.tensor @ R.T
+        return Inertia(self.mass, p + R @ self.com, 0.5 * (tensor + tensor.T))
+
+    @classmethod
+    def merged(cls, parts: Iterable[Inertia]) -> Inertia:
+        """Bodies fixed to each other as one, all in one frame: I = Σ I_i + m_i (d_i² 1 − d_i d_iᵀ), d_i = c_i − c."""
+        parts = list(parts)
+        if len(parts) == 1:
+            return parts[0]
+        mass = sum(part.mass for part in parts)
+        com = sum((part.mass * part.com for part in parts), np.zeros(3)) / mass if mass > 0.0 else np.zeros(3)
+        tensor = np.zeros((3, 3))
+        for part in parts:
+            d = part.com - com
+            tensor += part.tensor + part.mass * (d @ d * np.eye(3) - np.outer(d, d))
+        return cls(mass, com, tensor)
 
     def check(self, name: str) -> None:
-        """Raise :class:`ModelError` unless a real body can have these mass properties."""
+        """Raise :class:`ModelError` unless a real body can have these mass properties.
+
+        Files have rounded moments, and rotations round them again: what is below 1e-9 of the largest moment, or below
+        that of the mass at a micrometre from its centre, counts as zero.
+        """
         if not (np.isfinite(self.mass) and self.mass >= 0.0):
             raise ModelError(f"{name}: mass {self.mass} kg; a mass must be zero or positive")
-        if not np.allclose(self.tensor, self.tensor.T, rtol=0, atol=1e-12 * max(1.0, float(abs(self.tensor).max()))):
+        small = 1e-12 * self.mass
+        if not np.allclose(self.tensor, self.tensor.T, rtol=0, atol=1e-9 * abs(self.tensor).max() + small):
             raise ModelError(f"{name}: the inertia tensor is not symmetric")
         moments = np.linalg.eigvalsh(self.tensor)
-        slack = 1e-9 * max(float(moments[-1]), 1e-300)
+        slack = 1e-9 * float(abs(moments).max()) + small
         if moments[0] < -slack or moments[0] + moments[1] < moments[2] - slack:
             raise ModelError(
                 f"{name}: principal moments of inertia {moments} kg m² are not those of a body "
@@ -112,6 +126,19 @@ class Link:
     def units(self) -> tuple[str, str, str, str]:
         """Units of position, velocity, acceleration and force of the joint."""
         return ("m", "m/s", "m/s²", "N") if self.kind == "prismatic" else ("rad", "rad/s", "rad/s²", "N m")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A named frame fixed on a body, such as a tool flange; its rotation and origin in the body's frame.
+
+    ``body`` is None for what is fixed to the world: it has a name, but nothing that moves can be attached to it.
+    """
+
+    name: str
+    body: str | None
+    R: Array
+    p: Array
 
 
 @dataclass(frozen=True)
@@ -209,7 +236,7 @@ class Robot:
     """A tree of links with its motors.
 
     ``hand`` is the controlled point (body name, point in its frame [m]); ``q0`` the initial configuration [rad or m],
-    zero unless given.
+    zero unless given; ``frames`` further names to attach points to.
     """
 
     name: str
@@ -218,6 +245,29 @@ class Robot:
     hand: tuple[str, Array]
     gravity: Array = field(default_factory=lambda: vector(0.0, 0.0, -9.81))
     q0: Array | None = None
+    frames: tuple[Frame, ...] = ()
+
+    def attach(self, name: str, point: Array) -> tuple[int, Array]:
+        """Index of the body that has a name, or a frame of that name, and a point of that frame in the body's [m].
+
+        Raises
+        ------
+        ModelError
+            No such body or frame, or a frame that is fixed to the world.
+        """
+        bodies = [link.name for link in self.links]
+        if name in bodies:
+            return bodies.index(name), point
+        frame = next((frame for frame in self.frames if frame.name == name), None)
+        if frame is None:
+            names = [*bodies, *(frame.name for frame in self.frames if frame.body is not None)]
+            near = difflib.get_close_matches(name[:100], names, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            fixed = f"; frames: {', '.join(names[len(bodies) :])}" if len(names) > len(bodies) else ""
+            raise ModelError(f"no body {name!r}{hint}; bodies: {', '.join(bodies)}{fixed}")
+        if frame.body is None:
+            raise ModelError(f"{name!r} is fixed to the world and does not move; bodies: {', '.join(bodies)}")
+        return bodies.index(frame.body), frame.p + frame.R @ point
 
     @property
     def initial(self) -> Array:
@@ -232,7 +282,7 @@ class Robot:
             link = links.get(motor.joint)
             if motor.mass > 0.0 and link is not None and link.parent in inertia:
                 point = link.p_PJ if motor.mass_point is None else motor.mass_point
-                inertia[link.parent] = inertia[link.parent].with_point(motor.mass, point)
+                inertia[link.parent] = Inertia.merged((inertia[link.parent], Inertia(motor.mass, point)))
         return replace(
             self,
             links=tuple(replace(link, inertia=inertia[link.name]) for link in self.links),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -43,17 +44,22 @@ class Model:
         self._bodies.body[:, ka.ARMATURE] = 0.0
 
     @classmethod
-    def from_urdf(cls, path: str | os.PathLike[str]) -> Model:
+    def from_urdf(cls, path: str | os.PathLike[str], lock: Mapping[str, float] | None = None) -> Model:
         """Read bodies and joints from a URDF file (fixed joints are merged into their parents).
+
+        Parameters
+        ----------
+        path : file
+        lock : positions [rad or m] of joints that are to be fixed, by name
 
         Raises
         ------
         ModelError
-            No such file, or a joint type that is not revolute, continuous, prismatic or fixed.
+            The message names file, line, link or joint and what to do; see :func:`dynsim.model.urdf.read_urdf`.
         """
         from dynsim.model.urdf import read_urdf
 
-        return cls(read_urdf(Path(path)))
+        return cls(read_urdf(Path(path), lock))
 
     def to_urdf(self) -> str:
         """The tree of bodies as URDF text."""
@@ -104,10 +110,11 @@ class Model:
         return self._workspace.joints[:, ka.QDD].copy()
 
     def point_position(self, body: str | int, point: ArrayLike, q: ArrayLike) -> Array:
-        """World position of a body-fixed point, (3,) [m]."""
+        """World position of a point fixed on a body, or in a frame of one by its name, (3,) [m]."""
+        index, on_body = self._attached(body, point)
         self._sweep(q)
         out = np.zeros(3)
-        kinematics.point_position(self._workspace, self.body_index(body), self._point(point), out)
+        kinematics.point_position(self._workspace, index, on_body, out)
         return out
 
     def point_jacobian(self, body: str | int, point: ArrayLike, q: ArrayLike) -> Array:
@@ -116,9 +123,10 @@ class Model:
 
     def point_position_and_jacobian(self, body: str | int, point: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
         """World position, (3,) [m], and its Jacobian, (3, n) [m/rad], from one sweep."""
-        position = self.point_position(body, point, q)
+        index, on_body = self._attached(body, point)
+        position = self.point_position(index, on_body, q)
         jacobian = np.zeros((3, self.n))
-        kinematics.point_jacobian(self.arrays, self._workspace, self.body_index(body), position, jacobian)
+        kinematics.point_jacobian(self.arrays, self._workspace, index, position, jacobian)
         return position, jacobian
 
     def body_pose(self, body: str | int, q: ArrayLike) -> tuple[Array, Array]:
@@ -156,6 +164,11 @@ class Model:
             if link.name == body:
                 return i
         raise ModelError(f"no body {body!r}; bodies: {', '.join(link.name for link in self.robot.links)}")
+
+    def _attached(self, body: str | int, point: ArrayLike) -> tuple[int, Array]:
+        """Index of the body that carries a body or frame, and the point in its frame [m]."""
+        checked = self._point(point)
+        return (body, checked) if isinstance(body, int) else self.robot.attach(body, checked)
 
     def _sweep(self, q: ArrayLike, v: ArrayLike | None = None) -> None:
         self._set(q, v)

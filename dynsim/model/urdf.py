@@ -1,110 +1,94 @@
 """URDF in and out: the tree of bodies, their joints, limits and viscous losses.
 
-Reading goes through Pinocchio, which merges everything behind fixed joints into the moving body that carries it.
+Files are read strictly (:mod:`dynsim.model.urdf_reader`); everything behind fixed and locked joints is merged into the
+moving body that carries it. Pinocchio reads every file too, and both must have found the same bodies and joints.
 Motors, gears, contacts and gravity are not part of a URDF file; they belong to the scenario.
 """
 
 from __future__ import annotations
 
+import heapq
 import math
 import warnings
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dynsim.errors import ModelError
-from dynsim.model.description import WORLD, Array, Inertia, Link, Robot
+from dynsim.model.description import WORLD, Array, Frame, Inertia, Link, Robot
+from dynsim.model.urdf_reader import MOVING, UNLIMITED, UrdfJoint, UrdfTree, read_tree, suggestion
 
-_KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
-# URDF demands numbers for the limits of position, effort and velocity: this one stands for "no limit" (rad, m, N m …).
-_UNLIMITED = 1e9
-_NUMERIC = frozenset(
-    {"xyz", "rpy", "value", "ixx", "ixy", "ixz", "iyy", "iyz", "izz", "lower", "upper"}
-    | {"effort", "velocity", "damping", "friction"}
-)
 HAND = "hand"
+# Two readers of the same decimals differ by roundings: of the sines of angles, and of sums over merged bodies.
+_AGREEMENT = 1e-9
 
 
-def read_urdf(path: Path) -> Robot:
+@dataclass(frozen=True)
+class _Place:
+    """The moving body that carries a link (None: the world), the link's frame there, and its distance from the root."""
+
+    body: str | None
+    R: Array
+    p: Array
+    moving: int
+    joints: int
+
+
+def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
     """Read the bodies and joints of a URDF file.
 
     Joints keep their names and the order of the file (a parent still comes first); each body is named after the link
-    at its moving joint. The hand is the link named ``hand``, else the tip of the chain with the most moving joints: the
-    last frame fixed to its last body, or that body's origin when nothing is fixed to it. The root link is the world.
+    at its moving joint, and every other link is a frame of the body that carries it. The hand is the link named
+    ``hand``, else the tip of the chain with the most moving joints: the last link fixed to its last body, or that
+    body's origin when nothing is fixed to it. The root link is the world.
+
+    Parameters
+    ----------
+    path : file
+    lock : positions [rad or m] of joints that are to be fixed, by name
 
     Raises
     ------
     ModelError
-        No such file, not URDF, or a joint that is mimic, floating or planar: the message names file and joint.
+        No such file, not URDF, a number that is none, a mass without inertia and the like; a joint that is mimic,
+        floating or planar and not locked; no joint of a name in ``lock``; or Pinocchio reads the file differently. The
+        message names file, line, link or joint, value and what to do.
 
     Warns
     -----
     UserWarning
-        The file states Coulomb friction of joints, which is not simulated.
+        The file states Coulomb friction of joints, which is not simulated; a link with a shape has no mass; moments of
+        inertia of a link are not those of a body; a joint is locked beyond its limits.
     """
-    root = _parse(path)
-    joints = root.findall("joint")
-    for joint in joints:
-        _check_joint(path, joint)
-    moving = [joint for joint in joints if joint.get("type") in _KINDS]
-    if not moving:
+    tree = read_tree(path)
+    locked = _locked(tree, lock or {})
+    for joint in locked.joints.values():
+        _check_joint(tree, joint)
+    _compare_with_pinocchio(tree)
+    places = _places(locked)
+    links = _links(locked, places)
+    if not links:
         raise ModelError(f"{path}: no moving joint")
-    # Imported here: Pinocchio takes a second to load, and only URDF files need it.
-    import pinocchio
-
-    try:
-        model = pinocchio.buildModelFromUrdf(str(path))
-    except (ValueError, RuntimeError) as error:
-        raise ModelError(f"{path}: not a valid URDF model: {' '.join(str(error).split())}") from error
-
-    child_of = {joint: _link_name(joint, "child") for joint in joints}
-    body_of = {0: None} | {model.getJointId(joint.get("name")): child_of[joint] for joint in moving}
-    links: list[Link] = []
-    while moving:
-        for joint in moving:
-            j = model.getJointId(joint.get("name"))
-            parent = body_of[model.parents[j]]
-            if parent is None or any(link.name == parent for link in links):
-                break
-        moving.remove(joint)
-        lower, upper = _position_limits(joint)
-        inertia, placement = model.inertias[j], model.jointPlacements[j]
-        tensor = np.array(inertia.inertia)
-        links.append(
-            Link(
-                name=child_of[joint],
-                joint=str(joint.get("name")),
-                parent=parent,
-                kind=_KINDS[joint.get("type", "")],
-                axis=_axis(path, joint),
-                inertia=Inertia(float(inertia.mass), np.array(inertia.lever), 0.5 * (tensor + tensor.T)),
-                R_PJ=np.array(placement.rotation),
-                p_PJ=np.array(placement.translation),
-                damping=_number(joint, "dynamics", "damping"),
-                lower=lower,
-                upper=upper,
-                velocity_limit=_size_limit(joint, "velocity"),
-                effort_limit=_size_limit(joint, "effort"),
-            )
-        )
-    rubbing = [str(joint.get("name")) for joint in joints if _number(joint, "dynamics", "friction") != 0.0]
-    if rubbing:
-        warnings.warn(f"{path}: Coulomb friction of joints is not simulated ({', '.join(rubbing)})", stacklevel=2)
-    return Robot(
-        name=root.get("name", path.stem), links=tuple(links), motors=(), hand=_hand(root, model, body_of, child_of)
-    )
+    _warn(locked, places, links)
+    frames = [Frame(name, place.body, place.R, place.p) for name, place in places.items() if place.body != name]
+    return Robot(name=tree.name, links=links, motors=(), hand=_hand(tree, places), frames=tuple(frames))
 
 
 def write_urdf(robot: Robot) -> str:
-    """The bodies and joints of a robot as URDF text, with the hand as a frame of its own.
+    """The bodies and joints of a robot as URDF text; frames, and the hand as one of them, are links without mass.
 
     Numbers are written in full, so that reading the text back gives the same dynamics to rounding.
     """
     root = ElementTree.Element("robot", name=robot.name)
-    taken = {link.name for link in robot.links}
-    base = next(name for name in (WORLD, "base_link", "root_link") if name not in taken)
+    frames = [frame for frame in robot.frames if frame.name != HAND]
+    taken = {link.name for link in robot.links} | {frame.name for frame in frames}
+    # The root link of the file that the robot came from is its first frame.
+    rooted = next((f.name for f in frames if f.body is None and not f.p.any() and np.array_equal(f.R, np.eye(3))), None)
+    base = rooted or next(name for name in (WORLD, "base_link", "root_link") if name not in taken)
     ElementTree.SubElement(root, "link", name=base)
     for link in robot.links:
         inertial = ElementTree.SubElement(ElementTree.SubElement(root, "link", name=link.name), "inertial")
@@ -120,145 +104,249 @@ def write_urdf(robot: Robot) -> str:
         ElementTree.SubElement(joint, "axis", xyz=_text(link.axis))
         if not (endless and all(map(math.isinf, limits))):
             # A continuous joint has no lower and upper.
-            texts = [_text(min(max(limit, -_UNLIMITED), _UNLIMITED)) for limit in limits]
+            texts = [_text(min(max(limit, -UNLIMITED), UNLIMITED)) for limit in limits]
             given = dict(zip(("lower", "upper", "effort", "velocity"), texts, strict=True))
             ElementTree.SubElement(joint, "limit", dict(list(given.items())[2:]) if endless else given)
         if link.damping:
             ElementTree.SubElement(joint, "dynamics", damping=_text(link.damping), friction="0.0")
     if HAND not in taken:
         body, point = robot.hand
-        ElementTree.SubElement(root, "link", name=HAND)
-        joint = ElementTree.SubElement(root, "joint", name=f"{HAND}_frame", type="fixed")
-        _connect(joint, body, HAND, point, np.eye(3))
+        turned = (f.R for f in robot.frames if f.name == HAND and f.body == body and np.array_equal(f.p, point))
+        frames.append(Frame(HAND, body, next(turned, np.eye(3)), point))
+    joints = set(robot.joint_names)
+    for frame in frames:
+        if frame.name == base:
+            continue
+        name = f"{frame.name}_frame"
+        while name in joints:
+            name += "_"
+        ElementTree.SubElement(root, "link", name=frame.name)
+        joint = ElementTree.SubElement(root, "joint", name=name, type="fixed")
+        _connect(joint, frame.body or base, frame.name, frame.p, frame.R)
     ElementTree.indent(root)
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def _parse(path: Path) -> ElementTree.Element:
-    try:
-        root = ElementTree.parse(path).getroot()
-    except OSError as error:
-        raise ModelError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except ElementTree.ParseError as error:
-        raise ModelError(f"{path}: not XML: {error}") from error
-    if root.tag != "robot":
-        raise ModelError(f"{path}: the outermost element is <{root.tag}>, a URDF file has <robot>")
-    _check_tree(path, root)
-    for owner in (*root.findall("link"), *root.findall("joint")):
-        _check_numbers(path, owner)
-    return root
+def _check_joint(tree: UrdfTree, joint: UrdfJoint) -> None:
+    if joint.mimics is not None and joint.kind != "fixed":
+        key, unit = ("lock_m", "m") if joint.kind == "prismatic" else ("lock_deg", "rad")
+        raise tree.error(
+            joint.line,
+            f"joint {joint.name!r} mimics joint {joint.mimics!r}; coupled joints are not simulated. Lock it with "
+            f"plant.{key}: {{{joint.name}: 0.0}}, in Python with lock={{{joint.name!r}: 0.0}} [{unit}]",
+        )
+    if joint.kind in ("floating", "planar"):
+        raise tree.error(
+            joint.line, f"joint {joint.name!r} is {joint.kind}; known: {', '.join(MOVING)}, fixed. Make it fixed"
+        )
 
 
-def _check_tree(path: Path, root: ElementTree.Element) -> None:
-    roots = [link.get("name") for link in root.findall("link")]
-    links = set(roots)
-    for joint in root.findall("joint"):
-        for end in ("parent", "child"):
-            if _link_name(joint, end) not in links:
-                raise ModelError(
-                    f"{path}: joint {joint.get('name')!r}: its {end} link {_link_name(joint, end)!r} is not in the file"
-                )
-        child = _link_name(joint, "child")
-        if child not in roots:
-            raise ModelError(f"{path}: joint {joint.get('name')!r}: its child {child!r} already hangs on another joint")
-        roots.remove(child)
-    if len(roots) != 1:
-        raise ModelError(f"{path}: a tree has one root link; here: {', '.join(map(str, roots)) or 'none'}")
-    reached, pending = set(roots), root.findall("joint")
-    while True:
-        grown = [joint for joint in pending if _link_name(joint, "parent") in reached]
-        if not grown:
-            break
-        reached |= {_link_name(joint, "child") for joint in grown}
-        pending = [joint for joint in pending if joint not in grown]
-    if pending:
-        raise ModelError(f"{path}: joint {pending[0].get('name')!r} is part of a loop that the root does not reach")
+def _locked(tree: UrdfTree, lock: Mapping[str, float]) -> UrdfTree:
+    """The tree with joints fixed at positions: T_PC = T_PJ · Rot(a, q), or T_PJ · Trans(a q) for a prismatic one."""
+    joints = dict(tree.joints)
+    for name, value in lock.items():
+        if name not in joints:
+            raise ModelError(
+                f"{tree.path}: lock: no joint {name!r}{suggestion(name, joints)}; joints: {', '.join(joints)}"
+            )
+        joint = joints[name]
+        if joint.kind not in MOVING:
+            raise tree.error(joint.line, f"lock: joint {name!r} is {joint.kind}, which has no position to lock it at")
+        if not math.isfinite(value):
+            raise ModelError(f"{tree.path}: lock: {name} = {value} is not a finite number")
+        if not joint.lower - 1e-9 <= value <= joint.upper + 1e-9:
+            warnings.warn(
+                f"{tree.path}: joint {name} is locked at {value:g}, its limits are {joint.lower:g} and {joint.upper:g}",
+                stacklevel=3,
+            )
+        if joint.kind == "prismatic":
+            joints[name] = replace(joint, kind="fixed", p=joint.p + joint.R @ joint.axis * value)
+        else:
+            joints[name] = replace(joint, kind="fixed", R=joint.R @ _turn(joint.axis, value))
+    return replace(tree, joints=joints)
 
 
-def _check_numbers(path: Path, owner: ElementTree.Element) -> None:
-    """Pinocchio's parser takes a mass it cannot read for zero; so look at every number that physics depends on."""
-    elements = list(owner) if owner.tag == "joint" else owner.findall("inertial/*")
-    for element in elements:
-        for key, text in element.items():
-            if key not in _NUMERIC:
-                continue
-            try:
-                fine = all(math.isfinite(float(word)) for word in text.split())
-            except ValueError:
-                fine = False
-            if not fine:
-                raise ModelError(
-                    f"{path}: {owner.tag} {owner.get('name')!r}: <{element.tag} {key}={text!r}> is not a finite number"
-                )
-        if element.tag == "mass" and float(element.get("value", "0")) < 0.0:
-            raise ModelError(f"{path}: link {owner.get('name')!r}: mass {element.get('value')} kg is negative")
+def _turn(axis: Array, angle: float) -> Array:
+    """Rotation about a unit axis, R = 1 + sin q [a]× + (1 − cos q) [a]×² (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
 
 
-def _check_joint(path: Path, joint: ElementTree.Element) -> None:
-    name, kind = joint.get("name"), joint.get("type")
-    if joint.find("mimic") is not None:
-        raise ModelError(f"{path}: joint {name!r} mimics another joint; coupled joints are not simulated")
-    if kind not in {*_KINDS, "fixed"}:
-        raise ModelError(f"{path}: joint {name!r} is {kind}; known: {', '.join(_KINDS)}, fixed")
-    if kind in ("revolute", "prismatic") and joint.find("limit") is None:
-        raise ModelError(f"{path}: joint {name!r} is {kind} and has no <limit>")
+def _places(tree: UrdfTree) -> dict[str, _Place]:
+    """Where every link is; a parent comes before its children, of those that could come next the first of the file."""
+    below: dict[str, list[tuple[int, UrdfJoint]]] = {name: [] for name in tree.links}
+    for order, joint in enumerate(tree.joints.values()):
+        below[joint.parent].append((order, joint))
+    places = {tree.root: _Place(None, np.eye(3), np.zeros(3), 0, 0)}
+    # Fixed joints first: what is behind them belongs to a body that is there, and may carry joints early in the file.
+    pending: list[tuple[bool, int, str]] = []
+    joints = tree.joints
+
+    def open_up(link: str) -> None:
+        for order, joint in below[link]:
+            heapq.heappush(pending, (joint.kind in MOVING, order, joint.name))
+
+    open_up(tree.root)
+    while pending:
+        moves, _, name = heapq.heappop(pending)
+        joint, parent = joints[name], places[joints[name].parent]
+        if moves:
+            places[joint.child] = _Place(joint.child, np.eye(3), np.zeros(3), parent.moving + 1, parent.joints + 1)
+        else:
+            R, p = parent.R @ joint.R, parent.p + parent.R @ joint.p
+            places[joint.child] = _Place(parent.body, R, p, parent.moving, parent.joints + 1)
+        open_up(joint.child)
+    return places
 
 
-def _link_name(joint: ElementTree.Element, end: str) -> str:
-    element = joint.find(end)
-    return "" if element is None else element.get("link", "")
+def _links(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[Link, ...]:
+    """The moving bodies, with all that is fixed to them."""
+    parts: dict[str | None, list[Inertia]] = {}
+    for name, place in places.items():
+        inertia = tree.links[name].inertia
+        if inertia is not None and place.body is not None:
+            own = name == place.body
+            parts.setdefault(place.body, []).append(inertia if own else inertia.placed(place.R, place.p))
+    joint_to = {joint.child: joint for joint in tree.joints.values()}
+    links = []
+    for name, place in places.items():
+        if place.body != name:
+            continue
+        joint = joint_to[name]
+        parent = places[joint.parent]
+        links.append(
+            Link(
+                name=name,
+                joint=joint.name,
+                parent=parent.body,
+                kind=MOVING[joint.kind],
+                axis=joint.axis,
+                inertia=Inertia.merged(parts.get(name, [Inertia(0.0)])),
+                R_PJ=parent.R @ joint.R,
+                p_PJ=parent.p + parent.R @ joint.p,
+                damping=joint.damping,
+                lower=joint.lower,
+                upper=joint.upper,
+                velocity_limit=joint.velocity_limit,
+                effort_limit=joint.effort_limit,
+            )
+        )
+    return tuple(links)
 
 
-def _number(joint: ElementTree.Element, tag: str, attribute: str) -> float:
-    element = joint.find(tag)
-    return 0.0 if element is None else float(element.get(attribute, "0"))
-
-
-def _position_limits(joint: ElementTree.Element) -> tuple[float, float]:
-    if joint.get("type") == "continuous":
-        return -math.inf, math.inf
-    lower, upper = _number(joint, "limit", "lower"), _number(joint, "limit", "upper")
-    return (-math.inf if lower <= -_UNLIMITED else lower), (math.inf if upper >= _UNLIMITED else upper)
-
-
-def _size_limit(joint: ElementTree.Element, attribute: str) -> float:
-    """Limit of velocity or effort. Zero stands in files whose author knew none: a joint so limited could not move."""
-    limit = _number(joint, "limit", attribute)
-    return limit if 0.0 < limit < _UNLIMITED else math.inf
-
-
-def _axis(path: Path, joint: ElementTree.Element) -> Array:
-    """Unit joint axis in the joint frame; URDF's default is x."""
-    element = joint.find("axis")
-    axis = np.array([float(x) for x in (element.get("xyz", "1 0 0") if element is not None else "1 0 0").split()])
-    length = float(np.linalg.norm(axis))
-    if axis.shape != (3,) or not length > 0.0:
-        raise ModelError(f"{path}: joint {joint.get('name')!r}: axis {axis} is no direction")
-    # A unit axis stays as it is: dividing by 1 − 1e-16 would take it off the exact coordinate directions.
-    return axis if abs(length - 1.0) < 1e-15 else axis / length
-
-
-def _hand(
-    root: ElementTree.Element, model: Any, body_of: dict[int, Any], child_of: dict[Any, str]
-) -> tuple[str, Array]:
-    """The controlled point: the frame ``hand``, else the tip of the deepest chain."""
-    joint_to = {child: joint for joint, child in child_of.items()}
-
-    def depth(name: str) -> tuple[int, int]:
-        """Number of moving joints and of all joints between the root and a link."""
-        moving = total = 0
-        while name in joint_to:
-            joint = joint_to[name]
-            moving, total = moving + (joint.get("type") in _KINDS), total + 1
-            name = _link_name(joint, "parent")
-        return moving, total
-
-    names = [str(link.get("name")) for link in root.findall("link")]
-    tip = max(names, key=depth)
-    if HAND in names and depth(HAND)[0] > 0:
+def _hand(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[str, Array]:
+    """The controlled point: the link ``hand`` if it moves, else the tip of the deepest chain, the first of equals."""
+    tip = max(tree.links, key=lambda name: (places[name].moving, places[name].joints))
+    if HAND in places and places[HAND].moving > 0:
         tip = HAND
-    frame = model.frames[model.getBodyId(tip)]
-    return str(body_of[frame.parentJoint]), np.array(frame.placement.translation)
+    return str(places[tip].body), places[tip].p
+
+
+def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...]) -> None:
+    """Refuse bodies that cannot be; warn of masses that are missing and of what is not simulated."""
+    for link in links:
+        link.inertia.check(
+            f"{tree.path}:{tree.links[link.name].line}: link {link.name!r}, with all that is fixed to it"
+        )
+    rubbing = [joint.name for joint in tree.joints.values() if joint.friction != 0.0 and joint.kind in MOVING]
+    if rubbing:
+        warnings.warn(f"{tree.path}: Coulomb friction of joints is not simulated ({', '.join(rubbing)})", stacklevel=3)
+    loaded: set[str | None] = set()
+    for link in reversed(links):
+        if link.name in loaded or link.inertia.mass > 0.0 or link.inertia.tensor.any():
+            loaded |= {link.name, link.parent}
+    empty = [link.joint for link in links if link.name not in loaded and (link.parent in loaded or not link.parent)]
+    if empty:
+        warnings.warn(f"{tree.path}: nothing beyond these joints has a mass ({', '.join(empty)})", stacklevel=3)
+    moving = [tree.links[name] for name, place in places.items() if place.body is not None]
+    bare = [link.name for link in moving if link.inertia is None and link.shaped]
+    if bare:
+        warnings.warn(
+            f"{tree.path}: links with a shape but without <inertial> have no mass ({', '.join(bare)})", stacklevel=3
+        )
+    odd = []
+    for part in moving:
+        try:
+            (part.inertia or Inertia(0.0)).check(part.name)
+        except ModelError:
+            odd.append(part.name)
+    if odd:
+        warnings.warn(
+            f"{tree.path}: moments of inertia that no body can have, taken as they stand because the bodies that these "
+            f"links are fixed to can have the sum ({', '.join(odd)})",
+            stacklevel=3,
+        )
+
+
+def _compare_with_pinocchio(tree: UrdfTree) -> None:
+    """Raise :class:`ModelError` unless Pinocchio finds the same joints and bodies in the file, before any is locked."""
+    # Imported here: Pinocchio takes a second to load, and only URDF files need it.
+    import pinocchio
+
+    try:
+        model = pinocchio.buildModelFromXML(tree.text)
+    except (ValueError, RuntimeError) as error:
+        raise ModelError(f"{tree.path}: not a valid URDF model: {' '.join(str(error).split())}") from error
+    neutral = pinocchio.neutral(model)
+    places = _places(tree)
+    links = _links(tree, places)
+    ours, theirs = {link.joint for link in links}, set(list(model.names)[1:])
+    if ours != theirs:
+        raise ModelError(
+            f"{tree.path}: two readers of the file differ in its moving joints: {', '.join(sorted(ours ^ theirs))}"
+        )
+    joint_of = {link.name: link.joint for link in links}
+    for link in links:
+        joint, j = tree.joints[link.joint], model.getJointId(link.joint)
+        inertia, placement = model.inertias[j], model.jointPlacements[j]
+        # Motion of the body per unit rate in its own frame: (0, a) of a revolute joint, (a, 0) of a prismatic one.
+        in_joint = model.joints[j].createData()
+        model.joints[j].calc(in_joint, neutral)
+        zero, revolute = np.zeros(3), link.kind == "revolute"
+        parent = "universe" if link.parent is None else joint_of[link.parent]
+        if model.names[model.parents[j]] != parent:
+            raise _difference(tree, link, "parent joint", parent, model.names[model.parents[j]])
+        length = max(1.0, float(np.abs(link.p_PJ).max()), float(np.abs(link.inertia.com).max()))
+        pairs: list[tuple[str, Any, Any, float]] = [
+            ("joint motion", np.concatenate([zero, link.axis] if revolute else [link.axis, zero]), in_joint.S, 1.0),
+            ("rotation of the joint", link.R_PJ, placement.rotation, 1.0),
+            ("position of the joint", link.p_PJ, placement.translation, length),
+            ("mass", link.inertia.mass, inertia.mass, link.inertia.mass),
+        ]
+        if link.inertia.mass > 0.0:
+            pairs.append(("centre of mass", link.inertia.com, inertia.lever, length))
+        size = float(np.abs(link.inertia.tensor).max()) + link.inertia.mass * length**2
+        pairs.append(("inertia", link.inertia.tensor, inertia.inertia, size))
+        pairs.append(("damping", link.damping, model.damping[model.joints[j].idx_v], link.damping))
+        if joint.kind != "continuous":
+            k = model.joints[j].idx_q
+            for name, value, limits in (
+                ("lower limit", link.lower, model.lowerPositionLimit),
+                ("upper limit", link.upper, model.upperPositionLimit),
+            ):
+                if math.isfinite(value):
+                    pairs.append((name, value, limits[k], abs(value)))
+        for name, value, limits in (
+            ("velocity limit", link.velocity_limit, model.velocityLimit),
+            ("effort limit", link.effort_limit, model.effortLimit),
+        ):
+            if math.isfinite(value):
+                pairs.append((name, value, limits[model.joints[j].idx_v], value))
+        for name, own, other, scale in pairs:
+            if not np.allclose(own, other, rtol=0.0, atol=_AGREEMENT * scale):
+                raise _difference(tree, link, name, own, other)
+
+
+def _difference(tree: UrdfTree, link: Link, name: str, own: Any, other: Any) -> ModelError:
+    def text(value: Any) -> str:
+        return " ".join(np.array2string(np.asarray(value), precision=12).split()) if np.ndim(value) else str(value)
+
+    return tree.error(
+        tree.links[link.name].line,
+        f"link {link.name!r} (joint {link.joint!r}): {name} is {text(own)} as written, but Pinocchio reads "
+        f"{text(other)}; write the numbers of this link and joint more plainly",
+    )
 
 
 def _connect(joint: ElementTree.Element, parent: str, child: str, position: Array, rotation: Array) -> None:

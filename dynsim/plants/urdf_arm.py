@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from dynsim.config import BodyPoint, NonNegative, StrictConfig, Vector3
+from dynsim.config import BodyPoint, NonNegative, StrictConfig, Vector3, error_at
 from dynsim.errors import ModelError
 from dynsim.families import union
 from dynsim.model.description import Robot
@@ -39,7 +39,38 @@ class Config(StrictConfig):
     )
     initial_deg: dict[str, float] = Field(default={}, description="initial angles of revolute joints by name; others 0")
     initial_m: dict[str, float] = Field(default={}, description="initial positions of prismatic joints; others 0")
-    hand: BodyPoint | None = Field(default=None, description="controlled point; default: the tip of the longest chain")
+    lock_deg: dict[str, float] = Field(default={}, description="revolute joints that are fixed, at these angles")
+    lock_m: dict[str, float] = Field(default={}, description="prismatic joints that are fixed, at these positions")
+    hand: BodyPoint | None = Field(
+        default=None, description="controlled point on a body or in a frame; default: the tip of the longest chain"
+    )
+
+    @model_validator(mode="after")
+    def _check_joints(self) -> Self:
+        """Names and kinds of joints: here, where an error knows its line. Other errors of the file come from build."""
+        from dynsim.model.urdf_reader import MOVING, read_tree, suggestion
+
+        try:
+            joints = read_tree(Path(self.file)).joints
+        except ModelError:
+            return self
+        locked = {*self.lock_deg, *self.lock_m}
+        units = {"revolute": "deg", "prismatic": "m"}
+        for key in ("motors", "initial_deg", "initial_m", "lock_deg", "lock_m"):
+            for name in getattr(self, key):
+                place = f"{key}.{name}"
+                if name not in joints:
+                    moving = ", ".join(joint.name for joint in joints.values() if joint.kind != "fixed")
+                    raise error_at(place, f"no joint {name!r}{suggestion(name, joints)}; joints of the file: {moving}")
+                kind = MOVING.get(joints[name].kind, joints[name].kind)
+                if kind not in units:
+                    raise error_at(place, f"{name!r} is {kind}: it has no motor and no position")
+                family, _, unit = key.partition("_")
+                if unit and unit != units[kind]:
+                    raise error_at(place, f"{name!r} is {kind}; give it in plant.{family}_{units[kind]}")
+                if name in locked and family != "lock":
+                    raise error_at(place, f"{name!r} is locked by plant.lock_{units[kind]}; remove one of the two")
+        return self
 
 
 def build(config: Config) -> Robot:
@@ -48,32 +79,30 @@ def build(config: Config) -> Robot:
     Raises
     ------
     ModelError
-        Unreadable file, a joint name that the file does not have, or an initial position in the other kind's unit.
+        A file that is refused (see :func:`dynsim.model.urdf.read_urdf`), or a hand on a body that it does not have.
     """
     from dynsim.model.urdf import read_urdf
 
-    robot = read_urdf(Path(config.file))
-    kinds = {link.joint: link.kind for link in robot.links}
-    for name in [*config.motors, *config.initial_deg, *config.initial_m]:
-        if name not in kinds:
-            raise ModelError(f"{config.file}: no joint {name!r}; joints: {', '.join(kinds)}")
-    for name in config.initial_deg:
-        if kinds[name] == "prismatic":
-            raise ModelError(f"plant.initial_deg: {name!r} is prismatic; give it in plant.initial_m")
-    for name in config.initial_m:
-        if kinds[name] == "revolute":
-            raise ModelError(f"plant.initial_m: {name!r} is revolute; give it in plant.initial_deg")
+    lock = {**{name: float(np.deg2rad(angle)) for name, angle in config.lock_deg.items()}, **config.lock_m}
+    robot = read_urdf(Path(config.file), lock)
     initial = {**{name: np.deg2rad(angle) for name, angle in config.initial_deg.items()}, **config.initial_m}
     given = {"revolute": config.damping_N_m_s_per_rad, "prismatic": config.damping_N_s_per_m}
     links = tuple(
         link if (loss := given[link.kind]) is None else dataclasses.replace(link, damping=loss) for link in robot.links
     )
-    chosen = {joint: config.motors.get(joint, config.motor) for joint in kinds}
+    chosen = {joint: config.motors.get(joint, config.motor) for joint in robot.joint_names}
+    hand = robot.hand
+    if config.hand is not None:
+        try:
+            body, point = robot.attach(config.hand.body, np.array(config.hand.point_m))
+        except ModelError as error:
+            raise ModelError(f"plant.hand.body: {error}") from None
+        hand = robot.links[body].name, point
     return dataclasses.replace(
         robot,
         links=links,
         motors=tuple(motor.motor(joint) for joint, motor in chosen.items() if motor is not None),
-        hand=robot.hand if config.hand is None else (config.hand.body, np.array(config.hand.point_m)),
+        hand=hand,
         gravity=np.array(config.gravity_m_s2),
-        q0=np.array([initial.get(joint, 0.0) for joint in kinds]),
+        q0=np.array([initial.get(joint, 0.0) for joint in robot.joint_names]),
     )

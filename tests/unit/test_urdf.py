@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -97,6 +98,42 @@ def test_round_trip_keeps_the_dynamics(seed: int, n: int, tmp_path_factory: pyte
         )
 
 
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 10**6), n=st.integers(2, 12))
+def test_locked_joints_are_pinocchios_reduced_model(
+    seed: int, n: int, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    robot, rng = random_robot(seed, n), np.random.default_rng(seed)
+    path = tmp_path_factory.mktemp("urdf") / "robot.urdf"
+    path.write_text(write_urdf(robot))
+    names = rng.permutation(robot.joint_names)[: rng.integers(1, n)]
+    lock = {str(name): float(rng.uniform(-1.4, 2.4)) for name in names}
+    ours, free = Model.from_urdf(path, lock), pinocchio.buildModelFromUrdf(str(path))
+
+    def at(model: pinocchio.Model, values: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
+        """Pinocchio's configuration (two numbers for an endless joint) and velocity for values by joint."""
+        v = np.zeros(model.nv)
+        for name, value in values.items():
+            v[model.joints[model.getJointId(name)].idx_v] = value
+        return pinocchio.integrate(model, pinocchio.neutral(model), v), v
+
+    theirs = pinocchio.buildReducedModel(free, [free.getJointId(name) for name in lock], at(free, lock)[0])
+    assert set(ours.joint_names) == set(theirs.names) - {"universe"}
+    order = [theirs.joints[theirs.getJointId(name)].idx_v for name in ours.joint_names]
+    q, v, a = rng.uniform(-2, 2, (3, ours.n))
+    (q_, _), (_, v_), (_, a_) = (at(theirs, dict(zip(ours.joint_names, x, strict=True))) for x in (q, v, a))
+    tau = pinocchio.rnea(theirs, theirs.createData(), q_, v_, a_)[order]
+    found = ours.inverse_dynamics(q, v, a)
+    np.testing.assert_allclose(found, tau, rtol=0, atol=ROUNDING * max(1.0, abs(tau).max()))
+    # The links of locked joints are frames of what carries them, at the same place as in the free arm.
+    free_q = [lock.get(name, dict(zip(ours.joint_names, q, strict=True)).get(name, 0.0)) for name in robot.joint_names]
+    for link in robot.links:
+        if next((f.body for f in ours.robot.frames if f.name == link.name), link.name) is not None:
+            expected = Model(robot).point_position(link.name, [0.1, 0.2, 0.3], free_q)
+            position = ours.point_position(link.name, [0.1, 0.2, 0.3], q)
+            np.testing.assert_allclose(position, expected, rtol=0, atol=ROUNDING * 10)
+
+
 def test_writing_what_was_read_gives_the_same_text(tmp_path: Path) -> None:
     first = Model.from_urdf(ARM).to_urdf()
     (tmp_path / "copy.urdf").write_text(first)
@@ -167,7 +204,7 @@ def joint(kind: str, inside: str = "", *, name: str = "hinge", child: str = "tip
         (TIP.replace('"1"', '"-1"') + joint("continuous"), ["tip", "-1", "negative"]),
         (TIP.replace('"0.1"', '"nan"') + joint("continuous"), ["tip", "nan"]),
         (TIP + joint("continuous", child="tup"), ["hinge", "tup"]),
-        (TIP + '<link name="loose"/>' + joint("continuous"), ["base, loose"]),
+        (TIP + '<link name="loose"/>' + joint("continuous"), ["'base', 'loose'"]),
         (TIP + joint("continuous") + joint("continuous", name="second"), ["second", "tip"]),
         (
             '<link name="a"/><link name="b"/>'
@@ -195,7 +232,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="cannot be read"):
         read_urdf(tmp_path)
     (tmp_path / "empty.urdf").write_text("")
-    with pytest.raises(ModelError, match="not XML"):
+    with pytest.raises(ModelError, match="is empty"):
         read_urdf(tmp_path / "empty.urdf")
     (tmp_path / "scene.xml").write_text("<mujoco/>")
     with pytest.raises(ModelError, match="mujoco"):
@@ -207,6 +244,91 @@ def test_coulomb_friction_is_not_dropped_silently(tmp_path: Path) -> None:
     path.write_text(f'<robot name="r">{BASE}{TIP}{joint("continuous", """<dynamics friction="0.2"/>""")}</robot>')
     with pytest.warns(UserWarning, match="hinge"):
         read_urdf(path)
+
+
+def test_frames_behind_fixed_joints_are_names_of_places() -> None:
+    model = Model.from_urdf(ARM)
+    q = np.random.default_rng(5).uniform(-2, 2, 6)
+    x, y, z = point = [0.01, 0.02, 0.03]
+    # gripper_mount is 0.03 m and tool_frame 0.13 m further along z of the flange, neither turned.
+    for frame, height in (("gripper", 0.03), ("tool", 0.16)):
+        there = [x, y, z + height]
+        expected = model.point_position("flange", there, q)
+        position, jacobian = model.point_position_and_jacobian(frame, point, q)
+        np.testing.assert_allclose(position, expected, rtol=0, atol=1e-15)
+        np.testing.assert_allclose(jacobian, model.point_jacobian("flange", there, q), rtol=0, atol=1e-15)
+    with pytest.raises(ModelError, match="'base' is fixed to the world"):
+        model.point_position("base", point, q)
+    with pytest.raises(ModelError, match=r"no body 'tol'; did you mean 'tool'\?; bodies: .*; frames: gripper, tool"):
+        model.point_position("tol", point, q)
+
+
+@pytest.mark.parametrize(
+    ("lock", "words"),
+    [
+        ({"elbow": 0.0}, "no joint 'elbow'; did you mean 'elbow_pitch'"),
+        ({"tool_frame": 0.0}, r"urdf:\d+: lock: joint 'tool_frame' is fixed"),
+        ({"elbow_pitch": float("nan")}, "elbow_pitch = nan"),
+    ],
+)
+def test_wrong_locks(lock: dict[str, float], words: str) -> None:
+    with pytest.raises(ModelError, match=words):
+        read_urdf(ARM, lock)
+    with pytest.raises(ModelError, match="no moving joint"):
+        read_urdf(ARM, dict.fromkeys(read_urdf(ARM).joint_names, 0.0))
+
+
+def test_writing_keeps_the_hand_and_does_not_name_joints_twice(tmp_path: Path) -> None:
+    """A controlled point of the scenario is not where the file had its hand; a moving joint has a frame's name."""
+    path = tmp_path / "robot.urdf"
+    frame = (
+        '<link name="{0}"/><joint name="mount_{0}" type="fixed"><origin xyz="0 0 0.5" rpy="0 1 0"/><parent link="tip"/>'
+    )
+    frames = "".join(f'{frame.format(name)}<child link="{name}"/></joint>' for name in ("hand", "tool"))
+    hinge = joint("continuous", name="tool_frame")
+    path.write_text(f'<robot name="r">{BASE}{TIP}{hinge}{frames}</robot>')
+    robot = read_urdf(path)
+    path.write_text(write_urdf(robot))
+    for before, after in zip(robot.frames, read_urdf(path).frames, strict=True):
+        if before.name == "hand":
+            np.testing.assert_allclose(after.R, before.R, rtol=0, atol=ROUNDING)
+    robot = dataclasses.replace(robot, hand=("tip", np.array([0.1, 0.0, 0.2])))
+    path.write_text(write_urdf(robot))
+    again = read_urdf(path)
+    assert (again.hand[0], again.hand[1].tolist()) == ("tip", [0.1, 0.0, 0.2])
+    assert {frame.name: frame.p.tolist() for frame in again.frames} == {
+        "base": [0, 0, 0], "tool": [0, 0, 0.5], "hand": [0.1, 0, 0.2]
+    }  # fmt: skip
+
+
+def test_locks_beyond_the_limits_are_said() -> None:
+    with pytest.warns(UserWarning, match=r"elbow_pitch is locked at 3, its limits are -2.61799 and 2.61799"):
+        read_urdf(ARM, {"elbow_pitch": 3.0})
+
+
+def test_tolerance_of_moments_follows_the_size_of_the_body() -> None:
+    """Moments that rounding has made negative are those of a point or a rod; such that matter are refused."""
+    turn = rotation(np.random.default_rng(1))
+    for mass, size in ((1e-6, 1e-4), (1.0, 0.1), (1e4, 10.0)):
+        small, large = mass * 1e-12, mass * size**2
+        for fine in (
+            np.zeros((3, 3)),
+            np.diag([-5e-20 * mass, 0.0, 1e-20 * mass]),
+            turn @ np.diag([-0.9 * small, 0.0, 0.0]) @ turn.T,
+            turn @ np.diag([0.0, large, large * (1 + 0.9e-9)]) @ turn.T,
+        ):
+            Inertia(mass, tensor=fine).check("body")
+        for bad in (
+            np.diag([-2 * small, 0.0, 0.0]),
+            np.diag([0.0, 0.0, 2 * small]),
+            np.diag([-1e-3, 1.0, 1.0]) * large,
+            np.diag([1.0, 1.0, 2.01]) * large,
+            np.array([[1.0, 1e-3, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]) * large,
+        ):
+            with pytest.raises(ModelError, match="body: "):
+                Inertia(mass, tensor=bad).check("body")
+    with pytest.raises(ModelError):
+        Inertia(0.0, tensor=np.diag([-1e-20, 0.0, 0.0])).check("body")
 
 
 def test_hand_is_the_tip_of_the_deepest_chain(tmp_path: Path) -> None:
@@ -223,6 +345,11 @@ def test_hand_is_the_tip_of_the_deepest_chain(tmp_path: Path) -> None:
         return body, point.tolist()
 
     assert hand("") == ("tip", [0, 0, 0])
+    # Of equals the first link of the file counts, whatever the order of its joints.
+    twins = f'<link name="left">{INERTIAL}</link><link name="right">{INERTIAL}</link>' + "".join(
+        joint("continuous", name=f"to_{side}", child=side).replace('"base"', '"tip"') for side in ("right", "left")
+    )
+    assert hand(twins) == ("left", [0, 0, 0])
     assert hand(tool.format(0.5, "tip", '<child link="tool"/>')) == ("tip", [0, 0, 0.5])
     assert hand(finger + tool.format(0.5, "tip", '<child link="tool"/>')) == ("finger", [0, 0, 0])
     assert hand(finger + tool.format(0.5, "tip", '<child link="hand"/>').replace("tool", "hand")) == (

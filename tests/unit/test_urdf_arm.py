@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dynsim.engine import simulate
-from dynsim.errors import ModelError
+from dynsim.engine import check, simulate
+from dynsim.errors import ModelError, ScenarioError
 from dynsim.record import Record
 from dynsim.scenario import build_model, load_scenario
 
@@ -48,8 +48,8 @@ def test_joints_start_and_lose_in_the_units_of_their_kind(scenario: Path):
     assert robot.initial == pytest.approx([0.2, np.pi / 2])
     assert [link.damping for link in robot.links] == [3.0, 0.5]
     for key, joint in (("initial_deg", "slide"), ("initial_m", "hinge")):
-        with pytest.raises(ModelError, match=rf"plant.{key}: '{joint}' is"):
-            build_model(load_scenario(scenario, overrides={f"plant.{key}.{joint}": 1}))
+        with pytest.raises(ScenarioError, match=rf"plant.{key}.{joint} = 1: '{joint}' is"):
+            load_scenario(scenario, overrides={f"plant.{key}.{joint}": 1})
 
 
 def test_signals_are_in_the_units_of_both_kinds(scenario: Path):
@@ -94,3 +94,87 @@ def test_zero_velocity_and_effort_mean_no_limit(scenario: Path):
     (scenario.parent / "slide.urdf").write_text(SLIDE.replace('effort="20" velocity="0.5"', 'effort="0" velocity="0"'))
     link = build_model(load_scenario(scenario)).robot.links[0]
     assert (link.velocity_limit, link.effort_limit) == (np.inf, np.inf)
+
+
+# On the arm: a bracket, turned by 90° about y and fixed at 0.3 m, and on it a flap that mimics the hinge.
+BRACKET = """<link name="bracket"/><joint name="mount" type="fixed"><origin xyz="0 0 0.3" rpy="0 1.5707963267948966 0"/>
+<parent link="arm"/><child link="bracket"/></joint>
+<link name="flap"><inertial><mass value="0.5"/>
+<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="flap_hinge" type="continuous"><parent link="bracket"/><child link="flap"/><axis xyz="0 1 0"/>
+<mimic joint="hinge"/></joint></robot>"""
+
+
+@pytest.fixture
+def bracket(scenario: Path) -> Path:
+    text = SLIDE.replace("</robot>", BRACKET)
+    (scenario.parent / "slide.urdf").write_text(text)
+    return scenario
+
+
+def test_coupled_joints_are_locked_by_the_scenario(bracket: Path):
+    with pytest.raises(ModelError, match=r"slide.urdf:10: joint 'flap_hinge' mimics joint 'hinge'.*lock_deg"):
+        build_model(load_scenario(bracket))
+    model = build_model(load_scenario(bracket, overrides={"plant.lock_deg": {"flap_hinge": 30}}))
+    assert model.joint_names == ("slide", "hinge")
+    assert model.robot.links[1].inertia.mass == 1.5
+    # The bracket's x is the arm's −z: of 0.2 m along the flap's x, cos 30° go down and sin 30° back along x.
+    position = model.point_position("flap", [0.2, 0, 0], [0, 0])
+    assert position == pytest.approx([-0.1, 0, 0.3 - 0.2 * np.cos(np.pi / 6)], abs=1e-15)
+    assert run(bracket, {"plant.lock_deg": {"flap_hinge": 30}}).summary["warnings"][0].startswith("slide: passes")
+
+
+def test_locked_positions_are_in_the_units_of_their_kind(bracket: Path):
+    overrides = {"plant.lock_deg": {"flap_hinge": 0}, "plant.lock_m": {"slide": 0.25}}
+    model = build_model(load_scenario(bracket, overrides=overrides))
+    assert model.joint_names == ("hinge",)
+    assert model.robot.links[0].p_PJ.tolist() == [0.25, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ("lock_deg: {flap_hing: 0}", ["case.yaml:3", "plant.lock_deg.flap_hing", "did you mean 'flap_hinge'?"]),
+        ("lock_m: {flap_hinge: 0}", ["case.yaml:3", "'flap_hinge' is revolute; give it in plant.lock_deg"]),
+        ("lock_deg: {slide: 0}", ["case.yaml:3", "'slide' is prismatic; give it in plant.lock_m"]),
+        ("lock_deg: {mount: 0}", ["case.yaml:3", "'mount' is fixed"]),
+        ("lock_deg: {hinge: 0}, initial_deg: {hinge: 0}", ["case.yaml:3", "initial_deg.hinge", "locked"]),
+        ("lock_deg: {hinge: 0}, motors: {hinge: {type: wang_minami}}", ["case.yaml:3", "motors.hinge", "locked"]),
+        ("lock_deg: {hinge: .nan}", ["case.yaml:3", "lock_deg.hinge", "finite"]),
+        ("motors: {hing: {type: wang_minami}}", ["case.yaml:3", "motors.hing", "did you mean 'hinge'?"]),
+    ],
+)
+def test_joints_of_the_scenario_are_checked_with_their_lines(bracket: Path, keys: str, words: list[str]):
+    text = SCENARIO.replace("file: slide.urdf, gravity_m_s2: [9.81, 0, 0]}", f"file: slide.urdf,\n  {keys}}}")
+    bracket.write_text(text)
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(bracket)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_contacts_and_hand_may_be_in_frames(bracket: Path):
+    """A point of the bracket is held to a wall as the same point of the arm is; the hand is there too."""
+    rest = {"plant.lock_deg": {"flap_hinge": 0}, "surfaces.wall": {"type": "plane", "point_m": [0, 0, 0.2]}}
+    records = []
+    # The bracket's x is the arm's −z, its z the arm's x: (0.1, 0, 0.4) there is (0.4, 0, 0.2) on the arm.
+    for body, point in (("bracket", [0.1, 0, 0.4]), ("arm", [0.4, 0, 0.2])):
+        at = {"body": body, "point_m": point}
+        overrides = {**rest, "plant.hand": at, "contacts.points.brace": {**at, "surface": "wall"}}
+        records.append(run(bracket, overrides))
+    first, second = records
+    assert first.summary["constraint_drift_max_m"] < 1e-9
+    # The points differ by a rounding.
+    for name in ("q", "hand_position", "contact_normal_force"):
+        np.testing.assert_allclose(first[name], second[name], rtol=1e-9, atol=1e-9)
+
+
+def test_names_that_are_no_place_are_refused(bracket: Path):
+    lock = {"plant.lock_deg": {"flap_hinge": 0}}
+    with pytest.raises(ModelError, match=r"plant.hand.body: no body 'braket'; did you mean 'bracket'"):
+        build_model(load_scenario(bracket, overrides={**lock, "plant.hand": {"body": "braket"}}))
+    with pytest.raises(ModelError, match=r"plant.hand.body: 'base' is fixed to the world"):
+        build_model(load_scenario(bracket, overrides={**lock, "plant.hand": {"body": "base"}}))
+    point = {"contacts.points.brace": {"body": "braket"}, "surfaces.floor": {"type": "plane"}}
+    with pytest.raises(ModelError, match=r"no body 'braket'; did you mean 'bracket'"):
+        check(load_scenario(bracket, overrides={**lock, **point}))
