@@ -79,16 +79,16 @@ def new_figure(height: float, title: str, width: float = WIDTH) -> Figure:
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a PNG under a temporary name, then rename.
+    """Write a PNG, see :func:`dynsim.files.replacing`.
 
     Raises
     ------
     RecordError
         The file cannot be written; an older one is left as it was.
     """
-    with replacing(path) as temporary:
+    with replacing(path) as stream:
         # Light compression: half the time for a third more bytes.
-        figure.savefig(temporary, format="png", dpi=DPI, pil_kwargs={"compress_level": 3})
+        figure.savefig(stream, format="png", dpi=DPI, pil_kwargs={"compress_level": 3})
     return path
 
 
