@@ -323,6 +323,8 @@ class _Reader:
         if not isinstance(found, str) or found != FORMAT:
             raise RecordError(f"an HDF5 file, but not a dynsim record ({FORMAT})")
         complete = self._attribute(file, "complete")
+        if complete is None:
+            raise RecordError("a dynsim record that lacks parts: no attribute complete")
         if not isinstance(complete, (bool, np.bool_)):
             raise RecordError("attribute complete is neither true nor false")
         time = self._numbers(self._child(file, "time", "time", h5py.Dataset), "time")
