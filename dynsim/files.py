@@ -10,8 +10,6 @@ import io
 import json
 import os
 import re
-import secrets
-import socket
 import stat
 import sys
 import time
@@ -69,11 +67,15 @@ def file_name(text: object) -> str:
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[BinaryIO]:
+def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
     """A stream whose content becomes the file ``path`` when the block ends well.
 
     A link at ``path`` is kept and the file it names replaced. A new file gets the mode that the umask asks for, a
     replaced one keeps its own. A device, pipe or socket gets the content written to it.
+
+    Parameters
+    ----------
+    durable : wait until the content is on the disk, so that a power cut, too, leaves the old file or the new one
 
     Raises
     ------
@@ -84,7 +86,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     try:
         with draft.one_line_errors():
             yield draft.open()
-            draft.complete()
+            draft.complete(durable)
             draft.publish()
     finally:
         draft.discard()
@@ -108,7 +110,7 @@ def replace_together(folder: Path, contents: Mapping[str, bytes | memoryview]) -
             cleaning.callback(draft.discard)
             with draft.one_line_errors():
                 draft.open().write(content)
-                draft.complete()
+                draft.complete(durable=True)
             drafts.append(draft)
         with _marked(folder, contents) as published:
             for draft in drafts:
@@ -201,7 +203,7 @@ class _Draft:
             raise PermissionError(0, "the file may not be written")
         _remove_left_behind(self._target.parent)
         # The name is nobody else's: made anew or not at all, and a link that lies there is not followed.
-        temporary = self._target.with_name(f".dynsim-{secrets.token_hex(8)}.tmp")
+        temporary = self._target.with_name(f".dynsim-{os.urandom(8).hex()}.tmp")
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
         descriptor = os.open(temporary, flags, 0o666)
         self._temporary, self._stream = temporary, os.fdopen(descriptor, "w+b")
@@ -213,12 +215,13 @@ class _Draft:
             os.fchmod(descriptor, stat.S_IMODE(existing.st_mode))
         return self._stream
 
-    def complete(self) -> None:
-        """All content is there: hand it to the disk."""
+    def complete(self, durable: bool) -> None:
+        """All content is there: hand it to the system, and let the disk have it."""
         assert self._stream is not None
         if self._temporary is not None:
             self._stream.flush()
-            os.fsync(self._stream.fileno())
+            if durable:
+                os.fsync(self._stream.fileno())
 
     def publish(self) -> None:
         """Let the content be what the path holds."""
@@ -272,6 +275,8 @@ def _write_through(path: Path, descriptor: int | None, content: memoryview) -> N
             stream.write(content)
         return
     if stat.S_ISSOCK(os.stat(path).st_mode):
+        import socket
+
         with socket.socket(socket.AF_UNIX) as connection:
             connection.connect(os.fspath(path))
             connection.sendall(content)
@@ -318,6 +323,7 @@ def _marked(folder: Path, names: Mapping[str, object]) -> Iterator[list[Path]]:
     """Mark the folder as incomplete with respect to the files named; yields a list for those that are exchanged.
 
     The mark goes when the block ends well, or before it has exchanged anything. One process at a time; others wait.
+    Mark and renames are not waited for: file systems with a journal keep their order, and an empty mark names all.
     """
     mark = folder / INCOMPLETE
     published: list[Path] = []
@@ -328,7 +334,6 @@ def _marked(folder: Path, names: Mapping[str, object]) -> Iterator[list[Path]]:
     with stream:
         try:
             _rewrite_mark(stream, before | set(names))
-            _sync_folder(folder)
             yield published
         except BaseException as error:
             if not published:
@@ -341,7 +346,6 @@ def _marked(folder: Path, names: Mapping[str, object]) -> Iterator[list[Path]]:
                 raise RecordError(f"{error}; {done} came before, so {folder} is marked {INCOMPLETE}") from error
             raise
         try:
-            _sync_folder(folder)
             _remove_mark(mark, stream, before - set(names))
         except OSError as error:
             raise RecordError(f"{mark}: cannot be removed ({_reason(error)}); the files beside it are whole") from error
@@ -384,20 +388,8 @@ def _rewrite_mark(stream: BinaryIO, names: set[str]) -> None:
     stream.seek(0)
     stream.truncate()
     stream.write("\n".join([_MARK, *sorted(names), ""]).encode("utf-8"))
-    os.fsync(stream.fileno())
 
 
 def _marked_names(text: str) -> set[str] | None:
     """Files that a mark names; None when it does not say, which means all."""
     return set(text.splitlines()[1:]) or None
-
-
-def _sync_folder(folder: Path) -> None:
-    """Renamed files stay renamed after a power cut."""
-    if hasattr(os, "O_DIRECTORY"):
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            with suppress(OSError):  # not every file system can
-                os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

@@ -120,7 +120,7 @@ class Record:
         """
         path = Path(path)
         content = self.to_hdf5()
-        with replacing(path) as stream:
+        with replacing(path, durable=True) as stream:
             stream.write(content)
         return path
 

@@ -16,7 +16,6 @@ import math
 import os
 import re
 import signal
-import subprocess
 import sys
 import zlib
 from collections.abc import Mapping
@@ -221,6 +220,8 @@ def _verified(path: Path, stream: BinaryIO) -> bool:
 
 def _read_apart(path: Path) -> bytes:
     """Read a file of unknown state in another process, which may die of it; gives it back written anew."""
+    import subprocess
+
     size = path.stat().st_size
     seconds = READING_TIME * (1.0 + size / 50e6)
     code = "from dynsim.record_file import _hand_over; _hand_over()"

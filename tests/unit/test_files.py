@@ -111,7 +111,7 @@ def test_a_link_is_kept_and_the_file_it_names_replaced(tmp_path: Path):
 
 def test_no_link_in_the_way_is_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     # Even one that has guessed the temporary name.
-    monkeypatch.setattr(files.secrets, "token_hex", lambda n: "0" * 2 * n)
+    monkeypatch.setattr(files.os, "urandom", bytes)
     (tmp_path / "victim").write_text("precious")
     for link in (".dynsim-0000000000000000.tmp", "file.tmp"):
         (tmp_path / link).symlink_to("victim")
