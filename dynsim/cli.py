@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
 
 from dynsim._version import __version__
 from dynsim.errors import DynsimError, SimulationInterrupted, SimulationStopped
 from dynsim.hardware.cli import export, hw
+from dynsim.terminal import Terminal
+from dynsim.terminal import escaped as _escape
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -35,8 +36,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 # emoji: rich would turn the ":b:" of a path or key into a picture.
-console = Console(emoji=False)
-errors = Console(stderr=True, soft_wrap=True, highlight=False, emoji=False)
+console = Terminal(emoji=False)
+errors = Terminal(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
 # Of a progress bar.
 _TITLE_WIDTH = 22
@@ -61,12 +62,6 @@ def main() -> None:
     except MemoryError as error:
         errors.print(f"[red]error:[/] not enough memory: {_escape(str(error))}".removesuffix(": "))
         sys.exit(2)
-
-
-def _escape(text: str) -> str:
-    from rich.markup import escape
-
-    return escape(text)
 
 
 def _print_version(wanted: bool) -> None:
@@ -108,7 +103,7 @@ def run(
     except SimulationStopped as stop:
         if stop.record is not None:
             save_run(stop.record, folder)
-            errors.print(f"what was simulated until then is in {folder}, marked incomplete")
+            errors.print(f"what was simulated until then is in {_escape(folder)}, marked incomplete")
         raise
     save_run(record, folder)
     if not no_figures:
@@ -117,7 +112,7 @@ def run(
         from dynsim.tables import print_summary
 
         print_summary(console, record.summary)
-        console.print(f"Written to {folder}", highlight=False, soft_wrap=True)
+        console.print(f"Written to {_escape(folder)}", highlight=False, soft_wrap=True)
 
 
 @app.command(epilog="Example: dynsim compare scenarios/elbow_comparison.yaml --jobs 2")
@@ -149,7 +144,8 @@ def compare(
     def stopped(name: str, stop: SimulationStopped) -> None:
         if stop.record is not None:
             save_run(stop.record, folder / name)
-            errors.print(f"what was simulated of {name} until then is in {folder / name}, marked incomplete")
+            where = _escape(folder / name)
+            errors.print(f"what was simulated of {_escape(name)} until then is in {where}, marked incomplete")
 
     failure: SimulationStopped | None = None
     try:
@@ -171,7 +167,7 @@ def compare(
             from dynsim.tables import print_comparison
 
             print_comparison(console, {name: record.summary for name, record in records.items()})
-            console.print(f"Written to {folder}", highlight=False, soft_wrap=True)
+            console.print(f"Written to {_escape(folder)}", highlight=False, soft_wrap=True)
     if failure is not None:
         raise failure
 
@@ -192,7 +188,7 @@ def check(
         try:
             variants: Sequence[str | None] = variant_names(name) or [None]
             for variant in variants:
-                with console.status(f"checking {_escape(name)} {variant or ''}"):
+                with console.status(f"checking {_escape(name)} {_escape(variant or '')}"):
                     check_scenario(load_scenario(name, variant, _overrides(overrides)))
         except SimulationInterrupted:
             raise
@@ -201,7 +197,7 @@ def check(
             errors.print(f"[red]error:[/] {_escape(str(error))}")
         else:
             count = f"{len(variants)} variants" if len(variants) > 1 else "1 variant"
-            console.print(f"{name}: ok ({count})", highlight=False, soft_wrap=True)
+            console.print(f"{_escape(name)}: ok ({count})", highlight=False, soft_wrap=True)
     if failed:
         raise typer.Exit(2)
 
@@ -274,8 +270,10 @@ def _overrides(given: list[str] | None) -> dict[str, Any]:
 
 
 def _label(path: Path, record: Record, taken: Container[str]) -> str:
-    """A name for a record among others: its variant, numbered where another has the same."""
-    name = record.summary.get("variant") or path.parent.name or path.stem
+    """A name for a record and its folder among others: its variant, numbered where another has the same."""
+    from dynsim.files import file_name
+
+    name = file_name(record.summary.get("variant") or path.parent.name or path.stem)
     return next(label for k in itertools.count(1) if (label := name if k == 1 else f"{name}_{k}") not in taken)
 
 
@@ -295,7 +293,7 @@ def _drawing(draw: Any, folder: Path, quiet: bool) -> None:
     if quiet:
         draw()
     else:
-        with console.status(f"drawing {folder}"):
+        with console.status(f"drawing {_escape(folder)}"):
             draw()
 
 

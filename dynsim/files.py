@@ -1,15 +1,43 @@
-"""Files that are complete or not there at all."""
+"""Files that are complete or not there at all, also several that belong together.
+
+A file is written beside its target under a name that no other process has, and renamed when it is complete. Devices,
+pipes and sockets are never replaced: they are written to, like any program does.
+"""
 
 from __future__ import annotations
 
+import io
 import json
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+import re
+import stat
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from dynsim.errors import RecordError
+
+try:
+    import fcntl
+except ImportError:  # not on Windows: then no two processes should write to one folder at the same time
+    fcntl = None  # type: ignore[assignment]
+
+INCOMPLETE = "INCOMPLETE"
+"""Name of the file that marks a folder while files that belong together are being exchanged in it."""
+_MARK = (
+    "Files of this folder are being exchanged, or a run died while it exchanged them: they may be of different runs."
+)
+_TEMPORARY = re.compile(r"\.dynsim-[0-9a-f]{16}\.tmp")
+_LEFT_BEHIND = 60.0
+"""A temporary file that nobody holds is a dead run's when it is older than this [s]; a living one's may be unlocked for
+a moment after it is made."""
+_LINKS = 40
+"""Links that lead to each other, as many as Linux follows."""
+_NAME_LENGTH = 120
+"""Of a file name made from a text [characters]; file systems end at 255 bytes."""
 
 
 def check_writable(folder: Path) -> None:
@@ -20,46 +48,109 @@ def check_writable(folder: Path) -> None:
     RecordError
         A file is in the way, or there is no permission.
     """
-    existing = folder.absolute()
-    while not existing.exists():
-        existing = existing.parent
+    try:
+        existing = folder.absolute()
+        while not existing.exists():
+            existing = existing.parent
+    except (OSError, ValueError) as error:
+        raise RecordError(f"cannot write to {folder}: {_reason(error)}") from error
     if not existing.is_dir():
         raise RecordError(f"cannot write to {folder}: {existing} is a file, not a folder")
     if not os.access(existing, os.W_OK | os.X_OK):
         raise RecordError(f"cannot write to {folder}: no permission to write in {existing}")
 
 
+def file_name(text: object) -> str:
+    """A name for a file or folder made of a text from anywhere: one that cannot lead to another folder."""
+    name = "".join(c if c.isprintable() and c not in '/\\:*?"<>|' else "_" for c in str(text))
+    return name.strip(". ")[:_NAME_LENGTH] or "unnamed"
+
+
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary name beside ``path`` to write to; renamed to ``path`` when the block ends well.
+def replacing(path: Path, *, durable: bool = False) -> Iterator[BinaryIO]:
+    """A stream whose content becomes the file ``path`` when the block ends well.
+
+    A link at ``path`` is kept and the file it names replaced. A new file gets the mode that the umask asks for, a
+    replaced one keeps its own. A device, pipe or socket gets the content written to it.
+
+    Parameters
+    ----------
+    durable : wait until the content is on the disk, so that a power cut, too, leaves the old file or the new one
 
     Raises
     ------
     RecordError
-        The file cannot be written (no space, no permission); an older file at ``path`` is left as it was.
+        ``path`` is a folder, or cannot be written (no space, no permission); an older file there is left as it was.
     """
-    temporary = path.with_name(path.name + ".tmp")
+    draft = _Draft(path)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield temporary
-        os.replace(temporary, path)
-    except OSError as error:
-        raise RecordError(f"cannot write {path}: {error.strerror or error}; nothing was changed there") from error
+        with draft.one_line_errors():
+            yield draft.open()
+            draft.complete(durable)
+            draft.publish()
     finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
+        draft.discard()
+
+
+def replace_together(folder: Path, contents: Mapping[str, bytes | memoryview]) -> None:
+    """Write files, by name, that belong together: all of them or none.
+
+    All are complete on disk before the first is renamed, and while they are renamed the folder holds a file
+    ``INCOMPLETE`` that names them: :func:`check_complete` refuses them if the process dies in between.
+
+    Raises
+    ------
+    RecordError
+        A file cannot be written; older ones are left as they were, unless the message says that they are marked.
+    """
+    with ExitStack() as cleaning:
+        drafts = []
+        for name, content in contents.items():
+            draft = _Draft(folder / name)
+            cleaning.callback(draft.discard)
+            with draft.one_line_errors():
+                draft.open().write(content)
+                draft.complete(durable=True)
+            drafts.append(draft)
+        with _marked(folder, contents) as published:
+            for draft in drafts:
+                with draft.one_line_errors():
+                    draft.publish()
+                published.append(draft.path)
+
+
+def check_complete(path: Path) -> None:
+    """Refuse a file that may be of another run than those beside it, see :func:`replace_together`.
+
+    Raises
+    ------
+    RecordError
+        The folder is marked, and the mark names the file.
+    """
+    mark = path.parent / INCOMPLETE
+    try:
+        if not mark.is_file():
+            return
+        names = _marked_names(mark.read_text(encoding="utf-8", errors="replace"))
+    except OSError:
+        names = None
+    if names is None or path.name in names:
+        raise RecordError(
+            f"{path}: may be of another run than the files beside it: {mark} says that a run died, or is at work, "
+            "while it exchanged them; run it again, or delete that mark to take the files as they are"
+        )
 
 
 def write_text(path: Path, text: str) -> Path:
-    """Write a text file under a temporary name, then rename.
+    """Write a text file, see :func:`replacing`.
 
     Raises
     ------
     RecordError
         The file cannot be written; an older one is left as it was.
     """
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    with replacing(path) as stream:
+        stream.write(text.encode("utf-8"))
     return path
 
 
@@ -71,3 +162,234 @@ def write_json(path: Path, data: Any) -> Path:
 def json_text(data: Any) -> str:
     """JSON as dynsim writes it."""
     return json.dumps(data, indent=2, ensure_ascii=False) + "\n"
+
+
+class _Draft:
+    """Content on its way to ``path``: in a temporary file beside it, or in memory when it goes to a device."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._target: Path | None = None
+        self._descriptor: int | None = None
+        self._temporary: Path | None = None
+        self._stream: BinaryIO | None = None
+
+    @contextmanager
+    def one_line_errors(self) -> Iterator[None]:
+        """OSError as RecordError."""
+        try:
+            yield
+        except (OSError, UnicodeEncodeError) as error:
+            kept = "" if self._target is None else "; nothing was changed there"
+            raise RecordError(f"cannot write {self.path}: {_reason(error)}{kept}") from error
+
+    def open(self) -> BinaryIO:
+        """Find out what is at the path, and make the temporary file."""
+        self._target = self.path
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            existing: os.stat_result | None = os.stat(self.path)
+        except FileNotFoundError:
+            existing = None
+        if existing is not None and stat.S_ISDIR(existing.st_mode):
+            raise IsADirectoryError(0, "is a folder, not a file")
+        self._target, self._descriptor = _final_target(self.path)
+        if existing is not None and not stat.S_ISREG(existing.st_mode):
+            self._target = None
+        if self._target is None:
+            self._stream = io.BytesIO()
+            return self._stream
+        if existing is not None and not os.access(self._target, os.W_OK):
+            raise PermissionError(0, "the file may not be written")
+        _remove_left_behind(self._target.parent)
+        # The name is nobody else's: made anew or not at all, and a link that lies there is not followed.
+        temporary = self._target.with_name(f".dynsim-{os.urandom(8).hex()}.tmp")
+        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+        descriptor = os.open(temporary, flags, 0o666)
+        self._temporary, self._stream = temporary, os.fdopen(descriptor, "w+b")
+        _lock(descriptor, wait=False)
+        if existing is not None and hasattr(os, "fchmod"):
+            with suppress(OSError):  # only root may give files away; then they are ours, as after any replacement
+                if (existing.st_uid, existing.st_gid) != (os.geteuid(), os.getegid()):
+                    os.fchown(descriptor, existing.st_uid, existing.st_gid)
+            os.fchmod(descriptor, stat.S_IMODE(existing.st_mode))
+        return self._stream
+
+    def complete(self, durable: bool) -> None:
+        """All content is there: hand it to the system, and let the disk have it."""
+        assert self._stream is not None
+        if self._temporary is not None:
+            self._stream.flush()
+            if durable:
+                os.fsync(self._stream.fileno())
+
+    def publish(self) -> None:
+        """Let the content be what the path holds."""
+        assert self._stream is not None
+        if self._target is None:
+            assert isinstance(self._stream, io.BytesIO)
+            with self._stream.getbuffer() as content:
+                _write_through(self.path, self._descriptor, content)
+        else:
+            assert self._temporary is not None
+            if not hasattr(os, "fchmod"):
+                self._stream.close()  # Windows renames no open file
+            os.replace(self._temporary, self._target)
+            self._temporary = None
+
+    def discard(self) -> None:
+        """Close, and remove the temporary file if it was not published."""
+        with suppress(OSError):
+            if self._stream is not None:
+                self._stream.close()
+        if self._temporary is not None:
+            with suppress(OSError):
+                self._temporary.unlink()
+
+
+def _reason(error: Exception) -> str:
+    return str(getattr(error, "strerror", None) or error)
+
+
+def _final_target(path: Path) -> tuple[Path | None, int | None]:
+    """The file that links at ``path`` lead to, there or not; None for an open file of a process (/dev/stdout).
+
+    If the process is this one, the descriptor of the open file comes with it.
+    """
+    for _ in range(_LINKS):
+        folder = os.path.realpath(path.parent)
+        if process := re.fullmatch(r"/proc/([0-9]+)(/task/[0-9]+)?/fd", folder):
+            return None, int(path.name) if int(process[1]) == os.getpid() else None
+        path = Path(folder, path.name)
+        if not path.is_symlink():
+            return path, None
+        path = Path(folder, os.readlink(path))
+    raise OSError(0, "too many links that lead to each other")
+
+
+def _write_through(path: Path, descriptor: int | None, content: memoryview) -> None:
+    if descriptor is not None:
+        # At its place: opened by name, it would begin at the beginning, and the next print too.
+        sys.stdout.flush()
+        with os.fdopen(os.dup(descriptor), "wb") as stream:
+            stream.write(content)
+        return
+    if stat.S_ISSOCK(os.stat(path).st_mode):
+        import socket
+
+        with socket.socket(socket.AF_UNIX) as connection:
+            connection.connect(os.fspath(path))
+            connection.sendall(content)
+        return
+    # Not created: what was there is written to, or nothing is.
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_TRUNC), "wb") as stream:
+        stream.write(content)
+
+
+def _lock(descriptor: int, *, wait: bool) -> bool:
+    """Hold a file until it is closed; False if somebody else does."""
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return wait
+    return True
+
+
+def _remove_left_behind(folder: Path) -> None:
+    """Remove temporary files of runs that died."""
+    if fcntl is None:
+        return
+    with suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            if not _TEMPORARY.fullmatch(entry.name):
+                continue
+            with suppress(OSError):
+                if time.time() - entry.stat(follow_symlinks=False).st_mtime < _LEFT_BEHIND:
+                    continue
+                descriptor = os.open(entry.path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+                try:
+                    if _lock(descriptor, wait=False):
+                        os.unlink(entry.path)
+                finally:
+                    os.close(descriptor)
+
+
+@contextmanager
+def _marked(folder: Path, names: Mapping[str, object]) -> Iterator[list[Path]]:
+    """Mark the folder as incomplete with respect to the files named; yields a list for those that are exchanged.
+
+    The mark goes when the block ends well, or before it has exchanged anything. One process at a time; others wait.
+    Mark and renames are not waited for: file systems with a journal keep their order, and an empty mark names all.
+    """
+    mark = folder / INCOMPLETE
+    published: list[Path] = []
+    try:
+        stream, before = _open_mark(mark)
+    except OSError as error:
+        raise RecordError(f"cannot write {mark}: {_reason(error)}; nothing was changed there") from error
+    with stream:
+        try:
+            _rewrite_mark(stream, before | set(names))
+            yield published
+        except BaseException as error:
+            if not published:
+                with suppress(OSError):
+                    _remove_mark(mark, stream, before)
+            if isinstance(error, OSError):
+                raise RecordError(f"cannot write {mark}: {_reason(error)}; nothing was changed there") from error
+            if published and isinstance(error, RecordError):
+                done = ", ".join(path.name for path in published)
+                raise RecordError(f"{error}; {done} came before, so {folder} is marked {INCOMPLETE}") from error
+            raise
+        try:
+            _remove_mark(mark, stream, before - set(names))
+        except OSError as error:
+            raise RecordError(f"{mark}: cannot be removed ({_reason(error)}); the files beside it are whole") from error
+
+
+def _remove_mark(mark: Path, stream: BinaryIO, left: set[str]) -> None:
+    """Remove the mark, unless there are files that others left when they died."""
+    if left:
+        _rewrite_mark(stream, left)
+        return
+    if fcntl is None:
+        stream.close()  # Windows removes no open file
+    mark.unlink()
+
+
+def _open_mark(mark: Path) -> tuple[BinaryIO, set[str]]:
+    """The mark, held by this process, and the names it had."""
+    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+    while True:
+        stream = os.fdopen(os.open(mark, flags | getattr(os, "O_NONBLOCK", 0), 0o666), "r+b", buffering=0)
+        try:
+            _lock(stream.fileno(), wait=True)
+            status = os.fstat(stream.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise OSError(0, "is in the way; it is no file")
+            with suppress(FileNotFoundError):
+                if os.path.samestat(status, os.lstat(mark)):
+                    text = stream.read().decode("utf-8", errors="replace")
+                    if text and not text.startswith(_MARK):
+                        raise OSError(0, "is in the way: no mark of dynsim; move it")
+                    return stream, _marked_names(text) or set()
+            # Another process has removed it meanwhile: it was done.
+            stream.close()
+        except BaseException:
+            stream.close()
+            raise
+
+
+def _rewrite_mark(stream: BinaryIO, names: set[str]) -> None:
+    stream.seek(0)
+    stream.truncate()
+    stream.write("\n".join([_MARK, *sorted(names), ""]).encode("utf-8"))
+
+
+def _marked_names(text: str) -> set[str] | None:
+    """Files that a mark names; None when it does not say, which means all."""
+    return set(text.splitlines()[1:]) or None

@@ -5,41 +5,37 @@ A record knows nothing of the engine that made it: simulated and measured runs l
 
 from __future__ import annotations
 
-import io
+import difflib
+import importlib
 import json
 import os
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, KeysView, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dynsim import record_file
 from dynsim.errors import RecordError
 from dynsim.files import replacing
+from dynsim.record_file import FORMAT, Signal
 
-FORMAT = "dynsim-record-1"
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+__all__ = ["FORMAT", "Record", "Signal", "UnknownSignal"]
+
+# Signals named in the repr.
+_SHOWN = 6
 
 
-@dataclass(frozen=True)
-class Signal:
-    """One quantity over time.
+class UnknownSignal(RecordError, KeyError):
+    """A record has no signal of that name; the message lists those that it has."""
 
-    Attributes
-    ----------
-    data : array, shape (T,) or (T, k) or (T, k, 3)
-    unit : str
-        SI unit as text, "1" for pure numbers.
-    labels : tuple of str
-        Names of the k columns, empty for a scalar signal.
-    description : str
-    """
-
-    data: NDArray[Any]
-    unit: str
-    labels: tuple[str, ...] = ()
-    description: str = ""
+    # Not that of KeyError, which shows its message as a quoted string.
+    __str__ = Exception.__str__
 
 
 class Record:
@@ -60,19 +56,39 @@ class Record:
     def add(
         self, name: str, data: ArrayLike, unit: str, *, labels: tuple[str, ...] = (), description: str = ""
     ) -> None:
-        """Add a signal; its first axis is time, its second (if any) is named by ``labels``."""
-        array = np.asarray(data)
-        if array.shape[:1] != self.time.shape:
-            raise RecordError(f"signal {name!r} has {array.shape[:1]} samples, the record has {self.time.shape}")
-        if array.ndim > 1 and len(labels) != array.shape[1]:
-            raise RecordError(f"signal {name!r} has {array.shape[1]} columns and {len(labels)} labels")
-        self.signals[name] = Signal(array, unit, tuple(labels), description)
+        """Add a signal; its first axis is time, its second (if any) is named by ``labels``.
+
+        Raises
+        ------
+        RecordError
+            No real numbers, another number of samples than the record has, or of labels than columns.
+        """
+        signal = Signal(np.asarray(data), unit, tuple(labels), description)
+        record_file.check_signal(name, signal, len(self.time))
+        self.signals[name] = signal
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         try:
             return self.signals[name].data
-        except KeyError:
-            raise KeyError(f"no signal {name!r}; this record has: {', '.join(self.signals)}") from None
+        except (KeyError, TypeError):
+            near = difflib.get_close_matches(str(name), self.signals, 1)
+            hint = f" (did you mean {near[0]!r}?)" if near else ""
+            have = ", ".join(self.signals) or "none"
+            raise UnknownSignal(f"no signal {name!r} in this record{hint}; it has: {have}") from None
+
+    def __repr__(self) -> str:
+        scenario = self.provenance.get("scenario")
+        names = [scenario.get("name"), scenario.get("variant")] if isinstance(scenario, Mapping) else []
+        title = " / ".join(str(name) for name in names if name)
+        span = f", {self.time[0]:g} to {self.time[-1]:g} s" if len(self) else ""
+        shown = ", ".join(list(self.signals)[:_SHOWN]) + (", …" if len(self.signals) > _SHOWN else "")
+        parts = [f"{len(self)} samples{span}", f"{len(self.signals)} signals{f' ({shown})' if shown else ''}"]
+        parts += [] if self.complete else ["incomplete"]
+        return f"<Record {f'{title}: ' if title else ''}{', '.join(parts)}>"
+
+    def keys(self) -> KeysView[str]:
+        """Names of the signals."""
+        return self.signals.keys()
 
     def __contains__(self, name: object) -> bool:
         return name in self.signals
@@ -94,72 +110,116 @@ class Record:
         return {name: signal.labels for name, signal in self.signals.items()}
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write HDF5 to ``path``: complete or not at all (temporary name, then rename).
+        """Write HDF5 to ``path``: complete or not at all (see :func:`dynsim.files.replacing`).
 
         Raises
         ------
         RecordError
-            The file cannot be written (no space, no permission); an older file at ``path`` is left as it was.
+            The file cannot be written (no space, no permission); an older file at ``path`` is left as it was. Or the
+            time axis runs backwards or is not finite.
         """
         path = Path(path)
-        with replacing(path) as temporary:
-            temporary.write_bytes(self.to_hdf5())
+        content = self.to_hdf5()
+        with replacing(path, durable=True) as stream:
+            stream.write(content)
         return path
 
     def to_hdf5(self) -> memoryview:
         """The bytes of the file that :meth:`save` writes."""
-        import h5py
-
-        # Made in memory: HDF5 crashes the process when the disk is full while it closes a file.
-        image = io.BytesIO()
-        with h5py.File(image, "w") as file:
-            file.attrs["format"] = FORMAT
-            file.attrs["complete"] = self.complete
-            # Long texts as data sets: HDF5 attributes end at 64 kB.
-            file["summary"] = json.dumps(self.summary)
-            file["provenance"] = json.dumps(self.provenance, default=str)
-            _write(file, "time", Signal(self.time, "s"))
-            for name, signal in self.signals.items():
-                _write(file, f"signals/{name}", signal)
-        return image.getbuffer()
+        return record_file.encode(
+            record_file.Content(self.time, self.signals, self.summary, self.provenance, self.complete)
+        )
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Record:
-        """Read a record written by :meth:`save`.
+        """Read a record written by :meth:`save`. What lies in the file is checked, not believed.
 
         Raises
         ------
         RecordError
-            No such file, or not a dynsim record.
+            No such file, damaged, or not a dynsim record; or it lies beside the file ``INCOMPLETE`` of a run that died
+            while it was saved. The message has the file and the reason.
         """
-        import h5py
-
-        path = Path(path)
-        if not path.is_file():
-            raise RecordError(f"{path}: no such record")
-        try:
-            with h5py.File(path, "r") as file:
-                if file.attrs.get("format") != FORMAT:
-                    raise RecordError(f"{path}: an HDF5 file, but not a dynsim record ({FORMAT})")
-                record = cls(file["time"][()], provenance=json.loads(file["provenance"].asstr()[()]))
-                record.summary = json.loads(file["summary"].asstr()[()])
-                record.complete = bool(file.attrs["complete"])
-                for name, data in file["signals"].items() if "signals" in file else ():
-                    attributes = data.attrs
-                    record.signals[name] = Signal(
-                        data[()], attributes["unit"], tuple(attributes["labels"]), attributes["description"]
-                    )
-        except OSError as error:
-            raise RecordError(f"{path}: not a readable HDF5 file ({error})") from error
-        except (KeyError, ValueError) as error:
-            raise RecordError(f"{path}: a dynsim record that lacks parts ({error})") from error
+        content = record_file.read(Path(path))
+        record = cls(content.time, provenance=content.provenance)
+        record.signals.update(content.signals)
+        record.summary.update(content.summary)
+        record.complete = content.complete
         return record
 
+    def to_dataframe(self) -> pandas.DataFrame:
+        """A pandas DataFrame: time [s] is the index, every column of every signal a column.
 
-def _write(file: Any, name: str, signal: Signal) -> None:
-    # gzip only where it pays: it costs time on every run, and short records are small anyway.
-    options = {"compression": "gzip", "compression_opts": 1} if signal.data.nbytes > 1 << 22 else {}
-    data = file.create_dataset(name, data=signal.data, **options)
-    data.attrs["unit"] = signal.unit
-    data.attrs["labels"] = list(signal.labels)
-    data.attrs["description"] = signal.description
+        Columns are called ``signal``, ``signal.label`` or, of vectors, ``signal.label.x``; their units are in
+        ``attrs["units"]``.
+
+        Raises
+        ------
+        RecordError
+            pandas is not installed.
+        """
+        pandas = _optional("pandas")
+        columns, names, units = [], [], {}
+        for name, signal in self.signals.items():
+            for column in np.ndindex(signal.data.shape[1:]):
+                parts = [name]
+                if column:
+                    parts.append(signal.labels[column[0]])
+                    parts += [_axes(signal.data.shape[2])[k] for k in column[1:]]
+                names.append(".".join(parts))
+                columns.append(signal.data[:, *column])
+                units[names[-1]] = signal.unit
+        frame = (
+            pandas.concat([pandas.Series(column) for column in columns], axis=1, keys=names)
+            if columns
+            else pandas.DataFrame(index=range(len(self)))
+        )
+        frame.index = pandas.Index(self.time, name="time [s]")
+        frame.attrs["units"] = units
+        return frame
+
+    def to_xarray(self) -> xarray.Dataset:
+        """An xarray Dataset: signals over ``time``, with ``units`` and ``long_name`` as attributes.
+
+        Signals with the same labels share a dimension, which is called after the first of them (``q_label``); the third
+        axis of vectors is ``axis`` (x, y, z). Summary and provenance are attributes, as JSON.
+
+        Raises
+        ------
+        RecordError
+            xarray is not installed.
+        """
+        xarray = _optional("xarray")
+        dimensions: dict[tuple[str, ...], str] = {}
+        coordinates: dict[str, Any] = {"time": ("time", self.time, {"units": "s"})}
+        variables = {}
+        for name, signal in self.signals.items():
+            axes = ["time"]
+            if signal.data.ndim > 1:
+                label = dimensions.setdefault(signal.labels, f"{name}_label")
+                coordinates[label] = list(signal.labels)
+                axes.append(label)
+            if signal.data.ndim > 2:
+                count = signal.data.shape[2]
+                axis = "axis" if count == 3 else f"axis_{count}"
+                coordinates[axis] = list(_axes(count))
+                axes.append(axis)
+            variables[name] = (axes, signal.data, {"units": signal.unit, "long_name": signal.description})
+        attributes = {
+            "complete": int(self.complete),
+            "summary": json.dumps(self.summary),
+            "provenance": json.dumps(self.provenance, default=str),
+        }
+        return xarray.Dataset(variables, coordinates, attributes)
+
+
+def _axes(count: int) -> Sequence[str]:
+    """Names of the components of a vector."""
+    return "xyz" if count == 3 else [str(k) for k in range(count)]
+
+
+def _optional(package: str) -> Any:
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise RecordError(f"{package} is not installed: pip install 'dynsim[tables]'") from error

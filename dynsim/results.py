@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dynsim.files import json_text, replacing, write_text
+from dynsim.files import json_text, replace_together
 from dynsim.record import Record
 from dynsim.scenario import to_yaml
 
@@ -12,14 +12,16 @@ from dynsim.scenario import to_yaml
 def save_run(record: Record, folder: Path) -> None:
     """Write ``record.h5``, ``summary.json`` and the resolved ``scenario.yaml`` to a folder: all three or none.
 
+    A process that dies while it exchanges them leaves a file ``INCOMPLETE`` there, which :meth:`Record.load` heeds.
+
     Raises
     ------
     RecordError
         A file cannot be written; older ones are left as they were.
     """
-    # Renamed only when all are written, so that no file of this run lies beside those of another.
-    with replacing(folder / "record.h5") as file:
-        file.write_bytes(record.to_hdf5())
-        with replacing(folder / "summary.json") as file:
-            file.write_text(json_text(record.summary), encoding="utf-8")
-            write_text(folder / "scenario.yaml", to_yaml(record.provenance["scenario"]))
+    contents: dict[str, bytes | memoryview] = {
+        "record.h5": record.to_hdf5(),
+        "summary.json": json_text(record.summary).encode("utf-8"),
+        "scenario.yaml": to_yaml(record.provenance["scenario"]).encode("utf-8"),
+    }
+    replace_together(folder, contents)

@@ -22,6 +22,7 @@ from pydantic import BaseModel, Field, ValidationError, field_validator
 from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.families import PACKAGES, member, members, union
+from dynsim.files import check_complete
 from dynsim.model.description import Contact, Quadric, Robot
 from dynsim.model.model import Model
 
@@ -232,9 +233,12 @@ def find_scenario(name: str | Path) -> Path:
     ------
     ScenarioError
         Neither exists, with near names in the message; or a folder.
+    RecordError
+        The scenario of a run that died while it was saved.
     """
     path = Path(name)
     if path.is_file():
+        check_complete(path)
         return path
     if path.is_dir():
         raise ScenarioError(f"{name}: is a folder; a scenario is a YAML file")

@@ -8,8 +8,9 @@ from typing import Any
 
 from rich import box
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+
+from dynsim.terminal import escaped_line
 
 Summary = Mapping[str, Any]
 
@@ -61,16 +62,16 @@ _ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = 
 def print_summary(console: Console, summary: Summary) -> None:
     """One run: its numbers, contacts and warnings."""
     title = f"{summary['scenario']} {summary['variant']}".strip()
-    table = Table(title=title, box=box.SIMPLE_HEAD, show_header=False, title_justify="left")
+    table = Table(title=escaped_line(title), box=box.SIMPLE_HEAD, show_header=False, title_justify="left")
     table.add_column()
     table.add_column(justify="right")
     for heading, take, show in _ROWS:
         value = take(summary)
         if value is not None:
-            table.add_row(escape(heading), show(value))
+            table.add_row(escaped_line(heading), show(value))
     for contact in summary.get("contacts", ()):
         for heading, show_contact in _CONTACT_ROWS:
-            table.add_row(escape(_of(contact["name"], heading)), show_contact(contact))
+            table.add_row(escaped_line(_of(contact["name"], heading)), show_contact(contact))
     console.print(table)
     _print_warnings(console, {"": summary})
 
@@ -86,15 +87,17 @@ def print_comparison(console: Console, summaries: Mapping[str, Summary]) -> None
 
 
 def _print_columns(console: Console, summaries: Mapping[str, Summary], names: Sequence[str]) -> None:
-    table = Table(title=next(iter(summaries.values()))["scenario"], box=box.SIMPLE_HEAD, title_justify="left")
+    table = Table(
+        title=escaped_line(next(iter(summaries.values()))["scenario"]), box=box.SIMPLE_HEAD, title_justify="left"
+    )
     table.add_column("", no_wrap=True)
     for name in names:
-        table.add_column(name, justify="right", no_wrap=True)
+        table.add_column(escaped_line(name), justify="right", no_wrap=True)
     shown = [summaries[name] for name in names]
     for heading, take, show in _ROWS:
         if any(take(summary) is not None for summary in summaries.values()):
             values = [take(summary) for summary in shown]
-            table.add_row(escape(heading), *("–" if value is None else show(value) for value in values))
+            table.add_row(escaped_line(heading), *("–" if value is None else show(value) for value in values))
     energies = [summary.get("electrical_energy_J") or 0.0 for summary in summaries.values()]
     if min(energies) > 0.0:
         ratios = (summary["electrical_energy_J"] / min(energies) for summary in shown)
@@ -104,7 +107,7 @@ def _print_columns(console: Console, summaries: Mapping[str, Summary], names: Se
         by_variant = [next((c for c in s["contacts"] if c["name"] == contact), None) for s in shown]
         for heading, show_contact in _CONTACT_ROWS:
             cells = (show_contact(c) if c else "–" for c in by_variant)
-            table.add_row(escape(_of(contact, heading)), *cells)
+            table.add_row(escaped_line(_of(contact, heading)), *cells)
     console.print(table)
 
 
@@ -120,12 +123,12 @@ def print_choices(console: Console) -> None:
     for path in shipped_scenarios():
         description = load_scenario(path).config.description
         sentence = re.split(r"(?<!et al)\.\s", description, maxsplit=1)[0].strip().removesuffix(".")
-        table.add_row(path.stem, ", ".join(variant_names(path)), escape(sentence))
+        table.add_row(escaped_line(path.stem), escaped_line(", ".join(variant_names(path))), escaped_line(sentence))
     console.print(table)
     for family, names in choices().items():
         table = Table(title=f"{family}s", box=box.SIMPLE_HEAD, show_header=False, title_justify="left")
         for name in names:
-            table.add_row(name, escape((member(family, name).__doc__ or "").strip().splitlines()[0]))
+            table.add_row(name, escaped_line((member(family, name).__doc__ or "").strip().splitlines()[0]))
         console.print(table)
 
 
@@ -150,4 +153,4 @@ def _print_warnings(console: Console, summaries: Mapping[str, Summary]) -> None:
     for name, summary in summaries.items():
         for warning in summary.get("warnings", ()):
             prefix = f"{name}: " if name else ""
-            console.print(f"[yellow]warning:[/] {escape(prefix + warning)}", highlight=False)
+            console.print(f"[yellow]warning:[/] {escaped_line(prefix + warning)}", highlight=False)

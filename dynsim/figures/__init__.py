@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
@@ -25,11 +26,13 @@ def draw(record: Record, folder: Path) -> list[Path]:
     Raises
     ------
     RecordError
-        Nobody draws records of this engine, or a file cannot be written.
+        Nobody draws records of this engine, it lacks something, or a file cannot be written.
     """
     if not len(record):
         return []
-    return list(_module(record).draw(record, Path(folder)))
+    module = _module(record)
+    with _drawable():
+        return list(module.draw(record, Path(folder)))
 
 
 def draw_comparison(records: Mapping[str, Record], folder: Path) -> list[Path]:
@@ -46,11 +49,22 @@ def draw_comparison(records: Mapping[str, Record], folder: Path) -> list[Path]:
         return []
     if len(modules) > 1:
         raise RecordError("records of different engines cannot be drawn over each other")
-    return list(modules.pop().draw_comparison(drawn, Path(folder)))
+    with _drawable():
+        return list(modules.pop().draw_comparison(drawn, Path(folder)))
+
+
+@contextmanager
+def _drawable() -> Iterator[None]:
+    """A record may come from anywhere: what it lacks is its fault, and said in a line."""
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        text = " ".join(str(error).split())
+        raise RecordError(f"the record cannot be drawn: {type(error).__name__}: {text}") from error
 
 
 def _module(record: Record) -> ModuleType:
     engine = record.provenance.get("engine")
-    if engine not in MODULES:
+    if not isinstance(engine, str) or engine not in MODULES:
         raise RecordError(f"no figures for records of engine {engine!r}; known: {', '.join(MODULES)}")
     return importlib.import_module(MODULES[engine])

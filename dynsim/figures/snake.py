@@ -49,7 +49,6 @@ SHADES = LinearSegmentedColormap.from_list("shades", ["#CFCFCF", "#000000"])
 def draw(record: Record, folder: Path) -> list[Path]:
     """Write all figures of one run and the animation into ``folder``; returns the files."""
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     written = []
     with plt.rc_context(STYLE):
         makers: dict[str, Callable[[Record], Figure]] = {
@@ -68,7 +67,6 @@ def draw(record: Record, folder: Path) -> list[Path]:
 def draw_comparison(records: Mapping[str, Record], folder: Path) -> list[Path]:
     """Variants over each other, and figures and tables beside [T] where its experiments were run; returns the files."""
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     makers: dict[str, Callable[[Mapping[str, Record]], Figure]] = {
         "comparison": comparison,
         "postures": strips,
@@ -85,8 +83,8 @@ def draw_comparison(records: Mapping[str, Record], folder: Path) -> list[Path]:
 
 
 def _save(figure: Figure, path: Path) -> Path:
-    with replacing(path) as temporary:
-        figure.savefig(temporary, format="png")
+    with replacing(path) as stream:
+        figure.savefig(stream, format="png")
     plt.close(figure)
     return path
 
@@ -258,7 +256,7 @@ def animate(record: Record, path: Path, frames: int | None = None) -> Path:
             images.append(image.convert("RGB").quantize(32, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE))
             for artist in drawn[:-1]:
                 artist.remove()
-        with replacing(path) as temporary:
-            images[0].save(temporary, format="GIF", save_all=True, append_images=images[1:], duration=100, loop=0)
+        with replacing(path) as stream:
+            images[0].save(stream, format="GIF", save_all=True, append_images=images[1:], duration=100, loop=0)
         plt.close(figure)
     return path

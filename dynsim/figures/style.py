@@ -13,11 +13,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
 from dynsim.files import replacing
 from dynsim.record import Record
+from dynsim.terminal import plain
 
 Array = NDArray[np.float64]
 # A quantity over time, (T,) and (T,) or (T, k).
@@ -79,16 +81,19 @@ def new_figure(height: float, title: str, width: float = WIDTH) -> Figure:
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a PNG under a temporary name, then rename.
+    """Write a PNG, see :func:`dynsim.files.replacing`.
 
     Raises
     ------
     RecordError
         The file cannot be written; an older one is left as it was.
     """
-    with replacing(path) as temporary:
+    # Names from files: no font has a picture for a control character.
+    for text in figure.findobj(Text):
+        text.set_text(plain(text.get_text()))
+    with replacing(path) as stream:
         # Light compression: half the time for a third more bytes.
-        figure.savefig(temporary, format="png", dpi=DPI, pil_kwargs={"compress_level": 3})
+        figure.savefig(stream, format="png", dpi=DPI, pil_kwargs={"compress_level": 3})
     return path
 
 

@@ -28,8 +28,8 @@ from dynsim.figures.snake_view import (
     posture_strip,
     relax,
 )
+from dynsim.files import write_text
 from dynsim.record import Record
-from dynsim.results import write_text
 from dynsim.studies.tanaka2019 import (
     COORDINATES,
     HEAD_ERROR,

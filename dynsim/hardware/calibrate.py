@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from ruamel.yaml import YAML
 
+from dynsim.errors import RecordError
+from dynsim.files import write_text
 from dynsim.hardware.bus import Bus
 from dynsim.hardware.control_table import MX_106, STATE_BLOCK
 from dynsim.hardware.errors import ServoMapError, VerificationFailed
@@ -62,10 +66,11 @@ def write_zero_ticks(servo_map: ServoMap, ticks: dict[str, int], path: Path) -> 
     data = yaml.load(servo_map.path.read_text(encoding="utf-8"))
     for joint, tick in ticks.items():
         data["servos"][joint]["zero_tick"] = tick
-    draft = path.with_name(path.name + ".tmp")
-    try:
-        with draft.open("w", encoding="utf-8") as file:
-            yaml.dump(data, file)
+    text = io.StringIO()
+    yaml.dump(data, text)
+    with TemporaryDirectory() as folder:
+        draft = Path(folder, servo_map.path.name)
+        draft.write_text(text.getvalue(), encoding="utf-8")
         for servo in load_servo_map(draft).servos:
             ends = (
                 sorted(servo.to_ticks(angle) for angle in servo.position_limits) if servo.in_position_mode else [0, 0]
@@ -75,8 +80,7 @@ def write_zero_ticks(servo_map: ServoMap, ticks: dict[str, int], path: Path) -> 
                     f"{servo.joint}: with zero at tick {servo.zero_tick} its limits reach ticks {ends[0]} to "
                     f"{ends[1]}, position mode ends at 0 and 4095; turn the horn or narrow the limits"
                 )
-        draft.replace(path)
-    except OSError as error:
-        raise ServoMapError(f"{path}: cannot be written ({error.strerror})") from error
-    finally:
-        draft.unlink(missing_ok=True)
+    try:
+        write_text(path, text.getvalue())
+    except RecordError as error:
+        raise ServoMapError(str(error)) from error

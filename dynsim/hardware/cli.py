@@ -9,18 +9,18 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
 from dynsim.errors import DynsimError
-from dynsim.files import write_json
+from dynsim.files import file_name, write_json
+from dynsim.terminal import Terminal, plain
 
 hw = typer.Typer(
     no_args_is_help=True,
     help="Replay a record on Dynamixel servos (or virtual ones). A software stop is no safety device: fit a power cut.",
 )
 # Paths must survive copy and paste: long lines are left to the terminal. Without markup: "[rad]" is a unit, no style.
-console = Console(soft_wrap=True, highlight=False, markup=False, emoji=False)
+console = Terminal(soft_wrap=True, highlight=False, markup=False, emoji=False)
 
 
 class Policy(StrEnum):
@@ -182,7 +182,7 @@ def replay(
         simulated, servo_map, motion = _checked(record, map_file, rate, speed)
         script = load_fault_script(faults) if faults else None
         robot = _plant(plant, variant, servo_map, motion) if plant else None
-        folder = out or Path("results") / f"{servo_map.robot}_replay"
+        folder = out or Path("results") / file_name(f"{servo_map.robot}_replay")
         for warning in motion.warnings:
             console.print(f"warning: {warning}")
         moves = live or port == session.VIRTUAL
@@ -335,7 +335,7 @@ def virtual(
         stop = StopRequest()
         # A plain line: other programs wait for it.
         print(
-            f"{len(servo_map.servos)} virtual servos at {servo_map.bus.baud} bit/s on {link or terminal.device}",
+            f"{len(servo_map.servos)} virtual servos at {servo_map.bus.baud} bit/s on {plain(link or terminal.device)}",
             flush=True,
         )
         try:

@@ -131,7 +131,7 @@ def compare_records(simulated: Record, measured: Record) -> Comparison:
         return np.column_stack([np.interp(times, own_time, column) for column in reference.T])
 
     moving = np.ptp(reference, axis=0) > MOVING
-    speed = float(measured.provenance.get("speed", 1.0))
+    speed = _speed(measured)
     common = _delay(at, time, actual, moving)
     delay = 0.0 if np.isnan(common) else common
     joints = []
@@ -152,6 +152,14 @@ def compare_records(simulated: Record, measured: Record) -> Comparison:
             )
         )
     return Comparison(delay / speed, tuple(joints), time, at(time), actual)
+
+
+def _speed(measured: Record) -> float:
+    """Of a replay, in parts of the record's own; 1 for any other run."""
+    speed = measured.provenance.get("speed", 1.0)
+    if not isinstance(speed, (int, float)) or not 0.0 < speed < np.inf:
+        raise RecordError(f"the measured record gives {speed!r} as speed, which must be a positive number")
+    return float(speed)
 
 
 def _common_angles(simulated: Record, measured: Record) -> list[tuple[str, Array, Array]]:
@@ -253,6 +261,6 @@ def draw_comparison(comparison: Comparison, path: Path) -> Path:
     errors.set_xlabel("record time [s]")
     for axes in (angles, errors):
         axes.grid(alpha=0.3)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=140)
+    with replacing(path) as stream:
+        figure.savefig(stream, format="png", dpi=140)
     return path

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
+import re
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,7 @@ Format = Literal["csv", "joint-trajectory", "urdf-log"]
 SUFFIX: dict[str, str] = {"csv": ".csv", "joint-trajectory": ".trajectory.yaml", "urdf-log": ".jsonl"}
 RATES = {"q": "v", "phi": "phi_dot", "rho": "rho_dot"}
 """Angle signals of the records, and the signals that hold their rates."""
+_YAML_WORDS = {"y", "n", "yes", "no", "on", "off", "true", "false", "null"}
 
 
 def export_record(record: Record, path: Path, format_: Format, *, rate: float | None = None) -> Path:
@@ -48,8 +51,11 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
         knots = [_within(path_between, instant) for instant in time]
         position, velocity = np.array([q for q, _ in knots]), np.array([v for _, v in knots])
     writer = {"csv": _write_csv, "joint-trajectory": _write_joint_trajectory, "urdf-log": _write_urdf_log}[format_]
-    with replacing(path) as temporary:
-        writer(temporary, joints, time, position, velocity)
+    with replacing(path) as stream:
+        text = io.TextIOWrapper(stream, encoding="utf-8", newline="")
+        writer(text, joints, time, position, velocity)
+        text.flush()
+        text.detach()  # closed with it, the stream could not be published
     return path
 
 
@@ -68,6 +74,8 @@ def joint_motion(
     for name, rate in RATES.items():
         if name in record and rate in record:
             joints += record.labels[name]
+            if record[name].ndim != 2 or record[rate].shape != record[name].shape:
+                raise RecordError(f"{name} and {rate} of the record must have one column for each joint")
             angles.append(record[name])
             rates.append(record[rate])
     if not joints:
@@ -88,23 +96,26 @@ def _within(path: JointPath, time: float) -> tuple[NDArray[np.float64], NDArray[
 
 
 def _write_csv(
-    path: Path, joints: list[str], time: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64]
+    file: TextIO, joints: list[str], time: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64]
 ) -> None:
-    with path.open("w", encoding="utf-8", newline="") as file:
-        rows = csv.writer(file)
-        rows.writerow(["time [s]", *(f"{joint} [rad]" for joint in joints), *(f"{joint} [rad/s]" for joint in joints)])
-        rows.writerows([f"{value:.9g}" for value in (t, *qs, *vs)] for t, qs, vs in zip(time, q, v, strict=True))
+    rows = csv.writer(file)
+    rows.writerow(["time [s]", *(f"{joint} [rad]" for joint in joints), *(f"{joint} [rad/s]" for joint in joints)])
+    rows.writerows([f"{value:.9g}" for value in (t, *qs, *vs)] for t, qs, vs in zip(time, q, v, strict=True))
 
 
 def _write_joint_trajectory(
-    path: Path, joints: list[str], time: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64]
+    file: TextIO, joints: list[str], time: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64]
 ) -> None:
-    with path.open("w", encoding="utf-8") as file:
-        file.write(f"joint_names: [{', '.join(joints)}]\npoints:\n")
-        for t, qs, vs in zip(time, q, v, strict=True):
-            seconds, nanoseconds = divmod(round(t * 1e9), 1_000_000_000)
-            file.write(f"- positions: {_flow(qs)}\n  velocities: {_flow(vs)}\n")
-            file.write(f"  time_from_start: {{sec: {seconds}, nanosec: {nanoseconds}}}\n")
+    file.write(f"joint_names: [{', '.join(map(_yaml_text, joints))}]\npoints:\n")
+    for t, qs, vs in zip(time, q, v, strict=True):
+        seconds, nanoseconds = divmod(round(t * 1e9), 1_000_000_000)
+        file.write(f"- positions: {_flow(qs)}\n  velocities: {_flow(vs)}\n")
+        file.write(f"  time_from_start: {{sec: {seconds}, nanosec: {nanoseconds}}}\n")
+
+
+def _yaml_text(joint: str) -> str:
+    """A name as it is, if YAML takes it for one; else in quotes, which YAML reads like JSON."""
+    return joint if re.fullmatch(r"[A-Za-z_][\w.-]*", joint) and joint.lower() not in _YAML_WORDS else json.dumps(joint)
 
 
 def _flow(values: NDArray[np.float64]) -> str:
@@ -113,13 +124,12 @@ def _flow(values: NDArray[np.float64]) -> str:
 
 
 def _write_urdf_log(
-    path: Path, joints: list[str], time: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64]
+    file: TextIO, joints: list[str], time: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64]
 ) -> None:
-    with path.open("w", encoding="utf-8") as file:
-        for t, qs, vs in zip(time, q, v, strict=True):
-            line = {
-                "time": round(float(t), 9),
-                "position": dict(zip(joints, (round(float(x), 9) for x in qs), strict=True)),
-                "velocity": dict(zip(joints, (round(float(x), 9) for x in vs), strict=True)),
-            }
-            file.write(json.dumps(line) + "\n")
+    for t, qs, vs in zip(time, q, v, strict=True):
+        line = {
+            "time": round(float(t), 9),
+            "position": dict(zip(joints, (round(float(x), 9) for x in qs), strict=True)),
+            "velocity": dict(zip(joints, (round(float(x), 9) for x in vs), strict=True)),
+        }
+        file.write(json.dumps(line) + "\n")

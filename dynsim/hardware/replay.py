@@ -17,6 +17,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dynsim.errors import RecordError
 from dynsim.hardware.bus import Bus, NoAnswer, RequestRefused
 from dynsim.hardware.check import CheckedMotion, velocity_limit
 from dynsim.hardware.clock import Clock
@@ -617,7 +618,7 @@ class Replay:
             return
         try:
             dump_registers(self.bus, self.map, self._dump_folder / "registers_after_fault.json")
-        except PortError as error:
+        except (PortError, RecordError) as error:
             self._say(f"no register dump: {error}")
 
     def _released_by_user(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -12,24 +13,37 @@ import numpy as np
 from dynsim.hardware.rules import Cycle
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import Record
+from dynsim.terminal import plain
 
 
 class RunLog:
-    """Lines "time [s]  state  text", each on disk as soon as it is written."""
+    """Lines "time [s]  state  text", each on disk as soon as it is written.
+
+    A disk that fails does not keep a robot from being stopped: from then on the lines are only in ``lines``.
+    """
 
     def __init__(self, path: Path | None) -> None:
-        self._file: TextIO | None = path.open("w", encoding="utf-8", buffering=1) if path else None
+        # Written in place: it is there to be followed.
+        self._file: TextIO | None = (
+            path.open("w", encoding="utf-8", errors="backslashreplace", buffering=1) if path else None
+        )
         self.lines: list[str] = []
 
     def write(self, time: float, state: str, text: str) -> None:
-        line = f"{time:10.4f}  {state:<13}  {text}"
+        line = plain(f"{time:10.4f}  {state:<13}  {text}")
         self.lines.append(line)
         if self._file:
-            self._file.write(line + "\n")
+            try:
+                self._file.write(line + "\n")
+            except OSError as error:
+                self.close()
+                self.lines.append(f"the log could not be written on: {error.strerror}")
 
     def close(self) -> None:
         if self._file:
-            self._file.close()
+            with suppress(OSError):
+                self._file.close()
+            self._file = None
 
     def __enter__(self) -> RunLog:
         return self

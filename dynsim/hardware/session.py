@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dynsim.files import write_json
+from dynsim.files import json_text, replace_together
 from dynsim.hardware.bus import NoAnswer, RequestRefused
 from dynsim.hardware.check import CheckedMotion
 from dynsim.hardware.clock import Clock, VirtualClock, WallClock
@@ -131,8 +131,8 @@ def run_replay(
         )
         result = replay.run()
     try:
-        result.record.save(folder / "measured.h5")
-        write_json(folder / "summary.json", result.record.summary)
+        summary = json_text(result.record.summary).encode("utf-8")
+        replace_together(folder, {"measured.h5": result.record.to_hdf5(), "summary.json": summary})
     finally:
         # What happened to the robot matters more than a full disk.
         raise_for(result, folder)

@@ -142,6 +142,10 @@ def column_of(record: Record, signal: str, servo: Servo, unit: str) -> NDArray[n
         raise CheckRefused(f"{servo.joint} follows column {servo.label!r} of {signal!r}; it has {', '.join(labels)}")
     if record.units[signal] != unit:
         raise CheckRefused(f"signal {signal!r} is in {record.units[signal]!r}; {servo.joint} needs {unit!r}")
+    if record[signal].ndim != 2:
+        raise CheckRefused(
+            f"signal {signal!r} must have one column for each joint, not the shape {record[signal].shape}"
+        )
     data = np.asarray(record[signal][:, labels.index(servo.label)], dtype=np.float64)
     if not np.all(np.isfinite(data)):
         bad = int(np.flatnonzero(~np.isfinite(data))[0])

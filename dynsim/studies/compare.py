@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 from dynsim.engine import SIMULATION, simulate
 from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped
-from dynsim.files import write_json, write_text
+from dynsim.files import json_text, replace_together
 from dynsim.record import Record
 from dynsim.scenario import Scenario, load_scenario, variant_names
 
@@ -185,7 +185,6 @@ def _simulate(scenario: Scenario) -> Record:
 def save_comparison(records: Mapping[str, Record], folder: Path) -> None:
     """Write ``comparison.json`` and ``comparison.csv``."""
     summaries = {name: record.summary for name, record in records.items()}
-    write_json(folder / "comparison.json", {"variants": summaries})
     columns = ["variant"] + [key for key, value in next(iter(summaries.values())).items() if _is_scalar(value)]
     columns = list(dict.fromkeys(columns))
     contacts = list(dict.fromkeys(c["name"] for s in summaries.values() for c in s.get("contacts", ())))
@@ -201,7 +200,10 @@ def save_comparison(records: Mapping[str, Record], folder: Path) -> None:
         row = [name if key == "variant" else summary.get(key, "") for key in columns]
         row += [by_name.get(contact, {}).get(key, "") for contact in contacts for key in contact_keys]
         writer.writerow(row)
-    write_text(folder / "comparison.csv", stream.getvalue())
+    table = json_text({"variants": summaries})
+    replace_together(
+        folder, {"comparison.json": table.encode("utf-8"), "comparison.csv": stream.getvalue().encode("utf-8")}
+    )
 
 
 def _is_scalar(value: Any) -> bool:

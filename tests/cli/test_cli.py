@@ -127,6 +127,56 @@ def test_plot_keeps_apart_records_of_the_same_variant(tmp_path: Path):
     assert (tmp_path / "figures" / "compare_hand_path.png").is_file()
 
 
+def test_plot_writes_nothing_outside_of_its_folder_and_shows_names_as_they_are(tmp_path: Path):
+    evil = "\x1b[31m[red]x[/]"
+    for name, variant in (("a", "../../../outside"), ("b", str(tmp_path / "outside")), ("c", ".."), ("d", evil)):
+        record = Record([0.0, 1.0], provenance={"engine": "dynamics", "scenario": {"name": evil, "variant": variant}})
+        record.add("hand_position", [[0.0, 0.0, 1.0]] * 2, "m", labels=("x", "y", "z"))
+        record.summary = {"variant": variant}
+        record.save(tmp_path / "in" / name / "record.h5")
+    records = [str(path) for path in sorted((tmp_path / "in").glob("*/record.h5"))]
+    before = set(tmp_path.rglob("*"))
+    result = dynsim("plot", *records, "--out", "deep/down/figures", folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    written = {path for path in set(tmp_path.rglob("*")) - before if path.is_file()}
+    assert written
+    assert all(path.is_relative_to(tmp_path / "deep" / "down" / "figures") for path in written)
+    assert "\x1b" not in result.stdout + result.stderr
+
+
+@pytest.mark.parametrize("what", ["posture", "q"])
+def test_a_record_that_lacks_what_a_figure_needs_is_one_line(tmp_path: Path, what: str):
+    # [link] and [red] would be taken for markup.
+    record = Record([0.0, 1.0], provenance={"engine": "kinematic", "scenario": {"name": "[red]x\x1b[0m"}})
+    record.add(what, [0.0, 0.0], "m")
+    record.save(tmp_path / "[red]\x1b[0m" / "record.h5")
+    result = dynsim("plot", "[red]\x1b[0m/record.h5", folder=tmp_path)
+    assert result.returncode == 2
+    assert len(result.stderr.splitlines()) == 1
+    assert result.stderr.startswith("error: ")
+    assert "\x1b" not in result.stdout + result.stderr
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes with names are POSIX")
+@pytest.mark.parametrize("format_", ["csv", "joint-trajectory", "urdf-log"])
+def test_export_writes_to_a_pipe_and_leaves_it_there(tmp_path: Path, format_: str):
+    record = Record([0.0, 1.0])
+    for name, unit in (("q", "rad"), ("v", "rad/s")):
+        record.add(name, [[0.0, 0.5]] * 2, unit, labels=("joint_1", "yes"))
+    record.save(tmp_path / "record.h5")
+    os.mkfifo(tmp_path / "pipe")
+    reader = subprocess.Popen(["cat", "pipe"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    try:
+        result = dynsim("export", "record.h5", "--format", format_, "--out", "pipe", folder=tmp_path)
+        assert result.returncode == 0, result.stderr
+        assert "joint_1" in reader.communicate(timeout=60)[0]
+    finally:
+        reader.kill()
+        reader.wait()
+    assert (tmp_path / "pipe").is_fifo()
+    assert {path.name for path in tmp_path.iterdir()} == {"record.h5", "pipe"}
+
+
 def test_divergence_stops_with_code_3_and_keeps_what_there_is(tmp_path: Path):
     # RK4 is unstable beyond 1.4 ms for this arm.
     result = dynsim(

@@ -1,0 +1,495 @@
+"""Records as HDF5 files: written with checksums, read as if they came from an enemy.
+
+A file is HDF5 and, after its end, one line with the SHA-256 of all bytes before it. HDF5 ignores the line; with it,
+damage is found before the HDF5 library, which may crash or never return on a damaged file, has seen it. A file without
+that line (dynsim 0.1, or changed by another program) is read in a process of its own. The attribute ``sha256`` is a
+checksum of the content: of times, signals and texts, however they are stored.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import itertools
+import json
+import math
+import os
+import re
+import signal
+import sys
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.errors import RecordError
+from dynsim.files import check_complete
+
+FORMAT = "dynsim-record-1"
+SIZE_LIMIT = 2 << 30
+"""A file may unpack to this many bytes, or to ``RATIO_LIMIT`` times its own size if that is more."""
+RATIO_LIMIT = 100
+READING_TIME = 10.0
+"""Of the process that reads a file without a checksum, and as much again for every 50 MB [s of processor time]."""
+_PATIENCE = 6.0
+"""Wall time that it gets, in times of its processor time: the machine may be busy."""
+_LABELS_IN_ATTRIBUTE = 1000
+"""More labels are a data set: HDF5 attributes end at 64 kB, which is 4090 labels."""
+_CHECKSUM = "sha256"
+_LAST_LINE = re.compile(rb"\ndynsim-sha256:([0-9a-f]{64})\n")
+_LAST_LINE_SIZE = 80
+_CHUNK_LIMIT = 64 << 20
+_NUMBERS = "biuf"
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One quantity over time.
+
+    Attributes
+    ----------
+    data : array, shape (T,) or (T, k) or (T, k, 3)
+    unit : str
+        SI unit as text, "1" for pure numbers.
+    labels : tuple of str
+        Names of the k columns, empty for a scalar signal.
+    description : str
+    """
+
+    data: NDArray[Any]
+    unit: str
+    labels: tuple[str, ...] = ()
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class Content:
+    """All that a file holds."""
+
+    time: NDArray[np.float64]
+    signals: Mapping[str, Signal] = field(default_factory=dict)
+    summary: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    complete: bool = True
+
+
+def check_time(time: NDArray[Any]) -> None:
+    """Refuse a time axis that is none.
+
+    Raises
+    ------
+    RecordError
+        Not one-dimensional, not finite, or running backwards.
+    """
+    if time.ndim != 1:
+        raise RecordError(f"time has the shape {time.shape}; it must have one axis")
+    if not np.isfinite(time).all():
+        raise RecordError(f"time is not finite at sample {int(np.flatnonzero(~np.isfinite(time))[0])}")
+    if (backwards := np.flatnonzero(np.diff(time) < 0.0)).size:
+        raise RecordError(f"time runs backwards after sample {int(backwards[0])}")
+
+
+def check_signal(name: str, signal: Signal, samples: int) -> None:
+    """Refuse a signal that no record can hold.
+
+    Raises
+    ------
+    RecordError
+        Its name, type, shape or labels.
+    """
+    data = signal.data
+    if name in ("", ".") or "/" in name or "\0" in name:
+        raise RecordError(f"signal {name!r}: a name must not be empty, a dot, or hold a slash")
+    if data.dtype.kind not in _NUMBERS or data.dtype.itemsize > 8:
+        raise RecordError(f"signal {name!r} holds {data.dtype}, not real numbers")
+    if not 1 <= data.ndim <= 3:
+        raise RecordError(f"signal {name!r} has {data.ndim} axes; one to three can be kept")
+    if data.shape[0] != samples:
+        raise RecordError(f"signal {name!r} has {data.shape[0]} samples, the record has {samples}")
+    if data.ndim > 1 and len(signal.labels) != data.shape[1]:
+        raise RecordError(f"signal {name!r} has {data.shape[1]} columns and {len(signal.labels)} labels")
+
+
+def encode(content: Content) -> memoryview:
+    """The bytes of a file.
+
+    Raises
+    ------
+    RecordError
+        The time axis, or a text that HDF5 cannot keep.
+    """
+    import h5py
+
+    check_time(content.time)
+    summary, provenance = json.dumps(content.summary), json.dumps(content.provenance, default=str)
+    # Made in memory: HDF5 crashes the process when the disk is full while it closes a file.
+    image = io.BytesIO()
+    with h5py.File(image, "w") as file:
+        file.attrs["format"] = FORMAT
+        file.attrs["complete"] = content.complete
+        file.attrs[_CHECKSUM] = _checksum(content, summary, provenance)
+        # Long texts as data sets: HDF5 attributes end at 64 kB.
+        file["summary"] = summary
+        file["provenance"] = provenance
+        _write(file, "time", Signal(content.time, "s"))
+        for name, one in content.signals.items():
+            try:
+                _write(file, f"signals/{name}", one)
+                if len(one.labels) > _LABELS_IN_ATTRIBUTE:
+                    file.create_dataset(f"labels/{name}", data=list(one.labels), dtype=h5py.string_dtype())
+            except ValueError as error:
+                raise RecordError(f"signal {name!r} cannot be saved: {error}") from error
+    image.seek(0, os.SEEK_END)
+    image.write(b"\ndynsim-sha256:%s\n" % hashlib.sha256(image.getbuffer()).hexdigest().encode("ascii"))
+    return image.getbuffer()
+
+
+def _write(file: Any, name: str, one: Signal) -> None:
+    # gzip only where it pays: it costs time on every run, and short records are small anyway.
+    options = {"compression": "gzip", "compression_opts": 1} if one.data.nbytes > 1 << 22 else {}
+    data = file.create_dataset(name, data=one.data, **options)
+    data.attrs["unit"] = one.unit
+    if len(one.labels) <= _LABELS_IN_ATTRIBUTE:
+        data.attrs["labels"] = list(one.labels)
+    data.attrs["description"] = one.description
+
+
+def _checksum(content: Content, summary: str, provenance: str) -> str:
+    """SHA-256 of everything that counts, in hexadecimal digits."""
+    total = hashlib.sha256(json.dumps([bool(content.complete), summary, provenance]).encode("ascii"))
+    for name, one in [("", Signal(content.time, "s")), *sorted(content.signals.items())]:
+        data = np.ascontiguousarray(one.data)
+        header = [name, data.dtype.str, data.shape, one.unit, one.labels, one.description]
+        total.update(json.dumps(header).encode("ascii"))
+        total.update(data.data if data.size else b"")
+    return total.hexdigest()
+
+
+def read(path: Path) -> Content:
+    """Read a file.
+
+    Raises
+    ------
+    RecordError
+        No such file; damaged, or no record; or it may be of another run than the files beside it.
+    """
+    try:
+        if not path.exists():
+            raise RecordError(f"{path}: no such record")
+        if not path.is_file():
+            raise RecordError(f"{path}: not a file; a record is an HDF5 file")
+        check_complete(path)
+        with path.open("rb") as stream:
+            verified = _verified(path, stream)
+    except (OSError, ValueError) as error:
+        raise RecordError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
+    if verified or not sys.executable or getattr(sys, "frozen", False):
+        return decode(path, path)
+    return decode(path, io.BytesIO(_read_apart(path)))
+
+
+def _verified(path: Path, stream: BinaryIO) -> bool:
+    """Whether the bytes are those that were written; False if there is no checksum.
+
+    Raises
+    ------
+    RecordError
+        They are not, or it is no HDF5 file.
+    """
+    size = stream.seek(0, os.SEEK_END)
+    stream.seek(max(size - _LAST_LINE_SIZE, 0))
+    found = _LAST_LINE.fullmatch(stream.read())
+    stream.seek(0)
+    if not stream.read(8).startswith(b"\x89HDF\r\n\x1a\n"):
+        raise RecordError(f"{path}: not a readable HDF5 file (it does not begin like one)")
+    if found is None:
+        return False
+    stream.seek(0)
+    actual, left = hashlib.sha256(), size - _LAST_LINE_SIZE
+    while left and (block := stream.read(min(left, 1 << 20))):
+        actual.update(block)
+        left -= len(block)
+    if actual.hexdigest().encode("ascii") != found[1]:
+        raise RecordError(f"{path}: damaged: its bytes do not agree with its checksum (SHA-256)")
+    return True
+
+
+def _read_apart(path: Path) -> bytes:
+    """Read a file of unknown state in another process, which may die of it; gives it back written anew."""
+    import subprocess
+
+    size = path.stat().st_size
+    seconds = READING_TIME * (1.0 + size / 50e6)
+    code = "from dynsim.record_file import _hand_over; _hand_over()"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "HDF5_PLUGIN_PRELOAD": "::"}
+    try:
+        result = subprocess.run(
+            [sys.executable, "-c", code, os.path.abspath(path), repr(seconds), repr(4 * _allowed(size) + (4 << 30))],
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=_PATIENCE * seconds,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise RecordError(f"{path}: damaged: reading it does not end") from error
+    if result.returncode < 0:
+        number = -result.returncode
+        what = "does not end" if number == signal.SIGXCPU else f"ends with {signal.Signals(number).name}"
+        raise RecordError(f"{path}: damaged: reading it {what}")
+    if result.returncode == _REFUSED:
+        raise RecordError(f"{path}: {result.stdout.decode('utf-8', errors='replace')}")
+    if result.returncode != 0:
+        last = result.stderr.decode("utf-8", errors="replace").strip().splitlines()[-1:]
+        raise RecordError(f"{path}: cannot be read ({''.join(last) or f'exit code {result.returncode}'})")
+    return result.stdout
+
+
+_REFUSED = 11
+"""Exit code of the process that reads apart: what is wrong is on its output."""
+
+
+def _hand_over() -> None:
+    """In the other process: the file, written anew, or the reason why not, to the output."""
+    path, seconds, memory = Path(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3])
+    try:
+        import resource
+    except ImportError:  # not on Windows, where wall time must do
+        pass
+    else:
+        for kind, limit in ((resource.RLIMIT_CPU, math.ceil(seconds)), (resource.RLIMIT_AS, memory)):
+            _, hard = resource.getrlimit(kind)
+            resource.setrlimit(kind, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
+    try:
+        sys.stdout.buffer.write(encode(decode(path, path)))
+    except RecordError as error:
+        sys.stdout.buffer.write(str(error).removeprefix(f"{path}: ").encode("utf-8", errors="replace"))
+        sys.stdout.flush()
+        sys.exit(_REFUSED)
+    sys.stdout.flush()
+
+
+def decode(path: Path, source: Path | BinaryIO) -> Content:
+    """What an HDF5 file holds, checked part by part; nothing is believed.
+
+    Parameters
+    ----------
+    path : its name, for messages
+    source : the file, or its bytes
+
+    Raises
+    ------
+    RecordError
+        With file and reason.
+    """
+    import h5py
+
+    try:
+        size = source.stat().st_size if isinstance(source, Path) else source.seek(0, os.SEEK_END)
+        with h5py.File(source, "r") as file:
+            return _Reader(file, size).content()
+    except RecordError as error:
+        raise RecordError(f"{path}: {error}") from error
+    except MemoryError as error:
+        raise RecordError(f"{path}: too large for the memory") from error
+    # Damaged files make h5py raise almost anything.
+    except Exception as error:
+        text = str(error).strip("'\"").splitlines() or [type(error).__name__]
+        raise RecordError(f"{path}: not a readable HDF5 file ({text[0]})") from error
+
+
+def _allowed(size: int) -> int:
+    """How many bytes a file of this size may unpack to."""
+    return max(SIZE_LIMIT, RATIO_LIMIT * size)
+
+
+class _Reader:
+    """Reads an open file; its errors do not name it."""
+
+    def __init__(self, file: Any, size: int) -> None:
+        self._file = file
+        self._size = size
+        self._left = _allowed(size)
+
+    def content(self) -> Content:
+        import h5py
+
+        file = self._file
+        found = self._attribute(file, "format")
+        if not isinstance(found, str) or found != FORMAT:
+            raise RecordError(f"an HDF5 file, but not a dynsim record ({FORMAT})")
+        complete = self._attribute(file, "complete")
+        if complete is None:
+            raise RecordError("a dynsim record that lacks parts: no attribute complete")
+        if not isinstance(complete, (bool, np.bool_)):
+            raise RecordError("attribute complete is neither true nor false")
+        time = self._numbers(self._child(file, "time", "time", h5py.Dataset), "time")
+        check_time(time)
+        texts = [self._text(name) for name in ("summary", "provenance")]
+        summary, provenance = self._mapping("summary", texts[0]), self._mapping("provenance", texts[1])
+        signals = {}
+        if "signals" in file:
+            group = self._child(file, "signals", "group signals", h5py.Group)
+            for name in group:
+                what = f"signal {name!r}"
+                data = self._child(group, name, what, h5py.Dataset)
+                one = Signal(
+                    self._numbers(data, what),
+                    self._string(data, "unit", what),
+                    self._labels(data, name, what),
+                    self._string(data, "description", what),
+                )
+                check_signal(name, one, len(time))
+                signals[name] = one
+        content = Content(time, signals, summary, provenance, bool(complete))
+        wanted = self._attribute(file, _CHECKSUM)
+        if wanted is not None and not (isinstance(wanted, str) and wanted == _checksum(content, *texts)):
+            raise RecordError(
+                "damaged: its content does not agree with its checksum; if you have changed it yourself, delete the "
+                f"attribute {_CHECKSUM}"
+            )
+        native = {
+            name: Signal(_native(one.data), one.unit, one.labels, one.description) for name, one in signals.items()
+        }
+        return Content(_native(time).astype(np.float64, copy=False), native, summary, provenance, bool(complete))
+
+    def _child(self, parent: Any, name: str, what: str, kind: type) -> Any:
+        """A group or data set that lies in the file itself."""
+        import h5py
+
+        link = parent.get(name, getlink=True)
+        if link is None:
+            raise RecordError(f"a dynsim record that lacks parts: no {what}")
+        if not isinstance(link, h5py.HardLink):
+            raise RecordError(f"{what} is a link to somewhere else; links are not followed")
+        found = parent[name]
+        if not isinstance(found, kind):
+            raise RecordError(f"{what} is no {'group' if kind is h5py.Group else 'data set'}")
+        return found
+
+    def _numbers(self, data: Any, what: str) -> NDArray[Any]:
+        """An array of real numbers."""
+        dtype = data.dtype
+        if dtype.kind not in _NUMBERS or dtype.itemsize > 8:
+            raise RecordError(f"{what} holds {dtype}, not real numbers")
+        self._check_storage(data, what)
+        if data.chunks is None:
+            return np.asarray(data[()])
+        return _unpacked(data, what)
+
+    def _check_storage(self, data: Any, what: str) -> None:
+        """Refuse what lies outside of the file, and sizes that are not there or beyond the limit."""
+        import h5py
+
+        properties = data.id.get_create_plist()
+        if properties.get_external_count() or data.is_virtual:
+            raise RecordError(f"{what} lies in other files, which are not opened")
+        if data.shape is None:
+            raise RecordError(f"{what} is empty")
+        filters = [properties.get_filter(k)[0] for k in range(properties.get_nfilters())]
+        if filters not in ([], [h5py.h5z.FILTER_DEFLATE]):
+            raise RecordError(
+                f"{what} is packed in a way (HDF5 filters {filters}) that dynsim does not read; gzip it does"
+            )
+        size, stored = math.prod(data.shape) * data.dtype.itemsize, data.id.get_storage_size()
+        if stored > self._size or (size > stored and not filters):
+            raise RecordError(f"{what} claims {size} bytes, but the file ({self._size} bytes) holds {stored} of them")
+        self._left -= size
+        if self._left < 0:
+            raise RecordError(
+                f"{what} would unpack to {size} bytes; a file of {self._size} bytes may unpack to "
+                f"{_allowed(self._size)} in all"
+            )
+
+    def _text(self, name: str) -> str:
+        """A long text, kept as a data set."""
+        import h5py
+
+        data = self._child(self._file, name, name, h5py.Dataset)
+        if h5py.check_string_dtype(data.dtype) is None or data.shape != ():
+            raise RecordError(f"{name} is not a text")
+        self._check_storage(data, name)
+        return str(data.asstr()[()])
+
+    def _mapping(self, name: str, text: str) -> dict[str, Any]:
+        try:
+            found = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise RecordError(f"{name} is not JSON ({error})") from error
+        if not isinstance(found, dict):
+            raise RecordError(f"{name} is {type(found).__name__}, not a mapping")
+        return found
+
+    def _attribute(self, owner: Any, name: str) -> Any:
+        """An attribute of a size that fits the file, None if there is none."""
+        if name not in owner.attrs:
+            return None
+        identifier = owner.attrs.get_id(name)
+        if math.prod(identifier.shape or ()) * identifier.dtype.itemsize > self._size:
+            raise RecordError(f"attribute {name} claims more bytes than the file has")
+        return owner.attrs[name]
+
+    def _string(self, owner: Any, name: str, what: str) -> str:
+        value = self._attribute(owner, name)
+        if isinstance(value, bytes):
+            value = value.decode("utf-8")
+        if not isinstance(value, str):
+            raise RecordError(f"{what} has no text as {name}")
+        return value
+
+    def _labels(self, data: Any, name: str, what: str) -> tuple[str, ...]:
+        import h5py
+
+        if "labels" in data.attrs:
+            found = np.asarray(self._attribute(data, "labels"))
+        elif "labels" in self._file:
+            kept = self._child(self._file, "labels", "group labels", h5py.Group)
+            labels = self._child(kept, name, f"labels of {what}", h5py.Dataset)
+            if h5py.check_string_dtype(labels.dtype) is None:
+                raise RecordError(f"{what} has labels that are no texts")
+            self._check_storage(labels, f"labels of {what}")
+            found = np.asarray(labels[()])
+        else:
+            raise RecordError(f"a dynsim record that lacks parts: no labels of {what}")
+        if found.ndim != 1:
+            raise RecordError(f"{what} has labels that are no list")
+        texts = tuple(label.decode("utf-8") if isinstance(label, bytes) else label for label in found.tolist())
+        if not all(isinstance(text, str) for text in texts):
+            raise RecordError(f"{what} has labels that are no texts")
+        return texts
+
+
+def _unpacked(data: Any, what: str) -> NDArray[Any]:
+    """A data set in chunks. Not by the HDF5 library: it unpacks what there is, however much comes out."""
+    chunk, shape, dtype = data.chunks, data.shape, data.dtype
+    size = math.prod(chunk) * dtype.itemsize
+    if size > _CHUNK_LIMIT:
+        raise RecordError(f"{what} is in chunks of {size} bytes; {_CHUNK_LIMIT} are the most")
+    counts = [-(-length // step) for length, step in zip(shape, chunk, strict=True)]
+    if data.id.get_num_chunks() != math.prod(counts):
+        raise RecordError(f"{what} lacks {math.prod(counts) - data.id.get_num_chunks()} of {math.prod(counts)} chunks")
+    array = np.empty(shape, dtype)
+    packed = data.compression is not None
+    for place in itertools.product(*(range(0, n * step, step) for n, step in zip(counts, chunk, strict=True))):
+        skipped, raw = data.id.read_direct_chunk(place)
+        if packed and not skipped:
+            unpacker = zlib.decompressobj()
+            try:
+                raw = unpacker.decompress(raw, size + 1)
+            except zlib.error as error:
+                raise RecordError(f"{what} cannot be unpacked ({error})") from error
+        if len(raw) != size:
+            raise RecordError(f"{what} has a chunk of the wrong size")
+        part = array[tuple(slice(first, first + step) for first, step in zip(place, chunk, strict=True))]
+        part[...] = np.frombuffer(raw, dtype).reshape(chunk)[tuple(slice(length) for length in part.shape)]
+    return array
+
+
+def _native(array: NDArray[Any]) -> NDArray[Any]:
+    """In the byte order of this machine."""
+    return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))

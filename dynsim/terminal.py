@@ -1,0 +1,49 @@
+"""What comes from files, made fit for a terminal.
+
+A name in a scenario, a record or a servo map may hold anything: escape sequences that move the cursor, colour or
+rename the window, and the markup of rich. Both are shown as they are written, and do nothing.
+"""
+
+from __future__ import annotations
+
+import unicodedata
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.text import Text
+
+# Control characters, invisible and direction-changing ones, halves of surrogate pairs, line and paragraph separators.
+_UNFIT = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+
+
+def plain(text: object) -> str:
+    r"""A text with every character that a terminal might obey written out: ESC as ``\x1b``. Lines stay lines."""
+    written = str(text)
+    if written.isprintable():
+        return written
+    return "".join(
+        c if c == "\n" or unicodedata.category(c) not in _UNFIT else c.encode("unicode_escape").decode("ascii")
+        for c in written
+    )
+
+
+def escaped(text: object) -> str:
+    """A text for a place where rich reads markup: as :func:`plain`, and ``[red]`` stays ``[red]``."""
+    return escape(plain(text))
+
+
+def escaped_line(text: object) -> str:
+    r"""As :func:`escaped`, of a name or a sentence: a line break stays in the line, as ``\n``."""
+    return escape(plain(text).replace("\n", "\\n"))
+
+
+class Terminal(Console):
+    """A console on which no text, whoever printed it, can do more than be read.
+
+    Markup is read where the console is made to: :func:`escaped` is for what is put between.
+    """
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Cells, titles and prints all come by here."""
+        return super().render_str(plain(text), **options)

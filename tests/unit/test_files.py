@@ -1,0 +1,301 @@
+"""Writing files: devices stay devices, links stay links, and what belongs together comes together or not at all."""
+
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from dynsim import files
+from dynsim.errors import RecordError
+from dynsim.files import INCOMPLETE, check_complete, check_writable, file_name, replace_together, replacing, write_text
+
+posix = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="POSIX")
+PAIR = {"a.txt": b"new a", "b.txt": b"new b"}
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@posix
+def test_a_pipe_is_written_to_and_stays_a_pipe(tmp_path: Path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    found: list[bytes] = []
+    reader = threading.Thread(target=lambda: found.append(pipe.read_bytes()), daemon=True)
+    reader.start()
+    write_text(pipe, "through\n")
+    reader.join(20.0)
+    assert found == [b"through\n"]
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+    assert list(tmp_path.iterdir()) == [pipe]
+
+
+@posix
+def test_a_socket_is_written_to_and_stays_a_socket(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)  # names of sockets are short
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind("socket")
+        listening.listen(1)
+        write_text(Path("socket"), "through\n")
+        connection, _ = listening.accept()
+        with connection:
+            assert connection.recv(100) == b"through\n"
+    assert stat.S_ISSOCK(os.stat("socket").st_mode)
+
+
+@posix
+def test_a_device_is_written_to_and_stays_a_device(tmp_path: Path):
+    device = tmp_path / "null"
+    try:
+        os.mknod(device, 0o666 | stat.S_IFCHR, os.makedev(1, 3))
+        device.write_bytes(b"")
+    except OSError:
+        pytest.skip("making devices is not allowed here")
+    write_text(device, "gone")
+    assert stat.S_ISCHR(device.stat().st_mode)
+    assert list(tmp_path.iterdir()) == [device]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+def test_a_full_device_is_reported(tmp_path: Path):
+    link = tmp_path / "full"
+    link.symlink_to("/dev/full")
+    with pytest.raises(RecordError, match=r"cannot write .*full: No space left on device$"):
+        write_text(link, "x")
+    assert link.is_symlink()
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="no /proc here")
+@pytest.mark.parametrize("name", ["/dev/stdout", "link"])
+def test_standard_output_goes_where_it_goes_also_if_that_is_a_file(tmp_path: Path, name: str):
+    (tmp_path / "link").symlink_to("/dev/stdout")
+    code = (
+        "from pathlib import Path; from dynsim.files import write_text\n"
+        f"print('before'); write_text(Path({name!r}), 'through '); print('after')"
+    )
+    with (tmp_path / "output").open("wb") as output:
+        subprocess.run([sys.executable, "-c", code], cwd=tmp_path, stdout=output, check=True, timeout=60)
+    assert (tmp_path / "output").read_bytes() == b"before\nthrough after\n"
+    assert (tmp_path / "link").is_symlink()
+
+
+def test_a_folder_as_file_is_one_line(tmp_path: Path):
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(RecordError, match=f"cannot write {tmp_path / 'folder'}: is a folder"):
+        write_text(tmp_path / "folder", "x")
+    assert list(tmp_path.iterdir()) == [tmp_path / "folder"]
+
+
+def test_a_link_is_kept_and_the_file_it_names_replaced(tmp_path: Path):
+    (tmp_path / "there").mkdir()
+    target = tmp_path / "there" / "file"
+    target.write_text("old")
+    (tmp_path / "one").symlink_to("there/file")
+    (tmp_path / "two").symlink_to("one")
+    (tmp_path / "dangling").symlink_to("there/new")
+    for name in ("two", "dangling"):
+        write_text(tmp_path / name, name)
+        assert (tmp_path / name).is_symlink()
+    assert contents(tmp_path / "there") == {"file": b"two", "new": b"dangling"}
+    (tmp_path / "ring").symlink_to("ring")
+    with pytest.raises(RecordError, match="cannot write"):
+        write_text(tmp_path / "ring", "x")
+
+
+def test_no_link_in_the_way_is_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    # Even one that has guessed the temporary name.
+    monkeypatch.setattr(files.os, "urandom", bytes)
+    (tmp_path / "victim").write_text("precious")
+    for link in (".dynsim-0000000000000000.tmp", "file.tmp"):
+        (tmp_path / link).symlink_to("victim")
+    with pytest.raises(RecordError, match="cannot write"):
+        write_text(tmp_path / "file", "x")
+    assert (tmp_path / "victim").read_text() == "precious"
+    assert not (tmp_path / "file").exists()
+
+
+@posix
+def test_modes_follow_the_umask_and_those_of_existing_files_are_kept(tmp_path: Path):
+    before = os.umask(0o027)
+    try:
+        write_text(tmp_path / "new", "x")
+        (tmp_path / "old").write_text("x")
+        (tmp_path / "old").chmod(0o604)
+        write_text(tmp_path / "old", "y")
+        replace_together(tmp_path, PAIR)
+    finally:
+        os.umask(before)
+    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in tmp_path.iterdir()}
+    assert modes == {"new": 0o640, "old": 0o604, "a.txt": 0o640, "b.txt": 0o640}
+
+
+def test_writers_of_the_same_file_do_not_share_a_temporary_name(tmp_path: Path):
+    with replacing(tmp_path / "file") as one, replacing(tmp_path / "file") as other:
+        one.write(b"one")
+        other.write(b"other")
+        assert len(list(tmp_path.iterdir())) == 2
+    assert contents(tmp_path) == {"file": b"one"}
+
+
+@posix
+def test_what_dead_runs_left_is_removed_and_what_living_ones_write_is_not(tmp_path: Path):
+    code = (
+        "import os, signal, sys; from pathlib import Path; from dynsim.files import replacing\n"
+        "with replacing(Path('file')): os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=False, timeout=60)
+    (left,) = tmp_path.iterdir()
+    (tmp_path / "own.tmp").touch()
+    with replacing(tmp_path / "file") as stream:
+        (living,) = {*tmp_path.iterdir()} - {left, tmp_path / "own.tmp"}
+        assert stream.writable()
+        for path in tmp_path.iterdir():
+            os.utime(path, (0, 0))
+        write_text(tmp_path / "other", "x")
+        assert living.exists()
+    assert not left.exists()
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "other", "own.tmp"}
+
+
+def test_several_files_come_all_or_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    old = {"a.txt": b"old a", "b.txt": b"old b"}
+    replace_together(tmp_path, old)
+    assert contents(tmp_path) == old
+    calls = []
+
+    def full(descriptor: int) -> None:
+        calls.append(descriptor)
+        if len(calls) == 2:
+            raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(files.os, "fsync", full)
+        with pytest.raises(RecordError, match=r"b.txt: No space left on device; nothing was changed there"):
+            replace_together(tmp_path, PAIR)
+    assert contents(tmp_path) == old
+    replace_together(tmp_path, PAIR)
+    assert contents(tmp_path) == PAIR
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from dynsim import files
+
+renames, replace = [], os.replace
+def dying(source, target):
+    if len(renames) == int(sys.argv[1]):
+        os.kill(os.getpid(), signal.SIGKILL)
+    renames.append(target)
+    replace(source, target)
+os.replace = dying
+files.replace_together(Path("."), {"a.txt": b"new a", "b.txt": b"new b"})
+"""
+
+
+@posix
+@pytest.mark.parametrize("renamed", [0, 1])
+def test_a_run_killed_while_it_exchanges_files_leaves_a_mark_that_readers_heed(tmp_path: Path, renamed: int):
+    replace_together(tmp_path, {"a.txt": b"old a", "b.txt": b"old b", "c.txt": b"c"})
+    died = subprocess.run([sys.executable, "-c", KILLED, str(renamed)], cwd=tmp_path, check=False, timeout=60)
+    assert died.returncode == -signal.SIGKILL
+    for name in PAIR:
+        with pytest.raises(RecordError, match=f"{name}: may be of another run than .*{INCOMPLETE}"):
+            check_complete(tmp_path / name)
+    check_complete(tmp_path / "c.txt")
+    # Of the two only one came again: the other is still in doubt.
+    replace_together(tmp_path, {"a.txt": b"newer a"})
+    check_complete(tmp_path / "a.txt")
+    with pytest.raises(RecordError, match=INCOMPLETE):
+        check_complete(tmp_path / "b.txt")
+    replace_together(tmp_path, PAIR)
+    check_complete(tmp_path / "b.txt")
+    assert not (tmp_path / INCOMPLETE).exists()
+
+
+def test_a_rename_that_fails_is_marked_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    replace_together(tmp_path, {"a.txt": b"old a", "b.txt": b"old b"})
+    replace = os.replace
+
+    def refuse(name: str):
+        def rename(source: Path, target: Path) -> None:
+            if target.name == name:
+                raise PermissionError(1, "Operation not permitted")
+            replace(source, target)
+
+        return rename
+
+    with monkeypatch.context() as patched:
+        patched.setattr(files.os, "replace", refuse("a.txt"))
+        with pytest.raises(RecordError, match=r"a.txt: Operation not permitted; nothing was changed there$"):
+            replace_together(tmp_path, PAIR)
+    check_complete(tmp_path / "a.txt")
+    with monkeypatch.context() as patched:
+        patched.setattr(files.os, "replace", refuse("b.txt"))
+        with pytest.raises(RecordError, match=r"b.txt: .*; a.txt came before, so .* is marked INCOMPLETE"):
+            replace_together(tmp_path, PAIR)
+    with pytest.raises(RecordError, match=INCOMPLETE):
+        check_complete(tmp_path / "a.txt")
+
+
+@posix
+def test_two_runs_that_save_to_one_folder_do_not_mix(tmp_path: Path):
+    code = (
+        "import sys; from pathlib import Path; from dynsim.files import replace_together\n"
+        "for _ in range(40): replace_together(Path('.'), dict.fromkeys('abc', sys.argv[1].encode()))"
+    )
+    children = [subprocess.Popen([sys.executable, "-c", code, who], cwd=tmp_path) for who in ("one", "two")]
+    try:
+        assert [child.wait(120) for child in children] == [0, 0]
+    finally:
+        for child in children:
+            child.kill()
+            child.wait()
+    found = contents(tmp_path)
+    assert set(found) == {"a", "b", "c"}
+    assert len(set(found.values())) == 1
+
+
+def test_what_is_called_like_the_mark_but_is_none_stays(tmp_path: Path):
+    (tmp_path / INCOMPLETE).write_text("a list of what I have still to do")
+    with pytest.raises(RecordError, match="is in the way"):
+        replace_together(tmp_path, PAIR)
+    assert contents(tmp_path) == {INCOMPLETE: b"a list of what I have still to do"}
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("two_elbows", "two_elbows"),
+        ("../../x", "_.._x"),
+        ("/etc/passwd", "_etc_passwd"),
+        ("..", "unnamed"),
+        ("", "unnamed"),
+        ("a\0b\x1b[0m\n", "a_b_[0m_"),
+        ("x" * 300, "x" * 120),
+        (["no", "text"], "['no', 'text']"),
+    ],
+)
+def test_no_text_makes_a_name_that_leads_elsewhere(text: object, name: str):
+    assert file_name(text) == name
+
+
+def test_a_folder_that_cannot_be_written_is_found_without_making_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    check_writable(tmp_path / "new" / "deep")
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RecordError, match="is a file, not a folder"):
+        check_writable(tmp_path / "file" / "deep")
+    with pytest.raises(RecordError, match="cannot write to"):
+        check_writable(tmp_path / ("x" * 300) / "deep")
+    # Root may write everywhere, so the answer is given here.
+    monkeypatch.setattr("os.access", lambda *_: False)
+    with pytest.raises(RecordError, match=f"no permission to write in {tmp_path}"):
+        check_writable(tmp_path / "new")

@@ -1,0 +1,406 @@
+"""Files of records from an enemy: every one is read as it was written, or refused in one line. None crashes the reader.
+
+The HDF5 library itself crashes, or never returns, on one of sixty damaged files: so these tests read in children.
+"""
+
+import io
+import itertools
+import json
+import os
+import random
+import subprocess
+import sys
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from dynsim import record_file
+from dynsim.errors import RecordError
+from dynsim.record import Record
+
+
+def sample() -> Record:
+    record = Record(np.linspace(0.0, 1.0, 5), provenance={"scenario": {"name": "x"}, "engine": "dynamics"})
+    record.add("q", np.arange(10.0).reshape(5, 2), "rad", labels=("a", "b"), description="angles")
+    record.add("force", np.arange(30.0).reshape(5, 2, 3), "N", labels=("c", "d"))
+    record.add("closed", [True, False, True, True, False], "1")
+    record.summary = {"energy": 1.5}
+    return record
+
+
+def of_version_0_1(record: Record) -> bytes:
+    """As it was written before there were checksums."""
+    image = io.BytesIO()
+    with h5py.File(image, "w") as file:
+        file.attrs["format"] = "dynsim-record-1"
+        file.attrs["complete"] = record.complete
+        file["summary"] = json.dumps(record.summary)
+        file["provenance"] = json.dumps(record.provenance, default=str)
+        for name, data, unit, labels in [
+            ("time", record.time, "s", ()),
+            *((f"signals/{name}", record[name], record.units[name], record.labels[name]) for name in record),
+        ]:
+            one = file.create_dataset(name, data=data)
+            one.attrs["unit"], one.attrs["labels"], one.attrs["description"] = unit, list(labels), ""
+    return image.getvalue()
+
+
+def same(one: Record, other: Record) -> bool:
+    """Whether two records hold the same, descriptions aside."""
+    return (
+        np.array_equal(one.time, other.time)
+        and sorted(one) == sorted(other)
+        and all(np.array_equal(one[name], other[name]) for name in one)
+        and (one.units, one.labels) == (other.units, other.labels)
+        and (one.summary, one.provenance, one.complete) == (other.summary, other.provenance, other.complete)
+    )
+
+
+def test_files_of_version_0_1_are_read(tmp_path: Path):
+    (tmp_path / "old.h5").write_bytes(of_version_0_1(sample()))
+    assert same(Record.load(tmp_path / "old.h5"), sample())
+
+
+def test_large_signals_are_packed_and_unpacked(tmp_path: Path):
+    record = Record(np.arange(300_000.0))
+    record.add("x", np.random.default_rng(1).standard_normal((300_000, 3)), "m", labels=("a", "b", "c"))
+    record.add("zero", np.zeros((300_000, 2, 3), dtype=np.float32), "m", labels=("a", "b"))
+    again = Record.load(record.save(tmp_path / "record.h5"))
+    assert h5py.File(tmp_path / "record.h5")["signals/zero"].compression == "gzip"
+    assert same(again, record)
+    assert again["zero"].dtype == np.float32
+
+
+def test_one_changed_byte_is_found(tmp_path: Path):
+    path = sample().save(tmp_path / "record.h5")
+    whole = path.read_bytes()
+    place = whole.index(np.array([7.0, 8.0]).tobytes())
+    path.write_bytes(whole[:place] + b"\x01" + whole[place + 1 :])
+    with pytest.raises(RecordError, match=r"record.h5: damaged: its bytes do not agree with its checksum"):
+        Record.load(path)
+    # Without the last line, what is read is held against the checksum of the content.
+    path.write_bytes(path.read_bytes()[:-80])
+    with pytest.raises(RecordError, match="damaged: its content does not agree with its checksum; if you"):
+        Record.load(path)
+    path.write_bytes(whole[:-80])
+    assert same(Record.load(path), sample())
+
+
+def test_a_file_changed_by_another_program_is_read_when_that_is_said(tmp_path: Path):
+    path = sample().save(tmp_path / "record.h5")
+    with h5py.File(path, "r+") as file:
+        file["signals/q"][0, 0] = 42.0
+    with pytest.raises(RecordError, match="delete the attribute sha256"):
+        Record.load(path)
+    with h5py.File(path, "r+") as file:
+        del file.attrs["sha256"]
+    assert Record.load(path)["q"][0, 0] == 42.0
+
+
+Change = Callable[[h5py.File, Path], Any]
+
+
+def replaced(name: str, value: Any, **attributes: Any) -> Change:
+    """Another data set under a name, with the attributes of a signal or others."""
+
+    def change(file: h5py.File, _: Path) -> None:
+        before = dict(file[name].attrs) if name in file and name.startswith("signals/") else {}
+        if name in file:
+            del file[name]
+        file[name] = value
+        file[name].attrs.update(before | attributes)
+
+    return change
+
+
+def attribute(owner: str, name: str, value: Any) -> Change:
+    def change(file: h5py.File, _: Path) -> None:
+        if value is None:
+            del file[owner].attrs[name]
+        else:
+            file[owner].attrs[name] = value
+
+    return change
+
+
+def removed(name: str) -> Change:
+    return lambda file, _: file.__delitem__(name)
+
+
+def external(file: h5py.File, folder: Path) -> None:
+    with h5py.File(folder / "other.h5", "w") as other:
+        other["q"] = np.zeros((5, 2))
+    del file["signals/q"]
+    file["signals/q"] = h5py.ExternalLink(str(folder / "other.h5"), "/q")
+
+
+def soft(file: h5py.File, _: Path) -> None:
+    del file["signals/q"]
+    file["signals/q"] = h5py.SoftLink("/signals/force")
+
+
+def soft_group(file: h5py.File, _: Path) -> None:
+    del file["signals"]
+    file["signals"] = h5py.SoftLink("/")
+
+
+def circle(file: h5py.File, _: Path) -> None:
+    file["signals/again"] = file["signals"]
+
+
+def nested(file: h5py.File, _: Path) -> None:
+    del file["signals/q"]
+    file["signals/q/nested"] = 1.0
+
+
+def raw_file(file: h5py.File, folder: Path) -> None:
+    (folder / "secret").write_bytes(b"8 bytes!" * 5)
+    file.create_dataset("signals/s", (5,), "f8", external=[(str(folder / "secret"), 0, 40)])
+
+
+def virtual(file: h5py.File, folder: Path) -> None:
+    layout = h5py.VirtualLayout((5,), "f8")
+    layout[:] = h5py.VirtualSource(str(folder / "other.h5"), "x", (5,))
+    file.create_virtual_dataset("signals/s", layout)
+
+
+def bomb(file: h5py.File, _: Path) -> None:
+    file.create_dataset("signals/s", (1 << 40, 5), "f8", chunks=(1 << 17, 5), compression="gzip")
+
+
+def no_chunks(file: h5py.File, _: Path) -> None:
+    file.create_dataset("signals/s", (5,), "f8", chunks=(2,), compression="gzip")
+
+
+def large_chunks(file: h5py.File, _: Path) -> None:
+    file.create_dataset("signals/s", (5,), "f8", chunks=(1 << 25,), maxshape=(None,), compression="gzip")
+
+
+def overfull_chunk(file: h5py.File, _: Path) -> None:
+    one = file.create_dataset("signals/s", (5,), "f8", chunks=(5,), compression="gzip")
+    one.id.write_direct_chunk((0,), zlib.compress(bytes(1 << 24)))
+
+
+def no_gzip(file: h5py.File, _: Path) -> None:
+    one = file.create_dataset("signals/s", (5,), "f8", chunks=(5,), compression="gzip")
+    one.id.write_direct_chunk((0,), b"this is no gzip")
+
+
+def huge_contiguous(file: h5py.File, _: Path) -> None:
+    file.create_dataset("time2", (1 << 45,), "f8")
+    del file["time"]
+    file["time"] = file["time2"]
+
+
+def shuffled(file: h5py.File, _: Path) -> None:
+    file.create_dataset("signals/s", data=np.zeros(5), chunks=(5,), shuffle=True)
+
+
+def type_as_signal(file: h5py.File, _: Path) -> None:
+    file["signals/s"] = np.dtype("f8")
+
+
+def many_labels(file: h5py.File, _: Path) -> None:
+    del file["signals/q"].attrs["labels"]
+    file["labels/q"] = np.arange(2)
+
+
+FOREIGN: list[tuple[Change, str]] = [
+    (attribute("/", "format", "dynsim-record-9"), "not a dynsim record"),
+    (attribute("/", "format", np.arange(3)), "not a dynsim record"),
+    (attribute("/", "complete", None), "lacks parts: no attribute complete"),
+    (attribute("/", "complete", "yes"), "neither true nor false"),
+    (removed("time"), "lacks parts: no time"),
+    (removed("summary"), "lacks parts: no summary"),
+    (replaced("time", "soon"), "not real numbers"),
+    (replaced("time", 1.0), "must have one axis"),
+    (replaced("time", np.zeros((5, 1))), "must have one axis"),
+    (replaced("time", [0.0, 0.25, np.nan, 0.75, 1.0]), "not finite at sample 2"),
+    (replaced("time", [0.0, 0.25, np.inf, 0.75, 1.0]), "not finite at sample 2"),
+    (replaced("time", [0.0, 0.25, 0.2, 0.75, 1.0]), "backwards after sample 1"),
+    (replaced("time", np.arange(4.0)), "samples, the record has 4"),
+    (replaced("time", h5py.Empty("f8")), "empty"),
+    (replaced("summary", 3.0), "summary is not a text"),
+    (replaced("summary", ["{}"]), "summary is not a text"),
+    (replaced("summary", "{"), "summary is not JSON"),
+    (replaced("summary", "[1]"), "summary is list, not a mapping"),
+    (replaced("summary", "[" * 100_000), "summary is not JSON"),
+    (replaced("summary", "1" * 5000), "summary is not JSON"),
+    (replaced("provenance", "null"), "provenance is NoneType, not a mapping"),
+    (replaced("provenance", b"\xff\xfe"), "not a text|can't decode"),
+    (replaced("signals", 1.0), "group signals is no group"),
+    (replaced("signals/q", "text"), "not real numbers"),
+    (replaced("signals/q", np.zeros((5, 2), dtype=complex)), "not real numbers"),
+    (replaced("signals/q", np.zeros((5, 2), dtype=[("x", "f8")])), "not real numbers"),
+    (replaced("signals/q", np.zeros((4, 2))), "has 4 samples"),
+    (replaced("signals/q", np.zeros((5, 3))), "3 columns and 2 labels"),
+    (replaced("signals/q", np.zeros((5, 2, 1, 1))), "4 axes"),
+    (replaced("signals/q", np.zeros((5, 2)), labels=[1.0, 2.0]), "labels that are no texts"),
+    (replaced("signals/q", np.zeros((5, 2)), labels=[["a", "b"]]), "labels that are no list"),
+    (replaced("signals/q", np.zeros((5, 2)), unit=3), "no text as unit"),
+    (nested, "signal 'q' is no data set"),
+    (attribute("signals/q", "unit", None), "no text as unit"),
+    (attribute("signals/q", "labels", None), "lacks parts: no labels"),
+    (attribute("signals/q", "labels", h5py.Empty("f8")), "labels that are no list"),
+    (attribute("signals/q", "description", [1, 2]), "no text as description"),
+    (attribute("/", "sha256", "0" * 64), "does not agree with its checksum"),
+    (attribute("/", "sha256", np.arange(5)), "does not agree with its checksum"),
+    (external, "is a link to somewhere else"),
+    (soft, "is a link to somewhere else"),
+    (soft_group, "is a link to somewhere else"),
+    (circle, "is no data set"),
+    (raw_file, "lies in other files"),
+    (virtual, "lies in other files"),
+    (bomb, "would unpack to"),
+    (no_chunks, "lacks 3 of 3 chunks"),
+    (large_chunks, "in chunks of"),
+    (overfull_chunk, "chunk of the wrong size"),
+    (no_gzip, "cannot be unpacked"),
+    (huge_contiguous, "claims"),
+    (shuffled, "HDF5 filters"),
+    (type_as_signal, "is no data set"),
+    (many_labels, "labels that are no texts"),
+]
+
+
+def foreign(change: Change, folder: Path) -> Path:
+    """A file of version 0.1 that somebody has changed."""
+    path = folder / "foreign.h5"
+    path.write_bytes(of_version_0_1(sample()))
+    with h5py.File(path, "r+") as file:
+        change(file, folder)
+    return path
+
+
+@pytest.mark.parametrize(("change", "expected"), FOREIGN, ids=itertools.count())
+def test_a_file_that_is_no_record_is_refused_with_the_reason(tmp_path: Path, change: Change, expected: str):
+    path = foreign(change, tmp_path)
+    with pytest.raises(RecordError, match=expected) as error:
+        record_file.decode(path, path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("change", "expected"), [FOREIGN[0], (external, "is a link"), (bomb, "would unpack to")])
+def test_the_reason_comes_from_the_process_that_reads(tmp_path: Path, change: Change, expected: str):
+    with pytest.raises(RecordError, match=f"^{tmp_path}/foreign.h5: .*{expected}"):
+        Record.load(foreign(change, tmp_path))
+
+
+def test_what_is_no_file_is_refused(tmp_path: Path):
+    for path in (tmp_path, Path("/dev/zero")):
+        with pytest.raises(RecordError, match="not a file"):
+            Record.load(path)
+    if hasattr(os, "mkfifo"):
+        os.mkfifo(tmp_path / "pipe")
+        with pytest.raises(RecordError, match="not a file"):
+            Record.load(tmp_path / "pipe")
+    for path in (tmp_path / "none.h5", tmp_path / "none" / "none.h5"):
+        with pytest.raises(RecordError, match="no such record"):
+            Record.load(path)
+    with pytest.raises(RecordError, match="cannot be read"):
+        Record.load(tmp_path / ("x" * 300))
+    for content in (b"", b"hello", b"\x89HDF\r\n\x1a\n"):
+        (tmp_path / "text.h5").write_bytes(content)
+        with pytest.raises(RecordError, match="not a readable HDF5 file"):
+            Record.load(tmp_path / "text.h5")
+
+
+# -- damage -----------------------------------------------------------------------------------------------------------
+
+
+def flipped(whole: bytes, seed: int) -> bytes:
+    """With one to many bytes changed."""
+    dice = random.Random(seed)
+    data = bytearray(whole)
+    places = [k for k, value in enumerate(data) if value] if dice.random() < 0.7 else range(len(data))
+    for _ in range(dice.choice([1, 1, 1, 2, 4, 8, 32])):
+        data[dice.choice(places)] ^= dice.choice([1 << dice.randrange(8), 255])
+    return bytes(data)
+
+
+def mangled(whole: bytes, seed: int) -> bytes:
+    """With the end cut off, something appended, a block zeroed or copied to elsewhere; all without the last line."""
+    dice = random.Random(seed)
+    data = bytearray(whole[:-80])
+    length = dice.randrange(1, 64)
+    to, source = dice.randrange(len(data) - length), dice.randrange(len(data) - length)
+    match seed % 4:
+        case 0:
+            del data[to:]
+        case 1:
+            data += dice.randbytes(length)
+        case 2:
+            data[to : to + length] = bytes(length)
+        case _:
+            data[to : to + length] = data[source : source + length]
+    return bytes(data)
+
+
+def load_all(folder: Path, contents: list[bytes]) -> list[str]:
+    """Load files in a child; gives "same", "refused" or what else came of it, for each."""
+    for number, content in enumerate(contents):
+        (folder / f"{number}.h5").write_bytes(content)
+    code = (
+        "import sys; from dynsim.record import Record; from dynsim.errors import RecordError\n"
+        "sys.path.insert(0, sys.argv[1]); from test_record_file import same, sample\n"
+        "for number in range(int(sys.argv[2])):\n"
+        "    try: print('same' if same(Record.load(f'{number}.h5'), sample()) else 'other', flush=True)\n"
+        "    except RecordError as error:\n"
+        "        print('refused' if str(error).startswith(f'{number}.h5: ') else repr(error), flush=True)\n"
+        "    except BaseException as error: print(repr(error), flush=True)\n"
+    )
+    arguments = [sys.executable, "-c", code, str(Path(__file__).parent), str(len(contents))]
+    child = subprocess.run(arguments, cwd=folder, capture_output=True, text=True, check=False)
+    assert child.returncode == 0, child.stderr
+    return child.stdout.splitlines()
+
+
+def test_damage_is_found_or_does_no_harm(tmp_path: Path):
+    whole = bytes(sample().to_hdf5())
+    # The rest is read in a process each, which takes its time.
+    contents = [flipped(whole[:-80], seed) + whole[-80:] for seed in range(400)]
+    contents += [whole[:-80] + flipped(whole[-80:], seed) for seed in range(3)]
+    contents += [mangled(whole, seed) for seed in range(8)]
+    found = load_all(tmp_path, contents)
+    assert len(found) == len(contents)
+    # What is not refused is what was written: the damage was in the checksum's own line, or in unused space.
+    assert set(found) == {"same", "refused"}
+    assert set(found[:400]) == {"refused"}
+
+
+@pytest.mark.slow
+def test_damage_of_files_without_checksum_crashes_nothing(tmp_path: Path):
+    whole = of_version_0_1(sample())
+    contents = [flipped(whole, seed) for seed in range(300)]
+    found = load_all(tmp_path, contents)
+    assert len(found) == len(contents)
+    # Without a checksum, damaged numbers are numbers.
+    assert set(found) == {"same", "refused", "other"}
+
+
+@pytest.mark.skipif(not Path("/bin/sh").exists(), reason="a shell stands for the process that reads")
+@pytest.mark.parametrize(
+    ("script", "expected"),
+    [
+        ("kill -SEGV $$", "damaged: reading it ends with SIGSEGV$"),
+        ("kill -XCPU $$", "damaged: reading it does not end$"),
+        ("exec sleep 60", "damaged: reading it does not end$"),
+        ("echo 'ImportError: no h5py' >&2; exit 1", "cannot be read .ImportError: no h5py.$"),
+    ],
+)
+def test_a_reader_that_dies_is_a_damaged_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, expected: str
+):
+    (tmp_path / "old.h5").write_bytes(of_version_0_1(sample()))
+    (tmp_path / "python").write_text(f"#!/bin/sh\n{script}\n")
+    (tmp_path / "python").chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setattr(record_file, "READING_TIME", 0.1 if "sleep" in script else 10.0)
+    with pytest.raises(RecordError, match=f"^{tmp_path}/old.h5: {expected}"):
+        Record.load(tmp_path / "old.h5")
