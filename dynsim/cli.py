@@ -183,17 +183,22 @@ def check(
     ],
     overrides: SetOption = None,
 ) -> None:
-    """Validate scenarios without running them: schema, model, contacts at the start, reachable references."""
+    """Validate scenarios without running them: schema, model, contacts at the start, reachable references.
+
+    Prints where hand and contact points start, in full digits, to be copied into a surface or a path.
+    """
     from dynsim.engine import check as check_scenario
     from dynsim.scenario import load_scenario, variant_names
+    from dynsim.tables import print_starts
 
     failed = False
     for name in scenarios:
         try:
             variants: Sequence[str | None] = variant_names(name) or [None]
+            starts = {}
             for variant in variants:
                 with console.status(f"checking {_escape(name)} {variant or ''}"):
-                    check_scenario(load_scenario(name, variant, _overrides(overrides)))
+                    starts[variant or ""] = check_scenario(load_scenario(name, variant, _overrides(overrides)))
         except SimulationInterrupted:
             raise
         except DynsimError as error:
@@ -202,6 +207,7 @@ def check(
         else:
             count = f"{len(variants)} variants" if len(variants) > 1 else "1 variant"
             console.print(f"{name}: ok ({count})", highlight=False, soft_wrap=True)
+            print_starts(console, starts)
     if failed:
         raise typer.Exit(2)
 

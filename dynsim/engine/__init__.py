@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, UnreachableReference
 from dynsim.record import Record
@@ -22,6 +26,20 @@ class Progress(Protocol):
     """
 
     def __call__(self, time: float, stage: str = SIMULATION) -> None: ...
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a scenario starts, in the world [m].
+
+    Attributes
+    ----------
+    hand : (3,) the controlled point
+    contacts : (3,) of each enabled contact point, by its name
+    """
+
+    hand: NDArray[np.float64]
+    contacts: Mapping[str, NDArray[np.float64]]
 
 
 def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
@@ -50,15 +68,21 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
         return _module(scenario).simulate(scenario, progress)
 
 
-def check(scenario: Scenario) -> None:
+def check(scenario: Scenario) -> Start:
     """Do everything that comes before the first step: model, contacts at the start, references, size of the record.
+
+    Returns
+    -------
+    Start
+        Positions of the hand and of the contact points at t = 0.
 
     Raises
     ------
     ModelError, UnreachableReference, ScenarioError
     """
     with _named(scenario):
-        _module(scenario).prepare(scenario)
+        module = _module(scenario)
+        return module.start(module.prepare(scenario))
 
 
 @contextmanager

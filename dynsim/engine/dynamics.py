@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from dynsim import metrics
-from dynsim.engine import REFERENCES, SIMULATION, Progress
+from dynsim.engine import REFERENCES, SIMULATION, Progress, Start
 from dynsim.engine.outcome import check_size, raise_stopped
 from dynsim.engine.provenance import provenance
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
@@ -88,6 +88,13 @@ def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
     )
     workspace = ka.workspace(n, na, c)
     return Prepared(model, contacts, control, system, run, workspace)
+
+
+def start(prepared: Prepared) -> Start:
+    """Positions of the hand and of the contact points at t = 0."""
+    model, q = prepared.model, prepared.model.robot.initial
+    contacts = {contact.name: model.point_position(contact.body, contact.point, q) for contact in prepared.contacts}
+    return Start(model.point_position(*model.robot.hand, q), contacts)
 
 
 def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:

@@ -7,7 +7,7 @@ from types import ModuleType
 
 import numpy as np
 
-from dynsim.engine import Progress
+from dynsim.engine import Progress, Start
 from dynsim.engine.kinematic_record import make_record
 from dynsim.engine.kinematic_run import Run
 from dynsim.engine.mode_switching import ModeSwitcher
@@ -92,6 +92,11 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> Run:
     )
     _read_commands(run, waiting=False)
     return run
+
+
+def start(run: Run) -> Start:
+    """Position of the controlled point at t = 0; a snake has no contact points."""
+    return Start(run.state.w_target[:3].copy(), {})
 
 
 def simulate(scenario: Scenario, progress: Progress | None = None, source: CommandSource | None = None) -> Record:

@@ -13,8 +13,9 @@ import h5py
 import pytest
 
 from dynsim.cli import main
+from dynsim.engine import check
 from dynsim.record import FORMAT, Record
-from dynsim.scenario import SHIPPED
+from dynsim.scenario import SHIPPED, build_model, load_scenario
 
 SHORT = ["--set", "duration_s=0.2", "--set", "metrics.settle_s=0.05"]
 
@@ -231,6 +232,38 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(tmp_path: Path):
         "error: cannot write full/record.h5: File too large; nothing was changed there"
     ]
     assert list((tmp_path / "full").iterdir()) == []
+
+
+def test_check_prints_positions_that_can_be_copied_into_a_surface(tmp_path: Path):
+    """What is printed reads back to the same doubles, and the surface through it is accepted."""
+    scenario = load_scenario("elbow_comparison", "two_elbows")
+    start = check(scenario)
+    model, robot = build_model(scenario), scenario.robot()
+    assert start.hand.tolist() == model.point_position(*robot.hand, robot.initial).tolist()
+    assert list(start.contacts) == ["elbow_4", "elbow_7"]
+    shown = dynsim("check", "elbow_comparison", "snake_operator", folder=tmp_path).stdout.splitlines()
+    assert shown[:4] == [
+        "elbow_comparison: ok (4 variants)",
+        "  two_elbows, at the start [m]:",
+        f"    hand             {start.hand.tolist()}",
+        f"    contact elbow_4  {start.contacts['elbow_4'].tolist()}",
+    ]
+    assert [line.split(",")[0] for line in shown if "at the start" in line][1:4] == [
+        "  elbow_7", "  elbow_4", "  no_elbow",
+    ]  # fmt: skip
+    copied = shown[4].removeprefix("    contact elbow_7  ")
+    tilted = [
+        "check",
+        "elbow_comparison",
+        "--set",
+        f"surfaces.tilted={{type: plane, normal: [0.2, -0.1, 1], point_m: {copied}}}",
+    ]
+    again = dynsim(*tilted, "--set", "contacts.points.elbow_7.surface=tilted", folder=tmp_path)
+    assert again.returncode == 0, again.stderr
+    # The snake has no contact points; its head starts where its record does.
+    snake = check(load_scenario("snake_operator"))
+    assert shown[-2:] == ["  at the start [m]:", f"    hand  {snake.hand.tolist()}"]
+    assert not snake.contacts
 
 
 def test_list_check_schema_and_version(tmp_path: Path):
