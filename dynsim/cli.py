@@ -15,7 +15,7 @@ import typer
 from rich.console import Console
 
 from dynsim._version import __version__
-from dynsim.errors import DynsimError, SimulationInterrupted, SimulationStopped
+from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
 from dynsim.hardware.cli import export, hw
 
 if TYPE_CHECKING:
@@ -236,7 +236,10 @@ def plot(
         label = _label(path, record, labelled)
         labelled[label] = record
         folder = path.parent / "figures" if out is None else out if len(records) == 1 else out / label
-        _draw(record, folder, quiet=False)
+        try:
+            _draw(record, folder, quiet=False)
+        except RecordError as error:
+            raise RecordError(f"{path}: {error}") from error
     if len(labelled) > 1:
         _draw_comparison(labelled, out or Path("figures"), quiet=False)
 

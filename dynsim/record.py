@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dynsim.errors import RecordError
+from dynsim.errors import MissingEntry, RecordError, shown
 from dynsim.files import replacing
 
 FORMAT = "dynsim-record-1"
@@ -42,6 +42,17 @@ class Signal:
     description: str = ""
 
 
+class Entries(dict[str, Any]):
+    """A mapping that says in words which entry it does not have."""
+
+    def __init__(self, what: str, entries: Mapping[str, Any]) -> None:
+        super().__init__(entries)
+        self._what = what
+
+    def __missing__(self, key: object) -> Any:
+        raise MissingEntry(f"no {self._what} {shown(key)}; this record has: {', '.join(self) or 'none'}")
+
+
 class Record:
     """Signals of one run on one time axis.
 
@@ -53,8 +64,8 @@ class Record:
     def __init__(self, time: ArrayLike, *, provenance: Mapping[str, Any] | None = None) -> None:
         self.time: NDArray[np.float64] = np.asarray(time, dtype=np.float64)
         self.signals: dict[str, Signal] = {}
-        self.summary: dict[str, Any] = {}
-        self.provenance: dict[str, Any] = dict(provenance or {})
+        self.summary = {}
+        self.provenance = provenance or {}
         self.complete = True
 
     def add(
@@ -69,10 +80,9 @@ class Record:
         self.signals[name] = Signal(array, unit, tuple(labels), description)
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        try:
-            return self.signals[name].data
-        except KeyError:
-            raise KeyError(f"no signal {name!r}; this record has: {', '.join(self.signals)}") from None
+        if not isinstance(name, str) or name not in self.signals:
+            raise MissingEntry(f"no signal {shown(name)}; this record has: {', '.join(self.signals) or 'none'}")
+        return self.signals[name].data
 
     def __contains__(self, name: object) -> bool:
         return name in self.signals
@@ -86,12 +96,30 @@ class Record:
     @property
     def units(self) -> dict[str, str]:
         """Unit of every signal."""
-        return {name: signal.unit for name, signal in self.signals.items()}
+        return Entries("signal", {name: signal.unit for name, signal in self.signals.items()})
 
     @property
     def labels(self) -> dict[str, tuple[str, ...]]:
         """Column names of every signal."""
-        return {name: signal.labels for name, signal in self.signals.items()}
+        return Entries("signal", {name: signal.labels for name, signal in self.signals.items()})
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The numbers of ``summary.json``."""
+        return self._summary
+
+    @summary.setter
+    def summary(self, entries: Mapping[str, Any]) -> None:
+        self._summary = _entries("summary", entries)
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """What made the record: resolved scenario, version, commit, libraries."""
+        return self._provenance
+
+    @provenance.setter
+    def provenance(self, entries: Mapping[str, Any]) -> None:
+        self._provenance = _entries("provenance", entries)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write HDF5 to ``path``: complete or not at all (temporary name, then rename).
@@ -154,6 +182,12 @@ class Record:
         except (KeyError, ValueError) as error:
             raise RecordError(f"{path}: a dynsim record that lacks parts ({error})") from error
         return record
+
+
+def _entries(what: str, entries: Mapping[str, Any]) -> Entries:
+    if not isinstance(entries, Mapping):
+        raise RecordError(f"the {what} of a record is a mapping of names to values, not {shown(entries)}")
+    return Entries(f"entry of the {what}", entries)
 
 
 def _write(file: Any, name: str, signal: Signal) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, UnreachableReference
 from dynsim.record import Record
-from dynsim.scenario import Scenario
+from dynsim.scenario import Scenario, require_scenario
 
 REFERENCES, SIMULATION = "references", "simulation"
 
@@ -88,8 +88,7 @@ def check(scenario: Scenario) -> Start:
 @contextmanager
 def _named(scenario: Scenario) -> Iterator[None]:
     """Say in errors which scenario and variant they are about; those of reading it name file and line themselves."""
-    if not isinstance(scenario, Scenario):
-        raise ScenarioError(f"needs a Scenario, not {scenario!r}; load_scenario(name or file) gives one")
+    require_scenario(scenario)
     name = f"{scenario.source or scenario.name}{f' ({scenario.variant})' if scenario.variant else ''}"
     try:
         yield

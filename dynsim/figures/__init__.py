@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
-from dynsim.errors import RecordError
+from dynsim.errors import DynsimError, RecordError
 from dynsim.record import Record
 
 # Engine that made a record → module with ``draw`` and ``draw_comparison``.
@@ -25,11 +26,12 @@ def draw(record: Record, folder: Path) -> list[Path]:
     Raises
     ------
     RecordError
-        Nobody draws records of this engine, or a file cannot be written.
+        Nobody draws records of this engine, the record lacks what the figures need, or a file cannot be written.
     """
     if not len(record):
         return []
-    return list(_module(record).draw(record, Path(folder)))
+    with _of_its_engine():
+        return list(_module(record).draw(record, Path(folder)))
 
 
 def draw_comparison(records: Mapping[str, Record], folder: Path) -> list[Path]:
@@ -46,11 +48,23 @@ def draw_comparison(records: Mapping[str, Record], folder: Path) -> list[Path]:
         return []
     if len(modules) > 1:
         raise RecordError("records of different engines cannot be drawn over each other")
-    return list(modules.pop().draw_comparison(drawn, Path(folder)))
+    with _of_its_engine():
+        return list(modules.pop().draw_comparison(drawn, Path(folder)))
+
+
+@contextmanager
+def _of_its_engine() -> Iterator[None]:
+    """What a record holds in another shape or kind than the engine that it names is an error of the record."""
+    try:
+        yield
+    except DynsimError:
+        raise
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
+        raise RecordError(f"cannot be drawn, it is not as its engine makes records ({error})") from error
 
 
 def _module(record: Record) -> ModuleType:
     engine = record.provenance.get("engine")
-    if engine not in MODULES:
+    if not isinstance(engine, str) or engine not in MODULES:
         raise RecordError(f"no figures for records of engine {engine!r}; known: {', '.join(MODULES)}")
     return importlib.import_module(MODULES[engine])

@@ -41,7 +41,7 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
     """
     joints, time, position, velocity = joint_motion(record)
     if rate is not None:
-        if not rate > 0:
+        if not 0 < rate < np.inf:
             raise RecordError(f"--rate must be positive, not {rate}")
         path_between = JointPath(time, position, velocity[:-1], velocity[1:], float(time[-1]))
         time = np.arange(0.0, time[-1] + 0.5 / rate, 1.0 / rate).clip(max=time[-1])
@@ -67,6 +67,11 @@ def joint_motion(
     angles, rates = [], []
     for name, rate in RATES.items():
         if name in record and rate in record:
+            if record[name].ndim != 2 or record[rate].shape != record[name].shape:
+                raise RecordError(
+                    f"signals {name!r} {record[name].shape} and {rate!r} {record[rate].shape} of the record must both "
+                    "have a row per sample and a column per joint"
+                )
             joints += record.labels[name]
             angles.append(record[name])
             rates.append(record[rate])

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError
 
+from dynsim.errors import shown
 from dynsim.hardware.control_table import (
     BAUD_RATES,
     MAX_ID,
@@ -342,6 +343,10 @@ def load_servo_map(path: str | Path) -> ServoMap:
     ServoMapError
         The file is missing, is not YAML, or an entry is wrong; with file and line.
     """
+    if not isinstance(path, (str, Path)):
+        raise ServoMapError(
+            f"a servo map is named by its file, or by its name when it is shipped, not by {shown(path)}"
+        )
     path = Path(path)
     shipped = SHIPPED / f"{path.stem}.yaml"
     if not path.is_file() and path.parent in (Path(), Path("scenarios/hardware")) and shipped.is_file():

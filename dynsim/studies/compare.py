@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from dynsim.engine import SIMULATION, simulate
-from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped
+from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped, shown
 from dynsim.files import write_json, write_text
 from dynsim.record import Record
 from dynsim.scenario import Scenario, load_scenario, variant_names
@@ -56,10 +56,12 @@ def compare(
     Raises
     ------
     ScenarioError
-        The file has no variants, or one of them is not valid; all are checked before the first runs.
+        The file has no variants, one of them is not valid (all are checked before the first runs), or no such ``jobs``.
     SimulationStopped, SimulationInterrupted
         A variant stopped (after the others have run) or Ctrl-C. Names all that stopped; holds the record of the first.
     """
+    if not isinstance(jobs, int) or jobs < 1:
+        raise ScenarioError(f"jobs = {shown(jobs)}: must be a whole number of processes, 1 or more")
     names = variant_names(path)
     if not names:
         raise ScenarioError(f"{path}: has no variants to compare; use `dynsim run`")
