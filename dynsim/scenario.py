@@ -22,7 +22,7 @@ from pydantic import BaseModel, Field, ValidationError, field_validator
 from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig
 from dynsim.errors import ModelError, ScenarioError, shown
 from dynsim.families import PACKAGES, member, members, union
-from dynsim.model.description import Contact, Quadric, Robot
+from dynsim.model.description import Contact, Quadric, Robot, listed
 from dynsim.model.model import Model
 
 _CHECKOUT = Path(__file__).resolve().parent.parent / "scenarios"
@@ -122,6 +122,15 @@ class Scenario:
     variant: str
     config: ScenarioConfig
     source: Path | None = None
+
+    def __repr__(self) -> str:
+        config = self.config
+        parts = [config.plant.type, config.controller.type if config.controller else "no controller"]
+        parts.append(f"{config.duration_s:g} s")
+        contacts = [name for name, point in config.contacts.points.items() if point.enabled]
+        if contacts:
+            parts.append(f"contacts {listed(contacts)}")
+        return f"<Scenario {self.name}{f' ({self.variant})' if self.variant else ''}: {', '.join(parts)}>"
 
     @property
     def duration_s(self) -> float:

@@ -13,7 +13,7 @@ from dynsim.errors import ModelError, shown
 from dynsim.kernels import arrays as ka
 from dynsim.kernels import articulated, energy, kinematics, newton_euler
 from dynsim.model.arrays import compile_model
-from dynsim.model.description import Array, Robot
+from dynsim.model.description import Array, Robot, listed
 
 _FLOAT64 = np.dtype(np.float64)
 
@@ -48,6 +48,16 @@ class Model:
         # forward_dynamics and mass_matrix are those of the bodies alone: no rotor inertia.
         self._bodies = self.arrays._replace(body=self.arrays.body.copy())
         self._bodies.body[:, ka.ARMATURE] = 0.0
+
+    def __repr__(self) -> str:
+        robot = self.robot
+        driven = [motor.joint for motor in robot.motors]
+        motors = (
+            "no motors" if not driven else "a motor on each" if len(driven) == self.n else f"motors on {listed(driven)}"
+        )
+        mass = sum(link.inertia.mass for link in robot.links)
+        joints = f"joint{'s' if self.n > 1 else ''} {listed(self.joint_names)}"
+        return f"<Model {robot.name}: {joints}, {motors}, hand on {robot.hand[0]}, {mass:.4g} kg>"
 
     @classmethod
     def from_urdf(cls, path: str | os.PathLike[str]) -> Model:
