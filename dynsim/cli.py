@@ -9,7 +9,7 @@ from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import typer
 from rich.console import Console
@@ -80,8 +80,35 @@ def _options(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Say on stderr what takes long, and the warnings of runs.")
+    ] = False,
 ) -> None:
-    pass
+    if verbose:
+        _log_to_stderr()
+
+
+def _log_to_stderr() -> None:
+    # Imported here: --help and --version need not wait for it.
+    import logging
+
+    class OnStderr(logging.StreamHandler[TextIO]):
+        """Stderr; on a terminal the one of the moment: a progress bar puts what is written there above itself."""
+
+        def __init__(self) -> None:
+            super().__init__(sys.stderr)
+            self.on_terminal = sys.stderr.isatty()
+
+        def emit(self, record: logging.LogRecord) -> None:
+            if self.on_terminal:
+                self.setStream(sys.stderr)
+            super().emit(record)
+
+    handler = OnStderr()
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    library = logging.getLogger("dynsim")
+    library.addHandler(handler)
+    library.setLevel(logging.INFO)
 
 
 @app.command(epilog="Example: dynsim run elbow_comparison --variant two_elbows --set integrator.rtol=1e-8")

@@ -130,7 +130,12 @@ class Scenario:
         contacts = [name for name, point in config.contacts.points.items() if point.enabled]
         if contacts:
             parts.append(f"contacts {listed(contacts)}")
-        return f"<Scenario {self.name}{f' ({self.variant})' if self.variant else ''}: {', '.join(parts)}>"
+        return f"<Scenario {self.title}: {', '.join(parts)}>"
+
+    @property
+    def title(self) -> str:
+        """Name and variant, for a line of text."""
+        return f"{self.name} ({self.variant})" if self.variant else self.name
 
     @property
     def duration_s(self) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,9 +13,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, UnreachableReference
+from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped, UnreachableReference
 from dynsim.record import Record
 from dynsim.scenario import Scenario, require_scenario
+
+# A library says nothing unless it is asked to. Here, not in dynsim/__init__.py: everything that logs imports this.
+logging.getLogger("dynsim").addHandler(logging.NullHandler())
+log = logging.getLogger(__name__)
 
 REFERENCES, SIMULATION = "references", "simulation"
 
@@ -65,7 +70,18 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
         The scenario describes no physics, or a path that the hand cannot follow.
     """
     with _named(scenario):
-        return _module(scenario).simulate(scenario, progress)
+        try:
+            record: Record = _module(scenario).simulate(scenario, progress)
+        except SimulationStopped as stop:
+            _log_warnings(scenario, stop.record)
+            raise
+        _log_warnings(scenario, record)
+        return record
+
+
+def _log_warnings(scenario: Scenario, record: Record | None) -> None:
+    for warning in record.summary["warnings"] if record is not None else ():
+        log.warning("%s: %s", scenario.title, warning)
 
 
 def check(scenario: Scenario) -> Start:

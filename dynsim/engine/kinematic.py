@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time as clock
 from types import ModuleType
 
@@ -11,7 +12,7 @@ from dynsim.engine import Progress, Start
 from dynsim.engine.kinematic_record import make_record
 from dynsim.engine.kinematic_run import Run
 from dynsim.engine.mode_switching import ModeSwitcher
-from dynsim.engine.outcome import check_size, raise_stopped
+from dynsim.engine.outcome import check_size, kernels_logged, raise_stopped
 from dynsim.engine.provenance import provenance
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.families import member
@@ -40,6 +41,8 @@ from dynsim.model.snake import (
 )
 from dynsim.record import Record
 from dynsim.scenario import Scenario
+
+log = logging.getLogger(__name__)
 
 CHUNK = 2000  # ticks between two looks at Ctrl-C and the progress bar; about 0.1 s
 
@@ -116,7 +119,9 @@ def simulate(scenario: Scenario, progress: Progress | None = None, source: Comma
         least_margin=controller.least_margin,
         predict=lambda row: _predict(run, row),
     )
-    _load_kernels(run)
+    with kernels_logged(log):
+        _load_kernels(run)
+    log.info("%s: integrating %g s in %d control periods", scenario.title, scenario.duration_s, run.ticks)
     stop: SimulationStopped | None = None
     started = clock.perf_counter()
     try:
@@ -128,7 +133,9 @@ def simulate(scenario: Scenario, progress: Progress | None = None, source: Comma
         stop = SimulationInterrupted(
             f"interrupted at t = {reached:.3f} s of {scenario.duration_s:g} s", time=reached, state=_named(run.state)
         )
-    record = make_record(run, scenario, provenance(scenario), switcher, clock.perf_counter() - started)
+    wall = clock.perf_counter() - started
+    log.info("%s: integrated %d control periods in %.3f s", scenario.title, run.state.counts[TICKS], wall)
+    record = make_record(run, scenario, provenance(scenario), switcher, wall)
     if stop is not None:
         raise_stopped(stop, record)
     return record
