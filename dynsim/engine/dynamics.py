@@ -107,11 +107,11 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
     # Loading or compiling the kernels is no integration time.
     with kernels_logged(log):
         ki.advance(prepared.system, prepared.workspace, run, 0)
-    log.info("%s: integrating %g s by %s", scenario.title, scenario.duration_s, scenario.integrator.method)
     if progress is not None:
         progress(0.0, SIMULATION)
     started, limit, interrupted = clock.perf_counter(), 20, False
     try:
+        log.info("%s: integrating %g s by %s", scenario.title, scenario.duration_s, scenario.integrator.method)
         while run.count[ki.STATUS] == ki.RUNNING:
             before = clock.perf_counter()
             ki.advance(prepared.system, prepared.workspace, run, limit)

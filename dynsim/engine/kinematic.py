@@ -121,10 +121,10 @@ def simulate(scenario: Scenario, progress: Progress | None = None, source: Comma
     )
     with kernels_logged(log):
         _load_kernels(run)
-    log.info("%s: integrating %g s in %d control periods", scenario.title, scenario.duration_s, run.ticks)
     stop: SimulationStopped | None = None
     started = clock.perf_counter()
     try:
+        log.info("%s: integrating %g s in %d control periods", scenario.title, scenario.duration_s, run.ticks)
         _advance(run, switcher, progress)
     except SimulationStopped as stopped:
         stop = stopped
