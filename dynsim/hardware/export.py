@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -18,16 +20,16 @@ from dynsim.record import Record
 Format = Literal["csv", "joint-trajectory", "urdf-log"]
 SUFFIX: dict[str, str] = {"csv": ".csv", "joint-trajectory": ".trajectory.yaml", "urdf-log": ".jsonl"}
 RATES = {"q": "v", "phi": "phi_dot", "rho": "rho_dot"}
-"""Angle signals of the records, and the signals that hold their rates."""
+"""Position signals of the records, and the signals that hold their rates."""
 
 
 def export_record(record: Record, path: Path, format_: Format, *, rate: float | None = None) -> Path:
-    """Write the joint angles and rates of a record.
+    """Write the joint positions and rates of a record.
 
-    ``csv``: one row per sample, columns "time [s]", "<joint> [rad]", "<joint> [rad/s]". ``joint-trajectory``: the
-    fields of a ROS trajectory_msgs/JointTrajectory as YAML, for a joint trajectory controller. ``urdf-log``: one JSON
-    object per line, {"time", "position": {joint: rad}, "velocity": {joint: rad/s}}, joint names being those of the
-    URDF.
+    ``csv``: one row per sample, columns "time [s]", "<joint> [rad]", "<joint> [rad/s]", with the units of the record
+    ("rad or m" where it has joints of both kinds). ``joint-trajectory``: the fields of a ROS
+    trajectory_msgs/JointTrajectory as YAML, for a joint trajectory controller. ``urdf-log``: one JSON object per line,
+    {"time", "position": {joint: rad or m}, "velocity": {joint: rad/s or m/s}}, joint names being those of the URDF.
 
     Parameters
     ----------
@@ -47,16 +49,20 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
         time = np.arange(0.0, time[-1] + 0.5 / rate, 1.0 / rate).clip(max=time[-1])
         knots = [_within(path_between, instant) for instant in time]
         position, velocity = np.array([q for q, _ in knots]), np.array([v for _, v in knots])
-    writer = {"csv": _write_csv, "joint-trajectory": _write_joint_trajectory, "urdf-log": _write_urdf_log}[format_]
+    writers: dict[str, Callable[..., None]] = {
+        "csv": partial(_write_csv, record),
+        "joint-trajectory": _write_joint_trajectory,
+        "urdf-log": _write_urdf_log,
+    }
     with replacing(path) as temporary:
-        writer(temporary, joints, time, position, velocity)
+        writers[format_](temporary, joints, time, position, velocity)
     return path
 
 
 def joint_motion(
     record: Record,
 ) -> tuple[list[str], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Joint names, time from 0 [s], angles [rad] and rates [rad/s] of a record.
+    """Joint names, time from 0 [s], positions and rates [rad, rad/s; m, m/s] of a record.
 
     Raises
     ------
@@ -93,11 +99,19 @@ def _within(path: JointPath, time: float) -> tuple[NDArray[np.float64], NDArray[
 
 
 def _write_csv(
-    path: Path, joints: list[str], time: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64]
+    record: Record,
+    path: Path,
+    joints: list[str],
+    time: NDArray[np.float64],
+    q: NDArray[np.float64],
+    v: NDArray[np.float64],
 ) -> None:
+    pairs = [(name, rate) for name, rate in RATES.items() if name in record and rate in record]
+    units = [[record.units[pair[k]] for pair in pairs for _ in record.labels[pair[0]]] for k in (0, 1)]
+    headings = [f"{joint} [{unit}]" for column in units for joint, unit in zip(joints, column, strict=True)]
     with path.open("w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file)
-        rows.writerow(["time [s]", *(f"{joint} [rad]" for joint in joints), *(f"{joint} [rad/s]" for joint in joints)])
+        rows.writerow(["time [s]", *headings])
         rows.writerows([f"{value:.9g}" for value in (t, *qs, *vs)] for t, qs, vs in zip(time, q, v, strict=True))
 
 

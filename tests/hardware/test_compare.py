@@ -100,6 +100,16 @@ def test_csv_holds_the_samples_with_units_in_the_header(tmp_path) -> None:
     assert np.allclose(data[:, 4:6], record["v"], atol=1e-8)
 
 
+def test_csv_of_a_sliding_joint_says_metres(tmp_path) -> None:
+    record = Record([0.0, 1.0])
+    record.add("q", np.zeros((2, 1)), "m", labels=("slide",))
+    record.add("v", np.zeros((2, 1)), "m/s", labels=("slide",))
+    record.add("rho", np.zeros((2, 1)), "rad", labels=("wheel",))
+    record.add("rho_dot", np.zeros((2, 1)), "rad/s", labels=("wheel",))
+    (heading, *_) = export_record(record, tmp_path / "a.csv", "csv").read_text(encoding="utf-8").splitlines()
+    assert heading == "time [s],slide [m],wheel [rad],slide [m/s],wheel [rad/s]"
+
+
 def test_joint_trajectory_resampled_is_valid_yaml_in_order(tmp_path) -> None:
     path = export_record(swing(), tmp_path / "t.yaml", "joint-trajectory", rate=50)
     message = YAML(typ="safe").load(path)
