@@ -15,7 +15,7 @@ from dynsim._version import __version__
 from dynsim.errors import DynsimError
 
 if TYPE_CHECKING:
-    from dynsim.engine import simulate
+    from dynsim.engine import check, simulate
     from dynsim.model.model import Model
     from dynsim.record import Record
     from dynsim.scenario import Scenario, build_model, load_scenario
@@ -28,6 +28,7 @@ __all__ = [
     "Scenario",
     "__version__",
     "build_model",
+    "check",
     "compare",
     "load_scenario",
     "simulate",
@@ -39,6 +40,7 @@ _HOME = {
     "Record": "dynsim.record",
     "Scenario": "dynsim.scenario",
     "build_model": "dynsim.scenario",
+    "check": "dynsim.engine",
     "compare": "dynsim.studies.compare",
     "load_scenario": "dynsim.scenario",
     "simulate": "dynsim.engine",

@@ -9,12 +9,12 @@ from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import typer
 
 from dynsim._version import __version__
-from dynsim.errors import DynsimError, SimulationInterrupted, SimulationStopped
+from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
 from dynsim.hardware.cli import export, hw
 from dynsim.terminal import Terminal
 from dynsim.terminal import escaped as _escape
@@ -75,8 +75,35 @@ def _options(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Say on stderr what takes long, and the warnings of runs.")
+    ] = False,
 ) -> None:
-    pass
+    if verbose:
+        _log_to_stderr()
+
+
+def _log_to_stderr() -> None:
+    # Imported here: --help and --version need not wait for it.
+    import logging
+
+    class OnStderr(logging.StreamHandler[TextIO]):
+        """Stderr; on a terminal the one of the moment: a progress bar puts what is written there above itself."""
+
+        def __init__(self) -> None:
+            super().__init__(sys.stderr)
+            self.on_terminal = sys.stderr.isatty()
+
+        def emit(self, record: logging.LogRecord) -> None:
+            if self.on_terminal:
+                self.setStream(sys.stderr)
+            super().emit(record)
+
+    handler = OnStderr()
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    library = logging.getLogger("dynsim")
+    library.addHandler(handler)
+    library.setLevel(logging.INFO)
 
 
 @app.command(epilog="Example: dynsim run elbow_comparison --variant two_elbows --set integrator.rtol=1e-8")
@@ -179,17 +206,22 @@ def check(
     ],
     overrides: SetOption = None,
 ) -> None:
-    """Validate scenarios without running them: schema, model, contacts at the start, reachable references."""
+    """Validate scenarios without running them: schema, model, contacts at the start, reachable references.
+
+    Prints where hand and contact points start, in full digits, to be copied into a surface or a path.
+    """
     from dynsim.engine import check as check_scenario
     from dynsim.scenario import load_scenario, variant_names
+    from dynsim.tables import print_starts
 
     failed = False
     for name in scenarios:
         try:
             variants: Sequence[str | None] = variant_names(name) or [None]
+            starts = {}
             for variant in variants:
                 with console.status(f"checking {_escape(name)} {_escape(variant or '')}"):
-                    check_scenario(load_scenario(name, variant, _overrides(overrides)))
+                    starts[variant or ""] = check_scenario(load_scenario(name, variant, _overrides(overrides)))
         except SimulationInterrupted:
             raise
         except DynsimError as error:
@@ -198,6 +230,7 @@ def check(
         else:
             count = f"{len(variants)} variants" if len(variants) > 1 else "1 variant"
             console.print(f"{_escape(name)}: ok ({count})", highlight=False, soft_wrap=True)
+            print_starts(console, starts)
     if failed:
         raise typer.Exit(2)
 
@@ -226,7 +259,10 @@ def plot(
         label = _label(path, record, labelled)
         labelled[label] = record
         folder = path.parent / "figures" if out is None else out if len(records) == 1 else out / label
-        _draw(record, folder, quiet=False)
+        try:
+            _draw(record, folder, quiet=False)
+        except RecordError as error:
+            raise RecordError(f"{path}: {error}") from error
     if len(labelled) > 1:
         _draw_comparison(labelled, out or Path("figures"), quiet=False)
 

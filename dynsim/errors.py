@@ -11,6 +11,12 @@ class DynsimError(Exception):
     exit_code: ClassVar[int] = 2
 
 
+def shown(value: object) -> str:
+    """Any value in an error message: in one line, and not long."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
 class ScenarioError(DynsimError):
     """A scenario cannot be read or is not valid: the message names file, line, key, value and the fix."""
 
@@ -25,6 +31,13 @@ class UnreachableReference(DynsimError):
 
 class RecordError(DynsimError):
     """A record cannot be written or read."""
+
+
+class MissingEntry(RecordError, KeyError):
+    """A record has no signal, or its summary no entry, of that name; the message lists those that there are."""
+
+    # A KeyError shows its message in quotes.
+    __str__ = Exception.__str__
 
 
 class SimulationStopped(DynsimError):

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dynsim import record_file
-from dynsim.errors import RecordError
+from dynsim.errors import MissingEntry, RecordError, shown
 from dynsim.files import replacing
 from dynsim.record_file import FORMAT, Signal
 
@@ -25,17 +25,21 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
-__all__ = ["FORMAT", "Record", "Signal", "UnknownSignal"]
+__all__ = ["FORMAT", "Record", "Signal"]
 
 # Signals named in the repr.
 _SHOWN = 6
 
 
-class UnknownSignal(RecordError, KeyError):
-    """A record has no signal of that name; the message lists those that it has."""
+class Entries(dict[str, Any]):
+    """A mapping that says in words which entry it does not have."""
 
-    # Not that of KeyError, which shows its message as a quoted string.
-    __str__ = Exception.__str__
+    def __init__(self, what: str, entries: Mapping[str, Any]) -> None:
+        super().__init__(entries)
+        self._what = what
+
+    def __missing__(self, key: object) -> Any:
+        raise MissingEntry(f"no {self._what} {shown(key)}; this record has: {', '.join(self) or 'none'}")
 
 
 class Record:
@@ -49,8 +53,8 @@ class Record:
     def __init__(self, time: ArrayLike, *, provenance: Mapping[str, Any] | None = None) -> None:
         self.time: NDArray[np.float64] = np.asarray(time, dtype=np.float64)
         self.signals: dict[str, Signal] = {}
-        self.summary: dict[str, Any] = {}
-        self.provenance: dict[str, Any] = dict(provenance or {})
+        self.summary = {}
+        self.provenance = provenance or {}
         self.complete = True
 
     def add(
@@ -68,21 +72,19 @@ class Record:
         self.signals[name] = signal
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        try:
-            return self.signals[name].data
-        except (KeyError, TypeError):
+        if not isinstance(name, str) or name not in self.signals:
             near = difflib.get_close_matches(str(name), self.signals, 1)
             hint = f" (did you mean {near[0]!r}?)" if near else ""
-            have = ", ".join(self.signals) or "none"
-            raise UnknownSignal(f"no signal {name!r} in this record{hint}; it has: {have}") from None
+            raise MissingEntry(f"no signal {shown(name)}{hint}; this record has: {', '.join(self.signals) or 'none'}")
+        return self.signals[name].data
 
     def __repr__(self) -> str:
         scenario = self.provenance.get("scenario")
         names = [scenario.get("name"), scenario.get("variant")] if isinstance(scenario, Mapping) else []
         title = " / ".join(str(name) for name in names if name)
         span = f", {self.time[0]:g} to {self.time[-1]:g} s" if len(self) else ""
-        shown = ", ".join(list(self.signals)[:_SHOWN]) + (", …" if len(self.signals) > _SHOWN else "")
-        parts = [f"{len(self)} samples{span}", f"{len(self.signals)} signals{f' ({shown})' if shown else ''}"]
+        first = ", ".join(list(self.signals)[:_SHOWN]) + (", …" if len(self.signals) > _SHOWN else "")
+        parts = [f"{len(self)} samples{span}", f"{len(self.signals)} signals{f' ({first})' if first else ''}"]
         parts += [] if self.complete else ["incomplete"]
         return f"<Record {f'{title}: ' if title else ''}{', '.join(parts)}>"
 
@@ -102,12 +104,30 @@ class Record:
     @property
     def units(self) -> dict[str, str]:
         """Unit of every signal."""
-        return {name: signal.unit for name, signal in self.signals.items()}
+        return Entries("signal", {name: signal.unit for name, signal in self.signals.items()})
 
     @property
     def labels(self) -> dict[str, tuple[str, ...]]:
         """Column names of every signal."""
-        return {name: signal.labels for name, signal in self.signals.items()}
+        return Entries("signal", {name: signal.labels for name, signal in self.signals.items()})
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The numbers of ``summary.json``."""
+        return self._summary
+
+    @summary.setter
+    def summary(self, entries: Mapping[str, Any]) -> None:
+        self._summary = _entries("summary", entries)
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """What made the record: resolved scenario, version, commit, libraries."""
+        return self._provenance
+
+    @provenance.setter
+    def provenance(self, entries: Mapping[str, Any]) -> None:
+        self._provenance = _entries("provenance", entries)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write HDF5 to ``path``: complete or not at all (see :func:`dynsim.files.replacing`).
@@ -223,3 +243,9 @@ def _optional(package: str) -> Any:
         return importlib.import_module(package)
     except ImportError as error:
         raise RecordError(f"{package} is not installed: pip install 'dynsim[tables]'") from error
+
+
+def _entries(what: str, entries: Mapping[str, Any]) -> Entries:
+    if not isinstance(entries, Mapping):
+        raise RecordError(f"the {what} of a record is a mapping of names to values, not {shown(entries)}")
+    return Entries(f"entry of the {what}", entries)

@@ -20,10 +20,10 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig
-from dynsim.errors import ModelError, ScenarioError
+from dynsim.errors import ModelError, ScenarioError, shown
 from dynsim.families import PACKAGES, member, members, union
 from dynsim.files import check_complete
-from dynsim.model.description import Contact, Quadric, Robot
+from dynsim.model.description import Contact, Quadric, Robot, listed
 from dynsim.model.model import Model
 
 _CHECKOUT = Path(__file__).resolve().parent.parent / "scenarios"
@@ -127,6 +127,20 @@ class Scenario:
     config: ScenarioConfig
     source: Path | None = None
 
+    def __repr__(self) -> str:
+        config = self.config
+        parts = [config.plant.type, config.controller.type if config.controller else "no controller"]
+        parts.append(f"{config.duration_s:g} s")
+        contacts = [name for name, point in config.contacts.points.items() if point.enabled]
+        if contacts:
+            parts.append(f"contacts {listed(contacts)}")
+        return f"<Scenario {self.title}: {', '.join(parts)}>"
+
+    @property
+    def title(self) -> str:
+        """Name and variant, for a line of text."""
+        return f"{self.name} ({self.variant})" if self.variant else self.name
+
     @property
     def duration_s(self) -> float:
         """Simulated time [s]."""
@@ -173,6 +187,8 @@ class Scenario:
 
     def build_controller(self, model: Model, progress: Callable[[float], None] | None = None) -> Any:
         """The controller for the robot; ``progress`` is called with the time [s] that its references have come to."""
+        if self.controller is None:
+            raise ModelError("the scenario has no controller; its motors are short-circuited")
         return member("controller", self.controller.type).build(self.controller, model, self.duration_s, progress)
 
     def surfaces(self) -> dict[str, Quadric]:
@@ -220,10 +236,25 @@ class Scenario:
 
 
 def build_model(scenario: Scenario) -> Model:
-    """The rigid-body model of a scenario's plant."""
+    """The rigid-body model of a scenario's plant.
+
+    Raises
+    ------
+    ModelError
+        The plant has none, or is not physical.
+    ScenarioError
+        Not a scenario.
+    """
+    require_scenario(scenario)
     if scenario.engine != "dynamics":
         raise ModelError(f"plant {scenario.plant.type!r} is kinematic: it has no rigid-body model")
     return Model(scenario.robot())
+
+
+def require_scenario(scenario: object) -> None:
+    """Raise :class:`ScenarioError` for what is none, such as the name of one."""
+    if not isinstance(scenario, Scenario):
+        raise ScenarioError(f"needs a Scenario, not {shown(scenario)}; load_scenario(name or file) gives one")
 
 
 def find_scenario(name: str | Path) -> Path:
@@ -236,6 +267,8 @@ def find_scenario(name: str | Path) -> Path:
     RecordError
         The scenario of a run that died while it was saved.
     """
+    if not isinstance(name, (str, Path)):
+        raise ScenarioError(f"a scenario is named by its file, or by its name when it is shipped, not by {shown(name)}")
     path = Path(name)
     if path.is_file():
         check_complete(path)
@@ -284,9 +317,11 @@ def load_scenario(path: str | Path, variant: str | None = None, overrides: Mappi
         raise ScenarioError(f"{path}: variants must be a mapping of names to what differs")
     if variant is None and variants:
         variant = next(iter(variants))
-    if variant is not None and variants and variant not in variants:
+    # A list of the names: what is no name need not be hashable.
+    if variant is not None and variants and variant not in list(variants):
         raise ScenarioError(
-            f"{path}: no variant {variant!r}{_suggest(variant, variants)}; variants: {', '.join(variants)}"
+            f"{path}: no variant {variant!r}{_suggest(str(variant), variants)}; "
+            f"variants: {', '.join(map(str, variants))}"
         )
     if variant is not None and not variants and variant != data.get("variant"):
         raise ScenarioError(f"{path}: has no variants, so there is no {variant!r}")
@@ -294,6 +329,12 @@ def load_scenario(path: str | Path, variant: str | None = None, overrides: Mappi
     if not isinstance(difference, Mapping):
         raise ScenarioError(f"{path}: variant {variant!r} must be a mapping of what differs")
     merged = _merge(data, difference)
+    if overrides is not None and not (
+        isinstance(overrides, Mapping) and all(isinstance(key, str) for key in overrides)
+    ):
+        raise ScenarioError(
+            f"overrides must map dotted keys to values, as {{'integrator.rtol': 1e-8}} does, not {shown(overrides)}"
+        )
     for key, value in (overrides or {}).items():
         _override(merged, key, value, _origin(overrides))
     merged = _plain(merged)
@@ -316,6 +357,8 @@ def scenario_from_resolved(resolved: Mapping[str, Any]) -> Scenario:
     ScenarioError
         It was written by a version of dynsim with other keys.
     """
+    if not isinstance(resolved, Mapping):
+        raise ScenarioError(f"the scenario in this record must be a mapping of keys to values, not {shown(resolved)}")
     try:
         config = ScenarioConfig.model_validate(resolved)
     except ValidationError as error:
@@ -413,10 +456,12 @@ def _parse_yaml(text: str, source: str) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Round-trip YAML nodes as plain Python values."""
+    """Round-trip YAML nodes, and arrays of overrides, as plain Python values."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list):
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
     if isinstance(value, bool) or value is None:
         return value

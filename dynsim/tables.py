@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
 from dynsim.terminal import escaped_line
+
+if TYPE_CHECKING:
+    from dynsim.engine import Start
 
 Summary = Mapping[str, Any]
 
@@ -130,6 +133,16 @@ def print_choices(console: Console) -> None:
         for name in names:
             table.add_row(name, escaped_line((member(family, name).__doc__ or "").strip().splitlines()[0]))
         console.print(table)
+
+
+def print_starts(console: Console, starts: Mapping[str, Start]) -> None:
+    """Per variant the positions of hand and contact points [m], as lists of YAML that read back to the same doubles."""
+    for variant, start in starts.items():
+        points = {"hand": start.hand, **{f"contact {name}": point for name, point in start.contacts.items()}}
+        width = max(map(len, points))
+        lines = [f"  {variant}{', ' if variant else ''}at the start [m]:"]
+        lines += [f"    {name:<{width}}  {point.tolist()}" for name, point in points.items()]
+        console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
 
 
 def _pulling(contact: Summary) -> str:

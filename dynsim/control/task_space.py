@@ -111,8 +111,8 @@ class Config(Script):
         return self
 
 
-def build(config: Config, plant: SnakeDescription, duration_s: float | None = None) -> TaskSpaceController:
-    """Controller for a robot; ``duration_s`` is not needed, a script ends by itself.
+def build(config: Config, plant: SnakeDescription) -> TaskSpaceController:
+    """Controller for a robot.
 
     Raises
     ------

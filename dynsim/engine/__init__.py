@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
+import logging
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Protocol
 
-from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, UnreachableReference
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped, UnreachableReference
 from dynsim.record import Record
-from dynsim.scenario import Scenario
+from dynsim.scenario import Scenario, require_scenario
+
+# A library says nothing unless it is asked to. Here, not in dynsim/__init__.py: everything that logs imports this.
+logging.getLogger("dynsim").addHandler(logging.NullHandler())
+log = logging.getLogger(__name__)
 
 REFERENCES, SIMULATION = "references", "simulation"
 
@@ -22,6 +31,20 @@ class Progress(Protocol):
     """
 
     def __call__(self, time: float, stage: str = SIMULATION) -> None: ...
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a scenario starts, in the world [m].
+
+    Attributes
+    ----------
+    hand : (3,) the controlled point
+    contacts : (3,) of each enabled contact point, by its name
+    """
+
+    hand: NDArray[np.float64]
+    contacts: Mapping[str, NDArray[np.float64]]
 
 
 def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
@@ -47,25 +70,41 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
         The scenario describes no physics, or a path that the hand cannot follow.
     """
     with _named(scenario):
-        return _module(scenario).simulate(scenario, progress)
+        try:
+            record: Record = _module(scenario).simulate(scenario, progress)
+        except SimulationStopped as stop:
+            _log_warnings(scenario, stop.record)
+            raise
+        _log_warnings(scenario, record)
+        return record
 
 
-def check(scenario: Scenario) -> None:
+def _log_warnings(scenario: Scenario, record: Record | None) -> None:
+    for warning in record.summary["warnings"] if record is not None else ():
+        log.warning("%s: %s", scenario.title, warning)
+
+
+def check(scenario: Scenario) -> Start:
     """Do everything that comes before the first step: model, contacts at the start, references, size of the record.
+
+    Returns
+    -------
+    Start
+        Positions of the hand and of the contact points at t = 0.
 
     Raises
     ------
     ModelError, UnreachableReference, ScenarioError
     """
     with _named(scenario):
-        _module(scenario).prepare(scenario)
+        module = _module(scenario)
+        return module.start(module.prepare(scenario))
 
 
 @contextmanager
 def _named(scenario: Scenario) -> Iterator[None]:
     """Say in errors which scenario and variant they are about; those of reading it name file and line themselves."""
-    if not isinstance(scenario, Scenario):
-        raise ScenarioError(f"needs a Scenario, not {scenario!r}; load_scenario(name or file) gives one")
+    require_scenario(scenario)
     name = f"{scenario.source or scenario.name}{f' ({scenario.variant})' if scenario.variant else ''}"
     try:
         yield

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time as clock
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -10,8 +11,8 @@ from functools import partial
 import numpy as np
 
 from dynsim import metrics
-from dynsim.engine import REFERENCES, SIMULATION, Progress
-from dynsim.engine.outcome import check_size, raise_stopped
+from dynsim.engine import REFERENCES, SIMULATION, Progress, Start
+from dynsim.engine.outcome import check_size, kernels_logged, raise_stopped
 from dynsim.engine.provenance import provenance
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.kernels import arrays as ka
@@ -25,6 +26,8 @@ from dynsim.model.description import Contact, Link, Robot
 from dynsim.model.model import Model
 from dynsim.record import Record
 from dynsim.scenario import Scenario, build_model
+
+log = logging.getLogger(__name__)
 
 # Wall time between two looks at progress and Ctrl-C [s].
 _CHUNK_S = 0.1
@@ -92,16 +95,25 @@ def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
     return Prepared(model, contacts, control, system, run, workspace)
 
 
+def start(prepared: Prepared) -> Start:
+    """Positions of the hand and of the contact points at t = 0."""
+    model, q = prepared.model, prepared.model.robot.initial
+    contacts = {contact.name: model.point_position(contact.body, contact.point, q) for contact in prepared.contacts}
+    return Start(model.point_position(*model.robot.hand, q), contacts)
+
+
 def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
     """See :func:`dynsim.engine.simulate`."""
     prepared = prepare(scenario, progress)
     run = prepared.run
     # Loading or compiling the kernels is no integration time.
-    ki.advance(prepared.system, prepared.workspace, run, 0)
+    with kernels_logged(log):
+        ki.advance(prepared.system, prepared.workspace, run, 0)
     if progress is not None:
         progress(0.0, SIMULATION)
     started, limit, interrupted = clock.perf_counter(), 20, False
     try:
+        log.info("%s: integrating %g s by %s", scenario.title, scenario.duration_s, scenario.integrator.method)
         while run.count[ki.STATUS] == ki.RUNNING:
             before = clock.perf_counter()
             ki.advance(prepared.system, prepared.workspace, run, limit)
@@ -112,6 +124,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
     except KeyboardInterrupt:
         interrupted = True
     wall = clock.perf_counter() - started
+    log.info("%s: integrated %g s in %d steps, %.3f s", scenario.title, run.clock[ki.TIME], run.count[ki.STEPS], wall)
     record = _record(scenario, prepared, wall)
     status, reached = int(run.count[ki.STATUS]), float(run.clock[ki.TIME])
     if interrupted or status != ki.FINISHED:
@@ -155,7 +168,10 @@ def _check_stiffness(scenario: Scenario, robot: Robot) -> None:
 def _control(scenario: Scenario, model: Model, progress: Progress | None) -> JointControl:
     if scenario.controller is None:
         return JointControl.short_circuit(len(model.robot.motors))
+    log.info("%s: planning references over %g s", scenario.title, scenario.duration_s)
+    started = clock.perf_counter()
     control = scenario.build_controller(model, None if progress is None else partial(progress, stage=REFERENCES))
+    log.info("%s: planned references in %.3f s", scenario.title, clock.perf_counter() - started)
     if not isinstance(control, JointControl):
         raise ModelError(f"controller {scenario.controller.type!r} cannot drive a {scenario.plant.type!r}")
     return control

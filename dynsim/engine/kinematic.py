@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 import time as clock
 from types import ModuleType
 
 import numpy as np
 
-from dynsim.engine import Progress
+from dynsim.engine import Progress, Start
 from dynsim.engine.kinematic_record import make_record
 from dynsim.engine.kinematic_run import Run
 from dynsim.engine.mode_switching import ModeSwitcher
-from dynsim.engine.outcome import check_size, raise_stopped
+from dynsim.engine.outcome import check_size, kernels_logged, raise_stopped
 from dynsim.engine.provenance import provenance
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.families import member
@@ -40,6 +41,8 @@ from dynsim.model.snake import (
 )
 from dynsim.record import Record
 from dynsim.scenario import Scenario
+
+log = logging.getLogger(__name__)
 
 CHUNK = 2000  # ticks between two looks at Ctrl-C and the progress bar; about 0.1 s
 
@@ -94,6 +97,11 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> Run:
     return run
 
 
+def start(run: Run) -> Start:
+    """Position of the controlled point at t = 0; a snake has no contact points."""
+    return Start(run.state.w_target[:3].copy(), {})
+
+
 def simulate(scenario: Scenario, progress: Progress | None = None, source: CommandSource | None = None) -> Record:
     """See :func:`dynsim.engine.simulate`; also raises what :func:`prepare` raises.
 
@@ -111,10 +119,12 @@ def simulate(scenario: Scenario, progress: Progress | None = None, source: Comma
         least_margin=controller.least_margin,
         predict=lambda row: _predict(run, row),
     )
-    _load_kernels(run)
+    with kernels_logged(log):
+        _load_kernels(run)
     stop: SimulationStopped | None = None
     started = clock.perf_counter()
     try:
+        log.info("%s: integrating %g s in %d control periods", scenario.title, scenario.duration_s, run.ticks)
         _advance(run, switcher, progress)
     except SimulationStopped as stopped:
         stop = stopped
@@ -123,7 +133,9 @@ def simulate(scenario: Scenario, progress: Progress | None = None, source: Comma
         stop = SimulationInterrupted(
             f"interrupted at t = {reached:.3f} s of {scenario.duration_s:g} s", time=reached, state=_named(run.state)
         )
-    record = make_record(run, scenario, provenance(scenario), switcher, clock.perf_counter() - started)
+    wall = clock.perf_counter() - started
+    log.info("%s: integrated %d control periods in %.3f s", scenario.title, run.state.counts[TICKS], wall)
+    record = make_record(run, scenario, provenance(scenario), switcher, wall)
     if stop is not None:
         raise_stopped(stop, record)
     return record

@@ -1,12 +1,27 @@
-"""What both engines say about a record: too large to be made, or not complete."""
+"""What both engines say about a run: that kernels are compiled, a record too large to be made, or not complete."""
 
 from __future__ import annotations
 
+import logging
+import time as clock
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NoReturn
 
 from dynsim.errors import ScenarioError, SimulationStopped
+from dynsim.kernels.jit import is_cached
 from dynsim.record import Record
 from dynsim.scenario import Scenario
+
+
+@contextmanager
+def kernels_logged(log: logging.Logger) -> Iterator[None]:
+    """Log the time in which the kernels are loaded, or compiled, which takes half a minute."""
+    cached, started = is_cached(), clock.perf_counter()
+    if not cached:
+        log.info("compiling the kernels: once after an installation or an edit, about half a minute")
+    yield
+    log.info("%s the kernels in %.1f s", "loaded" if cached else "compiled", clock.perf_counter() - started)
 
 
 def check_size(scenario: Scenario, rows: int, columns: int) -> None:

@@ -21,10 +21,18 @@ def provenance(scenario: Scenario) -> dict[str, Any]:
         "engine": scenario.engine,
         "dynsim_version": __version__,
         "commit": commit(),
-        "libraries": {name: metadata.version(name) for name in LIBRARIES},
+        "libraries": {name: _version(name) for name in LIBRARIES},
         "python": platform.python_version(),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+
+
+def _version(library: str) -> str:
+    try:
+        return metadata.version(library)
+    except metadata.PackageNotFoundError:
+        # Pinocchio has another name in other distributions than PyPI's.
+        return "unknown"
 
 
 def commit() -> str:
@@ -32,7 +40,8 @@ def commit() -> str:
     git = Path(__file__).resolve().parents[2] / ".git"
     try:
         if git.is_file():  # a linked work tree
-            git = Path(git.read_text(encoding="utf-8").removeprefix("gitdir:").strip())
+            # Of a submodule the path is relative to this file.
+            git = git.parent / git.read_text(encoding="utf-8").removeprefix("gitdir:").strip()
         head = (git / "HEAD").read_text(encoding="utf-8").strip()
         if not head.startswith("ref:"):
             return head
@@ -43,5 +52,5 @@ def commit() -> str:
             return (root / name).read_text(encoding="utf-8").strip()
         packed = (root / "packed-refs").read_text(encoding="utf-8").splitlines()
         return next((line.split()[0] for line in packed if line.endswith(" " + name)), "")
-    except OSError:
+    except (OSError, UnicodeDecodeError):
         return ""

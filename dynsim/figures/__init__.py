@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
-from dynsim.errors import RecordError
+from dynsim.errors import DynsimError, RecordError
 from dynsim.record import Record
 
 # Engine that made a record → module with ``draw`` and ``draw_comparison``.
@@ -26,13 +26,12 @@ def draw(record: Record, folder: Path) -> list[Path]:
     Raises
     ------
     RecordError
-        Nobody draws records of this engine, it lacks something, or a file cannot be written.
+        Nobody draws records of this engine, the record lacks what the figures need, or a file cannot be written.
     """
     if not len(record):
         return []
-    module = _module(record)
     with _drawable():
-        return list(module.draw(record, Path(folder)))
+        return list(_module(record).draw(record, Path(folder)))
 
 
 def draw_comparison(records: Mapping[str, Record], folder: Path) -> list[Path]:
@@ -58,6 +57,8 @@ def _drawable() -> Iterator[None]:
     """A record may come from anywhere: what it lacks is its fault, and said in a line."""
     try:
         yield
+    except DynsimError:
+        raise
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         text = " ".join(str(error).split())
         raise RecordError(f"the record cannot be drawn: {type(error).__name__}: {text}") from error

@@ -97,7 +97,7 @@ def posture(record: Record) -> Figure | None:
     if "hand_position" not in record or "q" not in record:
         return None
     body, note = _body(record)
-    drawn = [] if body is None else [body.segments(record["q"][k]) for k in _moments(len(record))]
+    drawn = [] if body is None else [body.segments(record["q"][k]) for k in _moments(record)]
     plane = _side_plane(record, drawn)
     low, high = _bounds([record], drawn)
     wide = np.hypot(high[0] - low[0], high[1] - low[1]) > 2.2 * (high[2] - low[2])
@@ -129,8 +129,7 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
         return None
     some = [records[name] for name in shown]
     drawn = {
-        name: [body.segments(records[name]["q"][k]) for k in _moments(len(records[name]))]
-        for name, body in shown.items()
+        name: [body.segments(records[name]["q"][k]) for k in _moments(records[name])] for name, body in shown.items()
     }
     everything = [segments for one in drawn.values() for segments in one]
     plane = _side_plane(some[0], everything)
@@ -221,9 +220,12 @@ def _body(record: Record) -> tuple[Body | None, str]:
         return None, f"posture not drawn: {str(error).splitlines()[0][:90]}"
 
 
-def _moments(samples: int) -> list[int]:
-    """Indices of the drawn postures, the last one last."""
-    return list(dict.fromkeys(np.linspace(0, samples - 1, FAINT + 1).astype(int).tolist()))
+def _moments(record: Record) -> list[int]:
+    """Indices of the drawn postures, the last one last; a run that diverged may end in some that are not finite."""
+    rows = np.flatnonzero(np.isfinite(record["q"]).all(axis=1))
+    if not len(rows):
+        return []
+    return list(dict.fromkeys(rows[np.linspace(0, len(rows) - 1, FAINT + 1).astype(int)].tolist()))
 
 
 def _points(records: Sequence[Record], drawn: Sequence[Array]) -> Array:
@@ -431,7 +433,7 @@ def _draw_surface(axes: Axes3D, surface: Quadric, low: Array, high: Array) -> No
 
 def _contact_points(record: Record, body: Body | None) -> list[tuple[Contact, Array, float]]:
     """Contact, position at the end and normal force at the end of every contact."""
-    if body is None or "contact_normal_force" not in record:
+    if body is None or "contact_normal_force" not in record or not np.isfinite(record["q"][-1]).all():
         return []
     last = dict(zip(record.labels["contact_normal_force"], record["contact_normal_force"][-1], strict=True))
     return [

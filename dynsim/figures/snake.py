@@ -41,7 +41,8 @@ from dynsim.files import replacing
 from dynsim.record import Record
 from dynsim.studies.tanaka2019 import used_limit
 
-FRAMES = 50
+# Postures of an animation, in a row, and over each other in one picture.
+FRAMES, IN_A_ROW, IN_A_PICTURE = 50, 6, 7
 # Postures over time in grey: the lines beside them have the colours.
 SHADES = LinearSegmentedColormap.from_list("shades", ["#CFCFCF", "#000000"])
 
@@ -110,26 +111,26 @@ def comparison(records: Mapping[str, Record]) -> Figure:
     return figure
 
 
-def strips(records: Mapping[str, Record], count: int = 6) -> Figure:
+def strips(records: Mapping[str, Record]) -> Figure:
     """Postures of every variant over time, a line each."""
     lines = {}
     for name, record in records.items():
-        views = [View(record, row) for row in moments(record, count)]
+        views = [View(record, row) for row in moments(record, IN_A_ROW)]
         waiting = record.summary["waiting_s"]
         label = name.replace("_", "\n") + (f"\n(waited {waiting:.0f} s)" if waiting >= 0.5 else "")
         lines[label] = [(view, f"{view.time:.1f} s, mode {view.mode}") for view in views]
     return posture_grid(lines, one_scale=False)
 
 
-def postures(record: Record, count: int = 6) -> Figure:
+def postures(record: Record) -> Figure:
     """Postures over time: top view above, side view along the base's heading below."""
-    views = [View(record, row) for row in moments(record, count)]
+    views = [View(record, row) for row in moments(record, IN_A_ROW)]
     return posture_strip([(view, f"t = {view.time:.1f} s, mode {view.mode}") for view in views])
 
 
-def overview(record: Record, count: int = 7) -> Figure:
+def overview(record: Record) -> Figure:
     """Top view of the whole run in one picture: postures over time, path of the controlled point and its target."""
-    rows = moments(record, count)
+    rows = moments(record, IN_A_PICTURE)
     x0, x1, y0, y1 = limits([*record["posture"][rows][:, :, :2], record["w"][:, :2]], 0.06)
     width = 5.0
     figure, axis = plt.subplots(figsize=(width + 1.4, max(width * (y1 - y0) / (x1 - x0), 1.0) + 0.9))
@@ -225,9 +226,9 @@ def redundancy(record: Record) -> Figure:
     return figure
 
 
-def animate(record: Record, path: Path, frames: int | None = None) -> Path:
+def animate(record: Record, path: Path) -> Path:
     """Animated GIF: top view and side view with grounded and lifted wheels."""
-    rows = moments(record, frames or FRAMES)
+    rows = moments(record, FRAMES)
     views = [View(record, row) for row in rows]
     top = limits([view.outline() for view in views], 0.08)
     side = limits([np.vstack([view.side, view.side * [1, 0]]) for view in views], 0.08)

@@ -72,9 +72,9 @@ def look() -> AbstractContextManager[None]:
     return matplotlib.rc_context(_LOOK)
 
 
-def new_figure(height: float, title: str, width: float = WIDTH) -> Figure:
+def new_figure(height: float, title: str) -> Figure:
     """An empty figure [inch] that belongs to no pyplot and needs no display."""
-    figure = Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title)
     return figure
@@ -156,10 +156,10 @@ def settle_time(record: Record) -> float:
     return float(record.provenance.get("scenario", {}).get("metrics", {}).get("settle_s", 0.0))
 
 
-def thin(time: Array, values: Array, count: int = LINE_POINTS) -> Series:
-    """At most about ``count`` points of a line: the smallest and the largest of each bin, so that peaks stay."""
-    size = -(-2 * len(time) // count)
-    if len(time) <= count:
+def thin(time: Array, values: Array) -> Series:
+    """At most about ``LINE_POINTS`` points of a line: the smallest and the largest of each bin, so that peaks stay."""
+    size = -(-2 * len(time) // LINE_POINTS)
+    if len(time) <= LINE_POINTS:
         return time, values
     whole = len(time) // size * size
     bins = values[:whole].reshape(-1, size)

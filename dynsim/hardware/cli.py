@@ -12,7 +12,7 @@ import typer
 from rich.table import Table
 
 from dynsim.errors import DynsimError
-from dynsim.files import file_name, write_json
+from dynsim.files import file_name, json_text, write_json
 from dynsim.terminal import Terminal, plain
 
 hw = typer.Typer(
@@ -365,6 +365,14 @@ def stop_servos(
         who = f"ID {', '.join(map(str, on))}" if on else "any servo"
         raise VerificationFailed(f"torque off was sent, but NOT confirmed by {who}: cut the power")
     console.print(f"torque off, confirmed by {len(torque)} servos")
+
+
+@hw.command(epilog="Example: dynsim hw schema > servo_map.schema.json")
+def schema() -> None:
+    """Print the JSON schema of servo maps, for editors."""
+    from dynsim.hardware.servo_map import json_schema
+
+    print(json_text(json_schema()), end="")
 
 
 @hw.command(epilog="Example: dynsim hw calibrate --map my_arm.yaml --port /dev/ttyUSB0")

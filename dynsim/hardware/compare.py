@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.optimize import minimize_scalar
 
-from dynsim.errors import RecordError
+from dynsim.errors import RecordError, shown
 from dynsim.files import replacing
 from dynsim.hardware.errors import ComparisonGateFailed
 from dynsim.hardware.replay import State
@@ -112,8 +112,16 @@ def compare_records(simulated: Record, measured: Record) -> Comparison:
     Raises
     ------
     RecordError
-        No common angles, or no sample of the replayed motion.
+        No common angles, no sample of the replayed motion, or a measured run that is not as a replay makes them.
     """
+    for name in ("state", "record_time"):
+        if name in measured and measured[name].shape != measured.time.shape:
+            raise RecordError(
+                f"signal {name!r} of the measured run has shape {measured[name].shape}; it has one column"
+            )
+    speed = measured.provenance.get("speed", 1.0)
+    if not isinstance(speed, (int, float)) or not 0.0 < speed < np.inf:
+        raise RecordError(f"the provenance of the measured run says speed {shown(speed)}; a replay has a positive one")
     rows = measured["state"] == State.REPLAY if "state" in measured else np.ones(len(measured), dtype=bool)
     time = measured["record_time"] if "record_time" in measured else measured.time  # noqa: SIM401
     rows &= np.isfinite(time) & (time >= 0) & (time <= simulated.time[-1] - simulated.time[0])
@@ -131,7 +139,6 @@ def compare_records(simulated: Record, measured: Record) -> Comparison:
         return np.column_stack([np.interp(times, own_time, column) for column in reference.T])
 
     moving = np.ptp(reference, axis=0) > MOVING
-    speed = _speed(measured)
     common = _delay(at, time, actual, moving)
     delay = 0.0 if np.isnan(common) else common
     joints = []
@@ -154,18 +161,12 @@ def compare_records(simulated: Record, measured: Record) -> Comparison:
     return Comparison(delay / speed, tuple(joints), time, at(time), actual)
 
 
-def _speed(measured: Record) -> float:
-    """Of a replay, in parts of the record's own; 1 for any other run."""
-    speed = measured.provenance.get("speed", 1.0)
-    if not isinstance(speed, (int, float)) or not 0.0 < speed < np.inf:
-        raise RecordError(f"the measured record gives {speed!r} as speed, which must be a positive number")
-    return float(speed)
-
-
 def _common_angles(simulated: Record, measured: Record) -> list[tuple[str, Array, Array]]:
     pairs = []
     for name, signal in simulated.signals.items():
-        if signal.unit != "rad" or name not in measured or signal.data.ndim != 2 or name == "rho":
+        if signal.unit != "rad" or name not in measured or name == "rho":
+            continue
+        if signal.data.ndim != 2 or measured[name].ndim != 2:
             continue
         theirs = measured.labels[name]
         for column, label in enumerate(signal.labels):

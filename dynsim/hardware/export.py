@@ -6,6 +6,8 @@ import csv
 import io
 import json
 import re
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Literal, TextIO
 
@@ -20,17 +22,17 @@ from dynsim.record import Record
 Format = Literal["csv", "joint-trajectory", "urdf-log"]
 SUFFIX: dict[str, str] = {"csv": ".csv", "joint-trajectory": ".trajectory.yaml", "urdf-log": ".jsonl"}
 RATES = {"q": "v", "phi": "phi_dot", "rho": "rho_dot"}
-"""Angle signals of the records, and the signals that hold their rates."""
+"""Position signals of the records, and the signals that hold their rates."""
 _YAML_WORDS = {"y", "n", "yes", "no", "on", "off", "true", "false", "null"}
 
 
 def export_record(record: Record, path: Path, format_: Format, *, rate: float | None = None) -> Path:
-    """Write the joint angles and rates of a record.
+    """Write the joint positions and rates of a record.
 
-    ``csv``: one row per sample, columns "time [s]", "<joint> [rad]", "<joint> [rad/s]". ``joint-trajectory``: the
-    fields of a ROS trajectory_msgs/JointTrajectory as YAML, for a joint trajectory controller. ``urdf-log``: one JSON
-    object per line, {"time", "position": {joint: rad}, "velocity": {joint: rad/s}}, joint names being those of the
-    URDF.
+    ``csv``: one row per sample, columns "time [s]", "<joint> [rad]", "<joint> [rad/s]", with the units of the record
+    ("rad or m" where it has joints of both kinds). ``joint-trajectory``: the fields of a ROS
+    trajectory_msgs/JointTrajectory as YAML, for a joint trajectory controller. ``urdf-log``: one JSON object per line,
+    {"time", "position": {joint: rad or m}, "velocity": {joint: rad/s or m/s}}, joint names being those of the URDF.
 
     Parameters
     ----------
@@ -44,16 +46,20 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
     """
     joints, time, position, velocity = joint_motion(record)
     if rate is not None:
-        if not rate > 0:
+        if not 0 < rate < np.inf:
             raise RecordError(f"--rate must be positive, not {rate}")
         path_between = JointPath(time, position, velocity[:-1], velocity[1:], float(time[-1]))
         time = np.arange(0.0, time[-1] + 0.5 / rate, 1.0 / rate).clip(max=time[-1])
         knots = [_within(path_between, instant) for instant in time]
         position, velocity = np.array([q for q, _ in knots]), np.array([v for _, v in knots])
-    writer = {"csv": _write_csv, "joint-trajectory": _write_joint_trajectory, "urdf-log": _write_urdf_log}[format_]
+    writers: dict[str, Callable[..., None]] = {
+        "csv": partial(_write_csv, record),
+        "joint-trajectory": _write_joint_trajectory,
+        "urdf-log": _write_urdf_log,
+    }
     with replacing(path) as stream:
         text = io.TextIOWrapper(stream, encoding="utf-8", newline="")
-        writer(text, joints, time, position, velocity)
+        writers[format_](text, joints, time, position, velocity)
         text.flush()
         text.detach()  # closed with it, the stream could not be published
     return path
@@ -62,7 +68,7 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
 def joint_motion(
     record: Record,
 ) -> tuple[list[str], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Joint names, time from 0 [s], angles [rad] and rates [rad/s] of a record.
+    """Joint names, time from 0 [s], positions and rates [rad, rad/s; m, m/s] of a record.
 
     Raises
     ------
@@ -73,9 +79,12 @@ def joint_motion(
     angles, rates = [], []
     for name, rate in RATES.items():
         if name in record and rate in record:
-            joints += record.labels[name]
             if record[name].ndim != 2 or record[rate].shape != record[name].shape:
-                raise RecordError(f"{name} and {rate} of the record must have one column for each joint")
+                raise RecordError(
+                    f"signals {name!r} {record[name].shape} and {rate!r} {record[rate].shape} of the record must both "
+                    "have a row per sample and a column per joint"
+                )
+            joints += record.labels[name]
             angles.append(record[name])
             rates.append(record[rate])
     if not joints:
@@ -96,10 +105,18 @@ def _within(path: JointPath, time: float) -> tuple[NDArray[np.float64], NDArray[
 
 
 def _write_csv(
-    file: TextIO, joints: list[str], time: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64]
+    record: Record,
+    file: TextIO,
+    joints: list[str],
+    time: NDArray[np.float64],
+    q: NDArray[np.float64],
+    v: NDArray[np.float64],
 ) -> None:
+    pairs = [(name, rate) for name, rate in RATES.items() if name in record and rate in record]
+    units = [[record.units[pair[k]] for pair in pairs for _ in record.labels[pair[0]]] for k in (0, 1)]
+    headings = [f"{joint} [{unit}]" for column in units for joint, unit in zip(joints, column, strict=True)]
     rows = csv.writer(file)
-    rows.writerow(["time [s]", *(f"{joint} [rad]" for joint in joints), *(f"{joint} [rad/s]" for joint in joints)])
+    rows.writerow(["time [s]", *headings])
     rows.writerows([f"{value:.9g}" for value in (t, *qs, *vs)] for t, qs, vs in zip(time, q, v, strict=True))
 
 

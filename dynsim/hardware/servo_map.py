@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError
 
+from dynsim.errors import shown
 from dynsim.hardware.control_table import (
     BAUD_RATES,
     MAX_ID,
@@ -82,6 +83,15 @@ class Limits(StrictModel):
     torque: Positive
 
 
+# For editors; what loading says about it is in _position_limits_fit_the_mode.
+_POSITION_NEEDS_LIMITS: dict[str, Any] = {
+    "if": {"properties": {"mode": {"const": "position"}}},
+    "then": {
+        "properties": {"limits": {"required": ["position_deg"], "properties": {"position_deg": {"type": "array"}}}}
+    },
+}
+
+
 class Kind(StrictModel):
     """Everything servos of one sort have in common.
 
@@ -108,6 +118,8 @@ class Kind(StrictModel):
     following_error: Positive
     gear: Positive = 1.0
 
+    model_config = ConfigDict(json_schema_extra=_POSITION_NEEDS_LIMITS)
+
     @model_validator(mode="after")
     def _position_limits_fit_the_mode(self) -> Kind:
         limits = self.limits.position_deg
@@ -129,6 +141,10 @@ class ServoEntry(StrictModel):
     hold_at_deg: Finite | None = None
 
 
+# 4.5 Mbit/s is the servos' but not the client library's.
+_BAUD_CHOICES = [rate for rate in BAUD_RATES if rate <= 4_000_000]
+
+
 class Bus(StrictModel):
     """The serial line.
 
@@ -144,16 +160,15 @@ class Bus(StrictModel):
         Longest return delay a servo may have stored [s].
     """
 
-    baud: int = 3_000_000
+    baud: Annotated[int, Field(json_schema_extra={"enum": _BAUD_CHOICES})] = 3_000_000
     rate: Positive = 200.0
     latency: Positive = 2e-3
     return_delay: Annotated[float, Field(ge=0, le=508e-6)] = 0.0
 
     @model_validator(mode="after")
     def _baud_is_one_of_the_servos(self) -> Bus:
-        choices = [rate for rate in BAUD_RATES if rate <= 4_000_000]
-        if self.baud not in choices:
-            raise ValueError(f"baud {self.baud} is not one of {', '.join(map(str, choices))}")
+        if self.baud not in _BAUD_CHOICES:
+            raise ValueError(f"baud {self.baud} is not one of {', '.join(map(str, _BAUD_CHOICES))}")
         return self
 
 
@@ -203,11 +218,15 @@ class Safety(StrictModel):
 
 
 class _MapFile(StrictModel):
+    """A servo map: which servo follows which column of a record, and what that joint may do."""
+
+    model_config = ConfigDict(title="ServoMap")
+
     robot: str
     bus: Bus = Bus()
     safety: Safety = Safety()
     kinds: dict[str, Kind]
-    servos: dict[str, ServoEntry]
+    servos: Annotated[dict[str, ServoEntry], Field(json_schema_extra={"minProperties": 1})]
 
     @model_validator(mode="after")
     def _servos_are_consistent(self) -> _MapFile:
@@ -324,11 +343,24 @@ def load_servo_map(path: str | Path) -> ServoMap:
     ServoMapError
         The file is missing, is not YAML, or an entry is wrong; with file and line.
     """
+    if not isinstance(path, (str, Path)):
+        raise ServoMapError(
+            f"a servo map is named by its file, or by its name when it is shipped, not by {shown(path)}"
+        )
     path = Path(path)
     shipped = SHIPPED / f"{path.stem}.yaml"
     if not path.is_file() and path.parent in (Path(), Path("scenarios/hardware")) and shipped.is_file():
         path = shipped
     return ServoMap(path, read_yaml(path, _MapFile))
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON schema of servo maps, for editors.
+
+    It cannot say what ties entries together: that ``kind`` names one of ``kinds``, that IDs differ, and that the lower
+    limit is below the upper one. Loading checks these.
+    """
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **_MapFile.model_json_schema()}
 
 
 _Schema = TypeVar("_Schema", bound=BaseModel)

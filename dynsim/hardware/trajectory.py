@@ -105,10 +105,13 @@ def path_of_record(record: Record, servo_map: ServoMap) -> Path:
     """
     if len(record) < 2:
         raise CheckRefused(f"the record has {len(record)} samples; a motion needs two")
-    time = record.time - record.time[0]
-    if not np.all(np.isfinite(time)) or not np.all(np.diff(time) > 0):
-        bad = int(np.flatnonzero(~(np.diff(time) > 0))[0]) + 1
+    with np.errstate(invalid="ignore"):
+        steps = np.diff(record.time)
+    later = np.isfinite(steps) & (steps > 0)
+    if not later.all():
+        bad = int(np.flatnonzero(~later)[0]) + 1
         raise CheckRefused(f"the record's time does not increase at sample {bad} (t = {record.time[bad]:g} s)")
+    time = record.time - record.time[0]
     position = np.empty((len(record), len(servo_map.servos)))
     rate_after, rate_before = np.empty_like(position[1:]), np.empty_like(position[1:])
     for column, servo in enumerate(servo_map.servos):

@@ -536,8 +536,8 @@ class VirtualPort(PortHandler):
 
     POLL = 1e-5
 
-    def __init__(self, line: VirtualLine, clock: VirtualClock, *, baud: int, name: str = "virtual") -> None:
-        super().__init__(name)
+    def __init__(self, line: VirtualLine, clock: VirtualClock, *, baud: int) -> None:
+        super().__init__("virtual")
         self.line = line
         self.clock = clock
         self.baudrate = baud

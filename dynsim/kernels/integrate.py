@@ -278,7 +278,8 @@ def weight_rk43(run: Run, size):
 
     z = |h (f(y_new) − k_4)| / |y_new − Y_4|, Y_4 the state of the fourth stage at the same time, is |h λ| of the modes
     that the two differ in (Hairer, Wanner: Solving Ordinary Differential Equations II, IV.2, eq 2.25): the method is
-    stable up to z of 2.8, and smooth motions have small ones. The weight falls from 1/6 at z = 0 to 0.03 from z = √½ on, a quarter of that.
+    stable up to z of 2.8, and smooth motions have small ones. The weight falls from 1/6 at z = 0 to 0.03
+    from z = √½ on, a quarter of that.
     """
     h, y, y_new, k, atol, rtol = run.clock[STEP], run.y, run.y_new, run.stage, run.clock[ATOL], run.clock[RTOL]
     slope, change = 0.0, 0.0

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from dynsim.errors import ModelError
+from dynsim.errors import ModelError, shown
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.jit import integers, reals
 from dynsim.model.description import Contact, Link, Motor, Robot
@@ -20,11 +20,13 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
     Raises
     ------
     ModelError
-        Duplicate names, a parent that does not come first, an impossible inertia, a joint that nothing can accelerate.
+        Duplicate names, a parent that does not come first, an impossible inertia, a joint that nothing can accelerate,
+        a hand on a body that there is not, or vectors of another shape or with what is no finite number.
     """
     links = robot.links
     if not links:
         raise ModelError(f"{robot.name}: a robot needs at least one link")
+    _check_shapes(robot)
     index: dict[str, int] = {}
     tree = np.zeros((len(links), ka.TREE_SIZE), dtype=np.int64)
     body = np.zeros((len(links), ka.BODY_SIZE))
@@ -39,17 +41,18 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         norm = float(np.linalg.norm(link.axis))
         if not abs(norm - 1.0) < 1e-9:
             raise ModelError(f"{link.joint}: the axis {link.axis} has length {norm:.6g}; it must be a unit vector")
-        if np.abs(link.R_PJ @ link.R_PJ.T - np.eye(3)).max() > 1e-9 or np.linalg.det(link.R_PJ) < 0.0:
+        R_PJ = np.asarray(link.R_PJ)
+        if np.abs(R_PJ @ R_PJ.T - np.eye(3)).max() > 1e-9 or np.linalg.det(R_PJ) < 0.0:
             raise ModelError(f"{link.joint}: R_PJ is not a rotation")
         parent = -1 if link.parent is None else index[link.parent]
         index[link.name] = i
         tree[i, ka.PARENT] = parent
         tree[i, ka.KIND] = _joint_kind(link)
-        tree[i, ka.TURNED] = int(not np.array_equal(link.R_PJ, np.eye(3)))
+        tree[i, ka.TURNED] = int(not np.array_equal(R_PJ, np.eye(3)))
         if parent >= 0 and parent != i - 1:
             tree[parent, ka.BRANCHES] += 1
-        tensor = link.inertia.tensor
-        body[i, ka.R_PJ : ka.R_PJ + 9] = link.R_PJ.ravel()
+        tensor = np.asarray(link.inertia.tensor)
+        body[i, ka.R_PJ : ka.R_PJ + 9] = R_PJ.ravel()
         body[i, ka.P_PJ : ka.P_PJ + 3] = link.p_PJ
         body[i, ka.AXIS : ka.AXIS + 3] = link.axis
         body[i, ka.MASS] = link.inertia.mass
@@ -118,6 +121,37 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArr
         point[k, ka.QUADRIC + 9] = scale * surface.c
         point[k, ka.MU], point[k, ka.V_S] = contact.friction, contact.slip_smoothing
     return ka.ContactArrays(link=integers(link), point=reals(point))
+
+
+def _check_shapes(robot: Robot) -> None:
+    """Refuse what numpy would spread over the tables, or the kernels carry on as NaN."""
+    names = [link.name for link in robot.links]
+    body, point = robot.hand
+    if body not in names:
+        raise ModelError(f"{robot.name}: the hand is on {body!r}, which is no body; bodies: {', '.join(names)}")
+    quantities: list[tuple[str, object, tuple[int, ...]]] = [
+        (f"{robot.name}: gravity", robot.gravity, (3,)),
+        (f"{robot.name}: the hand's point", point, (3,)),
+        (f"{robot.name}: q0", robot.initial, (len(names),)),
+    ]
+    for link in robot.links:
+        inertia = link.inertia
+        quantities += [
+            (f"{link.joint}: axis", link.axis, (3,)),
+            (f"{link.joint}: R_PJ", link.R_PJ, (3, 3)),
+            (f"{link.joint}: p_PJ", link.p_PJ, (3,)),
+            (f"{link.name}: mass", inertia.mass, ()),
+            (f"{link.name}: centre of mass", inertia.com, (3,)),
+            (f"{link.name}: inertia tensor", inertia.tensor, (3, 3)),
+        ]
+    for what, value, shape in quantities:
+        try:
+            array = np.asarray(value)
+        except ValueError:  # rows of unequal length
+            array = np.array(None)
+        if array.dtype.kind not in "fiu" or array.shape != shape or not np.isfinite(array).all():
+            wanted = f"an array of shape {shape} of finite numbers" if shape else "a finite number"
+            raise ModelError(f"{what} is {shown(value)}; it must be {wanted}")
 
 
 def _joint_kind(link: Link) -> int:

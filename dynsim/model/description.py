@@ -7,7 +7,7 @@ moves with the joint; at q = 0 it is the joint frame J, placed in the parent's b
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,6 +22,11 @@ WORLD = "world"
 def vector(x: float, y: float, z: float) -> Array:
     """A 3-vector."""
     return np.array([x, y, z], dtype=np.float64)
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names for a line of text: all of a few, the first and the last of many."""
+    return ", ".join(names) if len(names) <= 4 else f"{names[0]} … {names[-1]} ({len(names)})"
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,11 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from dynsim.errors import ModelError
+from dynsim.errors import ModelError, shown
 from dynsim.kernels import arrays as ka
 from dynsim.kernels import articulated, energy, kinematics, newton_euler
 from dynsim.model.arrays import compile_model
-from dynsim.model.description import Array, Robot
+from dynsim.model.description import Array, Robot, listed
+
+_FLOAT64 = np.dtype(np.float64)
 
 
 class Model:
@@ -31,9 +34,15 @@ class Model:
     ------
     ModelError
         The description is not a physical tree of bodies.
+
+    Every method raises ModelError for vectors of another length, for what is no finite number, and for unknown bodies.
     """
 
     def __init__(self, robot: Robot) -> None:
+        if not isinstance(robot, Robot):
+            raise ModelError(
+                f"needs a Robot, not {shown(robot)}; Model.from_urdf(file) and build_model(scenario) give a model"
+            )
         robot = robot.with_motors_mounted() if any(motor.mass for motor in robot.motors) else robot
         self.robot = robot
         self.arrays = compile_model(robot)
@@ -42,6 +51,16 @@ class Model:
         # forward_dynamics and mass_matrix are those of the bodies alone: no rotor inertia.
         self._bodies = self.arrays._replace(body=self.arrays.body.copy())
         self._bodies.body[:, ka.ARMATURE] = 0.0
+
+    def __repr__(self) -> str:
+        robot = self.robot
+        driven = [motor.joint for motor in robot.motors]
+        motors = (
+            "no motors" if not driven else "a motor on each" if len(driven) == self.n else f"motors on {listed(driven)}"
+        )
+        mass = sum(link.inertia.mass for link in robot.links)
+        joints = f"joint{'s' if self.n > 1 else ''} {listed(self.joint_names)}"
+        return f"<Model {robot.name}: {joints}, {motors}, hand on {robot.hand[0]}, {mass:.4g} kg>"
 
     @classmethod
     def from_urdf(cls, path: str | os.PathLike[str], lock: Mapping[str, float] | None = None) -> Model:
@@ -59,6 +78,8 @@ class Model:
         """
         from dynsim.model.urdf import read_urdf
 
+        if not isinstance(path, (str, os.PathLike)):
+            raise ModelError(f"a URDF file is named by its path, not by {shown(path)}")
         return cls(read_urdf(Path(path), lock))
 
     def to_urdf(self) -> str:
@@ -151,15 +172,18 @@ class Model:
         return float(energy.potential_energy(self.arrays, self._workspace))
 
     def body_index(self, body: str | int) -> int:
-        """Index of a body by name.
+        """Index of a body by name; an index stays as it is.
 
         Raises
         ------
         ModelError
             No such body.
         """
-        if isinstance(body, int):
-            return body
+        if type(body) is int or isinstance(body, np.integer):
+            # The kernels do not look whether an index is within their tables.
+            if not 0 <= body < self.n:
+                raise ModelError(f"no body {body}; indices of this model are 0 to {self.n - 1}")
+            return int(body)
         for i, link in enumerate(self.robot.links):
             if link.name == body:
                 return i
@@ -179,14 +203,34 @@ class Model:
         self._workspace.joints[:, ka.QD] = 0.0 if v is None else self._vector(v, "v")
 
     def _vector(self, values: ArrayLike, name: str) -> Array:
-        array = np.asarray(values, dtype=np.float64)
+        array = _numbers(values, name)
         if array.shape != (self.n,):
             raise ModelError(f"{name} has shape {array.shape}; this model has {self.n} joints")
+        # The sum of Python's numbers first: it neither warns nor takes as long as a look by numpy at every element.
+        if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():
+            k = int(np.flatnonzero(~np.isfinite(array))[0])
+            raise ModelError(f"{name} is {array[k]} at {self.joint_names[k]}; it must be finite")
         return array
 
     @staticmethod
     def _point(point: ArrayLike) -> Array:
-        array = np.array(point, dtype=np.float64)
+        # A copy: an array of another layout would be compiled for anew.
+        array = np.array(_numbers(point, "point"))
         if array.shape != (3,):
             raise ModelError(f"point has shape {array.shape}; it must be (3,): x, y, z in the body's frame [m]")
+        if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():
+            raise ModelError(f"point is {array.tolist()}; it must be finite [m]")
         return array
+
+
+def _numbers(values: ArrayLike, name: str) -> Array:
+    """Real numbers as float64; texts, complex numbers and rows of unequal length are none."""
+    if type(values) is np.ndarray and values.dtype is _FLOAT64:
+        return values
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise ModelError(f"{name} is no array of numbers: {error}") from error
+    if array.dtype.kind not in "fiu":
+        raise ModelError(f"{name} must be real numbers, not {shown(values)}")
+    return np.asarray(array, dtype=np.float64)

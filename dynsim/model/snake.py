@@ -51,7 +51,6 @@ class SnakeDescription:
     base_joints: int
     link_length: float
     wheel_radius: float
-    gripper_length: float
     point_offset: float
     reference_joints: NDArray[np.float64]  # (n_phi,) head raised, base straight: where damping takes its scale
     joint_names: tuple[str, ...]

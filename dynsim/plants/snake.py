@@ -124,7 +124,6 @@ def build(config: Config) -> SnakeDescription:
         base_joints=n_b,
         link_length=config.link_length_m,
         wheel_radius=config.wheel_radius_m,
-        gripper_length=config.gripper_length_m,
         point_offset=config.gripper_length_m if config.controlled_point == "gripper" else 0.0,
         reference_joints=np.concatenate([raised, np.zeros(n_b)]),
         joint_names=names,

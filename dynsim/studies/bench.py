@@ -254,7 +254,18 @@ def _take_turns(timed: list[Timed], rounds: int, share: float) -> dict[str, list
 
 @dataclass(frozen=True)
 class Case:
-    """One whole run that several programs do; ``reference_contacts`` says what the reference assumes."""
+    """One whole run that several programs do.
+
+    Attributes
+    ----------
+    variant : str
+        Of elbow_comparison.
+    mujoco_contacts : str
+        ``contacts`` of :func:`dynsim.studies.mujoco_peer.build_mujoco`.
+    same_physics : bool
+        Whether the programs solve the same equations; where not, MuJoCo's rows are marked and no ratio is given.
+    note : str
+    """
 
     variant: str
     mujoco_contacts: str

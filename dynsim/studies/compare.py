@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import csv
 import io
+import logging
 import signal
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing import active_children, get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
+from threading import Thread
 from typing import Any, Protocol
 
 from dynsim.engine import SIMULATION, simulate
-from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped
+from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped, shown
 from dynsim.files import json_text, replace_together
 from dynsim.record import Record
 from dynsim.scenario import Scenario, load_scenario, variant_names
+
+log = logging.getLogger(__name__)
 
 # In a worker process: set when it shall stop and hand back what it has.
 _interrupt: Any = None
@@ -56,10 +61,12 @@ def compare(
     Raises
     ------
     ScenarioError
-        The file has no variants, or one of them is not valid; all are checked before the first runs.
+        The file has no variants, one of them is not valid (all are checked before the first runs), or no such ``jobs``.
     SimulationStopped, SimulationInterrupted
         A variant stopped (after the others have run) or Ctrl-C. Names all that stopped; holds the record of the first.
     """
+    if not isinstance(jobs, int) or jobs < 1:
+        raise ScenarioError(f"jobs = {shown(jobs)}: must be a whole number of processes, 1 or more")
     names = variant_names(path)
     if not names:
         raise ScenarioError(f"{path}: has no variants to compare; use `dynsim run`")
@@ -126,7 +133,15 @@ def _run_in_processes(
                 del waiting[future]
 
     workers = min(jobs, len(scenarios))
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker, initargs=(interrupt,)) as pool:
+    with (
+        _logged_here(context) as sender,
+        ProcessPoolExecutor(
+            workers,
+            mp_context=context,
+            initializer=_start_worker,
+            initargs=(interrupt, sender, log.getEffectiveLevel()),
+        ) as pool,
+    ):
         try:
             try:
                 with _sigint_held():
@@ -148,6 +163,41 @@ def _run_in_processes(
     return False
 
 
+class _ToParent(logging.Handler):
+    """In a worker: hands what is logged to the parent by one write to a pipe. A killed worker leaves no lock behind."""
+
+    LONGEST = 1000  # characters; with their frame less than what a pipe takes in one piece
+
+    def __init__(self, sender: Connection) -> None:
+        super().__init__()
+        self.sender = sender
+
+    def emit(self, record: logging.LogRecord) -> None:
+        with suppress(OSError):
+            self.sender.send((record.name, record.levelno, record.getMessage()[: self.LONGEST]))
+
+
+@contextmanager
+def _logged_here(context: Any) -> Iterator[Connection]:
+    """Log what the workers log, until all of them have ended; yields what they send it by."""
+    receiver, sender = context.Pipe(duplex=False)
+
+    def listen() -> None:
+        with suppress(EOFError, OSError):
+            while True:
+                name, level, text = receiver.recv()
+                logging.getLogger(name).log(level, "%s", text)
+
+    listener = Thread(target=listen, name="log of the workers", daemon=True)
+    listener.start()
+    try:
+        yield sender
+    finally:
+        # Without this end the pipe ends with the last worker.
+        sender.close()
+        listener.join(timeout=1.0)
+
+
 @contextmanager
 def _sigint_held() -> Iterator[None]:
     """Processes started here do not get the Ctrl-C of the terminal, not even while they start; this one gets it after.
@@ -164,10 +214,13 @@ def _sigint_held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _start_worker(interrupt: Any) -> None:
+def _start_worker(interrupt: Any, sender: Connection, level: int) -> None:
     global _interrupt
     _interrupt = interrupt
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    library = logging.getLogger("dynsim")
+    library.setLevel(level)
+    library.addHandler(_ToParent(sender))
 
 
 def _simulate(scenario: Scenario) -> Record:

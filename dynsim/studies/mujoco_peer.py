@@ -30,7 +30,6 @@ def build_mujoco(
     integrator: Literal["euler", "implicitfast", "rk4"] = "euler",
     motors: bool = True,
     contacts: Literal["none", "soft", "equality"] = "none",
-    stiffness_time: float | None = None,
     cone: Literal["pyramidal", "elliptic"] = "pyramidal",
 ) -> Any:
     """The bodies, motors and contacts of ``system`` as a ``mujoco.MjModel``.
@@ -44,7 +43,6 @@ def build_mujoco(
         "equality": the point is held at its distance from the centre of a sphere surface by an equality constraint
         on the length of a tendon, the one-row bilateral constraint that MuJoCo has; without friction.
     cone : of the friction; MuJoCo's default, which is faster, or the one that is Coulomb's
-    stiffness_time : time constant of the soft constraints [s]; default: two steps, the stiffest that MuJoCo allows.
 
     Notes
     -----
@@ -66,7 +64,8 @@ def build_mujoco(
     bodies = _add_bodies(spec, system)
     if motors:
         _add_motors(spec, system)
-    solref = [2.0 * step if stiffness_time is None else stiffness_time, 1.0]
+    # Time constant of the soft constraints [s] and damping ratio: the stiffest that MuJoCo allows.
+    solref = [2.0 * step, 1.0]
     radii = []
     for k in range(len(system.contacts.link)):
         body = bodies[system.contacts.link[k, ka.LINK]]

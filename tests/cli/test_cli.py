@@ -5,16 +5,19 @@ import os
 import signal
 import subprocess
 import sys
-import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import h5py
 import pytest
+from processes import started
 
+from dynsim._version import __version__
 from dynsim.cli import main
+from dynsim.engine import check
 from dynsim.record import FORMAT, Record
-from dynsim.scenario import SHIPPED
+from dynsim.scenario import SHIPPED, build_model, load_scenario
 
 SHORT = ["--set", "duration_s=0.2", "--set", "metrics.settle_s=0.05"]
 
@@ -58,14 +61,15 @@ def test_run_writes_everything_that_is_promised(tmp_path: Path):
 def test_compare_prints_the_table_and_writes_the_comparison(tmp_path: Path):
     result = dynsim("compare", "elbow_comparison", "--no-figures", *SHORT, folder=tmp_path)
     assert result.returncode == 0, result.stderr
-    for name in ("two_elbows", "elbow_7", "elbow_4", "no_elbow"):
-        assert name in result.stdout
+    # The heading of the table: names of contacts are those of variants.
+    assert any(line.split() == ["two_elbows", "elbow_7", "elbow_4", "no_elbow"] for line in result.stdout.splitlines())
     folder = tmp_path / "results" / "elbow_comparison"
     variants = json.loads((folder / "comparison.json").read_text())["variants"]
     assert list(variants) == ["two_elbows", "elbow_7", "elbow_4", "no_elbow"]
     rows = (folder / "comparison.csv").read_text().splitlines()
     assert len(rows) == 5
-    assert rows[0].startswith("variant,") or ",variant," in rows[0]
+    assert rows[0].startswith("variant,")
+    assert [row.split(",")[0] for row in rows[1:]] == list(variants)
     assert {"elbow_4.closed_fraction", "elbow_4.slip_distance_m"} <= set(rows[0].split(","))
 
 
@@ -191,46 +195,45 @@ def test_divergence_stops_with_code_3_and_keeps_what_there_is(tmp_path: Path):
     assert "q" in record.provenance["stopped"]["state"]
 
 
+LONG = ["--set", "duration_s=5000", "--set", "controller.knot_spacing_s=10", "--set",
+        "controller.hand.path.period_s=5000", "--set", "record.rate_hz=10"]  # fmt: skip
+
+
+def verbose(*arguments: str) -> list[str]:
+    """A command that says on stderr how far it is."""
+    return [sys.executable, "-m", "dynsim", "--verbose", *arguments]
+
+
+def without_log(stderr: str) -> list[str]:
+    return [line for line in stderr.splitlines() if " INFO " not in line and " WARNING " not in line]
+
+
 def test_ctrl_c_saves_what_was_simulated(tmp_path: Path):
-    process = subprocess.Popen(
-        [sys.executable, "-m", "dynsim", "run", "elbow_comparison", "--no-figures", "--set", "duration_s=5000",
-         "--set", "controller.knot_spacing_s=10", "--set", "controller.hand.path.period_s=5000",
-         "--set", "record.rate_hz=10"],
-        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed_ctrl_c,
-    )  # fmt: skip
-    time.sleep(8.0)
-    os.kill(process.pid, signal.SIGINT)
-    _, stderr = process.communicate(timeout=120)
-    assert process.returncode == 130, stderr
+    command = verbose("run", "elbow_comparison", "--no-figures", *LONG)
+    with started(command, tmp_path / "stderr", cwd=tmp_path, preexec_fn=heed_ctrl_c) as child:
+        child.wait_for("integrating 5000 s")
+        os.kill(child.process.pid, signal.SIGINT)
+        assert child.end() == 130, child.stderr
     record = Record.load(tmp_path / "results" / "elbow_comparison" / "two_elbows" / "record.h5")
     assert not record.complete
     assert "incomplete" in record.summary["warnings"][-1]
 
 
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="process groups are POSIX")
-def test_ctrl_c_saves_all_variants_that_run_in_processes(tmp_path: Path):
+@pytest.mark.parametrize("kill", [os.kill, os.killpg])
+def test_ctrl_c_saves_all_variants_that_run_in_processes(tmp_path: Path, kill: Callable[[int, int], None]):
     # Two run, two wait. One signal goes to the parent alone, the other, as a terminal sends it, to all.
-    processes = {
-        kill: subprocess.Popen(
-            [sys.executable, "-m", "dynsim", "compare", "elbow_comparison", "--jobs", "2", "--no-figures",
-             "--set", "duration_s=5000", "--set", "controller.knot_spacing_s=10",
-             "--set", "controller.hand.path.period_s=5000", "--set", "record.rate_hz=10", "--out", kill.__name__],
-            cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            preexec_fn=heed_ctrl_c, start_new_session=True,
-        )
-        for kill in (os.kill, os.killpg)
-    }  # fmt: skip
-    time.sleep(12.0)
-    for kill, process in processes.items():
-        kill(process.pid, signal.SIGINT)
-        _, stderr = process.communicate(timeout=120)
-        assert process.returncode == 130, stderr
-        *saved, error = stderr.splitlines()
-        assert sorted(line.split()[4] for line in saved) == ["elbow_7", "two_elbows"]
-        assert error.startswith("error: two_elbows: interrupted at t = ")
-        assert {path.name for path in (tmp_path / kill.__name__).iterdir()} == {"elbow_7", "two_elbows"}
-        for name in ("elbow_7", "two_elbows"):
-            assert not Record.load(tmp_path / kill.__name__ / name / "record.h5").complete
+    command = verbose("compare", "elbow_comparison", "--jobs", "2", "--no-figures", *LONG, "--out", "out")
+    with started(command, tmp_path / "stderr", cwd=tmp_path, preexec_fn=heed_ctrl_c) as child:
+        child.wait_for("integrating 5000 s", count=2)
+        kill(child.process.pid, signal.SIGINT)
+        assert child.end() == 130, child.stderr
+    *saved, error = without_log(child.stderr)
+    assert sorted(line.split()[4] for line in saved) == ["elbow_7", "two_elbows"]
+    assert error.startswith("error: two_elbows: interrupted at t = ")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"elbow_7", "two_elbows"}
+    for name in ("elbow_7", "two_elbows"):
+        assert not Record.load(tmp_path / "out" / name / "record.h5").complete
 
 
 @pytest.mark.parametrize("jobs", ["1", "2"])
@@ -250,22 +253,16 @@ def test_a_variant_that_stops_does_not_keep_the_others_from_the_comparison(tmp_p
     assert not Record.load(tmp_path / "out" / "bad" / "record.h5").complete
 
 
-def test_ctrl_c_before_the_first_step_says_that_nothing_is_saved(tmp_path: Path):
+@pytest.mark.parametrize("command", ["run", "check"])
+def test_ctrl_c_before_the_first_step_says_that_nothing_is_saved(tmp_path: Path, command: str):
     # Many knots: the inverse kinematics take minutes.
-    arguments = ["elbow_comparison", "--set", "duration_s=50000", "--set", "record.rate_hz=1"]
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-m", "dynsim", command, *arguments],
-            cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed_ctrl_c,
-        )
-        for command in ("run", "check")
-    ]  # fmt: skip
-    time.sleep(10.0)
-    for process in processes:
-        os.kill(process.pid, signal.SIGINT)
-        _, stderr = process.communicate(timeout=120)
-        assert process.returncode == 130, stderr
-        assert "(two_elbows): interrupted before there was anything to save" in stderr
+    arguments = verbose(command, "elbow_comparison", "--set", "duration_s=50000", "--set", "record.rate_hz=1")
+    with started(arguments, tmp_path / "stderr", cwd=tmp_path, preexec_fn=heed_ctrl_c) as child:
+        child.wait_for("planning references over 50000 s")
+        os.kill(child.process.pid, signal.SIGINT)
+        assert child.end() == 130, child.stderr
+    assert "planned references" not in child.stderr
+    assert "(two_elbows): interrupted before there was anything to save" in child.stderr
     assert not (tmp_path / "results").exists()
 
 
@@ -283,12 +280,44 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(tmp_path: Path):
     assert list((tmp_path / "full").iterdir()) == []
 
 
+def test_check_prints_positions_that_can_be_copied_into_a_surface(tmp_path: Path):
+    """What is printed reads back to the same doubles, and the surface through it is accepted."""
+    scenario = load_scenario("elbow_comparison", "two_elbows")
+    start = check(scenario)
+    model, robot = build_model(scenario), scenario.robot()
+    assert start.hand.tolist() == model.point_position(*robot.hand, robot.initial).tolist()
+    assert list(start.contacts) == ["elbow_4", "elbow_7"]
+    shown = dynsim("check", "elbow_comparison", "snake_operator", folder=tmp_path).stdout.splitlines()
+    assert shown[:4] == [
+        "elbow_comparison: ok (4 variants)",
+        "  two_elbows, at the start [m]:",
+        f"    hand             {start.hand.tolist()}",
+        f"    contact elbow_4  {start.contacts['elbow_4'].tolist()}",
+    ]
+    assert [line.split(",")[0] for line in shown if "at the start" in line][1:4] == [
+        "  elbow_7", "  elbow_4", "  no_elbow",
+    ]  # fmt: skip
+    copied = shown[4].removeprefix("    contact elbow_7  ")
+    tilted = [
+        "check",
+        "elbow_comparison",
+        "--set",
+        f"surfaces.tilted={{type: plane, normal: [0.2, -0.1, 1], point_m: {copied}}}",
+    ]
+    again = dynsim(*tilted, "--set", "contacts.points.elbow_7.surface=tilted", folder=tmp_path)
+    assert again.returncode == 0, again.stderr
+    # The snake has no contact points; its head starts where its record does.
+    snake = check(load_scenario("snake_operator"))
+    assert shown[-2:] == ["  at the start [m]:", f"    hand  {snake.hand.tolist()}"]
+    assert not snake.contacts
+
+
 def test_list_check_schema_and_version(tmp_path: Path):
     for arguments, expected in (
         (["list"], "wang_minami"),
         (["check", "elbow_comparison", "single_pendulum"], "ok (4 variants)"),
         (["schema"], "duration_s"),
-        (["--version"], "."),
+        (["--version"], f"{__version__}\n"),
         (["run", "--help"], "Example"),
     ):
         result = dynsim(*arguments, folder=tmp_path)

@@ -188,6 +188,7 @@ def test_what_is_sent_never_violates_a_limit(rig: Rig, knots, interval: float, s
     check_goals_within_limits(run)
     for servo in run.map.servos[:2]:
         sent = [(time, value) for time, id_, value in run.goals() if id_ == servo.id]
+        assert len(sent) > 2
         times, ticks = np.array([t for t, _ in sent]), np.array([v for _, v in sent])
         # One tick of rounding at each end of the step.
         allowed = velocity_limit(servo) * np.maximum(np.diff(times), run.replay._period) / RAD_PER_TICK + 1

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from dynsim import cli
+from dynsim.hardware.servo_map import json_schema
 from dynsim.record import Record
 
 from .conftest import MAP, swing
@@ -110,6 +111,14 @@ def test_mistakes_are_one_clear_line(call, files: Path, arguments: tuple[str, ..
     assert error.startswith("error: ")
     assert message in error
     assert len(error.strip().splitlines()) == 1
+
+
+def test_the_schema_of_maps_is_printed(capsys, monkeypatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["dynsim", "hw", "schema"])
+    with pytest.raises(SystemExit) as leaving:
+        cli.main()
+    assert not leaving.value.code
+    assert json.loads(capsys.readouterr().out) == json_schema()
 
 
 def test_export_writes_beside_the_record(call, files: Path) -> None:

@@ -109,6 +109,7 @@ def check_nothing_but_the_policy_after(run) -> None:
 def check_comes_to_rest(run) -> None:
     """Steps of the decelerating goals never grow beyond rounding, and the last one is zero or a tick."""
     troubled = run.result.fault.ids
+    assert len(run.result.policy_goals) > len(run.map.servos)
     for servo in run.map.servos:
         values = [value for _, id_, value in run.result.policy_goals if id_ == servo.id]
         if servo.id in troubled or len(values) < 3:
@@ -170,6 +171,8 @@ def check_reaction(run, onset: float, case: Case, what: str) -> None:
         starts = (record.time + run.replay._origin)[before]
     cycles = int((starts >= onset + case.visible_after).sum())
     assert cycles <= bound, f"{what}: {cycles} cycles, bound {bound}"
+    # No cycle at all only where the fault struck within the one that declared it: the clock says so too.
+    assert onset <= run.result.fault_time <= onset + case.visible_after + (bound + 1) / run.map.bus.rate, what
 
 
 def over_the_threshold(run) -> np.ndarray:

@@ -12,7 +12,7 @@ import pytest
     ("module", "absent"),
     [
         # `dynsim run` mounts the commands: no serial port, no servo.
-        ("dynsim.cli", ("serial", "dynamixel_sdk", "dynsim.hardware.session", "numba", "matplotlib")),
+        ("dynsim.cli", ("serial", "dynamixel_sdk", "dynsim.hardware.session", "numba", "matplotlib", "logging")),
         ("dynsim.hardware.cli", ("serial", "dynamixel_sdk", "dynsim.hardware.session", "numba", "matplotlib")),
         # Replaying knows nothing of how a record was made.
         ("dynsim.hardware.session", ("numba", "dynsim.kernels", "dynsim.model", "dynsim.scenario", "matplotlib")),

@@ -144,9 +144,13 @@ def test_fuzzing_a_million_packets_finds_no_crash_and_no_misread() -> None:
     fuzz(1_000_000, seed=2)
 
 
-@given(st.binary(max_size=200))
-def test_any_bytes_are_survived(data: bytes) -> None:
+@given(st.binary(max_size=60), packets, st.binary(max_size=60))
+def test_any_bytes_are_survived(before: bytes, sent: Packet, after: bytes) -> None:
+    """Whatever is around a packet: what comes out was in it, and the packet is among it."""
+    data = before + encode(sent) + after
     decoder = Decoder()
-    for packet in [*decoder.feed(data), *decoder.flush()]:
+    received = [*decoder.feed(data), *decoder.flush()]
+    assert sent in received
+    for packet in received:
         assert HEADER in data
         assert encode(packet) in data

@@ -7,13 +7,14 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from dynamixel_sdk import COMM_SUCCESS, PortHandler, Protocol2PacketHandler
+from processes import Child, started, wait_for
 
 from dynsim.hardware.control_table import MX_106
 from dynsim.hardware.dynamixel_bus import DynamixelBus, open_serial_port
@@ -38,13 +39,6 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command(*arguments), capture_output=True, text=True, timeout=60, check=False)
 
 
-def wait_for(condition, timeout: float = 20.0) -> None:
-    end = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < end, "nothing happened"
-        time.sleep(0.02)
-
-
 class Servos:
     """Virtual servos in a process of their own."""
 
@@ -63,7 +57,7 @@ class Servos:
             text=True,
         )
         assert self.process.stdout is not None
-        assert "3 virtual servos at 1000000 bit/s" in self.process.stdout.readline()
+        self.greeting = self.process.stdout.readline()
 
     def replay(self, *options: object) -> list[str]:
         return command(
@@ -90,19 +84,37 @@ class Servos:
         bus.close()
         return values
 
-    def close(self) -> int:
+    def end(self) -> int:
+        """Exit code after one Ctrl-C."""
         self.process.send_signal(signal.SIGINT)
-        assert self.process.stdout is not None
-        self.process.stdout.close()
         return self.process.wait(timeout=20)
+
+
+@contextmanager
+def virtual_servos(folder: Path, faults: str = "") -> Iterator[Servos]:
+    servos = Servos(folder, faults)
+    try:
+        assert "3 virtual servos at 1000000 bit/s" in servos.greeting
+        yield servos
+    finally:
+        servos.process.kill()
+        servos.process.communicate(timeout=20)
 
 
 @pytest.fixture
 def servos(tmp_path: Path) -> Iterator[Servos]:
-    servos = Servos(tmp_path)
-    yield servos
-    assert servos.close() == 0
-    assert not servos.device.is_symlink()
+    with virtual_servos(tmp_path) as servos:
+        yield servos
+        assert servos.end() == 0
+        assert not servos.device.is_symlink()
+
+
+@contextmanager
+def replaying(servos: Servos) -> Iterator[Child]:
+    """A slow replay in a process of its own, in the middle of its motion."""
+    with started(servos.replay("--live", "--yes", "--speed", "0.1"), servos.folder / "stderr") as child:
+        wait_for(lambda: "REPLAY         enter" in servos.log)
+        yield child
 
 
 def test_the_stock_client_library_finds_the_servos(servos: Servos) -> None:
@@ -146,40 +158,34 @@ def test_a_second_replay_is_refused_and_stop_works_beside_the_first(servos: Serv
     with pytest.raises(PortError, match="in use by another process"):
         open_serial_port(str(servos.device), 1_000_000)
     first.closePort()
-    running = subprocess.Popen(servos.replay("--live", "--yes", "--speed", "0.1"), stderr=subprocess.PIPE, text=True)
-    wait_for(lambda: "REPLAY         enter" in servos.log)
-    second = subprocess.run(servos.replay("--live", "--yes"), capture_output=True, text=True, timeout=60, check=False)
-    assert second.returncode == 3
-    assert "in use by another process" in second.stderr
-    stop = run("hw", "stop", "--port", servos.device, "--map", servos.map)
-    _, error = running.communicate(timeout=60)
-    assert running.returncode == 4, error
+    with replaying(servos) as running:
+        again = servos.replay("--live", "--yes")
+        second = subprocess.run(again, capture_output=True, text=True, timeout=60, check=False)
+        assert second.returncode == 3
+        assert "in use by another process" in second.stderr
+        stop = run("hw", "stop", "--port", servos.device, "--map", servos.map)
+        assert running.end() == 4, running.stderr
     assert servos.torque() == [0, 0, 0]
     assert stop.returncode in (0, 3)  # the replay may have taken the answers off the line
 
 
 @pytest.mark.parametrize(("presses", "left"), [(1, [1, 1, 1]), (2, [0, 0, 0])])
 def test_ctrl_c_in_a_running_replay(servos: Servos, presses: int, left: list[int]) -> None:
-    running = subprocess.Popen(servos.replay("--live", "--yes", "--speed", "0.1"), stderr=subprocess.PIPE, text=True)
-    wait_for(lambda: "REPLAY         enter" in servos.log)
-    for press in range(presses):
-        os.kill(running.pid, signal.SIGINT)
-        if press == 0 and presses == 2:
-            wait_for(lambda: "stopped by the user" in servos.log)
-    _, error = running.communicate(timeout=60)
-    assert running.returncode == 130, error
-    assert error.startswith("error: interrupted in REPLAY")
+    with replaying(servos) as running:
+        for press in range(presses):
+            os.kill(running.process.pid, signal.SIGINT)
+            if press == 0 and presses == 2:
+                wait_for(lambda: "stopped by the user" in servos.log)
+        assert running.end() == 130, running.stderr
+    assert running.stderr.startswith("error: interrupted in REPLAY")
     assert servos.torque() == left
 
 
 def test_an_adapter_pulled_out_ends_the_replay(tmp_path: Path) -> None:
-    servos = Servos(tmp_path, "faults: [{kind: unplug, at: 2.0}]")
-    live = subprocess.run(
-        servos.replay("--live", "--yes", "--speed", "0.1"), capture_output=True, text=True, timeout=60, check=False
-    )
-    assert live.returncode == 4, live.stderr
-    assert "the port died" in live.stderr
-    assert "robot left unreachable" in live.stderr
-    assert servos.process.wait(timeout=20) == 0
-    assert servos.process.stdout is not None
-    servos.process.stdout.close()
+    with virtual_servos(tmp_path, "faults: [{kind: unplug, at: 2.0}]") as servos:
+        slowly = servos.replay("--live", "--yes", "--speed", "0.1")
+        live = subprocess.run(slowly, capture_output=True, text=True, timeout=60, check=False)
+        assert live.returncode == 4, live.stderr
+        assert "the port died" in live.stderr
+        assert "robot left unreachable" in live.stderr
+        assert servos.process.wait(timeout=20) == 0

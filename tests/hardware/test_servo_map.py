@@ -8,10 +8,12 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from jsonschema import Draft202012Validator
+from ruamel.yaml import YAML
 
 from dynsim.hardware.calibrate import read_zero_ticks, write_zero_ticks
 from dynsim.hardware.errors import ServoMapError, VerificationFailed
-from dynsim.hardware.servo_map import load_servo_map
+from dynsim.hardware.servo_map import json_schema, load_servo_map
 
 SHIPPED = Path(__file__).parents[2] / "scenarios" / "hardware"
 
@@ -54,26 +56,49 @@ def test_sense_zero_and_limits(rig) -> None:
     assert wheel.position_limits == (-math.inf, math.inf)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("robot: rig", "robott: rig", r"map.yaml:1: robott: unknown key; known are robot, bus, safety, kinds, servos"),
-        ("id: 7", "id: 2", r"servos.wheel.id: 2 is also the ID of elbow"),
-        ("kind: wheel, id: 7", "kind: whel, id: 7", r"servos.wheel.kind: 'whel' is not one of joint, wheel"),
-        ("baud: 1000000", "baud: 1234", r"map.yaml:2: bus: baud 1234 is not one of 9600, 57600"),
-        ("[-60, 60]", "[60, -60]", r"limits.position_deg: 60.0 is not below -60.0"),
-        ("position_deg: [-60, 60], ", "", r"a servo in position mode needs limits.position_deg"),
-        ("sign: -1", "sign: 2", r"map.yaml:19: servos.elbow.sign"),
-        ("velocity: 3.0, torque: 6.0}", "velocity: -3.0, torque: 6.0}", r"map.yaml:9: kinds.joint.limits.velocity"),
-        ("policy: decelerate", "policy: panic", r"map.yaml:3: safety.policy"),
-        ("torque: 6.0}", "torque: 6.0, torqe: 1}", r"torqe: unknown key; known are position_deg, velocity, torque"),
-        ("kinds:", "kinds: [", r"map.yaml:\d+: not YAML"),
-        ("id: 1}", "id: 254}", r"servos.shoulder.id"),
-    ],
-)
+# What is replaced in the rig's map, by what, and the error.
+MISTAKES = [
+    ("robot: rig", "robott: rig", r"map.yaml:1: robott: unknown key; known are robot, bus, safety, kinds, servos"),
+    ("id: 7", "id: 2", r"servos.wheel.id: 2 is also the ID of elbow"),
+    ("kind: wheel, id: 7", "kind: whel, id: 7", r"servos.wheel.kind: 'whel' is not one of joint, wheel"),
+    ("baud: 1000000", "baud: 1234", r"map.yaml:2: bus: baud 1234 is not one of 9600, 57600"),
+    ("[-60, 60]", "[60, -60]", r"limits.position_deg: 60.0 is not below -60.0"),
+    ("position_deg: [-60, 60], ", "", r"a servo in position mode needs limits.position_deg"),
+    ("sign: -1", "sign: 2", r"map.yaml:19: servos.elbow.sign"),
+    ("velocity: 3.0, torque: 6.0}", "velocity: -3.0, torque: 6.0}", r"map.yaml:9: kinds.joint.limits.velocity"),
+    ("policy: decelerate", "policy: panic", r"map.yaml:3: safety.policy"),
+    ("torque: 6.0}", "torque: 6.0, torqe: 1}", r"torqe: unknown key; known are position_deg, velocity, torque"),
+    ("kinds:", "kinds: [", r"map.yaml:\d+: not YAML"),
+    ("id: 1}", "id: 254}", r"servos.shoulder.id"),
+]
+# What ties entries together is beyond a schema.
+UNSEEN = ("is also the ID of", "is not one of joint, wheel", "is not below", "not YAML")
+
+
+@pytest.mark.parametrize(("old", "new", "message"), MISTAKES)
 def test_mistakes_are_named_with_file_and_line(write_map, old: str, new: str, message: str) -> None:
     with pytest.raises(ServoMapError, match=message):
         load_servo_map(write_map((old, new)))
+
+
+def invalid(path: Path) -> list[str]:
+    """What a validator of JSON schemas finds in a map."""
+    validator = Draft202012Validator(json_schema())
+    return [error.message for error in validator.iter_errors(YAML(typ="safe").load(path.read_text(encoding="utf-8")))]
+
+
+def test_the_schema_is_one_and_every_shipped_map_follows_it() -> None:
+    Draft202012Validator.check_schema(json_schema())
+    maps = sorted(SHIPPED.glob("*.yaml"))
+    assert [path.stem for path in maps] == ["arm", "snake"]
+    for path in maps:
+        assert invalid(path) == []
+
+
+@pytest.mark.parametrize(("old", "new", "message"), [row for row in MISTAKES if not any(u in row[2] for u in UNSEEN)])
+def test_the_schema_refuses_what_loading_refuses(write_map, old: str, new: str, message: str) -> None:
+    assert invalid(write_map()) == []
+    assert invalid(write_map((old, new)))
 
 
 def test_missing_empty_and_binary_files(tmp_path: Path) -> None:

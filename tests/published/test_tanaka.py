@@ -134,6 +134,7 @@ class TestJointLimitAvoidance:
         """ "The cost function decreased V with time." Eq 18, third term: "it is semi-negative definite"."""
         cost = simulated("snake_joint_limits", variant)["cost"]
         assert np.diff(cost).max() <= 0.0
+        assert cost[-1] < 0.9 * cost[0]
 
     @pytest.mark.parametrize(("variant", "bound"), [("eq20", 0.0), ("eq20_min", 1e-7)])
     def test_cost_20_never_rises_within_a_mode(self, simulated, variant, bound):
@@ -142,6 +143,7 @@ class TestJointLimitAvoidance:
         record = simulated("snake_joint_limits", variant)
         same = np.diff(record["mode"]) == 0
         assert np.diff(record["cost"])[same].max() <= bound
+        assert np.diff(record["cost"])[same].sum() < -0.5 * record["cost"][0]
 
     def test_joint_angles_fall(self, simulated):
         """ "Although the angle of the base part was in the neighborhood of the joint angle limit, the angle decreased
@@ -161,6 +163,7 @@ class TestJointLimitAvoidance:
         passes its limit. Clamping it costs head error, taking it out of the allocation costs none."""
         unlimited = simulated("snake_joint_limits", "unlimited")
         assert np.diff(unlimited["cost"]).max() <= 0.0
+        assert unlimited["cost"][-1] < unlimited["cost"][0]
         assert unlimited.summary["joint_limit_violation_max_rad"] > 0.2
         assert simulated("snake_joint_limits", "saturate").summary["position_error_max_m"] > 1e-3
 

@@ -304,10 +304,6 @@ def test_a_name_is_no_scenario():
         dynsim.simulate("single_pendulum")  # type: ignore[arg-type]
 
 
-def test_what_is_public_is_listed():
-    assert set(dynsim.__all__) <= set(dir(dynsim))
-
-
 @pytest.mark.parametrize("point", [[0.1, 0.2], [0.1, 0.2, 0.3, 0.4]])
 def test_a_point_has_three_coordinates(point: list[float]):
     model = build_model(load_scenario("single_pendulum"))

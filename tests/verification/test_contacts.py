@@ -96,7 +96,7 @@ def test_a_contact_given_twice_shares_one_force(seed):
 
 
 def test_friction_takes_energy_where_the_surface_pushes_and_always_when_dissipative():
-    pulled = 0
+    pulled = taken = 0
     for seed in range(60):
         robot, contacts, q, v, current = random_case(seed, most=1)
         if np.abs(rows(robot, contacts, q)).max() < 1e-2:
@@ -113,12 +113,16 @@ def test_friction_takes_energy_where_the_surface_pushes_and_always_when_dissipat
             slip = row[ka.SLIP_VELOCITY : ka.SLIP_VELOCITY + 3] @ row[ka.TANGENT : ka.TANGENT + 3]
             expected = contacts[0].friction * slip * (force if law == "signed" else abs(force))
             assert power == pytest.approx(expected, rel=1e-10, abs=1e-12)  # rounding
+            if force > 0.0 or law == "dissipative":
+                assert power >= -1e-12
+                taken += power > 1e-6
     assert pulled > 20
+    assert taken > 20
 
 
 def test_no_consistent_friction_is_said_and_not_papered_over():
     """With large μ some states allow neither a pushing nor a pulling force (Painlevé): NaN and a count."""
-    found = 0
+    found = consistent = 0
     for seed in range(200):
         robot, contacts, q, v, current = random_case(seed, most=2)
         b = bench(robot, [replace(c, friction=5.0, pulling_friction="dissipative") for c in contacts])
@@ -130,7 +134,9 @@ def test_no_consistent_friction_is_said_and_not_papered_over():
         elif b.ws.deficient[0] == 0:
             force, sign = b.ws.contacts[:, ka.FORCE], b.ws.contacts[:, ka.SIGN]
             assert (force * sign >= -1e-9 * (1.0 + np.abs(force).max())).all()
+            consistent += 1
     assert found > 0
+    assert consistent > 50
 
 
 @pytest.mark.parametrize("kind", ["plane", "sphere", "cylinder"])

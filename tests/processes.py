@@ -1,0 +1,63 @@
+"""Child processes of tests: waited for by what they do, and ended whatever happens."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+
+def wait_for(condition: Callable[[], bool], timeout: float = 120.0, what: str = "nothing happened") -> None:
+    """Return as soon as the condition holds; fail after ``timeout`` [s], long enough for a busy machine."""
+    end = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < end, what
+        time.sleep(0.02)
+
+
+class Child:
+    """A child in a process group of its own, with its stderr in a file that can be read while it runs."""
+
+    def __init__(self, command: Sequence[str], stderr: Path, **options: Any) -> None:
+        self._stderr = stderr
+        with stderr.open("w") as file:
+            self.process = subprocess.Popen(
+                command, stdout=subprocess.DEVNULL, stderr=file, start_new_session=True, **options
+            )
+
+    @property
+    def stderr(self) -> str:
+        return self._stderr.read_text()
+
+    def wait_for(self, text: str, count: int = 1) -> None:
+        """Until the child has written ``text`` to stderr so many times; fails if it ends before."""
+
+        def written() -> bool:
+            ended = self.process.poll() is not None
+            if self.stderr.count(text) >= count:
+                return True
+            assert not ended, self.stderr
+            return False
+
+        wait_for(written, what=f"no {text!r} in {self.stderr!r}")
+
+    def end(self, timeout: float = 120.0) -> int:
+        """Exit code of a child that ends by itself."""
+        return self.process.wait(timeout)
+
+
+@contextmanager
+def started(command: Sequence[str], stderr: Path, **options: Any) -> Iterator[Child]:
+    """A running child; when the block ends, nothing of its group is left."""
+    child = Child(command, stderr, **options)
+    try:
+        yield child
+    finally:
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(child.process.pid, signal.SIGKILL)
+        child.process.wait(timeout=20)

@@ -1,0 +1,282 @@
+"""What a user of the Python interface gets wrong is one error of dynsim, in one line, that says what and what to do."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import dynsim
+from dynsim import figures
+from dynsim.engine import provenance
+from dynsim.errors import DynsimError, MissingEntry, ModelError, RecordError, ScenarioError
+from dynsim.figures import snake as snake_figures
+from dynsim.figures import style
+from dynsim.hardware.check import check_motion
+from dynsim.hardware.compare import compare_records
+from dynsim.hardware.errors import CheckRefused, ServoMapError
+from dynsim.hardware.export import export_record
+from dynsim.hardware.servo_map import load_servo_map
+from dynsim.model.description import Inertia, Link, Robot
+from dynsim.model.model import Model
+from dynsim.record import Record
+from dynsim.scenario import build_model, load_scenario, scenario_from_resolved, variant_names
+
+Q = np.zeros(10)
+ORIGIN = [0.0, 0.0, 0.0]
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    return build_model(load_scenario("elbow_comparison"))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda m: m.point_position(10, ORIGIN, Q), "no body 10; indices of this model are 0 to 9"),
+        (lambda m: m.point_jacobian(-1, ORIGIN, Q), "no body -1; indices of this model are 0 to 9"),
+        (lambda m: m.point_position(np.int64(10), ORIGIN, Q), "no body 10; indices"),
+        (lambda m: m.body_pose(True, Q), "no body True; bodies: link_1, link_2"),
+        (lambda m: m.body_pose(None, Q), "no body None; bodies: link_1, link_2"),
+        (lambda m: m.body_pose("link_11", Q), "no body 'link_11'; bodies: link_1, link_2"),
+        (lambda m: m.mass_matrix("upright"), "q must be real numbers, not 'upright'"),
+        (lambda m: m.mass_matrix(["0"] * 10), "q must be real numbers, not ['0', '0'"),
+        (lambda m: m.mass_matrix(None), "q must be real numbers, not None"),
+        (lambda m: m.mass_matrix(Q + 1j), "q must be real numbers, not array([0.+1.j, "),
+        (lambda m: m.mass_matrix([[0.0], [0.0, 1.0]]), "q is no array of numbers"),
+        (lambda m: m.mass_matrix(Q[:9]), "q has shape (9,); this model has 10 joints"),
+        (lambda m: m.mass_matrix(np.where(np.arange(10) == 2, np.nan, 0.0)), "q is nan at joint_3; it must be finite"),
+        (lambda m: m.bias_forces(Q, Q - np.inf), "v is -inf at joint_1; it must be finite"),
+        (lambda m: m.inverse_dynamics(Q, Q, Q * np.nan), "vdot is nan at joint_1"),
+        (lambda m: m.forward_dynamics(Q, Q, [1.0]), "tau has shape (1,)"),
+        (lambda m: m.point_position(0, "tip", Q), "point must be real numbers, not 'tip'"),
+        (lambda m: m.point_position(0, [0.0, np.nan, 0.0], Q), "point is [0.0, nan, 0.0]; it must be finite"),
+        (lambda m: Model("elbow_comparison"), "needs a Robot, not 'elbow_comparison'; Model.from_urdf(file)"),
+        (lambda m: Model.from_urdf(None), "a URDF file is named by its path, not by None"),
+    ],
+)
+def test_a_model_names_what_it_cannot_take(model: Model, call: Any, message: str) -> None:
+    with pytest.raises(ModelError) as caught:
+        call(model)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_indices_of_numpy_are_taken(model: Model) -> None:
+    by_name = model.point_position("link_4", ORIGIN, Q + 0.3)
+    assert model.point_position(np.int64(3), ORIGIN, Q + 0.3).tolist() == by_name.tolist()
+
+
+BODY = Link("body", "hinge", None, "revolute", np.array([0.0, 0.0, 1.0]), Inertia(1.0))
+
+
+@pytest.mark.parametrize(
+    ("link", "robot", "message"),
+    [
+        ({"axis": np.array([0.0, 1.0])}, {}, "hinge: axis is array([0., 1.]); it must be an array of shape (3,)"),
+        ({"axis": "z"}, {}, "hinge: axis is 'z'"),
+        ({"R_PJ": np.eye(2)}, {}, "hinge: R_PJ is array([[1., 0.], [0., 1.]])"),
+        ({"p_PJ": np.full(3, np.nan)}, {}, "hinge: p_PJ is array([nan, nan, nan])"),
+        ({"p_PJ": [[0.0], [0.0, 1.0]]}, {}, "hinge: p_PJ is [[0.0], [0.0, 1.0]]"),
+        ({"inertia": Inertia(1.0, np.full(3, np.inf))}, {}, "body: centre of mass is array([inf, inf, inf])"),
+        ({"inertia": Inertia(1.0, tensor=np.zeros(6))}, {}, "body: inertia tensor is array([0., 0., 0., 0., 0., 0.])"),
+        ({"inertia": Inertia("1")}, {}, "body: mass is '1'; it must be a finite number"),
+        ({}, {"hand": ("tip", np.zeros(3))}, "arm: the hand is on 'tip', which is no body; bodies: body"),
+        ({}, {"hand": ("body", np.zeros(2))}, "arm: the hand's point is array([0., 0.])"),
+        ({}, {"gravity": 9.81}, "arm: gravity is 9.81; it must be an array of shape (3,)"),
+        ({}, {"q0": np.zeros(2)}, "arm: q0 is array([0., 0.]); it must be an array of shape (1,)"),
+    ],
+)
+def test_a_description_by_hand_is_refused_with_the_quantity(link: Any, robot: Any, message: str) -> None:
+    with pytest.raises(ModelError) as caught:
+        Model(replace(Robot("arm", (replace(BODY, **link),), (), ("body", np.zeros(3))), **robot))
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: load_scenario(None), ScenarioError, "a scenario is named by its file"),
+        (lambda: variant_names(3), ScenarioError, "not by 3"),
+        (lambda: load_scenario("elbow_comparison", 3), ScenarioError, "no variant 3; variants: two_elbows, elbow_7"),
+        (lambda: load_scenario("elbow_comparison", ["a"]), ScenarioError, "no variant ['a']; variants: two_elbows"),
+        (lambda: load_scenario("elbow_comparison", overrides=["a=1"]), ScenarioError, "overrides must map dotted keys"),
+        (lambda: load_scenario("elbow_comparison", overrides={1: 2}), ScenarioError, "not {1: 2}"),
+        (lambda: scenario_from_resolved(None), ScenarioError, "must be a mapping of keys to values, not None"),
+        (lambda: build_model("elbow_comparison"), ScenarioError, "needs a Scenario, not 'elbow_comparison'"),
+        (lambda: dynsim.check("elbow_comparison"), ScenarioError, "needs a Scenario, not 'elbow_comparison'"),
+        (lambda: dynsim.compare("elbow_comparison", jobs=0), ScenarioError, "jobs = 0: must be a whole number"),
+        (lambda: dynsim.compare("elbow_comparison", jobs="2"), ScenarioError, "jobs = '2': must be a whole number"),
+        (lambda: build_model(load_scenario("snake_operator")), ModelError, "is kinematic: it has no rigid-body model"),
+        (
+            lambda: (s := load_scenario("single_pendulum")).build_controller(build_model(s)),
+            ModelError,
+            "the scenario has no controller",
+        ),
+        (lambda: load_servo_map(None), ServoMapError, "a servo map is named by its file"),
+    ],
+)
+def test_scenarios_and_maps_name_what_they_cannot_take(call: Any, error: type[DynsimError], message: str) -> None:
+    with pytest.raises(error) as caught:
+        call()
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("center", [(1.4, 1.45, 0.4), np.array([1.4, 1.45, 0.4]), np.array([1.4, 1.45, 0.4])[::1]])
+def test_overrides_may_be_arrays_and_tuples(center: Any) -> None:
+    scenario = load_scenario("elbow_comparison", overrides={"controller.hand.path.center_m": center})
+    assert scenario.controller.hand.path.center_m == [1.4, 1.45, 0.4]
+    assert load_scenario("elbow_comparison", overrides={"duration_s": np.float64(3)}).duration_s == 3.0
+
+
+def small_record() -> Record:
+    record = Record(np.linspace(0.0, 1.0, 5), provenance={"engine": "dynamics"})
+    record.add("q", np.zeros((5, 2)), "rad", labels=("a", "b"))
+    record.summary = {"steps": 3}
+    return record
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda r: r["v"], "no signal 'v'; this record has: q"),
+        (lambda r: r[0], "no signal 0; this record has: q"),
+        (lambda r: r[["q"]], "no signal ['q']; this record has: q"),
+        (lambda r: r.units["v"], "no signal 'v'; this record has: q"),
+        (lambda r: r.labels["v"], "no signal 'v'; this record has: q"),
+        (lambda r: r.summary["step"], "no entry of the summary 'step'; this record has: steps"),
+        (lambda r: r.provenance["scenario"], "no entry of the provenance 'scenario'; this record has: engine"),
+    ],
+)
+def test_what_a_record_lacks_is_a_sentence(call: Any, message: str) -> None:
+    for record in (small_record(), copy.deepcopy(small_record()), pickle.loads(pickle.dumps(small_record()))):
+        with pytest.raises(MissingEntry) as caught:
+            call(record)
+        assert str(caught.value) == message
+        # For those who look for KeyError, and for the command line.
+        assert isinstance(caught.value, KeyError)
+        assert isinstance(caught.value, RecordError)
+
+
+def test_summary_and_provenance_are_mappings_still(tmp_path: Path) -> None:
+    record = Record.load(small_record().save(tmp_path / "record.h5"))
+    assert (record.summary, record.provenance) == ({"steps": 3}, {"engine": "dynamics"})
+    assert record.summary.get("none") is None
+    record.summary |= {"more": 1}
+    assert record.summary == {"steps": 3, "more": 1}
+    with pytest.raises(RecordError, match="the summary of a record is a mapping of names to values, not 3"):
+        record.summary = 3  # type: ignore[assignment]
+
+
+def lacking(record: Record, name: str) -> Record:
+    result = copy.copy(record)
+    result.signals = {other: signal for other, signal in record.signals.items() if other != name}
+    return result
+
+
+@pytest.mark.parametrize("scenario", ["elbow_comparison", "snake_joint_limits"])
+def test_a_record_that_lacks_a_signal_is_drawn_without_or_refused(scenario: str, tmp_path: Path, monkeypatch) -> None:
+    # What is drawn counts here, not the pictures.
+    monkeypatch.setattr(style, "save", lambda figure, path: path)
+    monkeypatch.setattr(snake_figures, "_save", lambda figure, path: plt.close(figure) or path)
+    monkeypatch.setattr(snake_figures, "FRAMES", 1)
+    short = {"duration_s": 0.2, "record.rate_hz": 50, "metrics.settle_s": 0.0}
+    record = dynsim.simulate(load_scenario(scenario, overrides=short))
+    outcomes = set()
+    for name in record:
+        try:
+            outcomes.add(bool(figures.draw(lacking(record, name), tmp_path)))
+        except RecordError as error:
+            outcomes.add(repr(name) in str(error) and "refused")
+    assert outcomes == {True, "refused"}
+    engine = record.provenance["engine"]
+    for odd in ({}, {"engine": ["?"]}, {"engine": engine, "scenario": "x", "snake": []}):
+        other = copy.copy(record)
+        other.provenance = odd
+        with pytest.raises(RecordError):
+            figures.draw(other, tmp_path)
+        with pytest.raises(RecordError):
+            figures.draw_comparison({"a": other}, tmp_path)
+
+
+def test_plot_names_the_record_that_lacks_something(tmp_path: Path, monkeypatch, capfd) -> None:
+    from dynsim import cli
+
+    record = dynsim.simulate(load_scenario("elbow_comparison", overrides={"duration_s": 0.05, "metrics.settle_s": 0}))
+    path = lacking(record, "heat_joule").save(tmp_path / "record.h5")
+    monkeypatch.setattr("sys.argv", ["dynsim", "plot", str(path)])
+    with pytest.raises(SystemExit) as leaving:
+        cli.main()
+    assert leaving.value.code == 2
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if line.strip()]
+    assert line.startswith(f"error: {path}: no signal 'heat_joule'; this record has: ")
+
+
+def replayed() -> tuple[Record, Record]:
+    t = np.linspace(0.0, 2.0, 101)
+    simulated, measured = Record(t), Record(t)
+    for record in (simulated, measured):
+        record.add("q", np.sin(t)[:, None], "rad", labels=("a",))
+        record.add("v", np.cos(t)[:, None], "rad/s", labels=("a",))
+    return simulated, measured
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m: m.add("q", m.time, "rad"), "share no joint angles"),
+        (lambda m: m.add("state", np.zeros((101, 2)), "1", labels=("a", "b")), "'state' of the measured run has shape"),
+        (lambda m: m.add("record_time", np.zeros((101, 1)), "s", labels=("a",)), "'record_time' of the measured run"),
+        (lambda m: m.provenance.update(speed="fast"), "says speed 'fast'"),
+        (lambda m: m.provenance.update(speed=0), "says speed 0"),
+    ],
+)
+def test_compare_refuses_what_is_no_measured_run(change: Any, message: str) -> None:
+    simulated, measured = replayed()
+    assert compare_records(simulated, measured).worst.rms < 1e-12
+    change(measured)
+    with pytest.raises(RecordError, match=message):
+        compare_records(simulated, measured)
+
+
+def test_export_refuses_motion_without_columns_and_endless_rates(tmp_path: Path) -> None:
+    record, _ = replayed()
+    with pytest.raises(RecordError, match="--rate must be positive, not inf"):
+        export_record(record, tmp_path / "a.csv", "csv", rate=float("inf"))
+    record.add("v", record.time, "rad/s")
+    with pytest.raises(RecordError, match=r"signals 'q' \(101, 1\) and 'v' \(101,\) of the record must both have"):
+        export_record(record, tmp_path / "a.csv", "csv")
+
+
+@pytest.mark.parametrize(("sample", "value"), [(100, np.inf), (0, -np.inf), (0, np.nan), (50, np.nan)])
+def test_times_that_are_none_are_refused(sample: int, value: float) -> None:
+    record = Record(np.linspace(0.0, 2.0, 101))
+    record.time[sample] = value
+    with pytest.raises(CheckRefused, match=f"time does not increase at sample {max(sample, 1)}"):
+        check_motion(record, load_servo_map("arm"))
+
+
+def test_provenance_does_without_the_metadata_of_a_library_and_finds_the_commit_of_a_submodule(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(provenance, "LIBRARIES", ("numpy", "no_such_library"))
+    made_by = provenance.provenance(load_scenario("single_pendulum"))
+    assert made_by["libraries"] == {"numpy": np.__version__, "no_such_library": "unknown"}
+    package = tmp_path / "outer" / "inner" / "dynsim" / "engine"
+    git = tmp_path / "outer" / ".git" / "modules" / "inner"
+    package.mkdir(parents=True)
+    git.mkdir(parents=True)
+    (tmp_path / "outer" / "inner" / ".git").write_text("gitdir: ../.git/modules/inner\n")
+    (git / "HEAD").write_text("0123abcd\n")
+    monkeypatch.setattr(provenance, "__file__", str(package / "provenance.py"))
+    assert provenance.commit() == "0123abcd"
+    (git / "HEAD").write_bytes(b"\xff\xfe")
+    assert provenance.commit() == ""
