@@ -8,12 +8,18 @@ from random_robots import Bench, bench
 from scipy.special import ellipk
 
 from dynsim.kernels import arrays as ka
-from dynsim.kernels.integrate import DRIFT_MAX
+from dynsim.kernels.integrate import DRIFT_MAX, METHODS
 from dynsim.model.description import Contact, Inertia, Link, Motor, Quadric, Robot
 
 G = 9.81
 X, Y, Z = np.eye(3)
 PLANE = np.zeros((3, 3))
+every_method = pytest.mark.parametrize("method", METHODS)
+
+
+def step_of(method: str, step: float) -> float:
+    """A step for the fixed-step method; the others choose theirs."""
+    return step if method == "rk4" else 0.0
 
 
 def robot(*links: Link, motors: tuple[Motor, ...] = (), gravity: float = G) -> Robot:
@@ -31,36 +37,40 @@ def bead(mass: float, surface: Quadric, friction: float = 0.0, v_s: float = 1e-3
 
 
 @pytest.mark.parametrize("amplitude", [0.1, 1.5, 3.0])
-def test_pendulum_period(amplitude):
+@every_method
+def test_pendulum_period(amplitude, method):
     """T = 4 √(l/g) K(sin²(θ0/2)), K the complete elliptic integral."""
     length = 0.7
     link = Link("bob", "hinge", None, "revolute", Y, Inertia(0.3, np.array([0.0, 0.0, -length])))
     period = 4.0 * np.sqrt(length / G) * ellipk(np.sin(0.5 * amplitude) ** 2)
     b = bench(robot(link))
-    run = b.simulate(b.state([amplitude], [0.0]), np.array([0.25, 0.5, 1.0]) * period, rtol=1e-11)
+    run = b.simulate(
+        b.state([amplitude], [0.0]), np.array([0.25, 0.5, 1.0]) * period, method, step=step_of(method, 2e-4), rtol=1e-11
+    )
     # A thousand times the tolerance: near the top the swing magnifies errors.
     np.testing.assert_allclose(run.sample[:, 0], [0.0, -amplitude, amplitude], rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize("method", ["dopri5", "rk4", "rodas4"])
+@every_method
 def test_current_in_a_blocked_motor_rises_exponentially(method):
     """i = u/R (1 − exp(−R t/L))."""
     heavy = Link("wheel", "shaft", None, "revolute", Z, Inertia(1.0, np.zeros(3), 1e15 * np.eye(3)))
     motor = Motor("shaft", 0.2, resistance=1.1, inductance=1.7e-3, rotor_inertia=0.0, gear_ratio=3.0)
     b = bench(robot(heavy, motors=(motor,)), held=np.array([0.4]), k_p=30.0, k_d=0.0)
     t = np.linspace(0.0, 8e-3, 9)
-    run = b.simulate(b.state([0.0], [0.0]), t, method, step=1e-4 if method == "rk4" else 0.0, rtol=1e-9)
+    run = b.simulate(b.state([0.0], [0.0]), t, method, step=step_of(method, 1e-4), rtol=1e-9)
     expected = 30.0 * 0.4 / 1.1 * (1.0 - np.exp(-1.1 / 1.7e-3 * t))
     # RK4: (h R/L)^5/120 per step = 1e-8; cubic dense output at grid points adds nothing. The others: 10 rtol |i|.
     np.testing.assert_allclose(run.sample[:, 2], expected, rtol=0, atol=1e-6 if method == "rk4" else 1e-7)
 
 
-def test_current_with_a_voltage_limit_rises_as_if_the_limit_were_the_voltage():
+@every_method
+def test_current_with_a_voltage_limit_rises_as_if_the_limit_were_the_voltage(method):
     heavy = Link("wheel", "shaft", None, "revolute", Z, Inertia(1.0, np.zeros(3), 1e15 * np.eye(3)))
     motor = Motor("shaft", 0.2, 1.1, 1.7e-3, rotor_inertia=0.0, gear_ratio=3.0, voltage_limit=5.0)
     b = bench(robot(heavy, motors=(motor,)), held=np.array([0.4]), k_p=30.0)
     t = np.array([1e-3, 5e-3])
-    run = b.simulate(b.state([0.0], [0.0]), t, rtol=1e-9)
+    run = b.simulate(b.state([0.0], [0.0]), t, method, step=step_of(method, 2e-5), rtol=1e-9)
     np.testing.assert_allclose(run.sample[:, 2], 5.0 / 1.1 * (1.0 - np.exp(-1.1 / 1.7e-3 * t)), rtol=0, atol=1e-7)
 
 
@@ -76,25 +86,29 @@ def test_block_on_an_incline(speed):
     assert b.ws.contacts[0, ka.FORCE] == pytest.approx(mass * G * np.cos(alpha), rel=1e-13)
 
 
-def test_block_slides_down_an_incline():
+@every_method
+def test_block_slides_down_an_incline(method):
     """s = v0 t + (sin α − μ cos α) g t²/2 while v ≫ v_s; friction heat = μ m g cos α s."""
     alpha, mu, mass, v0, v_s = 0.6, 0.25, 1.7, 1.0, 1e-6
     normal, down = np.array([np.sin(alpha), 0.0, np.cos(alpha)]), np.array([np.cos(alpha), 0.0, -np.sin(alpha)])
     b = bead(mass, Quadric(PLANE, normal, 0.0), friction=mu, v_s=v_s)
     t = np.array([0.5, 1.0])
-    run = b.simulate(b.state(np.zeros(3), v0 * down), t, rtol=1e-9)
+    run = b.simulate(b.state(np.zeros(3), v0 * down), t, method, step=step_of(method, 1e-3), rtol=1e-9)
     s = v0 * t + 0.5 * G * (np.sin(alpha) - mu * np.cos(alpha)) * t**2
     # v_s²/v² = 1e-12 and the tolerance of the integration.
     np.testing.assert_allclose(run.sample[:, :3] @ down, s, rtol=1e-8)
     np.testing.assert_allclose(run.sample[:, 6 + 5], mu * mass * G * np.cos(alpha) * s, rtol=1e-8)
 
 
-def test_bead_on_a_sphere_is_held_by_weight_less_centrifugal_force():
+@every_method
+def test_bead_on_a_sphere_is_held_by_weight_less_centrifugal_force(method):
     """Frictionless from rest near the top: v² = 2 g ρ (cos θ0 − cos θ), f_n = m (g cos θ − v²/ρ): it pulls past 48°."""
     radius, mass, theta = 0.8, 0.4, 0.2
     b = bead(mass, Quadric(np.eye(3), np.zeros(3), -0.5 * radius**2))
     start = radius * np.array([np.sin(theta), 0.0, np.cos(theta)])
-    run = b.simulate(b.state(start, np.zeros(3)), np.linspace(0.1, 1.0, 10), rtol=1e-10)
+    run = b.simulate(
+        b.state(start, np.zeros(3)), np.linspace(0.1, 1.0, 10), method, step=step_of(method, 5e-4), rtol=1e-10
+    )
     r, v = run.sample[:, :3], run.sample[:, 3:6]
     square = 2.0 * G * (start[2] - r[:, 2])
     # A hundred times the tolerance of the integration.
@@ -106,12 +120,15 @@ def test_bead_on_a_sphere_is_held_by_weight_less_centrifugal_force():
     assert 0.0 < run.extremes[0, DRIFT_MAX] <= 1e-9
 
 
-def test_bead_on_a_cylinder_without_weight_runs_along_a_helix():
+@every_method
+def test_bead_on_a_cylinder_without_weight_runs_along_a_helix(method):
     """Constant speed along and around; f_n = −m v_t²/ρ."""
     radius, mass, around, along = 0.5, 0.3, 1.2, 0.7
     b = bead(mass, Quadric(np.diag([1.0, 1.0, 0.0]), np.zeros(3), -0.5 * radius**2), gravity=0.0)
     t = np.linspace(0.5, 3.0, 6)
-    run = b.simulate(b.state([radius, 0.0, 0.0], [0.0, around, along]), t, rtol=1e-10)
+    run = b.simulate(
+        b.state([radius, 0.0, 0.0], [0.0, around, along]), t, method, step=step_of(method, 1e-3), rtol=1e-10
+    )
     angle = around / radius * t
     expected = np.stack([radius * np.cos(angle), radius * np.sin(angle), along * t], axis=1)
     np.testing.assert_allclose(run.sample[:, :3], expected, rtol=0, atol=1e-8)  # a hundred tolerances
