@@ -313,9 +313,7 @@ def find_scenario(name: str | Path) -> Path:
     if shipped is not None:
         return shipped
     names = [file.stem for file in shipped_scenarios()]
-    raise ScenarioError(
-        f"{name}: no such file{_suggest(path.stem, names)}; shipped scenarios: {', '.join(names)}"
-    )
+    raise ScenarioError(f"{name}: no such file{_suggest(path.stem, names)}; shipped scenarios: {', '.join(names)}")
 
 
 def variant_names(path: str | Path) -> list[str]:
@@ -446,7 +444,7 @@ def to_yaml(resolved: Mapping[str, Any]) -> str:
     from ruamel.yaml import YAML
 
     stream = io.StringIO()
-    yaml = YAML(typ="safe", pure=True)
+    yaml: Any = YAML(typ="safe", pure=True)
     yaml.default_flow_style = None
     yaml.sort_base_mapping_type_on_output = False
     yaml.dump(dict(resolved), stream)
