@@ -34,6 +34,8 @@ from dynsim.shipped import shipped_scenario, shipped_scenarios
 START_TOLERANCE = 1e-6
 # Bytes of the name of a folder on common file systems.
 NAME_LIMIT = 255
+# Numbers of a scenario, in whatever unit.
+SIZE_MAX = 1e30
 # Of what messages show: unknown keys, characters of a value or key.
 UNKNOWN_SHOWN = 20
 SHOWN_LIMIT = 80
@@ -369,7 +371,7 @@ def _merged(
     """One variant of a file with overrides on top, and where its values come from."""
     shared = YamlMapping()
     shared.update({key: value for key, value in data.items() if key != "variants"})
-    shared.lines = data.lines
+    shared.lines = {key: line for key, line in data.lines.items() if key in shared}
     difference: Any = variants.get(variant) if variant is not None else None
     if difference is None:
         difference = {}
@@ -386,6 +388,7 @@ def _merged(
     if variant is not None:
         merged["variant"] = variant
     _make_absolute(merged, path.parent)
+    _check_sizes(merged, (), origin)
     return merged, origin
 
 
@@ -583,6 +586,18 @@ def _unknown_keys(error: ValidationError, merged: Any, origin: Origin) -> list[s
             suggestion = f"; known here: {', '.join(known)}"
         texts.append(f"{origin.place(keys)}: {_dotted(keys)}: unknown key{suggestion}")
     return texts
+
+
+def _check_sizes(value: Any, keys: tuple[int | str, ...], origin: Origin) -> None:
+    """Refuse numbers whose powers and products leave the range of a float; other checks see to NaN and infinity."""
+    if isinstance(value, dict | list):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            _check_sizes(item, (*keys, key), origin)
+    elif isinstance(value, int | float) and (SIZE_MAX < abs(value) < np.inf or 0 < abs(value) < 1.0 / SIZE_MAX):
+        raise ScenarioError(
+            f"{origin.place(keys)}: {_dotted(keys)} = {_shown(value)}: its size must be between "
+            f"{1.0 / SIZE_MAX:g} and {SIZE_MAX:g}, or zero"
+        )
 
 
 def _explain(error: ValidationError, merged: Any, origin: Origin, unknown: Sequence[str]) -> str:
