@@ -467,12 +467,16 @@ def json_schema() -> dict[str, Any]:
 
 
 def _by_type(schema: Any) -> Any:
-    """Every choice of a ``type`` as conditions on it instead of ``oneOf``, for which editors say only "no match"."""
+    """Choices as conditions, on ``type`` and on null: of ``oneOf`` and ``anyOf`` editors say only "no match"."""
     if isinstance(schema, list):
         return [_by_type(item) for item in schema]
     if not isinstance(schema, dict):
         return schema
     schema = {key: _by_type(item) for key, item in schema.items()}
+    chosen = [item for item in schema.get("anyOf", ()) if item != {"type": "null"}]
+    if len(chosen) == 1 and len(schema["anyOf"]) == 2 and ("$ref" in chosen[0] or "discriminator" in chosen[0]):
+        del schema["anyOf"]
+        return schema | {"if": {"type": "null"}, "else": chosen[0]}
     if "oneOf" not in schema or "discriminator" not in schema:
         return schema
     del schema["oneOf"]
@@ -611,7 +615,6 @@ def _explain(error: ValidationError, merged: Any, origin: Origin, unknown: Seque
     problem = problems[0]
     loc = (*problem["loc"], *problem.get("ctx", {}).get("key", "").split("."))
     keys, value, found = _locate(merged, tuple(part for part in loc if part != ""))
-    dotted = _dotted(keys)
     kind, message = problem["type"], problem["msg"].removeprefix("Value error, ")
     more = len(problems) - 1
     if kind == "missing" and isinstance(problem["loc"][-1], int) and isinstance(value, list):
@@ -624,7 +627,7 @@ def _explain(error: ValidationError, merged: Any, origin: Origin, unknown: Seque
     elif kind in ("union_tag_invalid", "union_tag_not_found"):
         expected = problem["ctx"].get("expected_tags", "").replace("'", "") if "ctx" in problem else ""
         tag = value.get("type", "") if isinstance(value, Mapping) else ""
-        dotted += ".type"
+        keys = [*keys, "type"]
         if tag:
             text = f"unknown type {_shown(tag)}{_suggest(str(tag), expected.split(', '))}; known: {expected}"
         else:
@@ -635,7 +638,7 @@ def _explain(error: ValidationError, merged: Any, origin: Origin, unknown: Seque
     else:
         text = " ".join((message[0].lower() + message[1:]).splitlines())
     given = f" = {_shown(value)}" if found and not isinstance(value, (Mapping, list)) else ""
-    return f"{origin.place(keys)}: {dotted}{given}: {text}{_and_more(more)}"
+    return f"{origin.place(keys)}: {_dotted(keys)}{given}: {text}{_and_more(more)}"
 
 
 def _and_more(count: int) -> str:
