@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from glob import escape
 from pathlib import Path
 
 import typer
 
 from dynsim.errors import ScenarioError
-from dynsim.inputs import YamlMapping, is_file, parse_yaml, read_text
 from dynsim.shipped import shipped_scenario, shipped_scenarios
 
 
 def scenarios(incomplete: str) -> list[str]:
     """Names of shipped scenarios, and YAML files of the folder that was begun."""
+    from glob import escape
+
     folder, separator, _ = incomplete.rpartition("/")
     files = sorted(Path(folder + separator).glob(f"{escape(incomplete.removeprefix(folder + separator))}*.yaml"))
     names = [path.stem for path in shipped_scenarios()]
@@ -22,6 +22,9 @@ def scenarios(incomplete: str) -> list[str]:
 
 def variants(ctx: typer.Context, incomplete: str) -> list[str]:
     """Variants of the scenario on the command line."""
+    # Imported here: the command line loads this module.
+    from dynsim.inputs import YamlMapping, is_file, parse_yaml, read_text
+
     # While the option lacks its value, what stands before it is not parsed yet.
     path = Path(ctx.params.get("scenario") or next(iter(ctx.args), ""))
     try:
