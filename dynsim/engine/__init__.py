@@ -105,11 +105,16 @@ def check(scenario: Scenario) -> Start:
 def _named(scenario: Scenario) -> Iterator[None]:
     """Say in errors which scenario and variant they are about; those of reading it name file and line themselves."""
     require_scenario(scenario)
-    name = f"{scenario.source or scenario.name}{f' ({scenario.variant})' if scenario.variant else ''}"
+    variant = f" ({scenario.variant})" if scenario.variant else ""
+    name = scenario.place(variant=variant)
     try:
         yield
-    except (ModelError, ScenarioError, UnreachableReference) as error:
+    except ModelError as error:
+        raise ModelError(f"{scenario.place(error.keys, variant)}: {error}") from error
+    except (ScenarioError, UnreachableReference) as error:
         raise type(error)(f"{name}: {error}") from error
+    except (ArithmeticError, np.linalg.LinAlgError) as error:
+        raise ModelError(f"{name}: numbers of very different size, no result can be computed ({error})") from error
     except MemoryError as error:
         reason = f"not enough memory ({error})" if str(error) else "not enough memory"
         raise ScenarioError(f"{name}: {reason}; a lower record.rate_hz or duration_s needs less") from error

@@ -14,8 +14,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
-from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError
 
 from dynsim.errors import shown
 from dynsim.hardware.control_table import (
@@ -29,6 +27,7 @@ from dynsim.hardware.control_table import (
     ServoModel,
 )
 from dynsim.hardware.errors import ServoMapError
+from dynsim.inputs import is_file, parse_yaml, read_text
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent / "scenarios" / "hardware"
@@ -349,7 +348,8 @@ def load_servo_map(path: str | Path) -> ServoMap:
         )
     path = Path(path)
     shipped = SHIPPED / f"{path.stem}.yaml"
-    if not path.is_file() and path.parent in (Path(), Path("scenarios/hardware")) and shipped.is_file():
+    named = path.parent in (Path(), Path("scenarios/hardware")) and shipped.is_file()
+    if named and not is_file(path, ServoMapError):
         path = shipped
     return ServoMap(path, read_yaml(path, _MapFile))
 
@@ -374,43 +374,43 @@ def read_yaml(path: Path, schema: type[_Schema]) -> _Schema:
     ServoMapError
         Missing file, bad YAML or bad entry; the message holds file, line and key.
     """
-    try:
-        data = YAML(typ="rt").load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ServoMapError(f"{path}: cannot be read ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise ServoMapError(f"{path}: not a text file") from error
-    except MarkedYAMLError as error:
-        mark = error.problem_mark
-        line = f":{mark.line + 1}" if mark else ""
-        raise ServoMapError(f"{path}{line}: not YAML: {error.problem or error.context}") from error
+    data = parse_yaml(read_text(path, ServoMapError), ServoMapError, str(path))
     if not isinstance(data, dict):
         raise ServoMapError(f"{path}: expected a mapping with the keys {', '.join(schema.model_fields)}")
     try:
         return schema.model_validate(data)
     except ValidationError as error:
-        # A misspelt key makes two errors: the wrong one says more than the missing one.
-        first = min(error.errors(include_url=False), key=lambda found: found["type"] != "extra_forbidden")
-        where = ".".join(str(part) for part in first["loc"])
-        message = first["msg"].removeprefix("Value error, ")
-        if first["type"] == "extra_forbidden":
-            known = _known_keys(schema, first["loc"])
+        raise ServoMapError(_explain(error, path, data, schema)) from error
+
+
+# Unknown keys that one message names.
+_UNKNOWN_SHOWN = 20
+
+
+def _explain(error: ValidationError, path: Path, data: Any, schema: type[BaseModel]) -> str:
+    """One line: all unknown keys, else the first problem."""
+    problems = error.errors(include_url=False, include_input=False)
+    # A misspelt key makes two errors: the wrong one says more than the missing one.
+    unknown = [problem for problem in problems if problem["type"] == "extra_forbidden"]
+    texts = []
+    for problem in unknown[:_UNKNOWN_SHOWN] or problems[:1]:
+        where = ".".join(str(part) for part in problem["loc"])
+        message = " ".join(problem["msg"].removeprefix("Value error, ").split())
+        if unknown:
+            known = _known_keys(schema, problem["loc"])
             message = f"unknown key; known are {', '.join(known)}" if known else "unknown key"
-        more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-        raise ServoMapError(
-            f"{path}:{_line(data, first['loc'])}: {where + ': ' if where else ''}{message}{more}"
-        ) from error
+        texts.append(f"{path}:{_line(data, problem['loc'])}: {where + ': ' if where else ''}{message}")
+    more = f" (and {len(problems) - len(texts)} more)" if len(problems) > len(texts) else ""
+    return "; ".join(texts) + more
 
 
 def _line(data: Any, location: tuple[int | str, ...]) -> int:
     line = 1
     for key in location:
-        try:
-            position = data.lc.data[key]
-        except (AttributeError, KeyError, TypeError):
+        lines = getattr(data, "lines", {})
+        if key not in lines:
             break
-        line = position[0] + 1
-        data = data[key]
+        line, data = lines[key], data[key]
     return line
 
 

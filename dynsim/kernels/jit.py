@@ -146,8 +146,10 @@ def cache_folder() -> Path:
         digest.update(source.read_bytes())
     name = Path("dynsim", digest.hexdigest()[:16])
     roots = [os.environ.get(variable) for variable in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")]
-    home = next((root for root in roots if root), "~/.cache")
-    for root in (Path(os.path.expanduser(home)), Path(tempfile.gettempdir(), f"cache-{os.getuid()}")):
+    home = os.path.expanduser(next((root for root in roots if root), "~/.cache"))
+    temporary = Path(tempfile.gettempdir(), f"cache-{os.getuid()}")
+    # A user without a home keeps the tilde.
+    for root in (temporary,) if home.startswith("~") else (Path(home), temporary):
         folder = root / name
         try:
             folder.mkdir(parents=True, exist_ok=True, mode=0o700)

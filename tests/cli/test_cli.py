@@ -2,16 +2,13 @@
 
 import json
 import os
-import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import h5py
 import pytest
-from processes import started
 
 from dynsim._version import __version__
 from dynsim.cli import main
@@ -26,11 +23,6 @@ def dynsim(*arguments: str, folder: Path, **options: Any) -> subprocess.Complete
     return subprocess.run(
         [sys.executable, "-m", "dynsim", *arguments], cwd=folder, capture_output=True, text=True, timeout=300, **options
     )
-
-
-def heed_ctrl_c() -> None:
-    """Where the tests run in the background, SIGINT is ignored and would be in their children too."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def test_run_writes_everything_that_is_promised(tmp_path: Path):
@@ -88,7 +80,7 @@ def test_compare_prints_the_table_and_writes_the_comparison(tmp_path: Path):
         (["run", "."], "is a folder"),
         (
             ["run", "elbow_comparison", "--set", "plant.initial_deg.1=40"],
-            "(two_elbows): contact elbow_4: its point starts",
+            ".yaml:45 (two_elbows): contacts.points.elbow_4: its point starts",
         ),
         (["check", "elbow_comparison", "--set", "controller.hand.path.radius_m=0.6"], "at t = 0.000 s it stays 0.34 m"),
         (
@@ -195,47 +187,6 @@ def test_divergence_stops_with_code_3_and_keeps_what_there_is(tmp_path: Path):
     assert "q" in record.provenance["stopped"]["state"]
 
 
-LONG = ["--set", "duration_s=5000", "--set", "controller.knot_spacing_s=10", "--set",
-        "controller.hand.path.period_s=5000", "--set", "record.rate_hz=10"]  # fmt: skip
-
-
-def verbose(*arguments: str) -> list[str]:
-    """A command that says on stderr how far it is."""
-    return [sys.executable, "-m", "dynsim", "--verbose", *arguments]
-
-
-def without_log(stderr: str) -> list[str]:
-    return [line for line in stderr.splitlines() if " INFO " not in line and " WARNING " not in line]
-
-
-def test_ctrl_c_saves_what_was_simulated(tmp_path: Path):
-    command = verbose("run", "elbow_comparison", "--no-figures", *LONG)
-    with started(command, tmp_path / "stderr", cwd=tmp_path, preexec_fn=heed_ctrl_c) as child:
-        child.wait_for("integrating 5000 s")
-        os.kill(child.process.pid, signal.SIGINT)
-        assert child.end() == 130, child.stderr
-    record = Record.load(tmp_path / "results" / "elbow_comparison" / "two_elbows" / "record.h5")
-    assert not record.complete
-    assert "incomplete" in record.summary["warnings"][-1]
-
-
-@pytest.mark.skipif(not hasattr(os, "killpg"), reason="process groups are POSIX")
-@pytest.mark.parametrize("kill", [os.kill, os.killpg])
-def test_ctrl_c_saves_all_variants_that_run_in_processes(tmp_path: Path, kill: Callable[[int, int], None]):
-    # Two run, two wait. One signal goes to the parent alone, the other, as a terminal sends it, to all.
-    command = verbose("compare", "elbow_comparison", "--jobs", "2", "--no-figures", *LONG, "--out", "out")
-    with started(command, tmp_path / "stderr", cwd=tmp_path, preexec_fn=heed_ctrl_c) as child:
-        child.wait_for("integrating 5000 s", count=2)
-        kill(child.process.pid, signal.SIGINT)
-        assert child.end() == 130, child.stderr
-    *saved, error = without_log(child.stderr)
-    assert sorted(line.split()[4] for line in saved) == ["elbow_7", "two_elbows"]
-    assert error.startswith("error: two_elbows: interrupted at t = ")
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"elbow_7", "two_elbows"}
-    for name in ("elbow_7", "two_elbows"):
-        assert not Record.load(tmp_path / "out" / name / "record.h5").complete
-
-
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_a_variant_that_stops_does_not_keep_the_others_from_the_comparison(tmp_path: Path, jobs: str):
     text = (SHIPPED / "elbow_comparison.yaml").read_text().partition("\nvariants:")[0]
@@ -251,19 +202,6 @@ def test_a_variant_that_stops_does_not_keep_the_others_from_the_comparison(tmp_p
     assert list(json.loads((tmp_path / "out" / "comparison.json").read_text())["variants"]) == ["one", "two"]
     assert "electrical energy" in result.stdout
     assert not Record.load(tmp_path / "out" / "bad" / "record.h5").complete
-
-
-@pytest.mark.parametrize("command", ["run", "check"])
-def test_ctrl_c_before_the_first_step_says_that_nothing_is_saved(tmp_path: Path, command: str):
-    # Many knots: the inverse kinematics take minutes.
-    arguments = verbose(command, "elbow_comparison", "--set", "duration_s=50000", "--set", "record.rate_hz=1")
-    with started(arguments, tmp_path / "stderr", cwd=tmp_path, preexec_fn=heed_ctrl_c) as child:
-        child.wait_for("planning references over 50000 s")
-        os.kill(child.process.pid, signal.SIGINT)
-        assert child.end() == 130, child.stderr
-    assert "planned references" not in child.stderr
-    assert "(two_elbows): interrupted before there was anything to save" in child.stderr
-    assert not (tmp_path / "results").exists()
 
 
 def test_a_full_disk_is_one_line_and_leaves_no_half_file(tmp_path: Path):
@@ -323,3 +261,100 @@ def test_list_check_schema_and_version(tmp_path: Path):
         result = dynsim(*arguments, folder=tmp_path)
         assert result.returncode == 0, result.stderr
         assert expected in result.stdout
+
+
+def in_process(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture, *arguments: str
+) -> tuple[int, str, list[str]]:
+    """Exit code, output and lines of errors of the command line, run here: starting Python takes a second."""
+    monkeypatch.setattr(sys, "argv", ["dynsim", *arguments])
+    with pytest.raises(SystemExit) as finished:
+        main()
+    captured = capfd.readouterr()
+    return finished.value.code, captured.out, [line for line in captured.err.splitlines() if line.strip()]
+
+
+@pytest.mark.parametrize("command", [[], ["run"], ["compare"], ["plot"], ["bench"], ["hw", "replay"]])
+def test_help_shows_flags_without_a_type(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture, command: list[str]
+):
+    code, output, _ = in_process(monkeypatch, capfd, *command, "--help")
+    assert code == 0
+    assert "--help " in output
+    for noise in ("bool", "int range", "...}"):
+        assert noise not in output
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("dynsim ru", ["run"]),
+        ("dynsim run elbow_comparison_", ["elbow_comparison_vertical"]),
+        ("dynsim check single_pendulum six", ["six_axis_arm"]),
+        ("dynsim compare mine/a", ["mine/a.yaml"]),
+        ("dynsim run elbow_comparison --variant elb", ["elbow_7", "elbow_4"]),
+        ("dynsim run mine/a.yaml --variant ", ["one", "two"]),
+        ("dynsim run gone.yaml --variant ", []),
+        ("dynsim run mine/bad.yaml --variant ", []),
+    ],
+)
+def test_the_shell_completes_scenarios_and_variants(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture, words: str, expected: list[str]
+):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "a.yaml").write_text("variants: {one: {}, two: {}}")
+    (tmp_path / "mine" / "bad.yaml").write_text("variants: [")
+    (tmp_path / "mine" / "a.txt").touch()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("_DYNSIM_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", words)
+    monkeypatch.setenv("COMP_CWORD", str(words.count(" ")))
+    code, output, errors = in_process(monkeypatch, capfd)
+    assert (code, output.split(), errors) == (0, expected, [])
+
+
+def test_the_shell_can_be_taught_to_complete(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture):
+    _, output, _ = in_process(monkeypatch, capfd, "--help")
+    assert "--install-completion" in output
+
+
+def test_completing_loads_nothing_heavy(tmp_path: Path):
+    heavy = "numpy numba scipy pydantic h5py matplotlib pinocchio"
+    code = f"import sys; from dynsim import cli; print(*(name for name in {heavy.split()} if name in sys.modules))"
+    result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "\n", "")
+
+
+def test_names_that_no_file_can_have_are_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+):
+    monkeypatch.chdir(tmp_path)
+    long, undecodable = "x" * 300, os.fsdecode(b"n\xff")
+    for arguments in (["run", long], ["check", long], ["plot", long], ["run", undecodable]):
+        code, _, errors = in_process(monkeypatch, capfd, *arguments)
+        assert code == 2
+        assert len(errors) == 1
+    code, _, (error,) = in_process(monkeypatch, capfd, "run", "single_pendulum", "--out", long)
+    assert code == 2
+    assert error.endswith("File name too long")
+
+
+def test_a_working_directory_that_is_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    code, output, _ = in_process(monkeypatch, capfd, "check", "single_pendulum")
+    assert (code, output.split()) == (0, ["single_pendulum:", "ok", "(1", "variant)"])
+    code, _, errors = in_process(monkeypatch, capfd, "run", "single_pendulum")
+    assert code == 2
+    assert errors == ["error: the working directory is no longer there; change to another folder"]
+
+
+def test_a_terminal_that_knows_ascii_only(tmp_path: Path):
+    for arguments in (["list"], ["run", "--help"], ["run", "−.yaml"]):
+        result = dynsim(*arguments, folder=tmp_path, env={**os.environ, "PYTHONIOENCODING": "ascii"})
+        assert result.returncode == (2 if "−.yaml" in arguments else 0), result.stderr
+        assert "Traceback" not in result.stderr

@@ -90,7 +90,7 @@ def test_exit_codes_of_refusal_verification_and_abort(call, files: Path) -> None
     [
         (("hw", "check", "nowhere.h5", "--map", "{map}"), "nowhere.h5: no such record"),
         (("hw", "check", "{map}", "--map", "{map}"), "not a readable HDF5 file"),
-        (("hw", "check", "{record}", "--map", "nowhere.yaml"), "nowhere.yaml: cannot be read"),
+        (("hw", "check", "{record}", "--map", "nowhere.yaml"), "nowhere.yaml: no such file"),
         (("hw", "replay", "{record}", "--map", "{map}", "--port", "/dev/ttyNone", "--out", "{out}"), "no such port"),
         (("hw", "scan", "--port", "/dev/ttyNone"), "no such port"),
         (("hw", "stop", "--port", "/dev/ttyNone"), "no such port"),
