@@ -16,7 +16,17 @@ class ScenarioError(DynsimError):
 
 
 class ModelError(DynsimError):
-    """A description of bodies, joints, motors or contacts that no physics can be made of."""
+    """A description of bodies, joints, motors or contacts that no physics can be made of.
+
+    Attributes
+    ----------
+    keys : tuple
+        Where in a scenario the fault is, for its line; empty where no one key is to blame.
+    """
+
+    def __init__(self, message: str, *, keys: tuple[int | str, ...] = ()) -> None:
+        super().__init__(message)
+        self.keys = keys
 
 
 class UnreachableReference(DynsimError):

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dynsim.errors import RecordError
 from dynsim.files import replacing
+from dynsim.inputs import is_file
 
 FORMAT = "dynsim-record-1"
 
@@ -135,7 +136,7 @@ class Record:
         import h5py
 
         path = Path(path)
-        if not path.is_file():
+        if not is_file(path, RecordError):
             raise RecordError(f"{path}: no such record")
         try:
             with h5py.File(path, "r") as file:

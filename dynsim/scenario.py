@@ -6,13 +6,15 @@ null removes). Overrides come on top. Every error names file, line, key and valu
 
 from __future__ import annotations
 
-import copy
 import difflib
 import io
+import itertools
+import re
 import types
 import typing
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,14 +24,23 @@ from pydantic import BaseModel, Field, ValidationError, field_validator
 from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.families import PACKAGES, member, members, union
+from dynsim.inputs import DEPTH_LIMIT, YamlMapping, is_file, parse_yaml, read_text
 from dynsim.model.description import Contact, Quadric, Robot
 from dynsim.model.model import Model
-
-_CHECKOUT = Path(__file__).resolve().parent.parent / "scenarios"
-SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else Path(__file__).resolve().parent / "shipped_scenarios"
+from dynsim.shipped import SHIPPED as SHIPPED
+from dynsim.shipped import shipped_scenario, shipped_scenarios
 
 # A contact point must start this close to its surface [m].
 START_TOLERANCE = 1e-6
+# Bytes of the name of a folder on common file systems.
+NAME_LIMIT = 255
+# Of what messages show: unknown keys, characters of a value or key.
+UNKNOWN_SHOWN = 20
+SHOWN_LIMIT = 80
+# Variants that are searched for further unknown keys once one was found.
+VARIANTS_SEARCHED = 100
+# A list index in a dotted key.
+_INDEX = re.compile("[0-9]{1,9}")
 
 
 class ContactPoint(BodyPoint):
@@ -102,7 +113,50 @@ class ScenarioConfig(StrictConfig):
         """Both name folders of the results: neither may lead out of them."""
         if value in (".", "..") or any(sign in value for sign in "/\\\0"):
             raise ValueError("names a folder of the results, so it must not have slashes or be dots")
+        if not value.isprintable():
+            raise ValueError("names a folder of the results, so it must be printable in one line")
+        if len(value.encode()) > NAME_LIMIT:
+            raise ValueError(f"names a folder of the results, so it must not be longer than {NAME_LIMIT} bytes")
         return value
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where the values of a scenario come from, so that messages can name the line of a key.
+
+    Attributes
+    ----------
+    file : Path or str
+        The file, or what else is to be called the source.
+    mappings : tuple
+        What was merged, as read: the variant's difference, then the rest of the file.
+    overrides : tuple of str
+        Dotted keys that were set on top, and ``overriding``, how that was done.
+    """
+
+    file: Path | str
+    mappings: tuple[Any, ...] = ()
+    overrides: tuple[str, ...] = ()
+    overriding: str = "overrides"
+
+    def sets(self, keys: Sequence[int | str]) -> bool:
+        """True when an override set the value at ``keys``, something in it or something that it is in."""
+        dotted = ".".join(map(str, keys))
+        return any(
+            dotted == key or dotted.startswith(key + ".") or key.startswith(dotted + ".") for key in self.overrides
+        )
+
+    def line(self, keys: Sequence[int | str]) -> int:
+        """Line of the last of ``keys`` that the file has; 0 when it has none of them."""
+        # The mapping that has most of the keys; of equals the first, because the variant lies over the rest.
+        found = [_line(mapping, keys) for mapping in self.mappings]
+        return max(found, key=lambda depth_and_line: depth_and_line[0], default=(0, 0))[1]
+
+    def place(self, keys: Sequence[int | str]) -> str:
+        """``file:line`` of a key, or how it was overridden."""
+        if self.sets(keys):
+            return self.overriding
+        return f"{self.file}:{line}" if (line := self.line(keys)) else str(self.file)
 
 
 @dataclass(frozen=True)
@@ -116,12 +170,15 @@ class Scenario:
     config : ScenarioConfig
     source : Path or None
         The file it came from.
+    origin : Origin or None
+        Lines of its keys in that file.
     """
 
     name: str
     variant: str
     config: ScenarioConfig
     source: Path | None = None
+    origin: Origin | None = field(default=None, repr=False, compare=False)
 
     @property
     def duration_s(self) -> float:
@@ -163,6 +220,14 @@ class Scenario:
         """The scenario with every default and override written out; reading it again gives the same simulation."""
         return self.config.model_dump(mode="json", exclude_none=True)
 
+    def place(self, keys: Sequence[int | str] = (), variant: str = "") -> str:
+        """``file:line`` of a key, the text for ``variant``, and how the key was overridden."""
+        line, overridden = 0, ""
+        if keys and self.origin is not None:
+            overridden = f": {self.origin.overriding}" if self.origin.sets(keys) else ""
+            line = 0 if overridden else self.origin.line(keys)
+        return f"{self.source or self.name}{f':{line}' if line else ''}{variant}{overridden}"
+
     def robot(self) -> Robot:
         """The tree of bodies with its motors (plants of the dynamics engine)."""
         return member("plant", self.plant.type).build(self.plant)
@@ -184,9 +249,11 @@ class Scenario:
             if not point.enabled:
                 continue
             if point.surface not in surfaces:
+                keys = ("contacts", "points", name, "surface")
                 raise ModelError(
-                    f"contact {name}: no surface {point.surface!r}{_suggest(point.surface, surfaces)}; "
-                    f"surfaces: {', '.join(surfaces) or 'none'}"
+                    f"{_dotted(keys)} = {point.surface!r}: no such surface{_suggest(point.surface, surfaces)}; "
+                    f"surfaces: {', '.join(surfaces) or 'none'}",
+                    keys=keys,
                 )
             result.append(
                 Contact(
@@ -203,15 +270,20 @@ class Scenario:
         return result
 
     def check_start(self, model: Model) -> None:
-        """Raise :class:`ModelError` unless every contact point starts on its surface."""
+        """Raise :class:`ModelError` unless every contact point is on a body of the robot and starts on its surface."""
         for contact in self.contacts():
-            position = model.point_position(contact.body, contact.point, model.robot.initial)
+            keys = ("contacts", "points", contact.name)
+            try:
+                position = model.point_position(contact.body, contact.point, model.robot.initial)
+            except ModelError as error:
+                raise ModelError(f"{_dotted((*keys, 'body'))}: {error}", keys=(*keys, "body")) from error
             gap = contact.surface.gap(position)
             if not abs(gap) <= START_TOLERANCE:
                 raise ModelError(
-                    f"contact {contact.name}: its point starts {gap:+.4g} m from surface {contact.surface_name!r} "
+                    f"{_dotted(keys)}: its point starts {gap:+.4g} m from surface {contact.surface_name!r} "
                     f"(limit {START_TOLERANCE:g} m), at ({position[0]:.4g}, {position[1]:.4g}, {position[2]:.4g}); "
-                    "change the initial configuration or the surface, or disable the contact"
+                    "change the initial configuration or the surface, or disable the contact",
+                    keys=keys,
                 )
 
 
@@ -231,23 +303,19 @@ def find_scenario(name: str | Path) -> Path:
         Neither exists, with near names in the message; or a folder.
     """
     path = Path(name)
-    if path.is_file():
-        return path
-    if path.is_dir():
-        raise ScenarioError(f"{name}: is a folder; a scenario is a YAML file")
-    for candidate in (SHIPPED / path.name, SHIPPED / f"{path.name}.yaml"):
-        if candidate.is_file() and path.parent in (Path(), Path("scenarios")):
-            return candidate
-    shipped = shipped_scenarios()
+    shipped = shipped_scenario(path)
+    try:
+        if is_file(path, ScenarioError):
+            return path
+    except ScenarioError:
+        if shipped is None:
+            raise
+    if shipped is not None:
+        return shipped
+    names = [file.stem for file in shipped_scenarios()]
     raise ScenarioError(
-        f"{name}: no such file{_suggest(path.stem, [p.stem for p in shipped])}; "
-        f"shipped scenarios: {', '.join(p.stem for p in shipped)}"
+        f"{name}: no such file{_suggest(path.stem, names)}; shipped scenarios: {', '.join(names)}"
     )
-
-
-def shipped_scenarios() -> list[Path]:
-    """Scenario files that come with dynsim."""
-    return sorted(SHIPPED.glob("*.yaml"))
 
 
 def variant_names(path: str | Path) -> list[str]:
@@ -272,33 +340,69 @@ def load_scenario(path: str | Path, variant: str | None = None, overrides: Mappi
     """
     path = find_scenario(path)
     data = _read(path)
-    variants = data.pop("variants", None) or {}
+    variants = data.get("variants")
+    if variants is None:
+        variants = {}
     if not isinstance(variants, Mapping):
-        raise ScenarioError(f"{path}: variants must be a mapping of names to what differs")
+        raise ScenarioError(f"{path}:{data.lines['variants']}: variants must be a mapping of names to what differs")
     if variant is None and variants:
         variant = next(iter(variants))
     if variant is not None and variants and variant not in variants:
         raise ScenarioError(
-            f"{path}: no variant {variant!r}{_suggest(variant, variants)}; variants: {', '.join(variants)}"
+            f"{path}: no variant {variant!r}{_suggest(variant, variants)}; variants: {', '.join(map(_key, variants))}"
         )
     if variant is not None and not variants and variant != data.get("variant"):
         raise ScenarioError(f"{path}: has no variants, so there is no {variant!r}")
-    difference = (variants.get(variant) or {}) if variant is not None else {}
-    if not isinstance(difference, Mapping):
-        raise ScenarioError(f"{path}: variant {variant!r} must be a mapping of what differs")
-    merged = _merge(data, difference)
-    for key, value in (overrides or {}).items():
-        _override(merged, key, value, _origin(overrides))
-    merged = _plain(merged)
-    merged["name"] = merged.get("name") or path.stem
-    if variant is not None:
-        merged["variant"] = variant
-    _make_absolute(merged, path.parent)
+    merged, origin = _merged(path, data, variants, variant, overrides or {})
     try:
         config = ScenarioConfig.model_validate(merged)
     except ValidationError as error:
-        raise ScenarioError(_explain(error, path, merged, (difference, data), overrides or {})) from None
-    return Scenario(config.name, config.variant, config, path)
+        unknown = _unknown_keys(error, merged, origin)
+        if unknown:
+            for other in [name for name in itertools.islice(variants, VARIANTS_SEARCHED) if name != variant]:
+                unknown += _unknown_keys_of(path, data, variants, other, overrides or {})
+        raise ScenarioError(_explain(error, merged, origin, unknown)) from None
+    return Scenario(config.name, config.variant, config, path, origin)
+
+
+def _merged(
+    path: Path, data: YamlMapping, variants: Mapping[str, Any], variant: str | None, overrides: Mapping[str, Any]
+) -> tuple[dict[str, Any], Origin]:
+    """One variant of a file with overrides on top, and where its values come from."""
+    shared = YamlMapping()
+    shared.update({key: value for key, value in data.items() if key != "variants"})
+    shared.lines = data.lines
+    difference: Any = variants.get(variant) if variant is not None else None
+    if difference is None:
+        difference = {}
+    if not isinstance(difference, Mapping):
+        line = f":{variants.lines[variant]}" if isinstance(variants, YamlMapping) and variant is not None else ""
+        raise ScenarioError(f"{path}{line}: variant {_shown(variant)} must be a mapping of what differs")
+    overriding = "--set" if isinstance(overrides, SetOptions) else "overrides"
+    origin = Origin(path, (difference, shared), tuple(overrides), overriding)
+    merged = _plain(_merge(shared, difference))
+    for key, value in overrides.items():
+        _override(merged, key, _plain(value), overriding, variant)
+    if merged.get("name") in (None, ""):
+        merged["name"] = path.stem
+    if variant is not None:
+        merged["variant"] = variant
+    _make_absolute(merged, path.parent)
+    return merged, origin
+
+
+def _unknown_keys_of(
+    path: Path, data: YamlMapping, variants: Mapping[str, Any], variant: str, overrides: Mapping[str, Any]
+) -> list[str]:
+    """Unknown keys of another variant; nothing when it has other faults."""
+    try:
+        merged, origin = _merged(path, data, variants, variant, overrides)
+        ScenarioConfig.model_validate(merged)
+    except ScenarioError:
+        return []
+    except ValidationError as error:
+        return _unknown_keys(error, merged, origin)
+    return []
 
 
 def scenario_from_resolved(resolved: Mapping[str, Any]) -> Scenario:
@@ -312,17 +416,14 @@ def scenario_from_resolved(resolved: Mapping[str, Any]) -> Scenario:
     try:
         config = ScenarioConfig.model_validate(resolved)
     except ValidationError as error:
-        problem = _explain(error, "the scenario in this record", resolved, (), {})
+        origin = Origin("the scenario in this record")
+        problem = _explain(error, resolved, origin, _unknown_keys(error, resolved, origin))
         raise ScenarioError(f"{problem}; it was written by another version of dynsim") from None
     return Scenario(config.name, config.variant, config)
 
 
 class SetOptions(dict[str, Any]):
     """Overrides that were given as ``--set`` on the command line: errors call them so."""
-
-
-def _origin(overrides: Mapping[str, Any] | None) -> str:
-    return "--set" if isinstance(overrides, SetOptions) else "overrides"
 
 
 def parse_override(text: str) -> tuple[str, Any]:
@@ -334,15 +435,18 @@ def parse_override(text: str) -> tuple[str, Any]:
         No ``=`` in the text, or a value that is not YAML.
     """
     key, separator, value = text.partition("=")
-    if not separator or not key.strip():
-        raise ScenarioError(f"--set {text}: must look like integrator.rtol=1e-8")
-    return key.strip(), _plain(_parse_yaml(value, f"--set {key.strip()}"))
+    key = key.strip()
+    if not separator or not key:
+        raise ScenarioError(f"--set {_key(text)}: must look like integrator.rtol=1e-8")
+    return key, _plain(parse_yaml(value, ScenarioError, f"--set {_key(key)}", line_numbers=False))
 
 
 def to_yaml(resolved: Mapping[str, Any]) -> str:
     """YAML text of a resolved scenario."""
+    from ruamel.yaml import YAML
+
     stream = io.StringIO()
-    yaml = _yaml("safe")
+    yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style = None
     yaml.sort_base_mapping_type_on_output = False
     yaml.dump(dict(resolved), stream)
@@ -351,7 +455,7 @@ def to_yaml(resolved: Mapping[str, Any]) -> str:
 
 def json_schema() -> dict[str, Any]:
     """JSON schema of scenario files, for editors; of ``variants`` it says only that they are mappings."""
-    schema = ScenarioConfig.model_json_schema()
+    schema = _by_type(ScenarioConfig.model_json_schema())
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     schema["properties"]["variants"] = {
         "type": "object",
@@ -361,52 +465,45 @@ def json_schema() -> dict[str, Any]:
     return schema
 
 
+def _by_type(schema: Any) -> Any:
+    """Every choice of a ``type`` as conditions on it instead of ``oneOf``, for which editors say only "no match"."""
+    if isinstance(schema, list):
+        return [_by_type(item) for item in schema]
+    if not isinstance(schema, dict):
+        return schema
+    schema = {key: _by_type(item) for key, item in schema.items()}
+    if "oneOf" not in schema or "discriminator" not in schema:
+        return schema
+    del schema["oneOf"]
+    mapping = schema["discriminator"]["mapping"]
+    return schema | {
+        "type": "object",
+        "required": ["type"],
+        "properties": {"type": {"enum": list(mapping)}},
+        "allOf": [
+            {"if": {"properties": {"type": {"const": name}}, "required": ["type"]}, "then": {"$ref": reference}}
+            for name, reference in mapping.items()
+        ],
+    }
+
+
 def choices() -> dict[str, tuple[str, ...]]:
     """Members of every family."""
     return {family: members(family) for family in PACKAGES}
 
 
-def _yaml(kind: str) -> Any:
-    from ruamel.yaml import YAML
-
-    return YAML(typ=kind, pure=kind == "rt")
-
-
-def _read(path: Path) -> Any:
-    from ruamel.yaml.comments import CommentedMap
-
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        raise ScenarioError(
-            f"{path}:{line}: byte 0x{error.object[error.start]:02x} is not UTF-8; save it as UTF-8"
-        ) from error
-    data = _parse_yaml(text, str(path))
+def _read(path: Path) -> YamlMapping:
+    data = parse_yaml(read_text(path, ScenarioError), ScenarioError, str(path))
     if data is None:
         raise ScenarioError(f"{path}: is empty; a scenario needs at least duration_s and plant")
-    if not isinstance(data, CommentedMap):
+    if not isinstance(data, YamlMapping):
         kind = "list" if isinstance(data, list) else "single value"
         raise ScenarioError(f"{path}: must be a mapping of keys to values, not a {kind}")
     return data
 
 
-def _parse_yaml(text: str, source: str) -> Any:
-    from ruamel.yaml.error import MarkedYAMLError, YAMLError
-
-    try:
-        return _yaml("rt").load(text)
-    except MarkedYAMLError as error:
-        line = f":{error.problem_mark.line + 1}" if error.problem_mark else ""
-        raise ScenarioError(f"{source}{line}: not YAML: {error.problem or error.context}") from None
-    except YAMLError as error:
-        raise ScenarioError(f"{source}: not YAML: {str(error).splitlines()[0]}") from None
-
-
 def _plain(value: Any) -> Any:
-    """Round-trip YAML nodes as plain Python values."""
+    """A copy of a value in plain Python types."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list):
@@ -422,7 +519,7 @@ def _plain(value: Any) -> Any:
 def _merge(base: Any, difference: Any) -> Any:
     """``difference`` laid over ``base``: mappings merge, null removes, anything else replaces."""
     if not (isinstance(base, Mapping) and isinstance(difference, Mapping)):
-        return copy.copy(difference)
+        return difference
     merged = {key: _merge(value, {}) if isinstance(value, Mapping) else value for key, value in base.items()}
     for key, value in difference.items():
         if value is None:
@@ -432,19 +529,26 @@ def _merge(base: Any, difference: Any) -> Any:
     return merged
 
 
-def _override(data: Any, key: str, value: Any, origin: str) -> None:
+def _override(data: Any, key: str, value: Any, overriding: str, variant: str | None) -> None:
     """Set the dotted ``key`` in nested mappings and lists."""
-    node, parts = data, key.split(".")
+    node, parts = data, str(key).split(".")
+    place = f"{overriding} {_key(key)}"
+    if "" in parts:
+        raise ScenarioError(f"{place}: a part of the key is empty; it must look like integrator.rtol")
+    if len(parts) > DEPTH_LIMIT:
+        raise ScenarioError(f"{place}: has {len(parts)} parts; no key of a scenario has more than {DEPTH_LIMIT}")
+    if parts[0] == "variants" or (parts[0] == "variant" and variant is not None):
+        raise ScenarioError(f"{place}: which variant runs is chosen by its name (dynsim run --variant), not set")
     for depth, part in enumerate(parts):
         last = depth == len(parts) - 1
         if isinstance(node, list):
-            if not part.isdigit() or int(part) >= len(node):
-                raise ScenarioError(f"{origin} {key}: {part!r} is no index of a list of {len(node)}")
+            if not _INDEX.fullmatch(part) or int(part) >= len(node):
+                raise ScenarioError(f"{place}: {_shown(part)} is no index of a list of {len(node)}")
             index: Any = int(part)
         elif isinstance(node, Mapping):
             index = part
         else:
-            raise ScenarioError(f"{origin} {key}: {'.'.join(parts[:depth])} is a value, not a mapping")
+            raise ScenarioError(f"{place}: {_dotted(parts[:depth])} is a value, not a mapping")
         if last:
             node[index] = value
             return
@@ -458,7 +562,9 @@ def _make_absolute(data: Any, folder: Path) -> None:
     if isinstance(data, dict):
         for key, value in data.items():
             if key == "file" and isinstance(value, str):
-                data[key] = str((folder / value).resolve())
+                # A name that no file can have is left for its reader to refuse.
+                with suppress(OSError, ValueError, RuntimeError):
+                    data[key] = str((folder / value).resolve())
             else:
                 _make_absolute(value, folder)
     elif isinstance(data, list):
@@ -466,33 +572,40 @@ def _make_absolute(data: Any, folder: Path) -> None:
             _make_absolute(item, folder)
 
 
-def _explain(
-    error: ValidationError, path: Path | str, merged: Any, sources: tuple[Any, ...], overrides: Mapping[str, Any]
-) -> str:
-    """The first problem in one line: file:line, key, value, fix."""
-    problems = error.errors()
-    # Unknown keys first: a misspelt key also makes the right one missing.
-    problem = next((p for p in problems if p["type"] == "extra_forbidden"), problems[0])
+def _unknown_keys(error: ValidationError, merged: Any, origin: Origin) -> list[str]:
+    """Every unknown key: place, key, and the known one that it is like."""
+    texts: list[str] = []
+    for problem in error.errors(include_url=False, include_input=False):
+        if problem["type"] != "extra_forbidden" or len(texts) > UNKNOWN_SHOWN:
+            continue
+        keys, _, _ = _locate(merged, problem["loc"])
+        known = _fields(problem["loc"][:-1]) + (["variants"] if len(keys) == 1 else [])
+        suggestion = _suggest(str(keys[-1]), known)
+        if not suggestion and known:
+            suggestion = f"; known here: {', '.join(known)}"
+        texts.append(f"{origin.place(keys)}: {_dotted(keys)}: unknown key{suggestion}")
+    return texts
+
+
+def _explain(error: ValidationError, merged: Any, origin: Origin, unknown: Sequence[str]) -> str:
+    """One line with file:line, key, value and fix: all unknown keys, else the first problem."""
+    problems = error.errors(include_url=False, include_input=False)
+    if unknown:
+        # These first and alone: a misspelt key also makes the right one missing.
+        texts = list(dict.fromkeys(unknown))
+        shown = "; ".join(texts[:UNKNOWN_SHOWN]) + ("; and more" if len(texts) > UNKNOWN_SHOWN else "")
+        return shown + _and_more(sum(problem["type"] != "extra_forbidden" for problem in problems))
+    problem = problems[0]
     loc = (*problem["loc"], *problem.get("ctx", {}).get("key", "").split("."))
     keys, value, found = _locate(merged, tuple(part for part in loc if part != ""))
-    dotted = ".".join(str(key) for key in keys)
-    # The source that has most of the keys; of equals the first, because the variant lies over the rest.
-    found_in = [_line(source, keys) for source in sources]
-    _, line = max(found_in, key=lambda depth_and_line: depth_and_line[0], default=(0, 0))
-    place = f"{path}:{line}" if line else str(path)
-    if any(dotted == key or dotted.startswith(key + ".") or key.startswith(dotted + ".") for key in overrides):
-        place = _origin(overrides)
+    dotted = _dotted(keys)
     kind, message = problem["type"], problem["msg"].removeprefix("Value error, ")
-    if kind == "extra_forbidden":
-        known = _fields(problem["loc"][:-1]) + (["variants"] if len(keys) == 1 else [])
-        text = f"unknown key{_suggest(str(keys[-1]), known)}"
-        if not text.endswith("?"):
-            text += f"; known here: {', '.join(known)}" if known else ""
-    elif kind == "missing" and isinstance(problem["loc"][-1], int) and isinstance(value, list):
+    more = len(problems) - 1
+    if kind == "missing" and isinstance(problem["loc"][-1], int) and isinstance(value, list):
         # One problem for every entry that a list of fixed length lacks.
-        lacking = [p for p in problems if p["type"] == kind and p["loc"][:-1] == problem["loc"][:-1]]
-        text = f"has {len(value)} entries, {len(value) + len(lacking)} are needed"
-        problems = [p for p in problems if p is problem or p not in lacking]
+        lacking = sum(p["type"] == kind and p["loc"][:-1] == problem["loc"][:-1] for p in problems)
+        text = f"has {len(value)} entries, {len(value) + lacking} are needed"
+        more -= lacking - 1
     elif kind == "missing":
         text = "is missing; add it"
     elif kind in ("union_tag_invalid", "union_tag_not_found"):
@@ -500,17 +613,39 @@ def _explain(
         tag = value.get("type", "") if isinstance(value, Mapping) else ""
         dotted += ".type"
         if tag:
-            text = f"unknown type {tag!r}{_suggest(str(tag), expected.split(', '))}; known: {expected}"
+            text = f"unknown type {_shown(tag)}{_suggest(str(tag), expected.split(', '))}; known: {expected}"
         else:
             text = "is missing; it says which one" + (f": {expected}" if expected else "")
         found = False
     elif kind in ("model_type", "dict_type", "model_attributes_type"):
         text = "must be a mapping of keys to values"
     else:
-        text = message[0].lower() + message[1:]
-    shown = f" = {value!r}" if found and not isinstance(value, (Mapping, list)) and kind != "extra_forbidden" else ""
-    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
-    return f"{place}: {dotted}{shown}: {text}{more}"
+        text = " ".join((message[0].lower() + message[1:]).splitlines())
+    given = f" = {_shown(value)}" if found and not isinstance(value, (Mapping, list)) else ""
+    return f"{origin.place(keys)}: {dotted}{given}: {text}{_and_more(more)}"
+
+
+def _and_more(count: int) -> str:
+    return f" (and {count} more)" if count > 0 else ""
+
+
+def _key(key: object) -> str:
+    """A key for a message: in one line and not too long."""
+    text = str(key)
+    text = text if len(text) <= SHOWN_LIMIT else text[:SHOWN_LIMIT] + "…"
+    return text if text.isprintable() else repr(text)[1:-1]
+
+
+def _dotted(keys: Sequence[int | str]) -> str:
+    return ".".join(_key(key) if key != "" else "''" for key in keys)
+
+
+def _shown(value: object) -> str:
+    """A value for a message: in one line and not too long."""
+    if isinstance(value, str):
+        return repr(value if len(value) <= SHOWN_LIMIT else value[:SHOWN_LIMIT] + "…")
+    text = repr(value)
+    return text if len(text) <= SHOWN_LIMIT else text[:SHOWN_LIMIT] + "…"
 
 
 def _locate(data: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any, bool]:
@@ -518,7 +653,7 @@ def _locate(data: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any
     keys: list[int | str] = []
     node, found = data, True
     for part in loc:
-        if isinstance(node, list) and isinstance(part, str) and part.isdigit():
+        if isinstance(node, list) and isinstance(part, str) and _INDEX.fullmatch(part):
             part = int(part)  # of a dotted key
         in_mapping = isinstance(node, Mapping) and part in node
         in_list = isinstance(node, list) and isinstance(part, int) and part < len(node)
@@ -535,15 +670,15 @@ def _locate(data: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any
     return keys, node, found
 
 
-def _line(source: Any, keys: list[int | str]) -> tuple[int, int]:
-    """How many of ``keys`` lead into a round-trip YAML mapping, and the line of the last of them; (0, 0) for none."""
+def _line(mapping: Any, keys: Sequence[int | str]) -> tuple[int, int]:
+    """How many of ``keys`` lead into a mapping of a YAML file, and the line of the last of them; (0, 0) for none."""
     depth = line = 0
-    node = source
+    node = mapping
     for key in keys:
-        lines = getattr(getattr(node, "lc", None), "data", None)
-        if not lines or key not in lines:
+        lines = getattr(node, "lines", {})
+        if key not in lines:
             break
-        depth, line = depth + 1, lines[key][0] + 1
+        depth, line = depth + 1, lines[key]
         node = node[key]
     return depth, line
 
@@ -572,5 +707,7 @@ def _literals(model: type[BaseModel]) -> tuple[Any, ...]:
 
 
 def _suggest(word: str, known: Any) -> str:
-    near = difflib.get_close_matches(word, [str(k) for k in known], n=1, cutoff=0.6)
+    if len(word) > SHOWN_LIMIT:
+        return ""  # the comparison takes the square of the length
+    near = difflib.get_close_matches(word, [str(k) for k in itertools.islice(known, 1000)], n=1, cutoff=0.6)
     return f"; did you mean {near[0]!r}?" if near else ""

@@ -66,10 +66,13 @@ def _named(scenario: Scenario) -> Iterator[None]:
     """Say in errors which scenario and variant they are about; those of reading it name file and line themselves."""
     if not isinstance(scenario, Scenario):
         raise ScenarioError(f"needs a Scenario, not {scenario!r}; load_scenario(name or file) gives one")
-    name = f"{scenario.source or scenario.name}{f' ({scenario.variant})' if scenario.variant else ''}"
+    variant = f" ({scenario.variant})" if scenario.variant else ""
+    name = scenario.place(variant=variant)
     try:
         yield
-    except (ModelError, ScenarioError, UnreachableReference) as error:
+    except ModelError as error:
+        raise ModelError(f"{scenario.place(error.keys, variant)}: {error}") from error
+    except (ScenarioError, UnreachableReference) as error:
         raise type(error)(f"{name}: {error}") from error
     except MemoryError as error:
         reason = f"not enough memory ({error})" if str(error) else "not enough memory"

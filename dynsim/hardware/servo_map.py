@@ -14,8 +14,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
-from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError
 
 from dynsim.hardware.control_table import (
     BAUD_RATES,
@@ -28,6 +26,7 @@ from dynsim.hardware.control_table import (
     ServoModel,
 )
 from dynsim.hardware.errors import ServoMapError
+from dynsim.inputs import is_file, parse_yaml, read_text
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent / "scenarios" / "hardware"
@@ -326,7 +325,8 @@ def load_servo_map(path: str | Path) -> ServoMap:
     """
     path = Path(path)
     shipped = SHIPPED / f"{path.stem}.yaml"
-    if not path.is_file() and path.parent in (Path(), Path("scenarios/hardware")) and shipped.is_file():
+    named = path.parent in (Path(), Path("scenarios/hardware")) and shipped.is_file()
+    if named and not is_file(path, ServoMapError):
         path = shipped
     return ServoMap(path, read_yaml(path, _MapFile))
 
@@ -342,16 +342,7 @@ def read_yaml(path: Path, schema: type[_Schema]) -> _Schema:
     ServoMapError
         Missing file, bad YAML or bad entry; the message holds file, line and key.
     """
-    try:
-        data = YAML(typ="rt").load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ServoMapError(f"{path}: cannot be read ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise ServoMapError(f"{path}: not a text file") from error
-    except MarkedYAMLError as error:
-        mark = error.problem_mark
-        line = f":{mark.line + 1}" if mark else ""
-        raise ServoMapError(f"{path}{line}: not YAML: {error.problem or error.context}") from error
+    data = parse_yaml(read_text(path, ServoMapError), ServoMapError, str(path))
     if not isinstance(data, dict):
         raise ServoMapError(f"{path}: expected a mapping with the keys {', '.join(schema.model_fields)}")
     try:
@@ -373,12 +364,10 @@ def read_yaml(path: Path, schema: type[_Schema]) -> _Schema:
 def _line(data: Any, location: tuple[int | str, ...]) -> int:
     line = 1
     for key in location:
-        try:
-            position = data.lc.data[key]
-        except (AttributeError, KeyError, TypeError):
+        lines = getattr(data, "lines", {})
+        if key not in lines:
             break
-        line = position[0] + 1
-        data = data[key]
+        line, data = lines[key], data[key]
     return line
 
 

@@ -12,6 +12,7 @@ from pydantic import Field
 from dynsim.config import BodyPoint, NonNegative, StrictConfig, Vector3
 from dynsim.errors import ModelError
 from dynsim.families import union
+from dynsim.inputs import check_file
 from dynsim.model.description import Robot
 from dynsim.model.motor_parameters import MotorParameters
 
@@ -52,6 +53,7 @@ def build(config: Config) -> Robot:
     """
     from dynsim.model.urdf import read_urdf
 
+    check_file(config.file, ModelError)
     robot = read_urdf(Path(config.file))
     kinds = {link.joint: link.kind for link in robot.links}
     for name in [*config.motors, *config.initial_deg, *config.initial_m]:

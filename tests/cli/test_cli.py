@@ -84,7 +84,7 @@ def test_compare_prints_the_table_and_writes_the_comparison(tmp_path: Path):
         (["run", "."], "is a folder"),
         (
             ["run", "elbow_comparison", "--set", "plant.initial_deg.1=40"],
-            "(two_elbows): contact elbow_4: its point starts",
+            ".yaml:45 (two_elbows): contacts.points.elbow_4: its point starts",
         ),
         (["check", "elbow_comparison", "--set", "controller.hand.path.radius_m=0.6"], "at t = 0.000 s it stays 0.34 m"),
         (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal, Self
@@ -12,8 +13,12 @@ from pydantic import Field, model_validator
 from scipy.interpolate import PchipInterpolator
 
 from dynsim.config import StrictConfig
+from dynsim.errors import ModelError
+from dynsim.inputs import read_text
 
 COLUMNS = ("t_s", "x_m", "y_m", "z_m")
+# Of a file [bytes]: some million rows.
+SIZE_LIMIT = 100_000_000
 
 
 class Config(StrictConfig):
@@ -38,15 +43,15 @@ def _table(file: str) -> NDArray[np.float64]:
     """Rows (t, x, y, z) of the file; ValueError names what is wrong with it."""
     path = Path(file)
     try:
-        stream = path.open(encoding="utf-8")
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
-    with stream:
-        header = [name.strip() for name in stream.readline().split(",")]
-        if tuple(header) != COLUMNS:
-            raise ValueError(f"{path}: the first line is {','.join(header)!r}; it must be {','.join(COLUMNS)!r}")
-        lines = ((number, line.strip()) for number, line in enumerate(stream, 2))
-        rows = [_row(line, f"{path}:{number}") for number, line in lines if line and not line.startswith("#")]
+        # Line ends of every system become "\n".
+        stream = io.StringIO(read_text(path, ModelError, SIZE_LIMIT), newline=None)
+    except ModelError as error:
+        raise ValueError(str(error)) from error
+    header = stream.readline().strip()
+    if tuple(name.strip() for name in header.split(",")) != COLUMNS:
+        raise ValueError(f"{path}:1: the first line is {header[:80]!r}; it must be {','.join(COLUMNS)!r}")
+    lines = ((number, line.strip()) for number, line in enumerate(stream, 2))
+    rows = [_row(line, f"{path}:{number}") for number, line in lines if line and not line.startswith("#")]
     table = np.array(rows)
     if len(table) < 2 or not np.isfinite(table).all() or np.any(np.diff(table[:, 0]) <= 0.0):
         raise ValueError(f"{path}: needs two rows or more, finite numbers and increasing t_s")
@@ -58,6 +63,9 @@ def _row(line: str, place: str) -> list[float]:
     if len(cells) != len(COLUMNS):
         raise ValueError(f"{place}: {len(cells)} values; there must be {len(COLUMNS)}: {','.join(COLUMNS)}")
     try:
+        # Python's own reading of numbers knows underscores and the digits of every script.
+        if not line.isascii() or any("_" in cell for cell in cells):
+            raise ValueError
         return [float(cell) for cell in cells]
     except ValueError:
-        raise ValueError(f"{place}: {line!r} is not {len(COLUMNS)} numbers") from None
+        raise ValueError(f"{place}: {line[:80]!r} is not {len(COLUMNS)} numbers") from None

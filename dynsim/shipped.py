@@ -1,0 +1,21 @@
+"""Scenarios that come with dynsim: their files, found without loading anything."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+_CHECKOUT = Path(__file__).resolve().parent.parent / "scenarios"
+SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else Path(__file__).resolve().parent / "shipped_scenarios"
+
+
+def shipped_scenarios() -> list[Path]:
+    """Scenario files that come with dynsim."""
+    return sorted(SHIPPED.glob("*.yaml"))
+
+
+def shipped_scenario(path: Path) -> Path | None:
+    """The shipped file that a name without a folder (or in ``scenarios``) means, None when there is none."""
+    if path.parent not in (Path(), Path("scenarios")):
+        return None
+    files = {file.name: file for file in shipped_scenarios()}
+    return files.get(path.name) or files.get(f"{path.name}.yaml")
