@@ -313,9 +313,7 @@ def find_scenario(name: str | Path) -> Path:
     if shipped is not None:
         return shipped
     names = [file.stem for file in shipped_scenarios()]
-    raise ScenarioError(
-        f"{name}: no such file{_suggest(path.stem, names)}; shipped scenarios: {', '.join(names)}"
-    )
+    raise ScenarioError(f"{name}: no such file{_suggest(path.stem, names)}; shipped scenarios: {', '.join(names)}")
 
 
 def variant_names(path: str | Path) -> list[str]:
