@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import json
+import os
+import signal
 import sys
 from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
@@ -14,9 +17,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
+from dynsim import completion
 from dynsim._version import __version__
 from dynsim.errors import DynsimError, SimulationInterrupted, SimulationStopped
 from dynsim.hardware.cli import export, hw
+from dynsim.standard_streams import lenient_streams
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -30,7 +35,6 @@ app = typer.Typer(
     help="Dynamic simulator of braced hyper-redundant manipulators: energy, tracking, contact and motors.",
     epilog="Example: dynsim run single_pendulum",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
@@ -40,9 +44,16 @@ errors = Console(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
 # Of a progress bar.
 _TITLE_WIDTH = 22
+# Of a process that a signal ended: this and the number of the signal.
+_SIGNAL_EXIT = 128
 
 ScenarioArgument = Annotated[
-    str, typer.Argument(metavar="SCENARIO", help="Scenario file, or the name of a shipped one.")
+    str,
+    typer.Argument(
+        metavar="SCENARIO",
+        help="Scenario file, or the name of a shipped one.",
+        autocompletion=completion.scenarios,
+    ),
 ]
 SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="a.b.c=VALUE", help="Override a value; may be repeated.")
@@ -53,14 +64,87 @@ FiguresOption = Annotated[bool, typer.Option("--no-figures", help="Do not draw f
 
 def main() -> None:
     """Entry point: errors become one line and an exit code. Ctrl-C where nothing can be saved is typer's: 130."""
+    with _stop_signals() as received, lenient_streams() as output:
+        code = _exit_code()
+        if output is not None:
+            output.flush()
+            if code == 0 and output.failure is not None:
+                code = _explain_lost_output(output.failure)
+    sys.exit(_SIGNAL_EXIT + received[0] if received and code == SimulationInterrupted.exit_code else code)
+
+
+def _exit_code() -> int:
+    """Run the command that the arguments name; print its error, if any."""
     try:
-        app()
+        _command()()
+    except SystemExit as finished:
+        return finished.code if isinstance(finished.code, int) else 0 if finished.code is None else 1
     except DynsimError as error:
-        errors.print(f"[red]error:[/] {_escape(str(error))}")
-        sys.exit(error.exit_code)
+        problem, code = str(error), error.exit_code
     except MemoryError as error:
-        errors.print(f"[red]error:[/] not enough memory: {_escape(str(error))}".removesuffix(": "))
-        sys.exit(2)
+        problem, code = f"not enough memory: {error}".removesuffix(": "), DynsimError.exit_code
+    except OSError as error:
+        # What nobody could name better: of the system, not of dynsim.
+        problem, code = _explain_system(error), DynsimError.exit_code
+    except KeyboardInterrupt:
+        return SimulationInterrupted.exit_code
+    else:
+        return 0
+    errors.print(f"[red]error:[/] {_escape(problem)}")
+    return code
+
+
+def _command() -> Any:
+    """The command of ``app``; its flags do not show a type, which they do not take."""
+    command = typer.main.get_command(app)
+    waiting = [command]
+    while waiting:
+        group = waiting.pop()
+        waiting += getattr(group, "commands", {}).values()
+        for parameter in (*group.params, group.get_help_option(typer.Context(group))):
+            if parameter is not None and getattr(parameter, "is_flag", False):
+                parameter.metavar = ""
+    return command
+
+
+def _explain_system(error: OSError) -> str:
+    if error.errno == errno.ENOENT and error.filename is None:
+        try:
+            os.getcwd()
+        except OSError:
+            return "the working directory is no longer there; change to another folder"
+    return f"{error.filename}: {error.strerror}" if error.filename is not None else str(error.strerror or error)
+
+
+def _explain_lost_output(failure: OSError) -> int:
+    """Exit code when not all could be printed; a reader that wants no more (``| head``) is no error to speak of."""
+    if failure.errno == errno.EPIPE:
+        return _SIGNAL_EXIT + signal.SIGPIPE if hasattr(signal, "SIGPIPE") else 1
+    errors.print(f"[red]error:[/] standard output cannot be written ({failure.strerror})")
+    return DynsimError.exit_code
+
+
+@contextmanager
+def _stop_signals() -> Iterator[list[int]]:
+    """SIGTERM and SIGHUP stop as Ctrl-C does, so that what was simulated is saved; gives the signals that came.
+
+    One that is ignored (``nohup``) stays so.
+    """
+    received: list[int] = []
+
+    def stop(number: int, frame: Any) -> None:
+        received.append(number)
+        raise KeyboardInterrupt
+
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    heeded = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
+    for number in heeded:
+        signal.signal(number, stop)
+    try:
+        yield received
+    finally:
+        for number in heeded:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def _escape(text: str) -> str:
@@ -87,9 +171,14 @@ def _options(
 @app.command(epilog="Example: dynsim run elbow_comparison --variant two_elbows --set integrator.rtol=1e-8")
 def run(
     scenario: ScenarioArgument,
-    variant: Annotated[str | None, typer.Option(help="Variant to run; default: the first.")] = None,
+    variant: Annotated[
+        str | None,
+        typer.Option(metavar="VARIANT", help="Variant to run; default: the first.", autocompletion=completion.variants),
+    ] = None,
     overrides: SetOption = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the files; default: results/SCENARIO/VARIANT.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="For the files; default: results/SCENARIO/VARIANT.")
+    ] = None,
     no_figures: FiguresOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -124,8 +213,10 @@ def run(
 def compare(
     scenario: ScenarioArgument,
     overrides: SetOption = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the files; default: results/SCENARIO.")] = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes that simulate variants.")] = 1,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="For the files; default: results/SCENARIO.")
+    ] = None,
+    jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Processes that simulate variants.")] = 1,
     no_figures: FiguresOption = False,
     quiet: QuietOption = False,
 ) -> None:
@@ -179,7 +270,12 @@ def compare(
 @app.command(epilog="Example: dynsim check elbow_comparison six_axis_arm")
 def check(
     scenarios: Annotated[
-        list[str], typer.Argument(metavar="SCENARIO...", help="Scenario files, or names of shipped ones.")
+        list[str],
+        typer.Argument(
+            metavar="SCENARIO",
+            help="Scenario files, or names of shipped ones.",
+            autocompletion=completion.scenarios,
+        ),
     ],
     overrides: SetOption = None,
 ) -> None:
@@ -216,9 +312,10 @@ def list_() -> None:
 
 @app.command(epilog="Example: dynsim plot results/elbow_comparison/two_elbows/record.h5")
 def plot(
-    records: Annotated[list[Path], typer.Argument(metavar="RECORD...", help="Records (HDF5).")],
+    records: Annotated[list[Path], typer.Argument(metavar="RECORD", help="Records (HDF5).")],
     out: Annotated[
-        Path | None, typer.Option(help="Folder for the figures; default: figures/ beside each record.")
+        Path | None,
+        typer.Option(metavar="FOLDER", help="For the figures; default: figures/ beside each record."),
     ] = None,
 ) -> None:
     """Draw the figures of records; two or more are also laid over each other."""
@@ -238,7 +335,7 @@ def plot(
 @app.command(epilog="Example: dynsim bench --quick --json bench.json")
 def bench(
     quick: Annotated[bool, typer.Option("--quick", help="Fewer sizes and repetitions.")] = False,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures as JSON.")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures as JSON.")] = None,
 ) -> None:
     """Time right-hand sides and the whole job beside Pinocchio and MuJoCo (where installed)."""
     from dynsim.files import write_json

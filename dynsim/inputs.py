@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
@@ -24,6 +24,9 @@ DEPTH_LIMIT = 50
 # Digits of an integer: more than a float can hold are no quantity.
 DIGITS_LIMIT = 308
 
+# Makes the error to raise of its message: a class of errors, or one with something filled in.
+ErrorClass = Callable[[str], DynsimError]
+
 _NULLS = frozenset(("", "~", "null", "Null", "NULL"))
 _BOOLEANS = {"true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False}
 _INTEGER = re.compile(r"[-+]?(?:0b[01]+|0o[0-7]+|0x[0-9a-fA-F]+|[0-9]+(?:_[0-9]+)*)")
@@ -36,7 +39,7 @@ _CORE = "tag:yaml.org,2002:"
 _MERGE = object()
 
 
-def is_file(path: str | os.PathLike[str], error: type[DynsimError]) -> bool:
+def is_file(path: str | os.PathLike[str], error: ErrorClass) -> bool:
     """True for a regular file, False when there is nothing of that name.
 
     Raises
@@ -59,13 +62,13 @@ def is_file(path: str | os.PathLike[str], error: type[DynsimError]) -> bool:
     raise error(f"{path}: is a {kind}; a regular file is needed")
 
 
-def check_file(path: str | os.PathLike[str], error: type[DynsimError]) -> None:
+def check_file(path: str | os.PathLike[str], error: ErrorClass) -> None:
     """As :func:`is_file`, and raise ``error`` when there is no such file."""
     if not is_file(path, error):
         raise error(f"{path}: no such file")
 
 
-def read_text(path: Path, error: type[DynsimError], limit: int = SIZE_LIMIT) -> str:
+def read_text(path: Path, error: ErrorClass, limit: int = SIZE_LIMIT) -> str:
     """The text of a UTF-8 file of at most ``limit`` bytes, without a byte order mark.
 
     Raises
@@ -105,7 +108,7 @@ class YamlList(list[Any]):
         self.lines: dict[Any, int] = {}
 
 
-def parse_yaml(text: str, error: type[DynsimError], source: str, *, line_numbers: bool = True) -> Any:
+def parse_yaml(text: str, error: ErrorClass, source: str, *, line_numbers: bool = True) -> Any:
     """The one document of a YAML text as plain values in :class:`YamlMapping` and :class:`YamlList`; None without one.
 
     Keys are text as written: ``1`` and ``"1"`` are the same key. Aliases are copies, ``<<`` merges.
@@ -161,7 +164,7 @@ class _Open:
 class _Builder:
     """Puts the values of a document together from its events."""
 
-    def __init__(self, error: type[DynsimError], source: str, line_numbers: bool) -> None:
+    def __init__(self, error: ErrorClass, source: str, line_numbers: bool) -> None:
         self.root: Any = None
         self._error, self._source, self._line_numbers = error, source, line_numbers
         self._open: list[_Open] = []

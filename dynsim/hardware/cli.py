@@ -158,7 +158,7 @@ def replay(
     rate: Rate = None,
     speed: Speed = 1.0,
     policy: Annotated[Policy | None, typer.Option("--policy", help="on a fault; the map's if not given")] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="folder [results/<robot>_replay]")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="folder [results/ROBOT_replay]")] = None,
     live: Annotated[bool, typer.Option("--live", help="really move; a real port is a dry run without")] = False,
     yes: Annotated[bool, typer.Option("--yes", help="do not ask before moving")] = False,
     configure: Annotated[bool, typer.Option("--configure", help="write differing EEPROM settings")] = False,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -53,7 +54,7 @@ def build(config: Config) -> Robot:
     """
     from dynsim.model.urdf import read_urdf
 
-    check_file(config.file, ModelError)
+    check_file(config.file, partial(ModelError, keys=("plant", "file")))
     robot = read_urdf(Path(config.file))
     kinds = {link.joint: link.kind for link in robot.links}
     for name in [*config.motors, *config.initial_deg, *config.initial_m]:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
-from multiprocessing import active_children, get_context
+from multiprocessing import active_children, connection, get_context, parent_process
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,6 +21,9 @@ from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStoppe
 from dynsim.files import write_json, write_text
 from dynsim.record import Record
 from dynsim.scenario import Scenario, load_scenario, variant_names
+
+# A terminal or a service manager sends these to every process of a group: only the parent heeds them.
+STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 # In a worker process: set when it shall stop and hand back what it has.
 _interrupt: Any = None
@@ -58,7 +64,8 @@ def compare(
     ScenarioError
         The file has no variants, or one of them is not valid; all are checked before the first runs.
     SimulationStopped, SimulationInterrupted
-        A variant stopped (after the others have run) or Ctrl-C. Names all that stopped; holds the record of the first.
+        A variant stopped (after the others have run) or Ctrl-C. Names all that stopped and, after Ctrl-C, all that were
+        not started; holds the record of the first.
     """
     names = variant_names(path)
     if not names:
@@ -67,13 +74,19 @@ def compare(
     records: dict[str, Record] = {}
     stops: dict[str, SimulationStopped] = {}
 
-    def take(name: str, result: Callable[[], Record]) -> None:
+    def take(name: str, result: Callable[[], Record | None]) -> None:
         try:
             record = result()
+        except BrokenProcessPool:
+            # The operating system has ended it; a record would have come with a stop.
+            stops[name] = SimulationStopped(f"{name}: its process was ended from outside; is memory short for --jobs?")
+            return
         except SimulationStopped as stop:
             if stopped is not None:
                 stopped(name, stop)
             stops[name] = stop
+            return
+        if record is None:
             return
         if finished is not None:
             finished(name, record)
@@ -81,7 +94,7 @@ def compare(
 
     if jobs > 1:
 
-        def take_late(name: str, result: Callable[[], Record]) -> None:
+        def take_late(name: str, result: Callable[[], Record | None]) -> None:
             take(name, result)
             if progress is not None and name in records:
                 progress(name, scenarios[name].duration_s)
@@ -95,15 +108,18 @@ def compare(
                 interrupted = True
                 break
     if stops or interrupted:
-        raise _summed_up(path, {name: stops[name] for name in names if name in stops}, interrupted)
+        left = [name for name in names if name not in records and name not in stops]
+        raise _summed_up({name: stops[name] for name in names if name in stops}, left, interrupted)
     return {name: records[name] for name in names}
 
 
-def _summed_up(path: str | Path, stops: Mapping[str, SimulationStopped], interrupted: bool) -> SimulationStopped:
-    """One exception for all variants that stopped."""
-    first = next(iter(stops.values()), SimulationStopped(f"{path}: interrupted"))
+def _summed_up(stops: Mapping[str, SimulationStopped], left: list[str], interrupted: bool) -> SimulationStopped:
+    """One exception for all variants that stopped, and those that were left when the user stopped it all."""
     # Without a record the message names the variant already.
-    texts = [str(stop) if stop.record is None else f"{name}: {stop}" for name, stop in stops.items()] or [str(first)]
+    texts = [str(stop) if stop.record is None else f"{name}: {stop}" for name, stop in stops.items()]
+    if left:
+        texts.append(f"interrupted before {', '.join(left)} {'was' if len(left) == 1 else 'were'} started")
+    first = next(iter(stops.values()), SimulationStopped(""))
     kind = SimulationInterrupted if interrupted else SimulationStopped
     summed_up = kind("; ".join(texts), time=first.time, state=first.state)
     summed_up.record = next((stop.record for stop in stops.values() if stop.record is not None), None)
@@ -111,13 +127,15 @@ def _summed_up(path: str | Path, stops: Mapping[str, SimulationStopped], interru
 
 
 def _run_in_processes(
-    scenarios: Mapping[str, Scenario], jobs: int, take: Callable[[str, Callable[[], Record]], None]
+    scenarios: Mapping[str, Scenario], jobs: int, take: Callable[[str, Callable[[], Record | None]], None]
 ) -> bool:
     """Hand every result to ``take`` as it comes; True if Ctrl-C made the workers stop early."""
     # Spawned, not forked: the parent may hold threads and an open progress display.
     context = get_context("spawn")
-    interrupt = context.Event()
-    waiting: dict[Future[Record], str] = {}
+    # Also of multiprocessing's own helper, which the first shared object starts and which knows nothing of SIGHUP.
+    with _signals_held():
+        interrupt = context.Event()
+    waiting: dict[Future[Record | None], str] = {}
 
     def collect() -> None:
         while waiting:
@@ -129,7 +147,7 @@ def _run_in_processes(
     with ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker, initargs=(interrupt,)) as pool:
         try:
             try:
-                with _sigint_held():
+                with _signals_held():
                     for name, scenario in scenarios.items():
                         waiting[pool.submit(_simulate, scenario)] = name
                 collect()
@@ -143,21 +161,21 @@ def _run_in_processes(
             # A result that cannot be saved, or a second Ctrl-C: nobody waits for the others.
             pool.shutdown(wait=False, cancel_futures=True)
             for process in active_children():
-                process.terminate()
+                process.kill()  # they ignore the signal of terminate()
             raise
     return False
 
 
 @contextmanager
-def _sigint_held() -> Iterator[None]:
+def _signals_held() -> Iterator[None]:
     """Processes started here do not get the Ctrl-C of the terminal, not even while they start; this one gets it after.
 
-    Only the parent reacts to it, wherever it was sent, and tells the workers.
+    Only the parent reacts to it, wherever it was sent, and tells the workers. So with the other ``STOP_SIGNALS``.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     try:
         yield
     finally:
@@ -167,19 +185,27 @@ def _sigint_held() -> Iterator[None]:
 def _start_worker(interrupt: Any) -> None:
     global _interrupt
     _interrupt = interrupt
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in STOP_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
-def _simulate(scenario: Scenario) -> Record:
-    """In a worker: stop where Ctrl-C would have stopped it here, with what there is."""
+def _end_with_parent() -> None:
+    """In a worker: wait until the parent is gone, however it ended, and end too; nobody waits for the result."""
+    parent = parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
+
+
+def _simulate(scenario: Scenario) -> Record | None:
+    """In a worker: stop where Ctrl-C would have stopped it here, with what there is; None when it came before."""
 
     def look(time: float, stage: str = SIMULATION) -> None:
         if _interrupt.is_set():
             raise KeyboardInterrupt
 
-    if _interrupt.is_set():
-        raise SimulationInterrupted(f"{scenario.name} ({scenario.variant}): interrupted before it was started")
-    return simulate(scenario, look)
+    return None if _interrupt.is_set() else simulate(scenario, look)
 
 
 def save_comparison(records: Mapping[str, Record], folder: Path) -> None:

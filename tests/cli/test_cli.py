@@ -1,11 +1,8 @@
 """The command line as a user meets it: files, exit codes, one-line errors, Ctrl-C."""
 
 import json
-import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +20,6 @@ def dynsim(*arguments: str, folder: Path, **options: Any) -> subprocess.Complete
     return subprocess.run(
         [sys.executable, "-m", "dynsim", *arguments], cwd=folder, capture_output=True, text=True, timeout=300, **options
     )
-
-
-def heed_ctrl_c() -> None:
-    """Where the tests run in the background, SIGINT is ignored and would be in their children too."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def test_run_writes_everything_that_is_promised(tmp_path: Path):
@@ -141,48 +133,6 @@ def test_divergence_stops_with_code_3_and_keeps_what_there_is(tmp_path: Path):
     assert "q" in record.provenance["stopped"]["state"]
 
 
-def test_ctrl_c_saves_what_was_simulated(tmp_path: Path):
-    process = subprocess.Popen(
-        [sys.executable, "-m", "dynsim", "run", "elbow_comparison", "--no-figures", "--set", "duration_s=5000",
-         "--set", "controller.knot_spacing_s=10", "--set", "controller.hand.path.period_s=5000",
-         "--set", "record.rate_hz=10"],
-        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed_ctrl_c,
-    )  # fmt: skip
-    time.sleep(8.0)
-    os.kill(process.pid, signal.SIGINT)
-    _, stderr = process.communicate(timeout=120)
-    assert process.returncode == 130, stderr
-    record = Record.load(tmp_path / "results" / "elbow_comparison" / "two_elbows" / "record.h5")
-    assert not record.complete
-    assert "incomplete" in record.summary["warnings"][-1]
-
-
-@pytest.mark.skipif(not hasattr(os, "killpg"), reason="process groups are POSIX")
-def test_ctrl_c_saves_all_variants_that_run_in_processes(tmp_path: Path):
-    # Two run, two wait. One signal goes to the parent alone, the other, as a terminal sends it, to all.
-    processes = {
-        kill: subprocess.Popen(
-            [sys.executable, "-m", "dynsim", "compare", "elbow_comparison", "--jobs", "2", "--no-figures",
-             "--set", "duration_s=5000", "--set", "controller.knot_spacing_s=10",
-             "--set", "controller.hand.path.period_s=5000", "--set", "record.rate_hz=10", "--out", kill.__name__],
-            cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            preexec_fn=heed_ctrl_c, start_new_session=True,
-        )
-        for kill in (os.kill, os.killpg)
-    }  # fmt: skip
-    time.sleep(12.0)
-    for kill, process in processes.items():
-        kill(process.pid, signal.SIGINT)
-        _, stderr = process.communicate(timeout=120)
-        assert process.returncode == 130, stderr
-        *saved, error = stderr.splitlines()
-        assert sorted(line.split()[4] for line in saved) == ["elbow_7", "two_elbows"]
-        assert error.startswith("error: two_elbows: interrupted at t = ")
-        assert {path.name for path in (tmp_path / kill.__name__).iterdir()} == {"elbow_7", "two_elbows"}
-        for name in ("elbow_7", "two_elbows"):
-            assert not Record.load(tmp_path / kill.__name__ / name / "record.h5").complete
-
-
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_a_variant_that_stops_does_not_keep_the_others_from_the_comparison(tmp_path: Path, jobs: str):
     text = (SHIPPED / "elbow_comparison.yaml").read_text().partition("\nvariants:")[0]
@@ -198,25 +148,6 @@ def test_a_variant_that_stops_does_not_keep_the_others_from_the_comparison(tmp_p
     assert list(json.loads((tmp_path / "out" / "comparison.json").read_text())["variants"]) == ["one", "two"]
     assert "electrical energy" in result.stdout
     assert not Record.load(tmp_path / "out" / "bad" / "record.h5").complete
-
-
-def test_ctrl_c_before_the_first_step_says_that_nothing_is_saved(tmp_path: Path):
-    # Many knots: the inverse kinematics take minutes.
-    arguments = ["elbow_comparison", "--set", "duration_s=50000", "--set", "record.rate_hz=1"]
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-m", "dynsim", command, *arguments],
-            cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed_ctrl_c,
-        )
-        for command in ("run", "check")
-    ]  # fmt: skip
-    time.sleep(10.0)
-    for process in processes:
-        os.kill(process.pid, signal.SIGINT)
-        _, stderr = process.communicate(timeout=120)
-        assert process.returncode == 130, stderr
-        assert "(two_elbows): interrupted before there was anything to save" in stderr
-    assert not (tmp_path / "results").exists()
 
 
 def test_a_full_disk_is_one_line_and_leaves_no_half_file(tmp_path: Path):

@@ -1,0 +1,204 @@
+"""Signals, pipes and full disks as processes meet them: what was simulated is saved, nothing is left running."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, Any
+
+import pytest
+
+from dynsim.record import Record
+
+# Nothing here takes this long; a test that waits for it fails.
+DEADLINE_S = 240.0
+VARIANTS = ("two_elbows", "elbow_7", "elbow_4", "no_elbow")
+# Long enough to be stopped on the way; cheap to prepare.
+LONG = ["--set", "duration_s=5000", "--set", "controller.knot_spacing_s=10", "--set", "record.rate_hz=10"]
+LONG += ["--set", "controller.hand.path.period_s=5000", "--no-figures"]
+# Many knots: the inverse kinematics take minutes.
+PLANNING = ["--set", "duration_s=50000", "--set", "record.rate_hz=1"]
+
+# The command line, in a process that leaves files which say what it does. Spawned workers run this module too.
+WATCHED = """
+import os, sys
+from pathlib import Path
+
+import dynsim.control.joint_pd as joint_pd
+import dynsim.kernels.integrate as integrate
+from dynsim.cli import main
+
+def mark(what, function):
+    def marked(*arguments):
+        Path(f"{what}_{os.getpid()}").touch()
+        return function(*arguments)
+    return marked
+
+# The first call of advance takes no step: it loads the kernels.
+advance, watched = integrate.advance, mark("simulating", integrate.advance)
+integrate.advance = lambda *arguments: (watched if arguments[-1] else advance)(*arguments)
+joint_pd.follow = mark("planning", joint_pd.follow)
+
+if __name__ == "__main__":
+    main()
+"""
+
+
+def prepare_child() -> None:
+    """Where the tests run in the background, SIGINT is ignored and would be in their children too; no core files."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+@contextmanager
+def started(folder: Path, *arguments: str, stdout: int | IO[Any] = subprocess.PIPE) -> Iterator[subprocess.Popen[str]]:
+    """A watched process of its own group, of which nothing is left after the block."""
+    (folder / "watched.py").write_text(WATCHED)
+    process = subprocess.Popen(
+        [sys.executable, "watched.py", *arguments],
+        cwd=folder, stdout=stdout, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=prepare_child,
+    )  # fmt: skip
+    try:
+        yield process
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+
+
+def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str] | None = None) -> None:
+    """Poll a condition; fail when it does not come, or when the process ended before."""
+    deadline = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert process is None or process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline, f"{condition} did not come"
+        time.sleep(0.05)
+
+
+def pids(folder: Path, what: str) -> list[int]:
+    """Processes that have come to ``what``."""
+    return [int(path.name.rpartition("_")[2]) for path in folder.glob(f"{what}_*")]
+
+
+def is_running(pid: int) -> bool:
+    """False for a process that has ended, also when nobody has asked for its exit code."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def communicate(process: subprocess.Popen[str]) -> tuple[str, str]:
+    return process.communicate(timeout=DEADLINE_S)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
+def test_a_signal_saves_what_was_simulated(tmp_path: Path, number: signal.Signals):
+    with started(tmp_path, "run", "elbow_comparison", *LONG) as process:
+        wait_until(lambda: bool(pids(tmp_path, "simulating")), process)
+        process.send_signal(number)
+        _, stderr = communicate(process)
+    assert process.returncode == 128 + number, stderr
+    record = Record.load(tmp_path / "results" / "elbow_comparison" / "two_elbows" / "record.h5")
+    assert not record.complete
+    assert "incomplete" in record.summary["warnings"][-1]
+
+
+def test_a_signal_saves_the_variant_that_runs(tmp_path: Path):
+    with started(tmp_path, "compare", "elbow_comparison", *LONG, "--out", "out") as process:
+        wait_until(lambda: bool(pids(tmp_path, "simulating")), process)
+        process.send_signal(signal.SIGTERM)
+        _, stderr = communicate(process)
+    assert process.returncode == 128 + signal.SIGTERM, stderr
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"two_elbows"}
+    assert not Record.load(tmp_path / "out" / "two_elbows" / "record.h5").complete
+    assert stderr.splitlines()[-1].endswith("; interrupted before elbow_7, elbow_4, no_elbow were started")
+
+
+@pytest.mark.parametrize(
+    ("number", "kill"),
+    [(signal.SIGINT, os.killpg), (signal.SIGTERM, os.kill), (signal.SIGHUP, os.killpg)],
+    ids=lambda value: getattr(value, "name", None) or value.__name__,
+)
+def test_a_signal_saves_all_variants_that_run_in_processes(
+    tmp_path: Path, number: signal.Signals, kill: Callable[[int, int], None]
+):
+    """To the parent alone or, as a terminal sends it, to all. Two variants run, two wait."""
+    with started(tmp_path, "compare", "elbow_comparison", "--jobs", "2", *LONG, "--out", "out") as process:
+        wait_until(lambda: len(pids(tmp_path, "simulating")) == 2, process)
+        kill(process.pid, number)
+        _, stderr = communicate(process)
+    assert process.returncode == 128 + number, stderr
+    *saved, error = stderr.splitlines()
+    assert sorted(line.split()[4] for line in saved) == ["elbow_7", "two_elbows"]
+    assert error.startswith("error: two_elbows: interrupted at t = ")
+    assert error.endswith("; interrupted before elbow_4, no_elbow were started")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"elbow_7", "two_elbows"}
+    for name in ("elbow_7", "two_elbows"):
+        assert not Record.load(tmp_path / "out" / name / "record.h5").complete
+    assert not any(is_running(pid) for pid in pids(tmp_path, "simulating"))
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes in /proc")
+@pytest.mark.parametrize("number", [signal.SIGQUIT, signal.SIGKILL], ids=lambda number: number.name)
+def test_workers_end_with_their_parent(tmp_path: Path, number: signal.Signals):
+    with started(tmp_path, "compare", "elbow_comparison", "--jobs", "2", *LONG, "--out", "out") as process:
+        wait_until(lambda: len(pids(tmp_path, "simulating")) == 2, process)
+        workers = pids(tmp_path, "simulating")
+        assert process.pid not in workers
+        process.send_signal(number)
+        process.wait(timeout=DEADLINE_S)
+        wait_until(lambda: not any(is_running(pid) for pid in workers))
+    assert process.returncode == -number
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_ctrl_c_while_references_are_planned_names_every_variant(tmp_path: Path, jobs: int):
+    with started(tmp_path, "compare", "elbow_comparison", "--jobs", str(jobs), *PLANNING) as process:
+        wait_until(lambda: len(pids(tmp_path, "planning")) == jobs, process)
+        process.send_signal(signal.SIGINT)
+        _, stderr = communicate(process)
+    assert process.returncode == 130, stderr
+    (error,) = stderr.splitlines()
+    for name in VARIANTS[:jobs]:
+        assert f"({name}): interrupted before there was anything to save" in error
+    assert error.endswith(f"interrupted before {', '.join(VARIANTS[jobs:])} were started")
+    assert not (tmp_path / "results").exists()
+
+
+@pytest.mark.parametrize("command", ["run", "check"])
+def test_ctrl_c_before_the_first_step_says_that_nothing_is_saved(tmp_path: Path, command: str):
+    with started(tmp_path, command, "elbow_comparison", *PLANNING) as process:
+        wait_until(lambda: bool(pids(tmp_path, "planning")), process)
+        process.send_signal(signal.SIGINT)
+        _, stderr = communicate(process)
+    assert process.returncode == 130, stderr
+    assert "(two_elbows): interrupted before there was anything to save" in stderr
+    assert not (tmp_path / "results").exists()
+
+
+def test_a_reader_that_leaves_ends_quietly_and_loses_no_run(tmp_path: Path):
+    arguments = ["single_pendulum", "--no-figures", "--set", "duration_s=0.2", "--set", "metrics.settle_s=0.05"]
+    for command in (["list"], ["schema"], ["run", *arguments, "--out", "out"]):
+        with started(tmp_path, *command) as process:
+            process.stdout.close()
+            process.stdout = None
+            _, stderr = communicate(process)
+        assert (process.returncode, stderr) == (128 + signal.SIGPIPE, "")
+    assert Record.load(tmp_path / "out" / "record.h5").complete
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_standard_output_is_one_line_and_loses_no_run(tmp_path: Path):
+    arguments = ["single_pendulum", "--no-figures", "--set", "duration_s=0.2", "--set", "metrics.settle_s=0.05"]
+    for command in (["--help"], ["schema"], ["run", *arguments, "--out", "out"]):
+        with open("/dev/full", "w") as full, started(tmp_path, *command, stdout=full) as process:
+            _, stderr = communicate(process)
+        assert process.returncode == 2
+        assert stderr == "error: standard output cannot be written (No space left on device)\n"
+    assert Record.load(tmp_path / "out" / "record.h5").complete
