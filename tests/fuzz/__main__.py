@@ -9,7 +9,7 @@ import tempfile
 from pathlib import Path
 
 from fuzz import campaign
-from fuzz.case import KINDS, draw
+from fuzz.case import KINDS, draw, put
 from fuzz.inputs.record import make_records
 
 
@@ -31,9 +31,7 @@ def main() -> int:
             case = draw(kind, options.seed, index, records)
             print(case.what, *(f"dynsim {' '.join(command)}" for command in case.commands), sep="\n")
             for name, data in case.files.items() if options.keep else ():
-                path = options.keep / name
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_bytes(data)
+                put(options.keep / name, data)
             cases = [(kind, index)]
         elif options.kind:
             cases = [(options.kind, index) for index in range(options.count)]

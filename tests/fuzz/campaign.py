@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fuzz.case import KINDS, draw
-from fuzz.worker import CRASH, FAILURES, HANG, INTERRUPTED, OK, READY, REFUSED, Outcome
+from fuzz.worker import CRASH, FAILURES, HANG, INTERRUPTED, LOSS, OK, READY, REFUSED, Outcome
 
 SEED = 8
 ROOT = Path(__file__).resolve().parents[2]
@@ -171,16 +171,17 @@ def spread(count: int) -> list[tuple[str, int]]:
 
 
 def table(results: list[Result]) -> str:
-    """Kind × outcome with counts."""
+    """Kind × outcome with counts; and for how many the second reading was held against what was taken."""
     columns = (OK, REFUSED, INTERRUPTED, *FAILURES)
     counts = Counter((result.kind, result.ended.outcome) for result in results)
-    lines = [f"{'kind':<10}{'inputs':>8}" + "".join(f"{name:>15}" for name in columns)]
+    compared = Counter(result.kind for result in results if result.ended.compared or result.ended.outcome == LOSS)
+    lines = [f"{'kind':<10}{'inputs':>8}{'compared':>10}" + "".join(f"{name:>15}" for name in columns)]
     for kind in KINDS:
         row = [counts[kind, name] for name in columns]
-        lines.append(f"{kind:<10}{sum(row):>8}" + "".join(f"{number:>15}" for number in row))
+        lines.append(f"{kind:<10}{sum(row):>8}{compared[kind]:>10}" + "".join(f"{number:>15}" for number in row))
     total = [sum(counts[kind, name] for kind in KINDS) for name in columns]
     slowest = max(results, key=lambda result: result.seconds)
-    lines.append(f"{'all':<10}{sum(total):>8}" + "".join(f"{number:>15}" for number in total))
+    lines.append(f"{'all':<10}{sum(total):>8}{compared.total():>10}" + "".join(f"{number:>15}" for number in total))
     lines.append(f"slowest: {slowest.kind} {slowest.index}, {slowest.seconds:.1f} s")
     return "\n".join(lines)
 

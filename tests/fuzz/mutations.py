@@ -54,11 +54,8 @@ SPECIAL_BYTES = b'\x00\t\n\r\x1b "&*-.:<[_{\x7f\x80\xc3\xff'
 
 def value(rng: Random, old: Any = None) -> Any:
     """Something else in the place of ``old``: often close to it, sometimes of another kind altogether."""
-    if isinstance(old, (int, float)) and not isinstance(old, bool) and rng.random() < 0.35:
-        near = rng.choice(
-            (lambda x: x * 1.01, lambda x: x + 1, lambda x: -x, lambda x: x * 1e6, lambda x: x * 1e-6, str)
-        )
-        return near(old)
+    if is_number(old) and rng.random() < 0.35:
+        return near(rng, old)
     choice = rng.random()
     if choice < 0.3:
         return rng.choice(NUMBERS)
@@ -87,6 +84,20 @@ def value(rng: Random, old: Any = None) -> Any:
     )
 
 
+def is_number(old: Any) -> bool:
+    """A number, not a flag."""
+    return isinstance(old, (int, float)) and not isinstance(old, bool)
+
+
+def near(rng: Random, number: float) -> Any:
+    """Another number, or the same one as text."""
+    ways = (
+        lambda x: x * 1.01, lambda x: x * 1.5, lambda x: x + 1, lambda x: -x, lambda x: x * 1e6, lambda x: x * 1e-6,
+        str,
+    )  # fmt: skip
+    return rng.choice(ways)(number)
+
+
 def places(tree: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """Paths of everything in a tree of mappings and lists, from the top down."""
     below: list[tuple[Any, ...]] = []
@@ -107,6 +118,12 @@ def mutate_tree(rng: Random, tree: Any) -> str:
     """Break one place of a tree; the answer says where and how."""
     if not (candidates := places(tree)):
         return "nothing left"
+    if rng.random() < 0.25:
+        candidates = [path for path in candidates if is_number(at(tree, path))] or candidates
+        path = rng.choice(candidates)
+        if is_number(old := at(tree, path)):
+            at(tree, path[:-1])[path[-1]] = new = near(rng, old)
+            return f"{'.'.join(map(str, path))} = {new!r}"
     path = rng.choice(candidates)
     owner, key = at(tree, path[:-1]), path[-1]
     dotted = ".".join(map(str, path))

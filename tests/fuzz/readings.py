@@ -167,23 +167,20 @@ def servo_map_losses(said: Mapping[str, Any], servo_map: Any) -> list[str]:
     """Entries of a servo map that its servos, bus and safety rules do not have."""
     lost = missing(said.get("bus") or {}, servo_map.bus.model_dump(), "bus")
     lost += missing(said.get("safety") or {}, servo_map.safety.model_dump(), "safety")
-    servos = {servo.joint: servo for servo in servo_map.servos}
-    if list(servos) != [str(joint) for joint in said["servos"]]:
-        lost.append(f"servos {list(said['servos'])} became {list(servos)}")
-    for joint, entry in said["servos"].items():
-        servo = servos[str(joint)]
-        taken = {
-            "id": servo.id, "sign": servo.sign, "zero_tick": servo.zero_tick, "label": servo.label,
-            "hold_at_deg": None if servo.hold_at is None else math.degrees(servo.hold_at), "kind": entry["kind"],
-        }  # fmt: skip
-        if entry.get("hold_at_deg") is not None:
-            entry = {**entry, "hold_at_deg": None}
-            if not math.isclose(
-                float(said["servos"][joint]["hold_at_deg"]), taken["hold_at_deg"] or 0.0, rel_tol=ROUNDING
-            ):
-                lost.append(f"servos.{joint}.hold_at_deg became {taken['hold_at_deg']}")
-        lost += missing(entry, taken, f"servos.{joint}")
-        lost += missing(said["kinds"][entry["kind"]], servo.kind.model_dump(), f"kinds.{entry['kind']}")
+    entries = list(said["servos"].items())
+    kinds = {str(name): kind for name, kind in said["kinds"].items()}
+    if len(entries) != len(servo_map.servos):
+        return [*lost, f"{len(entries)} servos became {len(servo_map.servos)}"]
+    for servo, (joint, entry) in zip(servo_map.servos, entries, strict=True):
+        # A key is text as written; this reader may have made a number or a date of it.
+        if isinstance(joint, str) and joint != servo.joint:
+            lost.append(f"servos.{joint} became {servo.joint}")
+        taken = {"id": servo.id, "sign": servo.sign, "zero_tick": servo.zero_tick, "label": servo.label}
+        lost += missing({key: item for key, item in entry.items() if key in taken}, taken, f"servos.{servo.joint}")
+        hold_at = entry.get("hold_at_deg")
+        if hold_at is not None and not math.isclose(hold_at, math.degrees(servo.hold_at), rel_tol=ROUNDING):
+            lost.append(f"servos.{servo.joint}.hold_at_deg = {hold_at} became {math.degrees(servo.hold_at)}")
+        lost += missing(kinds.get(str(entry["kind"]), {}), servo.kind.model_dump(), f"kinds.{entry['kind']}")
     return lost
 
 

@@ -26,7 +26,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from fuzz.case import SHIPPED, Draft, draw
+from fuzz.case import SHIPPED, Draft, draw, put
+from fuzz.readings import Unreadable
 
 OK, REFUSED, INTERRUPTED = "ok", "refused", "interrupted"
 TRACEBACK, HANG, CRASH, LOSS, MESSAGE, FILES = (
@@ -55,14 +56,14 @@ class Outcome:
     what: str = ""
     place: str = ""
     detail: str = ""
+    # What the input says was held against what was taken.
+    compared: bool = False
 
 
 def run_case(case: Draft, folder: Path, limit: float) -> Outcome:
     """Run all commands of a case in ``folder``; the first failure counts."""
     for name, data in case.files.items():
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
+        put(folder / name, data)
     # Some scenarios name it.
     shutil.copytree(SHIPPED / "robots", folder / "robots")
     ended = Outcome(OK)
@@ -86,6 +87,7 @@ def run_case(case: Draft, folder: Path, limit: float) -> Outcome:
         lost = _losses(case, folder, limit)
         if lost.outcome in FAILURES:
             return lost
+        ended.compared = lost.compared
     return ended
 
 
@@ -165,18 +167,22 @@ def _losses(case: Draft, folder: Path, limit: float) -> Outcome:
     from dynsim.errors import DynsimError
 
     assert case.losses is not None
-    lost: list[str] = []
     with _quiet(folder, limit) as said:
         warnings.simplefilter("ignore")
         try:
             lost = case.losses()
-        except (DynsimError, MemoryError, KeyboardInterrupt):
-            pass
+        except (DynsimError, MemoryError, KeyboardInterrupt, Unreadable):
+            return Outcome(OK) if not said.rang_at else _late(said, limit)
         except BaseException as error:
             return _traceback(error)
     if said.rang_at:
-        return Outcome(HANG, f"reading takes more than {limit:g} s", _place(said.rang_at))
-    return Outcome(LOSS, _class_of(lost[0]), "", "; ".join(lost)[:500]) if lost else Outcome(OK)
+        return _late(said, limit)
+    return Outcome(LOSS, _class_of(lost[0]), "", "; ".join(lost)[:500]) if lost else Outcome(OK, compared=True)
+
+
+def _late(said: _Said, limit: float) -> Outcome:
+    assert said.rang_at is not None
+    return Outcome(HANG, f"reading takes more than {limit:g} s", _place(said.rang_at))
 
 
 def _class_of(loss: str) -> str:

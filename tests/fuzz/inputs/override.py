@@ -8,8 +8,8 @@ from random import Random
 
 from fuzz.case import SHIPPED, Draft
 from fuzz.inputs.scenario import reading
-from fuzz.mutations import at, places, value, yaml_text
-from fuzz.readings import Unreadable, merged, scenario_losses, set_dotted, yaml_tree
+from fuzz.mutations import at, is_number, near, places, value, yaml_text
+from fuzz.readings import merged, scenario_losses, set_dotted, yaml_tree
 
 NAMES = ("elbow_comparison", "single_pendulum", "snake_positioning")
 KEYS = (
@@ -32,6 +32,10 @@ def _real_keys(name: str) -> tuple[str, ...]:
     return tuple(".".join(map(str, path)) for path in places(tree))
 
 
+def _path(key: str) -> tuple[str | int, ...]:
+    return tuple(int(part) if part.isdecimal() else part for part in key.split("."))
+
+
 def draw(rng: Random, records: Path) -> Draft:
     name = rng.choice(NAMES)
     tree = yaml_tree((SHIPPED / f"{name}.yaml").read_text(encoding="utf-8"))
@@ -40,11 +44,15 @@ def draw(rng: Random, records: Path) -> Draft:
         kept = rng.choice(list(variants))
         tree["variants"] = variants = {kept: variants[kept]}
     overrides = []
-    for _ in range(rng.choice((1, 1, 1, 2, 3))):
+    if rng.random() < 0.3:
+        # One that is likely to be taken, so that there is something to lose.
+        key = rng.choice([key for key in _real_keys(name) if is_number(at(tree, _path(key)))])
+        overrides.append(f"{key}={near(rng, at(tree, _path(key)))}")
+    for _ in range(rng.choice((1, 1, 1, 2, 3)) if not overrides else 0):
         real = rng.choice(_real_keys(name))
         key = rng.choice((real, real, real, rng.choice(KEYS), f"{real}.x", real[:-1], real.replace(".", "..")))
         try:
-            old = at(tree, tuple(int(part) if part.isdecimal() else part for part in key.split(".")))
+            old = at(tree, _path(key))
         except (LookupError, TypeError, ValueError):
             old = None
         item = value(rng, old)
@@ -70,12 +78,9 @@ def losses(overrides: list[str]) -> list[str]:
 
     name = next(iter(variant_names("scenario.yaml")), None)
     scenario = load_scenario("scenario.yaml", name, SetOptions(parse_override(text) for text in overrides))
-    try:
-        tree = yaml_tree(Path("scenario.yaml").read_text(encoding="utf-8"))
-        tree = merged(tree, (tree.get("variants") or {}).get(name) or {})
-        for text in overrides:
-            key, _, item = text.partition("=")
-            set_dotted(tree, key.strip(), yaml_tree(item))
-    except Unreadable:
-        return []
+    tree = yaml_tree(Path("scenario.yaml").read_text(encoding="utf-8"))
+    tree = merged(tree, (tree.get("variants") or {}).get(name) or {})
+    for text in overrides:
+        key, _, item = text.partition("=")
+        set_dotted(tree, key.strip(), yaml_tree(item))
     return scenario_losses(tree, scenario)

@@ -15,7 +15,7 @@ import numpy as np
 
 from fuzz.case import Draft
 from fuzz.mutations import TEXTS, mutate_bytes
-from fuzz.readings import record_losses
+from fuzz.readings import Unreadable, record_losses
 
 FORMATS = ("csv", "joint-trajectory", "urdf-log")
 
@@ -82,7 +82,7 @@ def losses() -> list[str]:
         record = Record.load("record.h5")
     read(record)
     if said or not Path("sound.h5").exists():
-        return []
+        raise Unreadable("it was said, or the record was changed on purpose")
     return record_losses(Record.load("sound.h5"), record)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from fuzz.case import SHIPPED, Draft
 from fuzz.mutations import mutate_text, mutate_tree, yaml_text
-from fuzz.readings import Unreadable, merged, scenario_losses, yaml_tree
+from fuzz.readings import merged, scenario_losses, yaml_tree
 
 # Weights: the dynamic ones read most, the snake's fewer.
 NAMES = (
@@ -68,10 +68,7 @@ def losses() -> list[str]:
 
     names: list[Any] = variant_names("scenario.yaml") or [None]
     loaded = [load_scenario("scenario.yaml", name) for name in names]
-    try:
-        tree = yaml_tree(Path("scenario.yaml").read_text(encoding="utf-8"))
-    except Unreadable:
-        return []
+    tree = yaml_tree(Path("scenario.yaml").read_text(encoding="utf-8"))
     variants = tree.get("variants") or {}
     found = []
     for name, scenario in zip(names, loaded, strict=True):

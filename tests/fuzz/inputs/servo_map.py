@@ -7,7 +7,7 @@ from random import Random
 
 from fuzz.case import SHIPPED, Draft
 from fuzz.mutations import mutate_text, mutate_tree, yaml_text
-from fuzz.readings import Unreadable, servo_map_losses, yaml_tree
+from fuzz.readings import servo_map_losses, yaml_tree
 
 
 def draw(rng: Random, records: Path) -> Draft:
@@ -38,8 +38,4 @@ def losses() -> list[str]:
     from dynsim.hardware.servo_map import load_servo_map
 
     servo_map = load_servo_map("map.yaml")
-    try:
-        said = yaml_tree(Path("map.yaml").read_text(encoding="utf-8"))
-    except Unreadable:
-        return []
-    return servo_map_losses(said, servo_map)
+    return servo_map_losses(yaml_tree(Path("map.yaml").read_text(encoding="utf-8")), servo_map)
