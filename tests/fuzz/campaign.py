@@ -55,10 +55,10 @@ class Result:
 class Worker:
     """One child process and the case it is at."""
 
-    def __init__(self, records: Path, folder: Path, limit: float, broken: str | None) -> None:
+    def __init__(self, records: Path, folder: Path, limit: float, broken: bool) -> None:
         self._records = records
         self._arguments = ["--records", str(records), "--folder", str(folder), "--limit", str(limit)]
-        self._arguments += ["--broken", broken] if broken else []
+        self._arguments += ["--broken"] if broken else []
         self._log = tempfile.TemporaryFile()  # noqa: SIM115
         self._process: subprocess.Popen[str] | None = None
 
@@ -139,7 +139,7 @@ def run(
     seed: int = SEED,
     jobs: int = 1,
     limit: float = 20.0,
-    broken: str | None = None,
+    broken: bool = False,
     report: Callable[[Result], None] = lambda result: None,
 ) -> list[Result]:
     """Run cases (kind, index) in ``jobs`` workers; ``report`` gets each result as it comes."""

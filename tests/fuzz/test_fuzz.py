@@ -9,16 +9,8 @@ import pytest
 
 from fuzz import campaign
 from fuzz.case import KINDS, draw
-from fuzz.inputs.record import make_records
 
 QUICK, ALL = 240, 6000
-
-
-@pytest.fixture(scope="module")
-def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("records")
-    make_records(folder)
-    return folder
 
 
 def check(results: list[campaign.Result], count: int) -> None:

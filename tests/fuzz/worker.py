@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import faulthandler
-import importlib
 import io
 import json
 import os
@@ -26,6 +25,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from fuzz import broken
 from fuzz.case import SHIPPED, Draft, draw, put
 from fuzz.readings import Unreadable
 
@@ -314,14 +314,14 @@ def main() -> None:
     parser.add_argument("--records", type=Path, required=True, help="folder of the sound records")
     parser.add_argument("--folder", type=Path, required=True, help="empty folder to work in")
     parser.add_argument("--limit", type=float, default=20.0, help="of a command [s]")
-    parser.add_argument("--broken", help="break a loader first: a function of fuzz.broken")
+    parser.add_argument("--broken", action="store_true", help="break the loaders first, see fuzz.broken")
     options = parser.parse_args()
     # Answers go to a copy of stdout: nothing that a case prints can stand between them.
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     faulthandler.enable(LOG)
     _load_everything(options.records)
     if options.broken:
-        getattr(importlib.import_module("fuzz.broken"), options.broken)()
+        broken.install()
     bound_memory()
     with contextlib.suppress(BrokenPipeError):
         print(READY, file=answers, flush=True)
