@@ -19,7 +19,7 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=6000, help="inputs, spread over all kinds")
     parser.add_argument("--kind", choices=KINDS, help="only inputs of this kind")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="worker processes")
-    parser.add_argument("--limit", type=float, default=20.0, help="of one command [s]")
+    parser.add_argument("--limit", type=float, default=campaign.LIMIT, help="of one command [s]")
     parser.add_argument("--repeat", nargs=2, metavar=("KIND", "INDEX"), help="one case again")
     parser.add_argument("--keep", type=Path, help="with --repeat: write the files of the case to this folder")
     options = parser.parse_args()

@@ -10,7 +10,9 @@ import pytest
 from fuzz import campaign
 from fuzz.case import KINDS, draw
 
-QUICK, ALL = 240, 6000
+# Damaged records are slower to read than the rest.
+QUICK = {**dict.fromkeys(KINDS, 45), "record": 15}
+ALL = 6000
 
 
 def check(results: list[campaign.Result], count: int) -> None:
@@ -20,7 +22,8 @@ def check(results: list[campaign.Result], count: int) -> None:
 
 
 def test_a_sample_of_broken_inputs(records: Path) -> None:
-    check(campaign.run(campaign.spread(QUICK), records=records), QUICK)
+    cases = [(kind, index) for kind, count in QUICK.items() for index in range(count)]
+    check(campaign.run(cases, records=records), len(cases))
 
 
 @pytest.mark.slow

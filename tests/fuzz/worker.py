@@ -43,7 +43,7 @@ READY = "ready"
 # What a worker may use on top of what it has after loading everything [bytes].
 MEMORY = 4 << 30
 # A simulation may take long because its input asks for it (stiff motors, say). It must then heed Ctrl-C [s].
-SIMULATION_LIMIT = 6.0
+SIMULATION_LIMIT = 20.0
 # Stderr as the parent gave it: file descriptor 2 is another one while a case runs.
 LOG = os.dup(2)
 
@@ -313,7 +313,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--records", type=Path, required=True, help="folder of the sound records")
     parser.add_argument("--folder", type=Path, required=True, help="empty folder to work in")
-    parser.add_argument("--limit", type=float, default=20.0, help="of a command [s]")
+    parser.add_argument("--limit", type=float, required=True, help="of a command [s]")
     parser.add_argument("--broken", action="store_true", help="break the loaders first, see fuzz.broken")
     options = parser.parse_args()
     # Answers go to a copy of stdout: nothing that a case prints can stand between them.
