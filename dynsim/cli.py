@@ -76,7 +76,7 @@ def main() -> None:
 def _exit_code() -> int:
     """Run the command that the arguments name; print its error, if any."""
     try:
-        _command()()
+        _command()(prog_name="dynsim")
     except SystemExit as finished:
         return finished.code if isinstance(finished.code, int) else 0 if finished.code is None else 1
     except DynsimError as error:

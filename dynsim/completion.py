@@ -22,7 +22,8 @@ def scenarios(incomplete: str) -> list[str]:
 
 def variants(ctx: typer.Context, incomplete: str) -> list[str]:
     """Variants of the scenario on the command line."""
-    path = Path(ctx.params.get("scenario") or "")
+    # While the option lacks its value, what stands before it is not parsed yet.
+    path = Path(ctx.params.get("scenario") or next(iter(ctx.args), ""))
     try:
         path = path if is_file(path, ScenarioError) else shipped_scenario(path) or path
         data = parse_yaml(read_text(path, ScenarioError), ScenarioError, str(path))

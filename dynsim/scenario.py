@@ -34,6 +34,8 @@ from dynsim.shipped import shipped_scenario, shipped_scenarios
 START_TOLERANCE = 1e-6
 # Bytes of the name of a folder on common file systems.
 NAME_LIMIT = 255
+# Numbers of a scenario, in whatever unit.
+SIZE_MAX = 1e30
 # Of what messages show: unknown keys, characters of a value or key.
 UNKNOWN_SHOWN = 20
 SHOWN_LIMIT = 80
@@ -369,7 +371,7 @@ def _merged(
     """One variant of a file with overrides on top, and where its values come from."""
     shared = YamlMapping()
     shared.update({key: value for key, value in data.items() if key != "variants"})
-    shared.lines = data.lines
+    shared.lines = {key: line for key, line in data.lines.items() if key in shared}
     difference: Any = variants.get(variant) if variant is not None else None
     if difference is None:
         difference = {}
@@ -386,6 +388,7 @@ def _merged(
     if variant is not None:
         merged["variant"] = variant
     _make_absolute(merged, path.parent)
+    _check_sizes(merged, (), origin)
     return merged, origin
 
 
@@ -464,12 +467,16 @@ def json_schema() -> dict[str, Any]:
 
 
 def _by_type(schema: Any) -> Any:
-    """Every choice of a ``type`` as conditions on it instead of ``oneOf``, for which editors say only "no match"."""
+    """Choices as conditions, on ``type`` and on null: of ``oneOf`` and ``anyOf`` editors say only "no match"."""
     if isinstance(schema, list):
         return [_by_type(item) for item in schema]
     if not isinstance(schema, dict):
         return schema
     schema = {key: _by_type(item) for key, item in schema.items()}
+    chosen = [item for item in schema.get("anyOf", ()) if item != {"type": "null"}]
+    if len(chosen) == 1 and len(schema["anyOf"]) == 2 and ("$ref" in chosen[0] or "discriminator" in chosen[0]):
+        del schema["anyOf"]
+        return schema | {"if": {"type": "null"}, "else": chosen[0]}
     if "oneOf" not in schema or "discriminator" not in schema:
         return schema
     del schema["oneOf"]
@@ -587,6 +594,18 @@ def _unknown_keys(error: ValidationError, merged: Any, origin: Origin) -> list[s
     return texts
 
 
+def _check_sizes(value: Any, keys: tuple[int | str, ...], origin: Origin) -> None:
+    """Refuse numbers whose powers and products leave the range of a float; other checks see to NaN and infinity."""
+    if isinstance(value, dict | list):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            _check_sizes(item, (*keys, key), origin)
+    elif isinstance(value, int | float) and (SIZE_MAX < abs(value) < np.inf or 0 < abs(value) < 1.0 / SIZE_MAX):
+        raise ScenarioError(
+            f"{origin.place(keys)}: {_dotted(keys)} = {_shown(value)}: its size must be between "
+            f"{1.0 / SIZE_MAX:g} and {SIZE_MAX:g}, or zero"
+        )
+
+
 def _explain(error: ValidationError, merged: Any, origin: Origin, unknown: Sequence[str]) -> str:
     """One line with file:line, key, value and fix: all unknown keys, else the first problem."""
     problems = error.errors(include_url=False, include_input=False)
@@ -598,7 +617,6 @@ def _explain(error: ValidationError, merged: Any, origin: Origin, unknown: Seque
     problem = problems[0]
     loc = (*problem["loc"], *problem.get("ctx", {}).get("key", "").split("."))
     keys, value, found = _locate(merged, tuple(part for part in loc if part != ""))
-    dotted = _dotted(keys)
     kind, message = problem["type"], problem["msg"].removeprefix("Value error, ")
     more = len(problems) - 1
     if kind == "missing" and isinstance(problem["loc"][-1], int) and isinstance(value, list):
@@ -611,7 +629,7 @@ def _explain(error: ValidationError, merged: Any, origin: Origin, unknown: Seque
     elif kind in ("union_tag_invalid", "union_tag_not_found"):
         expected = problem["ctx"].get("expected_tags", "").replace("'", "") if "ctx" in problem else ""
         tag = value.get("type", "") if isinstance(value, Mapping) else ""
-        dotted += ".type"
+        keys = [*keys, "type"]
         if tag:
             text = f"unknown type {_shown(tag)}{_suggest(str(tag), expected.split(', '))}; known: {expected}"
         else:
@@ -622,7 +640,7 @@ def _explain(error: ValidationError, merged: Any, origin: Origin, unknown: Seque
     else:
         text = " ".join((message[0].lower() + message[1:]).splitlines())
     given = f" = {_shown(value)}" if found and not isinstance(value, (Mapping, list)) else ""
-    return f"{origin.place(keys)}: {dotted}{given}: {text}{_and_more(more)}"
+    return f"{origin.place(keys)}: {_dotted(keys)}{given}: {text}{_and_more(more)}"
 
 
 def _and_more(count: int) -> str:

@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from types import ModuleType
 from typing import Protocol
 
+import numpy as np
+
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, UnreachableReference
 from dynsim.record import Record
 from dynsim.scenario import Scenario
@@ -74,6 +76,8 @@ def _named(scenario: Scenario) -> Iterator[None]:
         raise ModelError(f"{scenario.place(error.keys, variant)}: {error}") from error
     except (ScenarioError, UnreachableReference) as error:
         raise type(error)(f"{name}: {error}") from error
+    except (ArithmeticError, np.linalg.LinAlgError) as error:
+        raise ModelError(f"{name}: numbers of very different size, no result can be computed ({error})") from error
     except MemoryError as error:
         reason = f"not enough memory ({error})" if str(error) else "not enough memory"
         raise ScenarioError(f"{name}: {reason}; a lower record.rate_hz or duration_s needs less") from error

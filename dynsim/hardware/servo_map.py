@@ -355,17 +355,28 @@ def read_yaml(path: Path, schema: type[_Schema]) -> _Schema:
     try:
         return schema.model_validate(data)
     except ValidationError as error:
-        # A misspelt key makes two errors: the wrong one says more than the missing one.
-        first = min(error.errors(include_url=False), key=lambda found: found["type"] != "extra_forbidden")
-        where = ".".join(str(part) for part in first["loc"])
-        message = first["msg"].removeprefix("Value error, ")
-        if first["type"] == "extra_forbidden":
-            known = _known_keys(schema, first["loc"])
+        raise ServoMapError(_explain(error, path, data, schema)) from error
+
+
+# Unknown keys that one message names.
+_UNKNOWN_SHOWN = 20
+
+
+def _explain(error: ValidationError, path: Path, data: Any, schema: type[BaseModel]) -> str:
+    """One line: all unknown keys, else the first problem."""
+    problems = error.errors(include_url=False, include_input=False)
+    # A misspelt key makes two errors: the wrong one says more than the missing one.
+    unknown = [problem for problem in problems if problem["type"] == "extra_forbidden"]
+    texts = []
+    for problem in unknown[:_UNKNOWN_SHOWN] or problems[:1]:
+        where = ".".join(str(part) for part in problem["loc"])
+        message = " ".join(problem["msg"].removeprefix("Value error, ").split())
+        if unknown:
+            known = _known_keys(schema, problem["loc"])
             message = f"unknown key; known are {', '.join(known)}" if known else "unknown key"
-        more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
-        raise ServoMapError(
-            f"{path}:{_line(data, first['loc'])}: {where + ': ' if where else ''}{message}{more}"
-        ) from error
+        texts.append(f"{path}:{_line(data, problem['loc'])}: {where + ': ' if where else ''}{message}")
+    more = f" (and {len(problems) - len(texts)} more)" if len(problems) > len(texts) else ""
+    return "; ".join(texts) + more
 
 
 def _line(data: Any, location: tuple[int | str, ...]) -> int:

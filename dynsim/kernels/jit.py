@@ -10,6 +10,7 @@ import hashlib
 import os
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -37,7 +38,10 @@ def cache_folder() -> Path:
         digest.update(source.read_bytes())
     base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     name = Path("dynsim", digest.hexdigest()[:16])
-    for root in (Path(base).expanduser(), Path(tempfile.gettempdir(), f"cache-{os.getuid()}")):
+    roots = [Path(tempfile.gettempdir(), f"cache-{os.getuid()}")]
+    with suppress(RuntimeError):  # a user without a home
+        roots.insert(0, Path(base).expanduser())
+    for root in roots:
         try:
             (root / name).mkdir(parents=True, exist_ok=True)
         except OSError:

@@ -40,6 +40,13 @@ class LinkKeys(StrictConfig):
     initial_deg: float = Field(default=0.0, description="initial angle of a revolute joint")
     initial_m: float = Field(default=0.0, description="initial position of a prismatic joint")
 
+    @field_validator("axis")
+    @classmethod
+    def _check_axis(cls, axis: str | list[float]) -> str | list[float]:
+        if not isinstance(axis, str):
+            unit_vector(axis, "axis")
+        return axis
+
 
 # Keys that only one kind of joint has → their counterpart for the other kind.
 ONLY_REVOLUTE = {"damping_N_m_s_per_rad": "damping_N_s_per_m", "initial_deg": "initial_m"}

@@ -1,6 +1,7 @@
 """The command line as a user meets it: files, exit codes, one-line errors, Ctrl-C."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -175,3 +176,100 @@ def test_list_check_schema_and_version(tmp_path: Path):
         result = dynsim(*arguments, folder=tmp_path)
         assert result.returncode == 0, result.stderr
         assert expected in result.stdout
+
+
+def in_process(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture, *arguments: str
+) -> tuple[int, str, list[str]]:
+    """Exit code, output and lines of errors of the command line, run here: starting Python takes a second."""
+    monkeypatch.setattr(sys, "argv", ["dynsim", *arguments])
+    with pytest.raises(SystemExit) as finished:
+        main()
+    captured = capfd.readouterr()
+    return finished.value.code, captured.out, [line for line in captured.err.splitlines() if line.strip()]
+
+
+@pytest.mark.parametrize("command", [[], ["run"], ["compare"], ["plot"], ["bench"], ["hw", "replay"]])
+def test_help_shows_flags_without_a_type(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture, command: list[str]
+):
+    code, output, _ = in_process(monkeypatch, capfd, *command, "--help")
+    assert code == 0
+    assert "--help " in output
+    for noise in ("bool", "int range", "...}"):
+        assert noise not in output
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("dynsim ru", ["run"]),
+        ("dynsim run elbow_comparison_", ["elbow_comparison_vertical"]),
+        ("dynsim check single_pendulum six", ["six_axis_arm"]),
+        ("dynsim compare mine/a", ["mine/a.yaml"]),
+        ("dynsim run elbow_comparison --variant elb", ["elbow_7", "elbow_4"]),
+        ("dynsim run mine/a.yaml --variant ", ["one", "two"]),
+        ("dynsim run gone.yaml --variant ", []),
+        ("dynsim run mine/bad.yaml --variant ", []),
+    ],
+)
+def test_the_shell_completes_scenarios_and_variants(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture, words: str, expected: list[str]
+):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "a.yaml").write_text("variants: {one: {}, two: {}}")
+    (tmp_path / "mine" / "bad.yaml").write_text("variants: [")
+    (tmp_path / "mine" / "a.txt").touch()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("_DYNSIM_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", words)
+    monkeypatch.setenv("COMP_CWORD", str(words.count(" ")))
+    code, output, errors = in_process(monkeypatch, capfd)
+    assert (code, output.split(), errors) == (0, expected, [])
+
+
+def test_the_shell_can_be_taught_to_complete(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture):
+    _, output, _ = in_process(monkeypatch, capfd, "--help")
+    assert "--install-completion" in output
+
+
+def test_completing_loads_nothing_heavy(tmp_path: Path):
+    heavy = "numpy numba scipy pydantic h5py matplotlib pinocchio"
+    code = f"import sys; from dynsim import cli; print(*(name for name in {heavy.split()} if name in sys.modules))"
+    result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "\n", "")
+
+
+def test_names_that_no_file_can_have_are_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+):
+    monkeypatch.chdir(tmp_path)
+    long, undecodable = "x" * 300, os.fsdecode(b"n\xff")
+    for arguments in (["run", long], ["check", long], ["plot", long], ["run", undecodable]):
+        code, _, errors = in_process(monkeypatch, capfd, *arguments)
+        assert code == 2
+        assert len(errors) == 1
+    code, _, (error,) = in_process(monkeypatch, capfd, "run", "single_pendulum", "--out", long)
+    assert code == 2
+    assert error.endswith("File name too long")
+
+
+def test_a_working_directory_that_is_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    code, output, _ = in_process(monkeypatch, capfd, "check", "single_pendulum")
+    assert (code, output.split()) == (0, ["single_pendulum:", "ok", "(1", "variant)"])
+    code, _, errors = in_process(monkeypatch, capfd, "run", "single_pendulum")
+    assert code == 2
+    assert errors == ["error: the working directory is no longer there; change to another folder"]
+
+
+def test_a_terminal_that_knows_ascii_only(tmp_path: Path):
+    for arguments in (["list"], ["run", "--help"], ["run", "−.yaml"]):
+        result = dynsim(*arguments, folder=tmp_path, env={**os.environ, "PYTHONIOENCODING": "ascii"})
+        assert result.returncode == (2 if "−.yaml" in arguments else 0), result.stderr
+        assert "Traceback" not in result.stderr

@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import jsonschema
 import pytest
 
 import dynsim
@@ -126,6 +127,94 @@ def test_errors_are_one_line_that_names_the_place(tmp_path: Path, text: str, exp
     assert "\n" not in message
     for part in expected:
         assert part in message
+
+
+def test_all_unknown_keys_of_a_file_are_in_one_answer(tmp_path: Path):
+    text = (
+        MINIMAL.replace("axis: y", "axs: y")
+        + "integrater: {}\nrecord: {rate: 5, size_limit_GB: -1}\nvariants:\n  a: {}\n  b:\n    metrics: {settle: 1}\n"
+    )
+    path = write(tmp_path, text)
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(path)
+    assert str(caught.value) == (
+        f"{path}:2: plant.chain.0.axs: unknown key; did you mean 'axis'?; "
+        f"{path}:4: record.rate: unknown key; did you mean 'rate_hz'?; "
+        f"{path}:3: integrater: unknown key; did you mean 'integrator'?; "
+        f"{path}:8: metrics.settle: unknown key; did you mean 'settle_s'? (and 1 more)"
+    )
+
+
+def test_of_very_many_unknown_keys_the_first_are_named(tmp_path: Path):
+    with pytest.raises(ScenarioError, match=r"k19: unknown key.*; and more$") as caught:
+        load_scenario(write(tmp_path, MINIMAL + "".join(f"k{k}: 1\n" for k in range(5000))))
+    assert "k20:" not in str(caught.value)
+
+
+def test_errors_of_a_choice_are_about_the_type_that_is_named(tmp_path: Path):
+    text = MINIMAL + "surfaces:\n  floor:\n    type: sphere\n    center_m: [0, 0, 0]\n    normal: [0, 0, 1]\n"
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(write(tmp_path, text))
+    message = str(caught.value)
+    assert "case.yaml:7: surfaces.floor.normal: unknown key; known here: type, center_m, radius_m, inside" in message
+    with pytest.raises(ScenarioError, match=r"case.yaml:5: surfaces.floor.type: unknown type \['sphere'\]"):
+        load_scenario(write(tmp_path, text.replace("type: sphere", "type: [sphere]")))
+
+
+def test_the_schema_is_about_the_type_that_is_named():
+    """Editors report what a validator of JSON schemas does: the fault, not that none of the choices fits."""
+    validator = jsonschema.Draft202012Validator(json_schema())
+    scenario = load_scenario("elbow_comparison").resolved
+    assert not list(validator.iter_errors(scenario))
+    scenario["plant"]["bas"] = 1
+    scenario["surfaces"]["floor"]["type"] = "plan"
+    scenario["controller"]["hand"]["path"]["radius"] = 1
+    found = {(".".join(map(str, error.path)), error.message) for error in validator.iter_errors(scenario)}
+    assert found == {
+        ("plant", "Additional properties are not allowed ('bas' was unexpected)"),
+        ("surfaces.floor.type", "'plan' is not one of ['cylinder', 'plane', 'sphere']"),
+        ("controller.hand.path", "Additional properties are not allowed ('radius' was unexpected)"),
+    }
+    assert json_schema()["properties"]["plant"]["discriminator"]["propertyName"] == "type"
+
+
+CONTACT = """duration_s: 1
+plant: {type: serial_arm, chain: [{axis: y, initial_deg: 90}]}
+surfaces: {floor: {type: plane}}
+contacts:
+  points:
+    tip:
+      body: link_1
+      point_m: [0, 0, 0.3]
+      surface: floor
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (
+            ("surface: floor", "surface: flor"),
+            ":9: contacts.points.tip.surface = 'flor': no such surface; did you mean",
+        ),
+        (("body: link_1", "body: link_2"), ":7: contacts.points.tip.body: "),
+        (("initial_deg: 90", "initial_deg: 80"), ":6: contacts.points.tip: its point starts +0.05209 m from surface"),
+    ],
+)
+def test_errors_of_contacts_name_key_and_line(tmp_path: Path, change: tuple[str, str], expected: str):
+    path = write(tmp_path, CONTACT)
+    check(load_scenario(path))
+    write(tmp_path, CONTACT.replace(*change))
+    with pytest.raises(ModelError, match=f"^{re.escape(f'{path}{expected}')}"):
+        check(load_scenario(path))
+
+
+def test_errors_of_overridden_contacts_say_so(tmp_path: Path):
+    path = write(tmp_path, CONTACT + "variants: {one: {}}\n")
+    overrides = SetOptions({"contacts.points.tip.surface": "flor"})
+    expected = f"{path} (one): --set: contacts.points.tip.surface = 'flor'"
+    with pytest.raises(ModelError, match=f"^{re.escape(expected)}"):
+        check(load_scenario(path, overrides=overrides))
 
 
 def test_error_in_a_variant_names_the_variants_line(tmp_path: Path):
@@ -262,6 +351,66 @@ def test_parse_override():
     assert parse_override("a=[1, x]") == ("a", [1, "x"])
     with pytest.raises(ScenarioError):
         parse_override("a.b")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (".=1", "--set .: a part of the key is empty"),
+        ("plant..x=1", "--set plant..x: a part of the key is empty"),
+        ("=1", "--set =1: must look like"),
+        ("plant.chain.²=1", "--set plant.chain.²: '²' is no index of a list of 2"),
+        ("plant.chain.٠=1", "'٠' is no index"),
+        ("plant.chain.-1.mass_kg=1", "'-1' is no index"),
+        ("plant.chain." + "9" * 5000 + "=1", "is no index of a list of 2"),
+        ("variants={a: {}}", "--set variants: which variant runs is chosen by its name"),
+        ("variants.two_elbows=1", "--set variants.two_elbows: which variant runs"),
+        ("variant=x", "--set variant: which variant runs"),
+        ("duration_s=*a", "--set duration_s: alias *a: there is no anchor"),
+        ("duration_s=&a [*a]", "--set duration_s: alias *a is within"),
+        ("duration_s=" + "9" * 5000, "--set duration_s: a number of 5000 digits"),
+        ("duration_s=" + "9" * 308, "--set: duration_s = 99999"),
+        ("duration_s=1e-300", "--set: duration_s = 1e-300: its size must be between 1e-30 and 1e+30"),
+        ("duration_s=2024-99-99", "--set: duration_s = '2024-99-99'"),
+        ("duration_s=._", "--set: duration_s = '._'"),
+        ("duration_s='\"", "--set duration_s: not YAML"),
+        ("duration_s=\"'1'\"", "--set: duration_s = \"'1'\""),
+        ("duration_s=!!python/name:os.system", "--set duration_s: tag '!!python/name:os.system' is not known"),
+        ("duration_s=" + "{a: " * 100, "--set duration_s: more than 50 mappings"),
+        ("duration_s=a\ud800", "--set duration_s: not YAML: character U+D800"),
+        ("a" + ".a" * 100 + "=1", "has 101 parts; no key of a scenario has more than 50"),
+        ("a\nb=1", "--set: a\\nb: unknown key"),
+        ("a" * 5000 + "=1", "aaa…: unknown key"),
+        ("name=" + "x" * 300, "must not be longer than 255 bytes"),
+        ("name='a\tb'", "must be printable in one line"),
+        ("plant.type=[1]", "--set: plant.type: unknown type [1]"),
+    ],
+)
+def test_every_override_is_one_clear_error(text: str, expected: str):
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario("elbow_comparison", overrides=SetOptions([parse_override(text)]))
+    assert expected in str(caught.value)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 1000
+
+
+def test_an_override_changes_nothing_but_what_it_names(tmp_path: Path):
+    text = "duration_s: 1\nplant:\n  type: serial_arm\n  chain: [&link {com_m: &com [0, 0, 0]}, *link, {com_m: *com}]\n"
+    scenario = load_scenario(write(tmp_path, text), overrides={"plant.chain.0.com_m.2": 0.1})
+    assert [link["com_m"][2] for link in scenario.resolved["plant"]["chain"]] == [0.1, 0, 0]
+
+
+def test_numbers_that_no_result_can_be_computed_from_are_refused():
+    for value in (1e31, 1e-31, -1e300):
+        with pytest.raises(ScenarioError, match=r"plant\.chain\.0\.com_m\.2 = .*: its size must be between"):
+            load_scenario("elbow_comparison", overrides={"plant.chain.0.com_m": [0, 0, value]})
+    with pytest.raises(ModelError, match="numbers of very different size"):
+        check(load_scenario("elbow_comparison", overrides={"plant.initial_deg.7": 9999999999999999999999999}))
+
+
+def test_an_axis_has_a_direction():
+    with pytest.raises(ScenarioError, match=r"plant.chain.0.axis: .*axis has no direction"):
+        load_scenario("single_pendulum", overrides={"plant.chain.0.axis": [0, 0, 0]})
 
 
 def test_schema_knows_every_family():
