@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler
 from pydantic_core import PydanticCustomError
 
 Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -14,10 +14,32 @@ Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 
 
+def forbid_conversion(schema: Any) -> None:
+    """Make the numbers of a pydantic core schema take numbers only.
+
+    Otherwise ``true`` is 1 and the text "1_9.2" is 19.2: no file says so. Keys stay as they are, they are texts.
+    """
+    if isinstance(schema, dict):
+        if schema.get("type") in ("float", "int"):
+            schema["strict"] = True
+        for name, part in schema.items():
+            if name not in ("keys_schema", "metadata", "default"):
+                forbid_conversion(part)
+    elif isinstance(schema, (list, tuple)):
+        for part in schema:
+            forbid_conversion(part)
+
+
 class StrictConfig(BaseModel):
-    """A mapping of a scenario file; unknown keys are errors, numbers must be finite."""
+    """A mapping of a scenario file; unknown keys are errors, numbers must be finite, and neither texts nor true."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True)
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> Any:
+        schema = handler(source)
+        forbid_conversion(schema)
+        return schema
 
 
 class BodyPoint(StrictConfig):

@@ -567,6 +567,8 @@ def _plain(value: Any) -> Any:
         return [_plain(item) for item in value]
     if isinstance(value, bool) or value is None:
         return value
+    if isinstance(value, np.generic):
+        return value.item()
     for kind in (int, float, str):
         if isinstance(value, kind):
             return kind(value)

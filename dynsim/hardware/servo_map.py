@@ -13,8 +13,9 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError, model_validator
 
+from dynsim.config import forbid_conversion
 from dynsim.errors import shown
 from dynsim.hardware.control_table import (
     BAUD_RATES,
@@ -40,9 +41,15 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class StrictModel(BaseModel):
-    """Unknown keys are errors."""
+    """Unknown keys are errors, and numbers neither texts nor true."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> Any:
+        schema = handler(source)
+        forbid_conversion(schema)
+        return schema
 
 
 class Follows(StrictModel):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import io
-from functools import lru_cache
+import math
+import re
 from pathlib import Path
 from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 from scipy.interpolate import PchipInterpolator
 
 from dynsim.config import StrictConfig
@@ -19,6 +19,8 @@ from dynsim.inputs import read_text
 COLUMNS = ("t_s", "x_m", "y_m", "z_m")
 # Of a file [bytes]: some million rows.
 SIZE_LIMIT = 100_000_000
+# float() takes more: "1_0", digits of other scripts. No other program would read the file so.
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 
 
 class Config(StrictConfig):
@@ -26,46 +28,72 @@ class Config(StrictConfig):
 
     type: Literal["csv"]
     file: str = Field(description="CSV file, relative to the scenario file, with a header t_s,x_m,y_m,z_m")
+    # Read once: an edit of the file does not change a scenario that is already loaded, only the next one.
+    _rows: list[list[float]] = PrivateAttr()
 
     @model_validator(mode="after")
-    def _check(self) -> Self:
-        _table(self.file)
+    def _read(self) -> Self:
+        self._rows = _rows(self.file)
+        _check_curve(self._rows, self.file)
         return self
 
     def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
         """The curve at times t [s], shape (T, 3) [m]."""
-        table = _table(self.file)
-        return PchipInterpolator(table[:, 0], table[:, 1:])(np.clip(t, table[0, 0], table[-1, 0]))
+        curve = _curve(self._rows)
+        return curve(np.clip(t, curve.x[0], curve.x[-1]))
 
 
-@lru_cache(maxsize=8)
-def _table(file: str) -> NDArray[np.float64]:
-    """Rows (t, x, y, z) of the file; ValueError names what is wrong with it."""
-    path = Path(file)
+def _rows(file: str) -> list[list[float]]:
+    """Rows t, x, y, z of the file; ValueError names what is wrong with it."""
     try:
-        # Line ends of every system become "\n".
-        stream = io.StringIO(read_text(path, ModelError, SIZE_LIMIT), newline=None)
+        text = read_text(Path(file), ModelError, SIZE_LIMIT)
     except ModelError as error:
         raise ValueError(str(error)) from error
-    header = stream.readline().strip()
+    header, *lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     if tuple(name.strip() for name in header.split(",")) != COLUMNS:
-        raise ValueError(f"{path}:1: the first line is {header[:80]!r}; it must be {','.join(COLUMNS)!r}")
-    lines = ((number, line.strip()) for number, line in enumerate(stream, 2))
-    rows = [_row(line, f"{path}:{number}") for number, line in lines if line and not line.startswith("#")]
-    table = np.array(rows)
-    if len(table) < 2 or not np.isfinite(table).all() or np.any(np.diff(table[:, 0]) <= 0.0):
-        raise ValueError(f"{path}: needs two rows or more, finite numbers and increasing t_s")
-    return table
+        raise ValueError(f"{file}:1: the first line is {_shown(header)}; it must be {','.join(COLUMNS)!r}")
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines, 2):
+        content = line.partition("#")[0].strip(" \t")
+        if not content:
+            continue
+        rows.append(_row(content, f"{file}:{number}"))
+        if len(rows) > 1 and not rows[-1][0] > rows[-2][0]:
+            raise ValueError(
+                f"{file}:{number}: t_s = {rows[-1][0]:g} after {rows[-2][0]:g}; it must increase from row to row"
+            )
+    if len(rows) < 2:
+        raise ValueError(f"{file}: {len(rows)} rows below the header; a path needs two or more")
+    return rows
 
 
 def _row(line: str, place: str) -> list[float]:
-    cells = [cell.strip() for cell in line.partition("#")[0].split(",")]
+    cells = [cell.strip(" \t") for cell in line.split(",")]
     if len(cells) != len(COLUMNS):
         raise ValueError(f"{place}: {len(cells)} values; there must be {len(COLUMNS)}: {','.join(COLUMNS)}")
+    if not all(_NUMBER.fullmatch(cell) and math.isfinite(float(cell)) for cell in cells):
+        raise ValueError(f"{place}: {_shown(line)} is not {len(COLUMNS)} numbers, finite and in digits 0 to 9")
+    return [float(cell) for cell in cells]
+
+
+def _curve(rows: list[list[float]]) -> PchipInterpolator:
+    table = np.array(rows)
+    return PchipInterpolator(table[:, 0], table[:, 1:])
+
+
+def _check_curve(rows: list[list[float]], file: str) -> None:
+    """ValueError unless rounding leaves the curve finite and on its rows."""
+    table = np.array(rows)
     try:
-        # Python's own reading of numbers knows underscores and the digits of every script.
-        if not line.isascii() or any("_" in cell for cell in cells):
-            raise ValueError
-        return [float(cell) for cell in cells]
-    except ValueError:
-        raise ValueError(f"{place}: {line[:80]!r} is not {len(COLUMNS)} numbers") from None
+        with np.errstate(all="ignore"):
+            curve = _curve(rows)
+            met = np.allclose(curve(table[:, 0]), table[:, 1:], rtol=1e-9, atol=1e-12)
+    except ValueError:  # slopes that overflow
+        met = False
+    if not (met and np.isfinite(curve.c).all()):
+        raise ValueError(f"{file}: numbers too large, or rows too close in time, for a curve through them")
+
+
+def _shown(line: str) -> str:
+    """A line of the file for a message: one line, no control characters, not a page long."""
+    return repr(line if len(line) <= 80 else line[:79] + "…")

@@ -1,0 +1,63 @@
+"""All cases of a seed, or one of them again."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+from fuzz import campaign
+from fuzz.case import KINDS, draw, put
+from fuzz.inputs.record import make_records
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m fuzz", description=__doc__)
+    parser.add_argument("--seed", type=int, default=campaign.SEED)
+    parser.add_argument("--count", type=int, default=6000, help="inputs, spread over all kinds")
+    parser.add_argument("--kind", choices=KINDS, help="only inputs of this kind")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="worker processes")
+    parser.add_argument("--limit", type=float, default=campaign.LIMIT, help="of one command [s]")
+    parser.add_argument("--repeat", nargs=2, metavar=("KIND", "INDEX"), help="one case again")
+    parser.add_argument("--keep", type=Path, help="with --repeat: write the files of the case to this folder")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="fuzz-records-") as folder:
+        records = Path(folder)
+        make_records(records)
+        if options.repeat:
+            kind, index = options.repeat[0], int(options.repeat[1])
+            case = draw(kind, options.seed, index, records)
+            print(case.what, *(f"dynsim {' '.join(command)}" for command in case.commands), sep="\n")
+            for name, data in case.files.items() if options.keep else ():
+                put(options.keep / name, data)
+            cases = [(kind, index)]
+        elif options.kind:
+            cases = [(options.kind, index) for index in range(options.count)]
+        else:
+            cases = campaign.spread(options.count)
+        done = []
+
+        def report(result: campaign.Result) -> None:
+            done.append(result)
+            if sys.stderr.isatty() and len(done) % 20 == 0:
+                print(f"\r{len(done)} of {len(cases)}", end="", file=sys.stderr, flush=True)
+
+        results = campaign.run(
+            cases,
+            records=records,
+            seed=options.seed,
+            jobs=min(options.jobs, len(cases)),
+            limit=options.limit,
+            report=report,
+        )
+    print(campaign.failures(results))
+    print(campaign.table(results))
+    if options.repeat and not results[0].failed:
+        print(results[0].ended.detail)
+    return 1 if any(result.failed for result in results) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

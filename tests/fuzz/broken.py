@@ -1,0 +1,71 @@
+"""Deliberately broken loaders, one per kind of failure: the suite must find each of them.
+
+Records are loaded as ever after what :data:`WAYS` has for the number of the case; every link weighs a hundredth more.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+
+def install() -> None:
+    """Break the loaders of this process."""
+    from dynsim.plants.serial_arm import LinkConfig
+    from dynsim.record import Record
+
+    sound_load, sound_inertia = Record.load.__func__, LinkConfig.inertia  # type: ignore[attr-defined]
+
+    def load(cls: type[Record], path: Any) -> Record:
+        # A case runs in a folder of its name and number.
+        number = int(Path.cwd().name.rpartition("-")[2])
+        list(WAYS.values())[number % len(WAYS)]()
+        return sound_load(cls, path)
+
+    def inertia(self: Any) -> Any:
+        body = sound_inertia(self)
+        return type(body)(1.01 * body.mass, body.com, body.tensor)
+
+    Record.load = classmethod(load)  # type: ignore[assignment,method-assign]
+    LinkConfig.inertia = inertia  # type: ignore[method-assign]
+
+
+def _hang_deaf() -> None:
+    while True:
+        try:
+            time.sleep(3600)
+        except KeyboardInterrupt:
+            continue
+
+
+def _babble() -> None:
+    print("error: \x1b[31mone\nand more", file=sys.stderr)
+    _refuse()
+
+
+def _overwrite(name: str) -> None:
+    Path(name).write_text("gone", encoding="utf-8")
+    _refuse()
+
+
+def _refuse() -> None:
+    from dynsim.errors import RecordError
+
+    raise RecordError("refused")
+
+
+WAYS = {
+    "raises": lambda: int("no number"),
+    "hangs": lambda: time.sleep(3600),
+    "takes all memory": lambda: bytearray(64 << 30),
+    "babbles": _babble,
+    "overwrites": lambda: _overwrite("map.yaml"),
+    "litters": lambda: _overwrite("map.yaml.tmp"),
+    "hangs deaf": _hang_deaf,
+    "aborts": os.abort,
+    "exits": lambda: os._exit(0),
+    "refuses": _refuse,
+}

@@ -1,0 +1,198 @@
+"""Runs cases in worker processes; one that dies or hangs is a failure of the case it was at, and a new one goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from fuzz.case import KINDS, draw
+from fuzz.worker import CRASH, FAILURES, HANG, INTERRUPTED, LOSS, OK, READY, REFUSED, Outcome
+
+SEED = 8
+# Of a command, a hang beyond [s]: well above what dynsim itself allows for reading a damaged record on a busy machine.
+LIMIT = 90.0
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@dataclass(frozen=True)
+class Result:
+    """How one case ended."""
+
+    kind: str
+    seed: int
+    index: int
+    case: str
+    ended: Outcome
+    seconds: float
+
+    @property
+    def failed(self) -> bool:
+        return self.ended.outcome in FAILURES
+
+    @property
+    def cause(self) -> tuple[str, str, str, str]:
+        """Equal for failures of one cause, as far as can be told."""
+        return self.kind, self.ended.outcome, self.ended.what, self.ended.place
+
+    def __str__(self) -> str:
+        ended = self.ended
+        return (
+            f"{ended.outcome}: {ended.what} at {ended.place or '-'}\n  {self.kind}: {self.case[:200]}\n"
+            f"  repeat: PYTHONPATH=.:tests python -m fuzz --seed {self.seed} --repeat {self.kind} {self.index}\n"
+            + "".join(f"  | {line}\n" for line in ended.detail.strip().splitlines()[-8:])
+        )
+
+
+class Worker:
+    """One child process and the case it is at."""
+
+    def __init__(self, records: Path, folder: Path, limit: float, broken: bool) -> None:
+        self._records = records
+        self._arguments = ["--records", str(records), "--folder", str(folder), "--limit", str(limit)]
+        self._arguments += ["--broken"] if broken else []
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115
+        self._process: subprocess.Popen[str] | None = None
+
+    def run(self, kind: str, seed: int, index: int) -> Result:
+        """The outcome of one case; the child is started anew where needed."""
+        process = self._process or self._start()
+        started = time.monotonic()
+        line = ""
+        try:
+            process.stdin.write(f"{kind} {seed} {index}\n")  # type: ignore[union-attr]
+            process.stdin.flush()  # type: ignore[union-attr]
+            line = process.stdout.readline()  # type: ignore[union-attr]
+        except BrokenPipeError:
+            pass
+        seconds = time.monotonic() - started
+        if not line.endswith("\n"):
+            return Result(
+                kind, seed, index, draw(kind, seed, index, self._records).what, self._post_mortem(process), seconds
+            )
+        answer = json.loads(line)
+        case = answer.pop("case")
+        return Result(kind, seed, index, case, Outcome(**answer), seconds)
+
+    def close(self) -> None:
+        """End the child, whatever it does."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.communicate()
+            self._process = None
+        self._log.close()
+
+    def _start(self) -> subprocess.Popen[str]:
+        self._log.seek(0)
+        self._log.truncate()
+        paths = [str(ROOT), str(ROOT / "tests"), *filter(None, [os.environ.get("PYTHONPATH")])]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1", "COLUMNS": "200"}
+        process = subprocess.Popen(
+            [sys.executable, "-m", "fuzz.worker", *self._arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._log,
+            text=True,
+            env=environment,
+        )
+        self._process = process
+        if process.stdout.readline().strip() != READY:  # type: ignore[union-attr]
+            raise RuntimeError(f"a worker does not start: {self._read_log()[-2000:]}")
+        return process
+
+    def _post_mortem(self, process: subprocess.Popen[str]) -> Outcome:
+        process.kill()
+        process.communicate()
+        self._process = None
+        log = self._read_log()
+        places = [line.strip() for line in log.splitlines() if line.lstrip().startswith("File ")]
+        ours = next((line for line in places if f"{os.sep}dynsim{os.sep}" in line and "site-packages" not in line), "")
+        # 'File "…/dynsim/record.py", line 144 in load' → 'dynsim/record.py:load'
+        place = (
+            ":".join(ours.partition(f"{ROOT}{os.sep}")[2].replace('"', "").split(", line ")[:1] + ours.split()[-1:])
+            if ours
+            else ""
+        )
+        if "Timeout (" in log:
+            return Outcome(HANG, "heeds no Ctrl-C", place, log[-1500:])
+        code = process.returncode
+        end = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        return Outcome(CRASH, f"the process ended: {end}", place, log[-1500:])
+
+    def _read_log(self) -> str:
+        self._log.seek(0)
+        return self._log.read().decode("utf-8", "replace")
+
+
+def run(
+    cases: Iterable[tuple[str, int]],
+    *,
+    records: Path,
+    seed: int = SEED,
+    jobs: int = 1,
+    limit: float = LIMIT,
+    broken: bool = False,
+    report: Callable[[Result], None] = lambda result: None,
+) -> list[Result]:
+    """Run cases (kind, index) in ``jobs`` workers; ``report`` gets each result as it comes."""
+    todo: queue.SimpleQueue[tuple[str, int]] = queue.SimpleQueue()
+    for case in cases:
+        todo.put(case)
+
+    def work(folder: Path) -> list[Result]:
+        worker, results = Worker(records, folder, limit, broken), []
+        try:
+            while True:
+                try:
+                    kind, index = todo.get_nowait()
+                except queue.Empty:
+                    return results
+                results.append(worker.run(kind, seed, index))
+                report(results[-1])
+        finally:
+            worker.close()
+
+    with tempfile.TemporaryDirectory(prefix="fuzz-") as base, ThreadPoolExecutor(jobs) as pool:
+        results = [result for batch in pool.map(work, [Path(base, str(k)) for k in range(jobs)]) for result in batch]
+    return sorted(results, key=lambda result: (KINDS.index(result.kind), result.index))
+
+
+def spread(count: int) -> list[tuple[str, int]]:
+    """``count`` cases in turn over all kinds."""
+    return [(KINDS[k % len(KINDS)], k // len(KINDS)) for k in range(count)]
+
+
+def table(results: list[Result]) -> str:
+    """Kind × outcome with counts; and for how many the second reading was held against what was taken."""
+    columns = (OK, REFUSED, INTERRUPTED, *FAILURES)
+    counts = Counter((result.kind, result.ended.outcome) for result in results)
+    compared = Counter(result.kind for result in results if result.ended.compared or result.ended.outcome == LOSS)
+    lines = [f"{'kind':<10}{'inputs':>8}{'compared':>10}" + "".join(f"{name:>15}" for name in columns)]
+    for kind in KINDS:
+        row = [counts[kind, name] for name in columns]
+        lines.append(f"{kind:<10}{sum(row):>8}{compared[kind]:>10}" + "".join(f"{number:>15}" for number in row))
+    total = [sum(counts[kind, name] for kind in KINDS) for name in columns]
+    slowest = max(results, key=lambda result: result.seconds)
+    lines.append(f"{'all':<10}{sum(total):>8}{compared.total():>10}" + "".join(f"{number:>15}" for number in total))
+    lines.append(f"slowest: {slowest.kind} {slowest.index}, {slowest.seconds:.1f} s")
+    return "\n".join(lines)
+
+
+def failures(results: list[Result]) -> str:
+    """Failures by cause: how many, and the first of each."""
+    causes: dict[tuple[str, str, str, str], list[Result]] = {}
+    for result in results:
+        if result.failed:
+            causes.setdefault(result.cause, []).append(result)
+    ordered = sorted(causes.values(), key=lambda same: (KINDS.index(same[0].kind), -len(same)))
+    return "\n".join(f"{len(same)} × {same[0]}" for same in ordered)

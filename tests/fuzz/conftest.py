@@ -1,0 +1,17 @@
+"""The sound records, made once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fuzz.inputs.record import make_records
+
+
+@pytest.fixture(scope="session")
+def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the sound records that are broken."""
+    folder = tmp_path_factory.mktemp("records")
+    make_records(folder)
+    return folder

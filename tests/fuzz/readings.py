@@ -1,0 +1,322 @@
+"""What an input says, read without dynsim, held against what dynsim made of it.
+
+Every function answers with the losses as lines, none when all is there. Where the second reading cannot tell what an
+input says, it is not held against it.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+# Digits 0 to 9 only, no underscores: what float() takes beyond that is not a number to other programs.
+DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+# Keys whose values are made into something else on the way: paths absolute, names of folders from the file's name.
+_REWRITTEN = frozenset({"file", "name", "variant"})
+# What says yes and no without doubt where a flag is wanted.
+_TRUE, _FALSE = ("true", "1", "1.0", "yes", "on", "y", "t"), ("false", "0", "0.0", "-0.0", "no", "off", "n", "f")
+ROUNDING = 1e-9
+
+
+class Unreadable(Exception):
+    """The second reading cannot tell."""
+
+
+def yaml_tree(text: str) -> Any:
+    """A YAML text as plain values, by ruamel's safe reader; dynsim uses the one that keeps lines."""
+    from ruamel.yaml import YAML
+
+    if len(text) > 200_000:
+        raise Unreadable("too long for that reader, which takes a minute for a megabyte")
+    try:
+        return YAML(typ="safe", pure=True).load(io.StringIO(text))
+    except Exception as error:  # whatever it is, that reader cannot tell
+        raise Unreadable(str(error)) from error
+
+
+def merged(base: Any, difference: Any) -> Any:
+    """``difference`` over ``base`` as docs/scenarios say: mappings merge, lists and values replace, null removes."""
+    if not isinstance(difference, Mapping):
+        return difference
+    out = dict(base) if isinstance(base, Mapping) else {}
+    for key, item in difference.items():
+        if item is None:
+            out.pop(key, None)
+        else:
+            out[key] = merged(out.get(key), item)
+    return out
+
+
+def set_dotted(tree: Any, dotted: str, item: Any) -> None:
+    """Set ``a.b.0.c`` in a tree; :class:`Unreadable` where it leads nowhere."""
+    *path, last = dotted.split(".")
+    node = tree
+    try:
+        for key in path:
+            if isinstance(node, list):
+                node = node[int(key)]
+            else:
+                node = (
+                    node[key]
+                    if node.get(key) is not None
+                    else node.setdefault(key, {}) or node.__setitem__(key, {}) or node[key]
+                )
+        node[int(last) if isinstance(node, list) else last] = item
+    except (LookupError, ValueError, AttributeError, TypeError) as error:
+        raise Unreadable(dotted) from error
+
+
+def missing(said: Any, taken: Any, where: str = "") -> list[str]:
+    """Values of ``said`` that ``taken`` does not hold; ``taken`` may hold more (defaults)."""
+    if isinstance(said, Mapping):
+        if not said:
+            return []
+        if not isinstance(taken, Mapping):
+            return [f"{where}: a mapping became {taken!r}"]
+        lost = []
+        for key, item in said.items():
+            # Keys are text as written; this reader may have made a number or a date of it.
+            if item is None or key in _REWRITTEN or not isinstance(key, str):
+                continue
+            inner = f"{where}.{key}".lstrip(".")
+            if key not in taken:
+                lost.append(f"{inner} = {item!r} is gone")
+            else:
+                lost += missing(item, taken[key], inner)
+        return lost
+    if isinstance(said, (list, tuple)):
+        if not isinstance(taken, (list, tuple)) or len(said) != len(taken):
+            return [f"{where}: {len(said)} entries became {str(taken)[:60]}"]
+        return [
+            line for k, (a, b) in enumerate(zip(said, taken, strict=True)) for line in missing(a, b, f"{where}.{k}")
+        ]
+    return (
+        []
+        if _same(said, taken)
+        else [f"{where}: {str(said)[:60]!r} ({type(said).__name__}) was taken for {str(taken)[:60]!r}"]
+    )
+
+
+def _same(said: Any, taken: Any) -> bool:
+    if isinstance(taken, bool):
+        return str(said).lower() in (_TRUE if taken else _FALSE)
+    if isinstance(said, bool):
+        return isinstance(taken, str)
+    if isinstance(taken, (int, float)):
+        if isinstance(said, str):
+            return DECIMAL.fullmatch(said.strip()) is not None and float(said) == taken
+        return said == taken
+    # What this reader makes of dates, sets and the like is text as written to dynsim.
+    return said == taken or (isinstance(taken, str) and not isinstance(said, str))
+
+
+def scenario_losses(said: Mapping[str, Any], scenario: Any) -> list[str]:
+    """Values of a merged scenario that are not in the validated one, and masses and friction not in the model."""
+    said = {key: item for key, item in said.items() if key not in ("variants", *_REWRITTEN)}
+    taken = scenario.resolved
+    plant = dict(said["plant"]) if isinstance(said.get("plant"), Mapping) else {}
+    chain = plant.get("chain")
+    if plant.get("type") == "serial_arm" and isinstance(chain, list):
+        # The shared link is not in the resolved scenario: every entry of the chain has its keys.
+        shared = plant.pop("link", None) or {}
+        plant["chain"] = [_with_shared(shared, entry) for entry in chain]
+        said["plant"] = plant
+    return missing(said, taken) + _model_losses(said, plant, scenario)
+
+
+def _with_shared(shared: Mapping[str, Any], entry: Any) -> Any:
+    if not isinstance(entry, Mapping):
+        return entry
+    foreign = {"prismatic": ("damping_N_m_s_per_rad", "initial_deg")}.get(
+        entry.get("kind", shared.get("kind")), ("damping_N_s_per_m", "initial_m")
+    )
+    return {**{key: item for key, item in shared.items() if key not in foreign}, **entry}
+
+
+def _model_losses(said: Mapping[str, Any], plant: Mapping[str, Any], scenario: Any) -> list[str]:
+    lost: list[str] = []
+    if scenario.engine != "dynamics":
+        return lost
+    if plant.get("type") == "serial_arm":
+        masses = [
+            float(entry.get("mass_kg", 0.1)) for entry in plant["chain"] for _ in range(int(entry.get("count", 1)))
+        ]
+        built = [link.inertia.mass for link in scenario.robot().links]
+        if masses != built:
+            lost.append(f"masses {masses[:5]}… became {built[:5]}…")
+    contacts = said.get("contacts") or {}
+    points = contacts.get("points") or {}
+    friction = {
+        str(name): float(point["friction"] if point.get("friction") is not None else contacts.get("friction", 0.1))
+        for name, point in points.items()
+        if point is not None and point.get("enabled", True)
+    }
+    held = {contact.name: contact.friction for contact in scenario.contacts()}
+    if friction != held:
+        lost.append(f"friction {friction} became {held}")
+    return lost
+
+
+def servo_map_losses(said: Mapping[str, Any], servo_map: Any) -> list[str]:
+    """Entries of a servo map that its servos, bus and safety rules do not have."""
+    lost = missing(said.get("bus") or {}, servo_map.bus.model_dump(), "bus")
+    lost += missing(said.get("safety") or {}, servo_map.safety.model_dump(), "safety")
+    entries = list(said["servos"].items())
+    kinds = {str(name): kind for name, kind in said["kinds"].items()}
+    if len(entries) != len(servo_map.servos):
+        return [*lost, f"{len(entries)} servos became {len(servo_map.servos)}"]
+    for servo, (joint, entry) in zip(servo_map.servos, entries, strict=True):
+        # A key is text as written; this reader may have made a number or a date of it.
+        if isinstance(joint, str) and joint != servo.joint:
+            lost.append(f"servos.{joint} became {servo.joint}")
+        taken = {"id": servo.id, "sign": servo.sign, "zero_tick": servo.zero_tick, "label": servo.label}
+        lost += missing({key: item for key, item in entry.items() if key in taken}, taken, f"servos.{servo.joint}")
+        hold_at = entry.get("hold_at_deg")
+        if hold_at is not None and not math.isclose(hold_at, math.degrees(servo.hold_at), rel_tol=ROUNDING):
+            lost.append(f"servos.{servo.joint}.hold_at_deg = {hold_at} became {math.degrees(servo.hold_at)}")
+        lost += missing(kinds.get(str(entry["kind"]), {}), servo.kind.model_dump(), f"kinds.{entry['kind']}")
+    return lost
+
+
+def csv_rows(data: bytes) -> list[list[float]]:
+    """Rows of a path table, each number in decimal digits; :class:`Unreadable` otherwise."""
+    try:
+        lines = data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    except UnicodeDecodeError as error:
+        raise Unreadable("not UTF-8") from error
+    rows = []
+    for line in lines[1:]:
+        if line := line.partition("#")[0].strip(" \t"):
+            cells = [cell.strip(" \t") for cell in line.split(",")]
+            if len(cells) != 4 or not all(DECIMAL.fullmatch(cell) for cell in cells):
+                raise Unreadable(line)
+            rows.append([float(cell) for cell in cells])
+    return rows
+
+
+def urdf_losses(data: bytes, robot: Any) -> list[str]:
+    """Masses, inertias, joints and damping of a URDF file that a robot does not have; links are composed as fixed."""
+    try:
+        return _urdf_differences(ElementTree.fromstring(data), robot)
+    except (Unreadable, ElementTree.ParseError) as error:
+        return [f"a strict reading refuses the file: {error}"]
+
+
+def _urdf_differences(root: ElementTree.Element, robot: Any) -> list[str]:
+    links = {link.get("name"): _body(link) for link in root.findall("link")}
+    joints = root.findall("joint")
+    moving = {"revolute", "continuous", "prismatic"}
+    lost = []
+    named = {str(joint.get("name")) for joint in joints if joint.get("type") in moving}
+    locked = named - set(robot.joint_names)
+    if locked or len(named) != len(robot.links):
+        lost.append(f"joints {sorted(named)} became {sorted(robot.joint_names)}")
+    below: dict[str | None, list[ElementTree.Element]] = {}
+    for joint in joints:
+        if joint.get("type") == "fixed":
+            below.setdefault(joint.find("parent").get("link"), []).append(joint)
+
+    def composite(name: str | None) -> np.ndarray:
+        total = links[name]
+        for joint in below.get(name, ()):
+            total = total + _moved(composite(joint.find("child").get("link")), joint.find("origin"))
+        return total
+
+    child_of = {joint.get("name"): joint.find("child").get("link") for joint in joints}
+    damping_of = {joint.get("name"): joint.find("dynamics") for joint in joints}
+    for link in robot.links:
+        if link.joint not in child_of:
+            lost.append(f"joint {link.joint!r} is not in the file")
+            continue
+        said, taken = (
+            composite(child_of[link.joint]),
+            _pseudo_inertia(link.inertia.mass, link.inertia.com, link.inertia.tensor),
+        )
+        scale = np.abs(said).max()
+        if not np.allclose(said, taken, rtol=ROUNDING, atol=ROUNDING * max(scale, 1e-300)):
+            far = np.abs(said - taken).max()
+            lost.append(
+                f"body {link.name!r}: mass and moments differ ({said[3, 3]:.9g}, {taken[3, 3]:.9g} kg; {far:.3g})"
+            )
+        element = damping_of[link.joint]
+        damping = 0.0 if element is None else _number(element.get("damping", "0"))
+        if damping != link.damping:
+            lost.append(f"joint {link.joint!r}: damping {damping} became {link.damping}")
+    return lost
+
+
+def _number(text: str | None) -> float:
+    if text is None or not DECIMAL.fullmatch(text.strip(" \t\r\n")):
+        raise Unreadable(f"{text!r} is not a number")
+    return float(text)
+
+
+def _numbers(text: str) -> np.ndarray:
+    return np.array([_number(word) for word in text.split()])
+
+
+def _body(link: ElementTree.Element) -> np.ndarray:
+    """Pseudo-inertia of a link about its own frame, (4, 4); zero for one without <inertial>."""
+    name = link.get("name")
+    inertials = link.findall("inertial")
+    if not inertials:
+        return np.zeros((4, 4))
+    masses, inertias = inertials[0].findall("mass"), inertials[0].findall("inertia")
+    if len(inertials) != 1 or len(masses) != 1 or len(inertias) != 1:
+        raise Unreadable(
+            f"link {name!r} has {len(inertials)} <inertial>, {len(masses)} <mass>, {len(inertias)} <inertia>"
+        )
+    xx, xy, xz, yy, yz, zz = (_number(inertias[0].get(key)) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
+    tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return _moved(_pseudo_inertia(_number(masses[0].get("value")), np.zeros(3), tensor), inertials[0].find("origin"))
+
+
+def _pseudo_inertia(mass: float, com: np.ndarray, tensor: np.ndarray) -> np.ndarray:
+    """[[Σ, m c], [m cᵀ, m]] with Σ = ∫ r rᵀ dm = ½ tr(I) 1 − I about the frame; it moves as T J Tᵀ."""
+    J = np.empty((4, 4))
+    J[:3, :3] = 0.5 * np.trace(tensor) * np.eye(3) - tensor + mass * np.outer(com, com)
+    J[:3, 3] = J[3, :3] = mass * np.asarray(com)
+    J[3, 3] = mass
+    return J
+
+
+def _moved(J: np.ndarray, origin: ElementTree.Element | None) -> np.ndarray:
+    """A pseudo-inertia seen from the frame in which ``origin`` places it."""
+    if origin is None:
+        return J
+    T = np.eye(4)
+    xyz, rpy = _numbers(origin.get("xyz", "0 0 0")), _numbers(origin.get("rpy", "0 0 0"))
+    if len(xyz) != 3 or len(rpy) != 3:
+        raise Unreadable(f"<origin {dict(origin.items())}> is not of three numbers each")
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    T[:3, :3] = (
+        np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+        @ np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+        @ np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    )
+    T[:3, 3] = xyz
+    return T @ J @ T.T
+
+
+def record_losses(sound: Any, loaded: Any) -> list[str]:
+    """Signals, units, labels, summary and provenance of a sound record that a loaded one does not have."""
+    lost = []
+    if not np.array_equal(sound.time, loaded.time):
+        lost.append("time changed")
+    for name, signal in sound.signals.items():
+        if name not in loaded:
+            lost.append(f"signal {name!r} is gone")
+        elif not np.array_equal(signal.data, loaded[name], equal_nan=signal.data.dtype.kind == "f"):
+            lost.append(f"signal {name!r} changed")
+        elif (signal.unit, signal.labels) != (loaded.units[name], loaded.labels[name]):
+            lost.append(f"unit or labels of {name!r} changed: {loaded.units[name]!r} {loaded.labels[name]}")
+    for name in ("summary", "provenance", "complete"):
+        if getattr(sound, name) != getattr(loaded, name):
+            lost.append(f"{name} changed")
+    return lost

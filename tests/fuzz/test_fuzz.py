@@ -1,0 +1,40 @@
+"""Broken inputs of every kind: each ends well or with one clear error, and nothing is lost."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from fuzz import campaign
+from fuzz.case import KINDS, draw
+
+# Damaged records are slower to read than the rest.
+QUICK = {**dict.fromkeys(KINDS, 45), "record": 15}
+ALL = 6000
+
+
+def check(results: list[campaign.Result], count: int) -> None:
+    print(campaign.table(results))
+    assert len(results) == count
+    assert not any(result.failed for result in results), f"\n{campaign.failures(results)}\n{campaign.table(results)}"
+
+
+def test_a_sample_of_broken_inputs(records: Path) -> None:
+    cases = [(kind, index) for kind, count in QUICK.items() for index in range(count)]
+    check(campaign.run(cases, records=records), len(cases))
+
+
+@pytest.mark.slow
+def test_all_broken_inputs(records: Path) -> None:
+    """Seen with ``-s``: the table of kinds and outcomes."""
+    check(campaign.run(campaign.spread(ALL), records=records, jobs=os.cpu_count() or 1), ALL)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_case_is_the_same_whenever_it_is_drawn(kind: str, records: Path) -> None:
+    for index in range(20):
+        first, again = draw(kind, 1, index, records), draw(kind, 1, index, records)
+        assert (first.what, first.files, first.commands) == (again.what, again.files, again.commands)
+    assert draw(kind, 1, 0, records).files != draw(kind, 2, 0, records).files or kind == "override"

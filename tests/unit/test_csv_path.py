@@ -1,0 +1,69 @@
+"""Tables of hand paths: read as any other program reads them, or refused with file, line and reason."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from dynsim.control.paths.csv import Config
+
+HEADER = "t_s,x_m,y_m,z_m\n"
+
+
+def path_of(folder: Path, content: str | bytes) -> Config:
+    file = folder / "path.csv"
+    file.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return Config(type="csv", file=str(file))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        HEADER + "0,1,2,3\n1,2,2,4\n",
+        "\ufeff" + HEADER + "0,1,2,3\r\n1,2,2,4\r\n",
+        (HEADER + "0,1,2,3\n1,2,2,4").replace("\n", "\r"),
+        "t_s, x_m, y_m, z_m\n# a comment\n\n0 , +1.0, 2., 3e0 # at rest\n 1,\t2,.2e1,4\n",
+    ],
+)
+def test_a_path_goes_through_its_rows_and_rests_beyond_them(content: str, tmp_path: Path) -> None:
+    path = path_of(tmp_path, content)
+    times = np.array([-5.0, 0.0, 1.0, 9.0])
+    assert np.array_equal(path.position(times), [[1, 2, 3], [1, 2, 3], [2, 2, 4], [2, 2, 4]])
+
+
+@pytest.mark.parametrize(
+    "cell", ["1_0", "１２", "٣", "nan", "inf", "1e999", "0x10", "", "1 2", "1\u00a0", "\x1c1", '"1"']
+)
+def test_what_is_no_decimal_number_is_refused_with_its_line(cell: str, tmp_path: Path) -> None:
+    """Python alone would take the first three for numbers."""
+    with pytest.raises(ValidationError, match=r"path.csv:3: .* is not 4 numbers"):
+        path_of(tmp_path, f"{HEADER}0,1,2,3\n1,{cell},2,3\n")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (HEADER + "0,1,2,3\n1,1,2,3\n1,1,2,3\n", r"path.csv:4: t_s = 1 after 1; it must increase"),
+        (HEADER + "0,1,2,3\n", "1 rows below the header"),
+        ("time,x,y,z\n0,1,2,3\n", "path.csv:1: the first line is 'time,x,y,z'"),
+        (HEADER + "0,1,2,3\n0.1,1e308,2,3\n0.2,-1e308,2,3\n", "numbers too large"),
+        (HEADER + "0,1,2,3\n5e-324,1,3,3\n", "too close in time"),
+        (HEADER.encode() + b"0,1,2,3\n1,1,\xff2,3\n", r"path.csv:3: byte 0xff is not UTF-8"),
+        (b"\x1b[31m" * 50, r"the first line is '.{1,130}…'; it must be"),
+    ],
+)
+def test_a_table_without_a_path_is_refused(content: str | bytes, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValidationError, match=message) as refused:
+        path_of(tmp_path, content)
+    assert "\x1b" not in str(refused.value)
+
+
+def test_an_edited_file_is_read_anew(tmp_path: Path) -> None:
+    """The scenario that is loaded already keeps its path, the next one has the new rows."""
+    before = path_of(tmp_path, HEADER + "0,1,2,3\n1,1,2,3\n")
+    after = path_of(tmp_path, HEADER + "0,7,2,3\n1,7,2,3\n")
+    assert before.position(np.zeros(1))[0, 0] == 1.0
+    assert after.position(np.zeros(1))[0, 0] == 7.0
