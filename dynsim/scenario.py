@@ -83,6 +83,7 @@ class Integrator(StrictConfig):
     atol: float = Field(default=1e-8, ge=1e-16, le=1e-1)
     step_s: Positive | None = Field(default=None, description="fixed step of rk4 (default 0.001), else the first step")
     step_max_s: Positive | None = None
+    time_limit_h: Positive = Field(default=24.0, description="runs estimated to integrate for longer are refused [h]")
 
 
 class RecordOptions(StrictConfig):

@@ -63,6 +63,7 @@ def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
     n, na, c = model.n, len(robot.motors), len(contacts)
     times = _sample_times(scenario, columns=2 * n + na + LEDGER_SIZE + CONTACT_SIZE * c + ki.output_size(n, na, c))
     _check_stiffness(scenario, robot)
+    _check_work(scenario, n, c)
     control = _control(scenario, model, progress)
     _check_references(scenario, robot, contacts, control)
     options = scenario.integrator
@@ -111,7 +112,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
         ki.advance(prepared.system, prepared.workspace, run, 0)
     if progress is not None:
         progress(0.0, SIMULATION)
-    started, limit, interrupted = clock.perf_counter(), 20, False
+    started, limit, interrupted = clock.perf_counter(), 1, False
     try:
         log.info("%s: integrating %g s by %s", scenario.title, scenario.duration_s, scenario.integrator.method)
         while run.count[ki.STATUS] == ki.RUNNING:
@@ -162,6 +163,27 @@ def _check_stiffness(scenario: Scenario, robot: Robot) -> None:
         raise ScenarioError(
             f"{motor.joint}: R/L = {pole:.2g} 1/s holds integrator.method {method} to about {steps:.1g} steps for "
             f"{duration:g} s; take integrator.method: rodas4, or a larger inductance than {motor.inductance:g} H"
+        )
+
+
+def _check_work(scenario: Scenario, n: int, p: int) -> None:
+    """Refuse what would integrate for longer than ``integrator.time_limit_h``, by an estimate from its size."""
+    options = scenario.integrator
+    # Measured from 10 to 1000 links with up to 250 contacts, right to a factor of two: the sweeps, the p × p system of
+    # chains as long as n, its elimination, and the decomposition that dependent rows need (p > n always are).
+    seconds = 1e-7 * n + 4e-10 * n * p**2 + (8e-8 if p > n else 2e-10) * p**3
+    if options.solver == "m_star":
+        seconds += 3e-10 * (n + p) ** 3
+    # A Jacobian by differences, and its factors.
+    per_step = (2 * n + 6) * seconds + 3e-10 * n**3 if options.method == "rodas4" else 4.0 * seconds
+    # Motors and friction hold the step at about a millisecond.
+    steps = scenario.duration_s / (options.step_s if options.step_s and options.method == "rk4" else 1e-3)
+    hours = steps * per_step / 3600.0
+    if hours > options.time_limit_h:
+        raise ScenarioError(
+            f"{n} joints with {p} contacts: a right-hand side takes about {seconds:.1g} s, so "
+            f"{scenario.duration_s:g} s would integrate for about {hours:.2g} hours, the limit (integrator.time_limit_h) is "
+            f"{options.time_limit_h:g}; take fewer contacts or links, a shorter duration_s, or a higher limit"
         )
 
 

@@ -28,10 +28,11 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         raise ModelError(f"{robot.name}: a robot needs at least one link")
     _check_shapes(robot)
     index: dict[str, int] = {}
+    joints: dict[str, int] = {}
     tree = np.zeros((len(links), ka.TREE_SIZE), dtype=np.int64)
     body = np.zeros((len(links), ka.BODY_SIZE))
     for i, link in enumerate(links):
-        if link.name in index or link.joint in (other.joint for other in links[:i]):
+        if link.name in index or link.joint in joints:
             raise ModelError(f"{link.name}: the name of a body or joint occurs twice")
         if link.parent is not None and link.parent not in index:
             raise ModelError(f"{link.name}: its parent {link.parent!r} must be a body that comes before it")
@@ -45,7 +46,7 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         if np.abs(R_PJ @ R_PJ.T - np.eye(3)).max() > 1e-9 or np.linalg.det(R_PJ) < 0.0:
             raise ModelError(f"{link.joint}: R_PJ is not a rotation")
         parent = -1 if link.parent is None else index[link.parent]
-        index[link.name] = i
+        index[link.name], joints[link.joint] = i, i
         tree[i, ka.PARENT] = parent
         tree[i, ka.KIND] = _joint_kind(link)
         tree[i, ka.TURNED] = int(not np.array_equal(R_PJ, np.eye(3)))
@@ -66,7 +67,6 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         if frame.body is not None and frame.body not in index:
             raise ModelError(f"frame {frame.name}: no body {frame.body!r}")
         names.add(frame.name)
-    joints = {link.joint: i for i, link in enumerate(links)}
     for motor in robot.motors:
         _check_motor(motor, joints)
         i = joints[motor.joint]

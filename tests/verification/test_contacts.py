@@ -10,10 +10,13 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from random_robots import bench, random_contacts, random_robot, surface_through
 
+from dynsim.engine import check
+from dynsim.errors import ScenarioError
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.energy import FRICTION
 from dynsim.model.description import Contact, Quadric, Robot
 from dynsim.model.model import Model
+from dynsim.scenario import load_scenario
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -175,3 +178,16 @@ def test_a_scaled_plane_is_the_same_contact(seed):
     for one, two in zip(*results, strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-9 * np.abs(one).max())
     assert results[0][1][0, ka.GAP] == pytest.approx(plane.gap(Model(robot).point_position(body, point, q)), abs=1e-12)
+
+
+def test_more_contacts_than_a_machine_can_carry_are_refused_with_an_estimate():
+    """The work of a right-hand side grows with p² n and p³."""
+    points = {f"c{k}": {"body": "link_1"} for k in range(1000)}
+    size = {"plant.chain.0.initial_deg": 90, "plant.chain.0.axis": "y", "duration_s": 100, "contacts.points": points}
+    overrides = {**size, "surfaces.floor.type": "plane"}
+    with pytest.raises(
+        ScenarioError,
+        match=r"1 joints with 1000 contacts: .* about [\d.e+]+ hours, the limit .* is 24;",
+    ):
+        check(load_scenario("single_pendulum", overrides=overrides))
+    check(load_scenario("single_pendulum", overrides={**overrides, "integrator.time_limit_h": 1e6}))
