@@ -182,8 +182,9 @@ def _check_work(scenario: Scenario, n: int, p: int) -> None:
     if hours > options.time_limit_h:
         raise ScenarioError(
             f"{n} joints with {p} contacts: a right-hand side takes about {seconds:.1g} s, so "
-            f"{scenario.duration_s:g} s would integrate for about {hours:.2g} hours, the limit (integrator.time_limit_h) is "
-            f"{options.time_limit_h:g}; take fewer contacts or links, a shorter duration_s, or a higher limit"
+            f"{scenario.duration_s:g} s would integrate for about {hours:.2g} hours, the limit "
+            f"(integrator.time_limit_h) is {options.time_limit_h:g}; "
+            "take fewer contacts or links, a shorter duration_s, or a higher limit"
         )
 
 

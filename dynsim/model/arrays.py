@@ -11,6 +11,9 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels.jit import integers, reals
 from dynsim.model.description import Contact, Link, Motor, Robot
 
+# Beyond it the reduction of an angle to a quarter turn leaves too few digits (dynsim.kernels.newton_euler.sine_cosine).
+ANGLE_LIMIT = 1e6
+
 _FRICTION = {"signed": ka.FRICTION_SIGNED, "dissipative": ka.FRICTION_DISSIPATIVE}
 
 
@@ -32,6 +35,11 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
     tree = np.zeros((len(links), ka.TREE_SIZE), dtype=np.int64)
     body = np.zeros((len(links), ka.BODY_SIZE))
     for i, link in enumerate(links):
+        if link.kind == "revolute" and abs(robot.initial[i]) > ANGLE_LIMIT:
+            raise ModelError(
+                f"{link.joint}: an initial angle of {robot.initial[i]:.3g} rad; more than {ANGLE_LIMIT:g} rad "
+                "cannot be told from other angles, take it modulo a turn"
+            )
         if link.name in index or link.joint in joints:
             raise ModelError(f"{link.name}: the name of a body or joint occurs twice")
         if link.parent is not None and link.parent not in index:

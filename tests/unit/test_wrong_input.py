@@ -280,3 +280,8 @@ def test_provenance_does_without_the_metadata_of_a_library_and_finds_the_commit_
     assert provenance.commit() == "0123abcd"
     (git / "HEAD").write_bytes(b"\xff\xfe")
     assert provenance.commit() == ""
+
+
+def test_an_initial_angle_without_digits_is_refused():
+    with pytest.raises(ModelError, match=r"an initial angle of 3\.22e\+17 rad; .* take it modulo a turn"):
+        build_model(load_scenario("single_pendulum", overrides={"plant.chain.0.initial_deg": 2**64}))
