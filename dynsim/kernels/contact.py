@@ -36,6 +36,8 @@ from dynsim.kernels.jit import inlined_kernel, kernel
 
 # Tries, beyond two per contact, to find signs of dissipative contacts that agree with their forces.
 SIGN_PASSES = 64
+# A normal force below this fraction of the largest one is rounding.
+NO_FORCE = 1e-12
 
 
 @kernel
@@ -140,23 +142,25 @@ def sign_changed(contacts: ContactArrays, ws: Workspace, passes):
 
     All at once in the first passes, then only the first of them (least-index pivoting, which cannot cycle while a
     unique consistent choice exists). Without a consistent choice (Painlevé) the forces become NaN, the count in
-    ``ws.deficient[1]`` goes up and the search ends; forces that vanish to rounding may keep either sign.
+    ``ws.deficient[1]`` goes up and the search ends. Forces that vanish to rounding have no sign and take +, so that
+    the result does not depend on the signs that the search began with.
     """
     state = ws.contacts
     p = state.shape[0]
-    changed, largest, worst = False, 0.0, 0.0
+    changed, largest = False, 0.0
     for k in range(p):
         largest = max(largest, abs(state[k, FORCE]))
-        if contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE and state[k, FORCE] * state[k, SIGN] < 0.0:
-            worst = max(worst, abs(state[k, FORCE]))
-            if not (changed and passes > p):
-                state[k, SIGN] = -state[k, SIGN]
-                force_direction(contacts, ws, k)
-                changed = True
+    for k in range(p):
+        if contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE:
+            agreement = state[k, FORCE] * state[k, SIGN]
+            if agreement < -NO_FORCE * largest or (agreement <= NO_FORCE * largest and state[k, SIGN] < 0.0):
+                if not (changed and passes > p):
+                    state[k, SIGN] = -state[k, SIGN]
+                    force_direction(contacts, ws, k)
+                    changed = True
     if changed and passes > 2 * p + SIGN_PASSES:
-        if worst > 1e-10 * largest:
-            ws.deficient[1] += 1
-            for k in range(p):
-                state[k, FORCE] = math.nan
+        ws.deficient[1] += 1
+        for k in range(p):
+            state[k, FORCE] = math.nan
         return False
     return changed
