@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from dynsim.kernels import arrays as ka
 from dynsim.kernels import integrate as ki
 from dynsim.kernels.articulated import accelerate
+from dynsim.kernels.contact import SIGNS_LIMIT
 from dynsim.kernels.coupled import System, derivative
 from dynsim.kernels.rows import RANK_TOLERANCE
-from dynsim.kernels.uniqueness import DIAGONAL_TOLERANCE, FORCE_TOLERANCE, SIGNS_LIMIT
+from dynsim.kernels.uniqueness import DIAGONAL_TOLERANCE, FORCE_TOLERANCE
 from dynsim.metrics import MotionSpread
 from dynsim.model.description import Contact
 
@@ -89,7 +90,7 @@ class ContactMatrices:
         found: list[Array] = []
         for signs in self.choices():
             try:
-                force = np.linalg.solve(self.matrix(signs), self.rhs)
+                force: Array = np.linalg.solve(self.matrix(signs), self.rhs)
             except np.linalg.LinAlgError:
                 continue
             scale = FORCE_TOLERANCE * max(np.abs(force).max(), np.abs(self.force).max())
@@ -181,9 +182,7 @@ def paradox(
     several = matrices.free.any() and not near and matrices.basis().shape[1] == len(contacts)
     solutions = matrices.solutions() if several else []
     turned = matrices.reversed()
-    names = ", ".join(
-        contact.name for contact, mark in zip(contacts, turned, strict=True) if mark or not turned.any()
-    )
+    names = ", ".join(contact.name for contact, mark in zip(contacts, turned, strict=True) if mark or not turned.any())
     if len(solutions) > 1:
         forces = " and ".join(f"({', '.join(f'{force:.4g}' for force in solution)}) N" for solution in solutions)
         count = "two" if len(solutions) == 2 else len(solutions)

@@ -302,9 +302,9 @@ def step_explicit(system: System, ws: Workspace, run: Run):
         combine(y, h, A[s], s, k, y_new)
         derivative(system, t + node[s] * h, y_new, ws, k[s if s < last else 6])
         # A fixed step may jump over what an error estimate would not let pass, so its stages are watched too.
-        if run.method == RK4 and finite(k[s if s < last else 6]):
-            if not forces_unique(system, ws, run, t + node[s] * h):
-                return 0.0
+        stage = k[s if s < last else 6]
+        if run.method == RK4 and finite(stage) and not forces_unique(system, ws, run, t + node[s] * h):
+            return 0.0
     run.count[EVALUATIONS] += last
     if run.method == RK4:
         return 0.0

@@ -22,6 +22,7 @@ from dynsim.kernels.arrays import (
     D,
     Workspace,
 )
+from dynsim.kernels.contact import SIGNS_LIMIT
 from dynsim.kernels.jit import inlined_kernel, internal_kernel
 from dynsim.kernels.rows import RANK_TOLERANCE
 
@@ -30,8 +31,6 @@ UNIQUE, REVERSED, SEVERAL = 0, 1, 2
 # Blocks of the scratch ``room``, (ROOM, c, c); of SIGNS and FORCES only the first row is used.
 FRICTIONLESS, FRICTION, BASIS, MATRIX, PRODUCT, SIGNS, FORCES = 0, 1, 2, 3, 4, 5, 6
 ROOM = 7
-# With more dissipative contacts than this only the present signs and those that differ at one contact are tried.
-SIGNS_LIMIT = 8
 # A determinant above this fraction of what its terms would allow is positive without a closer look.
 CLEAR = 1e-3
 # Rounding: below these fractions a diagonal entry or a force has no sign, and two solutions are the same one.
@@ -229,7 +228,7 @@ def another_solution(contacts: ContactArrays, ws: Workspace, room):
     if not difference > FORCE_TOLERANCE * largest:
         return False
     for k in range(p):
-        if contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE:
-            if room[FORCES, 0, k] * room[SIGNS, 0, k] < -FORCE_TOLERANCE * largest:
-                return False
+        free = contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE
+        if free and room[FORCES, 0, k] * room[SIGNS, 0, k] < -FORCE_TOLERANCE * largest:
+            return False
     return True
