@@ -90,7 +90,7 @@ class ContactMatrices:
         found: list[Array] = []
         for signs in self.choices():
             try:
-                force: Array = np.linalg.solve(self.matrix(signs), self.rhs)
+                force = np.asarray(np.linalg.solve(self.matrix(signs), self.rhs), dtype=np.float64)
             except np.linalg.LinAlgError:
                 continue
             scale = FORCE_TOLERANCE * max(np.abs(force).max(), np.abs(self.force).max())
