@@ -19,7 +19,7 @@ from dynsim.kernels.articulated import accelerate
 from dynsim.kernels.contact import SIGNS_LIMIT
 from dynsim.kernels.coupled import System, derivative
 from dynsim.kernels.rows import RANK_TOLERANCE
-from dynsim.kernels.uniqueness import DIAGONAL_TOLERANCE, FORCE_TOLERANCE
+from dynsim.kernels.uniqueness import DIAGONAL_TOLERANCE, FORCE_TOLERANCE, IMMOBILE
 from dynsim.metrics import MotionSpread
 from dynsim.model.description import Contact
 
@@ -112,11 +112,15 @@ class ContactMatrices:
     def reversed(self) -> NDArray[np.bool_]:
         """Contacts whose own force alone would accelerate them against it: negative diagonal entries, (c,)."""
         own = np.diag(self.frictionless)
-        return np.diag(self.matrix(self.signs)) < -DIAGONAL_TOLERANCE * own
+        return (own > 0.0) & (np.diag(self.matrix(self.signs)) < -DIAGONAL_TOLERANCE * own)
+
+    def finite(self) -> bool:
+        """False for a state that has diverged."""
+        return bool(np.isfinite(self.frictionless).all() and np.isfinite(self.friction).all())
 
     def unique(self) -> bool:
         """False where the compiled watch stops a run."""
-        if self.determinant(self.signs) <= 0.0 or self.reversed().all():
+        if not self.finite() or self.determinant(self.signs) <= 0.0 or self.reversed().all():
             return False
         if not self.free.any() or self.basis().shape[1] < len(self.rhs):
             return True
@@ -129,11 +133,13 @@ def contact_matrices(system: System, ws: ka.Workspace, t: float, y: Array) -> Co
     contacts, state = system.contacts, ws.contacts
     rows, directions, inverse = ws.column[:, 1::2], ws.column[:, 2::2], ws.links[:, ka.D, None]
     frictionless = rows.T @ (inverse * rows)
+    moving = np.diag(frictionless) > IMMOBILE * (inverse * directions**2).sum(axis=0)
+    frictionless = frictionless * np.outer(moving, moving)
     dissipative = contacts.link[:, ka.FRICTION_LAW] == ka.FRICTION_DISSIPATIVE
     signs = np.where(dissipative, state[:, ka.SIGN], 1.0)
     return ContactMatrices(
         frictionless=frictionless,
-        friction=(frictionless - rows.T @ (inverse * directions)) * signs,
+        friction=(frictionless - moving[:, None] * (rows.T @ (inverse * directions))) * signs,
         rhs=state[:, ka.RHS].copy(),
         force=state[:, ka.FORCE].copy(),
         signs=signs,
@@ -176,6 +182,8 @@ def paradox(
     else:
         return None
     matrices = contact_matrices(system, ws, t, y)
+    if not matrices.finite():
+        return None
     value = matrices.determinant(matrices.signs)
     if near and not abs(value) < NEAR_ZERO:
         return None

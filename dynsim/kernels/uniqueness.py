@@ -33,6 +33,8 @@ FRICTIONLESS, FRICTION, BASIS, MATRIX, PRODUCT, SIGNS, FORCES = 0, 1, 2, 3, 4, 5
 ROOM = 7
 # A determinant above this fraction of what its terms would allow is positive without a closer look.
 CLEAR = 1e-3
+# A normal mobility below this fraction of that along the force is the square of rounding.
+IMMOBILE = 1e-24
 # Rounding: below these fractions a diagonal entry or a force has no sign, and two solutions are the same one.
 DIAGONAL_TOLERANCE = 1e-12
 FORCE_TOLERANCE = 1e-9
@@ -107,10 +109,12 @@ def force_verdict(contacts: ContactArrays, ws: Workspace, room, since, t):
     since : (c,) first time at which the contact's diagonal entry was negative [s], written here; inf: never
     """
     split_matrix(contacts, ws, room)
+    drop_immobile(contacts, ws, room)
     rank, p = frictionless_basis(room), ws.contacts.shape[0]
     negative, free = 0, 0
     for k in range(p):
-        if ws.small[0, k, k] < -DIAGONAL_TOLERANCE * room[FRICTIONLESS, k, k]:
+        own = room[FRICTIONLESS, k, k]
+        if own > 0.0 and ws.small[0, k, k] < -DIAGONAL_TOLERANCE * own:
             negative += 1
             since[k] = min(since[k], t)
         if contacts.point[k, MU] > 0.0 and contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE:
@@ -136,6 +140,19 @@ def force_verdict(contacts: ContactArrays, ws: Workspace, room, since, t):
     if doubtful and several:
         return SEVERAL
     return REVERSED if reverse else UNIQUE
+
+
+@internal_kernel
+def drop_immobile(contacts: ContactArrays, ws: Workspace, room):
+    """Zero the rows of points that no joint moves along their normals: what is left there is rounding, of any sign."""
+    p = room.shape[1]
+    for k in range(p):
+        along = 0.0
+        for i in range(contacts.link[k, LINK] + 1):
+            along += ws.column[i, 2 + 2 * k] * ws.column[i, 2 + 2 * k] * ws.links[i, D]
+        if room[FRICTIONLESS, k, k] <= IMMOBILE * along:
+            for m in range(p):
+                room[FRICTIONLESS, k, m], room[FRICTIONLESS, m, k], room[FRICTION, k, m] = 0.0, 0.0, 0.0
 
 
 @internal_kernel

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from random_robots import Bench, bench, random_contacts, random_robot
+from random_robots import Bench, bench, random_contacts, random_robot, random_unit
 
 import dynsim
 from dynsim.engine import dynamics
@@ -15,6 +15,7 @@ from dynsim.engine.uniqueness import acceleration_range, contact_matrices, motio
 from dynsim.errors import SimulationStopped
 from dynsim.kernels import arrays as ka
 from dynsim.kernels import integrate as ki
+from dynsim.kernels.uniqueness import ROOM, UNIQUE, force_verdict
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 
 X, Y, Z = np.eye(3)
@@ -296,6 +297,21 @@ def test_dependent_rows_are_no_paradox(method, friction, law):
     run = started(b, sliding(b), method, end=0.02)
     assert run.count[ki.STATUS] == ki.FINISHED
     assert np.isinf(run.extremes[:, ki.LOCAL_SINCE]).all()
+
+
+def test_a_point_that_no_joint_moves_along_its_normal_is_no_paradox():
+    """Its row is rounding, of either sign: a body that yaws about a tilted axis on the plane across that axis."""
+    for seed in range(20):
+        axis = random_unit(np.random.default_rng(seed))
+        link = Link("disc", "spin", None, "revolute", axis, Inertia(1.0, np.zeros(3), np.eye(3)))
+        point = np.cross(axis, [0.3, 0.2, 0.1])
+        foot = Contact("foot", "disc", point, Quadric(np.zeros((3, 3)), axis, 0.0), friction=0.9)
+        for law in ("signed", "dissipative"):
+            b = bench(Robot("disc", (link,), (), ("disc", np.zeros(3))), [replace(foot, pulling_friction=law)])
+            b.derivative(b.state(np.zeros(1), np.ones(1)))
+            since, room = np.full(1, np.inf), np.zeros((ROOM, 1, 1))
+            assert force_verdict(b.system.contacts, b.ws, room, since, 0.0) == UNIQUE
+            assert np.isinf(since).all()
 
 
 def test_a_contact_given_twice_is_stopped_like_one():
