@@ -47,7 +47,7 @@ from dynsim.kernels.arrays import (
 from dynsim.kernels.articulated import accelerate
 from dynsim.kernels.coupled import System, derivative
 from dynsim.kernels.energy import kinetic_energy, magnetic_energy, potential_energy
-from dynsim.kernels.jit import inlined_kernel, internal_kernel, kernel, merged_kernel, reals
+from dynsim.kernels.jit import internal_kernel, kernel, merged_kernel, reals
 from dynsim.kernels.kinematics import point_position
 from dynsim.kernels.rows import solve_small
 from dynsim.kernels.uniqueness import REVERSED, ROOM, UNIQUE, clearly_unique, force_verdict
@@ -552,11 +552,9 @@ def watch(ws: Workspace, run: Run, h):
         extremes[k, DRIFT_MAX] = max(extremes[k, DRIFT_MAX], abs(state[k, GAP]))
 
 
-@inlined_kernel
+@internal_kernel
 def forces_unique(system: System, ws: Workspace, run: Run, t):
     """True when the contacts determine their forces at time t, right after ``derivative``; else sets STATUS."""
-    if clearly_unique(system.contacts, ws, run.room):
-        return True
     verdict = force_verdict(system.contacts, ws, run.room, run.extremes[:, LOCAL_SINCE], t)
     if verdict == UNIQUE:
         return True
@@ -643,7 +641,7 @@ def accept(system: System, ws: Workspace, run: Run):
     if off_surface(ws) and not settle(system, t + h, run.y_new, ws, run.stage[6], run):
         run.count[STATUS] = NOT_PROJECTED
         return
-    if not forces_unique(system, ws, run, t + h):
+    if not (clearly_unique(system.contacts, ws) or forces_unique(system, ws, run, t + h)):
         return
     watch(ws, run, h)
     sample_step(system, ws, run)

@@ -41,28 +41,35 @@ FORCE_TOLERANCE = 1e-9
 
 
 @inlined_kernel
-def clearly_unique(contacts: ContactArrays, ws: Workspace, room):
-    """True when a cheap bound shows that the contacts determine their forces, right after ``derivative``.
+def clearly_unique(contacts: ContactArrays, ws: Workspace):
+    """True for no contact, and for one or two of signed friction whose determinant is positive by far.
 
-    Signed friction: the diagonal of J M⁻¹ F is positive, and so is the determinant by far (one or two contacts).
-    Dissipative friction: A(σ) is strictly diagonally dominant for all signs, so that none of them is singular.
+    Small, because it is merged into the step: passing the tables to the rest of the watch costs as much as a sweep.
     """
-    link, point, small, p = contacts.link, contacts.point, ws.small, ws.contacts.shape[0]
-    frictional, free = False, False
+    small, p = ws.small, ws.contacts.shape[0]
+    if p == 0 or p > 2:
+        return p == 0
     for k in range(p):
-        if point[k, MU] > 0.0:
-            frictional = True
-            free = free or link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE
+        if contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE or not small[0, k, k] > 0.0:
+            return False
+    if p == 1:
+        return True
+    straight, crossed = small[0, 0, 0] * small[0, 1, 1], small[0, 0, 1] * small[0, 1, 0]
+    return straight - crossed > CLEAR * (straight + abs(crossed))
+
+
+@internal_kernel
+def dominant(contacts: ContactArrays, ws: Workspace, room):
+    """True without friction, and when every A(σ) is strictly diagonally dominant, so that none of them is singular."""
+    point, small, p = contacts.point, ws.small, ws.contacts.shape[0]
+    frictional = False
+    for k in range(p):
+        frictional = frictional or point[k, MU] > 0.0
     if not frictional:
         return True
     for k in range(p):
         if not small[0, k, k] > 0.0:
             return False
-    if not free and p <= 2:
-        if p == 1:
-            return True
-        straight, crossed = small[0, 0, 0] * small[0, 1, 1], small[0, 0, 1] * small[0, 1, 0]
-        return straight - crossed > CLEAR * (straight + abs(crossed))
     split_matrix(contacts, ws, room)
     for k in range(p):
         rest = 0.0
@@ -75,7 +82,7 @@ def clearly_unique(contacts: ContactArrays, ws: Workspace, room):
     return True
 
 
-@inlined_kernel
+@internal_kernel
 def split_matrix(contacts: ContactArrays, ws: Workspace, room):
     """A0 and B into ``room``, from the eliminated rows and the matrix that the derivative has left in ``ws``.
 
@@ -108,6 +115,8 @@ def force_verdict(contacts: ContactArrays, ws: Workspace, room, since, t):
     room : (ROOM, c, c) scratch
     since : (c,) first time at which the contact's diagonal entry was negative [s], written here; inf: never
     """
+    if dominant(contacts, ws, room):
+        return UNIQUE
     split_matrix(contacts, ws, room)
     drop_immobile(contacts, ws, room)
     rank, p = frictionless_basis(room), ws.contacts.shape[0]
