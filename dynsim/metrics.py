@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim._version import __version__
-from dynsim.kernels.integrate import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, PULLING
+from dynsim.kernels.integrate import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, LOCAL_SINCE, PULLING
 from dynsim.model.clearance import Sinking, sinking
 from dynsim.model.description import Contact, Robot
 from dynsim.record import Record
@@ -39,6 +39,25 @@ LIMIT_SLACK = 1e-6
 
 
 @dataclass(frozen=True)
+class MotionSpread:
+    """What dependent frictional rows leave open: the range of one joint's acceleration over all admissible splits.
+
+    Attributes
+    ----------
+    joint : name; unit : of its acceleration
+    time : [s]
+    low, high : least and greatest acceleration; taken : that of the run, from the split of least norm
+    """
+
+    joint: str
+    unit: str
+    time: float
+    low: float
+    high: float
+    taken: float
+
+
+@dataclass(frozen=True)
 class Counts:
     """What the integrator counted.
 
@@ -49,7 +68,9 @@ class Counts:
     evaluations : right-hand sides, those for samples and projections included
     projections : corrections onto the contact surfaces
     deficient : right-hand sides whose constraint forces were not unique
-    extremes : (c, 5) over all steps, see dynsim.kernels.integrate: FORCE_MIN, FORCE_MAX, DRIFT_MAX, PULLING, LAST_FORCE
+    extremes : (c, 6) over all steps, see dynsim.kernels.integrate: FORCE_MIN, FORCE_MAX, DRIFT_MAX, PULLING,
+        LAST_FORCE, LOCAL_SINCE
+    spread : motion that dependent rows leave open; None: none
     """
 
     wall: float
@@ -59,6 +80,7 @@ class Counts:
     projections: int
     deficient: int
     extremes: NDArray[np.float64]
+    spread: MotionSpread | None = None
 
 
 def energy_residual(record: Record) -> NDArray[np.float64]:
@@ -192,6 +214,13 @@ def _warnings(
                 f"{100 * contact['pulling_fraction']:.1f} % of the run, with up to "
                 f"{-contact['normal_force_min_N']:.3g} N; a real arm would lift off"
             )
+    for contact, since in zip(contacts, counts.extremes[:, LOCAL_SINCE], strict=True):
+        if np.isfinite(since):
+            found.append(
+                f"{contact.name}: from t = {since:.4g} s on, its friction turns its own force against it (negative "
+                "diagonal of J M⁻¹F, Painlevé's paradox at one contact): only the other braces hold it there, and "
+                "whether real ones do depends on their stiffness; lower contacts.friction or take another posture"
+            )
     if summary["friction_heat_J"] < 0.0:
         found.append(
             f"friction has put {-summary['friction_heat_J']:.3g} J into the arm: f_t = μ f_n reverses with a pulling "
@@ -215,6 +244,13 @@ def _warnings(
     if counts.deficient:
         found.append(
             f"contact rows depended on each other in {counts.deficient} evaluations: forces are the split of least norm"
+        )
+    if counts.spread is not None:
+        s = counts.spread
+        found.append(
+            f"with friction, dependent contact rows leave the motion open too: at t = {s.time:.4g} s the acceleration "
+            f"of {s.joint} is anything from {s.low:.4g} to {s.high:.4g} {s.unit} over the splits of the normal forces "
+            f"that keep their signs (this run: {s.taken:.4g}); take away braces until the rest are independent"
         )
     return found
 

@@ -63,7 +63,7 @@ class Contacts(StrictConfig):
     friction: NonNegative = 0.1
     slip_smoothing_m_s: Positive = Field(default=1e-3, description="v_s of the slip direction v_t/√(v_t² + v_s²)")
     pulling_friction: Literal["signed", "dissipative"] = Field(
-        default="signed", description="f_t = μ f_n as printed in the paper, or μ |f_n|"
+        default="dissipative", description="f_t = μ f_n as printed in the paper, or μ |f_n|"
     )
     reference_tolerance_m: Positive = Field(
         default=2e-3, description="references that take a contact point further off its surface than this are refused"

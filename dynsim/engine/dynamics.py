@@ -14,6 +14,7 @@ from dynsim import metrics
 from dynsim.engine import REFERENCES, SIMULATION, Progress, Start
 from dynsim.engine.outcome import check_size, kernels_logged, raise_stopped
 from dynsim.engine.provenance import provenance
+from dynsim.engine.uniqueness import motion_spread, paradox
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.kernels import arrays as ka
 from dynsim.kernels import integrate as ki
@@ -129,13 +130,23 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
     record = _record(scenario, prepared, wall)
     status, reached = int(run.count[ki.STATUS]), float(run.clock[ki.TIME])
     if interrupted or status != ki.FINISHED:
-        state = _last_state(prepared)
         if interrupted:
             stop: SimulationStopped = SimulationInterrupted(
-                f"interrupted at t = {reached:.3f} s of {scenario.duration_s:g} s", time=reached, state=state
+                f"interrupted at t = {reached:.3f} s of {scenario.duration_s:g} s",
+                time=reached,
+                state=_last_state(prepared, run.y),
+            )
+        elif found := paradox(prepared.system, prepared.workspace, run, prepared.contacts):
+            reached, y, words = found
+            if scenario.integrator.method == "rk4":
+                words += "; a shorter integrator.step_s or an adaptive method (rk43) tells whether the step is to blame"
+            stop = SimulationStopped(
+                f"stopped at t = {reached:.6g} s: {words}", time=reached, state=_last_state(prepared, y)
             )
         else:
-            stop = SimulationStopped(_reason(status, scenario, prepared), time=reached, state=state)
+            stop = SimulationStopped(
+                _reason(status, scenario, prepared), time=reached, state=_last_state(prepared, run.y)
+            )
         raise_stopped(stop, record)
     return record
 
@@ -289,14 +300,19 @@ def _record(scenario: Scenario, prepared: Prepared, wall: float) -> Record:
     integrals = ledger[:, LEDGER_SIZE:].reshape(rows, c, CONTACT_SIZE)
     record.add("contact_impulse", integrals[:, :, 0], "N s", labels=names, description="∫ f_n dt")
     record.add("contact_slip_distance", integrals[:, :, 1], "m", labels=names, description="∫ |v_t| dt")
+    deficient, spread = int(prepared.workspace.deficient[0]), None
+    if deficient and rows and any(contact.friction > 0.0 for contact in contacts):
+        joint_units = [(link.joint, link.units[2]) for link in robot.links]
+        spread = motion_spread(prepared.system, run.sample_time[:rows], y, joint_units)
     counts = metrics.Counts(
         wall=wall,
         steps=int(run.count[ki.STEPS]),
         rejected=int(run.count[ki.REJECTED]),
         evaluations=int(run.count[ki.EVALUATIONS]),
         projections=int(run.count[ki.PROJECTIONS]),
-        deficient=int(prepared.workspace.deficient[0]),
+        deficient=deficient,
         extremes=run.extremes,
+        spread=spread,
     )
     record.summary = metrics.summarise(record, scenario, contacts, robot, counts)
     return record
@@ -308,8 +324,8 @@ def _joint_units(links: Iterable[Link]) -> Sequence[str]:
     return [" or ".join(kinds) for kinds in zip(*units, strict=True)]
 
 
-def _last_state(prepared: Prepared) -> dict[str, Sequence[float]]:
-    n, na, y = prepared.model.n, len(prepared.model.robot.motors), prepared.run.y
+def _last_state(prepared: Prepared, y: np.ndarray) -> dict[str, Sequence[float]]:
+    n, na = prepared.model.n, len(prepared.model.robot.motors)
     return {"q": y[:n].tolist(), "v": y[n : 2 * n].tolist(), "current": y[2 * n : 2 * n + na].tolist()}
 
 

@@ -36,6 +36,10 @@ from dynsim.kernels.jit import inlined_kernel, kernel
 
 # Tries, beyond two per contact, to find signs of dissipative contacts that agree with their forces.
 SIGN_PASSES = 64
+# With more contacts than this not every choice of signs is tried.
+SIGNS_LIMIT = 8
+# A normal force below this fraction of the largest one is rounding.
+NO_FORCE = 1e-12
 
 
 @kernel
@@ -138,25 +142,35 @@ def force_direction(contacts: ContactArrays, ws: Workspace, k):
 def sign_changed(contacts: ContactArrays, ws: Workspace, passes):
     """True when dissipative contacts' solved forces contradict their assumed signs; turns those directions around.
 
-    All at once in the first passes, then only the first of them (least-index pivoting, which cannot cycle while a
-    unique consistent choice exists). Without a consistent choice (Painlevé) the forces become NaN, the count in
-    ``ws.deficient[1]`` goes up and the search ends; forces that vanish to rounding may keep either sign.
+    All at once in the first passes, then only the first of them (least-index pivoting, which cannot cycle while all
+    choices have determinants of one sign), at last every choice in turn. Without a consistent choice (Painlevé) the
+    forces become NaN, the count in ``ws.deficient[1]`` goes up and the search ends. Forces that vanish to rounding
+    have no sign and take +. So the result does not depend on the signs that the search began with, unless several
+    choices are consistent (dynsim.kernels.uniqueness watches for that).
     """
     state = ws.contacts
     p = state.shape[0]
-    changed, largest, worst = False, 0.0, 0.0
+    limit = 2 * p + SIGN_PASSES
+    changed, largest = False, 0.0
     for k in range(p):
         largest = max(largest, abs(state[k, FORCE]))
-        if contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE and state[k, FORCE] * state[k, SIGN] < 0.0:
-            worst = max(worst, abs(state[k, FORCE]))
-            if not (changed and passes > p):
-                state[k, SIGN] = -state[k, SIGN]
-                force_direction(contacts, ws, k)
+    for k in range(p):
+        if contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE:
+            agreement = state[k, FORCE] * state[k, SIGN]
+            if agreement < -NO_FORCE * largest or (agreement <= NO_FORCE * largest and state[k, SIGN] < 0.0):
+                if passes < limit and not (changed and passes > p):
+                    state[k, SIGN] = -state[k, SIGN]
+                    force_direction(contacts, ws, k)
                 changed = True
-    if changed and passes > 2 * p + SIGN_PASSES:
-        if worst > 1e-10 * largest:
+    if changed and passes >= limit:
+        choice = passes - limit
+        if p > SIGNS_LIMIT or choice >= 1 << p:
             ws.deficient[1] += 1
             for k in range(p):
                 state[k, FORCE] = math.nan
-        return False
+            return False
+        for k in range(p):
+            if contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE:
+                state[k, SIGN] = -1.0 if (choice >> k) & 1 == 1 else 1.0
+                force_direction(contacts, ws, k)
     return changed

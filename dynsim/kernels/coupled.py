@@ -92,6 +92,8 @@ def derivative(system: System, t, y, ws: Workspace, dy):
     for i in range(n):
         joints[i, Q] = y[i]
         joints[i, QD] = y[n + i]
+        # The sweep multiplies it by zero, which would keep a NaN of a state without solution for ever.
+        joints[i, QDD] = 0.0
         joints[i, APPLIED] = -(model.body[i, DAMPING] + model.body[i, GEAR_DAMPING]) * joints[i, QD]
     for a in range(na):
         motors[a, CURRENT] = y[2 * n + a]

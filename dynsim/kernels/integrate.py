@@ -50,6 +50,7 @@ from dynsim.kernels.energy import CONTACT_SIZE, LEDGER_SIZE, kinetic_energy, mag
 from dynsim.kernels.jit import internal_kernel, kernel, merged_kernel, reals
 from dynsim.kernels.kinematics import point_position
 from dynsim.kernels.rows import solve_small
+from dynsim.kernels.uniqueness import REVERSED, ROOM, UNIQUE, clearly_unique, force_verdict
 
 DOPRI5, RK4, RODAS4, RK43 = 0, 1, 2, 3
 METHODS = {"rk43": RK43, "dopri5": DOPRI5, "rk4": RK4, "rodas4": RODAS4}
@@ -60,17 +61,20 @@ RATE_TOLERANCE = 1e-8
 PROJECTION_LIMIT = 6
 
 RUNNING, FINISHED, NOT_FINITE, STEP_TOO_SMALL, NOT_PROJECTED, NO_FORCES = 0, 1, 2, 3, 4, 5
+FORCES_REVERSED, SEVERAL_FORCES = 6, 7
 
 # Run.clock
 TIME, STEP, LAST_ERROR, END, RTOL, ATOL, STEP_MAX = 0, 1, 2, 3, 4, 5, 6
-CLOCK_SIZE = 7
+NOT_UNIQUE = 7  # end of the step at which the contact forces were not unique, which was not accepted [s]
+CLOCK_SIZE = 8
 # Run.count, int
 STEPS, REJECTED, EVALUATIONS, PROJECTIONS, SAMPLE, STATUS, STARTED = 0, 1, 2, 3, 4, 5, 6
 COUNT_SIZE = 7
 # Run.extremes, per contact
 FORCE_MIN, FORCE_MAX, DRIFT_MAX = 0, 1, 2
 PULLING, LAST_FORCE = 3, 4  # time with a negative normal force [s]; normal force at the last accepted step [N]
-EXTREMES_SIZE = 5
+LOCAL_SINCE = 5  # first time at which the contact's entry on the diagonal of J M⁻¹ F was negative [s], else inf
+EXTREMES_SIZE = 6
 
 
 class Run(NamedTuple):
@@ -88,6 +92,7 @@ class Run(NamedTuple):
     clock: np.ndarray  # (CLOCK_SIZE,)
     count: np.ndarray  # (COUNT_SIZE,) int
     extremes: np.ndarray  # (c, EXTREMES_SIZE)
+    room: np.ndarray  # (ROOM, c, c) scratch, see dynsim.kernels.uniqueness
     hand_link: int
     hand_point: np.ndarray  # (3,) in the body's frame
     sample_time: np.ndarray  # (T,)
@@ -115,7 +120,7 @@ def new_run(
     clock = np.zeros(CLOCK_SIZE)
     clock[[STEP, LAST_ERROR, END, RTOL, ATOL, STEP_MAX]] = step, 1e-4, end, rtol, atol, step_max
     extremes = np.zeros((c, EXTREMES_SIZE))
-    extremes[:, FORCE_MIN], extremes[:, FORCE_MAX] = np.inf, -np.inf
+    extremes[:, FORCE_MIN], extremes[:, FORCE_MAX], extremes[:, LOCAL_SINCE] = np.inf, -np.inf, np.inf
     return Run(
         method=method,
         y=reals(y),
@@ -129,6 +134,7 @@ def new_run(
         clock=clock,
         count=np.zeros(COUNT_SIZE, dtype=np.int64),
         extremes=extremes,
+        room=np.zeros((ROOM, c, c)),
         hand_link=hand[0],
         hand_point=reals(hand[1]),
         sample_time=reals(sample_time),
@@ -317,6 +323,10 @@ def step_explicit(system: System, ws: Workspace, run: Run):
     for s in range(1, last + 1):
         combine(y, h, A[s], s, k, y_new)
         derivative(system, t + node[s] * h, y_new, ws, k[s if s < last else 6])
+        # A fixed step may jump over what an error estimate would not let pass, so its stages are watched too.
+        stage = k[s if s < last else 6]
+        if run.method == RK4 and finite(stage) and not forces_unique(system, ws, run, t + node[s] * h):
+            return 0.0
     run.count[EVALUATIONS] += last
     if run.method == RK4:
         return 0.0
@@ -565,6 +575,17 @@ def watch(ws: Workspace, run: Run, h):
         extremes[k, DRIFT_MAX] = max(extremes[k, DRIFT_MAX], abs(state[k, GAP]))
 
 
+@internal_kernel
+def forces_unique(system: System, ws: Workspace, run: Run, t):
+    """True when the contacts determine their forces at time t, right after ``derivative``; else sets STATUS."""
+    verdict = force_verdict(system.contacts, ws, run.room, run.extremes[:, LOCAL_SINCE], t)
+    if verdict == UNIQUE:
+        return True
+    run.count[STATUS] = FORCES_REVERSED if verdict == REVERSED else SEVERAL_FORCES
+    run.clock[NOT_UNIQUE] = t
+    return False
+
+
 @kernel
 def finite(values):
     """True when no element is NaN or infinite."""
@@ -594,7 +615,7 @@ def start(system: System, ws: Workspace, run: Run):
         run.count[STATUS] = NOT_PROJECTED
     elif not finite(run.stage[0]):
         run.count[STATUS] = NO_FORCES if ws.deficient[1] > 0 else NOT_FINITE
-    else:
+    elif forces_unique(system, ws, run, run.clock[TIME]):
         watch(ws, run, 0.0)
         if run.clock[STEP] <= 0.0:
             first_step(run, run.y.shape[0] - ledger_length(ws))
@@ -619,6 +640,8 @@ def choose_step(run: Run):
 def rejected(ws: Workspace, run: Run, error, order):
     """True when a step of this error norm must be repeated: shrinks STEP, or sets STATUS when that is hopeless."""
     clock, count, h = run.clock, run.count, run.clock[STEP]
+    if count[STATUS] != RUNNING:
+        return True
     broken = NO_FORCES if ws.deficient[1] > 0 else NOT_FINITE
     if not (finite(run.y_new) and finite(run.stage[6])) or error != error:
         if run.method == RK4:
@@ -636,10 +659,12 @@ def rejected(ws: Workspace, run: Run, error, order):
 
 @merged_kernel
 def accept(system: System, ws: Workspace, run: Run):
-    """Project y_new, record, and make it the new y. Sets STATUS when the contacts cannot be met."""
+    """Project y_new, record, and make it the new y. Sets STATUS when contacts cannot be met or forces not be known."""
     t, h = run.clock[TIME], run.clock[STEP]
     if off_surface(ws) and not settle(system, t + h, run.y_new, ws, run.stage[6], run):
         run.count[STATUS] = NOT_PROJECTED
+        return
+    if not (clearly_unique(system.contacts, ws) or forces_unique(system, ws, run, t + h)):
         return
     watch(ws, run, h)
     sample_step(system, ws, run)

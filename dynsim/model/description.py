@@ -233,7 +233,7 @@ class Contact:
     surface_name: str = "floor"
     friction: float = 0.0
     slip_smoothing: float = 1e-3
-    pulling_friction: str = "signed"
+    pulling_friction: str = "dissipative"
 
 
 @dataclass(frozen=True)

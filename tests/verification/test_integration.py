@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from random_robots import Bench, bench
@@ -38,7 +40,9 @@ def arm(inductance: float = 1.7e-3, *, braced: bool = False, v_s: float = 0.05) 
     if braced:
         height = length * (np.cos(angles[1]) + np.cos(angles[1] + angles[2]))
         floor = Quadric(np.zeros((3, 3)), Z, -height)
-        contacts = [Contact("elbow", "b2", np.array([0.0, 0.0, length]), floor, friction=0.1, slip_smoothing=v_s)]
+        # Signed friction is smooth; μ |f_n| has a kink where the floor begins to pull, and no order there.
+        elbow = Contact("elbow", "b2", np.array([0.0, 0.0, length]), floor, friction=0.1, slip_smoothing=v_s)
+        contacts = [replace(elbow, pulling_friction="signed")]
     b = bench(robot, contacts, held=angles + np.array([0.3, 0.1, -0.2, 0.2, 0.3]), k_p=40.0, k_d=1.0)
     return b, b.state(angles, np.zeros(5))
 
