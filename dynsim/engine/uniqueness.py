@@ -131,7 +131,7 @@ def contact_matrices(system: System, ws: ka.Workspace, t: float, y: Array) -> Co
     """Evaluate the right-hand side at (t, y) and take A0, B and the forces out of the workspace."""
     derivative(system, t, y, ws, np.zeros_like(y))
     contacts, state = system.contacts, ws.contacts
-    rows, directions, inverse = ws.column[:, 1::2], ws.column[:, 2::2], ws.links[:, ka.D, None]
+    rows, directions, inverse = ws.column[:, 1::2], ws.column[:, 2::2], ws.links[:, ka.INVERSE_D, None]
     frictionless = rows.T @ (inverse * rows)
     moving = np.diag(frictionless) > IMMOBILE * (inverse * directions**2).sum(axis=0)
     frictionless = frictionless * np.outer(moving, moving)

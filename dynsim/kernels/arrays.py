@@ -65,8 +65,8 @@ S = 12  # 6: joint axis as a motion vector at the world origin
 V = 18  # 6: spatial velocity
 A = 24  # 6: spatial acceleration minus gravity
 F = 30  # 6: wrench through the joint; scratch of the solves
-U = 36  # 6: IA S / D
-D = 42  # 1 / (S.IA S + J_m)
+U_OVER_D = 36  # 6: IA S / D, D = S.IA S + J_m
+INVERSE_D = 42  # 1 / D
 IA = 43  # 21: articulated inertia handed down by branches: angular block 6, coupling 9 row-major, linear block 6
 LINK_SIZE = 64
 # Workspace.joints

@@ -14,18 +14,18 @@ from dynsim.kernels.arrays import (
     DIRECTION,
     FORCE,
     IA,
+    INVERSE_D,
     LINK,
     PARENT,
     QDD,
     RHS,
     ROW,
     TARGET,
+    U_OVER_D,
     ContactArrays,
-    D,
     F,
     ModelArrays,
     S,
-    U,
     Workspace,
 )
 from dynsim.kernels.jit import inlined_kernel, kernel
@@ -86,9 +86,9 @@ def factor(model: ModelArrays, ws: Workspace):
         d = 1.0 / (((sx * u0 + sy * u1) + (sz * u2 + lx * u3)) + ((ly * u4 + lz * u5) + body[i, ARMATURE]))
         w = joints[i, APPLIED] - (((sx * f0 + sy * f1) + (sz * f2 + lx * f3)) + (ly * f4 + lz * f5))
         d0, d1, d2, d3, d4, d5 = d * u0, d * u1, d * u2, d * u3, d * u4, d * u5
-        links[i, U], links[i, U + 1], links[i, U + 2] = d0, d1, d2
-        links[i, U + 3], links[i, U + 4], links[i, U + 5] = d3, d4, d5
-        links[i, D] = d
+        links[i, U_OVER_D], links[i, U_OVER_D + 1], links[i, U_OVER_D + 2] = d0, d1, d2
+        links[i, U_OVER_D + 3], links[i, U_OVER_D + 4], links[i, U_OVER_D + 5] = d3, d4, d5
+        links[i, INVERSE_D] = d
         column[i, 0] = w
         f0, f1, f2, f3, f4, f5 = f0 + d0 * w, f1 + d1 * w, f2 + d2 * w, f3 + d3 * w, f4 + d4 * w, f5 + d5 * w
         a0, a1, a2, a3, a4, a5 = a0 - d0 * u0, a1 - d0 * u1, a2 - d0 * u2, a3 - d1 * u1, a4 - d1 * u2, a5 - d2 * u2
@@ -142,15 +142,15 @@ def contact_system(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
             w = ((s0 * w0 + s1 * w1) + (s2 * w2 + s3 * w3)) + (s4 * w4 + s5 * w5)
             column[i, 1 + 2 * k] = r
             column[i, 2 + 2 * k] = w
-            d = links[i, D]
+            d = links[i, INVERSE_D]
             scaled = d * r
             own += scaled * w
             total -= scaled * column[i, 0]
             for m in range(k):
                 small[0, k, m] += scaled * column[i, 2 + 2 * m]
                 small[0, m, k] += d * w * column[i, 1 + 2 * m]
-            s0, s1, s2 = links[i, U], links[i, U + 1], links[i, U + 2]
-            s3, s4, s5 = links[i, U + 3], links[i, U + 4], links[i, U + 5]
+            s0, s1, s2 = links[i, U_OVER_D], links[i, U_OVER_D + 1], links[i, U_OVER_D + 2]
+            s3, s4, s5 = links[i, U_OVER_D + 3], links[i, U_OVER_D + 4], links[i, U_OVER_D + 5]
             r0, r1, r2, r3, r4, r5 = r0 - s0 * r, r1 - s1 * r, r2 - s2 * r, r3 - s3 * r, r4 - s4 * r, r5 - s5 * r
             w0, w1, w2, w3, w4, w5 = w0 - s0 * w, w1 - s1 * w, w2 - s2 * w, w3 - s3 * w, w4 - s4 * w, w5 - s5 * w
             i = tree[i, PARENT]
@@ -188,9 +188,9 @@ def accelerate(model: ModelArrays, ws: Workspace):
                 a3, a4, a5 = links[j, F + 3], links[j, F + 4], links[j, F + 5]
             else:
                 a0, a1, a2, a3, a4, a5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        u0, u1, u2 = links[i, U], links[i, U + 1], links[i, U + 2]
-        u3, u4, u5 = links[i, U + 3], links[i, U + 4], links[i, U + 5]
-        x = column[i, 0] * links[i, D] - (((u0 * a0 + u1 * a1) + (u2 * a2 + u3 * a3)) + (u4 * a4 + u5 * a5))
+        u0, u1, u2 = links[i, U_OVER_D], links[i, U_OVER_D + 1], links[i, U_OVER_D + 2]
+        u3, u4, u5 = links[i, U_OVER_D + 3], links[i, U_OVER_D + 4], links[i, U_OVER_D + 5]
+        x = column[i, 0] * links[i, INVERSE_D] - (((u0 * a0 + u1 * a1) + (u2 * a2 + u3 * a3)) + (u4 * a4 + u5 * a5))
         joints[i, QDD] = x
         a0, a1, a2 = a0 + links[i, S] * x, a1 + links[i, S + 1] * x, a2 + links[i, S + 2] * x
         a3, a4, a5 = a3 + links[i, S + 3] * x, a4 + links[i, S + 4] * x, a5 + links[i, S + 5] * x

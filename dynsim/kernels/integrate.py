@@ -30,6 +30,7 @@ from dynsim.kernels.arrays import (
     GAP,
     GAP_RATE,
     INDUCTANCE,
+    INVERSE_D,
     J_M,
     K_D,
     K_M,
@@ -41,7 +42,6 @@ from dynsim.kernels.arrays import (
     SLIP_VELOCITY,
     U_MAX,
     VOLTAGE,
-    D,
     Workspace,
 )
 from dynsim.kernels.articulated import accelerate
@@ -209,7 +209,7 @@ def project(system: System, ws: Workspace, y):
             for m in range(p):
                 small[0, k, m] = 0.0
                 for i in range(n):
-                    small[0, k, m] += column[i, 1 + 2 * k] * column[i, 1 + 2 * m] * ws.links[i, D]
+                    small[0, k, m] += column[i, 1 + 2 * k] * column[i, 1 + 2 * m] * ws.links[i, INVERSE_D]
         solve_small(small, state)
         for i in range(n):
             column[i, 0] = 0.0

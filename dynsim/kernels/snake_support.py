@@ -46,7 +46,7 @@ class Support(NamedTuple):
 
 
 def new_support(model: SnakeModel) -> Support:
-    """Empty workspace of :func:`support_polygon` and :func:`cost_and_gradient`."""
+    """Empty workspace of :func:`support_polygon`, :func:`cost_value` and :func:`cost_gradient`."""
     contacts, joints = 2 * (model.base_joints + 1), model.head_joints + model.base_joints
     return Support(
         np.zeros((contacts, 2)),

@@ -14,12 +14,12 @@ from dynsim.kernels.arrays import (
     FORCE,
     FRICTION_DISSIPATIVE,
     FRICTION_LAW,
+    INVERSE_D,
     LINK,
     MU,
     RHS,
     SIGN,
     ContactArrays,
-    D,
     Workspace,
 )
 from dynsim.kernels.contact import SIGNS_LIMIT
@@ -94,7 +94,7 @@ def split_matrix(contacts: ContactArrays, ws: Workspace, room):
         for m in range(k + 1):
             total = 0.0
             for i in range(min(link[k, LINK], link[m, LINK]) + 1):
-                total += column[i, 1 + 2 * k] * column[i, 1 + 2 * m] * links[i, D]
+                total += column[i, 1 + 2 * k] * column[i, 1 + 2 * m] * links[i, INVERSE_D]
             room[FRICTIONLESS, k, m] = total
             room[FRICTIONLESS, m, k] = total
     for k in range(p):
@@ -158,7 +158,7 @@ def drop_immobile(contacts: ContactArrays, ws: Workspace, room):
     for k in range(p):
         along = 0.0
         for i in range(contacts.link[k, LINK] + 1):
-            along += ws.column[i, 2 + 2 * k] * ws.column[i, 2 + 2 * k] * ws.links[i, D]
+            along += ws.column[i, 2 + 2 * k] * ws.column[i, 2 + 2 * k] * ws.links[i, INVERSE_D]
         if room[FRICTIONLESS, k, k] <= IMMOBILE * along:
             for m in range(p):
                 room[FRICTIONLESS, k, m], room[FRICTIONLESS, m, k], room[FRICTION, k, m] = 0.0, 0.0, 0.0
