@@ -8,6 +8,7 @@ import json
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -65,7 +66,7 @@ FiguresOption = Annotated[bool, typer.Option("--no-figures", help="Do not draw f
 
 def main() -> None:
     """Entry point: errors become one line and an exit code. Ctrl-C where nothing can be saved is typer's: 130."""
-    with _stop_signals() as received, lenient_streams() as output:
+    with _stop_signals() as received, lenient_streams() as output, _plain_warnings():
         code = _exit_code()
         if output is not None:
             output.flush()
@@ -146,6 +147,24 @@ def _stop_signals() -> Iterator[list[int]]:
     finally:
         for number in heeded:
             signal.signal(number, signal.SIG_DFL)
+
+
+@contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Warnings about what the user gave, or keeps on disk, are a line on stderr without the place in dynsim's code."""
+    shown = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *place: Any, **options: Any) -> None:
+        if issubclass(category, UserWarning):
+            errors.print(f"[yellow]warning:[/] {_escape(str(message))}")
+        else:
+            shown(message, category, *place, **options)
+
+    warnings.showwarning = show
+    try:
+        yield
+    finally:
+        warnings.showwarning = shown
 
 
 def _print_version(wanted: bool) -> None:

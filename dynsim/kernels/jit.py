@@ -10,11 +10,11 @@ Two habits of numba are mended here, because results must not depend on what a p
 from __future__ import annotations
 
 import hashlib
-import logging
 import os
 import pickle
 import stat
 import tempfile
+import warnings
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -29,8 +29,6 @@ from numba.core import config, serialize
 from numba.core.caching import _Cache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompileResult
-
-_log = logging.getLogger(__name__)
 
 # Packs the scalar formulas of 3-vectors and wrenches into vector instructions (numba leaves it off): a right-hand side
 # takes 8 % less time. Global, and read when numba compiles its first function in the process.
@@ -88,11 +86,11 @@ class _KernelCache(_Cache):
         except FileNotFoundError:
             return None
         except OSError as error:
-            _log.warning("%s: cannot be read (%s); compiling it anew", path, error.strerror)
+            _warn(f"{path}: cannot be read ({error.strerror}); compiling it anew")
             return None
         digest, payload = content[:_DIGEST_SIZE], content[_DIGEST_SIZE:]
         if hashlib.sha256(payload).digest() != digest:
-            _log.warning("%s: damaged machine code; compiling it anew", path)
+            _warn(f"{path}: damaged machine code; compiling it anew")
             return None
         return CompileResult._rebuild(target_context, *pickle.loads(payload))
 
@@ -114,7 +112,7 @@ class _KernelCache(_Cache):
                     os.unlink(file.name)
                     raise
         except OSError as error:
-            _log.warning("%s: cannot be kept (%s); the next run compiles it again", path, error.strerror)
+            _warn(f"{path}: cannot be kept ({error.strerror}); the next run compiles it again")
 
     def _path(self, sig: Any, codegen: Any) -> Path:
         """Named by what may differ for the same sources: processor, signature, and a function of another package."""
@@ -133,6 +131,10 @@ class _KernelCache(_Cache):
 
 _SUFFIX = ".kernel"
 _DIGEST_SIZE = hashlib.sha256().digest_size
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, UserWarning, stacklevel=3)
 
 
 @lru_cache(maxsize=1)
@@ -158,7 +160,7 @@ def cache_folder() -> Path:
             continue
         writable_by_others = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
         if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or writable_by_others:
-            _log.warning("%s: not used for compiled kernels, because others own it or can write to it", folder)
+            _warn(f"{folder}: not used for compiled kernels, because others own it or can write to it")
         elif os.access(folder, os.W_OK | os.X_OK):
             return folder
     return Path(tempfile.mkdtemp(prefix="dynsim-"))

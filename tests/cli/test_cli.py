@@ -13,6 +13,7 @@ import pytest
 from dynsim._version import __version__
 from dynsim.cli import main
 from dynsim.engine import check
+from dynsim.kernels.jit import cache_folder
 from dynsim.record import FORMAT, Record
 from dynsim.scenario import SHIPPED, build_model, load_scenario
 
@@ -360,3 +361,18 @@ def test_a_terminal_that_knows_ascii_only(tmp_path: Path):
         result = dynsim(*arguments, folder=tmp_path, env={**os.environ, "PYTHONIOENCODING": "ascii"})
         assert result.returncode == (2 if "−.yaml" in arguments else 0), result.stderr
         assert "Traceback" not in result.stderr
+
+
+def test_a_damaged_kernel_cache_is_a_warning_in_one_line(tmp_path: Path):
+    build_model(load_scenario("single_pendulum")).bias_forces([0.0], [0.0])
+    files = sorted(cache_folder().glob("dynsim.kernels.newton_euler.newton_euler-*"))
+    cache = tmp_path / "dynsim" / cache_folder().name
+    cache.mkdir(parents=True, mode=0o700)
+    assert files
+    for file in files:
+        (cache / file.name).write_bytes(file.read_bytes()[:-1])
+    done = dynsim("check", "single_pendulum", folder=tmp_path, env={**os.environ, "XDG_CACHE_HOME": str(tmp_path)})
+    assert done.returncode == 0
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("warning: ")
+    assert line.endswith(": damaged machine code; compiling it anew")
