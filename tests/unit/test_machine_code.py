@@ -140,7 +140,7 @@ def test_folders_of_others_are_not_used(tmp_path: Path, monkeypatch) -> None:
     folder.unlink()
     mine()
     monkeypatch.setattr(os, "getuid", lambda: folder.stat().st_uid + 1)
-    with pytest.warns(UserWarning, match=f"{folder}: not used"):
+    with pytest.warns(UserWarning, match="not used"):
         assert not mine().is_relative_to(tmp_path / "first")
 
 
