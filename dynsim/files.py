@@ -52,6 +52,8 @@ def check_writable(folder: Path) -> None:
         existing = folder.absolute()
         while not existing.exists():
             existing = existing.parent
+    except FileNotFoundError as error:  # only absolute() raises that
+        raise RecordError("the working directory is no longer there; change to another folder") from error
     except (OSError, ValueError) as error:
         raise RecordError(f"cannot write to {folder}: {_reason(error)}") from error
     if not existing.is_dir():

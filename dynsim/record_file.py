@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from dynsim.errors import RecordError
 from dynsim.files import check_complete
+from dynsim.inputs import is_file
 
 FORMAT = "dynsim-record-1"
 SIZE_LIMIT = 2 << 30
@@ -178,10 +179,8 @@ def read(path: Path) -> Content:
         No such file; damaged, or no record; or it may be of another run than the files beside it.
     """
     try:
-        if not path.exists():
+        if not is_file(path, RecordError):
             raise RecordError(f"{path}: no such record")
-        if not path.is_file():
-            raise RecordError(f"{path}: not a file; a record is an HDF5 file")
         check_complete(path)
         with path.open("rb") as stream:
             verified = _verified(path, stream)

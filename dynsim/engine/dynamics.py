@@ -23,7 +23,7 @@ from dynsim.kernels.energy import CONTACT_SIZE, LEDGER_SIZE
 from dynsim.model.arrays import compile_contacts, compile_drives
 from dynsim.model.clearance import poses
 from dynsim.model.control import JointControl
-from dynsim.model.description import Contact, Link, Robot
+from dynsim.model.description import Array, Contact, Link, Robot
 from dynsim.model.model import Model
 from dynsim.record import Record
 from dynsim.scenario import Scenario, build_model
@@ -215,9 +215,11 @@ def _check_references(scenario: Scenario, robot: Robot, contacts: Sequence[Conta
     """Refuse references that, followed exactly, would take a contact point off the surface that holds it."""
     links = {link.name: link for link in robot.links}
     motor_of = {motor.joint: a for a, motor in enumerate(robot.motors)}
-    held: dict[str, list[Contact]] = {}
+    held: dict[str, list[tuple[Contact, Array]]] = {}
     for contact in contacts:
-        chain, body = [], contact.body
+        index, point = robot.attach(contact.body, contact.point)
+        carrier = body = robot.links[index].name
+        chain = []
         while True:
             chain.append(motor_of.get(links[body].joint, -1))
             parent = links[body].parent
@@ -228,7 +230,7 @@ def _check_references(scenario: Scenario, robot: Robot, contacts: Sequence[Conta
         # moves, the point stays where it starts, which has its own check.
         follows = all(a >= 0 and control.k_p[a] > 0.0 for a in chain)
         if follows and any(control.reference.spline[a] >= 0 for a in chain):
-            held.setdefault(contact.body, []).append(contact)
+            held.setdefault(carrier, []).append((contact, point))
     if not held:
         return
     tolerance = scenario.config.contacts.reference_tolerance_m
@@ -238,8 +240,8 @@ def _check_references(scenario: Scenario, robot: Robot, contacts: Sequence[Conta
     first: dict[str, float] = {}
     for times, q in control.positions(robot.initial, driven):
         for link, R, p in poses(robot, q, held):
-            for contact in held.get(link.name, ()):
-                position = (p + contact.point @ R).T
+            for contact, point in held.get(link.name, ()):
+                position = (p + point @ R).T
                 gap = contact.surface.gaps(position)
                 k = int(np.abs(gap).argmax())
                 if abs(gap[k]) > tolerance:

@@ -192,7 +192,7 @@ class Model:
     def _attached(self, body: str | int, point: ArrayLike) -> tuple[int, Array]:
         """Index of the body that carries a body or frame, and the point in its frame [m]."""
         checked = self._point(point)
-        return (body, checked) if isinstance(body, int) else self.robot.attach(body, checked)
+        return self.robot.attach(body, checked) if isinstance(body, str) else (self.body_index(body), checked)
 
     def _sweep(self, q: ArrayLike, v: ArrayLike | None = None) -> None:
         self._set(q, v)

@@ -47,7 +47,8 @@ class RotorModel:
             rotors = tuple(
                 _rotor(robot.links[j], motor.rotor_inertia) for j, (_, motor) in zip(self.joint, of, strict=True)
             )
-            self.tree = Model(dataclasses.replace(robot, links=robot.links + rotors, motors=()))
+            turns = np.append(robot.initial, np.zeros(len(rotors)))
+            self.tree = Model(dataclasses.replace(robot, links=robot.links + rotors, motors=(), q0=turns))
             self.gears = np.vstack([np.eye(n), ratio[:, None] * np.eye(n)[self.joint]])
             self.armature = np.zeros(n)
         else:

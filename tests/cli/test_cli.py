@@ -81,7 +81,7 @@ def test_compare_prints_the_table_and_writes_the_comparison(tmp_path: Path):
         (["run", "."], "is a folder"),
         (
             ["run", "elbow_comparison", "--set", "plant.initial_deg.1=40"],
-            ".yaml:45 (two_elbows): contacts.points.elbow_4: its point starts",
+            ".yaml:46 (two_elbows): contacts.points.elbow_4: its point starts",
         ),
         (["check", "elbow_comparison", "--set", "controller.hand.path.radius_m=0.6"], "at t = 0.000 s it stays 0.34 m"),
         (
@@ -350,7 +350,7 @@ def test_a_working_directory_that_is_gone(
     monkeypatch.chdir(gone)
     gone.rmdir()
     code, output, _ = in_process(monkeypatch, capfd, "check", "single_pendulum")
-    assert (code, output.split()) == (0, ["single_pendulum:", "ok", "(1", "variant)"])
+    assert (code, output.splitlines()[0]) == (0, "single_pendulum: ok (1 variant)")
     code, _, errors = in_process(monkeypatch, capfd, "run", "single_pendulum")
     assert code == 2
     assert errors == ["error: the working directory is no longer there; change to another folder"]

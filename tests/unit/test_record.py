@@ -43,7 +43,7 @@ def test_wrong_length_and_labels_are_refused(record: Record):
 def test_unknown_signal_lists_what_there_is(record: Record):
     with pytest.raises(KeyError) as error:
         record["qq"]
-    assert str(error.value) == "no signal 'qq' in this record (did you mean 'q'?); it has: q, force"
+    assert str(error.value) == "no signal 'qq' (did you mean 'q'?); this record has: q, force"
     assert isinstance(error.value, RecordError)
 
 

@@ -294,11 +294,11 @@ def test_the_reason_comes_from_the_process_that_reads(tmp_path: Path, change: Ch
 
 def test_what_is_no_file_is_refused(tmp_path: Path):
     for path in (tmp_path, Path("/dev/zero")):
-        with pytest.raises(RecordError, match="not a file"):
+        with pytest.raises(RecordError, match="a regular file is needed"):
             Record.load(path)
     if hasattr(os, "mkfifo"):
         os.mkfifo(tmp_path / "pipe")
-        with pytest.raises(RecordError, match="not a file"):
+        with pytest.raises(RecordError, match="a regular file is needed"):
             Record.load(tmp_path / "pipe")
     for path in (tmp_path / "none.h5", tmp_path / "none" / "none.h5"):
         with pytest.raises(RecordError, match="no such record"):
