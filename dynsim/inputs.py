@@ -68,13 +68,13 @@ def check_file(path: str | os.PathLike[str], error: ErrorClass) -> None:
         raise error(f"{path}: no such file")
 
 
-def read_text(path: Path, error: ErrorClass, limit: int = SIZE_LIMIT) -> str:
-    """The text of a UTF-8 file of at most ``limit`` bytes, without a byte order mark.
+def read_bytes(path: Path, error: ErrorClass, limit: int = SIZE_LIMIT) -> bytes:
+    """The content of a file of at most ``limit`` bytes.
 
     Raises
     ------
     DynsimError
-        Of the class ``error``: no regular file, too large, not readable or not UTF-8.
+        Of the class ``error``: no regular file, too large or not readable.
     """
     check_file(path, error)
     try:
@@ -84,6 +84,18 @@ def read_text(path: Path, error: ErrorClass, limit: int = SIZE_LIMIT) -> str:
         raise error(f"{path}: cannot be read ({reason.strerror})") from reason
     if len(content) > limit:
         raise error(f"{path}: is larger than {limit / 1e6:g} MB, more than is read")
+    return content
+
+
+def read_text(path: Path, error: ErrorClass, limit: int = SIZE_LIMIT) -> str:
+    """The text of a UTF-8 file of at most ``limit`` bytes, without a byte order mark.
+
+    Raises
+    ------
+    DynsimError
+        Of the class ``error``: no regular file, too large, not readable or not UTF-8.
+    """
+    content = read_bytes(path, error, limit)
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as reason:

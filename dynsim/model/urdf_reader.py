@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import difflib
 import math
-import os
 import re
-import stat
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
@@ -20,6 +18,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from dynsim.errors import ModelError
+from dynsim.inputs import read_bytes
 from dynsim.model.description import Array, Inertia
 
 # The largest robots in use have some 100 links and 1 MB of text. Pinocchio walks the tree by recursion: some 5000 links
@@ -158,22 +157,7 @@ class _Reader:
         return UrdfTree(self.path, name, links, joints, top, _plain_text(root, name))
 
     def read(self) -> bytes:
-        try:
-            # Without waiting: to open a pipe that nobody writes to would never end.
-            handle = os.open(self.path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
-            try:
-                if not stat.S_ISREG(os.fstat(handle).st_mode):
-                    raise ModelError(f"{self.path}: cannot be read: it is no regular file; give a URDF file")
-                with os.fdopen(handle, "rb", closefd=False) as stream:
-                    data = stream.read(BYTES_MAX + 1)
-            finally:
-                os.close(handle)
-        except OSError as error:
-            raise ModelError(f"{self.path}: cannot be read: {error.strerror or error}") from error
-        except ValueError as error:
-            raise ModelError(f"{str(self.path)!r}: cannot be read: {error}") from error
-        if len(data) > BYTES_MAX:
-            raise ModelError(f"{self.path}: is larger than {BYTES_MAX // 1_000_000} MB; a URDF file names its meshes")
+        data = read_bytes(self.path, ModelError, BYTES_MAX)
         if not data.strip():
             raise ModelError(f"{self.path}: is empty; a URDF file has <robot> with links and joints")
         return data

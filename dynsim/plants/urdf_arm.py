@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Self
 
@@ -13,7 +12,6 @@ from pydantic import Field, model_validator
 from dynsim.config import BodyPoint, NonNegative, StrictConfig, Vector3, error_at
 from dynsim.errors import ModelError
 from dynsim.families import union
-from dynsim.inputs import check_file
 from dynsim.model.description import Robot
 from dynsim.model.motor_parameters import MotorParameters
 
@@ -86,7 +84,6 @@ def build(config: Config) -> Robot:
     from dynsim.model.urdf import read_urdf
 
     lock = {**{name: float(np.deg2rad(angle)) for name, angle in config.lock_deg.items()}, **config.lock_m}
-    check_file(config.file, partial(ModelError, keys=("plant", "file")))
     robot = read_urdf(Path(config.file), lock)
     initial = {**{name: np.deg2rad(angle) for name, angle in config.initial_deg.items()}, **config.initial_m}
     given = {"revolute": config.damping_N_m_s_per_rad, "prismatic": config.damping_N_s_per_m}

@@ -215,12 +215,12 @@ def test_what_is_no_file_is_refused_and_nothing_waits(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.urdf")
     (tmp_path / "zero.urdf").symlink_to("/dev/zero")
     for name, words in (
-        ("pipe.urdf", "no regular file"),
-        ("zero.urdf", "no regular file"),
-        ("missing.urdf", "No such file"),
+        ("pipe.urdf", "is a pipe; a regular file is needed"),
+        ("zero.urdf", "is a device or socket; a regular file is needed"),
+        ("missing.urdf", "no such file"),
         ("a" * 300, "too long"),
-        (".", "no regular file"),
-        ("a\0b", "cannot be read"),
+        (".", "is a folder; a regular file is needed"),
+        ("a\0b", "cannot be the name of a file"),
     ):
         assert words in refused(tmp_path / name), name
 
