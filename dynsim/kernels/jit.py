@@ -24,6 +24,7 @@ import llvmlite
 import numba
 import numba.extending
 import numpy as np
+from numba import _dynfunc
 from llvmlite.binding import Linkage
 from numba.core import config, serialize
 from numba.core.caching import _Cache
@@ -52,7 +53,9 @@ class _OwnCallees(JITCodeLibrary):
         for function in self._final_module.functions:
             if function.linkage == Linkage.linkonce_odr and not function.is_declaration:
                 function.linkage = Linkage.internal
-        super()._optimize_final_module()
+        # numba runs a cheaper set of passes before, for the sake of reference counting, which kernels do without.
+        passes, builder = self._codegen._module_pass_manager()
+        passes.run(self._final_module, builder)
 
 
 class _Compiler(Compiler):
@@ -62,6 +65,30 @@ class _Compiler(Compiler):
         self.state.library = _OwnCallees(self.state.targetctx.codegen(), func.__qualname__)
         self.state.library.enable_object_caching()
         return super().compile_extra(func)
+
+
+class _ToLink(JITCodeLibrary):
+    """Code that is only linked into other libraries, where it is optimised: it never becomes machine code of its own."""
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+
+class _PartCompiler(Compiler):
+    """numba's compiler, into :class:`_ToLink`."""
+
+    def compile_extra(self, func: Callable[..., Any]) -> Any:
+        self.state.library = _ToLink(self.state.targetctx.codegen(), func.__qualname__)
+        self.state.flags.no_compile = True
+        result = super().compile_extra(func)
+        # Nothing to call: numba only asks for an object of the kind.
+        entry = _dynfunc.make_function(result.fndesc.lookup_module(), func.__name__, "", 0, result.environment, (result.library,))
+        self.state.targetctx.insert_user_function(entry, result.fndesc, [result.library])
+        return result._replace(entry_point=entry)
 
 
 class _KernelCache(_Cache):
@@ -195,7 +222,7 @@ def internal_kernel(function: F) -> F:
 
     Unpacking the tables of a model from Python objects would take longer to compile than most of these functions.
     """
-    return numba.extending.register_jitable(**_OPTIONS, **_NO_ENTRY)(function)
+    return numba.extending.register_jitable(pipeline_class=_PartCompiler, **_OPTIONS, **_NO_ENTRY)(function)
 
 
 def inlined_kernel(function: F) -> F:
@@ -203,7 +230,9 @@ def inlined_kernel(function: F) -> F:
 
     Passing the tables of a model costs about as much as a whole sweep over ten links.
     """
-    return numba.extending.register_jitable(**_OPTIONS, **_NO_ENTRY, forceinline=True)(function)
+    return numba.extending.register_jitable(
+        pipeline_class=_PartCompiler, **_OPTIONS, **_NO_ENTRY, forceinline=True
+    )(function)
 
 
 def _compile(function: F, **options: Any) -> F:
