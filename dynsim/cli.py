@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import typer
 
-from dynsim import completion
+from dynsim import completion, interruption
 from dynsim._version import __version__
 from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
 from dynsim.hardware.cli import export, hw
@@ -66,7 +66,7 @@ FiguresOption = Annotated[bool, typer.Option("--no-figures", help="Do not draw f
 
 def main() -> None:
     """Entry point: errors become one line and an exit code. Ctrl-C where nothing can be saved is typer's: 130."""
-    with _stop_signals() as received, lenient_streams() as output, _plain_warnings():
+    with interruption.heeded() as received, lenient_streams() as output, _plain_warnings():
         code = _exit_code()
         if output is not None:
             output.flush()
@@ -124,29 +124,6 @@ def _explain_lost_output(failure: OSError) -> int:
         return _SIGNAL_EXIT + signal.SIGPIPE if hasattr(signal, "SIGPIPE") else 1
     errors.print(f"[red]error:[/] standard output cannot be written ({failure.strerror})")
     return DynsimError.exit_code
-
-
-@contextmanager
-def _stop_signals() -> Iterator[list[int]]:
-    """SIGTERM and SIGHUP stop as Ctrl-C does, so that what was simulated is saved; gives the signals that came.
-
-    One that is ignored (``nohup``) stays so.
-    """
-    received: list[int] = []
-
-    def stop(number: int, frame: Any) -> None:
-        received.append(number)
-        raise KeyboardInterrupt
-
-    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    heeded = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]
-    for number in heeded:
-        signal.signal(number, stop)
-    try:
-        yield received
-    finally:
-        for number in heeded:
-            signal.signal(number, signal.SIG_DFL)
 
 
 @contextmanager
@@ -226,12 +203,12 @@ def run(
     """Simulate one scenario and write its record, summary and figures."""
     from dynsim.engine import simulate
     from dynsim.files import check_writable
-    from dynsim.results import save_run
+    from dynsim.results import RUN_FILES, save_run
     from dynsim.scenario import load_scenario
 
     loaded = load_scenario(scenario, variant, _overrides(overrides))
     folder = out or Path("results", loaded.name, loaded.variant)
-    check_writable(folder)
+    check_writable(folder, RUN_FILES)
     try:
         with _progress([loaded], quiet) as report:
             record = simulate(loaded, partial(report, loaded.variant))
@@ -241,6 +218,8 @@ def run(
             errors.print(f"what was simulated until then is in {_escape(folder)}, marked incomplete")
         raise
     save_run(record, folder)
+    interruption.heed()
+    interruption.check()
     if not no_figures:
         _draw(record, folder / "figures", quiet)
     if not quiet:
@@ -262,8 +241,8 @@ def compare(
     quiet: QuietOption = False,
 ) -> None:
     """Simulate all variants of a scenario and compare them in a table and in figures."""
-    from dynsim.files import check_writable
-    from dynsim.results import save_run
+    from dynsim.files import check_writable, discard
+    from dynsim.results import COMPARISON_FILES, RUN_FILES, save_run
     from dynsim.scenario import load_scenario, variant_names
     from dynsim.studies.compare import compare as compare_variants
     from dynsim.studies.compare import save_comparison
@@ -271,15 +250,20 @@ def compare(
     given = _overrides(overrides)
     loaded = [load_scenario(scenario, name, given) for name in variant_names(scenario)]
     folder = out or Path("results", loaded[0].name if loaded else "")
-    check_writable(folder)
+    check_writable(folder, COMPARISON_FILES[:2])
+    for one in loaded:
+        check_writable(folder / one.variant, RUN_FILES)
     records: dict[str, Record] = {}
 
     def finished(name: str, record: Record) -> None:
+        # What described the old records goes before the first of them does.
+        discard(folder, COMPARISON_FILES)
         save_run(record, folder / name)
         records[name] = record
 
     def stopped(name: str, stop: SimulationStopped) -> None:
         if stop.record is not None:
+            discard(folder, COMPARISON_FILES)
             save_run(stop.record, folder / name)
             where = _escape(folder / name)
             errors.print(f"what was simulated of {_escape(name)} until then is in {where}, marked incomplete")
@@ -296,6 +280,8 @@ def compare(
     records = {s.variant: records[s.variant] for s in loaded if s.variant in records}
     if records:
         save_comparison(records, folder)
+        interruption.heed()
+        interruption.check()
         if not no_figures:
             for name, record in records.items():
                 _draw(record, folder / name / "figures", quiet)

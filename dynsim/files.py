@@ -13,7 +13,7 @@ import re
 import stat
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -40,8 +40,8 @@ _NAME_LENGTH = 120
 """Of a file name made from a text [characters]; file systems end at 255 bytes."""
 
 
-def check_writable(folder: Path) -> None:
-    """Find out before a long simulation whether its files can be written to a folder; creates nothing.
+def check_writable(folder: Path, names: Iterable[str] = ()) -> None:
+    """Find out before a long simulation whether its files, by name, can be written to a folder; creates nothing.
 
     Raises
     ------
@@ -51,7 +51,13 @@ def check_writable(folder: Path) -> None:
     try:
         existing = folder.absolute()
         while not existing.exists():
+            if existing.is_symlink():
+                raise RecordError(f"cannot write to {folder}: {existing} is a link to nothing")
             existing = existing.parent
+        mark = folder / INCOMPLETE
+        blocked = [name for name in names if (folder / name).is_dir()]
+        if blocked or (mark.exists() and not mark.is_file()):
+            raise RecordError(f"cannot write to {folder}: {(*blocked, INCOMPLETE)[0]} there is in the way; remove it")
     except FileNotFoundError as error:  # only absolute() raises that
         raise RecordError("the working directory is no longer there; change to another folder") from error
     except (OSError, ValueError) as error:
@@ -60,6 +66,14 @@ def check_writable(folder: Path) -> None:
         raise RecordError(f"cannot write to {folder}: {existing} is a file, not a folder")
     if not os.access(existing, os.W_OK | os.X_OK):
         raise RecordError(f"cannot write to {folder}: no permission to write in {existing}")
+
+
+def discard(folder: Path, patterns: Iterable[str]) -> None:
+    """Delete the files of a folder that match, if there are any; what cannot be deleted stays."""
+    for pattern in patterns:
+        for path in folder.glob(pattern):
+            with suppress(OSError):
+                path.unlink()
 
 
 def file_name(text: object) -> str:
@@ -105,6 +119,9 @@ def replace_together(folder: Path, contents: Mapping[str, bytes | memoryview]) -
     RecordError
         A file cannot be written; older ones are left as they were, unless the message says that they are marked.
     """
+    places = {os.path.realpath(folder / name) for name in contents}
+    if len(places) < len(contents):
+        raise RecordError(f"cannot write to {folder}: two of {', '.join(contents)} are links to one file")
     with ExitStack() as cleaning:
         drafts = []
         for name, content in contents.items():

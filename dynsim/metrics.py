@@ -262,10 +262,15 @@ def _sunk(record: Record, sunk: Sequence[Sinking]) -> list[str]:
         below = [s for s in sunk if s.surface == surface]
         deepest = max(below, key=lambda s: s.depth)
         names = ", ".join(s.body for s in below)
+        verb = "passes" if len(below) == 1 else "pass"
+        # Bodies from URDF have no radius.
+        thick = any(s.radius > 0.0 for s in below)
+        beyond = " by more than the link's radius" if thick else ""
+        radius = f", of {1e3 * deepest.radius:g} mm," if thick else ""
         found.append(
-            f"{names} {'passes' if len(below) == 1 else 'pass'} below {surface} by more than the link's radius: "
-            f"{deepest.body}, of {1e3 * deepest.radius:g} mm, by up to {1e3 * deepest.depth:.3g} mm in the samples, "
-            f"first at t = {record.time[min(s.sample for s in below)]:.4g} s; surfaces hold only the points of contacts"
+            f"{names} {verb} below {surface}{beyond}: {deepest.body}{radius} by up to {1e3 * deepest.depth:.3g} mm in "
+            f"the samples, first at t = {record.time[min(s.sample for s in below)]:.4g} s; "
+            "surfaces hold only the points of contacts"
         )
     return found
 

@@ -242,7 +242,7 @@ def _optional(package: str) -> Any:
     try:
         return importlib.import_module(package)
     except ImportError as error:
-        raise RecordError(f"{package} is not installed: pip install 'dynsim[tables]'") from error
+        raise RecordError(f"{package} is not installed: pip install {package}") from error
 
 
 def _entries(what: str, entries: Mapping[str, Any]) -> Entries:

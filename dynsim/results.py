@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dynsim.files import json_text, replace_together
+from dynsim.files import discard, json_text, replace_together
 from dynsim.record import Record
 from dynsim.scenario import to_yaml
+
+RUN_FILES = ("record.h5", "summary.json", "scenario.yaml")
+# What only describes records, and is drawn or written anew from them.
+FIGURES = ("figures/*.png",)
+COMPARISON_FILES = ("comparison.json", "comparison.csv", "compare_*.png")
 
 
 def save_run(record: Record, folder: Path) -> None:
@@ -24,4 +29,6 @@ def save_run(record: Record, folder: Path) -> None:
         "summary.json": json_text(record.summary).encode("utf-8"),
         "scenario.yaml": to_yaml(record.provenance["scenario"]).encode("utf-8"),
     }
+    # Figures of another record must not lie beside this one.
+    discard(folder, FIGURES)
     replace_together(folder, contents)

@@ -304,7 +304,7 @@ class Scenario:
             if not abs(gap) <= START_TOLERANCE:
                 raise ModelError(
                     f"{_dotted(keys)}: its point starts {gap:+.4g} m from surface {contact.surface_name!r} "
-                    f"(limit {START_TOLERANCE:g} m), at ({position[0]:.4g}, {position[1]:.4g}, {position[2]:.4g}); "
+                    f"(limit {START_TOLERANCE:g} m), at {position.tolist()}; "
                     "change the initial configuration or the surface, or disable the contact",
                     keys=keys,
                 )

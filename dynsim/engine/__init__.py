@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dynsim import interruption
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped, UnreachableReference
 from dynsim.record import Record
 from dynsim.scenario import Scenario, require_scenario
@@ -70,6 +71,8 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
         The scenario describes no physics, or a path that the hand cannot follow.
     """
     with _named(scenario):
+        interruption.heed()
+        interruption.check()
         try:
             record: Record = _module(scenario).simulate(scenario, progress)
         except SimulationStopped as stop:
@@ -119,6 +122,7 @@ def _named(scenario: Scenario) -> Iterator[None]:
         reason = f"not enough memory ({error})" if str(error) else "not enough memory"
         raise ScenarioError(f"{name}: {reason}; a lower record.rate_hz or duration_s needs less") from error
     except KeyboardInterrupt:
+        interruption.answered()
         raise SimulationInterrupted(f"{name}: interrupted before there was anything to save") from None
 
 

@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from dynsim import metrics
+from dynsim import interruption, metrics
 from dynsim.engine import REFERENCES, SIMULATION, Progress, Start
 from dynsim.engine.outcome import check_size, kernels_logged, raise_stopped
 from dynsim.engine.provenance import provenance
@@ -123,7 +123,11 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
             limit = int(min(max(limit * min(_CHUNK_S / max(taken, 1e-9), 10.0), 1), 1_000_000))
             if progress is not None:
                 progress(float(run.clock[ki.TIME]), SIMULATION)
+            interruption.check()
+        interruption.keep()
     except KeyboardInterrupt:
+        interruption.keep()
+        interruption.answered()
         interrupted = True
     wall = clock.perf_counter() - started
     log.info("%s: integrated %g s in %d steps, %.3f s", scenario.title, run.clock[ki.TIME], run.count[ki.STEPS], wall)

@@ -8,6 +8,7 @@ from types import ModuleType
 
 import numpy as np
 
+from dynsim import interruption
 from dynsim.engine import Progress, Start
 from dynsim.engine.kinematic_record import make_record
 from dynsim.engine.kinematic_run import Run
@@ -126,9 +127,13 @@ def simulate(scenario: Scenario, progress: Progress | None = None, source: Comma
     try:
         log.info("%s: integrating %g s in %d control periods", scenario.title, scenario.duration_s, run.ticks)
         _advance(run, switcher, progress)
+        interruption.keep()
     except SimulationStopped as stopped:
+        interruption.keep()
         stop = stopped
     except KeyboardInterrupt:
+        interruption.keep()
+        interruption.answered()
         reached = float(run.state.counts[TICKS] * controller.schedule.period)
         stop = SimulationInterrupted(
             f"interrupted at t = {reached:.3f} s of {scenario.duration_s:g} s", time=reached, state=_named(run.state)
@@ -248,6 +253,7 @@ def _advance(run: Run, switcher: ModeSwitcher, progress: Progress | None) -> Non
                 state.counts[MODE] = switcher.at_tick(int(state.counts[TICKS]), SWITCHING)
         if progress is not None:
             progress(float(state.counts[TICKS] * period))
+        interruption.check()
 
 
 def _is_released(run: Run) -> bool:

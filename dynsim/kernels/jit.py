@@ -24,8 +24,8 @@ import llvmlite
 import numba
 import numba.extending
 import numpy as np
-from numba import _dynfunc
 from llvmlite.binding import Linkage
+from numba import _dynfunc
 from numba.core import config, serialize
 from numba.core.caching import _Cache
 from numba.core.codegen import JITCodeLibrary
@@ -68,7 +68,7 @@ class _Compiler(Compiler):
 
 
 class _ToLink(JITCodeLibrary):
-    """Code that is only linked into other libraries, where it is optimised: it never becomes machine code of its own."""
+    """Code that is only linked into other libraries and optimised there; it never becomes machine code of its own."""
 
     def _optimize_final_module(self) -> None:
         pass
@@ -86,7 +86,9 @@ class _PartCompiler(Compiler):
         self.state.flags.no_compile = True
         result = super().compile_extra(func)
         # Nothing to call: numba only asks for an object of the kind.
-        entry = _dynfunc.make_function(result.fndesc.lookup_module(), func.__name__, "", 0, result.environment, (result.library,))
+        entry = _dynfunc.make_function(
+            result.fndesc.lookup_module(), func.__name__, "", 0, result.environment, (result.library,)
+        )
         self.state.targetctx.insert_user_function(entry, result.fndesc, [result.library])
         return result._replace(entry_point=entry)
 
@@ -122,8 +124,8 @@ class _KernelCache(_Cache):
         return CompileResult._rebuild(target_context, *pickle.loads(payload))
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        if data.library.has_dynamic_globals:
-            raise ValueError(f"{self._function.__qualname__}: holds addresses of this process and cannot be kept")
+        if data.library.has_dynamic_globals:  # addresses of this process, which NUMBA_OPT=0 leaves in
+            return
         path = self._path(sig, data.codegen)
         payload = serialize.dumps(data._reduce())
         try:
@@ -230,9 +232,9 @@ def inlined_kernel(function: F) -> F:
 
     Passing the tables of a model costs about as much as a whole sweep over ten links.
     """
-    return numba.extending.register_jitable(
-        pipeline_class=_PartCompiler, **_OPTIONS, **_NO_ENTRY, forceinline=True
-    )(function)
+    return numba.extending.register_jitable(pipeline_class=_PartCompiler, **_OPTIONS, **_NO_ENTRY, forceinline=True)(
+        function
+    )
 
 
 def _compile(function: F, **options: Any) -> F:

@@ -31,6 +31,9 @@ UNLIMITED = 1e9
 # No robot has such numbers, and with larger ones products overflow.
 _MAGNITUDE_MAX = 1e15
 
+# Elements of physics, whose values are attributes.
+_WITHOUT_TEXT = {"mass", "inertia", "origin", "axis", "limit", "dynamics", "mimic"}
+
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 # Child elements that physics depends on, by parent, and their attributes. Other elements and, on limits and losses,
@@ -181,6 +184,14 @@ class _Reader:
                 raise self.error(line, f"elements are nested more than {DEPTH_MAX} deep; URDF needs fewer than ten")
             if len(attributes) > ATTRIBUTES_MAX:
                 raise self.error(line, f"<{_cut(tag)}> has more than {ATTRIBUTES_MAX} attributes; simplify the model")
+            around = [element.tag for element in open_elements]
+            place = {"link": ["robot"], "inertial": ["robot", "link"]}.get(tag, around)
+            in_robot = around[:1] == ["robot"] and "gazebo" not in around
+            if in_robot and around != place and not (tag == "inertial" and around[:2] == place):
+                raise self.error(
+                    line,
+                    f"<{tag}> in <{_cut(around[-1])}> would be ignored; it belongs in <{place[-1]}>, move it there",
+                )
             element = _Element(tag, attributes, line)
             (open_elements[-1].children if open_elements else roots).append(element)
             open_elements.append(element)
@@ -188,12 +199,22 @@ class _Reader:
         def end(_: str) -> None:
             open_elements.pop()
 
+        def text(content: str) -> None:
+            element = open_elements[-1]
+            # Without attributes it is refused for what it lacks.
+            if content.strip() and element.tag in _WITHOUT_TEXT and element.attributes:
+                tag = element.tag
+                raise self.error(
+                    parser.CurrentLineNumber,
+                    f"<{tag}> holds the text {_shown(content.strip())}; URDF has values in attributes only",
+                )
+
         def document_type(*_: object) -> None:
             raise self.error(
                 parser.CurrentLineNumber, "has a DOCTYPE; entities and DTDs are not read: remove it, write them out"
             )
 
-        parser.StartElementHandler, parser.EndElementHandler = begin, end
+        parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = begin, end, text
         parser.StartDoctypeDeclHandler = document_type
         try:
             parser.Parse(data, True)

@@ -18,6 +18,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Protocol
 
+from dynsim import interruption
 from dynsim.engine import SIMULATION, simulate
 from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped, shown
 from dynsim.files import json_text, replace_together
@@ -28,6 +29,9 @@ log = logging.getLogger(__name__)
 
 # A terminal or a service manager sends these to every process of a group: only the parent heeds them.
 STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+
+# Between two looks for a signal that was lost [s].
+_LOOK_S = 0.5
 
 # In a worker process: set when it shall stop and hand back what it has.
 _interrupt: Any = None
@@ -145,9 +149,12 @@ def _run_in_processes(
 
     def collect() -> None:
         while waiting:
-            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+            for future in wait(waiting, timeout=_LOOK_S, return_when=FIRST_COMPLETED).done:
+                interruption.keep()
                 take(waiting[future], future.result)
                 del waiting[future]
+                interruption.heed()
+            interruption.check()
 
     workers = min(jobs, len(scenarios))
     with (
@@ -166,6 +173,7 @@ def _run_in_processes(
                         waiting[pool.submit(_simulate, scenario)] = name
                 collect()
             except KeyboardInterrupt:
+                interruption.answered()
                 interrupt.set()
                 for future in [future for future in waiting if future.cancel()]:
                     del waiting[future]

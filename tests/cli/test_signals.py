@@ -202,3 +202,90 @@ def test_a_full_standard_output_is_one_line_and_loses_no_run(tmp_path: Path):
         assert process.returncode == 2
         assert stderr == "error: standard output cannot be written (No space left on device)\n"
     assert Record.load(tmp_path / "out" / "record.h5").complete
+
+
+# A signal that comes just when something begins, to the process that does it.
+SIGNALLED = """
+import os, signal, sys
+import dynsim.{module} as module
+from dynsim.cli import main
+
+begin = {target}
+
+def signalled(*arguments, **options):
+    os.kill(os.getpid(), signal.{signal})
+    return begin(*arguments, **options)
+
+{target} = signalled
+main()
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+@pytest.mark.parametrize(
+    ("module", "target"),
+    [("metrics", "module.summarise"), ("record", "module.Record.to_hdf5")],
+    ids=["summary", "saving"],
+)
+@pytest.mark.parametrize("command", ["run", "compare"])
+def test_a_signal_after_the_last_step_loses_nothing(
+    tmp_path: Path, number: signal.Signals, module: str, target: str, command: str
+):
+    code = SIGNALLED.format(module=module, target=target, signal=number.name)
+    arguments = [command, "elbow_comparison", "--set", "duration_s=0.05", "--out", "out"]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], cwd=tmp_path, capture_output=True, text=True, timeout=DEADLINE_S
+    )
+    assert done.returncode == 128 + number, done.stderr
+    assert Record.load(next((tmp_path / "out").rglob("record.h5"))).complete
+    assert "Traceback" not in done.stderr
+    if command == "compare":
+        assert [path.name for path in (tmp_path / "out").iterdir()] == ["two_elbows"]
+        assert "interrupted before elbow_4, no_elbow were started" in done.stderr
+
+
+# A signal whose KeyboardInterrupt Python drops, because it comes while a callback of the garbage collector runs.
+LOST = """
+import os, signal, weakref
+import dynsim.engine.dynamics as dynamics
+from dynsim.cli import main
+
+class Thing: ...
+
+advance, calls = dynamics.ki.advance, []
+
+def lose(*arguments):
+    calls.append(1)
+    if len(calls) == 3:
+        thing = Thing()
+        watch = weakref.ref(thing, lambda _: os.kill(os.getpid(), signal.SIGTERM))
+        del thing
+    return advance(*arguments)
+
+dynamics.ki.advance = lose
+main()
+"""
+
+
+def test_a_signal_that_python_loses_is_heeded(tmp_path: Path):
+    done = subprocess.run(
+        [sys.executable, "-c", LOST, "run", "elbow_comparison", *LONG],
+        cwd=tmp_path, capture_output=True, text=True, timeout=DEADLINE_S,
+    )  # fmt: skip
+    assert done.returncode == 128 + signal.SIGTERM, done.stderr
+    assert not Record.load(next(tmp_path.rglob("record.h5"))).complete
+
+
+def test_what_described_older_records_goes_with_them(tmp_path: Path):
+    command = [sys.executable, "-m", "dynsim", "compare", "elbow_comparison", "--quiet", "--out", "out"]
+    options = {"cwd": tmp_path, "capture_output": True, "text": True, "timeout": DEADLINE_S}
+    assert subprocess.run([*command, "--set", "duration_s=0.02"], **options).returncode == 0
+    out = tmp_path / "out"
+    assert list(out.glob("compare_*.png"))
+    code = SIGNALLED.format(module="metrics", target="module.summarise", signal="SIGTERM")
+    again = [sys.executable, "-c", code, *command[3:], "--set", "duration_s=0.03"]
+    assert subprocess.run(again, **options).returncode == 128 + signal.SIGTERM
+    assert sorted(path.name for path in out.iterdir()) == ["elbow_4", "elbow_7", "no_elbow", "two_elbows"]
+    assert Record.load(out / "two_elbows" / "record.h5").time[-1] == 0.03
+    assert not list((out / "two_elbows").glob("figures/*"))
+    assert list((out / "no_elbow").glob("figures/*"))

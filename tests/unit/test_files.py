@@ -299,3 +299,26 @@ def test_a_folder_that_cannot_be_written_is_found_without_making_one(tmp_path: P
     monkeypatch.setattr("os.access", lambda *_: False)
     with pytest.raises(RecordError, match=f"no permission to write in {tmp_path}"):
         check_writable(tmp_path / "new")
+
+
+def test_what_is_in_the_way_is_found_before_a_simulation(tmp_path: Path):
+    (tmp_path / "gone").symlink_to(tmp_path / "unmounted" / "disk")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    for name in ("gone", "loop"):
+        with pytest.raises(RecordError, match=f"{name} is a link to nothing"):
+            check_writable(tmp_path / name / "out")
+    (tmp_path / "summary.json").mkdir()
+    check_writable(tmp_path)
+    with pytest.raises(RecordError, match=r"summary\.json there is in the way; remove it"):
+        check_writable(tmp_path, ["record.h5", "summary.json"])
+    (tmp_path / "INCOMPLETE").mkdir()
+    with pytest.raises(RecordError, match="INCOMPLETE there is in the way"):
+        check_writable(tmp_path)
+
+
+def test_two_files_of_a_run_cannot_be_one(tmp_path: Path):
+    (tmp_path / "a").symlink_to(tmp_path / "one")
+    (tmp_path / "b").symlink_to(tmp_path / "one")
+    with pytest.raises(RecordError, match="two of a, b are links to one file"):
+        replace_together(tmp_path, {"a": b"1", "b": b"2"})
+    assert not (tmp_path / "one").exists()

@@ -29,7 +29,7 @@ def parse(text: str):
         ("", None),
         ("# nothing", None),
         ("a: 1\nb: -2.5e3\nc: true\nd: ~\ne: x y", {"a": 1, "b": -2500.0, "c": True, "d": None, "e": "x y"}),
-        ("a: 012\nb: 0x1F\nc: 1_000\nd: 1E-8\ne: 5.", {"a": 12, "b": 31, "c": 1000, "d": 1e-8, "e": 5.0}),
+        ("a: 012\nb: 0x1F\nc: 1_000\nd: 1E-8\ne: 5.", {"a": 12, "b": 31, "c": "1_000", "d": 1e-8, "e": 5.0}),
         ("a: 2024-99-99\nb: ._\nc: yes\nd: 1:30", {"a": "2024-99-99", "b": "._", "c": "yes", "d": "1:30"}),
         ("a: '1'\nb: !!str 1\nc: !!float 1\nd: ! 1", {"a": "1", "b": "1", "c": 1.0, "d": "1"}),
         ("a: .inf\nb: -.INF", {"a": float("inf"), "b": -float("inf")}),

@@ -170,4 +170,4 @@ def test_a_missing_package_is_one_line_with_the_way_out(
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(RecordError) as error:
         getattr(record, method)()
-    assert str(error.value) == f"{package} is not installed: pip install 'dynsim[tables]'"
+    assert str(error.value) == f"{package} is not installed: pip install {package}"

@@ -420,3 +420,19 @@ def test_mutations_are_refused_or_read_in_full(tmp_path: Path) -> None:
     assert all(message.isprintable() for message in refusals)
     # Both ways are met often.
     assert 0.2 * MUTATIONS < read < 0.8 * MUTATIONS
+
+
+INSIDE = '<{0}><link name="payload">{1}</link></{0}></robot>'
+
+
+@pytest.mark.parametrize("around", ["group", "model", "sensor", "x:part"])
+def test_a_link_that_would_be_ignored_is_refused(tmp_path: Path, around: str) -> None:
+    text = f'<robot name="r" xmlns:x="x"><link name="a">{INERTIAL}</link>' + INSIDE.format(around, INERTIAL)
+    (tmp_path / "bad.urdf").write_text(text)
+    assert f"<link> in <{around}> would be ignored; it belongs in <robot>" in refused(tmp_path / "bad.urdf")
+
+
+def test_text_where_urdf_has_attributes_is_refused(tmp_path: Path) -> None:
+    text = '<robot name="r"><link name="a"><inertial><mass value="8.5">80</mass></inertial></link></robot>'
+    (tmp_path / "bad.urdf").write_text(text)
+    assert "<mass> holds the text '80'; URDF has values in attributes only" in refused(tmp_path / "bad.urdf")

@@ -1,0 +1,69 @@
+"""Signals that ask a run to stop: heeded at once where that loses nothing, kept while a result is made or saved.
+
+Python raises KeyboardInterrupt wherever it happens to be. Within a callback of the garbage collector it is lost, and
+between the last step and the saved record it would take the record with it. So a signal is also remembered, long work
+asks for it (:func:`check`), and between :func:`keep` and :func:`heed` it waits.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+_pending = False
+_kept = False
+
+
+@contextmanager
+def heeded() -> Iterator[list[int]]:
+    """Within: SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt, see above; gives the signals that came.
+
+    One that is ignored (``nohup``) or that somebody else handles stays so.
+    """
+    global _pending, _kept
+    received: list[int] = []
+
+    def hear(number: int, frame: Any) -> None:
+        global _pending
+        received.append(number)
+        _pending = True
+        if not _kept:
+            raise KeyboardInterrupt
+
+    before = {}
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+            before[number] = signal.signal(number, hear)
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        _pending = _kept = False
+
+
+def keep() -> None:
+    """From here on signals wait: a result is being made or saved."""
+    global _kept
+    _kept = True
+
+
+def heed() -> None:
+    """Signals are heeded again; one that came in between is raised by the next :func:`check`."""
+    global _kept
+    _kept = False
+
+
+def check() -> None:
+    """Raise KeyboardInterrupt for a signal that waits, or whose own was lost."""
+    if _pending:
+        raise KeyboardInterrupt
+
+
+def answered() -> None:
+    """The last signal has been heeded: :func:`check` need not raise for it any more."""
+    global _pending
+    _pending = False
