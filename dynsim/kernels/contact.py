@@ -32,7 +32,7 @@ from dynsim.kernels.arrays import (
     V,
     Workspace,
 )
-from dynsim.kernels.jit import inlined_kernel, kernel
+from dynsim.kernels.jit import exact_kernel, inlined_kernel, kernel
 
 # Tries, beyond two per contact, to find signs of dissipative contacts that agree with their forces.
 SIGN_PASSES = 64
@@ -119,9 +119,13 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
         force_direction(contacts, ws, k)
 
 
-@inlined_kernel
+@exact_kernel
 def force_direction(contacts: ContactArrays, ws: Workspace, k):
-    """Wrench of a unit normal force with its friction at contact k: n − σ μ t through the contact point."""
+    """Wrench of a unit normal force with its friction at contact k: n − σ μ t through the contact point.
+
+    The same bits where it is first made and where a sign has turned, so that a right-hand side does not depend on the
+    signs of the one before.
+    """
     state = ws.contacts
     mu = contacts.point[k, MU]
     if contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE:

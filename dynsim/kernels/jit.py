@@ -237,6 +237,15 @@ def inlined_kernel(function: F) -> F:
     )
 
 
+def exact_kernel(function: F) -> F:
+    """As :func:`inlined_kernel`, with every product rounded: for what is merged into several places.
+
+    Which products of a sum are contracted depends on the place, and so would the last bits of what it computes.
+    """
+    options = {**_OPTIONS, **_NO_ENTRY, "fastmath": False, "forceinline": True}
+    return numba.extending.register_jitable(pipeline_class=_PartCompiler, **options)(function)
+
+
 def _compile(function: F, **options: Any) -> F:
     compiled = numba.njit(pipeline_class=_Compiler, **_OPTIONS, **options)(function)
     if not config.DISABLE_JIT:
