@@ -12,13 +12,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+
 _pending = False
 _kept = False
 
 
 @contextmanager
 def heeded() -> Iterator[list[int]]:
-    """Within: SIGINT, SIGTERM and SIGHUP raise KeyboardInterrupt, see above; gives the signals that came.
+    """Within: the ``STOP_SIGNALS`` raise KeyboardInterrupt, see above; gives the signals that came.
 
     One that is ignored (``nohup``) or that somebody else handles stays so.
     """
@@ -33,9 +35,8 @@ def heeded() -> Iterator[list[int]]:
             raise KeyboardInterrupt
 
     before = {}
-    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
-        number = getattr(signal, name, None)
-        if number is not None and signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+    for number in STOP_SIGNALS:
+        if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
             before[number] = signal.signal(number, hear)
     try:
         yield received

@@ -22,13 +22,12 @@ from dynsim import interruption
 from dynsim.engine import SIMULATION, simulate
 from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped, shown
 from dynsim.files import json_text, replace_together
+from dynsim.interruption import STOP_SIGNALS
 from dynsim.record import Record
 from dynsim.scenario import Scenario, load_scenario, variant_names
 
 log = logging.getLogger(__name__)
 
-# A terminal or a service manager sends these to every process of a group: only the parent heeds them.
-STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 # Between two looks for a signal that was lost [s].
 _LOOK_S = 0.5
@@ -242,6 +241,7 @@ def _signals_held() -> Iterator[None]:
 def _start_worker(interrupt: Any, sender: Connection, level: int) -> None:
     global _interrupt
     _interrupt = interrupt
+    # A terminal or a service manager sends these to every process of a group: only the parent heeds them.
     for number in STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
