@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from dynsim.kernels import arrays as ka
-from dynsim.kernels.coupled import System, derivative
-from dynsim.kernels.energy import CONTACT_SIZE, LEDGER_SIZE
-from dynsim.kernels.integrate import FINISHED, METHODS, STATUS, Run, advance, new_run
+from dynsim.kernels.integrate.driver import advance
+from dynsim.kernels.integrate.run import FINISHED, METHODS, STATUS, Run, new_run
 from dynsim.kernels.jit import integers, reals
+from dynsim.kernels.state import block, output_layout, state_layout
+from dynsim.kernels.system import System, derivative
 from dynsim.model.arrays import compile_contacts, compile_drives, compile_model
 from dynsim.model.description import Contact, Inertia, Link, Motor, Quadric, Robot
 from dynsim.model.model import Model
@@ -139,13 +140,16 @@ class Bench:
         return len(self.robot.links), len(self.robot.motors), len(self.system.contacts.link)
 
     def state(self, q: np.ndarray, v: np.ndarray, current: np.ndarray | None = None) -> np.ndarray:
-        """State vector with empty ledger, (2 n + na + LEDGER_SIZE + CONTACT_SIZE c,)."""
-        n, na, c = self.sizes
-        y = np.zeros(2 * n + na + LEDGER_SIZE + CONTACT_SIZE * c)
-        y[:n], y[n : 2 * n] = q, v
+        """State vector with empty ledger, (layout.size,)."""
+        y = np.zeros(self.system.layout.size)
+        self.part(y, "q")[:], self.part(y, "v")[:] = q, v
         if current is not None:
-            y[2 * n : 2 * n + na] = current
+            self.part(y, "current")[:] = current
         return y
+
+    def part(self, y: np.ndarray, name: str) -> np.ndarray:
+        """A block of a state vector or of its derivative, by its name (a view)."""
+        return y[block(self.system.layout, name)]
 
     def derivative(self, y: np.ndarray, t: float = 0.0) -> np.ndarray:
         """dy/dt."""
@@ -169,6 +173,8 @@ class Bench:
         run = new_run(
             METHODS[method],
             y,
+            self.system.layout,
+            output_layout(n, na, c),
             n=n,
             na=na,
             c=c,
@@ -197,14 +203,15 @@ def bench(
 ) -> Bench:
     """Compile a robot and its contacts, with a voltage PD that holds ``held`` (zero by default)."""
     na = len(robot.motors)
-    size = len(robot.links) + na + len(contacts or [])
     contact_arrays = compile_contacts(robot, contacts or [])
+    n, c = len(robot.links), len(contacts or [])
     system = System(
+        layout=state_layout(n, n, na, c),
         model=compile_model(robot),
         drives=compile_drives(robot, k_p=[k_p] * na, k_d=[k_d] * na),
         reference=held_reference(np.zeros(na) if held is None else held),
         contacts=contact_arrays,
-        dense=np.zeros((size, size + 1)) if m_star else None,
+        dense=np.zeros((n + na + c, n + na + c + 1)) if m_star else None,
     )
-    ws = ka.workspace(len(robot.links), na, len(contacts or []))
+    ws = ka.workspace(n, na, c)
     return Bench(robot, system, ws)

@@ -16,7 +16,7 @@ import numpy as np
 
 # Joint kinds. The three axis-aligned revolute joints are special cases of REVOLUTE, for speed.
 REVOLUTE_X, REVOLUTE_Y, REVOLUTE_Z, REVOLUTE, PRISMATIC = 0, 1, 2, 3, 4
-# Friction of a contact under a negative (pulling) normal force, see dynsim.kernels.contact.
+# Friction of a contact under a negative (pulling) normal force, see dynsim.kernels.constraint.surface.
 FRICTION_SIGNED, FRICTION_DISSIPATIVE = 0, 1
 
 # ModelArrays.tree, int

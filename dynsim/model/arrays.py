@@ -11,7 +11,7 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels.jit import integers, reals
 from dynsim.model.description import Contact, Link, Motor, Robot
 
-# Beyond it the reduction of an angle to a quarter turn leaves too few digits (dynsim.kernels.newton_euler.sine_cosine).
+# Beyond it the reduction of an angle to a quarter turn leaves too few digits (dynsim.kernels.tree.sweep.sine_cosine).
 ANGLE_LIMIT = 1e6
 
 _FRICTION = {"signed": ka.FRICTION_SIGNED, "dissipative": ka.FRICTION_DISSIPATIVE}

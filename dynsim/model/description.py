@@ -184,7 +184,7 @@ class Quadric:
 
     def gap(self, position: Array) -> float:
         """Signed distance [m] of a point along the normal; exact for plane, sphere and cylinder."""
-        from dynsim.kernels.contact import surface_distance
+        from dynsim.kernels.constraint.surface import surface_distance
 
         gradient = self.Q @ position + self.b
         slope = float(np.linalg.norm(gradient))

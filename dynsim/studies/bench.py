@@ -22,9 +22,11 @@ from rich.table import Table
 from dynsim._version import __version__
 from dynsim.engine.dynamics import Prepared, prepare
 from dynsim.kernels import arrays as ka
-from dynsim.kernels import integrate as ki
-from dynsim.kernels.coupled import System, derivative
+from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.integrate.driver import advance
 from dynsim.kernels.jit import kernel
+from dynsim.kernels.state import block
+from dynsim.kernels.system import System, derivative
 from dynsim.scenario import load_scenario
 from dynsim.studies import mujoco_peer, pinocchio_peer
 
@@ -294,9 +296,8 @@ def _measure_job(case_name: str, rounds: int, *, with_mujoco: bool) -> list[dict
     case = CASES[case_name]
     reference = prepare_case(case, _TIGHT)
     _advance(reference)
-    n = reference.model.n
     run = reference.run
-    q, i = run.sample[:, :n], run.sample[:, 2 * n : 2 * n + len(reference.system.drives.link)]
+    q, i = run.states("q"), run.states("current")
     hand = _hand_path(reference, q)
 
     paths: dict[str, tuple[Array, Array]] = {}
@@ -356,7 +357,7 @@ def prepare_case(case: Case, options: dict[str, Any]) -> Prepared:
 
 
 def _advance(prepared: Prepared) -> None:
-    ki.advance(prepared.system, prepared.workspace, prepared.run, np.iinfo(np.int64).max)
+    advance(prepared.system, prepared.workspace, prepared.run, np.iinfo(np.int64).max)
     if prepared.run.count[ki.STATUS] != ki.FINISHED:
         raise RuntimeError(f"the benchmark run stopped at t = {prepared.run.clock[ki.TIME]:.3f} s")
 
@@ -365,10 +366,12 @@ def _dynsim_job(name: str, reference: Prepared, paths: dict[str, tuple[Array, Ar
     method, step, rtol, atol = _INTEGRATORS[name]
     n, na, c = reference.model.n, len(reference.system.drives.link), len(reference.contacts)
     y = np.zeros_like(reference.run.y)
-    y[:n] = reference.model.robot.initial
+    y[block(reference.run.layout, "q")] = reference.model.robot.initial
     run = ki.new_run(
         ki.METHODS[method],
         y,
+        reference.run.layout,
+        reference.run.columns,
         n=n,
         na=na,
         c=c,
@@ -387,8 +390,7 @@ def _dynsim_job(name: str, reference: Prepared, paths: dict[str, tuple[Array, Ar
         for field, values in fresh.items():
             getattr(prepared.run, field)[:] = values
         _advance(prepared)
-        sample = prepared.run.sample
-        paths[name] = sample[:, :n], sample[:, 2 * n : 2 * n + na]
+        paths[name] = prepared.run.states("q"), prepared.run.states("current")
         return 1
 
     return call

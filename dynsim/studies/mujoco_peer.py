@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.kernels import arrays as ka
-from dynsim.kernels.coupled import System
+from dynsim.kernels.system import System
 
 Array = NDArray[np.float64]
 

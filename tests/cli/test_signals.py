@@ -30,7 +30,7 @@ import os, sys
 from pathlib import Path
 
 import dynsim.control.joint_pd as joint_pd
-import dynsim.kernels.integrate as integrate
+import dynsim.kernels.integrate.driver as integrate
 from dynsim.cli import main
 
 def mark(what, function):
@@ -252,7 +252,7 @@ from dynsim.cli import main
 
 class Thing: ...
 
-advance, calls = dynamics.ki.advance, []
+advance, calls = dynamics.advance, []
 
 def lose(*arguments):
     calls.append(1)
@@ -262,7 +262,7 @@ def lose(*arguments):
         del thing
     return advance(*arguments)
 
-dynamics.ki.advance = lose
+dynamics.advance = lose
 main()
 """
 

@@ -15,9 +15,10 @@ mujoco = pytest.importorskip("mujoco", minversion="4.0")
 
 from dynsim.engine.dynamics import Prepared, prepare  # noqa: E402
 from dynsim.kernels import arrays as ka  # noqa: E402
-from dynsim.kernels import integrate as ki  # noqa: E402
-from dynsim.kernels.coupled import System  # noqa: E402
+from dynsim.kernels.integrate import run as ki  # noqa: E402
+from dynsim.kernels.integrate.driver import advance  # noqa: E402
 from dynsim.kernels.jit import integers, reals  # noqa: E402
+from dynsim.kernels.system import System  # noqa: E402
 from dynsim.model.arrays import compile_contacts, compile_drives  # noqa: E402
 from dynsim.model.description import Inertia, Link, Robot  # noqa: E402
 from dynsim.model.model import Model  # noqa: E402
@@ -76,7 +77,7 @@ def test_accelerations_of_random_trees(seed: int, n: int) -> None:
 
 
 def integrate(prepared: Prepared) -> ki.Run:
-    ki.advance(prepared.system, prepared.workspace, prepared.run, 10**9)
+    advance(prepared.system, prepared.workspace, prepared.run, 10**9)
     assert prepared.run.count[ki.STATUS] == ki.FINISHED
     return prepared.run
 

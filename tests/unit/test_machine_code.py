@@ -14,7 +14,7 @@ from llvmlite.binding import ObjectFileRef
 
 import dynsim
 from dynsim.kernels import jit
-from dynsim.kernels.newton_euler import newton_euler
+from dynsim.kernels.tree.sweep import newton_euler
 
 SHORT = {"duration_s": 0.3}
 
@@ -23,7 +23,7 @@ import hashlib, sys
 import numpy as np
 import dynsim
 from dynsim.engine.dynamics import prepare
-from dynsim.kernels.coupled import derivative
+from dynsim.kernels.system import derivative
 
 scenario = dynsim.load_scenario("elbow_comparison", overrides={"duration_s": 0.3})
 if "derivative" in sys.argv:

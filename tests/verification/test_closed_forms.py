@@ -8,7 +8,7 @@ from random_robots import Bench, bench
 from scipy.special import ellipk
 
 from dynsim.kernels import arrays as ka
-from dynsim.kernels.integrate import DRIFT_MAX, METHODS
+from dynsim.kernels.integrate.run import DRIFT_MAX, METHODS
 from dynsim.model.description import Contact, Inertia, Link, Motor, Quadric, Robot
 
 G = 9.81

@@ -9,7 +9,8 @@ import pytest
 from random_robots import Bench, bench
 
 from dynsim.kernels import energy
-from dynsim.kernels.integrate import DRIFT_MAX, FINISHED, METHODS, REJECTED, STATUS, STEPS, advance, new_run
+from dynsim.kernels.integrate.driver import advance
+from dynsim.kernels.integrate.run import DRIFT_MAX, FINISHED, METHODS, REJECTED, STATUS, STEPS, new_run
 from dynsim.model.description import Contact, Inertia, Link, Motor, Quadric, Robot
 
 Y, Z = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])

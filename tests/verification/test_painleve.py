@@ -14,8 +14,9 @@ from dynsim.engine import dynamics
 from dynsim.engine.uniqueness import acceleration_range, contact_matrices, motion_spread, paradox
 from dynsim.errors import SimulationStopped
 from dynsim.kernels import arrays as ka
-from dynsim.kernels import integrate as ki
-from dynsim.kernels.uniqueness import ROOM, UNIQUE, force_verdict
+from dynsim.kernels.constraint.uniqueness import ROOM, UNIQUE, force_verdict
+from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.integrate.driver import advance
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 
 X, Y, Z = np.eye(3)
@@ -53,7 +54,7 @@ def started(b: Bench, y: np.ndarray, method: str, *, end: float = 0.3, rtol: flo
         ki.METHODS[method], y, n=n, na=na, c=c, sample_time=np.linspace(0.0, end, 4), hand=(n - 1, np.zeros(3)),
         end=end, step=2e-4 if method == "rk4" else 0.0, step_max=np.inf, rtol=rtol, atol=1e-2 * rtol,
     )  # fmt: skip
-    ki.advance(b.system, b.ws, run, 10**6)
+    advance(b.system, b.ws, run, 10**6)
     return run
 
 
@@ -150,7 +151,7 @@ def test_the_compiled_watch_agrees_with_its_definition():
             ki.RK43, y, n=n, na=na, c=c, sample_time=np.array([1.0]), hand=(n - 1, np.zeros(3)), end=1.0, step=1e-3,
             step_max=np.inf, rtol=1e-6, atol=1e-8,
         )  # fmt: skip
-        ki.advance(b.system, b.ws, run, 0)
+        advance(b.system, b.ws, run, 0)
         if run.count[ki.STATUS] in (ki.NOT_PROJECTED, ki.NO_FORCES, ki.NOT_FINITE):
             continue
         matrices = contact_matrices(b.system, b.ws, 0.0, run.y)
@@ -323,7 +324,7 @@ def test_a_contact_given_twice_is_stopped_like_one():
             ki.RK43, y, n=3, na=0, c=2, sample_time=np.array([1.0]), hand=(2, np.zeros(3)), end=1.0, step=1e-3,
             step_max=np.inf, rtol=1e-6, atol=1e-8,
         )  # fmt: skip
-        ki.advance(twice.system, twice.ws, run, 0)
+        advance(twice.system, twice.ws, run, 0)
         assert run.count[ki.STATUS] == status
 
 
@@ -394,7 +395,7 @@ def test_a_reversed_diagonal_beside_a_positive_determinant_is_a_warning():
     """The forces are unique, and the summary says what they rest on."""
     scenario = dynsim.load_scenario("elbow_comparison", overrides={"duration_s": 0.02})
     prepared = dynamics.prepare(scenario)
-    ki.advance(prepared.system, prepared.workspace, prepared.run, 10**6)
+    advance(prepared.system, prepared.workspace, prepared.run, 10**6)
     for since, expected in ((np.inf, []), (0.013, ["elbow_4: from t = 0.013 s on"])):
         prepared.run.extremes[0, ki.LOCAL_SINCE] = since  # as the watch does, see the random cases above
         warnings = dynamics._record(scenario, prepared, 1.0).summary["warnings"]

@@ -6,7 +6,7 @@ import pytest
 import dynsim
 from dynsim.engine.dynamics import prepare
 from dynsim.errors import ScenarioError
-from dynsim.kernels.coupled import derivative
+from dynsim.kernels.system import derivative
 from dynsim.scenario import build_model, load_scenario
 from dynsim.studies.rotors import rotor_energies, rotor_model
 

@@ -5,7 +5,7 @@ State y, all in one vector:
     q  (n,)   joint positions [rad or m]
     v  (n,)   joint rates
     i  (na,)  motor currents [A]
-    ledger (LEDGER_SIZE,), then impulse and slip of each contact (2 c,): see dynsim.kernels.energy
+    ledger (LEDGER_SIZE,), then impulse and slip of each contact (2 c,): see dynsim.kernels.ledger
 """
 
 from __future__ import annotations
@@ -31,24 +31,28 @@ from dynsim.kernels.arrays import (
     ReferenceArrays,
     Workspace,
 )
-from dynsim.kernels.articulated import accelerate, add_contact_forces, contact_system, factor
-from dynsim.kernels.contact import contact_rows, sign_changed
-from dynsim.kernels.drive import emf_balance, motor_voltage
-from dynsim.kernels.energy import ledger_rates
+from dynsim.kernels.constraint.delassus import solve_small
+from dynsim.kernels.constraint.m_star import solve_m_star
+from dynsim.kernels.constraint.surface import contact_rows, sign_changed
+from dynsim.kernels.drive.law import emf_balance, motor_voltage
 from dynsim.kernels.jit import inlined_kernel, internal_kernel, kernel
-from dynsim.kernels.m_star import solve_m_star
-from dynsim.kernels.newton_euler import forward_sweep
-from dynsim.kernels.rows import solve_small
+from dynsim.kernels.ledger import ledger_rates
+from dynsim.kernels.state import StateLayout
+from dynsim.kernels.tree.articulated import accelerate, add_contact_forces, contact_system, factor
+from dynsim.kernels.tree.sweep import forward_sweep
 
 
 class System(NamedTuple):
     """All constant data of a simulation."""
 
+    layout: StateLayout
     model: ModelArrays
     drives: DriveArrays
     reference: ReferenceArrays
     contacts: ContactArrays
-    dense: np.ndarray | None  # room for M* and b, see dynsim.kernels.m_star; None for the articulated solve alone
+    dense: (
+        np.ndarray | None
+    )  # room for M* and b, see dynsim.kernels.constraint.m_star; None for the articulated solve alone
 
 
 @inlined_kernel
@@ -85,18 +89,18 @@ def m_star_acceleration(dense, model: ModelArrays, drives: DriveArrays, contacts
 
 @kernel
 def derivative(system: System, t, y, ws: Workspace, dy):
-    """dy/dt of the whole coupled system at time t. y, dy: (2 n + na + LEDGER_SIZE + CONTACT_SIZE c,)."""
-    model, drives, contacts = system.model, system.drives, system.contacts
+    """dy/dt of the whole coupled system at time t; y, dy: see dynsim.kernels.state."""
+    model, drives, contacts, layout = system.model, system.drives, system.contacts, system.layout
     joints, motors, motor = ws.joints, ws.motors, drives.motor
     n, na = joints.shape[0], motors.shape[0]
     for i in range(n):
-        joints[i, Q] = y[i]
-        joints[i, QD] = y[n + i]
+        joints[i, Q] = y[layout.q + i]
+        joints[i, QD] = y[layout.v + i]
         # The sweep multiplies it by zero, which would keep a NaN of a state without solution for ever.
         joints[i, QDD] = 0.0
         joints[i, APPLIED] = -(model.body[i, DAMPING] + model.body[i, GEAR_DAMPING]) * joints[i, QD]
     for a in range(na):
-        motors[a, CURRENT] = y[2 * n + a]
+        motors[a, CURRENT] = y[layout.current + a]
         joints[drives.link[a], APPLIED] += motor[a, K_M] * motors[a, CURRENT]
 
     forward_sweep(model, ws, 1.0, 0.0, 1.0)
@@ -109,8 +113,8 @@ def derivative(system: System, t, y, ws: Workspace, dy):
     m_star_acceleration(system.dense, model, drives, contacts, ws, found)
 
     for i in range(n):
-        dy[i] = joints[i, QD]
-        dy[n + i] = joints[i, QDD]
+        dy[layout.q + i] = joints[i, QD]
+        dy[layout.v + i] = joints[i, QDD]
     for a in range(na):
-        dy[2 * n + a] = motors[a, DIDT]
-    ledger_rates(model, drives, contacts, ws, dy, 2 * n + na)
+        dy[layout.current + a] = motors[a, DIDT]
+    ledger_rates(model, drives, contacts, ws, dy, layout)

@@ -22,10 +22,10 @@ from dynsim.kernels.arrays import (
     S,
     Workspace,
 )
-from dynsim.kernels.drive import emf_balance
+from dynsim.kernels.constraint.delassus import solve_small
+from dynsim.kernels.drive.law import emf_balance
 from dynsim.kernels.jit import internal_kernel
-from dynsim.kernels.newton_euler import mass_matrix, newton_euler
-from dynsim.kernels.rows import solve_small
+from dynsim.kernels.tree.sweep import mass_matrix, newton_euler
 
 
 @internal_kernel

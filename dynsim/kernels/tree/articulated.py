@@ -29,7 +29,7 @@ from dynsim.kernels.arrays import (
     Workspace,
 )
 from dynsim.kernels.jit import inlined_kernel, kernel
-from dynsim.kernels.newton_euler import body_inertia, forward_sweep, inertial_wrench
+from dynsim.kernels.tree.sweep import body_inertia, forward_sweep, inertial_wrench
 
 
 @inlined_kernel

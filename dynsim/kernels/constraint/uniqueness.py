@@ -22,9 +22,9 @@ from dynsim.kernels.arrays import (
     ContactArrays,
     Workspace,
 )
-from dynsim.kernels.contact import SIGNS_LIMIT
+from dynsim.kernels.constraint.delassus import RANK_TOLERANCE
+from dynsim.kernels.constraint.surface import SIGNS_LIMIT
 from dynsim.kernels.jit import inlined_kernel, internal_kernel
-from dynsim.kernels.rows import RANK_TOLERANCE
 
 UNIQUE, REVERSED, SEVERAL = 0, 1, 2
 

@@ -30,20 +30,26 @@ from dynsim.kernels.arrays import (
     Workspace,
 )
 from dynsim.kernels.jit import inlined_kernel, internal_kernel, kernel
-from dynsim.kernels.newton_euler import body_inertia
-
-# Integrals at the end of the state vector, all in joules. DRAWN, MECHANICAL and SUPPLY are reported, not part of the
-# balance.
-ELECTRICAL, DRAWN, JOULE, GEAR, JOINT, FRICTION, CONSTRAINT, MECHANICAL, SUPPLY = 0, 1, 2, 3, 4, 5, 6, 7, 8
-LEDGER_SIZE = 9
-# Per contact: impulse of the normal force [N s], slip distance [m].
-IMPULSE, SLIP = 0, 1
-CONTACT_SIZE = 2
+from dynsim.kernels.state import (
+    CONSTRAINT,
+    CONTACT_SIZE,
+    DRAWN,
+    ELECTRICAL,
+    FRICTION,
+    GEAR,
+    IMPULSE,
+    JOINT,
+    JOULE,
+    MECHANICAL,
+    SLIP,
+    SUPPLY,
+)
+from dynsim.kernels.tree.sweep import body_inertia
 
 
 @inlined_kernel
-def ledger_rates(model: ModelArrays, drives: DriveArrays, contacts: ContactArrays, ws: Workspace, out, start):
-    """Rates of all integrals, into out[start:], LEDGER_SIZE + CONTACT_SIZE c of them [W; N, m/s].
+def ledger_rates(model: ModelArrays, drives: DriveArrays, contacts: ContactArrays, ws: Workspace, out, layout):
+    """Rates of all integrals, into the blocks ledger and contact of ``out`` [W; N, m/s].
 
     Electrical Σ u i; drawn Σ max(u i, 0), a supply for each motor; supply max(Σ u i, 0), one for all; Joule Σ R i²;
     gear Σ D_m v²; joint Σ D v²; friction −Σ f_n (d − n)·v, d the force direction; constraint Σ f_n n·v (zero on the
@@ -65,7 +71,7 @@ def ledger_rates(model: ModelArrays, drives: DriveArrays, contacts: ContactArray
         gear += model.body[i, GEAR_DAMPING] * square
         joint += model.body[i, DAMPING] * square
     friction, constraint = 0.0, 0.0
-    first = start + LEDGER_SIZE
+    start, first = layout.ledger, layout.contact
     for k in range(contacts.link.shape[0]):
         f, rate = state[k, FORCE], state[k, GAP_RATE]
         x, y, z = state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2]

@@ -150,7 +150,7 @@ def sign_changed(contacts: ContactArrays, ws: Workspace, passes):
     choices have determinants of one sign), at last every choice in turn. Without a consistent choice (Painlevé) the
     forces become NaN, the count in ``ws.deficient[1]`` goes up and the search ends. Forces that vanish to rounding
     have no sign and take +. So the result does not depend on the signs that the search began with, unless several
-    choices are consistent (dynsim.kernels.uniqueness watches for that).
+    choices are consistent (dynsim.kernels.constraint.uniqueness watches for that).
     """
     state = ws.contacts
     p = state.shape[0]
