@@ -206,7 +206,7 @@ def bench(
     contact_arrays = compile_contacts(robot, contacts or [])
     n, c = len(robot.links), len(contacts or [])
     system = System(
-        layout=state_layout(n, n, na, c),
+        layout=state_layout(robot.nq, n, na, c),
         model=compile_model(robot),
         drives=compile_drives(robot, k_p=[k_p] * na, k_d=[k_d] * na),
         reference=held_reference(np.zeros(na) if held is None else held),

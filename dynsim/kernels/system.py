@@ -39,6 +39,7 @@ from dynsim.kernels.jit import inlined_kernel, internal_kernel, kernel
 from dynsim.kernels.ledger import ledger_rates
 from dynsim.kernels.state import StateLayout
 from dynsim.kernels.tree.articulated import accelerate, add_contact_forces, contact_system, factor
+from dynsim.kernels.tree.joints import position_rates, read_positions
 from dynsim.kernels.tree.sweep import forward_sweep
 
 
@@ -50,9 +51,7 @@ class System(NamedTuple):
     drives: DriveArrays
     reference: ReferenceArrays
     contacts: ContactArrays
-    dense: (
-        np.ndarray | None
-    )  # room for M* and b, see dynsim.kernels.constraint.m_star; None for the articulated solve alone
+    dense: np.ndarray | None  # room for M* and b, see constraint.m_star; None for the articulated solve alone
 
 
 @inlined_kernel
@@ -93,8 +92,13 @@ def derivative(system: System, t, y, ws: Workspace, dy):
     model, drives, contacts, layout = system.model, system.drives, system.contacts, system.layout
     joints, motors, motor = ws.joints, ws.motors, drives.motor
     n, na = joints.shape[0], motors.shape[0]
+    # Most robots have a position for each rate; the others read and write their positions by kind of joint.
+    plain = layout.extra == 0
+    if not plain:
+        read_positions(model, y, layout.q, ws)
     for i in range(n):
-        joints[i, Q] = y[layout.q + i]
+        if plain:
+            joints[i, Q] = y[layout.q + i]
         joints[i, QD] = y[layout.v + i]
         # The sweep multiplies it by zero, which would keep a NaN of a state without solution for ever.
         joints[i, QDD] = 0.0
@@ -112,8 +116,11 @@ def derivative(system: System, t, y, ws: Workspace, dy):
         motors[a, DIDT] = emf_balance(drives, ws, a) / motor[a, INDUCTANCE]
     m_star_acceleration(system.dense, model, drives, contacts, ws, found)
 
+    if not plain:
+        position_rates(model, ws, dy, layout.q)
     for i in range(n):
-        dy[layout.q + i] = joints[i, QD]
+        if plain:
+            dy[layout.q + i] = joints[i, QD]
         dy[layout.v + i] = joints[i, QDD]
     for a in range(na):
         dy[layout.current + a] = motors[a, DIDT]

@@ -79,4 +79,4 @@ def step_explicit(system: System, ws: Workspace, run: Run):
         for j in range(y.shape[0]):
             k[7, j] = 0.0
         combine(k[7], h, ERROR_DOPRI5, 7, k, k[7])
-    return error_norm(run, system.layout.ledger, k[7])
+    return error_norm(system, ws, run, k[7])

@@ -140,7 +140,7 @@ def step_rodas4(system: System, ws: Workspace, run: Run):
     for j in range(m):
         y_new[j] += k[6, j]
         k[7, j] = k[6, j]
-    error = error_norm(run, states, k[7])
+    error = error_norm(system, ws, run, k[7])
     derivative(system, t + h, y_new, ws, k[6])
     run.count[EVALUATIONS] += 7
     return error

@@ -23,17 +23,28 @@ from dynsim.kernels.integrate.run import (
     Run,
 )
 from dynsim.kernels.jit import internal_kernel, kernel
+from dynsim.kernels.system import System
+from dynsim.kernels.tree.joints import position_error
 
 
 @internal_kernel
-def error_norm(run: Run, size, error):
-    """Root mean square of error / (atol + rtol |y|) over positions, rates and currents, the first ``size`` states."""
-    y, y_new, atol, rtol = run.y, run.y_new, run.clock[ATOL], run.clock[RTOL]
+def error_norm(system: System, ws: Workspace, run: Run, error):
+    """Root mean square of error / (atol + rtol |y|) over positions, rates and currents; quaternions count as angles."""
+    y, y_new, atol, rtol, layout = run.y, run.y_new, run.clock[ATOL], run.clock[RTOL], system.layout
     total = 0.0
-    for j in range(size):
+    if layout.extra > 0:
+        total, size = position_error(system.model, y, y_new, error, layout.q, rtol, atol)
+        beyond = layout.q + ws.joints.shape[0] + layout.extra
+        for j in range(layout.ledger):
+            if j < layout.q or j >= beyond:
+                x = error[j] / (atol + rtol * max(abs(y[j]), abs(y_new[j])))
+                total += x * x
+                size += 1
+        return math.sqrt(total / size)
+    for j in range(layout.ledger):
         x = error[j] / (atol + rtol * max(abs(y[j]), abs(y_new[j])))
         total += x * x
-    return math.sqrt(total / size)
+    return math.sqrt(total / layout.ledger)
 
 
 @kernel
