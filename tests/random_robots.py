@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -140,7 +141,7 @@ class Bench:
         return len(self.robot.links), len(self.robot.motors), len(self.system.contacts.link)
 
     def state(self, q: np.ndarray, v: np.ndarray, current: np.ndarray | None = None) -> np.ndarray:
-        """State vector with empty ledger, (layout.size,)."""
+        """State vector whose integrals are zero, (layout.size,)."""
         y = np.zeros(self.system.layout.size)
         self.part(y, "q")[:], self.part(y, "v")[:] = q, v
         if current is not None:
@@ -157,7 +158,7 @@ class Bench:
         derivative(self.system, t, reals(y), self.ws, dy)
         return dy
 
-    def simulate(
+    def new_run(
         self,
         y: np.ndarray,
         times: np.ndarray,
@@ -168,9 +169,12 @@ class Bench:
         rtol: float = 1e-6,
         atol: float | None = None,
     ) -> Run:
-        """Integrate to the last of ``times`` and record there; ``fixed`` holds adaptive methods at ``step`` too."""
+        """A run from y to the last of ``times``, recorded there, that has not begun.
+
+        ``step`` 0 leaves the first step to the method; ``fixed`` holds adaptive methods at ``step`` too.
+        """
         n, na, c = self.sizes
-        run = new_run(
+        return new_run(
             METHODS[method],
             y,
             self.system.layout,
@@ -187,7 +191,15 @@ class Bench:
             # With an absolute tolerance out of reach every step is accepted and the next one is as long as allowed.
             atol=1e12 if fixed else rtol * 1e-2 if atol is None else atol,
         )
-        advance(self.system, self.ws, run, 10**7)
+
+    def advance(self, run: Run, limit: int = 10**7) -> Run:
+        """Take up to ``limit`` steps; 0 only starts the run, on its contacts."""
+        advance(self.system, self.ws, run, limit)
+        return run
+
+    def simulate(self, y: np.ndarray, times: np.ndarray, method: str = "dopri5", **options: Any) -> Run:
+        """Integrate to the last of ``times``, which must be reached; ``options`` are those of :meth:`new_run`."""
+        run = self.advance(self.new_run(y, times, method, **options))
         assert run.count[STATUS] == FINISHED
         return run
 

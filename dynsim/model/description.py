@@ -158,7 +158,7 @@ class Link:
 
 
 def in_rows(link: Link, rows: Sequence[tuple[str, str, Array]]) -> tuple[Link, ...]:
-    """A joint of several rows, (suffix, kind, axis) each, that carries the body of ``link``; all but the last massless."""
+    """A joint of several rows, (suffix, kind, axis) each, the body of ``link`` on the last; the others are massless."""
     made: list[Link] = []
     for suffix, kind, axis in rows:
         last, first = len(made) == len(rows) - 1, not made

@@ -168,7 +168,7 @@ def _arm(n: int, contacts: bool) -> Any:
 
 def _derivative_loop(prepared: Prepared) -> Callable[[int], int]:
     y, ws = prepared.run.y.copy(), prepared.workspace
-    y[prepared.model.n : 2 * prepared.model.n] = 0.1  # slipping, turning: no term is zero
+    y[block(prepared.run.layout, "v")] = 0.1  # slipping, turning: no term is zero
     dy = np.zeros_like(y)
 
     def call(count: int) -> int:

@@ -9,6 +9,7 @@ from dynsim.kernels.integrate.run import DOPRI5, END, RODAS4, SAMPLE, STEP, TIME
 from dynsim.kernels.integrate.tableaux import D_RODAS
 from dynsim.kernels.jit import internal_kernel, merged_kernel
 from dynsim.kernels.system import System
+from dynsim.kernels.tree.joints import normalise
 
 
 @internal_kernel
@@ -57,6 +58,8 @@ def sample_step(system: System, ws: Workspace, run: Run):
         row = run.sample[last]
         for j in range(row.shape[0]):
             row[j] = run.y[j] + x * (d[0, j] + z * (d[1, j] + x * (d[2, j] + z * d[3, j])))
+        if system.layout.extra > 0:
+            normalise(system.model, row, system.layout.q)
         settle(system, run.sample_time[last], row, ws, run.stage[7], run)
         write_output(system, ws, run, last)
         last += 1

@@ -44,6 +44,7 @@ from dynsim.kernels.integrate.steps import choose_step, finite, first_step, next
 from dynsim.kernels.integrate.watch import forces_unique, watch
 from dynsim.kernels.jit import kernel, merged_kernel
 from dynsim.kernels.system import System
+from dynsim.kernels.tree.joints import normalise
 
 
 @merged_kernel
@@ -56,7 +57,7 @@ def start(system: System, ws: Workspace, run: Run):
     elif forces_unique(system, ws, run, run.clock[TIME]):
         watch(ws, run, 0.0)
         if run.clock[STEP] <= 0.0:
-            first_step(run, system.layout.ledger)
+            first_step(run, system.layout.tracked)
     run.count[STARTED] = 1
 
 
@@ -70,6 +71,8 @@ def accept(system: System, ws: Workspace, run: Run):
     if not (clearly_unique(system.contacts, ws) or forces_unique(system, ws, run, t + h)):
         return
     watch(ws, run, h)
+    if system.layout.extra > 0:
+        normalise(system.model, run.y_new, system.layout.q)
     sample_step(system, ws, run)
     for j in range(run.y.shape[0]):
         run.y[j] = run.y_new[j]

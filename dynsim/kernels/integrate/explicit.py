@@ -72,7 +72,7 @@ def step_explicit(system: System, ws: Workspace, run: Run):
     if run.method == RK4:
         return 0.0
     if run.method == RK43:
-        weight = weight_rk43(run, system.layout.ledger)
+        weight = weight_rk43(run, system.layout.tracked)
         for j in range(y.shape[0]):
             k[7, j] = weight * h * (k[6, j] - k[3, j])
     else:

@@ -18,7 +18,7 @@ def differentiate(system: System, ws: Workspace, run: Run):
     written out in :func:`step_rodas4`.
     """
     t, y, y_new, k = run.clock[TIME], run.y, run.y_new, run.stage
-    m, states = y.shape[0], system.layout.ledger
+    m, states = y.shape[0], system.layout.tracked
     for j in range(m):
         y_new[j] = y[j]
     # The workspace may still hold a sample or a rejected step.
@@ -88,7 +88,7 @@ def step_rodas4(system: System, ws: Workspace, run: Run):
     """
     t, h, y, y_new, k = run.clock[TIME], run.clock[STEP], run.y, run.y_new, run.stage
     n, na, m = ws.joints.shape[0], ws.motors.shape[0], run.y.shape[0]
-    q, v, current, states = system.layout.q, system.layout.v, system.layout.current, system.layout.ledger
+    q, v, current, states = system.layout.q, system.layout.v, system.layout.current, system.layout.tracked
     differentiate(system, ws, run)
     factor_stage_matrix(system, ws, run, h)
     g = 1.0 / (GAMMA * h)

@@ -39,7 +39,7 @@ class Run(NamedTuple):
     y_new: np.ndarray  # (m,)
     stage: np.ndarray  # (8, m) stage derivatives; stage[0] belongs to y
     dense: np.ndarray  # (4, m) y(θ) = y + θ (d0 + (1−θ)(d1 + θ (d2 + (1−θ) d3)))
-    jacobian: np.ndarray  # (layout.ledger + 1, m) finite differences along q, v, i, t (rodas4)
+    jacobian: np.ndarray  # (layout.tracked + 1, m) finite differences along q, v, i, t (rodas4)
     matrix: np.ndarray  # (n, n) factored stage matrix (rodas4)
     pivot: np.ndarray  # (n,) int (rodas4)
     gain: np.ndarray  # (na, 2) k_p and k_d where the voltage is not at its limit, else 0 (rodas4)
@@ -94,7 +94,7 @@ def new_run(
         y_new=np.zeros(m),
         stage=np.zeros((8, m)),
         dense=np.zeros((4, m)),
-        jacobian=np.zeros((layout.ledger + 1, m) if rodas else (0, 0)),
+        jacobian=np.zeros((layout.tracked + 1, m) if rodas else (0, 0)),
         matrix=np.zeros((n, n) if rodas else (0, 0)),
         pivot=np.zeros(n if rodas else 0, dtype=np.int64),
         gain=np.zeros((na, 2)),

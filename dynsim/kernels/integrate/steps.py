@@ -35,16 +35,16 @@ def error_norm(system: System, ws: Workspace, run: Run, error):
     if layout.extra > 0:
         total, size = position_error(system.model, y, y_new, error, layout.q, rtol, atol)
         beyond = layout.q + ws.joints.shape[0] + layout.extra
-        for j in range(layout.ledger):
+        for j in range(layout.tracked):
             if j < layout.q or j >= beyond:
                 x = error[j] / (atol + rtol * max(abs(y[j]), abs(y_new[j])))
                 total += x * x
                 size += 1
         return math.sqrt(total / size)
-    for j in range(layout.ledger):
+    for j in range(layout.tracked):
         x = error[j] / (atol + rtol * max(abs(y[j]), abs(y_new[j])))
         total += x * x
-    return math.sqrt(total / layout.ledger)
+    return math.sqrt(total / layout.tracked)
 
 
 @kernel

@@ -3,8 +3,8 @@
 Every joint is a sequence of one-velocity rows. A row is a link of the tree with a motion axis S and one velocity; all
 rows of a joint but the last are massless. The axes of a joint with several rows are fixed in the body that it carries,
 so with V_J = Σ S_k v_k and V the velocity of that body, d/dt(S_k) = V × S_k, and the bias of the joint is
-V × V_J = V_P × V_J: each row has the bias V_P × S_k v_k, V_P the velocity of the *joint's* parent (``BASE``), not of the
-row before. The sweeps need nothing else.
+V × V_J = V_P × V_J: each row has the bias V_P × S_k v_k, V_P the velocity of what the *joint* is mounted on (``BASE``),
+not of the row before. The sweeps need nothing else.
 
 Positions are not the integrals of such velocities: q̇ = N(q) v, and there may be more of them than velocities. The
 first row takes its pose from the coordinates of the whole joint; the others copy it.
@@ -98,7 +98,7 @@ def row_motion(model: ModelArrays, ws: Workspace, i, b0, b1, b2, b3, b4, b5, b6,
 
 @internal_kernel
 def sweep_row(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
-    """What :func:`dynsim.kernels.tree.sweep.forward_sweep` does for a link, for row i: R, p, S, V and A of ``ws.links``.
+    """R, p, S, V and A of row i into ``ws.links``: what ``forward_sweep`` does for a link (dynsim.kernels.tree.sweep).
 
     v, vdot : rate and acceleration of the row with the sweep's factors; g : gravity likewise
     """

@@ -1,7 +1,7 @@
 """Kinds of joints, a module each: the rows that the kernels know them by, and their coordinates.
 
-A module exposes ``ROWS``, its rows by name (:attr:`dynsim.model.description.Link.kind`), and for a joint with several of
-them a function that makes its links. Modules are found by being here. The motion itself is a branch of
+A module exposes ``ROWS``, its rows by name (:attr:`dynsim.model.description.Link.kind`), and for a joint with several
+of them a function that makes its links. Modules are found by being here. The motion itself is a branch of
 :func:`dynsim.kernels.tree.sweep.forward_sweep` (one angle, one distance) or of
 :func:`dynsim.kernels.tree.joints.row_motion` (everything else).
 """

@@ -37,7 +37,7 @@ ROWS = {
 def ball(link: Link) -> tuple[Link, ...]:
     """Links of a ball joint that carries the body of ``link``, whose kind and axis do not matter.
 
-    Coordinates: the quaternion w, x, y, z of the body in the joint's frame. Rates: its angular velocity in its own axes.
+    Coordinates: the quaternion w, x, y, z of the body in the joint's frame. Rates: its angular velocity in its axes.
     """
     from dynsim.model.description import in_rows
 

@@ -44,8 +44,8 @@ def planar(link: Link) -> tuple[Link, ...]:
 def rolling(link: Link) -> tuple[Link, ...]:
     """Links of a body that rolls on the plane z = 0 of the joint's frame like a wheelset with its axle along y.
 
-    Coordinates: x, y and heading of the middle of the axle. Rates: speed along the heading, rate of turning. Sideways it
-    cannot move.
+    Coordinates: x, y and heading of the middle of the axle. Rates: speed along the heading, rate of turning. It cannot
+    move sideways.
     """
     from dynsim.model.description import in_rows
 
