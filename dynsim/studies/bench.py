@@ -25,7 +25,7 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels import integrate as ki
 from dynsim.kernels.coupled import System, derivative
 from dynsim.kernels.jit import kernel
-from dynsim.scenario import load_scenario
+from dynsim.scenario import build, load_scenario
 from dynsim.studies import mujoco_peer, pinocchio_peer
 
 Array = NDArray[np.float64]
@@ -344,7 +344,7 @@ def prepare_case(case: Case, options: dict[str, Any]) -> Prepared:
         model = load_scenario(SCENARIO, case.variant)
         overrides["contacts.friction"] = 0.0
         built = prepare(model)
-        for contact in model.contacts():
+        for contact in build.contacts(model):
             x, y, z = built.model.point_position(contact.body, contact.point, built.model.robot.initial)
             overrides[f"surfaces.under_{contact.name}"] = {
                 "type": "sphere",
