@@ -185,9 +185,9 @@ def _fields(schema: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
     """Keys that data of a schema may have at a pydantic location."""
     classes = [schema]
     for part in loc:
-        held = [c.model_fields[part].annotation for c in classes if isinstance(part, str) and part in c.model_fields]
+        held = [c.model_fields[part] for c in classes if isinstance(part, str) and part in c.model_fields]
         if held:
-            classes = [c for annotation in held for c in _models(annotation)]
+            classes = [c for field in held for held_in in (field.annotation, *field.metadata) for c in _models(held_in)]
         else:
             tagged = [c for c in classes if part in _literals(c)]
             classes = tagged or classes
@@ -195,6 +195,9 @@ def _fields(schema: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
+    """Configurations within an annotation; a choice by ``type`` (``families.Choice``) has them in ``models``."""
+    if callable(choices := getattr(annotation, "models", None)):
+        return list(choices())
     if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
         return [annotation] if issubclass(annotation, BaseModel) else []
     return [model for argument in typing.get_args(annotation) for model in _models(argument)]

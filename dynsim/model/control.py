@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ _PER_SEGMENT = 4
 _PIECE = 4096
 
 
+@runtime_checkable
 class HandPath(Protocol):
     """A path in space."""
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import overload
 
 import numpy as np
 
+from dynsim import families
 from dynsim.errors import ModelError, ScenarioError, shown
-from dynsim.families import member
+from dynsim.model.control import JointControl
 from dynsim.model.description import Contact, Quadric, Robot
 from dynsim.model.model import Model
+from dynsim.model.protocols import BuildContext
+from dynsim.model.snake import SnakeDescription, TaskSpaceController
 from dynsim.problems import dotted, suggest
 from dynsim.scenario.schema import Scenario
 
@@ -18,9 +21,24 @@ from dynsim.scenario.schema import Scenario
 START_TOLERANCE = 1e-6
 
 
+def machine(scenario: Scenario) -> Robot | SnakeDescription:
+    """What the plant of the scenario is, a tree of bodies or a snake."""
+    if scenario.engine == "kinematic":
+        return families.build("plant", scenario.plant, BuildContext(scenario.duration_s), SnakeDescription)
+    return robot(scenario)
+
+
 def robot(scenario: Scenario) -> Robot:
-    """The tree of bodies with its motors (plants of the dynamics engine)."""
-    return member("plant", scenario.plant.type).build(scenario.plant)
+    """The tree of bodies with its motors.
+
+    Raises
+    ------
+    ModelError
+        The plant is none, or cannot be built.
+    """
+    if scenario.engine == "kinematic":
+        raise ModelError(f"plant {scenario.plant.type!r} is kinematic: it has no rigid-body model")
+    return families.build("plant", scenario.plant, BuildContext(scenario.duration_s), Robot)
 
 
 def build_model(scenario: Scenario) -> Model:
@@ -34,23 +52,44 @@ def build_model(scenario: Scenario) -> Model:
         Not a scenario.
     """
     require_scenario(scenario)
-    if scenario.engine != "dynamics":
-        raise ModelError(f"plant {scenario.plant.type!r} is kinematic: it has no rigid-body model")
     return Model(robot(scenario))
 
 
-def controller(scenario: Scenario, model: Model, progress: Callable[[float], None] | None = None) -> Any:
-    """The controller for the robot; ``progress`` is called with the time [s] that its references have come to."""
-    if scenario.controller is None:
+@overload
+def controller(scenario: Scenario, machine: Model, progress: Callable[[float], None] | None = None) -> JointControl: ...
+@overload
+def controller(
+    scenario: Scenario, machine: SnakeDescription, progress: Callable[[float], None] | None = None
+) -> TaskSpaceController: ...
+def controller(
+    scenario: Scenario, machine: Model | SnakeDescription, progress: Callable[[float], None] | None = None
+) -> JointControl | TaskSpaceController:
+    """The controller for a machine; ``progress`` is called with the time [s] that its references have come to.
+
+    Raises
+    ------
+    ModelError
+        The scenario has none, it is for other machines, or does not fit this one.
+    UnreachableReference
+        The hand cannot follow its path.
+    """
+    config = scenario.controller
+    if config is None:
         raise ModelError("the scenario has no controller; its motors are short-circuited")
-    return member("controller", scenario.controller.type).build(
-        scenario.controller, model, scenario.duration_s, progress
-    )
+    if scenario.engine != families.member("controller", config.type).ENGINE:
+        raise ModelError(f"controller {config.type!r} cannot drive a {scenario.plant.type!r}")
+    context = BuildContext(scenario.duration_s, machine, progress=progress)
+    if isinstance(machine, Model):
+        return families.build("controller", config, context, JointControl)
+    return families.build("controller", config, context, TaskSpaceController)
 
 
 def surfaces(scenario: Scenario) -> dict[str, Quadric]:
     """All surfaces by name, whether anything touches them or not."""
-    return {name: member("surface", config.type).build(config) for name, config in scenario.config.surfaces.items()}
+    context = BuildContext(scenario.duration_s)
+    return {
+        name: families.build("surface", config, context, Quadric) for name, config in scenario.config.surfaces.items()
+    }
 
 
 def contacts(scenario: Scenario) -> list[Contact]:

@@ -15,6 +15,8 @@ from scipy.interpolate import PchipInterpolator
 from dynsim.config import StrictConfig
 from dynsim.errors import ModelError
 from dynsim.inputs import read_text
+from dynsim.model.control import HandPath
+from dynsim.model.protocols import BuildContext
 
 COLUMNS = ("t_s", "x_m", "y_m", "z_m")
 # Of a file [bytes]: some million rows.
@@ -41,6 +43,11 @@ class Config(StrictConfig):
         """The curve at times t [s], shape (T, 3) [m]."""
         curve = _curve(self._rows)
         return curve(np.clip(t, curve.x[0], curve.x[-1]))
+
+
+def build(config: Config, context: BuildContext) -> HandPath:
+    """The path, which its configuration is."""
+    return config
 
 
 def _rows(file: str) -> list[list[float]]:
