@@ -11,10 +11,8 @@ from scipy.interpolate import CubicSpline
 
 from dynsim import families
 from dynsim.config import NonNegative, Positive, StrictConfig
-from dynsim.control.inverse_kinematics import follow, spline_coefficients
+from dynsim.control.inverse_kinematics import follow
 from dynsim.errors import ModelError
-from dynsim.kernels.arrays import ReferenceArrays
-from dynsim.kernels.jit import integers, reals
 from dynsim.model.control import HandPath, JointControl
 from dynsim.model.protocols import BuildContext
 
@@ -89,10 +87,7 @@ def build(config: Config, context: BuildContext) -> JointControl:
     for name in config.joints:
         if robot.links[model.joint_names.index(name)].kind != "revolute":
             raise ModelError(f"controller: {name!r} is prismatic; waypoints in angles_deg are for revolute joints")
-    held = np.array([robot.initial[model.joint_names.index(name)] for name in driven])
-    spline = np.full(len(driven), -1)
-    grid, coefficients = [0.0, 1.0], np.zeros((1, 0, 6))
-    path = None
+    path, times, columns = None, np.zeros(0), []
     if config.hand is not None:
         path = families.build("path", config.hand.path, context, HandPath)  # type: ignore[type-abstract]
     if named:
@@ -104,22 +99,17 @@ def build(config: Config, context: BuildContext) -> JointControl:
             )
         # A quintic spline needs six knots.
         times = np.linspace(0.0, duration, max(int(np.ceil(segments)), 6) + 1)
-        columns = [_waypoints(path, times) for path in config.joints.values()]
+        columns = [_waypoints(joint, times) for joint in config.joints.values()]
         if config.hand is not None and path is not None:
             hand, targets = config.hand, path.position(times)
             followed = follow(model, times, targets, hand.joints, robot.initial, hand.tolerance_m, context.progress)
             columns.extend(followed.T)
-        coefficients = spline_coefficients(times, np.stack(columns, axis=1))
-        grid = [0.0, float(times[1])]
-        for k, name in enumerate(named):
-            spline[driven.index(name)] = k
-    reference = ReferenceArrays(
-        spline=integers(spline), held=reals(held), grid=reals(grid), coefficients=reals(coefficients)
-    )
-    return JointControl(
+    return JointControl.following(
+        robot,
         k_p=_per_motor(config.k_p_V_per_rad, driven, "k_p_V_per_rad"),
         k_d=_per_motor(config.k_d_V_s_per_rad, driven, "k_d_V_s_per_rad"),
-        reference=reference,
+        times=times,
+        positions=dict(zip(named, columns, strict=True)),
         path=path,
     )
 

@@ -80,7 +80,12 @@ def controller(
         raise ModelError(f"controller {config.type!r} cannot drive a {scenario.plant.type!r}")
     context = BuildContext(scenario.duration_s, machine, progress=progress)
     if isinstance(machine, Model):
-        return families.build("controller", config, context, JointControl)
+        control = families.build("controller", config, context, JointControl)
+        # The kernels would follow the last polynomial on.
+        if control.end < scenario.duration_s * (1.0 - 1e-6):
+            ends = f"end at {control.end:g} s, the run at {scenario.duration_s:g} s"
+            raise ModelError(f"controller {config.type!r}: its references {ends}")
+        return control
     return families.build("controller", config, context, TaskSpaceController)
 
 
