@@ -61,6 +61,7 @@ def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
     model = build_model(scenario)
     robot, contacts = model.robot, build.contacts(scenario)
     build.check_start(scenario, model)
+    build.loads(scenario, robot)
     n, na, c = model.n, len(robot.motors), len(contacts)
     times = _sample_times(scenario, columns=2 * n + na + LEDGER_SIZE + CONTACT_SIZE * c + ki.output_size(n, na, c))
     _check_stiffness(scenario, robot)

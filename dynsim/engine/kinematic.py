@@ -63,6 +63,8 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> Run:
         raise ModelError(f"plant {scenario.plant.type!r} (kinematic) needs controller.type: task_space")
     if scenario.config.contacts.points:
         raise ModelError(f"plant {scenario.plant.type!r} (kinematic) takes no contacts.points: it stands on its wheels")
+    if scenario.config.loads:
+        raise ModelError(f"plant {scenario.plant.type!r} (kinematic) takes no loads: it has no forces", keys=("loads",))
     description = build.machine(scenario)
     assert isinstance(description, SnakeDescription)
     controller = build.controller(scenario, description)

@@ -1,20 +1,23 @@
-"""What a scenario describes, built: its machine, controller, surfaces and contacts."""
+"""What a scenario describes, built: its machine, controller, surfaces, contacts and loads."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import overload
 
 import numpy as np
 
 from dynsim import families
+from dynsim.config import BodyPoint
 from dynsim.errors import ModelError, ScenarioError, shown
 from dynsim.model.control import JointControl
-from dynsim.model.description import Contact, Quadric, Robot
+from dynsim.model.description import Array, Contact, Inertia, Load, Quadric, Robot
 from dynsim.model.model import Model
 from dynsim.model.protocols import BuildContext
 from dynsim.model.snake import SnakeDescription, TaskSpaceController
 from dynsim.problems import dotted, suggest
+from dynsim.scenario.loads import Payload
 from dynsim.scenario.schema import Scenario
 
 # A contact point must start this close to its surface [m].
@@ -29,16 +32,25 @@ def machine(scenario: Scenario) -> Robot | SnakeDescription:
 
 
 def robot(scenario: Scenario) -> Robot:
-    """The tree of bodies with its motors.
+    """The tree of bodies with its motors and payloads.
 
     Raises
     ------
     ModelError
-        The plant is none, or cannot be built.
+        The plant is none or cannot be built, or a payload is on a body that it does not have.
     """
     if scenario.engine == "kinematic":
         raise ModelError(f"plant {scenario.plant.type!r} is kinematic: it has no rigid-body model")
-    return families.build("plant", scenario.plant, BuildContext(scenario.duration_s), Robot)
+    bare = families.build("plant", scenario.plant, BuildContext(scenario.duration_s), Robot)
+    inertias: dict[int, list[Inertia]] = {}
+    for name, config in scenario.config.loads.items():
+        if isinstance(config, Payload):
+            body, point, axes = _attached(bare, name, config)
+            inertias.setdefault(body, [bare.links[body].inertia]).append(_payload(name, config, point, axes))
+    links = list(bare.links)
+    for body, parts in inertias.items():
+        links[body] = replace(links[body], inertia=Inertia.merged(parts))
+    return replace(bare, links=tuple(links)) if inertias else bare
 
 
 def build_model(scenario: Scenario) -> Model:
@@ -131,6 +143,51 @@ def contacts(scenario: Scenario) -> list[Contact]:
             )
         )
     return result
+
+
+def loads(scenario: Scenario, robot: Robot) -> list[Load]:
+    """Forces and torques from outside on the links of a robot; payloads are part of the links already.
+
+    Raises
+    ------
+    ModelError
+        A load on a body that the robot does not have.
+    """
+    result = []
+    for name, config in scenario.config.loads.items():
+        if isinstance(config, Payload):
+            continue
+        body, point, axes = _attached(robot, name, config)
+        knots, coefficients = config.pieces(scenario.duration_s)
+        in_body = config.frame == "body"
+        if in_body:
+            # The axes of a frame fixed on a link are not the link's.
+            coefficients = np.einsum("ab,kwbp->kwap", axes, coefficients.reshape(-1, 2, 3, 4)).reshape(-1, 6, 4)
+        result.append(Load(name, robot.links[body].name, point, in_body, knots, coefficients, config.hold))
+    return result
+
+
+def _attached(robot: Robot, name: str, config: BodyPoint) -> tuple[int, Array, Array]:
+    """Index of the link that a load is on, its point in the link's frame [m], and the axes that it is given in."""
+    keys = ("loads", name, "body")
+    try:
+        index, point = robot.attach(config.body, np.array(config.point_m))
+        return index, point, robot.attached_axes(config.body)
+    except ModelError as error:
+        raise ModelError(f"{dotted(keys)}: {error}", keys=keys) from error
+
+
+def _payload(name: str, config: Payload, point: Array, axes: Array) -> Inertia:
+    """Mass properties of a payload in its link's frame."""
+    if config.inertia_kg_m2 is None:
+        return Inertia.solid_sphere(config.mass_kg, config.radius_m, point)
+    keys = ("loads", name, "inertia_kg_m2")
+    payload = Inertia(config.mass_kg, np.zeros(3), np.diag(config.inertia_kg_m2)).placed(axes, point)
+    try:
+        payload.check(dotted(keys))
+    except ModelError as error:
+        raise ModelError(str(error), keys=keys) from error
+    return payload
 
 
 def check_start(scenario: Scenario, model: Model) -> None:

@@ -13,6 +13,7 @@ from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig
 from dynsim.families import member, union
 from dynsim.model.description import listed
 from dynsim.problems import Origin
+from dynsim.scenario.loads import LoadConfig
 
 # Bytes of the name of a folder on common file systems.
 NAME_LIMIT = 255
@@ -82,6 +83,7 @@ class ScenarioConfig(StrictConfig):
     controller: union("controller") | None = None  # type: ignore[valid-type]
     surfaces: dict[str, union("surface")] = {}  # type: ignore[valid-type]
     contacts: Contacts = Contacts()
+    loads: dict[str, LoadConfig] = Field(default={}, description="forces, torques and payloads by name")
     integrator: Integrator = Integrator()
     record: RecordOptions = RecordOptions()
     metrics: Metrics = Metrics()
@@ -172,7 +174,10 @@ class Scenario:
     @property
     def resolved(self) -> dict[str, Any]:
         """The scenario with every default and override written out; reading it again gives the same simulation."""
-        return self.config.model_dump(mode="json", exclude_none=True)
+        resolved = self.config.model_dump(mode="json", exclude_none=True)
+        if not self.config.loads:
+            del resolved["loads"]
+        return resolved
 
     def place(self, keys: Sequence[int | str] = (), variant: str = "") -> str:
         """``file:line`` of a key, the text for ``variant``, and how the key was overridden."""
