@@ -332,6 +332,7 @@ def check(
             count = f"{len(variants)} variants" if len(variants) > 1 else "1 variant"
             console.print(f"{_escape(name)}: ok ({count})", highlight=False, soft_wrap=True)
             print_starts(console, starts)
+    _warn_of_plugins()
     if failed:
         raise typer.Exit(2)
 
@@ -342,6 +343,7 @@ def list_() -> None:
     from dynsim.tables import print_choices
 
     print_choices(console)
+    _warn_of_plugins()
 
 
 @app.command(epilog="Example: dynsim plot results/elbow_comparison/two_elbows/record.h5")
@@ -392,6 +394,7 @@ def schema() -> None:
     from dynsim.scenario import json_schema
 
     print(json.dumps(json_schema(), indent=2))
+    _warn_of_plugins()
 
 
 # These load serial ports and servos only when called.
@@ -399,6 +402,14 @@ app.add_typer(hw, name="hw")
 app.command(
     epilog="Example: dynsim export results/elbow_comparison/two_elbows/record.h5 --format joint-trajectory --rate 100"
 )(export)
+
+
+def _warn_of_plugins() -> None:
+    """Say on stderr which plug-ins do not work; a run says so only of those that it needs."""
+    from dynsim.families import faults
+
+    for fault in faults():
+        errors.print(f"[yellow]warning:[/] {_escape(fault)}")
 
 
 def _overrides(given: list[str] | None) -> dict[str, Any]:

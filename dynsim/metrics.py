@@ -14,7 +14,7 @@ from dynsim.kernels.integrate.run import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FO
 from dynsim.model.clearance import Sinking, sinking
 from dynsim.model.description import Contact, Robot
 from dynsim.record import Record
-from dynsim.scenario import Scenario
+from dynsim.scenario import Scenario, build
 
 # Integrals that the integrator carries, in the order of the state (dynsim.kernels.ledger).
 INTEGRALS = {
@@ -148,7 +148,7 @@ def summarise(
     turnover = energy_turnover(record)
     residual = float(np.abs(record["energy_residual"]).max(initial=0.0))
     denominator = max(turnover, residual_floor(record, robot, scenario.integrator.rtol))
-    sunk = sinking(robot, scenario.surfaces(), record["q"])
+    sunk = sinking(robot, build.surfaces(scenario), record["q"])
     summary: dict[str, Any] = {
         "scenario": scenario.name,
         "variant": scenario.variant,

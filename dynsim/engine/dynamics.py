@@ -38,7 +38,7 @@ from dynsim.model.control import JointControl
 from dynsim.model.description import Array, Contact, Link, Robot
 from dynsim.model.model import Model
 from dynsim.record import Record
-from dynsim.scenario import Scenario, build_model
+from dynsim.scenario import Scenario, build, build_model
 
 log = logging.getLogger(__name__)
 
@@ -71,8 +71,9 @@ def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
         The record would be larger than ``record.size_limit_GB``, or the explicit method would need too many steps.
     """
     model = build_model(scenario)
-    robot, contacts = model.robot, scenario.contacts()
-    scenario.check_start(model)
+    robot, contacts = model.robot, build.contacts(scenario)
+    build.check_start(scenario, model)
+    build.loads(scenario, robot)
     n, na, c = model.n, len(robot.motors), len(contacts)
     layout, columns = state_layout(model.nq, n, na, c), output_layout(n, na, c)
     times = _sample_times(scenario, columns=layout.size + columns.size)
@@ -224,7 +225,7 @@ def _control(scenario: Scenario, model: Model, progress: Progress | None) -> Joi
         return JointControl.short_circuit(len(model.robot.motors))
     log.info("%s: planning references over %g s", scenario.title, scenario.duration_s)
     started = clock.perf_counter()
-    control = scenario.build_controller(model, None if progress is None else partial(progress, stage=REFERENCES))
+    control = build.controller(scenario, model, None if progress is None else partial(progress, stage=REFERENCES))
     log.info("%s: planned references in %.3f s", scenario.title, clock.perf_counter() - started)
     if not isinstance(control, JointControl):
         raise ModelError(f"controller {scenario.controller.type!r} cannot drive a {scenario.plant.type!r}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time as clock
-from types import ModuleType
 
 import numpy as np
 
@@ -38,10 +37,9 @@ from dynsim.model.snake import (
     CommandSource,
     Feedback,
     SnakeDescription,
-    TaskSpaceController,
 )
 from dynsim.record import Record
-from dynsim.scenario import Scenario
+from dynsim.scenario import Scenario, build
 
 log = logging.getLogger(__name__)
 
@@ -61,12 +59,15 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> Run:
     ScenarioError
         The recording rate does not divide the control rate, or the record would be too large.
     """
-    if scenario.controller is None or getattr(_controller_module(scenario), "ENGINE", "") != "kinematic":
+    if scenario.controller is None or member("controller", scenario.controller.type).ENGINE != "kinematic":
         raise ModelError(f"plant {scenario.plant.type!r} (kinematic) needs controller.type: task_space")
     if scenario.config.contacts.points:
         raise ModelError(f"plant {scenario.plant.type!r} (kinematic) takes no contacts.points: it stands on its wheels")
-    description: SnakeDescription = member("plant", scenario.plant.type).build(scenario.plant)
-    controller: TaskSpaceController = _controller_module(scenario).build(scenario.controller, description)
+    if scenario.config.loads:
+        raise ModelError(f"plant {scenario.plant.type!r} (kinematic) takes no loads: it has no forces", keys=("loads",))
+    description = build.machine(scenario)
+    assert isinstance(description, SnakeDescription)
+    controller = build.controller(scenario, description)
     model, period = description.arrays(), controller.schedule.period
     ticks = round(scenario.duration_s / period)
     if ticks < 1:
@@ -144,10 +145,6 @@ def simulate(scenario: Scenario, progress: Progress | None = None, source: Comma
     if stop is not None:
         raise_stopped(stop, record)
     return record
-
-
-def _controller_module(scenario: Scenario) -> ModuleType:
-    return member("controller", scenario.controller.type)
 
 
 def _named(state: State) -> dict[str, list[float]]:

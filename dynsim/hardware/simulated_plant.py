@@ -132,9 +132,9 @@ def simulated_arm(
     ServoMapError
         The servos of the map are not its joints.
     """
-    from dynsim.scenario import build_model, load_scenario
+    from dynsim.scenario import build, build_model, load_scenario
 
     scenario = load_scenario(scenario_name, variant=variant)
     model = build_model(scenario)
     start = [posture.get(name, angle) for name, angle in zip(model.joint_names, model.robot.initial, strict=True)]
-    return SimulatedArm(model, scenario.contacts(), servo_map, np.array(start))
+    return SimulatedArm(model, build.contacts(scenario), servo_map, np.array(start))

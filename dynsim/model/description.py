@@ -46,6 +46,11 @@ class Inertia:
     tensor: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
     @classmethod
+    def solid_sphere(cls, mass: float, radius: float, center: Array) -> Inertia:
+        """Sphere about ``center``: I = 2 m r²/5; a point mass when the radius is zero."""
+        return cls(mass, center, np.eye(3) * (0.4 * mass * radius**2))
+
+    @classmethod
     def solid_cylinder(cls, mass: float, radius: float, length: float) -> Inertia:
         """Cylinder along +z from the frame's origin: I_x = I_y = m (3 r² + l²)/12, I_z = m r²/2."""
         side = mass * (3.0 * radius**2 + length**2) / 12.0
@@ -285,6 +290,38 @@ class Contact:
 
 
 @dataclass(frozen=True)
+class Load:
+    """A force and a torque from outside on a point of a body, as cubic polynomials of time.
+
+    Attributes
+    ----------
+    body : name of a link
+    point : (3,) where the force acts, in the link's frame [m]
+    in_body : whether the components are in the axes of the link, else of the world
+    knots : (K + 1,) increasing times [s]
+    coefficients : (K, 6, 4) ascending powers of t - knots[k], force x, y, z [N], then torque x, y, z [N m]
+    hold : whether the values at the first and the last knot go on beyond them, else it is zero there
+    """
+
+    name: str
+    body: str
+    point: Array
+    in_body: bool
+    knots: Array
+    coefficients: Array
+    hold: bool
+
+    def components(self, t: Array) -> Array:
+        """Force and torque at times t [s], (T,) → (T, 6) [N, N m]."""
+        t = np.asarray(t, dtype=np.float64)
+        inside = np.clip(t, self.knots[0], self.knots[-1])
+        segment = np.minimum(np.searchsorted(self.knots, inside, side="right") - 1, len(self.coefficients) - 1)
+        powers = (inside - self.knots[segment])[:, None] ** np.arange(4)
+        values = np.einsum("tcp,tp->tc", self.coefficients[segment], powers)
+        return values if self.hold else np.where((inside == t)[:, None], values, 0.0)
+
+
+@dataclass(frozen=True)
 class Robot:
     """A tree of links with its motors.
 
@@ -308,9 +345,18 @@ class Robot:
         ModelError
             No such body or frame, or a frame that is fixed to the world.
         """
+        index, frame = self._find(name)
+        return index, point if frame is None else frame.p + frame.R @ point
+
+    def attached_axes(self, name: str) -> Array:
+        """Axes of the body or frame of that name in the body's, (3, 3); raises what :meth:`attach` does."""
+        _, frame = self._find(name)
+        return np.eye(3) if frame is None else frame.R
+
+    def _find(self, name: str) -> tuple[int, Frame | None]:
         bodies = [link.name for link in self.links]
         if name in bodies:
-            return bodies.index(name), point
+            return bodies.index(name), None
         frame = next((frame for frame in self.frames if frame.name == name), None)
         if frame is None:
             names = [*bodies, *(frame.name for frame in self.frames if frame.body is not None)]
@@ -320,7 +366,7 @@ class Robot:
             raise ModelError(f"no body {name!r}{hint}; bodies: {', '.join(bodies)}{fixed}")
         if frame.body is None:
             raise ModelError(f"{name!r} is fixed to the world and does not move; bodies: {', '.join(bodies)}")
-        return bodies.index(frame.body), frame.p + frame.R @ point
+        return bodies.index(frame.body), frame
 
     @property
     def initial(self) -> Array:

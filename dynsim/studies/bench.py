@@ -27,7 +27,7 @@ from dynsim.kernels.integrate.driver import advance
 from dynsim.kernels.jit import kernel
 from dynsim.kernels.state import block
 from dynsim.kernels.system import System, derivative
-from dynsim.scenario import load_scenario
+from dynsim.scenario import build, load_scenario
 from dynsim.studies import mujoco_peer, pinocchio_peer
 
 Array = NDArray[np.float64]
@@ -345,7 +345,7 @@ def prepare_case(case: Case, options: dict[str, Any]) -> Prepared:
         model = load_scenario(SCENARIO, case.variant)
         overrides["contacts.friction"] = 0.0
         built = prepare(model)
-        for contact in model.contacts():
+        for contact in build.contacts(model):
             x, y, z = built.model.point_position(contact.body, contact.point, built.model.robot.initial)
             overrides[f"surfaces.under_{contact.name}"] = {
                 "type": "sphere",

@@ -15,7 +15,7 @@ import numpy as np
 from dynsim.model.control import JointControl
 from dynsim.model.description import Array, Contact, Inertia, Link
 from dynsim.model.model import Model
-from dynsim.scenario import Scenario, build_model
+from dynsim.scenario import Scenario, build, build_model
 
 # Steps [s], and how long the first holds: while the motors take up the weight.
 STEP, START_STEP, START_S = 5e-4, 1.25e-4, 0.5
@@ -146,8 +146,8 @@ def _rotor(link: Link, inertia: float) -> Link:
 def rotor_model(scenario: Scenario, *, spinning: bool) -> RotorModel:
     """The :class:`RotorModel` of a scenario with a joint controller, revolute joints and signed friction."""
     model = build_model(scenario)
-    control = scenario.build_controller(model)
-    return RotorModel(model, scenario.contacts(), control, scenario.duration_s, spinning=spinning)
+    control = build.controller(scenario, model)
+    return RotorModel(model, build.contacts(scenario), control, scenario.duration_s, spinning=spinning)
 
 
 def rotor_energies(scenario: Scenario) -> dict[str, float]:

@@ -15,7 +15,7 @@ from dynsim.engine import simulate
 from dynsim.files import write_json
 from dynsim.model.clearance import poses
 from dynsim.record import Record
-from dynsim.scenario import Scenario, load_scenario, scenario_from_resolved, shipped_scenarios, variant_names
+from dynsim.scenario import Scenario, build, load_scenario, scenario_from_resolved, shipped_scenarios, variant_names
 from dynsim.studies.compare import compare
 from dynsim.studies.rotors import rotor_energies
 
@@ -90,7 +90,7 @@ def elbow_numbers(record: Record, scenario: Scenario) -> dict[str, float]:
     keys = ("electrical_energy_J", "electrical_energy_supply_J", "electrical_energy_drawn_J", "mechanical_work_J")
     row = {key: summary[key] for key in keys}
     row["sum_of_absolute_power_J"] = float(np.trapezoid(np.abs(record["torque"] * record["v"]).sum(axis=1), time))
-    lowest = np.min([p[2] for _, _, p in poses(scenario.robot(), record["q"])], axis=0)
+    lowest = np.min([p[2] for _, _, p in poses(build.robot(scenario), record["q"])], axis=0)
     row["joint_depth_max_m"] = float(-lowest.min())
     row["joint_depth_from_2_s_min_m"] = float(-lowest[time >= 2.0].max())
     row["joint_depth_from_2_s_max_m"] = float(-lowest[time >= 2.0].min())

@@ -65,7 +65,7 @@ def test_the_gate_fails_with_every_bound_exceeded(rig, clean_run, tmp_path) -> N
         check_gate(comparison, Gate(rms_rad=0.001, delay_s=0.01))
     assert failure.value.exit_code == 5
     (tmp_path / "gate.yaml").write_text("rms: 0.1\n", encoding="utf-8")
-    with pytest.raises(ServoMapError, match="rms: unknown key; known are rms_rad"):
+    with pytest.raises(ServoMapError, match="rms: unknown key; did you mean 'rms_rad'"):
         load_gate(tmp_path / "gate.yaml")
     assert draw_comparison(comparison, tmp_path / "figures" / "comparison.png").stat().st_size > 10_000
     assert json.loads(json.dumps(comparison.summary()))["rms_rad"] == comparison.worst.rms

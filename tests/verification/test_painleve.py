@@ -18,6 +18,7 @@ from dynsim.kernels.constraint.uniqueness import ROOM, UNIQUE, force_verdict
 from dynsim.kernels.integrate import driver
 from dynsim.kernels.integrate import run as ki
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
+from dynsim.scenario import build
 
 X, Y, Z = np.eye(3)
 FLOOR = Quadric(np.zeros((3, 3)), Z, 0.0)
@@ -390,8 +391,10 @@ def test_a_reversed_diagonal_beside_a_positive_determinant_is_a_warning():
 
 def test_dissipative_is_the_default_and_the_published_comparisons_name_their_own_law():
     for name in ("elbow_comparison", "elbow_comparison_vertical"):
-        assert {contact.pulling_friction for contact in dynsim.load_scenario(name).contacts()} == {"signed"}
-    assert {contact.pulling_friction for contact in dynsim.load_scenario("thirty_links").contacts()} == {"dissipative"}
+        assert {contact.pulling_friction for contact in build.contacts(dynsim.load_scenario(name))} == {"signed"}
+    assert {contact.pulling_friction for contact in build.contacts(dynsim.load_scenario("thirty_links"))} == {
+        "dissipative"
+    }
     assert Contact("c", "b", np.zeros(3), FLOOR).pulling_friction == "dissipative"
 
 

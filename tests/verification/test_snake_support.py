@@ -18,11 +18,12 @@ from dynsim.kernels.snake_support import (
     smooth_margin,
     support_polygon,
 )
+from dynsim.model.protocols import BuildContext
 from dynsim.model.snake import ModeTable
 from dynsim.plants.snake import Config, build
 
 seeds = st.integers(0, 2**32 - 1)
-ROBOT = build(Config())
+ROBOT = build(Config(), BuildContext(1.0))
 MODEL = ROBOT.arrays()
 MODES = ModeTable.from_lifted(TABLE_II, 7)
 K_V = reals([15, 0.015] * 3 + [9.6, 4.8, 2.4, 1.2, 0.6, 0.3])
