@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from dynsim.hardware.control_table import Field
+from dynsim.hardware.bus.control_table import Field
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class NoAnswer(Exception):
 
 
 class RequestRefused(Exception):
-    """A servo answered with an error code (:class:`dynsim.hardware.packet.StatusError`)."""
+    """A servo answered with an error code (:class:`dynsim.hardware.bus.packet.StatusError`)."""
 
     def __init__(self, id_: int, code: int, text: str) -> None:
         super().__init__(f"ID {id_}: {text}")

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.hardware.control_table import RAD_PER_TICK
+from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.servo_map import ServoMap
-from dynsim.hardware.servo_plant import Drive, MotorLaw
+from dynsim.hardware.virtual.servo_plant import Drive, MotorLaw
 
 Array = NDArray[np.float64]
 
@@ -31,7 +31,7 @@ HELD = 1e9
 
 
 class SimulatedArm:
-    """Implements :class:`~dynsim.hardware.servo_plant.ServoPlant` for a robot whose every joint has a position servo.
+    """A :class:`~dynsim.hardware.virtual.servo_plant.ServoPlant`: a robot whose every joint has a position servo.
 
     A joint rests on the robot's stand until its servo is first switched on: otherwise an arm would fall while it is
     armed joint by joint.

@@ -6,9 +6,7 @@ from collections.abc import Callable
 from pathlib import Path as FilePath
 
 from dynsim.files import write_json
-from dynsim.hardware.bus import Bus, NoAnswer, RequestRefused
-from dynsim.hardware.check import CheckedMotion
-from dynsim.hardware.control_table import (
+from dynsim.hardware.bus.control_table import (
     HEALTH_BLOCK,
     MODEL_BY_NUMBER,
     RAD_S_PER_UNIT,
@@ -18,6 +16,8 @@ from dynsim.hardware.control_table import (
     OperatingMode,
     describe_hardware_error,
 )
+from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused
+from dynsim.hardware.replay.check import CheckedMotion
 from dynsim.hardware.servo_map import Servo, ServoMap
 
 EEPROM_BLOCK = (0, 64)

@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.hardware.control_table import MX_106, ServoModel
+from dynsim.hardware.bus.control_table import MX_106, ServoModel
 
 Array = NDArray[np.float64]
 

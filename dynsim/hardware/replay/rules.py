@@ -12,8 +12,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.hardware.check import CyclePlan
-from dynsim.hardware.control_table import HEALTH_BLOCK, VOLT_PER_UNIT, describe_hardware_error
+from dynsim.hardware.bus.control_table import HEALTH_BLOCK, VOLT_PER_UNIT, describe_hardware_error
+from dynsim.hardware.replay.check import CyclePlan
 from dynsim.hardware.servo_map import Servo, ServoMap
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from dynsim.hardware.errors import PortError
-from dynsim.hardware.virtual_bus import ADAPTER_LATENCY, VirtualLine
+from dynsim.hardware.virtual.line import ADAPTER_LATENCY, VirtualLine
 
 _BAUD_BY_CODE = {
     getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()

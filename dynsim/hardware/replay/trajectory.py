@@ -171,11 +171,3 @@ def _at_rest_at_both_ends(path: Path, acceleration: float) -> Path:
         position = np.concatenate([position, position[-1:] + 0.5 * duration * last])
         rate_after, rate_before = np.concatenate([rate_after, last]), np.concatenate([rate_before, rest])
     return Path(time, position, rate_after, rate_before, path.record_end)
-
-
-def quintic(duration: float, time: float) -> tuple[float, float]:
-    """Fraction of a rest-to-rest move and its rate [1/s] at ``time`` [s]: s = 10u³ − 15u⁴ + 6u⁵, u = time/duration."""
-    if duration <= 0:
-        return 1.0, 0.0
-    u = min(max(time / duration, 0.0), 1.0)
-    return u**3 * (10 + u * (-15 + 6 * u)), 30 * u * u * (1 - u) ** 2 / duration

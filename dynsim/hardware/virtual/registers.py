@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
-from dynsim.hardware.control_table import INDIRECT_BLOCKS, RAD_S_PER_UNIT, TABLE_SIZE, Field, OperatingMode, ServoModel
-from dynsim.hardware.packet import StatusError
+from dynsim.hardware.bus.control_table import (
+    INDIRECT_BLOCKS,
+    RAD_S_PER_UNIT,
+    TABLE_SIZE,
+    Field,
+    OperatingMode,
+    ServoModel,
+)
+from dynsim.hardware.bus.packet import StatusError
 
 GOAL_FIELDS = ("goal_pwm", "goal_current", "goal_velocity", "goal_position")
 MODES = {

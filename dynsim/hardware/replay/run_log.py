@@ -10,7 +10,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from dynsim.hardware.rules import Cycle
+from dynsim.hardware.replay.rules import Cycle
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import Record
 from dynsim.terminal import plain

@@ -14,7 +14,7 @@ from scipy.optimize import minimize_scalar
 from dynsim.errors import RecordError, shown
 from dynsim.files import replacing
 from dynsim.hardware.errors import ComparisonGateFailed
-from dynsim.hardware.replay import State
+from dynsim.hardware.replay.states import State
 from dynsim.hardware.servo_map import StrictModel, read_yaml
 from dynsim.record import Record
 

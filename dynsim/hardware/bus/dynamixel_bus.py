@@ -28,10 +28,10 @@ from typing import Any
 import serial
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PortHandler, Protocol2PacketHandler
 
-from dynsim.hardware.bus import BlockRead, NoAnswer, RequestRefused, ServoReply
-from dynsim.hardware.control_table import BROADCAST_ID, Field
+from dynsim.hardware.bus.control_table import BROADCAST_ID, Field
+from dynsim.hardware.bus.packet import ALERT, HEADER, STATUS, Decoder, StatusError
+from dynsim.hardware.bus.protocol import BlockRead, NoAnswer, RequestRefused, ServoReply
 from dynsim.hardware.errors import PortError
-from dynsim.hardware.packet import ALERT, HEADER, STATUS, Decoder, StatusError
 
 WRITE_TIMEOUT = 0.25
 READ_WAIT = 5e-4

@@ -12,10 +12,10 @@ from typing import Literal
 
 import numpy as np
 
-from dynsim.hardware.control_table import HEALTH_BLOCK, STATE_BLOCK, TICKS_PER_TURN
+from dynsim.hardware.bus.control_table import HEALTH_BLOCK, STATE_BLOCK, TICKS_PER_TURN
 from dynsim.hardware.errors import CheckRefused
+from dynsim.hardware.replay.trajectory import Path, column_of, path_of_record
 from dynsim.hardware.servo_map import Servo, ServoMap
-from dynsim.hardware.trajectory import Path, column_of, path_of_record
 from dynsim.record import Record
 
 BITS_PER_BYTE = 10
