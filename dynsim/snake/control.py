@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.kernels.jit import internal_kernel, kernel
-from dynsim.kernels.snake import (
+from dynsim.snake.kinematics import (
     Chain,
     SnakeModel,
     active_rows,
@@ -23,7 +23,7 @@ from dynsim.kernels.snake import (
     walk_chain,
     wrap_angle,
 )
-from dynsim.kernels.snake_support import Cost, Support, cost_gradient, new_support
+from dynsim.snake.support import Cost, Support, cost_gradient, new_support
 
 LIMITS_NONE, LIMITS_SATURATE, LIMITS_ALLOCATE = 0, 1, 2
 NULL_PAPER, NULL_SAFE = 0, 1

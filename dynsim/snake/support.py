@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.kernels.jit import internal_kernel, kernel
-from dynsim.kernels.snake import SnakeModel
+from dynsim.snake.kinematics import SnakeModel
 
 COST_ANGLES = 0  # eq 19
 COST_SUPPORT_NORM = 1  # eq 20 as printed: 1 / norm of the distances to all sides
