@@ -376,7 +376,8 @@ def bench(
 ) -> None:
     """Time right-hand sides and the whole job beside Pinocchio and MuJoCo (where installed)."""
     from dynsim.files import write_json
-    from dynsim.studies.bench import format_table, run_bench
+    from dynsim.studies.bench.run import run_bench
+    from dynsim.studies.bench.table import format_table
 
     with console.status("measuring"):
         result = run_bench(quick)

@@ -8,7 +8,7 @@ from dynsim.engine.dynamics import prepare
 from dynsim.errors import ScenarioError
 from dynsim.kernels.coupled import derivative
 from dynsim.scenario import build_model, load_scenario
-from dynsim.studies.rotors import rotor_energies, rotor_model
+from dynsim.studies.published.rotors import rotor_energies, rotor_model
 
 ARM = """
 duration_s: 1
