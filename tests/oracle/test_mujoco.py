@@ -24,8 +24,8 @@ from dynsim.model.arrays import compile_contacts, compile_drives  # noqa: E402
 from dynsim.model.description import Inertia, Link, Robot  # noqa: E402
 from dynsim.model.model import Model  # noqa: E402
 from dynsim.scenario import load_scenario  # noqa: E402
-from dynsim.studies.bench import CASES, prepare_case  # noqa: E402
-from dynsim.studies.mujoco_peer import build_mujoco, roll_out, setpoints, state_of  # noqa: E402
+from dynsim.studies.bench.job import CASES, prepare_case  # noqa: E402
+from dynsim.studies.bench.mujoco_peer import build_mujoco, roll_out, setpoints, state_of  # noqa: E402
 
 TIGHT = {"integrator.rtol": 1e-11, "integrator.atol": 1e-13}
 

@@ -9,7 +9,7 @@ from dynsim.errors import ScenarioError
 from dynsim.kernels.state import ELECTRICAL, block
 from dynsim.kernels.system import derivative
 from dynsim.scenario import build_model, load_scenario
-from dynsim.studies.rotors import rotor_energies, rotor_model
+from dynsim.studies.published.rotors import rotor_energies, rotor_model
 
 ARM = """
 duration_s: 1
