@@ -1,4 +1,4 @@
-"""The compiled tick loop: controller, plant, mode switching, recording."""
+"""The compiled tick loop: what the controller believes and asks for, what the plant does, and their recording."""
 
 from __future__ import annotations
 
