@@ -13,8 +13,8 @@ from dynsim.kernels.integrate.run import FINISHED, METHODS, STATUS, Run, new_run
 from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.state import block, output_layout, state_layout
 from dynsim.kernels.system import System, derivative
-from dynsim.model.arrays import compile_contacts, compile_drives, compile_model
-from dynsim.model.description import Contact, Inertia, Link, Motor, Quadric, Robot
+from dynsim.model.arrays import compile_contacts, compile_drives, compile_loads, compile_model
+from dynsim.model.description import Contact, Inertia, Link, Load, Motor, Quadric, Robot
 from dynsim.model.model import Model
 
 SURFACES = ("plane", "sphere", "cylinder")
@@ -209,6 +209,7 @@ def bench(
     contacts: list[Contact] | None = None,
     *,
     m_star: bool = False,
+    loads: list[Load] | None = None,
     held: np.ndarray | None = None,
     k_p: float = 30.0,
     k_d: float = 1.0,
@@ -218,11 +219,12 @@ def bench(
     contact_arrays = compile_contacts(robot, contacts or [])
     n, c = len(robot.links), len(contacts or [])
     system = System(
-        layout=state_layout(robot.nq, n, na, c),
+        layout=state_layout(robot.nq, n, na, c, len(loads or ())),
         model=compile_model(robot),
         drives=compile_drives(robot, k_p=[k_p] * na, k_d=[k_d] * na),
         reference=held_reference(np.zeros(na) if held is None else held),
         contacts=contact_arrays,
+        loads=compile_loads(robot, loads or ()),
         dense=np.zeros((n + na + c, n + na + c + 1)) if m_star else None,
     )
     ws = ka.workspace(n, na, c)

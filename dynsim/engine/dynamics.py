@@ -32,7 +32,7 @@ from dynsim.kernels.state import (
     state_layout,
 )
 from dynsim.kernels.system import System
-from dynsim.model.arrays import compile_contacts, compile_drives
+from dynsim.model.arrays import compile_contacts, compile_drives, compile_loads
 from dynsim.model.clearance import poses
 from dynsim.model.control import JointControl
 from dynsim.model.description import Array, Contact, Link, Robot
@@ -73,9 +73,9 @@ def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
     model = build_model(scenario)
     robot, contacts = model.robot, build.contacts(scenario)
     build.check_start(scenario, model)
-    build.loads(scenario, robot)
+    loads = build.loads(scenario, robot)
     n, na, c = model.n, len(robot.motors), len(contacts)
-    layout, columns = state_layout(model.nq, n, na, c), output_layout(n, na, c)
+    layout, columns = state_layout(model.nq, n, na, c, len(loads)), output_layout(n, na, c)
     times = _sample_times(scenario, columns=layout.size + columns.size)
     _check_stiffness(scenario, robot)
     _check_work(scenario, n, c)
@@ -90,6 +90,7 @@ def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
         drives=compile_drives(robot, k_p=list(control.k_p), k_d=list(control.k_d)),
         reference=control.reference,
         contacts=compile_contacts(robot, contacts),
+        loads=compile_loads(robot, loads),
         dense=np.zeros((n + c + na, n + c + na + 1)) if options.solver == "m_star" else None,
     )
     y = np.zeros(layout.size)

@@ -40,6 +40,7 @@ from dynsim.kernels.ledger import ledger_rates
 from dynsim.kernels.state import StateLayout
 from dynsim.kernels.tree.articulated import accelerate, add_contact_forces, contact_system, factor
 from dynsim.kernels.tree.joints import position_rates, read_positions
+from dynsim.kernels.tree.loads import LoadArrays, add_loads
 from dynsim.kernels.tree.sweep import forward_sweep
 
 
@@ -51,6 +52,7 @@ class System(NamedTuple):
     drives: DriveArrays
     reference: ReferenceArrays
     contacts: ContactArrays
+    loads: LoadArrays
     dense: np.ndarray | None  # room for M* and b, see constraint.m_star; None for the articulated solve alone
 
 
@@ -108,6 +110,8 @@ def derivative(system: System, t, y, ws: Workspace, dy):
         joints[drives.link[a], APPLIED] += motor[a, K_M] * motors[a, CURRENT]
 
     forward_sweep(model, ws, 1.0, 0.0, 1.0)
+    if system.loads.table.shape[0] > 0:
+        add_loads(model, system.loads, t, ws, dy, layout.load)
     contact_rows(model, contacts, ws)
     motor_voltage(drives, system.reference, t, ws)
     found = ws.deficient[0]

@@ -9,7 +9,9 @@ import numpy as np
 from dynsim.errors import ModelError, shown
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.jit import integers, reals
-from dynsim.model.description import Contact, Link, Motor, Robot
+from dynsim.kernels.tree import loads as kl
+from dynsim.kernels.tree.loads import LoadArrays
+from dynsim.model.description import Contact, Link, Load, Motor, Robot
 
 # Beyond it the reduction of an angle to a quarter turn leaves too few digits (dynsim.kernels.tree.sweep.sine_cosine).
 ANGLE_LIMIT = 1e6
@@ -134,6 +136,29 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArr
         point[k, ka.QUADRIC + 9] = scale * surface.c
         point[k, ka.MU], point[k, ka.V_S] = contact.friction, contact.slip_smoothing
     return ka.ContactArrays(link=integers(link), point=reals(point))
+
+
+def compile_loads(robot: Robot, loads: Sequence[Load]) -> LoadArrays:
+    """Tables of the external wrenches.
+
+    Raises
+    ------
+    ModelError
+        A body that the robot does not have.
+    """
+    table = np.zeros((len(loads), kl.TABLE_SIZE), dtype=np.int64)
+    parts: list[np.ndarray] = []
+    place = 0
+    for k, load in enumerate(loads):
+        try:
+            body, on_body = robot.attach(load.body, load.point)
+        except ModelError as error:
+            raise ModelError(f"load {load.name}: {error}") from None
+        segments = np.column_stack([load.knots[:-1], load.coefficients.reshape(len(load.coefficients), 24)])
+        table[k] = body, load.in_body, load.hold, place, len(segments)
+        parts += [on_body, np.zeros(6), segments.ravel(), load.knots[-1:]]
+        place += kl.FIRST_SEGMENT + segments.size + 1
+    return LoadArrays(table=integers(table), data=reals(np.concatenate(parts) if parts else np.zeros(0)))
 
 
 def _check_shapes(robot: Robot) -> None:

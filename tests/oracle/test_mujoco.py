@@ -20,7 +20,7 @@ from dynsim.kernels.integrate.driver import advance  # noqa: E402
 from dynsim.kernels.jit import integers, reals  # noqa: E402
 from dynsim.kernels.state import OUT_FORCE, OUT_SLIP, OUT_VECTOR, state_layout  # noqa: E402
 from dynsim.kernels.system import System  # noqa: E402
-from dynsim.model.arrays import compile_contacts, compile_drives  # noqa: E402
+from dynsim.model.arrays import compile_contacts, compile_drives, compile_loads  # noqa: E402
 from dynsim.model.description import Inertia, Link, Robot  # noqa: E402
 from dynsim.model.model import Model  # noqa: E402
 from dynsim.scenario import load_scenario  # noqa: E402
@@ -64,7 +64,9 @@ def test_accelerations_of_random_trees(seed: int, n: int) -> None:
     model = Model(robot)
     nothing = ka.ReferenceArrays(integers([]), reals([]), reals([0, 1]), reals(np.zeros((1, 0, 6))))
     drives, contacts = compile_drives(robot, k_p=[], k_d=[]), compile_contacts(robot, [])
-    system = System(state_layout(n, n, 0, 0), model.arrays, drives, nothing, contacts, None)
+    system = System(
+        state_layout(n, n, 0, 0), model.arrays, drives, nothing, contacts, compile_loads(model.robot, ()), None
+    )
     peer = build_mujoco(system, step=1e-3, motors=False)
     # MuJoCo numbers joints depth first, dynsim in the order of the description.
     order = [mujoco.mj_name2id(peer, mujoco.mjtObj.mjOBJ_JOINT, f"joint_{i}") for i in range(n)]

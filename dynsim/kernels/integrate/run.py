@@ -7,22 +7,42 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.kernels.constraint.uniqueness import ROOM
-from dynsim.kernels.jit import reals
+from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.state import OUTPUTS_PER_CONTACT, OutputLayout, StateLayout, block
 
 DOPRI5, RK4, RODAS4, RK43 = 0, 1, 2, 3
 METHODS = {"rk43": RK43, "dopri5": DOPRI5, "rk4": RK4, "rodas4": RODAS4}
 
 RUNNING, FINISHED, NOT_FINITE, STEP_TOO_SMALL, NOT_PROJECTED, NO_FORCES = 0, 1, 2, 3, 4, 5
-FORCES_REVERSED, SEVERAL_FORCES = 6, 7
+FORCES_REVERSED, SEVERAL_FORCES, STOPPED = 6, 7, 8
 
 # Run.clock
 TIME, STEP, LAST_ERROR, END, RTOL, ATOL, STEP_MAX = 0, 1, 2, 3, 4, 5, 6
 NOT_UNIQUE = 7  # end of the step at which the contact forces were not unique, which was not accepted [s]
-CLOCK_SIZE = 8
+# A step that would end beyond HOLD is left pending, not accepted; the step size proposed before a cut; error norm of
+# the step taken; the bracket of the root that is searched, from TIME on [s].
+HOLD, PROPOSED, ERROR, LOW, HIGH = 8, 9, 10, 11, 12
+CLOCK_SIZE = 13
 # Run.count, int
 STEPS, REJECTED, EVALUATIONS, PROJECTIONS, SAMPLE, STATUS, STARTED = 0, 1, 2, 3, 4, 5, 6
-COUNT_SIZE = 7
+# A step waits to be accepted; trials of a root; which end of the bracket moved last; the step ends at an event; it ends
+# at a tick; events in the log; bits of the ticks that the caller is to look at.
+PENDING, SEARCHING, TURNED_BACK, FIRED, TRIMMED, LOGGED, TICKED = 7, 8, 9, 10, 11, 12, 13
+COUNT_SIZE = 14
+# Run.event, and Run.event_table, int
+EVENT_LEVEL, SIDE, START_VALUE, VALUE, AT_LOW, AT_HIGH = 0, 1, 2, 3, 4, 5
+EVENT_SIZE = 6
+EVENT_KIND, EVENT_INDEX, DIRECTION, ON_EVENT = 0, 1, 2, 3
+EVENT_TABLE_SIZE = 4
+# What an event does besides being logged: nothing, the caller looks, the run ends.
+LOG, RETURN, STOP = 0, 1, 2
+# Run.tick, and Run.tick_table, int. Kinds are bits.
+TICK_PERIOD, TICK_NEXT, TICK_PHASE = 0, 1, 2
+TICK_SIZE = 3
+TICK_KIND, TICK_COUNT = 0, 1
+TICK_TABLE_SIZE = 2
+TAKE_COMMANDS, CALLER = 1, 2
+LOG_LENGTH = 1024
 # Run.extremes, per contact
 FORCE_MIN, FORCE_MAX, DRIFT_MAX = 0, 1, 2
 PULLING, LAST_FORCE = 3, 4  # time with a negative normal force [s]; normal force at the last accepted step [N]
@@ -51,6 +71,13 @@ class Run(NamedTuple):
     hand_point: np.ndarray  # (3,) in the body's frame
     sample_time: np.ndarray  # (T,)
     sample: np.ndarray  # (T, m) states
+    event: np.ndarray  # (e, EVENT_SIZE)
+    event_table: np.ndarray  # (e, EVENT_TABLE_SIZE) int
+    tick: np.ndarray  # (k, TICK_SIZE)
+    tick_table: np.ndarray  # (k, TICK_TABLE_SIZE) int
+    log_time: np.ndarray  # (LOG_LENGTH,) of events [s]
+    log_event: np.ndarray  # (LOG_LENGTH,) int: which
+    hand: np.ndarray  # (3,) room
     columns: OutputLayout
     output: np.ndarray  # (T, columns.size)
 
@@ -80,11 +107,16 @@ def new_run(
     step_max: float,
     rtol: float,
     atol: float,
+    events: tuple[np.ndarray, np.ndarray] | None = None,
+    ticks: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Run:
     """Allocate a :class:`Run` from t = 0 at state y, (layout.size,)."""
     m, rodas = len(y), method == RODAS4
     clock = np.zeros(CLOCK_SIZE)
     clock[[STEP, LAST_ERROR, END, RTOL, ATOL, STEP_MAX]] = step, 1e-4, end, rtol, atol, step_max
+    clock[HOLD] = np.inf
+    event, event_table = events or (np.zeros((0, EVENT_SIZE)), np.zeros((0, EVENT_TABLE_SIZE)))
+    tick, tick_table = ticks or (np.zeros((0, TICK_SIZE)), np.zeros((0, TICK_TABLE_SIZE)))
     extremes = np.zeros((c, EXTREMES_SIZE))
     extremes[:, FORCE_MIN], extremes[:, FORCE_MAX], extremes[:, LOCAL_SINCE] = np.inf, -np.inf, np.inf
     return Run(
@@ -106,6 +138,13 @@ def new_run(
         hand_point=reals(hand[1]),
         sample_time=reals(sample_time),
         sample=np.zeros((len(sample_time), m)),
+        event=reals(event),
+        event_table=integers(event_table),
+        tick=reals(tick),
+        tick_table=integers(tick_table),
+        log_time=np.zeros(LOG_LENGTH),
+        log_event=np.zeros(LOG_LENGTH, dtype=np.int64),
+        hand=np.zeros(3),
         columns=columns,
         output=np.zeros((len(sample_time), columns.size)),
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from dynsim.kernels.arrays import Workspace
+from dynsim.kernels.integrate.events import next_tick
 from dynsim.kernels.integrate.run import (
     ATOL,
     END,
@@ -20,6 +21,7 @@ from dynsim.kernels.integrate.run import (
     STEP_MAX,
     STEP_TOO_SMALL,
     TIME,
+    TRIMMED,
     Run,
 )
 from dynsim.kernels.jit import internal_kernel, kernel
@@ -71,9 +73,11 @@ def first_step(run: Run, states):
 
 @internal_kernel
 def choose_step(run: Run):
-    """Trim STEP so that END is met exactly: halve the way there rather than leave a sliver for the last step."""
+    """Trim STEP so that END, or a tick, is met exactly: halve the way rather than leave a sliver for the last step."""
     clock = run.clock
-    remaining = clock[END] - clock[TIME]
+    until = next_tick(run, clock[END])
+    remaining = until - clock[TIME]
+    run.count[TRIMMED] = 1 if until < clock[END] and remaining < 2.0 * clock[STEP] else 0
     if run.method == RK4:
         if remaining < clock[STEP] * (1.0 + 1e-9):
             clock[STEP] = remaining
