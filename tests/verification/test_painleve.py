@@ -10,7 +10,7 @@ import pytest
 from random_robots import Bench, bench, random_contacts, random_robot, random_unit
 
 import dynsim
-from dynsim.engine import dynamics
+from dynsim.engine import dynamics, recording
 from dynsim.engine.uniqueness import acceleration_range, contact_matrices, motion_spread, paradox
 from dynsim.errors import SimulationStopped
 from dynsim.kernels import arrays as ka
@@ -385,7 +385,7 @@ def test_a_reversed_diagonal_beside_a_positive_determinant_is_a_warning():
     driver.advance(prepared.system, prepared.workspace, prepared.run, 10**6)
     for since, expected in ((np.inf, []), (0.013, ["elbow_4: from t = 0.013 s on"])):
         prepared.run.extremes[0, ki.LOCAL_SINCE] = since  # as the watch does, see the random cases above
-        warnings = dynamics._record(scenario, prepared, 1.0).summary["warnings"]
+        warnings = recording.make_record(scenario, prepared, 1.0).summary["warnings"]
         assert [text[: len("elbow_4: from t = 0.013 s on")] for text in warnings if "Painlevé" in text] == expected
 
 
