@@ -31,7 +31,7 @@ controller: {type: sway, amplitudes: {slide: 0.1}, period_s: 1}
 MOUND = """duration_s: 0.2
 plant:
   type: serial_arm
-  link: {mass_kg: 0.2, length_m: 0.4, damping_N_m_s_per_rad: 0.3, motor: {type: wang_minami}}
+  link: {mass_kg: 0.2, length_m: 0.4, damping_N_m_s_per_rad: 0.3, motor: {type: small_servo}}
   chain:
     - {axis: z, length_m: 0.0}
     - {axis: y, initial_deg: 60}
@@ -221,13 +221,13 @@ def test_a_scenario_of_the_packages_own_members_looks_for_no_others(tmp_path: Pa
         "import importlib.metadata as metadata\n"
         "entry_points = metadata.entry_points\n"
         "def look(**given):\n"
-        "    if given.get('group', '').startswith('dynsim'): raise AssertionError('looked for entry points')\n"
+        "    if given.get('group', '').startswith('dynsim'): raise LookupError('looked for entry points')\n"
         "    return entry_points(**given)\n"
         "metadata.entry_points = look\n"
         "from dynsim import load_scenario, check\n"
         "check(load_scenario('elbow_comparison', overrides={'duration_s': 0.1}))\n"
         "try: load_scenario('elbow_comparison', overrides={'plant.type': 'unknown'})\n"
-        "except AssertionError as error: print(error)\n"
+        "except LookupError as error: print(error)\n"
     )
     answer = python(tmp_path, "-c", code)
     assert (answer.stdout, answer.stderr) == ("looked for entry points\n", "")
