@@ -18,8 +18,9 @@ from dynsim.control.commands import Script, ScriptedSource
 from dynsim.control.modes import TABLE_II, Switching
 from dynsim.errors import ModelError
 from dynsim.kernels.jit import integers, reals
-from dynsim.kernels.snake import SnakeModel, pose_of_point
-from dynsim.kernels.snake_control import (
+from dynsim.model.protocols import BuildContext
+from dynsim.model.snake import ModeTable, SnakeDescription, TaskSpaceController, conditioning
+from dynsim.snake.control import (
     LIMITS_ALLOCATE,
     LIMITS_NONE,
     LIMITS_SATURATE,
@@ -29,10 +30,9 @@ from dynsim.kernels.snake_control import (
     control_input,
     new_work,
 )
-from dynsim.kernels.snake_plant import ESTIMATED, FEEDFORWARD, MEASURED, Schedule
-from dynsim.kernels.snake_support import COST_ANGLES, COST_SUPPORT_MIN, COST_SUPPORT_NORM, Cost
-from dynsim.model.protocols import BuildContext
-from dynsim.model.snake import ModeTable, SnakeDescription, TaskSpaceController, conditioning
+from dynsim.snake.kinematics import SnakeModel, pose_of_point
+from dynsim.snake.state import ESTIMATED, FEEDFORWARD, MEASURED, Schedule
+from dynsim.snake.support import COST_ANGLES, COST_SUPPORT_MIN, COST_SUPPORT_NORM, Cost
 
 ENGINE = "kinematic"
 

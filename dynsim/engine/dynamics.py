@@ -17,9 +17,21 @@ from dynsim.engine.provenance import provenance
 from dynsim.engine.uniqueness import motion_spread, paradox
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.kernels import arrays as ka
-from dynsim.kernels import integrate as ki
-from dynsim.kernels.coupled import System
-from dynsim.kernels.energy import CONTACT_SIZE, LEDGER_SIZE
+from dynsim.kernels.integrate import driver
+from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.state import (
+    CONTACT_SIZE,
+    IMPULSE,
+    OUT_FORCE,
+    OUT_GAP,
+    OUT_SLIP,
+    OUT_VECTOR,
+    SLIP,
+    block,
+    output_layout,
+    state_layout,
+)
+from dynsim.kernels.system import System
 from dynsim.model.arrays import compile_contacts, compile_drives
 from dynsim.model.clearance import poses
 from dynsim.model.control import JointControl
@@ -63,7 +75,8 @@ def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
     build.check_start(scenario, model)
     build.loads(scenario, robot)
     n, na, c = model.n, len(robot.motors), len(contacts)
-    times = _sample_times(scenario, columns=2 * n + na + LEDGER_SIZE + CONTACT_SIZE * c + ki.output_size(n, na, c))
+    layout, columns = state_layout(model.nq, n, na, c), output_layout(n, na, c)
+    times = _sample_times(scenario, columns=layout.size + columns.size)
     _check_stiffness(scenario, robot)
     _check_work(scenario, n, c)
     control = _control(scenario, model, progress)
@@ -72,17 +85,20 @@ def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
     method = ki.METHODS[options.method]
     step = options.step_s or (1e-3 if method == ki.RK4 else 0.0)
     system = System(
+        layout=layout,
         model=model.arrays,
         drives=compile_drives(robot, k_p=list(control.k_p), k_d=list(control.k_d)),
         reference=control.reference,
         contacts=compile_contacts(robot, contacts),
         dense=np.zeros((n + c + na, n + c + na + 1)) if options.solver == "m_star" else None,
     )
-    y = np.zeros(2 * n + na + LEDGER_SIZE + CONTACT_SIZE * c)
-    y[:n] = robot.initial
+    y = np.zeros(layout.size)
+    y[block(layout, "q")] = robot.initial
     run = ki.new_run(
         method,
         y,
+        layout,
+        columns,
         n=n,
         na=na,
         c=c,
@@ -111,7 +127,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
     run = prepared.run
     # Loading or compiling the kernels is no integration time.
     with kernels_logged(log):
-        ki.advance(prepared.system, prepared.workspace, run, 0)
+        driver.advance(prepared.system, prepared.workspace, run, 0)
     if progress is not None:
         progress(0.0, SIMULATION)
     started, limit, interrupted = clock.perf_counter(), 1, False
@@ -119,7 +135,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
         log.info("%s: integrating %g s by %s", scenario.title, scenario.duration_s, scenario.integrator.method)
         while run.count[ki.STATUS] == ki.RUNNING:
             before = clock.perf_counter()
-            ki.advance(prepared.system, prepared.workspace, run, limit)
+            driver.advance(prepared.system, prepared.workspace, run, limit)
             taken = clock.perf_counter() - before
             limit = int(min(max(limit * min(_CHUNK_S / max(taken, 1e-9), 10.0), 1), 1_000_000))
             if progress is not None:
@@ -271,46 +287,43 @@ def _record(scenario: Scenario, prepared: Prepared, wall: float) -> Record:
     """Name the columns that the kernels have written."""
     model, run, contacts = prepared.model, prepared.run, prepared.contacts
     robot = model.robot
-    n, na, c = model.n, len(robot.motors), len(contacts)
     rows = int(run.count[ki.SAMPLE])
-    y, out = run.sample[:rows], run.output[:rows]
     joints, driven = robot.joint_names, tuple(motor.joint for motor in robot.motors)
     names = tuple(contact.name for contact in contacts)
     record = Record(run.sample_time[:rows], provenance=provenance(scenario))
     angle, rate, acceleration, _ = _joint_units(robot.links)
     with_motor = set(driven)
     *_, force = _joint_units([link for link in robot.links if link.joint in with_motor] or robot.links)
-    record.add("q", y[:, :n], angle, labels=joints, description="joint positions")
-    record.add("v", y[:, n : 2 * n], rate, labels=joints, description="joint rates")
-    record.add("vdot", out[:, :n], acceleration, labels=joints, description="joint accelerations")
-    current, voltage = y[:, 2 * n : 2 * n + na], out[:, n : n + na]
+    record.add("q", run.states("q"), angle, labels=robot.position_names, description="joint positions")
+    record.add("v", run.states("v"), rate, labels=joints, description="joint rates")
+    record.add("vdot", run.outputs("vdot"), acceleration, labels=joints, description="joint accelerations")
+    current, voltage = run.outputs("current"), run.outputs("voltage")
     record.add("current", current, "A", labels=driven, description="motor currents")
     record.add("voltage", voltage, "V", labels=driven, description="motor terminal voltages")
-    record.add("torque", out[:, n + na : n + 2 * na], force, labels=driven, description="shaft torques, [WM] eq 25")
+    record.add("torque", run.outputs("torque"), force, labels=driven, description="shaft torques, [WM] eq 25")
     record.add("power", current * voltage, "W", labels=driven, description="electrical power u i")
-    k = n + 2 * na
-    record.add("hand_position", out[:, k : k + 3], "m", labels=("x", "y", "z"))
+    record.add("hand_position", run.outputs("hand"), "m", labels=("x", "y", "z"))
     target = prepared.control.target(record.time)
     if target is not None:
         record.add("target_position", target, "m", labels=("x", "y", "z"))
-    ledger = y[:, 2 * n + na :]
-    for column, (name, text) in enumerate(metrics.INTEGRALS.items()):
-        record.add(name, ledger[:, column], "J", description=text)
-    for column, name in enumerate(metrics.STORES):
-        record.add(name, out[:, k + 3 + column], "J", description=f"{name.removeprefix('energy_')} energy")
+    for integral, (name, text) in zip(run.states("ledger").T, metrics.INTEGRALS.items(), strict=True):
+        record.add(name, integral, "J", description=text)
+    for store, name in zip(run.outputs("energy").T, metrics.STORES, strict=True):
+        record.add(name, store, "J", description=f"{name.removeprefix('energy_')} energy")
     record.add("energy_residual", metrics.energy_residual(record), "J", description="what the ledger does not explain")
-    per_contact = out[:, k + 6 :].reshape(rows, c, 8)
-    record.add("contact_normal_force", per_contact[:, :, 0], "N", labels=names, description="f_n; negative: pulling")
-    record.add("contact_force", per_contact[:, :, 1:4], "N", labels=names, description="normal and friction force, W")
-    record.add("contact_gap", per_contact[:, :, 4], "m", labels=names, description="distance from the surface")
-    record.add("contact_slip_velocity", per_contact[:, :, 5:8], "m/s", labels=names)
-    integrals = ledger[:, LEDGER_SIZE:].reshape(rows, c, CONTACT_SIZE)
-    record.add("contact_impulse", integrals[:, :, 0], "N s", labels=names, description="∫ f_n dt")
-    record.add("contact_slip_distance", integrals[:, :, 1], "m", labels=names, description="∫ |v_t| dt")
+    touch = run.outputs("contact")
+    vector, slip = slice(OUT_VECTOR, OUT_VECTOR + 3), slice(OUT_SLIP, OUT_SLIP + 3)
+    record.add("contact_normal_force", touch[:, :, OUT_FORCE], "N", labels=names, description="f_n; negative: pulling")
+    record.add("contact_force", touch[:, :, vector], "N", labels=names, description="normal and friction force, W")
+    record.add("contact_gap", touch[:, :, OUT_GAP], "m", labels=names, description="distance from the surface")
+    record.add("contact_slip_velocity", touch[:, :, slip], "m/s", labels=names)
+    integrals = run.states("contact").reshape(rows, len(contacts), CONTACT_SIZE)
+    record.add("contact_impulse", integrals[:, :, IMPULSE], "N s", labels=names, description="∫ f_n dt")
+    record.add("contact_slip_distance", integrals[:, :, SLIP], "m", labels=names, description="∫ |v_t| dt")
     deficient, spread = int(prepared.workspace.deficient[0]), None
     if deficient and rows and any(contact.friction > 0.0 for contact in contacts):
         joint_units = [(link.joint, link.units[2]) for link in robot.links]
-        spread = motion_spread(prepared.system, run.sample_time[:rows], y, joint_units)
+        spread = motion_spread(prepared.system, run.sample_time[:rows], run.sample[:rows], joint_units)
     counts = metrics.Counts(
         wall=wall,
         steps=int(run.count[ki.STEPS]),
@@ -332,8 +345,7 @@ def _joint_units(links: Iterable[Link]) -> Sequence[str]:
 
 
 def _last_state(prepared: Prepared, y: np.ndarray) -> dict[str, Sequence[float]]:
-    n, na = prepared.model.n, len(prepared.model.robot.motors)
-    return {"q": y[:n].tolist(), "v": y[n : 2 * n].tolist(), "current": y[2 * n : 2 * n + na].tolist()}
+    return {name: y[block(prepared.system.layout, name)].tolist() for name in ("q", "v", "current")}
 
 
 def _reason(status: int, scenario: Scenario, prepared: Prepared) -> str:

@@ -17,18 +17,6 @@ from dynsim.engine.provenance import provenance
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.families import member
 from dynsim.kernels.jit import integers, reals
-from dynsim.kernels.snake import pose_of_point
-from dynsim.kernels.snake_plant import (
-    MODE,
-    PLACE,
-    TICKS,
-    State,
-    new_rig,
-    new_state,
-    new_trace,
-    record_row,
-    run_ticks,
-)
 from dynsim.model.snake import (
     FIXING,
     NO_REQUEST,
@@ -40,6 +28,9 @@ from dynsim.model.snake import (
 )
 from dynsim.record import Record
 from dynsim.scenario import Scenario, build
+from dynsim.snake.kinematics import pose_of_point
+from dynsim.snake.state import MODE, PLACE, TICKS, State, new_rig, new_state, new_trace
+from dynsim.snake.ticks import record_row, run_ticks
 
 log = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, Validat
 
 from dynsim.config import error_at, forbid_conversion
 from dynsim.errors import shown
-from dynsim.hardware.control_table import (
+from dynsim.hardware.bus.control_table import (
     BAUD_RATES,
     MAX_ID,
     MODELS,

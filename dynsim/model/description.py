@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.errors import ModelError
+from dynsim.model.joints import Row, rows
 
 Array = NDArray[np.float64]
 WORLD = "world"
@@ -104,13 +105,15 @@ class Link:
         Names of the body and of its joint.
     parent : str or None
         Name of the parent body, None for the world.
-    kind : "revolute" or "prismatic"
+    kind : "revolute", "prismatic", or another row of :func:`dynsim.model.joints.rows`
     axis : (3,) unit joint axis in J (and B)
     R_PJ, p_PJ : (3, 3), (3,) placement of the joint in the parent's frame [m]
     damping : float
         Viscous loss D of the joint [N m s/rad or N s/m].
     lower, upper, velocity_limit, effort_limit : float
         Limits of the joint [rad or m; rad/s or m/s; N m or N]. Nothing enforces them: a run that passes one warns.
+    parameter : what else its kind of joint needs
+    joint_of_rows : name of the joint with several rows that this is one of, None for a joint of its own
     radius : of a cylinder about the body's axis [m], zero when unknown: deeper than that below a surface, a run warns
     tip : (3,) or None
         Other end of the axis in B [m], the first is the joint; None: the joints that the body carries, and the hand.
@@ -131,11 +134,56 @@ class Link:
     effort_limit: float = np.inf
     radius: float = 0.0
     tip: Array | None = None
+    parameter: float = 0.0
+    joint_of_rows: str | None = None
+
+    @property
+    def row(self) -> Row:
+        """Its kind.
+
+        Raises
+        ------
+        ModelError
+            There is no such kind.
+        """
+        if self.kind not in rows():
+            raise ModelError(f"{self.joint}: joint kind {self.kind!r}; known: {', '.join(rows())}")
+        return rows()[self.kind]
 
     @property
     def units(self) -> tuple[str, str, str, str]:
         """Units of position, velocity, acceleration and force of the joint."""
-        return ("m", "m/s", "m/s²", "N") if self.kind == "prismatic" else ("rad", "rad/s", "rad/s²", "N m")
+        return self.row.units
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """Names of the coordinates that begin with this row: those of its joint, none for a later row."""
+        row = self.row
+        return tuple(f"{self.joint_of_rows}.{name}" for name in row.names) or (self.joint,) * len(row.neutral)
+
+
+def in_rows(link: Link, rows: Sequence[tuple[str, str, Array]]) -> tuple[Link, ...]:
+    """A joint of several rows, (suffix, kind, axis) each, the body of ``link`` on the last; the others are massless."""
+    made: list[Link] = []
+    for suffix, kind, axis in rows:
+        last, first = len(made) == len(rows) - 1, not made
+        made.append(
+            replace(
+                link,
+                name=link.name if last else f"{link.name}.{suffix}",
+                joint=f"{link.joint}.{suffix}",
+                parent=link.parent if first else made[-1].name,
+                kind=kind,
+                axis=np.asarray(axis, dtype=np.float64),
+                inertia=link.inertia if last else Inertia(0.0),
+                R_PJ=link.R_PJ if first else np.eye(3),
+                p_PJ=link.p_PJ if first else np.zeros(3),
+                radius=link.radius if last else 0.0,
+                tip=link.tip if last else None,
+                joint_of_rows=link.joint,
+            )
+        )
+    return tuple(made)
 
 
 @dataclass(frozen=True)
@@ -189,7 +237,7 @@ class Quadric:
 
     def gap(self, position: Array) -> float:
         """Signed distance [m] of a point along the normal; exact for plane, sphere and cylinder."""
-        from dynsim.kernels.contact import surface_distance
+        from dynsim.kernels.constraint.surface import surface_distance
 
         gradient = self.Q @ position + self.b
         slope = float(np.linalg.norm(gradient))
@@ -322,8 +370,29 @@ class Robot:
 
     @property
     def initial(self) -> Array:
-        """Initial configuration, (n,)."""
-        return np.zeros(len(self.links)) if self.q0 is None else np.asarray(self.q0, dtype=np.float64)
+        """Initial configuration, (nq,)."""
+        neutral = [value for link in self.links for value in link.row.neutral]
+        return np.array(neutral) if self.q0 is None else np.asarray(self.q0, dtype=np.float64)
+
+    @property
+    def nq(self) -> int:
+        """Number of coordinates: one for each angle or distance, four for a ball joint."""
+        return sum(len(link.row.neutral) for link in self.links)
+
+    @property
+    def position_index(self) -> tuple[int, ...]:
+        """For each link where its own coordinates begin in q."""
+        found, first, beyond = [], 0, 0
+        for link in self.links:
+            if link.row.neutral:
+                first, beyond = beyond, beyond + len(link.row.neutral)
+            found.append(first + link.row.offset)
+        return tuple(found)
+
+    @property
+    def position_names(self) -> tuple[str, ...]:
+        """Names of the coordinates, in the order of q."""
+        return tuple(name for link in self.links for name in link.coordinates)
 
     def with_motors_mounted(self) -> Robot:
         """The robot whose motors weigh nothing any more: their masses are part of the links that they sit on."""
@@ -342,5 +411,5 @@ class Robot:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints, in the order of q."""
+        """Names of the joints, one for each rate, in the order of v."""
         return tuple(link.joint for link in self.links)

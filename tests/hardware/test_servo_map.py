@@ -129,11 +129,11 @@ def test_calibration_writes_zero_ticks_and_keeps_the_rest(rig, write_map) -> Non
 
 def test_calibration_refuses_torque_movement_and_impossible_zeros(rig, write_map) -> None:
     run = rig.prepare()
-    run.line._write(1, 64, b"\1")
+    run.line.servos.write(1, 64, b"\1")
     with pytest.raises(VerificationFailed, match="torque is on"):
         read_zero_ticks(run.replay.bus, rig.map.servos[:2])
     run = rig.prepare()
-    run.line.plant.velocity[0] = 2.0
+    run.line.servos.plant.velocity[0] = 2.0
     with pytest.raises(VerificationFailed, match="shoulder moves"):
         read_zero_ticks(run.replay.bus, rig.map.servos[:2])
     path = write_map()

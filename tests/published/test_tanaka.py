@@ -10,11 +10,11 @@ import pytest
 from dynsim.control import task_space
 from dynsim.control.modes import TABLE_II
 from dynsim.engine import simulate
-from dynsim.kernels.snake import pose_of_point
 from dynsim.model.protocols import BuildContext
 from dynsim.model.snake import conditioning
 from dynsim.plants import snake
 from dynsim.scenario import load_scenario
+from dynsim.snake.kinematics import pose_of_point
 
 SCENARIOS = {
     "snake_positioning": ["x", "y", "z", "alpha", "beta", "gamma"],

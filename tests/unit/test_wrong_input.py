@@ -18,10 +18,10 @@ from dynsim.engine import provenance
 from dynsim.errors import DynsimError, MissingEntry, ModelError, RecordError, ScenarioError
 from dynsim.figures import snake as snake_figures
 from dynsim.figures import style
-from dynsim.hardware.check import check_motion
-from dynsim.hardware.compare import compare_records
 from dynsim.hardware.errors import CheckRefused, ServoMapError
 from dynsim.hardware.export import export_record
+from dynsim.hardware.replay.check import check_motion
+from dynsim.hardware.replay.compare import compare_records
 from dynsim.hardware.servo_map import load_servo_map
 from dynsim.model.description import Inertia, Link, Robot
 from dynsim.model.model import Model

@@ -11,9 +11,9 @@ from random_snakes import robots
 
 from dynsim.errors import ModelError
 from dynsim.kernels.jit import integers, reals
-from dynsim.kernels.snake import active_rows, constraint_matrices, new_chain, pose_of_point, walk_chain
 from dynsim.model.protocols import BuildContext
 from dynsim.plants.snake import Config, build
+from dynsim.snake.kinematics import active_rows, constraint_matrices, new_chain, pose_of_point, walk_chain
 
 seeds = st.integers(0, 2**32 - 1)
 

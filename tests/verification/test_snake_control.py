@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from dynsim.control import task_space
 from dynsim.errors import ModelError
 from dynsim.kernels.jit import reals
-from dynsim.kernels.snake import constraint_matrices, new_chain, pose_of_point, walk_chain
-from dynsim.kernels.snake_control import control_input, new_work, sigma_min
 from dynsim.model.protocols import BuildContext
 from dynsim.model.snake import conditioning
 from dynsim.plants import snake
+from dynsim.snake.control import control_input, new_work, sigma_min
+from dynsim.snake.kinematics import constraint_matrices, new_chain, pose_of_point, walk_chain
 
 seeds = st.integers(0, 2**32 - 1)
 forms = st.sampled_from(["safe", "paper"])
