@@ -196,10 +196,10 @@ def _fields(schema: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
     """Configurations within an annotation; a choice by ``type`` (``families.Choice``) has them in ``models``."""
-    if callable(choices := getattr(annotation, "models", None)):
-        return list(choices())
     if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
         return [annotation] if issubclass(annotation, BaseModel) else []
+    if callable(choices := getattr(annotation, "models", None)):
+        return list(choices())
     return [model for argument in typing.get_args(annotation) for model in _models(argument)]
 
 

@@ -131,7 +131,8 @@ def print_choices(console: Console) -> None:
     for family in FAMILIES:
         table = Table(title=f"{family}s", box=box.SIMPLE_HEAD, show_header=False, title_justify="left")
         for name in members(family):
-            table.add_row(name, escaped_line((member(family, name).__doc__ or "").strip().splitlines()[0]))
+            first = (member(family, name).__doc__ or "").strip().partition("\n")[0]
+            table.add_row(escaped_line(name), escaped_line(first))
         console.print(table)
 
 
