@@ -42,8 +42,21 @@ class Prepared:
     workspace: ka.Workspace
 
 
-def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
+def prepare(
+    scenario: Scenario,
+    progress: Progress | None = None,
+    *,
+    pushable: bool = False,
+    times: np.ndarray | None = None,
+    end: float | None = None,
+) -> Prepared:
     """Compile a scenario; references that take long report to ``progress``.
+
+    Parameters
+    ----------
+    pushable : with an external wrench on every body, zero at first, after those of the scenario
+    times : of samples [s]; default: those of the whole record
+    end : of the run [s]; default: the scenario's duration
 
     Raises
     ------
@@ -56,9 +69,12 @@ def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
     robot, contacts = model.robot, build.contacts(scenario)
     build.check_start(scenario, model)
     loads = build.loads(scenario, robot)
+    if pushable:
+        loads = [*loads, *(_push(link.name) for link in robot.links)]
     n, na, c = model.n, len(robot.motors), len(contacts)
     layout, columns = state_layout(model.nq, n, na, c, len(loads)), output_layout(n, na, c)
-    times = _sample_times(scenario, columns=layout.size + columns.size)
+    if times is None:
+        times = sample_times(scenario, columns=layout.size + columns.size)
     _check_stiffness(scenario, robot)
     _check_work(scenario, n, c)
     control = _control(scenario, model, progress)
@@ -87,7 +103,7 @@ def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
         c=c,
         sample_time=times,
         hand=(model.body_index(robot.hand[0]), robot.hand[1]),
-        end=scenario.duration_s,
+        end=scenario.duration_s if end is None else end,
         step=step,
         step_max=options.step_max_s or np.inf,
         rtol=options.rtol,
@@ -97,7 +113,13 @@ def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
     return Prepared(model, contacts, control, system, run, workspace)
 
 
-def _sample_times(scenario: Scenario, columns: int) -> np.ndarray:
+def _push(body: str) -> Load:
+    """A wrench on a body that only its caller writes."""
+    return Load(body, body, np.zeros(3), False, np.zeros(1), np.zeros((0, 6, 4)), False)
+
+
+def sample_times(scenario: Scenario, columns: int) -> np.ndarray:
+    """Times of a whole record of so many columns, (T,) [s]; ScenarioError when it would be too large."""
     rate = scenario.record.rate_hz
     count = int(np.floor(scenario.duration_s * rate * (1.0 + 1e-12))) + 1
     check_size(scenario, count, columns)

@@ -15,8 +15,8 @@ from dynsim.record import Record
 from dynsim.scenario import Scenario
 
 
-def make_record(scenario: Scenario, prepared: Prepared, wall: float) -> Record:
-    """Name the columns that the kernels have written."""
+def make_record(scenario: Scenario, prepared: Prepared, wall: float, *, pushed: bool = False) -> Record:
+    """Name the columns that the kernels have written; ``pushed``: wrenches that are not in the scenario did work too."""
     model, run, contacts = prepared.model, prepared.run, prepared.contacts
     robot = model.robot
     rows = int(run.count[ki.SAMPLE])

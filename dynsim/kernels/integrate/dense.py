@@ -7,7 +7,7 @@ from dynsim.kernels.integrate.output import write_output
 from dynsim.kernels.integrate.project import settle
 from dynsim.kernels.integrate.run import DOPRI5, END, RODAS4, SAMPLE, STEP, TIME, Run
 from dynsim.kernels.integrate.tableaux import D_RODAS
-from dynsim.kernels.jit import internal_kernel, merged_kernel
+from dynsim.kernels.jit import internal_kernel, kernel, merged_kernel
 from dynsim.kernels.system import System
 from dynsim.kernels.tree.joints import normalise
 
@@ -36,6 +36,16 @@ def fill_dense(run: Run):
                     - 1453857185.0 / 822651844.0 * k[5, j]
                     + 69997945.0 / 29380423.0 * k[6, j]
                 )
+
+
+@kernel
+def state_within(run: Run, t, out):
+    """State at a time within the step that is pending, by the dense output, into out: (m,)."""
+    fill_dense(run)
+    d, x = run.dense, (t - run.clock[TIME]) / run.clock[STEP]
+    z = 1.0 - x
+    for j in range(out.shape[0]):
+        out[j] = run.y[j] + x * (d[0, j] + z * (d[1, j] + x * (d[2, j] + z * d[3, j])))
 
 
 @merged_kernel
