@@ -20,7 +20,7 @@ from dynsim.kernels.system import System
 from dynsim.model.arrays import compile_contacts, compile_drives, compile_loads
 from dynsim.model.clearance import poses
 from dynsim.model.control import JointControl
-from dynsim.model.description import Array, Contact, Robot
+from dynsim.model.description import Array, Contact, Load, Robot
 from dynsim.model.model import Model
 from dynsim.scenario import Scenario, build, build_model
 

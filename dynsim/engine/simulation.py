@@ -308,7 +308,6 @@ class Simulation:
         a = self._motor(joint)
         self._settle_now()
         self._prepared.system.reference.spline[a] = self._splines[a]
-        self._prepared.system.drives.table[a, ka.SAMPLED] = int(self._prepared.control.sample_time is not None)
         self._restart()
 
     def set_wrench(
