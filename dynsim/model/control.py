@@ -9,8 +9,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.kernels.arrays import ReferenceArrays
+from dynsim.kernels.arrays import HELD_POSITION, ReferenceArrays
 from dynsim.kernels.jit import integers, reals
+from dynsim.model.description import Robot, TorqueSource
 
 # Samples in a segment of the reference splines, and segments that are looked at together.
 _PER_SEGMENT = 4
@@ -24,9 +25,19 @@ class HandPath(Protocol):
         """Positions at times t [s], shape (T,) → (T, 3) [m]."""
 
 
+def held_values(robot: Robot) -> NDArray[np.float64]:
+    """What motors without a moving reference hold, (na,): the initial position of the joint; no torque of a source."""
+    initial = dict(zip(robot.joint_names, robot.initial, strict=True))
+    return np.array([0.0 if isinstance(m, TorqueSource) else initial[m.joint] for m in robot.motors])
+
+
 @dataclass(frozen=True)
 class JointControl:
-    """Gains of the voltage PD per motor [V/rad, V s/rad], joint references, and the path the hand is to follow."""
+    """Gains of the voltage PD per motor [V/rad, V s/rad], joint references, and the path the hand is to follow.
+
+    Only DC motors take the gains; ``k_p`` of a servo says whether it follows its position. References of a torque
+    source are its torques [N m].
+    """
 
     k_p: NDArray[np.float64]
     k_d: NDArray[np.float64]
@@ -34,11 +45,12 @@ class JointControl:
     path: HandPath | None
 
     @classmethod
-    def short_circuit(cls, motors: int) -> JointControl:
-        """No controller: every motor has zero volts on its terminals, so it brakes."""
+    def absent(cls, robot: Robot) -> JointControl:
+        """No controller: DC motors have zero volts and brake, servos hold where they start, torque sources rest."""
+        motors = len(robot.motors)
         reference = ReferenceArrays(
-            spline=integers(np.full(motors, -1)),
-            held=reals(np.zeros(motors)),
+            spline=integers(np.full(motors, HELD_POSITION)),
+            held=reals(held_values(robot)),
             grid=reals([0.0, 1.0]),
             coefficients=reals(np.zeros((1, 0, 6))),
         )

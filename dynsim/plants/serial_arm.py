@@ -9,13 +9,13 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig, Vector3, error_at, unit_vector
 from dynsim.families import union
-from dynsim.model.description import Inertia, Link, Motor, Robot, vector
-from dynsim.model.motor_parameters import MotorParameters
+from dynsim.model.description import Drive, Inertia, Link, Robot, vector
+from dynsim.model.motor_parameters import DriveParameters
 
 ENGINE = "dynamics"
 
 if TYPE_CHECKING:
-    MotorChoice = MotorParameters
+    MotorChoice = DriveParameters
 else:
     MotorChoice = union("motor")
 AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
@@ -169,7 +169,7 @@ def build(config: Config) -> Robot:
     yaw = np.deg2rad(config.base.yaw_deg)
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
     links: list[Link] = []
-    motors: list[Motor] = []
+    motors: list[Drive] = []
     initial: list[float] = []
     reach = 0.0
     for group in config.chain:

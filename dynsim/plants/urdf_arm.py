@@ -13,12 +13,12 @@ from dynsim.config import BodyPoint, NonNegative, StrictConfig, Vector3, error_a
 from dynsim.errors import ModelError
 from dynsim.families import union
 from dynsim.model.description import Robot
-from dynsim.model.motor_parameters import MotorParameters
+from dynsim.model.motor_parameters import DriveParameters
 
 ENGINE = "dynamics"
 
 if TYPE_CHECKING:
-    MotorChoice = MotorParameters
+    MotorChoice = DriveParameters
 else:
     MotorChoice = union("motor")
 

@@ -109,7 +109,7 @@ def test_free_arm_with_motors_converges_to_dynsim() -> None:
 def test_force_of_two_braces_held_by_equality_constraints() -> None:
     """Both elbows on spheres, without friction: MuJoCo's equality on a tendon is the same one-row constraint."""
     prepared = prepare_case(CASES["two elbows held, no friction"], {**TIGHT, "duration_s": 1.0})
-    run, n, na = integrate(prepared), prepared.model.n, len(prepared.system.drives.link)
+    run, n, na = integrate(prepared), prepared.model.n, len(prepared.system.drives.table)
     force = run.output[:, n + 2 * na + 6 :].reshape(-1, 2, 8)[:, :, 0]
     worst = []
     for step in (5e-4, 2.5e-4):
@@ -129,7 +129,7 @@ def test_force_of_a_soft_contact_without_friction() -> None:
     """Elbow 7 alone presses on the floor: MuJoCo's contact gives the force of the hard one, its softness ∝ h²."""
     options = {**TIGHT, "duration_s": 2.0, "contacts.friction": 0.0}
     prepared = prepare(load_scenario("elbow_comparison", "elbow_7", options))
-    run, n, na = integrate(prepared), prepared.model.n, len(prepared.system.drives.link)
+    run, n, na = integrate(prepared), prepared.model.n, len(prepared.system.drives.table)
     force = run.output[:, n + 2 * na + 6]
     errors = []
     for step in (1e-3, 5e-4):
@@ -148,7 +148,7 @@ def test_force_of_a_soft_contact_with_friction() -> None:
     dynsim's smoothed friction is μ f_n |v_t|/√(|v_t|² + v_s²), MuJoCo's μ f_n once it slides.
     """
     prepared = prepare(load_scenario("elbow_comparison", "elbow_4", {**TIGHT, "duration_s": 3.0}))
-    run, n, na = integrate(prepared), prepared.model.n, len(prepared.system.drives.link)
+    run, n, na = integrate(prepared), prepared.model.n, len(prepared.system.drives.table)
     peer = build_mujoco(prepared.system, step=1e-3, contacts="soft", cone="elliptic")
     sample = _forces(peer, prepared, 1e-3, 3.0, _contact_force)[-1]
     f, fx, fy, fz, _, *slip = run.output[-1, n + 2 * na + 6 :]
