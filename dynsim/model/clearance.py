@@ -67,8 +67,8 @@ def poses(robot: Robot, q: Array, bodies: Collection[str] | None = None) -> Iter
             # Later rows of a joint stay where its first one has put the body.
             if row.motion is not None:
                 turn, shift = row.motion(link, q[:, k : k + len(row.neutral)].T)
-                p = p + np.einsum("ijt,it->jt", R, shift)
-                R = np.einsum("jit,jkt->ikt", turn, R)
+                p = p + np.einsum("ijt,jt->it", R, shift)
+                R = np.einsum("ijt,jkt->ikt", R, turn)
         else:
             x, y, z = link.axis
             K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
