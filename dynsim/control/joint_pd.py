@@ -89,7 +89,7 @@ def build(
     for name in config.joints:
         if robot.links[model.joint_names.index(name)].kind != "revolute":
             raise ModelError(f"controller: {name!r} is prismatic; waypoints in angles_deg are for revolute joints")
-    held = np.array([robot.initial[model.joint_names.index(name)] for name in driven])
+    held = np.array([robot.initial[robot.position_index[model.joint_names.index(name)]] for name in driven])
     spline = np.full(len(driven), -1)
     grid, coefficients = [0.0, 1.0], np.zeros((1, 0, 6))
     if named:

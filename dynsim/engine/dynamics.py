@@ -76,6 +76,7 @@ def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
     n, na, c = model.n, len(robot.motors), len(contacts)
     layout, columns = state_layout(model.nq, n, na, c), output_layout(n, na, c)
     times = _sample_times(scenario, columns=layout.size + columns.size)
+    _check_coordinates(scenario, robot)
     _check_stiffness(scenario, robot)
     _check_work(scenario, n, c)
     control = _control(scenario, model, progress)
@@ -181,6 +182,16 @@ def _sample_times(scenario: Scenario, columns: int) -> np.ndarray:
     return times
 
 
+def _check_coordinates(scenario: Scenario, robot: Robot) -> None:
+    """Refuse ``rodas4``, whose Jacobian takes q̇ = v, for joints with more coordinates than rates."""
+    joint = next((link.joint_of_rows for link in robot.links if len(link.row.neutral) != 1), None)
+    if joint is not None and scenario.integrator.method == "rodas4":
+        raise ScenarioError(
+            f"integrator.method: rodas4 cannot integrate joint {joint!r}, which has more coordinates than rates; "
+            "take rk43 or dopri5"
+        )
+
+
 def _check_stiffness(scenario: Scenario, robot: Robot) -> None:
     """Refuse an explicit method where the circuits' own poles R/L already ask for too many steps."""
     method, duration = scenario.integrator.method, scenario.duration_s
@@ -254,7 +265,7 @@ def _check_references(scenario: Scenario, robot: Robot, contacts: Sequence[Conta
     if not held:
         return
     tolerance = scenario.config.contacts.reference_tolerance_m
-    joints = {link.joint: i for i, link in enumerate(robot.links)}
+    joints = dict(zip(robot.joint_names, robot.position_index, strict=True))
     driven = np.array([joints[motor.joint] for motor in robot.motors])
     worst: dict[str, tuple[float, float, np.ndarray]] = {}
     first: dict[str, float] = {}

@@ -83,6 +83,8 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
     for motor in robot.motors:
         _check_motor(motor, joints)
         i = joints[motor.joint]
+        if len(links[i].row.neutral) != 1:
+            raise ModelError(f"motor: {motor.joint} is one of several rates of a joint and has no position to control")
         body[i, ka.ARMATURE] += motor.rotor_inertia * motor.gear_ratio**2
         body[i, ka.GEAR_DAMPING] += motor.gear_damping * motor.gear_ratio**2
     _check_movable(robot, tree, body)

@@ -95,10 +95,11 @@ def sinking(robot: Robot, surfaces: Mapping[str, Quadric], q: Array) -> list[Sin
             tips[link.parent].append(link.p_PJ)
     if robot.hand[0] in open_ended:
         tips[robot.hand[0]].append(robot.hand[1])
+    carriers = robot.carriers
     # Of a run that diverged the last samples may be beyond what squares of floats can hold.
     with np.errstate(over="ignore", invalid="ignore"):
         for link, R, p in poses(robot, q):
-            for name, surface in surfaces.items():
+            for name, surface in surfaces.items() if link.name not in carriers else ():
                 gap = surface.gaps(p.T)
                 for tip in tips[link.name]:
                     gap = np.minimum(gap, _segment_gap(surface, p.T, (tip @ R).T))

@@ -44,20 +44,20 @@ class JointControl:
         )
         return cls(np.zeros(motors), np.zeros(motors), reference, None)
 
-    def positions(self, q: NDArray[np.float64], links: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.float64], ...]]:
-        """Times, (T,) [s], and the joint positions, (T, n), of the references, in pieces of some thousand samples.
+    def positions(self, q: NDArray[np.float64], places: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.float64], ...]]:
+        """Times, (T,) [s], and the joint positions, (T, nq), of the references, in pieces of some thousand samples.
 
         Taken at the knots and at three times between two of them.
 
         Parameters
         ----------
-        q : (n,) positions of all joints at the start; those without a moving reference stay there
-        links : (na,) index of the joint of each motor
+        q : (nq,) positions of all joints at the start; those without a moving reference stay there
+        places : (na,) where in q the joint of each motor is
         """
         reference = self.reference
         begin, spacing = reference.grid
         segments, columns = len(reference.coefficients), reference.spline[reference.spline >= 0]
-        moved = links[reference.spline >= 0]
+        moved = places[reference.spline >= 0]
         x = spacing * np.arange(_PER_SEGMENT + 1) / _PER_SEGMENT
         powers = x[:, None] ** np.arange(6)
         for first in range(0, segments, _PIECE):

@@ -26,6 +26,8 @@ from dynsim.model.description import Array, Inertia
 BYTES_MAX, ELEMENTS_MAX, DEPTH_MAX, LINKS_MAX = 16_000_000, 100_000, 100, 2000
 ATTRIBUTES_MAX, NAME_LENGTH_MAX, _NUMBER_LENGTH_MAX = 100, 200, 400
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+# Joints with several rates.
+SEVERAL = ("floating", "planar")
 # Numbers whose magnitude stands for "no limit" [rad, m, N m …]: URDF demands some number for most limits.
 UNLIMITED = 1e9
 # No robot has such numbers, and with larger ones products overflow.
@@ -262,10 +264,10 @@ class _Reader:
         who = f"joint {_shown(name)}"
         self.check_children(element, who)
         kind = element.attributes.get("type")
-        known = (*MOVING, "fixed", "floating", "planar")
+        known = (*MOVING, "fixed", *SEVERAL)
         if kind not in known:
             stated = "has no type" if kind is None else f"is {_shown(kind)}{suggestion(kind, known)}"
-            raise self.error(element.line, f"{who} {stated}; known: {', '.join(MOVING)}, fixed")
+            raise self.error(element.line, f"{who} {stated}; known: {', '.join(known)}")
         ends = []
         for tag in ("parent", "child"):
             end = self.required(element, tag, who, f'add it, like <{tag} link="arm"/>')
@@ -275,6 +277,11 @@ class _Reader:
                     end.line, f"{who}: its {tag} link {_shown(link)} is not in the file{suggestion(link, links)}"
                 )
             ends.append(link)
+        for tag in ("limit", "dynamics") if kind in SEVERAL else ():
+            if (single := self.child(element, tag)) is not None:
+                raise self.error(
+                    single.line, f"{who} is {kind}: <{tag}> has one number for several rates; remove <{tag}>"
+                )
         R, p = self.origin(element, who)
         lower, upper, velocity_limit, effort_limit = self.limits(element, kind, who)
         dynamics, mimic = self.child(element, "dynamics"), self.child(element, "mimic")
@@ -345,7 +352,13 @@ class _Reader:
         stated = self.child(element, "axis")
         default = (1.0, 0.0, 0.0)
         axis = np.array(default) if stated is None else self.numbers(stated, "xyz", 3, who)
-        if kind not in MOVING:
+        if kind == "planar" and stated is None:
+            raise self.error(
+                element.line,
+                f"{who} is planar and has no <axis>, the normal of its plane: URDF then means x, and many programs z; "
+                'add it, like <axis xyz="0 0 1"/>',
+            )
+        if kind not in (*MOVING, "planar"):
             return np.array(default)
         length = float(np.linalg.norm(axis))
         if stated is not None and not 1e-12 < length < math.inf:

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 
 # What runs in the copy. The nut of a vertical screw; and a screw anywhere in a tree beside the same tree with a sliding
 # and a turning joint in its place that a constraint couples, x = lead q, solved with its multiplier.
-SCREW = '''
+SCREW = """
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -78,7 +78,7 @@ for case in range(10):
         np.testing.assert_allclose(R[..., 0], R_model, rtol=0, atol=1e-14)
         np.testing.assert_allclose(p[:, 0], p_model, rtol=0, atol=1e-14)
 print("the screw turns")
-'''
+"""
 
 
 def extended(folder: Path) -> Path:
@@ -86,12 +86,14 @@ def extended(folder: Path) -> Path:
     shutil.copytree(ROOT / "dynsim", folder / "dynsim", ignore=shutil.ignore_patterns("__pycache__"))
     text = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
     section = text.split("\n## A joint\n")[1].split("\n## ")[0]
-    file, branch = re.findall(r"```python\n(.*?)```", section, flags=re.DOTALL)
+    file, column, branch = re.findall(r"```python\n(.*?)```", section, flags=re.DOTALL)
     (folder / "dynsim" / "model" / "joints" / "screw.py").write_text(file, encoding="utf-8")
     joints = folder / "dynsim" / "kernels" / "tree" / "joints.py"
-    before, found, after = joints.read_text(encoding="utf-8").partition("    elif kind == TURN:\n")
-    assert found
-    joints.write_text(before + branch + found + after, encoding="utf-8")
+    kernel = joints.read_text(encoding="utf-8")
+    for new, before in ((column, "from dynsim.kernels.jit import"), (branch, "    elif kind == TURN:\n")):
+        assert kernel.count(before) == 1
+        kernel = kernel.replace(before, new + before)
+    joints.write_text(kernel, encoding="utf-8")
     return folder
 
 

@@ -31,7 +31,6 @@ from dynsim.kernels.arrays import (
     EXTRA,
     KIND,
     P_PJ,
-    PARAMETER,
     PARENT,
     POSITION_INDEX,
     QD,
