@@ -351,7 +351,7 @@ def _record(scenario: Scenario, prepared: Prepared, wall: float) -> Record:
 def _joint_units(links: Iterable[Link]) -> Sequence[str]:
     """Units of position, velocity, acceleration and force of joints; "rad or m" when there are both kinds."""
     units = sorted({link.units for link in links}, reverse=True)
-    return [" or ".join(kinds) for kinds in zip(*units, strict=True)]
+    return [" or ".join(dict.fromkeys(kinds)) for kinds in zip(*units, strict=True)]
 
 
 def _last_state(prepared: Prepared, y: np.ndarray) -> dict[str, Sequence[float]]:

@@ -209,7 +209,7 @@ def _body(record: Record) -> tuple[Body | None, str]:
     try:
         scenario = scenario_from_resolved(record.provenance["scenario"])
         model = build_model(scenario)
-        if record["q"].shape[1] != model.n:
+        if record["q"].shape[1] != model.nq:
             return None, "posture not drawn: the plant has changed since the run"
         links = model.robot.links
         index = {link.name: k for k, link in enumerate(links)}

@@ -181,11 +181,10 @@ def test_names_that_are_no_place_are_refused(bracket: Path):
         check(load_scenario(bracket, overrides={**lock, **point}))
 
 
-# A body that floats, and one that slides and turns in a plane whose normal is (0.6, 0, 0.8) of the joint's frame.
-FREE = """<robot name="free"><link name="base"/>
-<link name="body"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<link name="puck"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<link name="arm"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+# A body that floats with an arm on it, and one that slides and turns in a plane whose normal is left open.
+FREE = f"""<robot name="free"><link name="base"/>
+<link name="body">{INERTIAL}</link><link name="puck">{INERTIAL}</link><link name="arm">{INERTIAL}</link>
 <joint name="root" type="floating"><origin xyz="0 0 1"/><parent link="base"/><child link="body"/></joint>
 <joint name="slide" type="planar"><parent link="base"/><child link="puck"/><axis xyz="%s"/></joint>
 <joint name="hinge" type="continuous"><parent link="body"/><child link="arm"/><axis xyz="0 1 0"/></joint></robot>"""
@@ -265,6 +264,7 @@ def test_the_record_names_coordinates_and_rates(free: Path):
         *(f"root.{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz")),
         *(f"slide.{name}" for name in ("x", "y", "angle")),
     )
+    assert (record.units["q"], record.units["v"]) == ("rad or m or 1", "rad/s or m/s")
     assert record.labels["v"][:6] == tuple(f"root.{name}" for name in ("x", "y", "z", "wx", "wy", "wz"))
     # Gravity 9.81 along x moves the floating body and the puck alike.
     fallen = 0.5 * 9.81 * 0.5**2

@@ -17,12 +17,14 @@ from random_robots import (
 )
 from scipy.special import ellipj
 
+from dynsim.errors import ModelError
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate.run import DRIFT_MAX, PROJECTIONS, REJECTED, STEPS
 from dynsim.kernels.state import CONSTRAINT, FRICTION, JOINT
 from dynsim.kernels.tree.joints import position_error
-from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
+from dynsim.model.description import Contact, Inertia, Link, Motor, Quadric, Robot
 from dynsim.model.joints.ball import ball, floating
+from dynsim.model.joints.ball import quaternion as ball_quaternion
 from dynsim.model.joints.planar import rolling
 from dynsim.model.model import Model
 
@@ -176,6 +178,39 @@ def test_momentum_and_energy_of_a_free_robot(method):
         np.testing.assert_allclose(found[0], linear, rtol=0, atol=1e-9 * np.linalg.norm(linear))
         np.testing.assert_allclose(found[1], angular, rtol=0, atol=1e-9 * np.linalg.norm(angular))
         assert model.kinetic_energy(q, v) == pytest.approx(energy, rel=1e-9)
+
+
+def test_a_start_that_is_no_attitude_is_refused():
+    robot = robot_of(floating(body("body")))
+    for length in (0.0, 1.0 + 1e-6):
+        with pytest.raises(ModelError, match=r"body_joint: the initial quaternion has length .*; it must be 1"):
+            Model(replace(robot, q0=np.r_[np.zeros(3), length, 0.0, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize("joint", ["body_joint.wx", "body_joint.wz", "body_joint.roll", "body_joint.turn"])
+def test_a_rate_without_a_position_has_no_motor(joint):
+    robot = robot_of(rolling(body("body")) if joint.endswith(("roll", "turn")) else floating(body("body")))
+    motor = Motor(joint, 0.1, 1.0, 1e-3, 1e-5, 10.0)
+    with pytest.raises(ModelError, match=rf"motor: {joint} is one of several rates of a joint"):
+        Model(replace(robot, motors=(motor,)))
+
+
+def test_contacts_are_on_bodies_and_not_on_rows():
+    robot = robot_of(floating(body("body")))
+    assert robot.carriers == {link.name for link in robot.links} - {"body"}
+    with pytest.raises(ModelError, match=r"no body 'body\.position'; bodies: body$"):
+        robot.attach("body.position", np.zeros(3))
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, 2.0, np.pi - 1e-9, np.pi])
+def test_quaternions_of_all_rotations(angle):
+    rng, robot = np.random.default_rng(2), robot_of(ball(body("body")))
+    for turn in (np.eye(3), random_rotation(rng), random_rotation(rng)):
+        for axis in range(3):
+            R = turn @ about(axis, angle) @ turn.T
+            q = ball_quaternion(R)
+            np.testing.assert_allclose(Model(robot).body_pose("body", q)[0], R, rtol=0, atol=1e-15 * 4)
+            assert q[0] >= 0.0
 
 
 # ---- error control
