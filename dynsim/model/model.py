@@ -92,7 +92,7 @@ class Model:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints, in the order of q."""
+        """Names of the joints, in the order of v."""
         return self.robot.joint_names
 
     @property
