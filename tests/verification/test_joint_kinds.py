@@ -157,6 +157,8 @@ def test_a_free_gyroscope_is_the_closed_form_for_100_seconds(method, moments):
         np.testing.assert_allclose(origin, centre + drift * t - R[k] @ com, rtol=0, atol=1e-9)
     # A square root and four products, each rounded.
     assert np.abs(np.linalg.norm(q[:, 3:], axis=1) - 1.0).max() < 1e-15
+    # Not only in the samples: an unscaled quaternion would be off by the sum of all errors, some 1e-12.
+    assert abs(np.linalg.norm(bench(robot).part(run.y, "q")[3:]) - 1.0) < 1e-15
 
 
 @pytest.mark.parametrize("method", ["rk43", "dopri5", "rk4"])
