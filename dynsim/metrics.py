@@ -290,9 +290,10 @@ def _passed_limits(record: Record, robot: Robot) -> list[str]:
     """Limits of joints that samples of the record lie beyond; the simulation does not enforce them."""
     torque = dict(zip(record.labels["torque"], record["torque"].T, strict=True))
     found = []
-    for link, q, v in zip(robot.links, record["q"].T, record["v"].T, strict=True):
+    for link, k, v in zip(robot.links, robot.position_index, record["v"].T, strict=True):
         if np.isinf((link.lower, link.upper, link.velocity_limit, link.effort_limit)).all():
             continue
+        q = record["q"][:, k]
         position, velocity, _, force = link.units
         for what, limit, unit, beyond in (
             ("lower position", link.lower, position, link.lower - q),

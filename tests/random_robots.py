@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,12 @@ from dynsim.kernels.state import block, output_layout, state_layout
 from dynsim.kernels.system import System, derivative
 from dynsim.model.arrays import compile_contacts, compile_drives, compile_loads, compile_model
 from dynsim.model.description import Contact, Inertia, Link, Load, Motor, Quadric, Robot
+from dynsim.model.joints.ball import ball, floating
+from dynsim.model.joints.planar import planar, rolling
 from dynsim.model.model import Model
 
 SURFACES = ("plane", "sphere", "cylinder")
+SEVERAL_ROWS = {"ball": ball, "floating": floating, "planar": planar, "rolling": rolling}
 
 
 def random_unit(rng: np.random.Generator) -> np.ndarray:
@@ -83,6 +87,45 @@ def random_robot(rng: np.random.Generator, n: int, *, branches: bool = True, mot
     )
 
 
+def random_robot_of(rng: np.random.Generator, kinds: Sequence[str], *, branches: bool = True) -> Robot:
+    """A body for each joint kind, in this order: single rows as in :func:`random_robot`, and :data:`SEVERAL_ROWS`.
+
+    All placements are turned; the names of the bodies are those of :func:`random_robot`.
+    """
+    links: list[Link] = []
+    for i, kind in enumerate(kinds):
+        parent = int(rng.integers(-1, i)) if branches and i and rng.random() < 0.35 else i - 1
+        link = Link(
+            name=f"body_{i}",
+            joint=f"joint_{i}",
+            parent=None if parent < 0 else f"body_{parent}",
+            kind=kind,
+            axis=random_unit(rng),
+            inertia=random_inertia(rng),
+            R_PJ=random_rotation(rng),
+            p_PJ=rng.normal(scale=0.3, size=3),
+            damping=rng.uniform(0.0, 0.5),
+        )
+        links.extend(SEVERAL_ROWS[kind](link) if kind in SEVERAL_ROWS else (link,))
+    return Robot(
+        "random", tuple(links), (), (links[-1].name, rng.normal(scale=0.2, size=3)), rng.normal(scale=6, size=3)
+    )
+
+
+def without_losses(robot: Robot) -> Robot:
+    """The robot with frictionless joints."""
+    return replace(robot, links=tuple(replace(link, damping=0.0) for link in robot.links))
+
+
+def random_positions(rng: np.random.Generator, robot: Robot) -> np.ndarray:
+    """Coordinates of all joints, (nq,): quaternions uniform on the rotations."""
+    q = rng.normal(scale=2.0, size=robot.nq)
+    for link, k in zip(robot.links, robot.position_index, strict=True):
+        if link.kind == "ball_x":
+            q[k : k + 4] /= np.linalg.norm(q[k : k + 4])
+    return q
+
+
 def surface_through(rng: np.random.Generator, kind: str, position: np.ndarray) -> Quadric:
     """A plane, sphere or cylinder of random attitude and size that passes through a point."""
     normal, radius = random_unit(rng), rng.uniform(0.3, 2.0)
@@ -100,13 +143,15 @@ def surface_through(rng: np.random.Generator, kind: str, position: np.ndarray) -
 def random_contacts(rng: np.random.Generator, robot: Robot, q: np.ndarray, count: int) -> list[Contact]:
     """Contacts at points of random bodies that lie on their surfaces at q, with both friction laws."""
     model, contacts = Model(robot), []
+    # The rows of a joint but the last carry no body.
+    bodies = [link.name for link in robot.links if link.inertia.mass > 0.0]
     for k in range(count):
-        body, point = int(rng.integers(len(robot.links))), rng.normal(scale=0.3, size=3)
+        body, point = bodies[int(rng.integers(len(bodies)))], rng.normal(scale=0.3, size=3)
         kind = SURFACES[rng.integers(3)]
         contacts.append(
             Contact(
                 name=f"contact_{k}",
-                body=f"body_{body}",
+                body=body,
                 point=point,
                 surface=surface_through(rng, kind, model.point_position(body, point, q)),
                 surface_name=kind,

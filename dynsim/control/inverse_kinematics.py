@@ -39,7 +39,7 @@ def follow(
     ----------
     times : (T,) [s]; targets : (T, 3) [m]
     joints : names of the joints that move
-    q : (n,) configuration to start from; it selects the branch
+    q : (nq,) configuration to start from; it selects the branch
     tolerance : distance that counts as reached [m]
     progress : called now and then with the time on the path [s], when it takes longer than a second
 
@@ -53,6 +53,7 @@ def follow(
         With the first time at which the hand cannot reach its target, and the distance that is left.
     """
     columns = [model.joint_names.index(name) for name in joints]
+    places = [model.robot.position_index[column] for column in columns]
     body, point = model.body_index(model.robot.hand[0]), model.robot.hand[1]
     q, identity = q.copy(), np.eye(3)
     result = np.zeros((len(times), len(columns)))
@@ -64,7 +65,7 @@ def follow(
         if k >= 3 and len(columns) <= 3:
             # The parabola through the last three solutions leaves one iteration to do. Not for redundant joints: what
             # the hand does not determine would run away along it.
-            q[columns] = 3.0 * result[k - 1] - 3.0 * result[k - 2] + result[k - 3]
+            q[places] = 3.0 * result[k - 1] - 3.0 * result[k - 2] + result[k - 3]
         best = np.inf
         for _ in range(ITERATIONS):
             position, jacobian = model.point_position_and_jacobian(body, point, q)
@@ -76,12 +77,12 @@ def follow(
                 break
             J = jacobian[:, columns]
             step = J.T @ np.linalg.solve(J @ J.T + (1e-12 + 0.1 * distance**2) * identity, error)
-            q[columns] += step * min(1.0, STEP_MAX / max(float(np.abs(step).max()), 1e-300))
+            q[places] += step * min(1.0, STEP_MAX / max(float(np.abs(step).max()), 1e-300))
         if best > tolerance:
             raise UnreachableReference(
                 f"the hand cannot follow its path with {', '.join(joints)}: at t = {t:.3f} s it stays "
                 f"{best:.4g} m from ({target[0]:.4g}, {target[1]:.4g}, {target[2]:.4g}) m; "
                 "move the path, or let more joints follow it"
             )
-        result[k] = q[columns]
+        result[k] = q[places]
     return result

@@ -75,6 +75,7 @@ def prepare(
     layout, columns = state_layout(model.nq, n, robot.circuits, c, len(loads)), output_layout(n, na, c)
     if times is None:
         times = sample_times(scenario, columns=layout.size + columns.size)
+    _check_coordinates(scenario, robot)
     _check_stiffness(scenario, robot)
     _check_work(scenario, n, c)
     control = _control(scenario, model, progress)
@@ -127,6 +128,16 @@ def sample_times(scenario: Scenario, columns: int) -> np.ndarray:
     if scenario.duration_s - times[-1] > 1e-9 * scenario.duration_s:
         times = np.append(times, scenario.duration_s)
     return times
+
+
+def _check_coordinates(scenario: Scenario, robot: Robot) -> None:
+    """Refuse ``rodas4``, whose Jacobian takes q̇ = v, for joints with more coordinates than rates."""
+    joint = next((link.joint_of_rows for link in robot.links if len(link.row.neutral) != 1), None)
+    if joint is not None and scenario.integrator.method == "rodas4":
+        raise ScenarioError(
+            f"integrator.method: rodas4 cannot integrate joint {joint!r}, which has more coordinates than rates; "
+            "take rk43 or dopri5"
+        )
 
 
 def _check_stiffness(scenario: Scenario, robot: Robot) -> None:
@@ -203,7 +214,7 @@ def _check_references(scenario: Scenario, robot: Robot, contacts: Sequence[Conta
     if not held:
         return
     tolerance = scenario.config.contacts.reference_tolerance_m
-    joints = {link.joint: i for i, link in enumerate(robot.links)}
+    joints = dict(zip(robot.joint_names, robot.position_index, strict=True))
     driven = np.array([joints[motor.joint] for motor in robot.motors])
     worst: dict[str, tuple[float, float, np.ndarray]] = {}
     first: dict[str, float] = {}

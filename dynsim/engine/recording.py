@@ -73,4 +73,4 @@ def make_record(scenario: Scenario, prepared: Prepared, wall: float, *, pushed: 
 def _joint_units(links: Iterable[Link]) -> Sequence[str]:
     """Units of position, velocity, acceleration and force of joints; "rad or m" when there are both kinds."""
     units = sorted({link.units for link in links}, reverse=True)
-    return [" or ".join(kinds) for kinds in zip(*units, strict=True)]
+    return [" or ".join(dict.fromkeys(kinds)) for kinds in zip(*units, strict=True)]

@@ -43,7 +43,7 @@ class Body:
     Attributes
     ----------
     model : Model
-    parents : for each body the index of its parent, −1 for the world; last: the hand's body
+    parents : for each body the index of its parent, −1 for the world, −2 for none; last: the hand's
     """
 
     model: Model
@@ -54,7 +54,7 @@ class Body:
     def segments(self, q: Array) -> Array:
         """From each body's parent to the body, and from its body to the hand, (m, 2, 3) [m]."""
         points = self.model.joint_positions(q)
-        base = [k for k, parent in enumerate(self.parents) if parent < 0]
+        base = [k for k, parent in enumerate(self.parents) if parent == -1]
         # A sliding joint at the root moves its body away from where it is mounted.
         roots = [np.stack([self.model.robot.links[k].p_PJ, points[k]]) for k in base]
         inner = [np.stack([points[p], points[k]]) for k, p in enumerate(self.parents) if p >= 0]
@@ -209,11 +209,14 @@ def _body(record: Record) -> tuple[Body | None, str]:
     try:
         scenario = scenario_from_resolved(record.provenance["scenario"])
         model = build_model(scenario)
-        if record["q"].shape[1] != model.n:
+        if record["q"].shape[1] != model.nq:
             return None, "posture not drawn: the plant has changed since the run"
         links = model.robot.links
         index = {link.name: k for k, link in enumerate(links)}
         parents = [-1 if link.parent in (None, "world") else index[str(link.parent)] for link in links]
+        # Nothing leads from the world or a body to what moves freely beside it.
+        free = [link.joint_of_rows is not None and link.kind in ("prismatic", "roll") for link in links]
+        parents = [-2 if apart else parent for apart, parent in zip(free, parents, strict=True)]
         parents.append(model.body_index(model.robot.hand[0]))
         return Body(model, build.contacts(scenario), build.surfaces(scenario), tuple(parents)), ""
     except (DynsimError, KeyError, OSError) as error:

@@ -44,6 +44,10 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
                 f"{link.joint}: an initial angle of {initial[position[i]]:.3g} rad; more than {ANGLE_LIMIT:g} rad "
                 "cannot be told from other angles, take it modulo a turn"
             )
+        if link.kind == "ball_x":
+            length = float(np.linalg.norm(initial[position[i] : position[i] + 4]))
+            if not abs(length - 1.0) < 1e-9:
+                raise ModelError(f"{link.joint_of_rows}: the initial quaternion has length {length:.6g}; it must be 1")
         if link.name in index or link.joint in joints:
             raise ModelError(f"{link.name}: the name of a body or joint occurs twice")
         if link.parent is not None and link.parent not in index:
@@ -87,6 +91,8 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
     for motor in robot.motors:
         _check_motor(motor, by_joint)
         i = joints[motor.joint]
+        if len(links[i].row.neutral) != 1:
+            raise ModelError(f"motor: {motor.joint} is one of several rates of a joint and has no position to control")
         if not isinstance(motor, TorqueSource):
             body[i, ka.ARMATURE] += motor.armature
             body[i, ka.GEAR_DAMPING] += motor.reflected_damping

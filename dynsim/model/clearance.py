@@ -67,8 +67,8 @@ def poses(robot: Robot, q: Array, bodies: Collection[str] | None = None) -> Iter
             # Later rows of a joint stay where its first one has put the body.
             if row.motion is not None:
                 turn, shift = row.motion(link, q[:, k : k + len(row.neutral)].T)
-                p = p + np.einsum("ijt,it->jt", R, shift)
-                R = np.einsum("jit,jkt->ikt", turn, R)
+                p = p + np.einsum("ijt,jt->it", R, shift)
+                R = np.einsum("ijt,jkt->ikt", R, turn)
         else:
             x, y, z = link.axis
             K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -95,10 +95,11 @@ def sinking(robot: Robot, surfaces: Mapping[str, Quadric], q: Array) -> list[Sin
             tips[link.parent].append(link.p_PJ)
     if robot.hand[0] in open_ended:
         tips[robot.hand[0]].append(robot.hand[1])
+    carriers = robot.carriers
     # Of a run that diverged the last samples may be beyond what squares of floats can hold.
     with np.errstate(over="ignore", invalid="ignore"):
         for link, R, p in poses(robot, q):
-            for name, surface in surfaces.items():
+            for name, surface in surfaces.items() if link.name not in carriers else ():
                 gap = surface.gaps(p.T)
                 for tip in tips[link.name]:
                     gap = np.minimum(gap, _segment_gap(surface, p.T, (tip @ R).T))

@@ -33,7 +33,7 @@ class HandPath(Protocol):
 
 def held_values(robot: Robot) -> NDArray[np.float64]:
     """What motors without a moving reference hold, (na,): the initial position of the joint; no torque of a source."""
-    initial = dict(zip(robot.joint_names, robot.initial, strict=True))
+    initial = dict(zip(robot.joint_names, robot.initial[list(robot.position_index)], strict=True))
     return np.array([0.0 if isinstance(m, TorqueSource) else initial[m.joint] for m in robot.motors])
 
 
@@ -117,20 +117,20 @@ class JointControl:
         moving = bool((self.reference.spline >= 0).any())
         return float(begin + spacing * len(self.reference.coefficients)) if moving else np.inf
 
-    def positions(self, q: NDArray[np.float64], links: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.float64], ...]]:
-        """Times, (T,) [s], and the joint positions, (T, n), of the references, in pieces of some thousand samples.
+    def positions(self, q: NDArray[np.float64], places: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.float64], ...]]:
+        """Times, (T,) [s], and the joint positions, (T, nq), of the references, in pieces of some thousand samples.
 
         Taken at the knots and at three times between two of them.
 
         Parameters
         ----------
-        q : (n,) positions of all joints at the start; those without a moving reference stay there
-        links : (na,) index of the joint of each motor
+        q : (nq,) positions of all joints at the start; those without a moving reference stay there
+        places : (na,) where in q the joint of each motor is
         """
         reference = self.reference
         begin, spacing = reference.grid
         segments, columns = len(reference.coefficients), reference.spline[reference.spline >= 0]
-        moved = links[reference.spline >= 0]
+        moved = places[reference.spline >= 0]
         x = spacing * np.arange(_PER_SEGMENT + 1) / _PER_SEGMENT
         powers = x[:, None] ** np.arange(6)
         for first in range(0, segments, _PIECE):

@@ -402,6 +402,14 @@ class Robot:
     q0: Array | None = None
     frames: tuple[Frame, ...] = ()
 
+    @property
+    def carriers(self) -> frozenset[str]:
+        """Names of the links that carry no body: of a joint with several rows all but the last."""
+        joint = {link.name: link.joint_of_rows or link.joint for link in self.links}
+        return frozenset(
+            link.parent for link in self.links if link.parent in joint and joint[link.parent] == link.joint_of_rows
+        )
+
     def attach(self, name: str, point: Array) -> tuple[int, Array]:
         """Index of the body that has a name, or a frame of that name, and a point of that frame in the body's [m].
 
@@ -419,19 +427,20 @@ class Robot:
         return np.eye(3) if frame is None else frame.R
 
     def _find(self, name: str) -> tuple[int, Frame | None]:
-        bodies = [link.name for link in self.links]
+        names, carriers = [link.name for link in self.links], self.carriers
+        bodies = [name for name in names if name not in carriers]
         if name in bodies:
-            return bodies.index(name), None
+            return names.index(name), None
         frame = next((frame for frame in self.frames if frame.name == name), None)
         if frame is None:
-            names = [*bodies, *(frame.name for frame in self.frames if frame.body is not None)]
-            near = difflib.get_close_matches(name[:100], names, n=1)
+            known = [*bodies, *(frame.name for frame in self.frames if frame.body is not None)]
+            near = difflib.get_close_matches(name[:100], known, n=1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
-            fixed = f"; frames: {', '.join(names[len(bodies) :])}" if len(names) > len(bodies) else ""
+            fixed = f"; frames: {', '.join(known[len(bodies) :])}" if len(known) > len(bodies) else ""
             raise ModelError(f"no body {name!r}{hint}; bodies: {', '.join(bodies)}{fixed}")
         if frame.body is None:
             raise ModelError(f"{name!r} is fixed to the world and does not move; bodies: {', '.join(bodies)}")
-        return bodies.index(frame.body), frame
+        return names.index(frame.body), frame
 
     @property
     def initial(self) -> Array:

@@ -92,7 +92,7 @@ class Model:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints, in the order of q."""
+        """Names of the joints, in the order of v."""
         return self.robot.joint_names
 
     @property
@@ -141,7 +141,7 @@ class Model:
         return out
 
     def point_jacobian(self, body: str | int, point: ArrayLike, q: ArrayLike) -> Array:
-        """∂(world position)/∂q of a body-fixed point, (3, n) [m/rad]."""
+        """Jacobian of a body-fixed point: its velocity in the world is J v, (3, n) [m/rad]."""
         return self.point_position_and_jacobian(body, point, q)[1]
 
     def point_position_and_jacobian(self, body: str | int, point: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:

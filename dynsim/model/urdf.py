@@ -20,9 +20,12 @@ import numpy as np
 
 from dynsim.errors import ModelError
 from dynsim.model.description import WORLD, Array, Frame, Inertia, Link, Robot
-from dynsim.model.urdf_reader import MOVING, UNLIMITED, UrdfJoint, UrdfTree, read_tree, suggestion
+from dynsim.model.joints.ball import floating
+from dynsim.model.joints.planar import planar
+from dynsim.model.urdf_reader import MOVING, SEVERAL, UNLIMITED, UrdfJoint, UrdfTree, read_tree, suggestion
 
 HAND = "hand"
+_ROWS = {"floating": floating, "planar": planar}
 # Two readers of the same decimals differ by roundings: of the sines of angles, and of sums over merged bodies.
 _AGREEMENT = 1e-9
 
@@ -42,7 +45,8 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
     """Read the bodies and joints of a URDF file.
 
     Joints keep their names and the order of the file (a parent still comes first); each body is named after the link
-    at its moving joint, and every other link is a frame of the body that carries it. The hand is the link named
+    at its moving joint, and every other link is a frame of the body that carries it. Floating and planar joints become
+    their rows (:mod:`dynsim.model.joints`). The hand is the link named
     ``hand``, else the tip of the chain with the most moving joints: the last link fixed to its last body, or that
     body's origin when nothing is fixed to it. The root link is the world.
 
@@ -54,9 +58,9 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
     Raises
     ------
     ModelError
-        No such file, not URDF, a number that is none, a mass without inertia and the like; a joint that is mimic,
-        floating or planar and not locked; no joint of a name in ``lock``; or Pinocchio reads the file differently. The
-        message names file, line, link or joint, value and what to do.
+        No such file, not URDF, a number that is none, a mass without inertia and the like; a joint that is mimic and
+        not locked; no joint of a name in ``lock``, or one without a single position; or Pinocchio reads the file
+        differently. The message names file, line, link or joint, value and what to do.
 
     Warns
     -----
@@ -75,14 +79,21 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
         raise ModelError(f"{path}: no moving joint")
     _warn(locked, places, links)
     frames = [Frame(name, place.body, place.R, place.p) for name, place in places.items() if place.body != name]
-    return Robot(name=tree.name, links=links, motors=(), hand=_hand(tree, places), frames=tuple(frames))
+    rows = tuple(row for link in links for row in (_ROWS[link.kind](link) if link.kind in _ROWS else (link,)))
+    return Robot(name=tree.name, links=rows, motors=(), hand=_hand(tree, places), frames=tuple(frames))
 
 
 def write_urdf(robot: Robot) -> str:
     """The bodies and joints of a robot as URDF text; frames, and the hand as one of them, are links without mass.
 
     Numbers are written in full, so that reading the text back gives the same dynamics to rounding.
+
+    Raises
+    ------
+    ModelError
+        A joint of a kind that URDF does not have, or a loss of one whose losses it cannot state.
     """
+    links = _whole_joints(robot)
     root = ElementTree.Element("robot", name=robot.name)
     frames = [frame for frame in robot.frames if frame.name != HAND]
     taken = {link.name for link in robot.links} | {frame.name for frame in frames}
@@ -90,19 +101,20 @@ def write_urdf(robot: Robot) -> str:
     rooted = next((f.name for f in frames if f.body is None and not f.p.any() and np.array_equal(f.R, np.eye(3))), None)
     base = rooted or next(name for name in (WORLD, "base_link", "root_link") if name not in taken)
     ElementTree.SubElement(root, "link", name=base)
-    for link in robot.links:
+    for link in links:
         inertial = ElementTree.SubElement(ElementTree.SubElement(root, "link", name=link.name), "inertial")
         ElementTree.SubElement(inertial, "origin", xyz=_text(link.inertia.com), rpy="0 0 0")
         ElementTree.SubElement(inertial, "mass", value=_text(link.inertia.mass))
         moments = {f"i{'xyz'[i]}{'xyz'[j]}": _text(link.inertia.tensor[i, j]) for i in range(3) for j in range(i, 3)}
         ElementTree.SubElement(inertial, "inertia", moments)
-    for link in robot.links:
+    for link in links:
         limits = (link.lower, link.upper, link.effort_limit, link.velocity_limit)
         endless = link.kind == "revolute" and math.isinf(link.lower) and math.isinf(link.upper)
         joint = ElementTree.SubElement(root, "joint", name=link.joint, type="continuous" if endless else link.kind)
         _connect(joint, link.parent or base, link.name, link.p_PJ, link.R_PJ)
-        ElementTree.SubElement(joint, "axis", xyz=_text(link.axis))
-        if not (endless and all(map(math.isinf, limits))):
+        if link.kind != "floating":
+            ElementTree.SubElement(joint, "axis", xyz=_text(link.axis))
+        if link.kind in MOVING.values() and not (endless and all(map(math.isinf, limits))):
             # A continuous joint has no lower and upper.
             texts = [_text(min(max(limit, -UNLIMITED), UNLIMITED)) for limit in limits]
             given = dict(zip(("lower", "upper", "effort", "velocity"), texts, strict=True))
@@ -113,7 +125,7 @@ def write_urdf(robot: Robot) -> str:
         body, point = robot.hand
         turned = (f.R for f in robot.frames if f.name == HAND and f.body == body and np.array_equal(f.p, point))
         frames.append(Frame(HAND, body, next(turned, np.eye(3)), point))
-    joints = set(robot.joint_names)
+    joints = {link.joint for link in links}
     for frame in frames:
         if frame.name == base:
             continue
@@ -135,10 +147,6 @@ def _check_joint(tree: UrdfTree, joint: UrdfJoint) -> None:
             f"joint {joint.name!r} mimics joint {joint.mimics!r}; coupled joints are not simulated. Lock it with "
             f"plant.{key}: {{{joint.name}: 0.0}}, in Python with lock={{{joint.name!r}: 0.0}} [{unit}]",
         )
-    if joint.kind in ("floating", "planar"):
-        raise tree.error(
-            joint.line, f"joint {joint.name!r} is {joint.kind}; known: {', '.join(MOVING)}, fixed. Make it fixed"
-        )
 
 
 def _locked(tree: UrdfTree, lock: Mapping[str, float]) -> UrdfTree:
@@ -151,7 +159,10 @@ def _locked(tree: UrdfTree, lock: Mapping[str, float]) -> UrdfTree:
             )
         joint = joints[name]
         if joint.kind not in MOVING:
-            raise tree.error(joint.line, f"lock: joint {name!r} is {joint.kind}, which has no position to lock it at")
+            fix = "; make it fixed in the file" if joint.kind in SEVERAL else ""
+            raise tree.error(
+                joint.line, f"lock: joint {name!r} is {joint.kind}, which has no position to lock it at{fix}"
+            )
         if not math.isfinite(value):
             raise ModelError(f"{tree.path}: lock: {name} = {value} is not a finite number")
         if not joint.lower - 1e-9 <= value <= joint.upper + 1e-9:
@@ -185,7 +196,7 @@ def _places(tree: UrdfTree) -> dict[str, _Place]:
 
     def open_up(link: str) -> None:
         for order, joint in below[link]:
-            heapq.heappush(pending, (joint.kind in MOVING, order, joint.name))
+            heapq.heappush(pending, (joint.kind != "fixed", order, joint.name))
 
     open_up(tree.root)
     while pending:
@@ -201,7 +212,7 @@ def _places(tree: UrdfTree) -> dict[str, _Place]:
 
 
 def _links(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[Link, ...]:
-    """The moving bodies, with all that is fixed to them."""
+    """The moving bodies, with all that is fixed to them; a floating or planar joint is still one, of this kind."""
     parts: dict[str | None, list[Inertia]] = {}
     for name, place in places.items():
         inertia = tree.links[name].inertia
@@ -220,7 +231,7 @@ def _links(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[Link, ...]:
                 name=name,
                 joint=joint.name,
                 parent=parent.body,
-                kind=MOVING[joint.kind],
+                kind=MOVING.get(joint.kind, joint.kind),
                 axis=joint.axis,
                 inertia=Inertia.merged(parts.get(name, [Inertia(0.0)])),
                 R_PJ=parent.R @ joint.R,
@@ -233,6 +244,29 @@ def _links(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[Link, ...]:
             )
         )
     return tuple(links)
+
+
+def _whole_joints(robot: Robot) -> list[Link]:
+    """The links of the file: rows that make a floating or planar joint as one link of that kind."""
+    rows: dict[str, list[Link]] = {}
+    for link in robot.links:
+        rows.setdefault(link.joint_of_rows or link.joint, []).append(link)
+    return [_whole_joint(name, group) for name, group in rows.items()]
+
+
+def _whole_joint(name: str, rows: list[Link]) -> Link:
+    first, last = rows[0], rows[-1]
+    if first.joint_of_rows is None and first.kind in MOVING.values():
+        return first
+    whole = replace(last, joint=name, parent=first.parent, R_PJ=first.R_PJ, p_PJ=first.p_PJ, joint_of_rows=None)
+    for kind, make in _ROWS.items():
+        made = make(whole)
+        same = [(row.joint, row.kind) for row in made] == [(row.joint, row.kind) for row in rows]
+        if same and all(np.allclose(a.axis, b.axis, rtol=0.0, atol=1e-15) for a, b in zip(made, rows, strict=True)):
+            if any(row.damping for row in rows):
+                raise ModelError(f"{name}: has losses; URDF has no unit for those of a {kind} joint")
+            return replace(whole, kind=kind)
+    raise ModelError(f"{name}: is made of {', '.join(row.kind for row in rows)}; URDF has no such joint")
 
 
 def _hand(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[str, Array]:
@@ -249,7 +283,7 @@ def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...])
         link.inertia.check(
             f"{tree.path}:{tree.links[link.name].line}: link {link.name!r}, with all that is fixed to it"
         )
-    rubbing = [joint.name for joint in tree.joints.values() if joint.friction != 0.0 and joint.kind in MOVING]
+    rubbing = [joint.name for joint in tree.joints.values() if joint.friction != 0.0 and joint.kind != "fixed"]
     if rubbing:
         warnings.warn(f"{tree.path}: Coulomb friction of joints is not simulated ({', '.join(rubbing)})", stacklevel=3)
     loaded: set[str | None] = set()
@@ -300,16 +334,11 @@ def _compare_with_pinocchio(tree: UrdfTree) -> None:
     for link in links:
         joint, j = tree.joints[link.joint], model.getJointId(link.joint)
         inertia, placement = model.inertias[j], model.jointPlacements[j]
-        # Motion of the body per unit rate in its own frame: (0, a) of a revolute joint, (a, 0) of a prismatic one.
-        in_joint = model.joints[j].createData()
-        model.joints[j].calc(in_joint, neutral)
-        zero, revolute = np.zeros(3), link.kind == "revolute"
         parent = "universe" if link.parent is None else joint_of[link.parent]
         if model.names[model.parents[j]] != parent:
             raise _difference(tree, link, "parent joint", parent, model.names[model.parents[j]])
         length = max(1.0, float(np.abs(link.p_PJ).max()), float(np.abs(link.inertia.com).max()))
         pairs: list[tuple[str, Any, Any, float]] = [
-            ("joint motion", np.concatenate([zero, link.axis] if revolute else [link.axis, zero]), in_joint.S, 1.0),
             ("rotation of the joint", link.R_PJ, placement.rotation, 1.0),
             ("position of the joint", link.p_PJ, placement.translation, length),
             ("mass", link.inertia.mass, inertia.mass, link.inertia.mass),
@@ -319,7 +348,17 @@ def _compare_with_pinocchio(tree: UrdfTree) -> None:
         size = float(np.abs(link.inertia.tensor).max()) + link.inertia.mass * length**2
         pairs.append(("inertia", link.inertia.tensor, inertia.inertia, size))
         pairs.append(("damping", link.damping, model.damping[model.joints[j].idx_v], link.damping))
-        if joint.kind != "continuous":
+        if link.kind in SEVERAL:
+            # Of a plane Pinocchio does not read the normal: it takes z.
+            pairs.append(("number of rates", len(_ROWS[link.kind](link)), model.joints[j].nv, 0.0))
+        else:
+            # Motion of the body per unit rate in its own frame: (0, a) of a revolute joint, (a, 0) of a prismatic one.
+            in_joint = model.joints[j].createData()
+            model.joints[j].calc(in_joint, neutral)
+            zero, revolute = np.zeros(3), link.kind == "revolute"
+            motion = np.concatenate([zero, link.axis] if revolute else [link.axis, zero])
+            pairs.append(("joint motion", motion, in_joint.S, 1.0))
+        if joint.kind not in ("continuous", *SEVERAL):
             k = model.joints[j].idx_q
             for name, value, limits in (
                 ("lower limit", link.lower, model.lowerPositionLimit),

@@ -20,6 +20,8 @@ from dynsim.model.urdf_xml import MOMENTS, Element, UrdfFile, cut, plain_text, s
 # overflow its stack.
 LINKS_MAX = 2000
 MOVING = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+# Joints with several rates.
+SEVERAL = ("floating", "planar")
 # Numbers whose magnitude stands for "no limit" [rad, m, N m …]: URDF demands some number for most limits.
 UNLIMITED = 1e9
 
@@ -149,10 +151,10 @@ class _Reader:
         who = f"joint {shown(name)}"
         self.file.check_children(element, who)
         kind = element.attributes.get("type")
-        known = (*MOVING, "fixed", "floating", "planar")
+        known = (*MOVING, "fixed", *SEVERAL)
         if kind not in known:
             stated = "has no type" if kind is None else f"is {shown(kind)}{suggestion(kind, known)}"
-            raise self.file.error(element.line, f"{who} {stated}; known: {', '.join(MOVING)}, fixed")
+            raise self.file.error(element.line, f"{who} {stated}; known: {', '.join(known)}")
         ends = []
         for tag in ("parent", "child"):
             end = self.file.required(element, tag, who, f'add it, like <{tag} link="arm"/>')
@@ -162,6 +164,11 @@ class _Reader:
                     end.line, f"{who}: its {tag} link {shown(link)} is not in the file{suggestion(link, links)}"
                 )
             ends.append(link)
+        for tag in ("limit", "dynamics") if kind in SEVERAL else ():
+            if (single := element.child(tag)) is not None:
+                raise self.file.error(
+                    single.line, f"{who} is {kind}: <{tag}> has one number for several rates; remove <{tag}>"
+                )
         R, p = self.origin(element, who)
         lower, upper, velocity_limit, effort_limit = self.limits(element, kind, who)
         dynamics, mimic = element.child("dynamics"), element.child("mimic")
@@ -234,7 +241,13 @@ class _Reader:
         stated = element.child("axis")
         default = (1.0, 0.0, 0.0)
         axis = np.array(default) if stated is None else self.file.numbers(stated, "xyz", 3, who)
-        if kind not in MOVING:
+        if kind == "planar" and stated is None:
+            raise self.file.error(
+                element.line,
+                f"{who} is planar and has no <axis>, the normal of its plane: URDF then means x, and many programs z; "
+                'add it, like <axis xyz="0 0 1"/>',
+            )
+        if kind not in (*MOVING, "planar"):
             return np.array(default)
         length = float(np.linalg.norm(axis))
         if stated is not None and not 1e-12 < length < math.inf:

@@ -12,12 +12,19 @@ from pydantic import Field, model_validator
 from dynsim import families
 from dynsim.config import BodyPoint, NonNegative, StrictConfig, Vector3, error_at
 from dynsim.errors import ModelError
-from dynsim.model.description import Drive, Robot
+from dynsim.model.description import Array, Drive, Robot
 from dynsim.model.protocols import BuildContext
 
 ENGINE = "dynamics"
 
 MotorChoice: Any = families.union("motor")
+
+
+class Pose(StrictConfig):
+    """Place and attitude of a body in the frame of its joint, R = Rz(yaw) Ry(pitch) Rx(roll)."""
+
+    position_m: Vector3 = [0.0, 0.0, 0.0]
+    rpy_deg: Vector3 = [0.0, 0.0, 0.0]
 
 
 class Config(StrictConfig):
@@ -36,6 +43,9 @@ class Config(StrictConfig):
     )
     initial_deg: dict[str, float] = Field(default={}, description="initial angles of revolute joints by name; others 0")
     initial_m: dict[str, float] = Field(default={}, description="initial positions of prismatic joints; others 0")
+    initial_pose: dict[str, Pose] = Field(
+        default={}, description="initial poses of the bodies of floating and planar joints, by joint name"
+    )
     lock_deg: dict[str, float] = Field(default={}, description="revolute joints that are fixed, at these angles")
     lock_m: dict[str, float] = Field(default={}, description="prismatic joints that are fixed, at these positions")
     hand: BodyPoint | None = Field(
@@ -45,7 +55,7 @@ class Config(StrictConfig):
     @model_validator(mode="after")
     def _check_joints(self) -> Self:
         """Names and kinds of joints: here, where an error knows its line. Other errors of the file come from build."""
-        from dynsim.model.urdf_reader import MOVING, read_tree, suggestion
+        from dynsim.model.urdf_reader import MOVING, SEVERAL, read_tree, suggestion
 
         try:
             joints = read_tree(Path(self.file)).joints
@@ -53,15 +63,22 @@ class Config(StrictConfig):
             return self
         locked = {*self.lock_deg, *self.lock_m}
         units = {"revolute": "deg", "prismatic": "m"}
-        for key in ("motors", "initial_deg", "initial_m", "lock_deg", "lock_m"):
+        for key in ("motors", "initial_deg", "initial_m", "initial_pose", "lock_deg", "lock_m"):
             for name in getattr(self, key):
                 place = f"{key}.{name}"
                 if name not in joints:
                     moving = ", ".join(joint.name for joint in joints.values() if joint.kind != "fixed")
                     raise error_at(place, f"no joint {name!r}{suggestion(name, joints)}; joints of the file: {moving}")
                 kind = MOVING.get(joints[name].kind, joints[name].kind)
+                if kind in SEVERAL:
+                    if key == "initial_pose":
+                        continue
+                    start = "" if key == "motors" else f"; it starts where plant.initial_pose.{name} says"
+                    raise error_at(place, f"{name!r} is {kind}: it has no motor, angle or distance{start}")
                 if kind not in units:
                     raise error_at(place, f"{name!r} is {kind}: it has no motor and no position")
+                if key == "initial_pose":
+                    raise error_at(place, f"{name!r} is {kind}; give it in plant.initial_{units[kind]}")
                 family, _, unit = key.partition("_")
                 if unit and unit != units[kind]:
                     raise error_at(place, f"{name!r} is {kind}; give it in plant.{family}_{units[kind]}")
@@ -84,10 +101,15 @@ def build(config: Config, context: BuildContext) -> Robot:
     robot = read_urdf(Path(config.file), lock)
     initial = {**{name: np.deg2rad(angle) for name, angle in config.initial_deg.items()}, **config.initial_m}
     given = {"revolute": config.damping_N_m_s_per_rad, "prismatic": config.damping_N_s_per_m}
+    # Joints with several rates have neither losses nor motors.
+    single = [link for link in robot.links if link.joint_of_rows is None]
     links = tuple(
-        link if (loss := given[link.kind]) is None else dataclasses.replace(link, damping=loss) for link in robot.links
+        dataclasses.replace(link, damping=loss)
+        if link.joint_of_rows is None and (loss := given[link.kind]) is not None
+        else link
+        for link in robot.links
     )
-    chosen = {joint: config.motors.get(joint, config.motor) for joint in robot.joint_names}
+    chosen = {link.joint: config.motors.get(link.joint, config.motor) for link in single}
     hand = robot.hand
     if config.hand is not None:
         try:
@@ -105,5 +127,29 @@ def build(config: Config, context: BuildContext) -> Robot:
         ),
         hand=hand,
         gravity=np.array(config.gravity_m_s2),
-        q0=np.array([initial.get(joint, 0.0) for joint in robot.joint_names]),
+        q0=_initial(robot, initial, config.initial_pose),
     )
+
+
+def _initial(robot: Robot, positions: dict[str, float], poses: dict[str, Pose]) -> Array:
+    """Coordinates of all joints, (nq,); those of floating and planar joints from the poses of their bodies."""
+    from dynsim.model.joints.ball import quaternion
+    from dynsim.model.urdf_reader import rotation
+
+    q, index = robot.initial, robot.position_index
+    for i, link in enumerate(robot.links):
+        if link.joint in positions:
+            q[index[i]] = positions[link.joint]
+    for name, pose in poses.items():
+        rows = [i for i, link in enumerate(robot.links) if link.joint_of_rows == name]
+        p, R = np.array(pose.position_m), rotation(*np.deg2rad(pose.rpy_deg))
+        if len(rows) == 6:
+            q[index[rows[0]] : index[rows[0]] + 7] = *p, *quaternion(R)
+            continue
+        x, y, normal = (robot.links[i].axis for i in rows)
+        place = f"plant.initial_pose.{name}"
+        for key, off in (("position_m", abs(normal @ p)), ("rpy_deg", float(np.abs(R @ normal - normal).max()))):
+            if off > 1e-9:
+                raise ModelError(f"{place}.{key}: leaves the plane of the joint, whose normal is {normal.tolist()}")
+        q[index[rows[0]] : index[rows[0]] + 3] = x @ p, y @ p, np.arctan2(y @ R @ x, x @ R @ x)
+    return q

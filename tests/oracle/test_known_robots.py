@@ -227,3 +227,136 @@ def test_it_runs_with_a_brace(known: Known, tmp_path: Path) -> None:
     assert np.abs(record["contact_normal_force"]).max() > 1.0
     hand = model.point_position(known.frame, [0.0, 0.0, 0.01], record["q"][-1])
     np.testing.assert_allclose(record["hand_position"][-1], hand, rtol=0, atol=1e-12)
+
+
+# Robots that stand on legs, with the links of their feet.
+FREE = {
+    "solo": ("solo12.urdf", ["FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT"]),
+    "talos": ("talos_reduced.urdf", ["left_sole_link", "right_sole_link"]),
+}
+
+
+@dataclass(frozen=True)
+class Free:
+    """A robot of the package on a floating joint, in dynsim by its URDF and in Pinocchio by its free flyer."""
+
+    path: Path
+    feet: list[str]
+    theirs: Any
+
+    def transformed(self, ours: Model, q: Any, v: Any, vdot: Any) -> tuple[Any, ...]:
+        """Pinocchio's q, v, v̇ and T, v_P = T v: its velocity of the root has the axes of the body."""
+        w, x, y, z = q[3:7]
+        R = pinocchio.Quaternion(w, x, y, z).matrix()
+        order = [self.theirs.joints[self.theirs.getJointId(name)].idx_v for name in ours.joint_names[6:]]
+        T = np.zeros((ours.n, ours.n))
+        T[:3, :3], T[3:6, 3:6], T[order, range(6, ours.n)] = R.T, np.eye(3), 1.0
+        angles = np.zeros(ours.n)
+        angles[order] = q[7:]
+        at = pinocchio.integrate(self.theirs, pinocchio.neutral(self.theirs), angles)
+        at[:7] = *q[:3], x, y, z, w
+        rates = T @ vdot
+        rates[:3] -= np.cross(v[3:6], R.T @ v[:3])
+        return at, T @ v, rates, T
+
+
+@pytest.fixture(params=FREE)
+def free(request: pytest.FixtureRequest, tmp_path: Path) -> Free:
+    """The file with a floating joint between the world and its root link."""
+    name, feet = FREE[request.param]
+    path = next(path for path in packaged() if path.name == name)
+    joint = f'''<link name="the_world"/><joint name="root" type="floating"><parent link="the_world"/>
+        <child link="{read_tree(path).root}"/></joint></robot>'''
+    (tmp_path / name).write_text(path.read_text().replace("</robot>", joint))
+    return Free(tmp_path / name, feet, pinocchio.buildModelFromUrdf(str(path), pinocchio.JointModelFreeFlyer()))
+
+
+def test_free_robots_are_pinocchios(free: Free, tmp_path: Path) -> None:
+    ours, theirs = Model.from_urdf(free.path), free.theirs
+    data = theirs.createData()
+    assert ours.n == theirs.nv
+    assert ours.nq == ours.n + 1
+    (tmp_path / "again.urdf").write_text(ours.to_urdf())
+    again = Model.from_urdf(tmp_path / "again.urdf")
+    assert again.robot.position_names == ours.robot.position_names
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        q, v, vdot = rng.uniform(-2, 2, ours.nq), *rng.uniform(-2, 2, (2, ours.n))
+        q[3:7] /= np.linalg.norm(q[3:7])
+        q_theirs, v_theirs, vdot_theirs, T = free.transformed(ours, q, v, vdot)
+        M = pinocchio.crba(theirs, data, q_theirs)
+        M = T.T @ (np.triu(M) + np.triu(M, 1).T) @ T
+        tau = T.T @ pinocchio.rnea(theirs, data, q_theirs, v_theirs, vdot_theirs)
+        pinocchio.framesForwardKinematics(theirs, data, q_theirs)
+        for model in (ours, again):
+            np.testing.assert_allclose(model.mass_matrix(q), M, rtol=0, atol=ROUNDING * abs(M).max())
+            np.testing.assert_allclose(model.inverse_dynamics(q, v, vdot), tau, rtol=0, atol=ROUNDING * abs(tau).max())
+            for foot in free.feet:
+                position = data.oMf[theirs.getFrameId(foot)].translation
+                np.testing.assert_allclose(model.point_position(foot, np.zeros(3), q), position, rtol=0, atol=ROUNDING)
+
+
+def run_free(free: Free, tmp_path: Path, **contacts: Any) -> tuple[Model, Any]:
+    motor = {
+        "type": "dc",
+        "torque_constant_N_m_per_A": 0.1,
+        "resistance_ohm": 0.5,
+        "inductance_H": 0.0005,
+        "rotor_inertia_kg_m2": 1e-5,
+        "gear_ratio": 30,
+        "gear_damping_N_m_s_per_rad": 1e-5,
+    }
+    pose = {"position_m": [0.1, -0.2, 1.0], "rpy_deg": [10, -20, 120]}
+    plant = {"type": "urdf_arm", "file": str(free.path), "motor": motor, "initial_pose": {"root": pose}}
+    control = {"type": "joint_pd", "k_p_V_per_rad": 50, "k_d_V_s_per_rad": 1}
+    scenario = {"duration_s": 0.2, "plant": plant, "controller": control, "integrator": {"rtol": 1e-8}, **contacts}
+    path = tmp_path / "free.yaml"
+    path.write_text(json.dumps(scenario))
+    loaded = load_scenario(path)
+    return build_model(loaded), simulate(loaded)
+
+
+def check_motion(free: Free, model: Model, record: Any, points: dict[str, str]) -> None:
+    """tau_P(q, v, v̇) is what motors, losses and contacts do, at every sample; the samples are of unit quaternions."""
+    q, v = record["q"], record["v"]
+    assert np.abs(np.linalg.norm(q[:, 3:7], axis=1) - 1.0).max() < 1e-15
+    driven = [model.joint_names.index(name) for name in record.labels["torque"]]
+    assert driven == list(range(6, model.n))
+    # The record's torque is that of the shaft: without the rotor's inertia and the gear's loss.
+    losses = np.array([link.damping for link in model.robot.links])
+    for k in range(0, len(record), 10):
+        at, rate, acceleration, T = free.transformed(model, q[k], v[k], record["vdot"][k])
+        expected = T.T @ pinocchio.rnea(free.theirs, free.theirs.createData(), at, rate, acceleration)
+        tau = -losses * v[k]
+        tau[driven] += record["torque"][k]
+        for c, name in enumerate(record.labels["contact_normal_force"]):
+            tau += model.point_jacobian(points[name], np.zeros(3), q[k]).T @ record["contact_force"][k, c]
+        # Contact forces carry the condition of the contacts' rows.
+        np.testing.assert_allclose(tau, expected, rtol=0, atol=1e-8 * max(1.0, abs(expected).max()))
+
+
+def test_a_free_robot_falls_as_pinocchios_does(free: Free, tmp_path: Path) -> None:
+    model, record = run_free(free, tmp_path)
+    check_motion(free, model, record, {})
+    robot, data = free.theirs, free.theirs.createData()
+    heights = []
+    for k in (0, -1):
+        at, _, _, _ = free.transformed(model, record["q"][k], record["v"][k], record["vdot"][k])
+        heights.append(pinocchio.centerOfMass(robot, data, at)[2])
+    assert heights[1] - heights[0] == pytest.approx(-0.5 * 9.81 * 0.2**2, abs=1e-7)
+    assert record["q"][0, 0:3] == pytest.approx([0.1, -0.2, 1.0])
+
+
+def test_a_free_robot_with_its_feet_on_slopes(free: Free, tmp_path: Path) -> None:
+    """Every foot on a plane through where it starts, with friction: drift, ledger, and Pinocchio's inverse dynamics."""
+    start, _ = run_free(free, tmp_path)
+    surfaces, points = {}, {}
+    for k, foot in enumerate(free.feet):
+        place = start.point_position(foot, np.zeros(3), start.robot.initial)
+        surfaces[f"slope_{k}"] = {"type": "plane", "point_m": place.tolist(), "normal": [0.1 * k - 0.1, 0.2, 1.0]}
+        points[f"foot_{k}"] = {"body": foot, "surface": f"slope_{k}"}
+    model, record = run_free(free, tmp_path, surfaces=surfaces, contacts={"points": points, "friction": 0.2})
+    check_motion(free, model, record, {name: point["body"] for name, point in points.items()})
+    assert record.summary["constraint_drift_max_m"] < 1e-9
+    assert abs(record.summary["energy_residual_relative"]) < 1e-6
+    assert np.abs(record["contact_normal_force"]).max() > 1.0

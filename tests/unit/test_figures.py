@@ -307,3 +307,23 @@ def test_side_plane_of_an_arm_along_minus_y() -> None:
     segments = np.array([[[0.0, 0.0, 0.0], [0.0, -1.0, 0.3]], [[0.0, -1.0, 0.3], [0.0, -2.0, 0.1]]])
     plane = posture._side_plane(record, [segments])
     np.testing.assert_allclose(plane.project(np.array([0.0, -2.0, 0.1])), [2.0, 0.1], atol=1e-12)
+
+
+def test_a_free_body_hangs_on_nothing(tmp_path: Path):
+    """Of a body that floats with an arm on it, the posture is the arm: no line leads there from the world."""
+    inertial = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    (tmp_path / "free.urdf").write_text(
+        f'<robot name="free"><link name="base"/><link name="body">{inertial}</link><link name="arm">{inertial}</link>'
+        '<joint name="root" type="floating"><parent link="base"/><child link="body"/></joint>'
+        '<joint name="hinge" type="continuous"><origin xyz="0.5 0 0"/><parent link="body"/><child link="arm"/></joint>'
+        "</robot>"
+    )
+    (tmp_path / "free.yaml").write_text(
+        "duration_s: 0.01\n"
+        "plant: {type: urdf_arm, file: free.urdf, hand: {body: arm, point_m: [0.2, 0, 0]},"
+        " initial_pose: {root: {position_m: [1, 2, 3]}}}\n"
+    )
+    body, _ = posture._body(dynsim.simulate(load_scenario(tmp_path / "free.yaml")))
+    segments = body.segments(np.array([1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0, 0.0]))
+    drawn = [segment for segment in segments if np.ptp(segment, axis=0).any()]
+    np.testing.assert_allclose(drawn, [[[1, 2, 3], [1.5, 2, 3]], [[1.5, 2, 3], [1.7, 2, 3]]], atol=1e-15)

@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 
 from dynsim.errors import ModelError
 from dynsim.model.description import Inertia, Link, Robot
+from dynsim.model.joints.ball import ball, floating
+from dynsim.model.joints.planar import planar, rolling
 from dynsim.model.model import Model
 from dynsim.model.urdf import read_urdf, write_urdf
 
@@ -134,6 +136,65 @@ def test_locked_joints_are_pinocchios_reduced_model(
             np.testing.assert_allclose(position, expected, rtol=0, atol=ROUNDING * 10)
 
 
+def moving(name: str, parent: str | None = None, **options: object) -> Link:
+    """A body of 1 kg whose joint is turned and displaced; its kind is that of the rows it is made of."""
+    R = rotation(np.random.default_rng(len(name)))
+    inertia = Inertia(1.0, np.array([0.1, 0.2, 0.3]), np.diag([0.2, 0.3, 0.4]))
+    axis = np.array([0.6, 0.0, 0.8])
+    return Link(name, f"{name}_joint", parent, "revolute", axis, inertia, R, np.array([0.3, 0.2, 0.1]), **options)  # type: ignore[arg-type]
+
+
+def test_floating_and_planar_joints_are_written_whole(tmp_path: Path) -> None:
+    """Also in the middle of a tree; what is read has the same rows, names, axes and dynamics."""
+    links = (*floating(moving("root")), moving("arm", "root"), *planar(moving("table", "arm")), moving("pole", "table"))
+    robot = Robot("free", (*links, *floating(moving("cup", "pole"))), (), ("cup", np.array([0.1, 0.0, 0.2])))
+    text = write_urdf(robot)
+    assert text.count("<joint") - text.count('type="fixed"') == 5
+    assert [text.count(f'type="{kind}"') for kind in ("floating", "planar")] == [2, 1]
+    (tmp_path / "free.urdf").write_text(text)
+    again = read_urdf(tmp_path / "free.urdf")
+    for link, copy in zip(robot.links, again.links, strict=True):
+        for name in ("name", "joint", "parent", "kind", "joint_of_rows"):
+            assert getattr(copy, name) == getattr(link, name)
+        np.testing.assert_allclose(copy.axis, link.axis, rtol=0, atol=1e-15)
+    rng = np.random.default_rng(1)
+    before, after = Model(robot), Model(again)
+    q, v = rng.uniform(-2, 2, before.nq), rng.uniform(-2, 2, before.n)
+    bias = before.bias_forces(q, v)
+    np.testing.assert_allclose(after.bias_forces(q, v), bias, rtol=0, atol=ROUNDING * abs(bias).max())
+
+
+@pytest.mark.parametrize(
+    ("links", "message"),
+    [
+        (ball(moving("root")), "root_joint: is made of ball_x, ball_y, ball_z; URDF has no such joint"),
+        (rolling(moving("root")), "root_joint: is made of roll, turn; URDF has no such joint"),
+        (planar(moving("root", damping=0.1)), "root_joint: has losses; URDF has no unit for those of a planar joint"),
+        ((dataclasses.replace(moving("root"), kind="screw"),), "root_joint: is made of screw"),
+    ],
+)
+def test_joints_that_urdf_does_not_have_are_refused(links: tuple[Link, ...], message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        write_urdf(Robot("free", links, (), ("root", np.zeros(3))))
+
+
+def test_a_free_root_is_merged_carries_frames_and_cannot_be_locked(tmp_path: Path) -> None:
+    path = tmp_path / "free.urdf"
+    tool = f'<link name="tool">{INERTIAL}</link>'
+    fixed = (
+        '<joint name="flange" type="fixed"><origin xyz="0 0 1"/><parent link="tip"/><child link="tool"/></joint>'
+        '<joint name="stand" type="fixed"><origin xyz="0 0 2"/><parent link="base"/><child link="post"/></joint>'
+    )
+    free = joint("floating").replace('link="base"', 'link="post"')
+    path.write_text(f'<robot name="free">{BASE}<link name="post"/>{TIP}{tool}{fixed}{free}</robot>')
+    model = Model.from_urdf(path)
+    assert model.robot.position_names == tuple(f"hinge.{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
+    assert model.robot.links[-1].inertia.mass == 2.0
+    np.testing.assert_allclose(model.point_position("tool", [0, 0, 0], model.robot.initial), [0, 0, 3])
+    with pytest.raises(ModelError, match=r"urdf:1: lock: joint 'hinge' is floating, .*; make it fixed in the file"):
+        read_urdf(path, {"hinge": 0.0})
+
+
 def test_writing_what_was_read_gives_the_same_text(tmp_path: Path) -> None:
     first = Model.from_urdf(ARM).to_urdf()
     (tmp_path / "copy.urdf").write_text(first)
@@ -192,8 +253,9 @@ def joint(kind: str, inside: str = "", *, name: str = "hinge", child: str = "tip
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (TIP + joint("floating"), ["hinge", "floating"]),
-        (TIP + joint("planar"), ["hinge", "planar"]),
+        (TIP + joint("floating", '<dynamics damping="1"/>'), ["hinge", "floating", "remove <dynamics>"]),
+        (TIP + joint("planar", '<axis xyz="0 0 1"/><limit lower="0" upper="1"/>'), ["planar", "remove <limit>"]),
+        (TIP + joint("planar"), ["hinge", "planar", "<axis>", "normal"]),
         (TIP + joint("hyper"), ["hinge", "hyper", "continuous"]),
         (TIP + joint("continuous", '<mimic joint="other"/>'), ["hinge", "mimic"]),
         (TIP + joint("revolute"), ["hinge", "limit"]),

@@ -8,6 +8,7 @@ import pytest
 
 from dynsim.engine import check, simulate
 from dynsim.errors import ModelError, ScenarioError
+from dynsim.model.urdf_reader import rotation
 from dynsim.record import Record
 from dynsim.scenario import build_model, load_scenario
 
@@ -178,3 +179,139 @@ def test_names_that_are_no_place_are_refused(bracket: Path):
     point = {"contacts.points.brace": {"body": "braket"}, "surfaces.floor": {"type": "plane"}}
     with pytest.raises(ModelError, match=r"no body 'braket'; did you mean 'bracket'"):
         check(load_scenario(bracket, overrides={**lock, **point}))
+
+
+INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+# A body that floats with an arm on it, and one that slides and turns in a plane whose normal is left open.
+FREE = f"""<robot name="free"><link name="base"/>
+<link name="body">{INERTIAL}</link><link name="puck">{INERTIAL}</link><link name="arm">{INERTIAL}</link>
+<joint name="root" type="floating"><origin xyz="0 0 1"/><parent link="base"/><child link="body"/></joint>
+<joint name="slide" type="planar"><parent link="base"/><child link="puck"/><axis xyz="%s"/></joint>
+<joint name="hinge" type="continuous"><parent link="body"/><child link="arm"/><axis xyz="0 1 0"/></joint></robot>"""
+
+
+@pytest.fixture
+def free(tmp_path: Path) -> Path:
+    (tmp_path / "slide.urdf").write_text(FREE % "0 0 1")
+    (tmp_path / "case.yaml").write_text(SCENARIO)
+    return tmp_path / "case.yaml"
+
+
+def test_free_bodies_start_in_the_poses_of_the_scenario(free: Path):
+    poses = {
+        "root": {"position_m": [1, 2, 3], "rpy_deg": [30, -60, 170]},
+        "slide": {"position_m": [0.5, -0.25, 0], "rpy_deg": [0, 0, 100]},
+    }
+    overrides = {"plant.initial_pose": poses, "plant.initial_deg": {"hinge": 20}}
+    model = build_model(load_scenario(free, overrides=overrides))
+    q = model.robot.initial
+    R, p = model.body_pose("body", q)
+    np.testing.assert_allclose(p, [1, 2, 4], atol=1e-15)
+    np.testing.assert_allclose(R, rotation(*np.deg2rad([30, -60, 170])), atol=1e-15)
+    R, p = model.body_pose("puck", q)
+    np.testing.assert_allclose(p, [0.5, -0.25, 0], atol=1e-15)
+    np.testing.assert_allclose(R, rotation(0, 0, np.deg2rad(100)), atol=1e-15)
+    assert dict(zip(model.robot.position_names, q, strict=True))["hinge"] == pytest.approx(np.deg2rad(20))
+
+
+def test_a_pose_in_a_plane_that_is_not_horizontal(free: Path):
+    (free.parent / "slide.urdf").write_text(FREE % "0 1 0")
+    pose = {"position_m": [0.5, 0, -0.25], "rpy_deg": [0, 35, 0]}
+    model = build_model(load_scenario(free, overrides={"plant.initial_pose": {"slide": pose}}))
+    R, p = model.body_pose("puck", model.robot.initial)
+    np.testing.assert_allclose(p, [0.5, 0, -0.25], atol=1e-15)
+    np.testing.assert_allclose(R, rotation(0, np.deg2rad(35), 0), atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("initial_pose.hinge", {}, r"plant.initial_pose.hinge.*'hinge' is revolute; give it in plant.initial_deg"),
+        ("initial_pose.roof", {}, r"plant.initial_pose.roof.*no joint 'roof'"),
+        ("initial_pose.root", {"rpy_deg": [0, 0]}, r"plant.initial_pose.root.rpy_deg"),
+        ("initial_m.slide", 1, r"'slide' is planar: it has no motor, .* starts where plant.initial_pose.slide says"),
+        ("lock_deg.root", 1, r"'root' is floating: it has no motor"),
+        ("motors.root", {"type": "wang_minami"}, r"plant.motors.root.*'root' is floating: it has no motor"),
+    ],
+)
+def test_free_bodies_have_no_motor_angle_or_distance(free: Path, key: str, value: Any, message: str):
+    with pytest.raises(ScenarioError, match=message):
+        load_scenario(free, overrides={f"plant.{key}": value})
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        ({"position_m": [0, 0, 0.1]}, "plant.initial_pose.slide.position_m: leaves the plane"),
+        ({"rpy_deg": [0, 10, 0]}, "plant.initial_pose.slide.rpy_deg: leaves the plane"),
+    ],
+)
+def test_a_pose_off_the_plane_is_refused(free: Path, pose: dict[str, Any], message: str):
+    with pytest.raises(ModelError, match=message):
+        build_model(load_scenario(free, overrides={"plant.initial_pose": {"slide": pose}}))
+
+
+def test_the_motor_of_all_joints_is_not_that_of_free_bodies(free: Path):
+    plant = {"plant.motor": {"type": "wang_minami"}, "plant.damping_N_m_s_per_rad": 0.5, "plant.damping_N_s_per_m": 3}
+    robot = build_model(load_scenario(free, overrides=plant)).robot
+    assert [motor.joint for motor in robot.motors] == ["hinge"]
+    assert {link.joint: link.damping for link in robot.links if link.damping} == {"hinge": 0.5}
+
+
+def test_the_record_names_coordinates_and_rates(free: Path):
+    record = run(free, {"plant.motors": {"hinge": {"type": "wang_minami"}}})
+    assert record.labels["q"][:10] == (
+        *(f"root.{name}" for name in ("x", "y", "z", "qw", "qx", "qy", "qz")),
+        *(f"slide.{name}" for name in ("x", "y", "angle")),
+    )
+    assert (record.units["q"], record.units["v"]) == ("rad or m or 1", "rad/s or m/s")
+    assert record.labels["v"][:6] == tuple(f"root.{name}" for name in ("x", "y", "z", "wx", "wy", "wz"))
+    # Gravity 9.81 along x moves the floating body and the puck alike.
+    fallen = 0.5 * 9.81 * 0.5**2
+    assert record["q"][-1, [0, 7]] == pytest.approx([fallen, fallen], abs=1e-8)
+
+
+def test_rodas4_is_refused_where_coordinates_are_more_than_rates(free: Path):
+    message = "integrator.method: rodas4 cannot integrate joint 'root', .* take rk43 or dopri5"
+    with pytest.raises(ScenarioError, match=message):
+        check(load_scenario(free, overrides={"integrator.method": "rodas4"}))
+    (free.parent / "slide.urdf").write_text(FREE.replace("floating", "fixed") % "0 0 1")
+    # Of a planar joint every rate is that of a coordinate.
+    record = run(free, {"integrator.method": "rodas4"})
+    assert record["q"][-1, 0] == pytest.approx(0.5 * 9.81 * 0.5**2, abs=1e-8)
+
+
+def test_limits_behind_a_free_body_are_looked_at_in_their_own_coordinate(free: Path):
+    limited = '<axis xyz="0 1 0"/><limit lower="-0.1" upper="0.2" velocity="0.4" effort="50"/></joint></robot>'
+    text = (FREE % "0 0 1").replace('"hinge" type="continuous"', '"hinge" type="revolute"')
+    (free.parent / "slide.urdf").write_text(text.replace('<axis xyz="0 1 0"/></joint></robot>', limited))
+    overrides = {"plant.initial_deg": {"hinge": 18}, "plant.initial_pose": {"root": {"position_m": [5, 5, 5]}}}
+    warnings = [line for line in run(free, overrides).summary["warnings"] if "limit" in line]
+    assert len(warnings) == 1
+    assert warnings[0].startswith("hinge: passes its upper position limit of 0.2 rad by up to 0.114 rad")
+
+
+def test_motors_hold_and_the_hand_is_led_behind_a_free_body(free: Path):
+    """A far heavier body that floats: its arm, of one hinge, follows a path; the columns of q are not those of v."""
+    heavy = (FREE % "0 0 1").replace(
+        '<mass value="1"/><inertia ixx="1" iyy="1" izz="1"',
+        '<mass value="1e9"/><inertia ixx="1e9" iyy="1e9" izz="1e9"',
+        1,
+    )
+    (free.parent / "slide.urdf").write_text(heavy)
+    base = {
+        "plant.gravity_m_s2": [0, 0, 0],
+        "plant.hand": {"body": "arm", "point_m": [1, 0, 0]},
+        "plant.motor": {"type": "wang_minami"},
+        "plant.initial_deg": {"hinge": 20},
+        "integrator": {},
+    }
+    held = run(free, {**base, "controller": {"type": "joint_pd"}})
+    assert np.ptp(held["q"][:, 10]) < 1e-6
+    # The hinge's angle about y: down by it.
+    a, b = np.deg2rad([20, 26])
+    line = {"type": "line", "from_m": [np.cos(a), 0, 1 - np.sin(a)], "to_m": [np.cos(b), 0, 1 - np.sin(b)]}
+    path = {**line, "start_s": 0, "duration_s": 0.4}
+    hand = {"path": path, "joints": ["hinge"], "tolerance_m": 0.01}
+    led = run(free, {**base, "controller": {"type": "joint_pd", "hand": hand, "k_p_V_per_rad": 5000}})
+    assert led["q"][-1, 10] == pytest.approx(b, abs=0.01)

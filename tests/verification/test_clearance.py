@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from random_robots import random_robot, random_unit
+from random_robots import random_positions, random_robot, random_robot_of, random_unit
 from rich.console import Console
 
 import dynsim
@@ -15,6 +15,7 @@ from dynsim.engine import check
 from dynsim.errors import ModelError
 from dynsim.model.clearance import poses, sinking
 from dynsim.model.description import Inertia, Link, Quadric, Robot
+from dynsim.model.joints.ball import floating
 from dynsim.model.model import Model
 from dynsim.scenario import build, load_scenario, scenario_from_resolved
 from dynsim.tables import print_comparison, print_summary
@@ -35,6 +36,32 @@ def test_poses_of_many_samples_are_those_of_the_model(seed):
             np.testing.assert_allclose(R[:, :, k], rotation, atol=1e-12)
             np.testing.assert_allclose(p[:, k], origin, atol=1e-11)
     assert seen == [link.name for link in robot.links]
+
+
+@given(seeds)
+def test_poses_behind_joints_of_every_kind(seed):
+    rng = np.random.default_rng(seed)
+    kinds = ["ball", "floating", "planar", "rolling", "revolute", "prismatic"]
+    robot = random_robot_of(rng, [str(kind) for kind in rng.permutation(kinds)])
+    model, q = Model(robot), np.array([random_positions(rng, robot) for _ in range(5)])
+    # Between two normalisations a quaternion is not quite of unit length.
+    q *= 1.0 + 1e-3 * np.array([[name.split(".")[-1] in ("qw", "qx", "qy", "qz") for name in robot.position_names]])
+    for link, R, p in poses(robot, q):
+        for k in range(5):
+            rotation, origin = model.body_pose(link.name, q[k])
+            np.testing.assert_allclose(R[:, :, k], rotation, atol=1e-12)
+            np.testing.assert_allclose(p[:, k], origin, atol=1e-11)
+
+
+def test_rows_without_a_body_do_not_sink():
+    """The first rows of a floating joint are at its frame, below the table that the body is above."""
+    table = {"table": Quadric(np.zeros((3, 3)), np.array([0.0, 0.0, 1.0]), -1.0)}
+    robot = Robot("r", floating(Link("body", "free", None, "", np.eye(3)[2], Inertia(1.0))), (), ("body", np.zeros(3)))
+    q = np.array([[0.3, 0.2, 1.5, 1.0, 0.0, 0.0, 0.0], [0.3, 0.2, 0.8, 1.0, 0.0, 0.0, 0.0]])
+    assert sinking(robot, table, q[:1]) == []
+    (sunk,) = sinking(robot, table, q)
+    assert (sunk.body, sunk.sample) == ("body", 1)
+    assert sunk.depth == pytest.approx(0.2)
 
 
 def test_only_the_bodies_asked_for_and_what_carries_them():

@@ -69,7 +69,7 @@ def start(system: System, ws: Workspace, run: Run):
     elif forces_unique(system, ws, run, run.clock[TIME]):
         watch(ws, run, 0.0)
         if run.clock[STEP] <= 0.0:
-            first_step(run, system.layout.tracked)
+            first_step(system, ws, run)
     run.count[STARTED] = 1
 
 

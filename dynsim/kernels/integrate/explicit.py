@@ -20,7 +20,7 @@ from dynsim.kernels.system import System, derivative
 
 
 @internal_kernel
-def weight_rk43(run: Run, size):
+def weight_rk43(system: System, ws: Workspace, run: Run):
     """Weight of the error estimate of RK43, by what sets the step: accuracy or stability.
 
     z = |h (f(y_new) − k_4)| / |y_new − Y_4|, Y_4 the state of the fourth stage at the same time, is |h λ| of the modes
@@ -30,11 +30,19 @@ def weight_rk43(run: Run, size):
     """
     h, y, y_new, k, atol, rtol = run.clock[STEP], run.y, run.y_new, run.stage, run.clock[ATOL], run.clock[RTOL]
     slope, change = 0.0, 0.0
-    for j in range(size):
-        scale = 1.0 / (atol + rtol * max(abs(y[j]), abs(y_new[j])))
-        df, dy = h * (k[6, j] - k[3, j]) * scale, (y_new[j] - y[j] - h * k[2, j]) * scale
-        slope += df * df
-        change += dy * dy
+    if system.layout.extra > 0:
+        for j in range(system.layout.tracked):
+            k[7, j] = h * (k[6, j] - k[3, j])
+        slope = error_norm(system, ws, run, k[7]) ** 2
+        for j in range(system.layout.tracked):
+            k[7, j] = y_new[j] - y[j] - h * k[2, j]
+        change = error_norm(system, ws, run, k[7]) ** 2
+    else:
+        for j in range(system.layout.tracked):
+            scale = 1.0 / (atol + rtol * max(abs(y[j]), abs(y_new[j])))
+            df, dy = h * (k[6, j] - k[3, j]) * scale, (y_new[j] - y[j] - h * k[2, j]) * scale
+            slope += df * df
+            change += dy * dy
     remote = max(1.0 - 2.0 * slope / change, 0.0) if change > 0.0 else 1.0
     return WEIGHT_STABILITY + (WEIGHT_ACCURACY - WEIGHT_STABILITY) * remote * remote
 
@@ -72,7 +80,7 @@ def step_explicit(system: System, ws: Workspace, run: Run):
     if run.method == RK4:
         return 0.0
     if run.method == RK43:
-        weight = weight_rk43(run, system.layout.tracked)
+        weight = weight_rk43(system, ws, run)
         for j in range(y.shape[0]):
             k[7, j] = weight * h * (k[6, j] - k[3, j])
     else:

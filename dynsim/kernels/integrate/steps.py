@@ -59,14 +59,20 @@ def finite(values):
 
 
 @internal_kernel
-def first_step(run: Run, states):
+def first_step(system: System, ws: Workspace, run: Run):
     """Hairer's first guess of the step size: one that changes the state by a hundredth of its scale."""
     clock, y, k = run.clock, run.y, run.stage
     size, slope = 0.0, 0.0
-    for j in range(states):
-        scale = clock[ATOL] + clock[RTOL] * abs(y[j])
-        size += (y[j] / scale) ** 2
-        slope += (k[0, j] / scale) ** 2
+    if system.layout.extra > 0:
+        # A guess that is the same for every attitude: of a quaternion only its rotation counts.
+        for j in range(y.shape[0]):
+            run.y_new[j] = y[j]
+        size, slope = error_norm(system, ws, run, y) ** 2, error_norm(system, ws, run, k[0]) ** 2
+    else:
+        for j in range(system.layout.tracked):
+            scale = clock[ATOL] + clock[RTOL] * abs(y[j])
+            size += (y[j] / scale) ** 2
+            slope += (k[0, j] / scale) ** 2
     guess = 0.01 * math.sqrt(size / slope) if size > 1e-10 and slope > 1e-10 else 1e-6
     clock[STEP] = min(guess, clock[STEP_MAX], clock[END] - clock[TIME])
 

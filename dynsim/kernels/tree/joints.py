@@ -66,6 +66,7 @@ def row_motion(model: ModelArrays, ws: Workspace, i, b0, b1, b2, b3, b4, b5, b6,
         Rotation (9) and origin (3) of the body, axis as a motion vector at the world origin (6).
     """
     kind, joints, trig = model.tree[i, KIND], ws.joints, ws.trig
+    # Of a unit rate: the angular velocity s, and the velocity l of the body's origin.
     sx, sy, sz, lx, ly, lz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     if kind == BALL_X:
         w, x, y, z = joints[i, Q], joints[i, EXTRA], joints[i + 1, Q], joints[i + 2, Q]
@@ -91,8 +92,8 @@ def row_motion(model: ModelArrays, ws: Workspace, i, b0, b1, b2, b3, b4, b5, b6,
         lx, ly, lz = b0, b3, b6
     elif kind == TURN:
         sx, sy, sz = b2, b5, b8
-    if kind != ROLL:
-        lx, ly, lz = py * sz - pz * sy, pz * sx - px * sz, px * sy - py * sx
+    # As a motion at the world origin.
+    lx, ly, lz = lx + py * sz - pz * sy, ly + pz * sx - px * sz, lz + px * sy - py * sx
     return b0, b1, b2, b3, b4, b5, b6, b7, b8, px, py, pz, sx, sy, sz, lx, ly, lz
 
 
