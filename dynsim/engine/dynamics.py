@@ -25,7 +25,9 @@ from dynsim.model.clearance import poses
 from dynsim.model.control import JointControl
 from dynsim.model.description import Array, Contact, Link, Robot
 from dynsim.model.model import Model
+from dynsim.model.scene import robot_scene
 from dynsim.record import Record
+from dynsim.record.poses import add_body_poses, pose_columns
 from dynsim.scenario import Scenario, build_model
 
 log = logging.getLogger(__name__)
@@ -62,7 +64,8 @@ def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
     robot, contacts = model.robot, scenario.contacts()
     scenario.check_start(model)
     n, na, c = model.n, len(robot.motors), len(contacts)
-    times = _sample_times(scenario, columns=2 * n + na + LEDGER_SIZE + CONTACT_SIZE * c + ki.output_size(n, na, c))
+    columns = 2 * n + na + LEDGER_SIZE + CONTACT_SIZE * c + ki.output_size(n, na, c) + pose_columns(n)
+    times = _sample_times(scenario, columns)
     _check_stiffness(scenario, robot)
     _check_work(scenario, n, c)
     control = _control(scenario, model, progress)
@@ -306,6 +309,8 @@ def _record(scenario: Scenario, prepared: Prepared, wall: float) -> Record:
     integrals = ledger[:, LEDGER_SIZE:].reshape(rows, c, CONTACT_SIZE)
     record.add("contact_impulse", integrals[:, :, 0], "N s", labels=names, description="∫ f_n dt")
     record.add("contact_slip_distance", integrals[:, :, 1], "m", labels=names, description="∫ |v_t| dt")
+    record.scene = robot_scene(robot, contacts, scenario.surfaces())
+    add_body_poses(record)
     deficient, spread = int(prepared.workspace.deficient[0]), None
     if deficient and rows and any(contact.friction > 0.0 for contact in contacts):
         joint_units = [(link.joint, link.units[2]) for link in robot.links]

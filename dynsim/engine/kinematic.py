@@ -30,6 +30,7 @@ from dynsim.kernels.snake_plant import (
     record_row,
     run_ticks,
 )
+from dynsim.model.scene import snake_scene
 from dynsim.model.snake import (
     FIXING,
     NO_REQUEST,
@@ -41,6 +42,7 @@ from dynsim.model.snake import (
     TaskSpaceController,
 )
 from dynsim.record import Record
+from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario
 
 log = logging.getLogger(__name__)
@@ -73,7 +75,8 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> Run:
         raise ScenarioError(f"duration_s = {scenario.duration_s:g} is shorter than controller.period_s = {period:g}")
     stride = _stride(scenario.record.rate_hz, period)
     rows = -(-ticks // stride) + 1
-    check_size(scenario, rows, sum(array[0].size for array in new_trace(model, 1)))
+    bodies = len(snake_scene(description).bodies)
+    check_size(scenario, rows, sum(array[0].size for array in new_trace(model, 1)) + pose_columns(bodies))
 
     state, rig = new_state(model), new_rig(model)
     state.base[:], state.phi[:] = description.initial_base_pose, description.initial_joints

@@ -22,8 +22,10 @@ from dynsim.kernels.snake_plant import (
     Trace,
     record_row,
 )
+from dynsim.model.scene import snake_scene
 from dynsim.model.snake import SnakeDescription, TaskSpaceController, conditioning
 from dynsim.record import Record
+from dynsim.record.poses import add_body_poses
 from dynsim.scenario import Scenario
 
 # Why the target waited, in the order of the counters of dynsim.kernels.snake_plant.State; the last is the rest: after
@@ -115,6 +117,8 @@ def make_record(
     add("at_limit", trace.at_limit, "1", labels=names, description="1 joint out of the allocation, 2 clamped")
     labels = tuple(f"point{i}" for i in range(points.shape[1]))
     add("posture", points, "m", labels=labels, description="polyline: controlled point, joints, axles to the tail")
+    record.scene = snake_scene(description)
+    add_body_poses(record)
     record.summary = _summary(run, scenario, switcher, record, wall)
     return record
 

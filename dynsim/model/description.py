@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.errors import ModelError
+from dynsim.record.scene import Shape
 
 Array = NDArray[np.float64]
 WORLD = "world"
@@ -109,6 +110,7 @@ class Link:
     radius : of a cylinder about the body's axis [m], zero when unknown: deeper than that below a surface, a run warns
     tip : (3,) or None
         Other end of the axis in B [m], the first is the joint; None: the joints that the body carries, and the hand.
+    shapes : what the body looks like, in B; empty: a cylinder about its axis, if ``radius`` and ``tip`` are known
     """
 
     name: str
@@ -126,6 +128,7 @@ class Link:
     effort_limit: float = np.inf
     radius: float = 0.0
     tip: Array | None = None
+    shapes: tuple[Shape, ...] = ()
 
     @property
     def units(self) -> tuple[str, str, str, str]:
@@ -241,7 +244,7 @@ class Robot:
     """A tree of links with its motors.
 
     ``hand`` is the controlled point (body name, point in its frame [m]); ``q0`` the initial configuration [rad or m],
-    zero unless given; ``frames`` further names to attach points to.
+    zero unless given; ``frames`` further names to attach points to; ``fixed_shapes`` what stands still in the world.
     """
 
     name: str
@@ -251,6 +254,7 @@ class Robot:
     gravity: Array = field(default_factory=lambda: vector(0.0, 0.0, -9.81))
     q0: Array | None = None
     frames: tuple[Frame, ...] = ()
+    fixed_shapes: tuple[Shape, ...] = ()
 
     def attach(self, name: str, point: Array) -> tuple[int, Array]:
         """Index of the body that has a name, or a frame of that name, and a point of that frame in the body's [m].

@@ -21,6 +21,7 @@ import numpy as np
 from dynsim.errors import ModelError
 from dynsim.model.description import WORLD, Array, Frame, Inertia, Link, Robot
 from dynsim.model.urdf_reader import MOVING, UNLIMITED, UrdfJoint, UrdfTree, read_tree, suggestion
+from dynsim.record.scene import Shape, quaternion
 
 HAND = "hand"
 # Two readers of the same decimals differ by roundings: of the sines of angles, and of sums over merged bodies.
@@ -75,7 +76,14 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
         raise ModelError(f"{path}: no moving joint")
     _warn(locked, places, links)
     frames = [Frame(name, place.body, place.R, place.p) for name, place in places.items() if place.body != name]
-    return Robot(name=tree.name, links=links, motors=(), hand=_hand(tree, places), frames=tuple(frames))
+    return Robot(
+        name=tree.name,
+        links=links,
+        motors=(),
+        hand=_hand(tree, places),
+        frames=tuple(frames),
+        fixed_shapes=_shapes(locked, places).get(None, ()),
+    )
 
 
 def write_urdf(robot: Robot) -> str:
@@ -209,6 +217,7 @@ def _links(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[Link, ...]:
             own = name == place.body
             parts.setdefault(place.body, []).append(inertia if own else inertia.placed(place.R, place.p))
     joint_to = {joint.child: joint for joint in tree.joints.values()}
+    shapes = _shapes(tree, places)
     links = []
     for name, place in places.items():
         if place.body != name:
@@ -230,9 +239,20 @@ def _links(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[Link, ...]:
                 upper=joint.upper,
                 velocity_limit=joint.velocity_limit,
                 effort_limit=joint.effort_limit,
+                shapes=shapes.get(name, ()),
             )
         )
     return tuple(links)
+
+
+def _shapes(tree: UrdfTree, places: Mapping[str, _Place]) -> dict[str | None, tuple[Shape, ...]]:
+    """What each moving body, and the world (None), looks like, with all that is fixed to it."""
+    found: dict[str | None, tuple[Shape, ...]] = {}
+    for name, place in places.items():
+        turn = quaternion(place.R)
+        shapes = tuple(shape.placed(place.p, turn) for shape in tree.links[name].shapes)
+        found[place.body] = (*found.get(place.body, ()), *shapes)
+    return found
 
 
 def _hand(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[str, Array]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
@@ -20,6 +20,8 @@ import numpy as np
 from dynsim.errors import ModelError
 from dynsim.inputs import read_bytes
 from dynsim.model.description import Array, Inertia
+from dynsim.model.urdf_visual import materials, visual_shapes
+from dynsim.record.scene import Shape
 
 # The largest robots in use have some 100 links and 1 MB of text. Pinocchio walks the tree by recursion: some 5000 links
 # in a chain overflow its stack.
@@ -60,12 +62,16 @@ _EXTENDED = ("limit", "dynamics")
 
 @dataclass(frozen=True)
 class UrdfLink:
-    """A link as the file has it; ``inertia`` is None without ``<inertial>``, ``shaped`` means visual or collision."""
+    """A link as the file has it; ``inertia`` is None without ``<inertial>``, ``shaped`` means visual or collision.
+
+    ``shapes`` are its visuals, as far as they can be drawn.
+    """
 
     name: str
     line: int
     inertia: Inertia | None
     shaped: bool
+    shapes: tuple[Shape, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -145,9 +151,10 @@ class _Reader:
         self.check_children(root, "the robot")
         links: dict[str, UrdfLink] = {}
         joints: dict[str, UrdfJoint] = {}
+        colours = materials(root)
         for element in root.children:
             if element.tag == "link":
-                link = self.link(element, links)
+                link = replace(self.link(element, links), shapes=visual_shapes(element, colours))
                 links[link.name] = link
                 if len(links) > LINKS_MAX:
                     raise self.error(link.line, f"more than {LINKS_MAX} links; simplify the model")

@@ -7,7 +7,7 @@ at joint position zero it is the joint's frame, which is placed in the parent's 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dynsim.errors import RecordError
+from dynsim.record.quaternion import of_matrix, product, rotated
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
+ShapeKind = Literal["cylinder", "capsule", "box", "sphere", "mesh"]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
 
 WORLD = -1
@@ -48,7 +50,7 @@ class Shape:
     """
 
     __pydantic_config__: ClassVar[Any] = _CHECKS
-    kind: Literal["cylinder", "capsule", "box", "sphere", "mesh"]
+    kind: ShapeKind
     size: tuple[float, ...]
     position: Vector3 = (0.0, 0.0, 0.0)
     orientation: Quaternion = HERE
@@ -59,6 +61,12 @@ class Shape:
         count = {"cylinder": 2, "capsule": 2, "box": 3, "sphere": 1, "mesh": 3}[self.kind]
         if len(self.size) != count:
             raise RecordError(f"a {self.kind} has {count} numbers as its size, not {len(self.size)}")
+
+    def placed(self, position: ArrayLike, orientation: ArrayLike) -> Shape:
+        """The same shape seen from a frame in which the body's has a position [m] and an orientation."""
+        turn = np.asarray(orientation, dtype=np.float64)
+        where = np.asarray(position) + rotated(turn, np.array(self.position))
+        return replace(self, position=vector3(where), orientation=_four(product(turn, np.array(self.orientation))))
 
 
 @dataclass(frozen=True)
@@ -248,21 +256,12 @@ def vector3(values: ArrayLike) -> Vector3:
 
 
 def quaternion(R: ArrayLike) -> Quaternion:
-    """Unit quaternion (w, x, y, z), w ≥ 0, of a rotation matrix."""
-    R = np.asarray(R, dtype=np.float64)
-    # 4 q qᵀ from the elements of R: its largest diagonal element tells which row to divide by without loss of digits.
-    trace = float(np.trace(R))
-    square = np.array([1.0 + trace, *(1.0 - trace + 2.0 * np.diag(R))])
-    k = int(square.argmax())
-    cross = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    row = np.empty(4)
-    if k == 0:
-        row[0], row[1:] = square[0], cross
-    else:
-        row[0], row[1:] = cross[k - 1], (R + R.T)[k - 1]
-        row[k] = square[k]
-    row /= np.linalg.norm(row)
-    w, x, y, z = (row if row[0] >= 0.0 else -row).tolist()
+    """Unit quaternion, w ≥ 0, of a rotation matrix, as plain floats."""
+    return _four(of_matrix(R))
+
+
+def _four(values: ArrayLike) -> Quaternion:
+    w, x, y, z = np.asarray(values, dtype=np.float64).tolist()
     return w, x, y, z
 
 

@@ -81,11 +81,11 @@ def same(one: Record, other: Record) -> bool:
     """Whether two records hold the same, descriptions aside."""
     return (
         np.array_equal(one.time, other.time)
+        and sorted(one) == sorted(other)
+        and all(np.array_equal(one[name], other[name]) for name in one)
         and one.axes.keys() == other.axes.keys()
         and all(np.array_equal(one.times(name), other.times(name)) for name in one)
         and (one.events, one.scene) == (other.events, other.scene)
-        and sorted(one) == sorted(other)
-        and all(np.array_equal(one[name], other[name]) for name in one)
         and (one.units, one.labels) == (other.units, other.labels)
         and (one.summary, one.provenance, one.complete) == (other.summary, other.provenance, other.complete)
     )
