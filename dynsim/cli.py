@@ -11,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager
+from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TextIO
@@ -62,6 +63,15 @@ SetOption = Annotated[
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 FiguresOption = Annotated[bool, typer.Option("--no-figures", help="Do not draw figures.")]
+
+
+class FigureFormat(StrEnum):
+    png = "png"
+    pdf = "pdf"
+    svg = "svg"
+
+
+FormatOption = Annotated[FigureFormat, typer.Option("--format", help="Files that figures are drawn to.")]
 
 
 def main() -> None:
@@ -198,6 +208,7 @@ def run(
         Path | None, typer.Option(metavar="FOLDER", help="For the files; default: results/SCENARIO/VARIANT.")
     ] = None,
     no_figures: FiguresOption = False,
+    format_: FormatOption = FigureFormat.png,
     quiet: QuietOption = False,
 ) -> None:
     """Simulate one scenario and write its record, summary and figures."""
@@ -221,7 +232,7 @@ def run(
     interruption.heed()
     interruption.check()
     if not no_figures:
-        _draw(record, folder / "figures", quiet)
+        _draw(record, folder / "figures", quiet, format_)
     if not quiet:
         from dynsim.tables import print_summary
 
@@ -238,6 +249,7 @@ def compare(
     ] = None,
     jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Processes that simulate variants.")] = 1,
     no_figures: FiguresOption = False,
+    format_: FormatOption = FigureFormat.png,
     quiet: QuietOption = False,
 ) -> None:
     """Simulate all variants of a scenario and compare them in a table and in figures."""
@@ -284,8 +296,8 @@ def compare(
         interruption.check()
         if not no_figures:
             for name, record in records.items():
-                _draw(record, folder / name / "figures", quiet)
-            _draw_comparison(records, folder, quiet)
+                _draw(record, folder / name / "figures", quiet, format_)
+            _draw_comparison(records, folder, quiet, format_)
         if not quiet:
             from dynsim.tables import print_comparison
 
@@ -351,6 +363,7 @@ def plot(
         Path | None,
         typer.Option(metavar="FOLDER", help="For the figures; default: figures/ beside each record."),
     ] = None,
+    format_: FormatOption = FigureFormat.png,
 ) -> None:
     """Draw the figures of records; two or more are also laid over each other."""
     from dynsim.record import Record
@@ -362,11 +375,11 @@ def plot(
         labelled[label] = record
         folder = path.parent / "figures" if out is None else out if len(records) == 1 else out / label
         try:
-            _draw(record, folder, quiet=False)
+            _draw(record, folder, quiet=False, format_=format_)
         except RecordError as error:
             raise RecordError(f"{path}: {error}") from error
     if len(labelled) > 1:
-        _draw_comparison(labelled, out or Path("figures"), quiet=False)
+        _draw_comparison(labelled, out or Path("figures"), quiet=False, format_=format_)
 
 
 @app.command(epilog="Example: dynsim bench --quick --json bench.json")
@@ -415,16 +428,16 @@ def _label(path: Path, record: Record, taken: Container[str]) -> str:
     return next(label for k in itertools.count(1) if (label := name if k == 1 else f"{name}_{k}") not in taken)
 
 
-def _draw(record: Record, folder: Path, quiet: bool) -> None:
+def _draw(record: Record, folder: Path, quiet: bool, format_: FigureFormat) -> None:
     from dynsim.figures import draw
 
-    _drawing(lambda: draw(record, folder), folder, quiet)
+    _drawing(lambda: draw(record, folder, format_.value), folder, quiet)
 
 
-def _draw_comparison(records: dict[str, Record], folder: Path, quiet: bool) -> None:
+def _draw_comparison(records: dict[str, Record], folder: Path, quiet: bool, format_: FigureFormat) -> None:
     from dynsim.figures import draw_comparison
 
-    _drawing(lambda: draw_comparison(records, folder), folder, quiet)
+    _drawing(lambda: draw_comparison(records, folder, format_.value), folder, quiet)
 
 
 def _drawing(draw: Any, folder: Path, quiet: bool) -> None:

@@ -31,6 +31,7 @@ from dynsim.hardware.control_table import (
     WATCHDOG_SECONDS_PER_UNIT,
 )
 from dynsim.hardware.errors import PortError
+from dynsim.hardware.measured import describe
 from dynsim.hardware.rules import AbortRules, Cause, Cycle, Fault, decode_health
 from dynsim.hardware.run_log import Recorder, RunLog, TimingStatistics
 from dynsim.hardware.servo_map import FaultPolicy, Servo, ServoMap
@@ -661,11 +662,13 @@ class Replay:
             held = self.map.safety.at_end == "hold"
             result.end_state = "not armed" if not self.live else "holding" if held else "off"
         started = self._replay_started if self._replay_started is not None else self._origin
-        result.record = self._recorder.record(started, self._provenance)
+        result.record = describe(self._recorder.record(started, self._provenance), self.motion.scene, State)
         result.record.complete = result.fault is None
         result.timing = self._recorder.timing()
         summary: dict[str, Any] = {"end_state": result.end_state}
         if result.fault is not None:
+            fault = result.fault
+            result.record.add_event(result.fault_time - started, "fault", fault.cause.value, description=fault.text)
             summary |= {"fault": result.fault.cause.value, "fault_text": result.fault.text}
         result.record.summary |= summary
         if result.timing:
