@@ -66,7 +66,7 @@ def snake_geometry(record: Record) -> SnakeGeometry:
 
 def _wheels(scene: Scene, pair: str) -> list[tuple[float, float]]:
     """Radius and distance from the middle of the axle of the wheels on a body: its own, and bodies that turn on it."""
-    index = next(k for k, body in enumerate(scene.bodies) if body.name == pair)
+    index = {body.name: k for k, body in enumerate(scene.bodies)}[pair]
     own = [(shape.size[0], abs(shape.position[1])) for shape in scene.bodies[index].shapes if shape.position[1] != 0.0]
     turning = [body for body in scene.bodies if body.parent == index and body.joint.signal == "rho"]
     return own + [(body.shapes[0].size[0], abs(body.joint.position[1])) for body in turning]

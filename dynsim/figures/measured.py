@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from dynsim.figures import arm, hand, posture, style
 from dynsim.figures.motors import COLOURS, DASHES
 from dynsim.figures.style import Array
-from dynsim.record import Record
+from dynsim.record import TIME, Record
 
 # More joints than this do not fit a page; those with the largest error are drawn.
 JOINTS = 24
@@ -114,7 +114,7 @@ def servos(record: Record) -> Figure | None:
         size = np.array([_finite(np.nanmax, np.abs(column - np.nanmean(values))) for column in values.T])
         shown = np.arange(len(names)) if len(names) <= LINES else np.sort(np.argsort(size)[::-1][:LINES])
         for place, k in enumerate(shown):
-            style.line(axes, record.time, values[:, k], label=names[k], **_look(place))
+            style.line(axes, record.times(name), values[:, k], label=names[k], **_look(place))
         axes.set_ylabel(label)
         _at_least(axes, 0.5)
         _mark_replay(axes, record, named=axes is grid[0, 0])
@@ -152,7 +152,8 @@ Followed = tuple[str, str, Array, Array]
 def _followed(record: Record) -> list[Followed]:
     """Label, unit, measured and goal of everything that had goals: positions, and rates of what has no position."""
     found: dict[str, Followed] = {}
-    names = [name for name in record if f"{name}_goal" in record and name != "hand_position"]
+    own = [name for name, signal in record.signals.items() if signal.axis == TIME and signal.data.ndim == 2]
+    names = [name for name in own if f"{name}_goal" in own and name != "hand_position"]
     for name in sorted(names, key=lambda name: record.units[name].endswith("/s")):
         goals = dict(zip(record.labels[f"{name}_goal"], record[f"{name}_goal"].T, strict=True))
         for label, measured in zip(record.labels[name], record[name].T, strict=True):
