@@ -15,11 +15,12 @@ from dynsim.errors import DynsimError, RecordError
 from dynsim.record import Record
 
 MEASURED, SIMULATED = "dynsim.figures.measured", "dynsim.figures.arm"
-# Module with ``draw`` and ``draw_comparison`` → signals of which a record needs one set; the first that fits draws.
+# Module with ``draw`` and ``draw_comparison`` → sets of signals, any of which tells its records; the first module that
+# finds one draws.
 MODULES: dict[str, tuple[set[str], ...]] = {
-    "dynsim.figures.snake": ({"posture", "w", "w_target", "grounded", "phi", "base_pose"},),
-    MEASURED: ({"record_time", "torque_estimate"},),
-    SIMULATED: ({"hand_position"}, {"current", "voltage"}, {"energy_residual"}),
+    "dynsim.figures.snake": ({"posture"}, {"base_pose"}, {"w", "w_target"}),
+    MEASURED: ({"q_goal"}, {"record_time"}, {"torque_estimate"}),
+    SIMULATED: ({"hand_position"}, {"current"}, {"energy_residual"}),
 }
 
 
