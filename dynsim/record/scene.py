@@ -138,7 +138,10 @@ class Surface:
     def of_quadric(cls, name: str, Q: ArrayLike, b: ArrayLike, c: float) -> Surface:
         """A surface by its coefficients, with the parameters of the simple kind that it is of, if any."""
         Q, b = np.asarray(Q, dtype=np.float64), np.asarray(b, dtype=np.float64)
-        kind, parameters = _simple_kind(Q, b, c)
+        with np.errstate(all="ignore"):
+            kind, parameters = _simple_kind(Q, b, float(c))
+        if not all(np.isfinite(value).all() for value in parameters.values()):
+            kind, parameters = "quadric", {}
         return cls(name, _matrix(Q), vector3(b), float(c), kind, **parameters)
 
     def value(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -272,8 +275,8 @@ def _matrix(values: NDArray[np.float64]) -> Matrix3:
 def _simple_kind(Q: NDArray[np.float64], b: NDArray[np.float64], c: float) -> tuple[Any, dict[str, Any]]:
     """Plane, sphere or cylinder, and its parameters."""
     if not Q.any():
-        square = float(b @ b)
-        return "plane", {"position": vector3(-c / square * b), "direction": vector3(b / square**0.5)}
+        slope = np.linalg.norm(b)
+        return "plane", {"position": vector3(-c / slope**2 * b), "direction": vector3(b / slope)}
     sizes, axes = np.linalg.eigh(Q)
     small = 1e-9 * float(np.abs(sizes).max())
     if np.ptp(sizes) <= small:

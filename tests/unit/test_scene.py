@@ -65,6 +65,9 @@ def test_planes_spheres_and_cylinders_are_recognised():
         np.testing.assert_allclose(off - axis * (axis @ off), 0.0, atol=1e-12)
     cone = Surface.of_quadric("s", np.diag([1.0, 1.0, -1.0]), np.zeros(3), 0.0)
     assert (cone.kind, cone.position) == ("quadric", None)
+    # No direction is its normal, so it has no parameters that a file could not hold.
+    nowhere = Surface.of_quadric("s", np.zeros((3, 3)), np.zeros(3), 1.0)
+    assert (nowhere.kind, nowhere.direction) == ("quadric", None)
     # No point is on it.
     assert Surface.of_quadric("s", np.eye(3), np.zeros(3), 1.0).kind == "quadric"
 
