@@ -106,15 +106,20 @@ def servos(record: Record) -> Figure | None:
     ]
     if not rows:
         return None
+    # The same joints in every row: those of which the first row has most to say.
+    first, names = record[rows[0][0]], record.labels[rows[0][0]]
+    size = [_finite(np.nanmax, np.abs(column)) for column in first.T]
+    shown = [names[k] for k in np.sort(np.argsort(size)[::-1][:LINES])]
     timed = "lateness" in record
-    figure = style.new_figure(1.1 + 1.35 * (len(rows) + timed), style.title(record, "servos"))
+    note = "" if len(shown) == len(names) else f"; {len(shown)} of {len(names)} with the largest {rows[0][0]}"
+    title = style.title(record, f"servos{note.replace('_', ' ')}")
+    figure = style.new_figure(1.1 + 1.35 * (len(rows) + timed), title)
     grid = figure.subplots(len(rows) + timed, 1, sharex=True, squeeze=False)
     for (name, label), axes in zip(rows, grid[:, 0], strict=False):
-        values, names = record[name], record.labels[name]
-        size = np.array([_finite(np.nanmax, np.abs(column - np.nanmean(values))) for column in values.T])
-        shown = np.arange(len(names)) if len(names) <= LINES else np.sort(np.argsort(size)[::-1][:LINES])
-        for place, k in enumerate(shown):
-            style.line(axes, record.times(name), values[:, k], label=names[k], **_look(place))
+        columns = dict(zip(record.labels[name], record[name].T, strict=True))
+        for place, joint in enumerate(shown):
+            if joint in columns:
+                style.line(axes, record.times(name), columns[joint], label=joint, **_look(place))
         axes.set_ylabel(label)
         _at_least(axes, 0.5)
         _mark_replay(axes, record, named=axes is grid[0, 0])

@@ -10,6 +10,7 @@ import pytest
 
 import dynsim
 from dynsim import cli, figures
+from dynsim.figures import measured as measured_figures
 from dynsim.figures import style
 from dynsim.hardware.check import check_motion
 from dynsim.record import Record
@@ -65,13 +66,13 @@ def drawn(folder: Path) -> set[str]:
 
 
 def test_a_measured_record_is_drawn_by_plot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From simulation to measured figures by the commands; then nothing but the file is left to draw from."""
+    """From simulation to measured figures by the commands, and drawn from the measured file alone."""
     shown = load_scenario("elbow_comparison", "two_elbows", {"duration_s": 0.4})
     simulated = dynsim.simulate(shown)
     record = simulated.save(tmp_path / "record.h5")
     options = ("--map", "arm", "--port", "virtual", "--out", tmp_path / "out", "--quiet")
     call(monkeypatch, "hw", "replay", record, *options)
-    record.unlink()
+    record.unlink()  # nothing but the measured file is left
     measured = Record.load(tmp_path / "out" / "measured.h5")
     assert measured.scene == simulated.scene
     assert [event.name for event in measured.events] == ["MOVE_TO_START", "SETTLE", "REPLAY", "SETTLE"]
@@ -125,6 +126,23 @@ def test_a_fault_is_an_event_and_what_came_before_is_drawn(scenic: Rig, tmp_path
     assert np.isfinite(record["hand_position"][~missed]).all()
     figures.draw(Record.load(record.save(tmp_path / "measured.h5")), tmp_path / "figures")
     assert drawn(tmp_path / "figures") == ARM_FIGURES
+
+
+def test_servos_of_many_joints_are_the_same_in_every_panel() -> None:
+    time, names = np.linspace(0.0, 1.0, 11), tuple(f"j{k}" for k in range(20))
+    record = Record(time)
+    torque = np.outer(np.ones(11), np.arange(20.0))
+    record.add("torque_estimate", torque, "N m", labels=names)
+    record.add_axis("health", [0.0, 0.5])
+    record.add("temperature", 50.0 - torque[:2], "degC", labels=names, axis="health")
+    figure = measured_figures.servos(record)
+    top, bottom = figure.axes
+    expected = [f"j{k}" for k in range(8, 20)]
+    assert [line.get_label() for line in top.get_lines()] == expected
+    assert [line.get_label() for line in bottom.get_lines()] == expected
+    assert [line.get_ydata()[0] for line in bottom.get_lines()] == [50.0 - k for k in range(8, 20)]
+    assert bottom.get_lines()[0].get_xdata().tolist() == [0.0, 0.5]
+    assert "12 of 20" in figure.get_suptitle()
 
 
 def test_without_a_scene_joints_and_servos_are_drawn(rig: Rig, tmp_path: Path) -> None:
