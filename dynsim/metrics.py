@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim._version import __version__
-from dynsim.kernels.integrate import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, LOCAL_SINCE, PULLING
+from dynsim.kernels.integrate.run import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, LOCAL_SINCE, PULLING
 from dynsim.measures import RESIDUAL_LIMIT, SINKS, STORES, energy_turnover, hand_error
 from dynsim.model.clearance import Sinking, sinking
 from dynsim.model.description import Contact, Robot
 from dynsim.record import Record
-from dynsim.scenario import Scenario
+from dynsim.scenario import Scenario, build
 
-# Integrals that the integrator carries, in the order of the state (dynsim.kernels.energy).
+# Integrals that the integrator carries, in the order of the state (dynsim.kernels.ledger).
 INTEGRALS = {
     "energy_electrical": "∫ Σ u i dt, net electrical energy",
     "energy_electrical_drawn": "∫ Σ max(u i, 0) dt, a supply for each motor that takes nothing back",
@@ -119,7 +119,7 @@ def summarise(
     turnover = energy_turnover(record)
     residual = float(np.abs(record["energy_residual"]).max(initial=0.0))
     denominator = max(turnover, residual_floor(record, robot, scenario.integrator.rtol))
-    sunk = sinking(robot, scenario.surfaces(), record["q"])
+    sunk = sinking(robot, build.surfaces(scenario), record["q"])
     summary: dict[str, Any] = {
         "scenario": scenario.name,
         "variant": scenario.variant,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -10,16 +9,16 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy.interpolate import CubicSpline
 
+from dynsim import families
 from dynsim.config import NonNegative, Positive, StrictConfig
-from dynsim.control.inverse_kinematics import follow, spline_coefficients
+from dynsim.control.inverse_kinematics import follow
 from dynsim.errors import ModelError
-from dynsim.families import union
-from dynsim.kernels.arrays import ReferenceArrays
-from dynsim.kernels.jit import integers, reals
-from dynsim.model.control import JointControl
-from dynsim.model.model import Model
+from dynsim.model.control import HandPath, JointControl
+from dynsim.model.protocols import BuildContext
 
-PathChoice: Any = union("path")
+ENGINE = "dynamics"
+
+PathChoice: Any = families.union("path")
 
 # Of the reference splines: half a gigabyte for each joint.
 SEGMENTS_MAX = 10_000_000
@@ -68,10 +67,8 @@ class Config(StrictConfig):
         return self
 
 
-def build(
-    config: Config, model: Model, duration: float, progress: Callable[[float], None] | None = None
-) -> JointControl:
-    """Resolve gains and references for a robot, over ``duration`` [s]; long inverse kinematics report to ``progress``.
+def build(config: Config, context: BuildContext) -> JointControl:
+    """Resolve gains and references for the model of the context; long inverse kinematics report to its ``progress``.
 
     Raises
     ------
@@ -80,6 +77,7 @@ def build(
     UnreachableReference
         The hand cannot follow its path.
     """
+    model, duration = context.model, context.duration
     robot = model.robot
     driven = [motor.joint for motor in robot.motors]
     named = [*config.joints, *(config.hand.joints if config.hand else ())]
@@ -89,9 +87,9 @@ def build(
     for name in config.joints:
         if robot.links[model.joint_names.index(name)].kind != "revolute":
             raise ModelError(f"controller: {name!r} is prismatic; waypoints in angles_deg are for revolute joints")
-    held = np.array([robot.initial[model.joint_names.index(name)] for name in driven])
-    spline = np.full(len(driven), -1)
-    grid, coefficients = [0.0, 1.0], np.zeros((1, 0, 6))
+    path, times, columns = None, np.zeros(0), []
+    if config.hand is not None:
+        path = families.build("path", config.hand.path, context, HandPath)  # type: ignore[type-abstract]
     if named:
         segments = duration / config.knot_spacing_s
         if segments > SEGMENTS_MAX:
@@ -101,24 +99,18 @@ def build(
             )
         # A quintic spline needs six knots.
         times = np.linspace(0.0, duration, max(int(np.ceil(segments)), 6) + 1)
-        columns = [_waypoints(path, times) for path in config.joints.values()]
-        if config.hand is not None:
-            targets = config.hand.path.position(times)
-            hand = config.hand
-            followed = follow(model, times, targets, hand.joints, robot.initial, hand.tolerance_m, progress)
+        columns = [_waypoints(joint, times) for joint in config.joints.values()]
+        if config.hand is not None and path is not None:
+            hand, targets = config.hand, path.position(times)
+            followed = follow(model, times, targets, hand.joints, robot.initial, hand.tolerance_m, context.progress)
             columns.extend(followed.T)
-        coefficients = spline_coefficients(times, np.stack(columns, axis=1))
-        grid = [0.0, float(times[1])]
-        for k, name in enumerate(named):
-            spline[driven.index(name)] = k
-    reference = ReferenceArrays(
-        spline=integers(spline), held=reals(held), grid=reals(grid), coefficients=reals(coefficients)
-    )
-    return JointControl(
+    return JointControl.following(
+        robot,
         k_p=_per_motor(config.k_p_V_per_rad, driven, "k_p_V_per_rad"),
         k_d=_per_motor(config.k_d_V_s_per_rad, driven, "k_d_V_s_per_rad"),
-        reference=reference,
-        path=config.hand.path if config.hand else None,
+        times=times,
+        positions=dict(zip(named, columns, strict=True)),
+        path=path,
     )
 
 

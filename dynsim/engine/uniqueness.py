@@ -1,7 +1,7 @@
 """What the engine says where the contacts do not determine their forces: Painlevé's paradox, and dependent rows.
 
-The watch itself is compiled (dynsim.kernels.uniqueness); here its finding is located and put into words, and the motion
-that dependent frictional rows leave open is measured. docs/physics.md derives the criteria.
+The watch itself is compiled (dynsim.kernels.constraint.uniqueness); here its finding is located and put into words,
+and the motion that dependent frictional rows leave open is measured. docs/physics.md derives the criteria.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.kernels import arrays as ka
-from dynsim.kernels import integrate as ki
-from dynsim.kernels.articulated import accelerate
-from dynsim.kernels.contact import SIGNS_LIMIT
-from dynsim.kernels.coupled import System, derivative
-from dynsim.kernels.rows import RANK_TOLERANCE
-from dynsim.kernels.uniqueness import DIAGONAL_TOLERANCE, FORCE_TOLERANCE, IMMOBILE
+from dynsim.kernels.constraint.delassus import RANK_TOLERANCE
+from dynsim.kernels.constraint.surface import SIGNS_LIMIT
+from dynsim.kernels.constraint.uniqueness import DIAGONAL_TOLERANCE, FORCE_TOLERANCE, IMMOBILE
+from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.system import System, derivative
+from dynsim.kernels.tree.articulated import accelerate
 from dynsim.metrics import MotionSpread
 from dynsim.model.description import Contact
 

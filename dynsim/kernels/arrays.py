@@ -16,7 +16,9 @@ import numpy as np
 
 # Joint kinds. The three axis-aligned revolute joints are special cases of REVOLUTE, for speed.
 REVOLUTE_X, REVOLUTE_Y, REVOLUTE_Z, REVOLUTE, PRISMATIC = 0, 1, 2, 3, 4
-# Friction of a contact under a negative (pulling) normal force, see dynsim.kernels.contact.
+# Rows of joints with several velocities, or with a motion of their own: dynsim.kernels.tree.joints.
+BALL_X, BALL_Y, BALL_Z, ROLL, TURN = 5, 6, 7, 8, 9
+# Friction of a contact under a negative (pulling) normal force, see dynsim.kernels.constraint.surface.
 FRICTION_SIGNED, FRICTION_DISSIPATIVE = 0, 1
 
 # ModelArrays.tree, int
@@ -24,7 +26,9 @@ PARENT = 0  # index of the parent link, -1 for the world
 KIND = 1  # joint kind
 TURNED = 2  # 0 when R_PJ is the identity, so that one product can be skipped
 BRANCHES = 3  # number of children other than link i + 1
-TREE_SIZE = 4
+POSITION_INDEX = 4  # where the row's coordinates begin in the block of positions
+BASE = 5  # index of the link that the row's joint is mounted on: that of its first row's parent, -1 for the world
+TREE_SIZE = 6
 # ModelArrays.body
 R_PJ = 0  # 9: rotation of the joint frame at q = 0 in the parent's frame, row-major
 P_PJ = 9  # 3: origin of the joint frame in the parent's frame [m]
@@ -35,7 +39,8 @@ INERTIA = 19  # 6: about the centre of mass, in B, xx xy xz yy yz zz [kg m^2]
 ARMATURE = 25  # reflected motor inertia J_m [kg m^2 or kg]
 DAMPING = 26  # viscous joint loss D [N m s/rad or N s/m]
 GEAR_DAMPING = 27  # viscous gear loss D_m, reflected [N m s/rad or N s/m]
-BODY_SIZE = 28
+PARAMETER = 28  # what else a kind of joint needs, such as the lead of a screw
+BODY_SIZE = 29
 # DriveArrays.motor
 K_M = 0  # K k [N m/A = V s/rad]
 RESISTANCE = 1  # [ohm]
@@ -75,7 +80,8 @@ QD = 1  # v [rad/s or m/s]
 QDD = 2  # vdot
 BIAS = 3  # h + g, or the result of newton_euler
 APPLIED = 4  # applied generalised force
-JOINT_SIZE = 5
+EXTRA = 5  # second coordinate of a row that has two
+JOINT_SIZE = 6
 # Workspace.motors
 CURRENT = 0  # [A]
 VOLTAGE = 1  # [V]

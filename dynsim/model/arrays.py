@@ -9,9 +9,11 @@ import numpy as np
 from dynsim.errors import ModelError, shown
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.jit import integers, reals
-from dynsim.model.description import Contact, Link, Motor, Robot
+from dynsim.kernels.tree import loads as kl
+from dynsim.kernels.tree.loads import LoadArrays
+from dynsim.model.description import Contact, Link, Load, Motor, Robot
 
-# Beyond it the reduction of an angle to a quarter turn leaves too few digits (dynsim.kernels.newton_euler.sine_cosine).
+# Beyond it the reduction of an angle to a quarter turn leaves too few digits (dynsim.kernels.tree.sweep.sine_cosine).
 ANGLE_LIMIT = 1e6
 
 _FRICTION = {"signed": ka.FRICTION_SIGNED, "dissipative": ka.FRICTION_DISSIPATIVE}
@@ -30,14 +32,15 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
     if not links:
         raise ModelError(f"{robot.name}: a robot needs at least one link")
     _check_shapes(robot)
+    initial, position = robot.initial, robot.position_index
     index: dict[str, int] = {}
     joints: dict[str, int] = {}
     tree = np.zeros((len(links), ka.TREE_SIZE), dtype=np.int64)
     body = np.zeros((len(links), ka.BODY_SIZE))
     for i, link in enumerate(links):
-        if link.kind == "revolute" and abs(robot.initial[i]) > ANGLE_LIMIT:
+        if link.kind == "revolute" and abs(initial[position[i]]) > ANGLE_LIMIT:
             raise ModelError(
-                f"{link.joint}: an initial angle of {robot.initial[i]:.3g} rad; more than {ANGLE_LIMIT:g} rad "
+                f"{link.joint}: an initial angle of {initial[position[i]]:.3g} rad; more than {ANGLE_LIMIT:g} rad "
                 "cannot be told from other angles, take it modulo a turn"
             )
         if link.name in index or link.joint in joints:
@@ -57,6 +60,9 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         index[link.name], joints[link.joint] = i, i
         tree[i, ka.PARENT] = parent
         tree[i, ka.KIND] = _joint_kind(link)
+        tree[i, ka.POSITION_INDEX] = position[i]
+        # Later rows of a joint are mounted where its first one is.
+        tree[i, ka.BASE] = parent if link.row.neutral else tree[parent, ka.BASE]
         tree[i, ka.TURNED] = int(not np.array_equal(R_PJ, np.eye(3)))
         if parent >= 0 and parent != i - 1:
             tree[parent, ka.BRANCHES] += 1
@@ -68,6 +74,7 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         body[i, ka.COM : ka.COM + 3] = link.inertia.com
         body[i, ka.INERTIA : ka.INERTIA + 6] = tensor[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
         body[i, ka.DAMPING] = link.damping
+        body[i, ka.PARAMETER] = link.parameter
     names = set(index)
     for frame in robot.frames:
         if frame.name in names:
@@ -131,6 +138,29 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArr
     return ka.ContactArrays(link=integers(link), point=reals(point))
 
 
+def compile_loads(robot: Robot, loads: Sequence[Load]) -> LoadArrays:
+    """Tables of the external wrenches.
+
+    Raises
+    ------
+    ModelError
+        A body that the robot does not have.
+    """
+    table = np.zeros((len(loads), kl.TABLE_SIZE), dtype=np.int64)
+    parts: list[np.ndarray] = []
+    place = 0
+    for k, load in enumerate(loads):
+        try:
+            body, on_body = robot.attach(load.body, load.point)
+        except ModelError as error:
+            raise ModelError(f"load {load.name}: {error}") from None
+        segments = np.column_stack([load.knots[:-1], load.coefficients.reshape(len(load.coefficients), 24)])
+        table[k] = body, load.in_body, load.hold, place, len(segments)
+        parts += [on_body, np.zeros(6), segments.ravel(), load.knots[-1:]]
+        place += kl.FIRST_SEGMENT + segments.size + 1
+    return LoadArrays(table=integers(table), data=reals(np.concatenate(parts) if parts else np.zeros(0)))
+
+
 def _check_shapes(robot: Robot) -> None:
     """Refuse what numpy would spread over the tables, or the kernels carry on as NaN."""
     names = [link.name for link in robot.links]
@@ -140,7 +170,7 @@ def _check_shapes(robot: Robot) -> None:
     quantities: list[tuple[str, object, tuple[int, ...]]] = [
         (f"{robot.name}: gravity", robot.gravity, (3,)),
         (f"{robot.name}: the hand's point", point, (3,)),
-        (f"{robot.name}: q0", robot.initial, (len(names),)),
+        (f"{robot.name}: q0", robot.initial, (robot.nq,)),
     ]
     for link in robot.links:
         inertia = link.inertia
@@ -163,14 +193,11 @@ def _check_shapes(robot: Robot) -> None:
 
 
 def _joint_kind(link: Link) -> int:
-    if link.kind == "prismatic":
-        return ka.PRISMATIC
-    if link.kind != "revolute":
-        raise ModelError(f"{link.joint}: joint kind {link.kind!r}; known: revolute, prismatic")
-    for kind, axis in ((ka.REVOLUTE_X, (1, 0, 0)), (ka.REVOLUTE_Y, (0, 1, 0)), (ka.REVOLUTE_Z, (0, 0, 1))):
-        if np.array_equal(link.axis, axis):
-            return kind
-    return ka.REVOLUTE
+    if link.kind == "revolute":
+        for kind, axis in ((ka.REVOLUTE_X, (1, 0, 0)), (ka.REVOLUTE_Y, (0, 1, 0)), (ka.REVOLUTE_Z, (0, 0, 1))):
+            if np.array_equal(link.axis, axis):
+                return kind
+    return link.row.code
 
 
 def _check_motor(motor: Motor, joints: dict[str, int]) -> None:

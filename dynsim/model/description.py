@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.errors import ModelError
+from dynsim.model.joints import Row, rows
 from dynsim.record.scene import Shape
 
 Array = NDArray[np.float64]
@@ -44,6 +45,11 @@ class Inertia:
     mass: float
     com: Array = field(default_factory=lambda: np.zeros(3))
     tensor: Array = field(default_factory=lambda: np.zeros((3, 3)))
+
+    @classmethod
+    def solid_sphere(cls, mass: float, radius: float, center: Array) -> Inertia:
+        """Sphere about ``center``: I = 2 m r²/5; a point mass when the radius is zero."""
+        return cls(mass, center, np.eye(3) * (0.4 * mass * radius**2))
 
     @classmethod
     def solid_cylinder(cls, mass: float, radius: float, length: float) -> Inertia:
@@ -100,13 +106,15 @@ class Link:
         Names of the body and of its joint.
     parent : str or None
         Name of the parent body, None for the world.
-    kind : "revolute" or "prismatic"
+    kind : "revolute", "prismatic", or another row of :func:`dynsim.model.joints.rows`
     axis : (3,) unit joint axis in J (and B)
     R_PJ, p_PJ : (3, 3), (3,) placement of the joint in the parent's frame [m]
     damping : float
         Viscous loss D of the joint [N m s/rad or N s/m].
     lower, upper, velocity_limit, effort_limit : float
         Limits of the joint [rad or m; rad/s or m/s; N m or N]. Nothing enforces them: a run that passes one warns.
+    parameter : what else its kind of joint needs
+    joint_of_rows : name of the joint with several rows that this is one of, None for a joint of its own
     radius : of a cylinder about the body's axis [m], zero when unknown: deeper than that below a surface, a run warns
     tip : (3,) or None
         Other end of the axis in B [m], the first is the joint; None: the joints that the body carries, and the hand.
@@ -129,11 +137,57 @@ class Link:
     radius: float = 0.0
     tip: Array | None = None
     shapes: tuple[Shape, ...] = ()
+    parameter: float = 0.0
+    joint_of_rows: str | None = None
+
+    @property
+    def row(self) -> Row:
+        """Its kind.
+
+        Raises
+        ------
+        ModelError
+            There is no such kind.
+        """
+        if self.kind not in rows():
+            raise ModelError(f"{self.joint}: joint kind {self.kind!r}; known: {', '.join(rows())}")
+        return rows()[self.kind]
 
     @property
     def units(self) -> tuple[str, str, str, str]:
         """Units of position, velocity, acceleration and force of the joint."""
-        return ("m", "m/s", "m/s²", "N") if self.kind == "prismatic" else ("rad", "rad/s", "rad/s²", "N m")
+        return self.row.units
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """Names of the coordinates that begin with this row: those of its joint, none for a later row."""
+        row = self.row
+        return tuple(f"{self.joint_of_rows}.{name}" for name in row.names) or (self.joint,) * len(row.neutral)
+
+
+def in_rows(link: Link, rows: Sequence[tuple[str, str, Array]]) -> tuple[Link, ...]:
+    """A joint of several rows, (suffix, kind, axis) each, the body of ``link`` on the last; the others are massless."""
+    made: list[Link] = []
+    for suffix, kind, axis in rows:
+        last, first = len(made) == len(rows) - 1, not made
+        made.append(
+            replace(
+                link,
+                name=link.name if last else f"{link.name}.{suffix}",
+                joint=f"{link.joint}.{suffix}",
+                parent=link.parent if first else made[-1].name,
+                kind=kind,
+                axis=np.asarray(axis, dtype=np.float64),
+                inertia=link.inertia if last else Inertia(0.0),
+                R_PJ=link.R_PJ if first else np.eye(3),
+                p_PJ=link.p_PJ if first else np.zeros(3),
+                radius=link.radius if last else 0.0,
+                tip=link.tip if last else None,
+                shapes=link.shapes if last else (),
+                joint_of_rows=link.joint,
+            )
+        )
+    return tuple(made)
 
 
 @dataclass(frozen=True)
@@ -187,7 +241,7 @@ class Quadric:
 
     def gap(self, position: Array) -> float:
         """Signed distance [m] of a point along the normal; exact for plane, sphere and cylinder."""
-        from dynsim.kernels.contact import surface_distance
+        from dynsim.kernels.constraint.surface import surface_distance
 
         gradient = self.Q @ position + self.b
         slope = float(np.linalg.norm(gradient))
@@ -240,6 +294,38 @@ class Contact:
 
 
 @dataclass(frozen=True)
+class Load:
+    """A force and a torque from outside on a point of a body, as cubic polynomials of time.
+
+    Attributes
+    ----------
+    body : name of a link
+    point : (3,) where the force acts, in the link's frame [m]
+    in_body : whether the components are in the axes of the link, else of the world
+    knots : (K + 1,) increasing times [s]
+    coefficients : (K, 6, 4) ascending powers of t - knots[k], force x, y, z [N], then torque x, y, z [N m]
+    hold : whether the values at the first and the last knot go on beyond them, else it is zero there
+    """
+
+    name: str
+    body: str
+    point: Array
+    in_body: bool
+    knots: Array
+    coefficients: Array
+    hold: bool
+
+    def components(self, t: Array) -> Array:
+        """Force and torque at times t [s], (T,) → (T, 6) [N, N m]."""
+        t = np.asarray(t, dtype=np.float64)
+        inside = np.clip(t, self.knots[0], self.knots[-1])
+        segment = np.minimum(np.searchsorted(self.knots, inside, side="right") - 1, len(self.coefficients) - 1)
+        powers = (inside - self.knots[segment])[:, None] ** np.arange(4)
+        values = np.einsum("tcp,tp->tc", self.coefficients[segment], powers)
+        return values if self.hold else np.where((inside == t)[:, None], values, 0.0)
+
+
+@dataclass(frozen=True)
 class Robot:
     """A tree of links with its motors.
 
@@ -264,9 +350,18 @@ class Robot:
         ModelError
             No such body or frame, or a frame that is fixed to the world.
         """
+        index, frame = self._find(name)
+        return index, point if frame is None else frame.p + frame.R @ point
+
+    def attached_axes(self, name: str) -> Array:
+        """Axes of the body or frame of that name in the body's, (3, 3); raises what :meth:`attach` does."""
+        _, frame = self._find(name)
+        return np.eye(3) if frame is None else frame.R
+
+    def _find(self, name: str) -> tuple[int, Frame | None]:
         bodies = [link.name for link in self.links]
         if name in bodies:
-            return bodies.index(name), point
+            return bodies.index(name), None
         frame = next((frame for frame in self.frames if frame.name == name), None)
         if frame is None:
             names = [*bodies, *(frame.name for frame in self.frames if frame.body is not None)]
@@ -276,12 +371,33 @@ class Robot:
             raise ModelError(f"no body {name!r}{hint}; bodies: {', '.join(bodies)}{fixed}")
         if frame.body is None:
             raise ModelError(f"{name!r} is fixed to the world and does not move; bodies: {', '.join(bodies)}")
-        return bodies.index(frame.body), frame.p + frame.R @ point
+        return bodies.index(frame.body), frame
 
     @property
     def initial(self) -> Array:
-        """Initial configuration, (n,)."""
-        return np.zeros(len(self.links)) if self.q0 is None else np.asarray(self.q0, dtype=np.float64)
+        """Initial configuration, (nq,)."""
+        neutral = [value for link in self.links for value in link.row.neutral]
+        return np.array(neutral) if self.q0 is None else np.asarray(self.q0, dtype=np.float64)
+
+    @property
+    def nq(self) -> int:
+        """Number of coordinates: one for each angle or distance, four for a ball joint."""
+        return sum(len(link.row.neutral) for link in self.links)
+
+    @property
+    def position_index(self) -> tuple[int, ...]:
+        """For each link where its own coordinates begin in q."""
+        found, first, beyond = [], 0, 0
+        for link in self.links:
+            if link.row.neutral:
+                first, beyond = beyond, beyond + len(link.row.neutral)
+            found.append(first + link.row.offset)
+        return tuple(found)
+
+    @property
+    def position_names(self) -> tuple[str, ...]:
+        """Names of the coordinates, in the order of q."""
+        return tuple(name for link in self.links for name in link.coordinates)
 
     def with_motors_mounted(self) -> Robot:
         """The robot whose motors weigh nothing any more: their masses are part of the links that they sit on."""
@@ -300,5 +416,5 @@ class Robot:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints, in the order of q."""
+        """Names of the joints, one for each rate, in the order of v."""
         return tuple(link.joint for link in self.links)

@@ -43,12 +43,12 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
 def _joint(link: Link) -> Joint:
     return Joint(
         name=link.joint,
-        kind="prismatic" if link.kind == "prismatic" else "revolute",
+        kind=link.row.drawn,
         axis=vector3(link.axis),
         position=vector3(link.p_PJ),
         orientation=quaternion(link.R_PJ),
         signal="q",
-        labels=(link.joint,),
+        labels=link.coordinates,
         lower=_limit(link.lower),
         upper=_limit(link.upper),
     )

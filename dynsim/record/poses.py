@@ -32,7 +32,7 @@ def add_body_poses(record: Record) -> bool:
     # The last samples of a run that diverged may be beyond all bounds.
     with np.errstate(over="ignore", invalid="ignore"):
         for k, body in enumerate(scene.bodies):
-            p, q = _pose(body, columns[body.joint.signal], known.get(body.parent))
+            p, q = _pose(body, len(record), columns[body.joint.signal], known.get(body.parent))
             if body.parent != WORLD:
                 left[body.parent] -= 1
                 if not left[body.parent]:
@@ -76,16 +76,21 @@ def _columns(record: Record, name: str) -> dict[str, Array]:
     return dict(zip(record.labels[name], record[name].T, strict=True))
 
 
-def _pose(body: Body, columns: dict[str, Array], parent: tuple[Array, Array] | None) -> tuple[Array, Array]:
-    """Position, (3, T), and orientation, (4, T), of a body from those of its parent."""
+def _pose(body: Body, count: int, columns: dict[str, Array], parent: tuple[Array, Array] | None) -> tuple[Array, Array]:
+    """Position, (3, T), and orientation, (4, T), of a body at T = ``count`` samples from those of its parent."""
     joint = body.joint
     moved = [columns[label] for label in joint.labels]
-    here = np.zeros((4, len(moved[0])))
+    here = np.zeros((4, count))
     here[0] = 1.0
-    p, q = (np.zeros((3, len(moved[0]))), here) if parent is None else parent
+    p, q = (np.zeros((3, count)), here) if parent is None else parent
     p = p + rotated(q, np.array(joint.position))
     if joint.orientation != HERE:
         q = product(q, np.array(joint.orientation))
+    if joint.kind == "fixed":
+        return p, q
+    if joint.kind == "ball":
+        turn = np.stack(moved)
+        return p, product(q, turn / np.sqrt((turn * turn).sum(axis=0)))
     if joint.kind == "prismatic":
         return p + rotated(q, np.multiply.outer(np.array(joint.axis), moved[0])), q
     if joint.kind == "planar":

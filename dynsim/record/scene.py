@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 ShapeKind = Literal["cylinder", "capsule", "box", "sphere", "mesh"]
+JointKind = Literal["revolute", "prismatic", "planar", "ball", "fixed"]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
 
 WORLD = -1
@@ -75,19 +76,19 @@ class Joint:
 
     Attributes
     ----------
-    kind : "revolute", "prismatic" or "planar"
-        Planar: along x and y of the joint's frame, then about z.
+    kind : "revolute", "prismatic", "planar", "ball" or "fixed"
+        Planar: along x and y of the joint's frame, then about z. Ball: the body's orientation in the joint's frame.
     axis : unit vector in the joint's frame (and the body's)
     position, orientation : placement of the joint in the parent's frame
     signal, labels : str, tuple of str
         Where the record has the joint's position: columns of a signal, one [rad or m], of a planar joint three [m, m,
-        rad].
+        rad], of a ball joint the four of a quaternion w, x, y, z of any length; none of what is fixed.
     lower, upper : limits [rad or m], None for none
     """
 
     __pydantic_config__: ClassVar[Any] = _CHECKS
     name: str
-    kind: Literal["revolute", "prismatic", "planar"]
+    kind: JointKind
     axis: Vector3
     position: Vector3
     orientation: Quaternion
@@ -97,7 +98,7 @@ class Joint:
     upper: float | None = None
 
     def __post_init__(self) -> None:
-        if len(self.labels) != (3 if self.kind == "planar" else 1):
+        if len(self.labels) != {"planar": 3, "ball": 4, "fixed": 0}.get(self.kind, 1):
             raise RecordError(f"joint {self.name!r} is {self.kind} and has {len(self.labels)} columns")
 
 

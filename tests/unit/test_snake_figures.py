@@ -14,7 +14,7 @@ from dynsim.figures import tanaka2019
 from dynsim.record import Record
 from dynsim.scenario import load_scenario
 from dynsim.snake_geometry import snake_geometry
-from dynsim.studies.tanaka2019 import TABLE_III, table_iii, tables
+from dynsim.studies.published.tanaka2019 import TABLE_III, table_iii, tables
 
 
 @pytest.fixture(scope="module")

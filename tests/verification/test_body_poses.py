@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from random_robots import random_robot
+from random_robots import random_robot, random_rotation, random_unit
 
 import dynsim.engine
 from dynsim.errors import ScenarioError
-from dynsim.kernels.energy import LEDGER_SIZE
-from dynsim.kernels.integrate import output_size
-from dynsim.model.description import Robot
+from dynsim.kernels.state import output_layout, state_layout
+from dynsim.model.description import Inertia, Link, Robot
+from dynsim.model.joints.ball import ball, floating
+from dynsim.model.joints.planar import planar, rolling
 from dynsim.model.model import Model
 from dynsim.model.scene import robot_scene
 from dynsim.record import Record
 from dynsim.record.poses import add_body_poses, point_positions, pose_columns
 from dynsim.record.quaternion import rotated
-from dynsim.record.scene import Body, Joint, Point, Scene
+from dynsim.record.scene import Body, Joint, Point, Scene, Shape
 from dynsim.scenario import load_scenario
 
 SINGLE = 3e-7
@@ -25,7 +26,7 @@ SINGLE = 3e-7
 
 def posed(robot: Robot, q: np.ndarray) -> Record:
     record = Record(np.arange(len(q)) * 0.01)
-    record.add("q", q, "rad or m", labels=robot.joint_names)
+    record.add("q", q, "rad or m", labels=robot.position_names)
     record.scene = robot_scene(robot, [], {})
     assert add_body_poses(record)
     return record
@@ -51,6 +52,41 @@ def test_poses_are_those_of_the_model(seed: int):
             np.testing.assert_allclose(matrix(record["body_orientation"][t, k]), R, atol=3.0 * SINGLE)
         hand = point_positions(record, record.scene.hand, t)
         np.testing.assert_allclose(hand, model.point_position(*robot.hand, q[t]), atol=5.0 * SINGLE * size)
+
+
+@pytest.mark.parametrize("mounted", [False, True], ids=["on the world", "on a body"])
+@pytest.mark.parametrize("joint", [ball, floating, planar, rolling])
+def test_poses_of_joints_with_several_rows_are_those_of_the_model(joint, mounted: bool):
+    """Between two hinges, or the first hinge left out; quaternions of any length and sign."""
+    rng = np.random.default_rng(5)
+
+    def link(name: str, parent: str | None) -> Link:
+        place, axis = random_rotation(rng), random_unit(rng)
+        return Link(name, f"to {name}", parent, "revolute", axis, Inertia(1.0), R_PJ=place, p_PJ=rng.normal(size=3))
+
+    first = (link("carrier", None),) if mounted else ()
+    moving = joint(link("base", "carrier" if mounted else None))
+    robot = Robot("r", (*first, *moving, link("arm", "base")), (), ("arm", rng.normal(size=3)))
+    model = Model(robot)
+    q = rng.normal(size=(30, model.nq))
+    record = posed(robot, q)
+    assert record.labels["body_position"] == tuple(body.name for body in robot.links)
+    size = 1.0 + np.abs(record["body_position"]).max()
+    for t in (0, 11, 29):
+        for k, body in enumerate(robot.links):
+            R, p = model.body_pose(body.name, q[t])
+            np.testing.assert_allclose(record["body_position"][t, k], p, atol=SINGLE * size)
+            np.testing.assert_allclose(matrix(record["body_orientation"][t, k]), R, atol=3.0 * SINGLE)
+        hand = point_positions(record, record.scene.hand, t)
+        np.testing.assert_allclose(hand, model.point_position(*robot.hand, q[t]), atol=5.0 * SINGLE * size)
+    assert Scene.from_json(record.scene.to_json()) == record.scene
+
+
+def test_only_the_body_of_a_joint_with_several_rows_has_its_shapes():
+    seen = Link("base", "j", None, "revolute", np.eye(3)[2], Inertia(1.0), shapes=(Shape("sphere", (0.1,)),))
+    for joint in (ball, floating, planar, rolling):
+        links = joint(seen)
+        assert [link.name for link in links if link.shapes] == ["base"]
 
 
 def test_signs_of_quaternions_do_not_jump():
@@ -136,6 +172,6 @@ def test_scene_of_the_snake_is_its_own_chain():
 def test_size_of_a_record_counts_its_poses():
     assert [pose_columns(n) for n in (0, 1, 2, 3)] == [0, 4, 7, 11]
     tiny = load_scenario("elbow_comparison", "no_elbow", {"record.size_limit_GB": 1e-6})
-    columns = 2 * 10 + 10 + LEDGER_SIZE + output_size(10, 10, 0) + 35
+    columns = state_layout(10, 10, 10, 0, 0).size + output_layout(10, 10, 0).size + 35
     with pytest.raises(ScenarioError, match=f"10 s of {columns} columns"):
         dynsim.engine.check(tiny)

@@ -1,0 +1,180 @@
+"""Points held to surfaces: geometry of the contact, slip direction, and its constraint row."""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.kernels.arrays import (
+    CURVED,
+    DIRECTION,
+    FORCE,
+    FRICTION_DISSIPATIVE,
+    FRICTION_LAW,
+    GAP,
+    GAP_RATE,
+    LINK,
+    MU,
+    NORMAL,
+    POINT,
+    POSITION,
+    QUADRIC,
+    ROW,
+    SIGN,
+    SLIP_VELOCITY,
+    TANGENT,
+    TARGET,
+    V_S,
+    A,
+    ContactArrays,
+    ModelArrays,
+    P,
+    R,
+    V,
+    Workspace,
+)
+from dynsim.kernels.jit import exact_kernel, inlined_kernel, kernel
+
+# Tries, beyond two per contact, to find signs of dissipative contacts that agree with their forces.
+SIGN_PASSES = 64
+# With more contacts than this not every choice of signs is tried.
+SIGNS_LIMIT = 8
+# A normal force below this fraction of the largest one is rounding.
+NO_FORCE = 1e-12
+
+
+@kernel
+def surface_distance(value, slope, curvature):
+    """Signed distance along the normal from the level-set value: root of C − |∇C| s + κ s²/2 with κ = nᵀQn.
+
+    Exact for the plane, the sphere and the cylinder.
+    """
+    inner = 1.0 - 2.0 * curvature * value / (slope * slope)
+    if inner <= 0.0:
+        return value / slope
+    return 2.0 * value / (slope * (1.0 + math.sqrt(inner)))
+
+
+@inlined_kernel
+def hessian_product(point, k, x, y, z):
+    """(x, y, z)·Q (x, y, z) of the surface of contact k; point: (c, POINT_SIZE)."""
+    return (
+        x * (point[k, QUADRIC] * x + 2.0 * (point[k, QUADRIC + 1] * y + point[k, QUADRIC + 2] * z))
+        + y * (point[k, QUADRIC + 3] * y + 2.0 * point[k, QUADRIC + 4] * z)
+        + z * point[k, QUADRIC + 5] * z
+    )
+
+
+@inlined_kernel
+def contact_rows(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
+    """Position, gap, constraint row and force direction of every contact, after ``forward_sweep``.
+
+    C(r) = r·Q r/2 + b·r + c, n = ∇C/|∇C| ([WM] eqs 3, 6, 8); a gap > 0 is off the surface. Row:
+    n·r̈ = −ṙᵀ(∂²C/∂r²)ṙ / |∇C| ([WM] eqs 15, 30). Force per unit f_n: n − σ μ t with the smoothed slip direction
+    t = v_t / √(|v_t|² + v_s²) ([WM] eqs 9, 14 and f_t = μ f_n); v_s is dynsim's assumption, the paper says nothing
+    of zero slip. σ is 1 in the paper's law; for the dissipative law it is the sign of f_n, kept between calls.
+    """
+    links, state, point, gravity = ws.links, ws.contacts, contacts.point, model.gravity
+    for k in range(contacts.link.shape[0]):
+        i = contacts.link[k, LINK]
+        x, y, z = point[k, POINT], point[k, POINT + 1], point[k, POINT + 2]
+        rx = links[i, P] + links[i, R] * x + links[i, R + 1] * y + links[i, R + 2] * z
+        ry = links[i, P + 1] + links[i, R + 3] * x + links[i, R + 4] * y + links[i, R + 5] * z
+        rz = links[i, P + 2] + links[i, R + 6] * x + links[i, R + 7] * y + links[i, R + 8] * z
+        # ∇C and C; a plane's ∇C is its unit normal, which spares every right-hand side two roots and three divisions.
+        nx, ny, nz = point[k, QUADRIC + 6], point[k, QUADRIC + 7], point[k, QUADRIC + 8]
+        gap = nx * rx + ny * ry + nz * rz + point[k, QUADRIC + 9]
+        inverse, curved = 1.0, contacts.link[k, CURVED] != 0
+        if curved:
+            qx = point[k, QUADRIC] * rx + point[k, QUADRIC + 1] * ry + point[k, QUADRIC + 2] * rz
+            qy = point[k, QUADRIC + 1] * rx + point[k, QUADRIC + 3] * ry + point[k, QUADRIC + 4] * rz
+            qz = point[k, QUADRIC + 2] * rx + point[k, QUADRIC + 4] * ry + point[k, QUADRIC + 5] * rz
+            nx, ny, nz = nx + qx, ny + qy, nz + qz
+            slope = math.sqrt(nx * nx + ny * ny + nz * nz)
+            inverse = 1.0 / slope
+            nx, ny, nz = nx * inverse, ny * inverse, nz * inverse
+            value = gap + 0.5 * (qx * rx + qy * ry + qz * rz)
+            gap = surface_distance(value, slope, hessian_product(point, k, nx, ny, nz))
+        # Velocity of the point, and its acceleration at vdot = 0 (A carries −g from its root).
+        wx, wy, wz = links[i, V], links[i, V + 1], links[i, V + 2]
+        vx = links[i, V + 3] + wy * rz - wz * ry
+        vy = links[i, V + 4] + wz * rx - wx * rz
+        vz = links[i, V + 5] + wx * ry - wy * rx
+        ex, ey, ez = links[i, A], links[i, A + 1], links[i, A + 2]
+        ax = links[i, A + 3] + gravity[0] + ey * rz - ez * ry + wy * vz - wz * vy
+        ay = links[i, A + 4] + gravity[1] + ez * rx - ex * rz + wz * vx - wx * vz
+        az = links[i, A + 5] + gravity[2] + ex * ry - ey * rx + wx * vy - wy * vx
+        rate = nx * vx + ny * vy + nz * vz
+        tx, ty, tz = vx - rate * nx, vy - rate * ny, vz - rate * nz
+        scale = 1.0 / math.sqrt(tx * tx + ty * ty + tz * tz + point[k, V_S] * point[k, V_S])
+        state[k, GAP] = gap
+        state[k, GAP_RATE] = rate
+        target = -(nx * ax + ny * ay + nz * az)
+        state[k, TARGET] = target - hessian_product(point, k, vx, vy, vz) * inverse if curved else target
+        state[k, POSITION], state[k, POSITION + 1], state[k, POSITION + 2] = rx, ry, rz
+        state[k, NORMAL], state[k, NORMAL + 1], state[k, NORMAL + 2] = nx, ny, nz
+        state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2] = tx, ty, tz
+        state[k, TANGENT], state[k, TANGENT + 1], state[k, TANGENT + 2] = tx * scale, ty * scale, tz * scale
+        state[k, ROW], state[k, ROW + 1], state[k, ROW + 2] = ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx
+        state[k, ROW + 3], state[k, ROW + 4], state[k, ROW + 5] = nx, ny, nz
+        force_direction(contacts, ws, k)
+
+
+@exact_kernel
+def force_direction(contacts: ContactArrays, ws: Workspace, k):
+    """Wrench of a unit normal force with its friction at contact k: n − σ μ t through the contact point.
+
+    The same bits where it is first made and where a sign has turned, so that a right-hand side does not depend on the
+    signs of the one before.
+    """
+    state = ws.contacts
+    mu = contacts.point[k, MU]
+    if contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE:
+        mu *= state[k, SIGN]
+    x, y, z = state[k, POSITION], state[k, POSITION + 1], state[k, POSITION + 2]
+    fx = state[k, NORMAL] - mu * state[k, TANGENT]
+    fy = state[k, NORMAL + 1] - mu * state[k, TANGENT + 1]
+    fz = state[k, NORMAL + 2] - mu * state[k, TANGENT + 2]
+    state[k, DIRECTION], state[k, DIRECTION + 1], state[k, DIRECTION + 2] = (
+        y * fz - z * fy,
+        z * fx - x * fz,
+        x * fy - y * fx,
+    )
+    state[k, DIRECTION + 3], state[k, DIRECTION + 4], state[k, DIRECTION + 5] = fx, fy, fz
+
+
+@inlined_kernel
+def sign_changed(contacts: ContactArrays, ws: Workspace, passes):
+    """True when dissipative contacts' solved forces contradict their assumed signs; turns those directions around.
+
+    All at once in the first passes, then only the first of them (least-index pivoting, which cannot cycle while all
+    choices have determinants of one sign), at last every choice in turn. Without a consistent choice (Painlevé) the
+    forces become NaN, the count in ``ws.deficient[1]`` goes up and the search ends. Forces that vanish to rounding
+    have no sign and take +. So the result does not depend on the signs that the search began with, unless several
+    choices are consistent (dynsim.kernels.constraint.uniqueness watches for that).
+    """
+    state = ws.contacts
+    p = state.shape[0]
+    limit = 2 * p + SIGN_PASSES
+    changed, largest = False, 0.0
+    for k in range(p):
+        largest = max(largest, abs(state[k, FORCE]))
+    for k in range(p):
+        if contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE:
+            agreement = state[k, FORCE] * state[k, SIGN]
+            if agreement < -NO_FORCE * largest or (agreement <= NO_FORCE * largest and state[k, SIGN] < 0.0):
+                if passes < limit and not (changed and passes > p):
+                    state[k, SIGN] = -state[k, SIGN]
+                    force_direction(contacts, ws, k)
+                changed = True
+    if changed and passes >= limit:
+        choice = passes - limit
+        if p > SIGNS_LIMIT or choice >= 1 << p:
+            ws.deficient[1] += 1
+            for k in range(p):
+                state[k, FORCE] = math.nan
+            return False
+        for k in range(p):
+            if contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE:
+                state[k, SIGN] = -1.0 if (choice >> k) & 1 == 1 else 1.0
+                force_direction(contacts, ws, k)
+    return changed

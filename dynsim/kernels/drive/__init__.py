@@ -1,0 +1,1 @@
+"""What drives the joints: motors with circuits, position servos, open torques."""

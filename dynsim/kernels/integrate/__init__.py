@@ -1,0 +1,1 @@
+"""Time integration: methods, error control, projection, dense output, samples, and the driver of it all."""

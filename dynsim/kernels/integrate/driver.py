@@ -1,0 +1,213 @@
+"""Time integration of the coupled system: one step per call of a method, error control, projection, sampling.
+
+Methods, all with dense output (so that records do not force steps):
+
+- ``RK43``: the classical method of order 4 with an embedded order 3, adaptive, four evaluations a step; cubic Hermite
+  dense output. The first choice: the motors of an arm hold the step at the stability limit (rates of −450 ± 1900i 1/s
+  in the published one), whatever the tolerance, and there the fewest evaluations per second win;
+- ``DOPRI5``: Dormand–Prince 5(4), adaptive, six evaluations a step; dense output of order 4 (Hairer, Nørsett, Wanner:
+  Solving Ordinary Differential Equations I, II.5–II.6). Better where accuracy sets the step;
+- ``RK4``: the classical method at a fixed step; cubic Hermite dense output;
+- ``RODAS4``: a linearly implicit (Rosenbrock) method of order 4(3), stiffly accurate, which keeps its order when the
+  inductance goes to zero (Hairer, Wanner: Solving Ordinary Differential Equations II, IV.7 and VI.4); adaptive.
+
+After each accepted step q and v are projected onto the closed contacts when they have left them by more than
+``GAP_TOLERANCE`` or ``RATE_TOLERANCE``.
+"""
+
+from __future__ import annotations
+
+from dynsim.kernels.arrays import Workspace
+from dynsim.kernels.constraint.uniqueness import clearly_unique
+from dynsim.kernels.integrate.dense import sample_step
+from dynsim.kernels.integrate.events import arm_events, cut_step, fire_events, take_ticks
+from dynsim.kernels.integrate.explicit import step_explicit
+from dynsim.kernels.integrate.project import off_surface, settle
+from dynsim.kernels.integrate.rosenbrock import step_rodas4
+from dynsim.kernels.integrate.run import (
+    CALLER,
+    DOPRI5,
+    END,
+    ERROR,
+    FINISHED,
+    FIRED,
+    HOLD,
+    NO_FORCES,
+    NOT_FINITE,
+    NOT_PROJECTED,
+    PENDING,
+    PROPOSED,
+    RK4,
+    RODAS4,
+    RUNNING,
+    SEARCHING,
+    STARTED,
+    STATUS,
+    STEP,
+    STEPS,
+    TAKE_COMMANDS,
+    TICKED,
+    TIME,
+    TRIMMED,
+    Run,
+)
+from dynsim.kernels.integrate.steps import choose_step, finite, first_step, next_step, rejected
+from dynsim.kernels.integrate.watch import forces_unique, watch
+from dynsim.kernels.jit import internal_kernel, kernel, merged_kernel
+from dynsim.kernels.system import System
+from dynsim.kernels.tree.joints import normalise
+
+
+@merged_kernel
+def start(system: System, ws: Workspace, run: Run):
+    """First derivative, on the contacts, and a first step size where none is given. Sets STATUS when there is none."""
+    if not settle(system, run.clock[TIME], run.y, ws, run.stage[0], run):
+        run.count[STATUS] = NOT_PROJECTED
+    elif not finite(run.stage[0]):
+        run.count[STATUS] = NO_FORCES if ws.deficient[1] > 0 else NOT_FINITE
+    elif forces_unique(system, ws, run, run.clock[TIME]):
+        watch(ws, run, 0.0)
+        if run.clock[STEP] <= 0.0:
+            first_step(run, system.layout.tracked)
+    run.count[STARTED] = 1
+
+
+@merged_kernel
+def accept(system: System, ws: Workspace, run: Run):
+    """Project y_new, record, and make it the new y. Sets STATUS when contacts cannot be met or forces not be known."""
+    t, h = run.clock[TIME], run.clock[STEP]
+    if off_surface(ws) and not settle(system, t + h, run.y_new, ws, run.stage[6], run):
+        run.count[STATUS] = NOT_PROJECTED
+        return
+    if not (clearly_unique(system.contacts, ws) or forces_unique(system, ws, run, t + h)):
+        return
+    watch(ws, run, h)
+    if system.layout.extra > 0:
+        normalise(system.model, run.y_new, system.layout.q)
+    sample_step(system, ws, run)
+    for j in range(run.y.shape[0]):
+        run.y[j] = run.y_new[j]
+        run.stage[0, j] = run.stage[6, j]
+    run.clock[TIME] = t + h
+    run.count[STEPS] += 1
+
+
+@merged_kernel
+def finished(run: Run):
+    """True when the run has ended, for whatever reason; sets STATUS at END."""
+    end = run.clock[END]
+    if run.count[STATUS] == RUNNING and end - run.clock[TIME] <= 1e-12 * max(1.0, end):
+        run.count[STATUS] = FINISHED
+    return run.count[STATUS] != RUNNING
+
+
+@merged_kernel
+def take_step(ws: Workspace, run: Run, error):
+    """What becomes of a step that has been taken: True when it is accepted by error control, events and HOLD."""
+    clock, count = run.clock, run.count
+    if run.event.shape[0] > 0 and cut_step(ws, run):
+        return False
+    clock[ERROR] = error
+    if clock[TIME] + clock[STEP] > clock[HOLD]:
+        count[PENDING] = 1
+        return False
+    return True
+
+
+@internal_kernel
+def propose(run: Run):
+    """The step to try next; while a root is searched it is given."""
+    if run.count[SEARCHING] == 0:
+        run.clock[PROPOSED] = run.clock[STEP]
+        choose_step(run)
+
+
+@internal_kernel
+def go_on(run: Run, order, beta):
+    """The step size after an accepted step."""
+    clock, count = run.clock, run.count
+    if run.method == RK4 or count[FIRED] == 1:
+        clock[STEP] = clock[PROPOSED]
+    else:
+        next_step(run, clock[ERROR], order, beta)
+        # A step that was cut short says nothing against the one proposed before.
+        if count[TRIMMED] == 1:
+            clock[STEP] = max(clock[STEP], clock[PROPOSED])
+
+
+@merged_kernel
+def ready(system: System, ws: Workspace, run: Run):
+    """Start or restart where that is due, and do what is due at this time; False when the caller is to look."""
+    count = run.count
+    due = take_ticks(run)
+    if due & TAKE_COMMANDS:
+        settle(system, run.clock[TIME], run.y, ws, run.stage[0], run)
+        # PLACEHOLDER take_commands
+        count[STARTED] = 0
+    if count[STARTED] == 0:
+        start(system, ws, run)
+        arm_events(ws, run)
+    count[TICKED] = due & CALLER
+    return count[TICKED] == 0
+
+
+@kernel
+def advance_explicit(system: System, ws: Workspace, run: Run, limit):
+    """:func:`advance` of the explicit methods."""
+    order = 5.0 if run.method == DOPRI5 else 4.0
+    count, taken = run.count, 0
+    while (count[STARTED] == 1 and run.tick.shape[0] == 0) or ready(system, ws, run):
+        if taken >= limit or finished(run):
+            return
+        taken += 1
+        if count[PENDING] == 0:
+            propose(run)
+            error = step_explicit(system, ws, run)
+            if rejected(ws, run, error, order):
+                count[SEARCHING] = 0
+                continue
+            if not take_step(ws, run, error):
+                if count[PENDING] == 1:
+                    return
+                continue
+        count[PENDING] = 0
+        accept(system, ws, run)
+        go_on(run, order, 0.04)
+        if run.event.shape[0] > 0 and fire_events(run):
+            return
+
+
+@kernel
+def advance_rodas4(system: System, ws: Workspace, run: Run, limit):
+    """:func:`advance` of RODAS4."""
+    count, taken = run.count, 0
+    while (count[STARTED] == 1 and run.tick.shape[0] == 0) or ready(system, ws, run):
+        if taken >= limit or finished(run):
+            return
+        taken += 1
+        if count[PENDING] == 0:
+            propose(run)
+            error = step_rodas4(system, ws, run)
+            if rejected(ws, run, error, 4.0):
+                count[SEARCHING] = 0
+                continue
+            if not take_step(ws, run, error):
+                if count[PENDING] == 1:
+                    return
+                continue
+        count[PENDING] = 0
+        accept(system, ws, run)
+        go_on(run, 4.0, 0.04)
+        if run.event.shape[0] > 0 and fire_events(run):
+            return
+
+
+def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:
+    """Take up to ``limit`` steps towards END; run.count[STATUS] says how it ended.
+
+    Returns before that when an event or a tick wants the caller to look (LOGGED, TICKED), and when the next step would
+    end beyond HOLD: it is kept, PENDING, and accepted by the next call unless the caller drops it.
+
+    Two compiled functions behind one name, so that the linearly implicit method is only compiled when it is used.
+    """
+    (advance_rodas4 if run.method == RODAS4 else advance_explicit)(system, ws, run, limit)

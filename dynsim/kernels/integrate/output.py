@@ -1,0 +1,52 @@
+"""What is recorded of a sample besides its state."""
+
+from __future__ import annotations
+
+from dynsim.kernels.arrays import (
+    CURRENT,
+    D_M,
+    DIRECTION,
+    FORCE,
+    GAP,
+    J_M,
+    K_M,
+    QD,
+    QDD,
+    SLIP_VELOCITY,
+    VOLTAGE,
+    Workspace,
+)
+from dynsim.kernels.integrate.run import Run
+from dynsim.kernels.jit import internal_kernel
+from dynsim.kernels.ledger import kinetic_energy, magnetic_energy, potential_energy
+from dynsim.kernels.state import OUT_FORCE, OUT_GAP, OUT_SLIP, OUT_VECTOR, OUTPUTS_PER_CONTACT
+from dynsim.kernels.system import System
+from dynsim.kernels.tree.points import point_position
+
+
+@internal_kernel
+def write_output(system: System, ws: Workspace, run: Run, row):
+    """Everything worth recording that is not a state, after ``derivative``, into the columns of OutputLayout."""
+    out, joints, motors, motor, state = run.output, ws.joints, ws.motors, system.drives.motor, ws.contacts
+    columns = run.columns
+    for i in range(joints.shape[0]):
+        out[row, columns.vdot + i] = joints[i, QDD]
+    for a in range(motors.shape[0]):
+        i = system.drives.link[a]
+        out[row, columns.current + a] = motors[a, CURRENT]
+        out[row, columns.voltage + a] = motors[a, VOLTAGE]
+        out[row, columns.torque + a] = (
+            motor[a, K_M] * motors[a, CURRENT] - motor[a, J_M] * joints[i, QDD] - motor[a, D_M] * joints[i, QD]
+        )
+    point_position(ws, run.hand_link, run.hand_point, out[row, columns.hand : columns.hand + 3])
+    out[row, columns.energy] = kinetic_energy(system.model, ws)
+    out[row, columns.energy + 1] = potential_energy(system.model, ws)
+    out[row, columns.energy + 2] = magnetic_energy(system.drives, ws)
+    k = columns.contact
+    for c in range(state.shape[0]):
+        out[row, k + OUT_FORCE] = state[c, FORCE]
+        out[row, k + OUT_GAP] = state[c, GAP]
+        for s in range(3):
+            out[row, k + OUT_VECTOR + s] = state[c, FORCE] * state[c, DIRECTION + 3 + s]
+            out[row, k + OUT_SLIP + s] = state[c, SLIP_VELOCITY + s]
+        k += OUTPUTS_PER_CONTACT

@@ -1,0 +1,118 @@
+"""Error norm and step size."""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.kernels.arrays import Workspace
+from dynsim.kernels.integrate.events import next_tick
+from dynsim.kernels.integrate.run import (
+    ATOL,
+    END,
+    LAST_ERROR,
+    NO_FORCES,
+    NOT_FINITE,
+    REJECTED,
+    RK4,
+    RTOL,
+    RUNNING,
+    STATUS,
+    STEP,
+    STEP_MAX,
+    STEP_TOO_SMALL,
+    TIME,
+    TRIMMED,
+    Run,
+)
+from dynsim.kernels.jit import internal_kernel, kernel
+from dynsim.kernels.system import System
+from dynsim.kernels.tree.joints import position_error
+
+
+@internal_kernel
+def error_norm(system: System, ws: Workspace, run: Run, error):
+    """Root mean square of error / (atol + rtol |y|) over positions, rates and currents; quaternions count as angles."""
+    y, y_new, atol, rtol, layout = run.y, run.y_new, run.clock[ATOL], run.clock[RTOL], system.layout
+    total = 0.0
+    if layout.extra > 0:
+        total, size = position_error(system.model, y, y_new, error, layout.q, rtol, atol)
+        beyond = layout.q + ws.joints.shape[0] + layout.extra
+        for j in range(layout.tracked):
+            if j < layout.q or j >= beyond:
+                x = error[j] / (atol + rtol * max(abs(y[j]), abs(y_new[j])))
+                total += x * x
+                size += 1
+        return math.sqrt(total / size)
+    for j in range(layout.tracked):
+        x = error[j] / (atol + rtol * max(abs(y[j]), abs(y_new[j])))
+        total += x * x
+    return math.sqrt(total / layout.tracked)
+
+
+@kernel
+def finite(values):
+    """True when no element is NaN or infinite."""
+    total = 0.0
+    for j in range(values.shape[0]):
+        total += values[j] * 0.0
+    return total == 0.0
+
+
+@internal_kernel
+def first_step(run: Run, states):
+    """Hairer's first guess of the step size: one that changes the state by a hundredth of its scale."""
+    clock, y, k = run.clock, run.y, run.stage
+    size, slope = 0.0, 0.0
+    for j in range(states):
+        scale = clock[ATOL] + clock[RTOL] * abs(y[j])
+        size += (y[j] / scale) ** 2
+        slope += (k[0, j] / scale) ** 2
+    guess = 0.01 * math.sqrt(size / slope) if size > 1e-10 and slope > 1e-10 else 1e-6
+    clock[STEP] = min(guess, clock[STEP_MAX], clock[END] - clock[TIME])
+
+
+@internal_kernel
+def choose_step(run: Run):
+    """Trim STEP so that END, or a tick, is met exactly: halve the way rather than leave a sliver for the last step."""
+    clock = run.clock
+    until = next_tick(run, clock[END])
+    remaining = until - clock[TIME]
+    run.count[TRIMMED] = 1 if until < clock[END] and remaining < 2.0 * clock[STEP] else 0
+    if run.method == RK4:
+        if remaining < clock[STEP] * (1.0 + 1e-9):
+            clock[STEP] = remaining
+    elif remaining <= clock[STEP] * 1.0000001:
+        clock[STEP] = remaining
+    elif remaining < 2.0 * clock[STEP]:
+        clock[STEP] = 0.5 * remaining
+
+
+@internal_kernel
+def rejected(ws: Workspace, run: Run, error, order):
+    """True when a step of this error norm must be repeated: shrinks STEP, or sets STATUS when that is hopeless."""
+    clock, count, h = run.clock, run.count, run.clock[STEP]
+    if count[STATUS] != RUNNING:
+        return True
+    broken = NO_FORCES if ws.deficient[1] > 0 else NOT_FINITE
+    if not (finite(run.y_new) and finite(run.stage[6])) or error != error:
+        if run.method == RK4:
+            count[STATUS] = broken
+            return True
+        error = 1e10
+    if error <= 1.0:
+        return False
+    count[REJECTED] += 1
+    clock[STEP] = h * max(0.1, 0.9 * error ** (-1.0 / order))
+    if clock[STEP] < 1e-13 * max(1.0, clock[TIME]):
+        count[STATUS] = broken if error >= 1e10 else STEP_TOO_SMALL
+    return True
+
+
+@internal_kernel
+def next_step(run: Run, error, order, beta):
+    """Proportional–integral step control (Hairer, Nørsett, Wanner II.4)."""
+    clock = run.clock
+    error = max(error, 1e-10)
+    change = 0.9 * error ** (0.75 * beta - 1.0 / order) * clock[LAST_ERROR] ** beta
+    clock[LAST_ERROR] = max(error, 1e-4)
+    clock[STEP] = min(clock[STEP] * min(max(change, 0.2), 5.0), clock[STEP_MAX])

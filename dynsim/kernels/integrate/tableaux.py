@@ -1,0 +1,62 @@
+"""Coefficients of the methods."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# Explicit methods: stage rows a_ij, with the solution as the last row, whose derivative is the next step's first stage.
+A_DOPRI5 = np.array(
+    [
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [1 / 5, 0.0, 0.0, 0.0, 0.0, 0.0],
+        [3 / 40, 9 / 40, 0.0, 0.0, 0.0, 0.0],
+        [44 / 45, -56 / 15, 32 / 9, 0.0, 0.0, 0.0],
+        [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729, 0.0, 0.0],
+        [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656, 0.0],
+        [35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84],
+    ]
+)
+NODE_DOPRI5 = np.array([0.0, 0.2, 0.3, 0.8, 8 / 9, 1.0, 1.0])
+ERROR_DOPRI5 = np.array([71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40])
+A_RK4 = np.array(
+    [[0.0] * 4, [0.5, 0.0, 0.0, 0.0], [0.0, 0.5, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1 / 6, 1 / 3, 1 / 3, 1 / 6]]
+)
+NODE_RK4 = np.array([0.0, 0.5, 0.5, 1.0, 1.0])
+# Weights of h (f(y_new) − k_4), the error estimate of RK43. The fourth stage and the derivative at y_new meet the same
+# third-order conditions, so moving any weight between them gives an embedded solution of order 3. All the weight that
+# the fourth stage has (1/6) makes the error of undamped motions about rtol. Where stability sets the step, the estimate
+# is the transient of modes that die out within some steps; a small weight keeps it from shortening steps for nothing.
+WEIGHT_ACCURACY = 1 / 6
+WEIGHT_STABILITY = 0.03
+
+
+# RODAS4(3), coefficients of Hairer and Wanner: a_ij and c_ij by stage, nodes, γ_i, dense output.
+GAMMA = 0.25
+A_RODAS = np.array(
+    [
+        [0.0, 0.0, 0.0, 0.0, 0.0],
+        [1.544000000000000, 0.0, 0.0, 0.0, 0.0],
+        [0.9466785280815826, 0.2557011698983284, 0.0, 0.0, 0.0],
+        [3.314825187068521, 2.896124015972201, 0.9986419139977817, 0.0, 0.0],
+        [1.221224509226641, 6.019134481288629, 12.53708332932087, -0.6878860361058950, 0.0],
+        [1.221224509226641, 6.019134481288629, 12.53708332932087, -0.6878860361058950, 1.0],
+    ]
+)
+C_RODAS = np.array(
+    [
+        [0.0, 0.0, 0.0, 0.0, 0.0],
+        [-5.668800000000000, 0.0, 0.0, 0.0, 0.0],
+        [-2.430093356833875, -0.2063599157091915, 0.0, 0.0, 0.0],
+        [-0.1073529058151375, -9.594562251023355, -20.47028614809616, 0.0, 0.0],
+        [7.496443313967647, -10.24680431464352, -33.99990352819905, 11.70890893206160, 0.0],
+        [8.083246795921522, -7.981132988064893, -31.52159432874371, 16.31930543123136, -6.058818238834054],
+    ]
+)
+NODE_RODAS = np.array([0.0, 0.386, 0.21, 0.63, 1.0, 1.0])
+GAMMA_RODAS = np.array([0.25, -0.1043, 0.1035, -0.0362, 0.0, 0.0])
+D_RODAS = np.array(
+    [
+        [10.12623508344586, -7.487995877610167, -34.80091861555747, -7.992771707568823, 1.025137723295662],
+        [-0.6762803392806898, 6.087714651680015, 16.43084320892478, 24.76722511418386, -6.594389125716872],
+    ]
+)

@@ -1,0 +1,140 @@
+"""Energies and the integrals of the ledger, which are states of the integrator."""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.kernels.arrays import (
+    ARMATURE,
+    CURRENT,
+    D_M,
+    DAMPING,
+    DIRECTION,
+    FORCE,
+    GAP_RATE,
+    GEAR_DAMPING,
+    INDUCTANCE,
+    J_M,
+    K_M,
+    PARENT,
+    QD,
+    QDD,
+    RESISTANCE,
+    SLIP_VELOCITY,
+    VOLTAGE,
+    ContactArrays,
+    DriveArrays,
+    ModelArrays,
+    S,
+    V,
+    Workspace,
+)
+from dynsim.kernels.jit import inlined_kernel, internal_kernel, kernel
+from dynsim.kernels.state import (
+    CONSTRAINT,
+    CONTACT_SIZE,
+    DRAWN,
+    ELECTRICAL,
+    FRICTION,
+    GEAR,
+    IMPULSE,
+    JOINT,
+    JOULE,
+    MECHANICAL,
+    SLIP,
+    SUPPLY,
+)
+from dynsim.kernels.tree.sweep import body_inertia
+
+
+@inlined_kernel
+def ledger_rates(model: ModelArrays, drives: DriveArrays, contacts: ContactArrays, ws: Workspace, out, layout):
+    """Rates of all integrals, into the blocks ledger and contact of ``out`` [W; N, m/s].
+
+    Electrical Σ u i; drawn Σ max(u i, 0), a supply for each motor; supply max(Σ u i, 0), one for all; Joule Σ R i²;
+    gear Σ D_m v²; joint Σ D v²; friction −Σ f_n (d − n)·v, d the force direction; constraint Σ f_n n·v (zero on the
+    constraint); mechanical Σ tau v with tau = K_m i − J_m vdot − D_m v ([WM] eq 25).
+    """
+    joints, motors, motor, state = ws.joints, ws.motors, drives.motor, ws.contacts
+    electrical, drawn, joule, mechanical = 0.0, 0.0, 0.0, 0.0
+    for a in range(motors.shape[0]):
+        i = drives.link[a]
+        current, v = motors[a, CURRENT], joints[i, QD]
+        power = motors[a, VOLTAGE] * current
+        electrical += power
+        drawn += max(power, 0.0)
+        joule += motor[a, RESISTANCE] * current * current
+        mechanical += (motor[a, K_M] * current - motor[a, J_M] * joints[i, QDD] - motor[a, D_M] * v) * v
+    gear, joint = 0.0, 0.0
+    for i in range(joints.shape[0]):
+        square = joints[i, QD] * joints[i, QD]
+        gear += model.body[i, GEAR_DAMPING] * square
+        joint += model.body[i, DAMPING] * square
+    friction, constraint = 0.0, 0.0
+    start, first = layout.ledger, layout.contact
+    for k in range(contacts.link.shape[0]):
+        f, rate = state[k, FORCE], state[k, GAP_RATE]
+        x, y, z = state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2]
+        # The slip velocity has no part along n, so d·v_t is the friction alone.
+        friction -= f * (state[k, DIRECTION + 3] * x + state[k, DIRECTION + 4] * y + state[k, DIRECTION + 5] * z)
+        constraint += f * rate
+        out[first + IMPULSE] = f
+        out[first + SLIP] = math.sqrt(x * x + y * y + z * z)
+        first += CONTACT_SIZE
+    out[start + ELECTRICAL] = electrical
+    out[start + DRAWN] = drawn
+    out[start + JOULE] = joule
+    out[start + GEAR] = gear
+    out[start + JOINT] = joint
+    out[start + FRICTION] = friction
+    out[start + CONSTRAINT] = constraint
+    out[start + MECHANICAL] = mechanical
+    out[start + SUPPLY] = max(electrical, 0.0)
+
+
+@kernel
+def kinetic_energy(model: ModelArrays, ws: Workspace):
+    """½ Σ V·I V + ½ Σ J_m v² [J], from the poses and axes of the last sweep; overwrites V."""
+    tree, links, joints = model.tree, ws.links, ws.joints
+    total = 0.0
+    for i in range(tree.shape[0]):
+        j = tree[i, PARENT]
+        for s in range(6):
+            links[i, V + s] = links[i, S + s] * joints[i, QD] + (links[j, V + s] if j >= 0 else 0.0)
+        wx, wy, wz, ox, oy, oz = (
+            links[i, V],
+            links[i, V + 1],
+            links[i, V + 2],
+            links[i, V + 3],
+            links[i, V + 4],
+            links[i, V + 5],
+        )
+        m, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz = body_inertia(model, ws, i)
+        vx, vy, vz = ox + wy * cz - wz * cy, oy + wz * cx - wx * cz, oz + wx * cy - wy * cx
+        total += 0.5 * (
+            wx * (ixx * wx + 2.0 * (ixy * wy + ixz * wz))
+            + wy * (iyy * wy + 2.0 * iyz * wz)
+            + izz * wz * wz
+            + m * (vx * vx + vy * vy + vz * vz)
+        )
+        total += 0.5 * model.body[i, ARMATURE] * joints[i, QD] * joints[i, QD]
+    return total
+
+
+@kernel
+def potential_energy(model: ModelArrays, ws: Workspace):
+    """−Σ m g·c [J], zero at the world origin, after ``forward_sweep``."""
+    total = 0.0
+    for i in range(ws.links.shape[0]):
+        m, cx, cy, cz, _, _, _, _, _, _ = body_inertia(model, ws, i)
+        total -= m * (cx * model.gravity[0] + cy * model.gravity[1] + cz * model.gravity[2])
+    return total
+
+
+@internal_kernel
+def magnetic_energy(drives: DriveArrays, ws: Workspace):
+    """½ Σ L i² [J]."""
+    total = 0.0
+    for a in range(ws.motors.shape[0]):
+        total += 0.5 * drives.motor[a, INDUCTANCE] * ws.motors[a, CURRENT] * ws.motors[a, CURRENT]
+    return total

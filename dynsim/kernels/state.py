@@ -1,0 +1,79 @@
+"""Where what lies in the state vector and in a row of recorded outputs: the one place that knows.
+
+State y, all in one vector, blocks in this order:
+
+    q        (nq,)  joint positions [rad or m; quaternions]
+    v        (n,)   joint rates
+    current  (k,)   currents of the motors that have a circuit [A]
+    ledger   (LEDGER_SIZE,) integrals of power [J], see dynsim.kernels.ledger
+    contact  (2 c,) impulse of the normal force [N s] and slip [m] of each contact point
+    load     (l,)   work of each external wrench [J]
+
+The first three are what error control looks at; the rest are integrals that nothing depends on.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+# Integrals of the ledger, all in joules. DRAWN, MECHANICAL and SUPPLY are reported, not part of the balance.
+ELECTRICAL, DRAWN, JOULE, GEAR, JOINT, FRICTION, CONSTRAINT, MECHANICAL, SUPPLY = 0, 1, 2, 3, 4, 5, 6, 7, 8
+LEDGER_SIZE = 9
+# Per contact: impulse of the normal force [N s], slip distance [m].
+IMPULSE, SLIP = 0, 1
+CONTACT_SIZE = 2
+
+
+class StateLayout(NamedTuple):
+    """First index of each block of the state, and what else kernels need to know of it."""
+
+    q: int
+    v: int
+    current: int
+    ledger: int
+    contact: int
+    load: int
+    size: int
+    tracked: int  # how many entries, from the first on, error control looks at: all that derivatives depend on
+    extra: int  # nq − n
+
+
+def state_layout(nq: int, n: int, circuits: int, contacts: int, loads: int = 0) -> StateLayout:
+    """The layout for nq positions, n rates, and so many circuits, contact points and external wrenches."""
+    starts = np.cumsum([0, nq, n, circuits, LEDGER_SIZE, CONTACT_SIZE * contacts, loads])
+    q, v, current, ledger, contact, load, size = (int(start) for start in starts)
+    return StateLayout(q, v, current, ledger, contact, load, size, tracked=ledger, extra=nq - n)
+
+
+class OutputLayout(NamedTuple):
+    """First column of each recorded output that is no state; ``contact`` has OUTPUTS_PER_CONTACT for each point."""
+
+    vdot: int
+    current: int
+    voltage: int
+    torque: int
+    hand: int
+    energy: int
+    contact: int
+    size: int
+
+
+def block(layout: StateLayout | OutputLayout, name: str) -> slice:
+    """Where a block lies, by its name: up to where the next one begins."""
+    names = layout._fields
+    return slice(getattr(layout, name), getattr(layout, names[names.index(name) + 1]))
+
+
+# Kinetic, potential and magnetic energy.
+ENERGIES = 3
+# Per contact: f_n, force vector (3), gap, slip velocity (3).
+OUT_FORCE, OUT_VECTOR, OUT_GAP, OUT_SLIP = 0, 1, 4, 5
+OUTPUTS_PER_CONTACT = 8
+
+
+def output_layout(n: int, motors: int, contacts: int) -> OutputLayout:
+    """The columns for n joints, so many motors and contact points."""
+    starts = np.cumsum([0, n, motors, motors, motors, 3, ENERGIES, OUTPUTS_PER_CONTACT * contacts])
+    return OutputLayout(*(int(start) for start in starts))

@@ -1,0 +1,131 @@
+"""The coupled system of bodies, motors and contacts as one right-hand side dy/dt ([WM] eqs 28–35).
+
+State y, all in one vector:
+
+    q  (n,)   joint positions [rad or m]
+    v  (n,)   joint rates
+    i  (na,)  motor currents [A]
+    ledger (LEDGER_SIZE,), then impulse and slip of each contact (2 c,): see dynsim.kernels.ledger
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from dynsim.kernels.arrays import (
+    APPLIED,
+    CURRENT,
+    DAMPING,
+    DIDT,
+    GEAR_DAMPING,
+    INDUCTANCE,
+    K_M,
+    QD,
+    QDD,
+    ContactArrays,
+    DriveArrays,
+    ModelArrays,
+    Q,
+    ReferenceArrays,
+    Workspace,
+)
+from dynsim.kernels.constraint.delassus import solve_small
+from dynsim.kernels.constraint.m_star import solve_m_star
+from dynsim.kernels.constraint.surface import contact_rows, sign_changed
+from dynsim.kernels.drive.law import emf_balance, motor_voltage
+from dynsim.kernels.jit import inlined_kernel, internal_kernel, kernel
+from dynsim.kernels.ledger import ledger_rates
+from dynsim.kernels.state import StateLayout
+from dynsim.kernels.tree.articulated import accelerate, add_contact_forces, contact_system, factor
+from dynsim.kernels.tree.joints import position_rates, read_positions
+from dynsim.kernels.tree.loads import LoadArrays, add_loads
+from dynsim.kernels.tree.sweep import forward_sweep
+
+
+class System(NamedTuple):
+    """All constant data of a simulation."""
+
+    layout: StateLayout
+    model: ModelArrays
+    drives: DriveArrays
+    reference: ReferenceArrays
+    contacts: ContactArrays
+    loads: LoadArrays
+    dense: np.ndarray | None  # room for M* and b, see constraint.m_star; None for the articulated solve alone
+
+
+@inlined_kernel
+def constrained_acceleration(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
+    """vdot and contact forces of the applied forces, by the articulated solve, into ``ws.joints``, ``ws.contacts``."""
+    factor(model, ws)
+    p, passes = ws.contacts.shape[0], 0
+    while p > 0:
+        passes += 1
+        contact_system(model, contacts, ws)
+        ws.deficient[0] += solve_small(ws.small, ws.contacts)
+        if not sign_changed(contacts, ws, passes):
+            break
+    add_contact_forces(model, contacts, ws)
+    accelerate(model, ws)
+
+
+@internal_kernel
+def m_star_acceleration(dense, model: ModelArrays, drives: DriveArrays, contacts: ContactArrays, ws: Workspace, found):
+    """The same unknowns by the dense M*, where ``dense`` has room for it.
+
+    The articulated solve has run before, because projection uses its factors; its rank findings (``found`` before it)
+    are not counted twice.
+    """
+    if dense is None:  # known to the compiler, which then leaves M* out of the default program
+        return
+    ws.deficient[0] = found
+    passes = 1
+    solve_m_star(dense, model, drives, contacts, ws)
+    while sign_changed(contacts, ws, passes):
+        passes += 1
+        solve_m_star(dense, model, drives, contacts, ws)
+
+
+@kernel
+def derivative(system: System, t, y, ws: Workspace, dy):
+    """dy/dt of the whole coupled system at time t; y, dy: see dynsim.kernels.state."""
+    model, drives, contacts, layout = system.model, system.drives, system.contacts, system.layout
+    joints, motors, motor = ws.joints, ws.motors, drives.motor
+    n, na = joints.shape[0], motors.shape[0]
+    # Most robots have a position for each rate; the others read and write their positions by kind of joint.
+    plain = layout.extra == 0
+    if not plain:
+        read_positions(model, y, layout.q, ws)
+    for i in range(n):
+        if plain:
+            joints[i, Q] = y[layout.q + i]
+        joints[i, QD] = y[layout.v + i]
+        # The sweep multiplies it by zero, which would keep a NaN of a state without solution for ever.
+        joints[i, QDD] = 0.0
+        joints[i, APPLIED] = -(model.body[i, DAMPING] + model.body[i, GEAR_DAMPING]) * joints[i, QD]
+    for a in range(na):
+        motors[a, CURRENT] = y[layout.current + a]
+        joints[drives.link[a], APPLIED] += motor[a, K_M] * motors[a, CURRENT]
+
+    forward_sweep(model, ws, 1.0, 0.0, 1.0)
+    if system.loads.table.shape[0] > 0:
+        add_loads(model, system.loads, t, ws, dy, layout.load)
+    contact_rows(model, contacts, ws)
+    motor_voltage(drives, system.reference, t, ws)
+    found = ws.deficient[0]
+    constrained_acceleration(model, contacts, ws)
+    for a in range(na):
+        motors[a, DIDT] = emf_balance(drives, ws, a) / motor[a, INDUCTANCE]
+    m_star_acceleration(system.dense, model, drives, contacts, ws, found)
+
+    if not plain:
+        position_rates(model, ws, dy, layout.q)
+    for i in range(n):
+        if plain:
+            dy[layout.q + i] = joints[i, QD]
+        dy[layout.v + i] = joints[i, QDD]
+    for a in range(na):
+        dy[layout.current + a] = motors[a, DIDT]
+    ledger_rates(model, drives, contacts, ws, dy, layout)

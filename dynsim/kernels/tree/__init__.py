@@ -1,0 +1,1 @@
+"""Trees of rigid bodies: joints, recursive Newton–Euler sweeps, the articulated solve."""
