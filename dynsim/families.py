@@ -15,8 +15,8 @@ import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from types import ModuleType, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast
 
 from pydantic import BaseModel, GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import PydanticKnownError, SchemaValidator, core_schema
@@ -133,7 +133,7 @@ def member(family: str, name: str) -> ModuleType:
     return _plugin(family, name).module
 
 
-def build(family: str, config: Any, context: BuildContext, expected: type[T]) -> T:
+def build(family: str, config: Any, context: BuildContext, expected: type[T] | UnionType) -> T:
     """What the member that a configuration belongs to makes of it, checked to be what the family gives.
 
     Raises
@@ -145,7 +145,7 @@ def build(family: str, config: Any, context: BuildContext, expected: type[T]) ->
     if not isinstance(result, expected):
         wanted = getattr(expected, "__name__", expected)
         raise ModelError(f"{family} {config.type!r}: its build must return a {wanted}, not {shown(result)}")
-    return result
+    return cast(T, result)
 
 
 def _plugin(family: str, name: str) -> Plugin:

@@ -217,15 +217,16 @@ def bench(
     """Compile a robot and its contacts, with a voltage PD that holds ``held`` (zero by default)."""
     na = len(robot.motors)
     contact_arrays = compile_contacts(robot, contacts or [])
-    n, c = len(robot.links), len(contacts or [])
+    n, c, circuits = len(robot.links), len(contacts or []), robot.circuits
+    size = n + c + circuits
     system = System(
-        layout=state_layout(robot.nq, n, na, c, len(loads or ())),
+        layout=state_layout(robot.nq, n, circuits, c, len(loads or ())),
         model=compile_model(robot),
         drives=compile_drives(robot, k_p=[k_p] * na, k_d=[k_d] * na),
         reference=held_reference(np.zeros(na) if held is None else held),
         contacts=contact_arrays,
         loads=compile_loads(robot, loads or ()),
-        dense=np.zeros((n + na + c, n + na + c + 1)) if m_star else None,
+        dense=np.zeros((size, size + 1)) if m_star else None,
     )
     ws = ka.workspace(n, na, c)
     return Bench(robot, system, ws)

@@ -20,7 +20,7 @@ from dynsim.kernels.system import System
 from dynsim.model.arrays import compile_contacts, compile_drives, compile_loads
 from dynsim.model.clearance import poses
 from dynsim.model.control import JointControl
-from dynsim.model.description import Array, Contact, Robot
+from dynsim.model.description import Array, Contact, Load, Motor, Robot
 from dynsim.model.model import Model
 from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, build, build_model
@@ -73,14 +73,14 @@ def prepare(
     if pushable:
         loads = [*loads, *(_push(link.name) for link in robot.links)]
     n, na, c = model.n, len(robot.motors), len(contacts)
-    layout, columns = state_layout(model.nq, n, na, c, len(loads)), output_layout(n, na, c)
+    layout, columns = state_layout(model.nq, n, robot.circuits, c, len(loads)), output_layout(n, na, c)
     if times is None:
         times = sample_times(scenario, columns=layout.size + columns.size + pose_columns(n))
     _check_stiffness(scenario, robot)
     _check_work(scenario, n, c)
     control = _control(scenario, model, progress)
     _check_references(scenario, robot, contacts, control)
-    options = scenario.integrator
+    options, size = scenario.integrator, n + c + robot.circuits
     method = ki.METHODS[options.method]
     step = options.step_s or (1e-3 if method == ki.RK4 else 0.0)
     system = System(
@@ -90,7 +90,7 @@ def prepare(
         reference=control.reference,
         contacts=compile_contacts(robot, contacts),
         loads=compile_loads(robot, loads),
-        dense=np.zeros((n + c + na, n + c + na + 1)) if options.solver == "m_star" else None,
+        dense=np.zeros((size, size + 1)) if options.solver == "m_star" else None,
     )
     y = np.zeros(layout.size)
     y[block(layout, "q")] = robot.initial
@@ -133,9 +133,10 @@ def sample_times(scenario: Scenario, columns: int) -> np.ndarray:
 def _check_stiffness(scenario: Scenario, robot: Robot) -> None:
     """Refuse an explicit method where the circuits' own poles R/L already ask for too many steps."""
     method, duration = scenario.integrator.method, scenario.duration_s
-    if method not in ("rk43", "dopri5") or not robot.motors:
+    circuits = [motor for motor in robot.motors if isinstance(motor, Motor)]
+    if method not in ("rk43", "dopri5") or not circuits:
         return
-    motor = max(robot.motors, key=lambda motor: motor.resistance / motor.inductance)
+    motor = max(circuits, key=lambda motor: motor.resistance / motor.inductance)
     pole = motor.resistance / motor.inductance
     # Explicit methods of these orders are stable up to |h pole| of about 3.
     steps = duration * pole / 3.0
@@ -170,7 +171,7 @@ def _check_work(scenario: Scenario, n: int, p: int) -> None:
 
 def _control(scenario: Scenario, model: Model, progress: Progress | None) -> JointControl:
     if scenario.controller is None:
-        return JointControl.short_circuit(len(model.robot.motors))
+        return JointControl.absent(model.robot)
     log.info("%s: planning references over %g s", scenario.title, scenario.duration_s)
     started = clock.perf_counter()
     control = build.controller(scenario, model, None if progress is None else partial(progress, stage=REFERENCES))

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dynsim.engine.outcome import raise_stopped
-from dynsim.engine.prepare import Prepared, prepare, sample_times
+from dynsim.engine.prepare import prepare, sample_times
 from dynsim.engine.recording import make_record
 from dynsim.engine.stopping import stopped
 from dynsim.errors import ModelError, ScenarioError, shown
@@ -114,7 +114,7 @@ class Simulation:
     scenario : of a plant with dynamics
     state : to start from, at its time; default: the scenario's, at t = 0. ``State.of(record)`` is that of a record's
         last sample. The ledger starts at zero.
-    duration : end of the run [s], ``math.inf`` for none; default: the scenario's. Moving references hold where they end.
+    duration : end of the run [s], ``math.inf`` for none; default: the scenario's. References hold where they end.
     trace : samples that are kept: all (None), the last so many, or none (0)
 
     Raises
@@ -343,9 +343,7 @@ class Simulation:
     def snapshot(self) -> Snapshot:
         """What :meth:`restore` needs to go on from here."""
         arrays = {name: array.copy() for name, array in self._arrays().items()}
-        return Snapshot(
-            arrays, self._time, tuple(self._rows), self._next_sample, tuple(self._happened), self._frozen
-        )
+        return Snapshot(arrays, self._time, tuple(self._rows), self._next_sample, tuple(self._happened), self._frozen)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot of this simulation: the same future, bit for bit.
@@ -538,7 +536,7 @@ class Simulation:
         # After the last sample the buffer must not hold steps back.
         return np.concatenate([found, np.full(max(count - len(found), 0) + 1, np.inf)]) if len(found) < count else found
 
-    def _swap(self, **arrays: NDArray[Any]) -> None:
+    def _swap(self, **arrays: Any) -> None:
         """Take other arrays for some of those of the run."""
         self._prepared = replace(self._prepared, run=self._prepared.run._replace(**arrays))
 

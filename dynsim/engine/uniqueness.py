@@ -263,7 +263,7 @@ def acceleration_range(system: System, t: float, y: Array) -> tuple[Array, Array
     accelerations are linear in z: one linear programme per joint and end. Infinite where the set has no end.
     """
     n, p = system.model.tree.shape[0], len(system.contacts.link)
-    ws = ka.workspace(n, len(system.drives.link), p)
+    ws = ka.workspace(n, len(system.drives.table), p)
     matrices = contact_matrices(system, ws, t, np.array(y))
     taken, force = ws.joints[:, ka.QDD].copy(), matrices.force
     _, values, vectors = np.linalg.svd(matrices.matrix(matrices.signs))

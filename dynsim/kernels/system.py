@@ -4,7 +4,7 @@ State y, all in one vector:
 
     q  (n,)   joint positions [rad or m]
     v  (n,)   joint rates
-    i  (na,)  motor currents [A]
+    i  (k,)   currents of the motors that have a circuit [A]
     ledger (LEDGER_SIZE,), then impulse and slip of each contact (2 c,): see dynsim.kernels.ledger
 """
 
@@ -16,12 +16,10 @@ import numpy as np
 
 from dynsim.kernels.arrays import (
     APPLIED,
-    CURRENT,
+    CIRCUIT,
     DAMPING,
     DIDT,
     GEAR_DAMPING,
-    INDUCTANCE,
-    K_M,
     QD,
     QDD,
     ContactArrays,
@@ -34,7 +32,7 @@ from dynsim.kernels.arrays import (
 from dynsim.kernels.constraint.delassus import solve_small
 from dynsim.kernels.constraint.m_star import solve_m_star
 from dynsim.kernels.constraint.surface import contact_rows, sign_changed
-from dynsim.kernels.drive.law import emf_balance, motor_voltage
+from dynsim.kernels.drive.law import drive
 from dynsim.kernels.jit import inlined_kernel, internal_kernel, kernel
 from dynsim.kernels.ledger import ledger_rates
 from dynsim.kernels.state import StateLayout
@@ -92,7 +90,7 @@ def m_star_acceleration(dense, model: ModelArrays, drives: DriveArrays, contacts
 def derivative(system: System, t, y, ws: Workspace, dy):
     """dy/dt of the whole coupled system at time t; y, dy: see dynsim.kernels.state."""
     model, drives, contacts, layout = system.model, system.drives, system.contacts, system.layout
-    joints, motors, motor = ws.joints, ws.motors, drives.motor
+    joints, motors = ws.joints, ws.motors
     n, na = joints.shape[0], motors.shape[0]
     # Most robots have a position for each rate; the others read and write their positions by kind of joint.
     plain = layout.extra == 0
@@ -105,19 +103,14 @@ def derivative(system: System, t, y, ws: Workspace, dy):
         # The sweep multiplies it by zero, which would keep a NaN of a state without solution for ever.
         joints[i, QDD] = 0.0
         joints[i, APPLIED] = -(model.body[i, DAMPING] + model.body[i, GEAR_DAMPING]) * joints[i, QD]
-    for a in range(na):
-        motors[a, CURRENT] = y[layout.current + a]
-        joints[drives.link[a], APPLIED] += motor[a, K_M] * motors[a, CURRENT]
+    drive(drives, system.reference, t, y, layout, ws)
 
     forward_sweep(model, ws, 1.0, 0.0, 1.0)
     if system.loads.table.shape[0] > 0:
         add_loads(model, system.loads, t, ws, dy, layout.load)
     contact_rows(model, contacts, ws)
-    motor_voltage(drives, system.reference, t, ws)
     found = ws.deficient[0]
     constrained_acceleration(model, contacts, ws)
-    for a in range(na):
-        motors[a, DIDT] = emf_balance(drives, ws, a) / motor[a, INDUCTANCE]
     m_star_acceleration(system.dense, model, drives, contacts, ws, found)
 
     if not plain:
@@ -127,5 +120,6 @@ def derivative(system: System, t, y, ws: Workspace, dy):
             dy[layout.q + i] = joints[i, QD]
         dy[layout.v + i] = joints[i, QDD]
     for a in range(na):
-        dy[layout.current + a] = motors[a, DIDT]
+        if drives.table[a, CIRCUIT] >= 0:
+            dy[layout.current + drives.table[a, CIRCUIT]] = motors[a, DIDT]
     ledger_rates(model, drives, contacts, ws, dy, layout)

@@ -11,7 +11,8 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.tree import loads as kl
 from dynsim.kernels.tree.loads import LoadArrays
-from dynsim.model.description import Contact, Link, Load, Motor, Robot
+from dynsim.model.description import Contact, Drive, Link, Load, Motor, Robot, Servo, TorqueSource
+from dynsim.model.servo import servo_row
 
 # Beyond it the reduction of an angle to a quarter turn leaves too few digits (dynsim.kernels.tree.sweep.sine_cosine).
 ANGLE_LIMIT = 1e6
@@ -82,29 +83,56 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         if frame.body is not None and frame.body not in index:
             raise ModelError(f"frame {frame.name}: no body {frame.body!r}")
         names.add(frame.name)
+    by_joint = {link.joint: link for link in links}
     for motor in robot.motors:
-        _check_motor(motor, joints)
+        _check_motor(motor, by_joint)
         i = joints[motor.joint]
-        body[i, ka.ARMATURE] += motor.rotor_inertia * motor.gear_ratio**2
-        body[i, ka.GEAR_DAMPING] += motor.gear_damping * motor.gear_ratio**2
+        if not isinstance(motor, TorqueSource):
+            body[i, ka.ARMATURE] += motor.armature
+            body[i, ka.GEAR_DAMPING] += motor.reflected_damping
     _check_movable(robot, tree, body)
     return ka.ModelArrays(tree=integers(tree), body=reals(body), gravity=reals(robot.gravity))
 
 
-def compile_drives(robot: Robot, *, k_p: Sequence[float], k_d: Sequence[float]) -> ka.DriveArrays:
-    """Tables of the motors with the gains of the voltage PD, one per motor [V/rad, V s/rad]."""
+def compile_drives(
+    robot: Robot, *, k_p: Sequence[float], k_d: Sequence[float], sampled: bool = False
+) -> ka.DriveArrays:
+    """Tables of the motors.
+
+    Parameters
+    ----------
+    k_p, k_d : gains of the voltage PD, one per motor [V/rad, V s/rad]; only DC motors take them
+    sampled : commands are held between ticks, see :func:`dynsim.kernels.drive.law.take_commands`
+    """
     joints = {link.joint: i for i, link in enumerate(robot.links)}
+    table = np.zeros((len(robot.motors), ka.DRIVE_SIZE), dtype=np.int64)
     motor = np.zeros((len(robot.motors), ka.MOTOR_SIZE))
+    given = np.zeros((len(robot.motors), ka.INPUT_SIZE))
+    circuits = 0
     for a, m in enumerate(robot.motors):
-        k = m.gear_ratio
-        motor[a, ka.K_M] = m.torque_constant * k
-        motor[a, ka.RESISTANCE] = m.resistance
-        motor[a, ka.INDUCTANCE] = m.inductance
-        motor[a, ka.J_M] = m.rotor_inertia * k**2
-        motor[a, ka.D_M] = m.gear_damping * k**2
-        motor[a, ka.K_P], motor[a, ka.K_D] = k_p[a], k_d[a]
-        motor[a, ka.U_MAX] = m.voltage_limit
-    return ka.DriveArrays(link=integers([joints[m.joint] for m in robot.motors]), motor=reals(motor))
+        table[a, ka.DRIVEN], table[a, ka.CIRCUIT], table[a, ka.SAMPLED] = joints[m.joint], -1, sampled
+        if isinstance(m, Motor):
+            table[a, ka.DRIVE_KIND], table[a, ka.CIRCUIT] = ka.DC_MOTOR, circuits
+            circuits += 1
+            motor[a] = _dc_motor(m, k_p[a], k_d[a])
+        elif isinstance(m, Servo):
+            table[a, ka.DRIVE_KIND] = ka.POSITION_SERVO
+            given[a, ka.MODE] = ka.VELOCITY_MODE if m.velocity_mode else ka.POSITION_MODE
+            motor[a] = servo_row(m)
+        else:
+            table[a, ka.DRIVE_KIND] = ka.OPEN_TORQUE
+            motor[a, ka.K_M], motor[a, ka.I_MAX], motor[a, ka.U_MAX] = 1.0, m.torque_limit, np.inf
+    return ka.DriveArrays(table=integers(table), motor=reals(motor), input=reals(given))
+
+
+def _dc_motor(m: Motor, k_p: float, k_d: float) -> np.ndarray:
+    row, k = np.zeros(ka.MOTOR_SIZE), m.gear_ratio
+    row[ka.K_M] = m.torque_constant * k
+    row[ka.RESISTANCE], row[ka.INDUCTANCE] = m.resistance, m.inductance
+    row[ka.J_M], row[ka.D_M] = m.armature, m.reflected_damping
+    row[ka.K_P], row[ka.K_D] = k_p, k_d
+    row[ka.U_MAX], row[ka.I_MAX] = m.voltage_limit, np.inf
+    return row
 
 
 def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArrays:
@@ -200,22 +228,39 @@ def _joint_kind(link: Link) -> int:
     return link.row.code
 
 
-def _check_motor(motor: Motor, joints: dict[str, int]) -> None:
+# What must be positive, and what zero or positive, of each kind of motor.
+_POSITIVE: dict[type, dict[str, str]] = {
+    Motor: {"torque_constant": "N m/A", "resistance": "ohm", "gear_ratio": "1"},
+    Servo: {"torque_constant": "N m/A", "resistance": "ohm", "coulomb_speed": "rad/s", "current_limit": "A"},
+    TorqueSource: {},
+}
+_NOT_NEGATIVE: dict[type, tuple[str, ...]] = {
+    Motor: ("rotor_inertia", "gear_damping"),
+    Servo: ("k_p", "k_d", "k_v", "armature", "reflected_damping", "coulomb_friction", "free_drag"),
+    TorqueSource: (),
+}
+
+
+def _check_motor(motor: Drive, joints: dict[str, Link]) -> None:
     if motor.joint not in joints:
         raise ModelError(f"motor: no joint {motor.joint!r}; joints: {', '.join(joints)}")
-    for quantity, unit in (("torque_constant", "N m/A"), ("resistance", "ohm"), ("gear_ratio", "1")):
+    for quantity, unit in _POSITIVE[type(motor)].items():
         if not getattr(motor, quantity) > 0.0:
             raise ModelError(f"motor of {motor.joint}: {quantity} {getattr(motor, quantity)} {unit} must be positive")
-    if not motor.inductance > 0.0:
+    if isinstance(motor, Motor) and not motor.inductance > 0.0:
         raise ModelError(
             f"motor of {motor.joint}: inductance {motor.inductance} H must be positive; "
             "for a circuit without inductance take a small one (1e-6 H) and `integrator: {method: rodas4}`"
         )
-    for quantity in ("rotor_inertia", "gear_damping"):
+    for quantity in _NOT_NEGATIVE[type(motor)]:
         if not getattr(motor, quantity) >= 0.0:
             raise ModelError(f"motor of {motor.joint}: {quantity} {getattr(motor, quantity)} must be zero or positive")
-    if not motor.voltage_limit > 0.0:
+    if not isinstance(motor, TorqueSource) and not motor.voltage_limit > 0.0:
         raise ModelError(f"motor of {motor.joint}: voltage limit {motor.voltage_limit} V must be positive")
+    if not isinstance(motor, Motor) and not motor.torque_limit > 0.0:
+        raise ModelError(f"motor of {motor.joint}: torque limit {motor.torque_limit} N m must be positive")
+    if isinstance(motor, Servo) and joints[motor.joint].kind != "revolute":
+        raise ModelError(f"motor of {motor.joint}: a servo turns, the joint is {joints[motor.joint].kind}")
 
 
 def _check_movable(robot: Robot, tree: np.ndarray, body: np.ndarray) -> None:

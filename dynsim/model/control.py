@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import make_interp_spline
 
 from dynsim.errors import ModelError
-from dynsim.kernels.arrays import ReferenceArrays
+from dynsim.kernels.arrays import HELD_POSITION, ReferenceArrays
 from dynsim.kernels.jit import integers, reals
-from dynsim.model.description import Robot
+from dynsim.model.description import Robot, TorqueSource
 
 # Samples in a segment of the reference splines, and segments that are looked at together.
 _PER_SEGMENT = 4
@@ -31,9 +31,19 @@ class HandPath(Protocol):
         """Positions at times t [s], shape (T,) → (T, 3) [m]."""
 
 
+def held_values(robot: Robot) -> NDArray[np.float64]:
+    """What motors without a moving reference hold, (na,): the initial position of the joint; no torque of a source."""
+    initial = dict(zip(robot.joint_names, robot.initial, strict=True))
+    return np.array([0.0 if isinstance(m, TorqueSource) else initial[m.joint] for m in robot.motors])
+
+
 @dataclass(frozen=True)
 class JointControl:
-    """Gains of the voltage PD per motor [V/rad, V s/rad], joint references, and the path the hand is to follow."""
+    """Gains of the voltage PD per motor [V/rad, V s/rad], joint references, and the path the hand is to follow.
+
+    Only DC motors take the gains; ``k_p`` of a servo says whether it follows its position. References of a torque
+    source are its torques [N m].
+    """
 
     k_p: NDArray[np.float64]
     k_d: NDArray[np.float64]
@@ -41,9 +51,10 @@ class JointControl:
     path: HandPath | None
 
     @classmethod
-    def short_circuit(cls, motors: int) -> JointControl:
-        """No controller: every motor has zero volts on its terminals, so it brakes."""
-        return cls(np.zeros(motors), np.zeros(motors), _reference(np.zeros(motors)), None)
+    def absent(cls, robot: Robot) -> JointControl:
+        """No controller: DC motors have zero volts and brake, servos hold where they start, torque sources rest."""
+        motors = len(robot.motors)
+        return cls(np.zeros(motors), np.zeros(motors), _reference(held_values(robot)), None)
 
     @classmethod
     def following(
@@ -74,8 +85,7 @@ class JointControl:
         """
         positions = positions or {}
         driven = [motor.joint for motor in robot.motors]
-        initial = dict(zip(robot.joint_names, robot.initial, strict=True))
-        held = np.array([initial[name] for name in driven])
+        held = held_values(robot)
         gains = _gains("k_p", k_p, len(driven)), _gains("k_d", k_d, len(driven))
         for name in positions:
             if name not in driven:
@@ -93,7 +103,7 @@ class JointControl:
             if column.shape != grid.shape or not np.isfinite(column).all():
                 raise ModelError(f"the reference of {name} needs {len(grid)} finite positions, one for each time")
             columns.append(column)
-        spline = np.full(len(driven), -1)
+        spline = np.full(len(driven), HELD_POSITION)
         for k, name in enumerate(positions):
             spline[driven.index(name)] = k
         coefficients = spline_coefficients(grid, np.stack(columns, axis=1))
@@ -149,9 +159,9 @@ def _reference(
     grid: tuple[float, float] = (0.0, 1.0),
     coefficients: NDArray[np.float64] | None = None,
 ) -> ReferenceArrays:
-    """References as the kernels take them: positions ``held``, (na,), where ``spline`` is -1, else that column."""
+    """References as the kernels take them: ``held``, (na,), where ``spline`` is HELD_POSITION, else that column."""
     return ReferenceArrays(
-        spline=integers(np.full(len(held), -1) if spline is None else spline),
+        spline=integers(np.full(len(held), HELD_POSITION) if spline is None else spline),
         held=reals(held),
         grid=reals(grid),
         coefficients=reals(np.zeros((1, 0, 6)) if coefficients is None else coefficients),

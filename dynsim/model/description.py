@@ -230,6 +230,71 @@ class Motor:
     mass: float = 0.0
     mass_point: Array | None = None
 
+    @property
+    def armature(self) -> float:
+        """J_m = I_m k² [kg m², or kg at a prismatic joint]."""
+        return self.rotor_inertia * self.gear_ratio**2
+
+    @property
+    def reflected_damping(self) -> float:
+        """D_m = d_m k² [N m s/rad, or N s/m]."""
+        return self.gear_damping * self.gear_ratio**2
+
+
+@dataclass(frozen=True)
+class Servo:
+    """A position servo on a revolute joint, everything at its output shaft; its law: dynsim.kernels.drive.servo.
+
+    Attributes
+    ----------
+    joint : str
+    torque_constant : K_m [N m/A = V s/rad]; resistance : R [Ω]
+    k_p, k_d : gains of the position loop [V/rad, V s/rad]
+    k_v : gain of the velocity loop [V s/rad]
+    velocity_mode : the loop follows the rate of the reference, not its position
+    armature : J_m [kg m²]; reflected_damping : D_m [N m s/rad]
+    coulomb_friction : τ_c [N m]; coulomb_speed : v_s [rad/s], below which it fades
+    voltage_limit, current_limit : [V], [A]; torque_limit : of the current, K_m i [N m]; inf for none
+    free_drag : viscous drag of the gear while the servo is off [N m s/rad]
+    mass, mass_point : as of a :class:`Motor`
+    """
+
+    joint: str
+    torque_constant: float
+    resistance: float
+    k_p: float
+    k_d: float = 0.0
+    k_v: float = 0.0
+    velocity_mode: bool = False
+    armature: float = 0.0
+    reflected_damping: float = 0.0
+    coulomb_friction: float = 0.0
+    coulomb_speed: float = 1e-2
+    voltage_limit: float = np.inf
+    current_limit: float = np.inf
+    torque_limit: float = np.inf
+    free_drag: float = 0.0
+    mass: float = 0.0
+    mass_point: Array | None = None
+
+    @property
+    def greatest_current(self) -> float:
+        """The lower of the limits of current and torque [A]."""
+        return min(self.current_limit, self.torque_limit / self.torque_constant)
+
+
+@dataclass(frozen=True)
+class TorqueSource:
+    """A torque on a joint that is its own reference, within ``torque_limit`` [N m, or N]; mass as of a motor."""
+
+    joint: str
+    torque_limit: float = np.inf
+    mass: float = 0.0
+    mass_point: Array | None = None
+
+
+Drive = Motor | Servo | TorqueSource
+
 
 @dataclass(frozen=True)
 class Quadric:
@@ -335,7 +400,7 @@ class Robot:
 
     name: str
     links: tuple[Link, ...]
-    motors: tuple[Motor, ...]
+    motors: tuple[Drive, ...]
     hand: tuple[str, Array]
     gravity: Array = field(default_factory=lambda: vector(0.0, 0.0, -9.81))
     q0: Array | None = None
@@ -413,6 +478,11 @@ class Robot:
             links=tuple(replace(link, inertia=inertia[link.name]) for link in self.links),
             motors=tuple(replace(motor, mass=0.0, mass_point=None) for motor in self.motors),
         )
+
+    @property
+    def circuits(self) -> int:
+        """How many motors have a circuit, whose current is a state."""
+        return sum(isinstance(motor, Motor) for motor in self.motors)
 
     @property
     def joint_names(self) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 from dynsim.config import StrictConfig
 from dynsim.errors import ModelError
 from dynsim.model.control import HandPath, JointControl
-from dynsim.model.description import Motor, Quadric, Robot
+from dynsim.model.description import Drive, Quadric, Robot
 from dynsim.model.model import Model
 from dynsim.model.snake import SnakeDescription, TaskSpaceController
 
@@ -104,4 +104,4 @@ class SurfaceModule(Member, Protocol):
 class MotorModule(Member, Protocol):
     """A motor, built for ``context.joint``."""
 
-    def build(self, config: Any, context: BuildContext) -> Motor: ...
+    def build(self, config: Any, context: BuildContext) -> Drive: ...

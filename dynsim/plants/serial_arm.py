@@ -9,7 +9,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from dynsim import families
 from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig, Vector3, error_at, unit_vector
-from dynsim.model.description import Inertia, Link, Motor, Robot, vector
+from dynsim.model.description import Drive, Inertia, Link, Robot, vector
 from dynsim.model.protocols import BuildContext
 
 ENGINE = "dynamics"
@@ -166,7 +166,7 @@ def build(config: Config, context: BuildContext) -> Robot:
     yaw = np.deg2rad(config.base.yaw_deg)
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
     links: list[Link] = []
-    motors: list[Motor] = []
+    motors: list[Drive] = []
     initial: list[float] = []
     reach = 0.0
     for group in config.chain:
@@ -189,7 +189,7 @@ def build(config: Config, context: BuildContext) -> Robot:
                 )
             )
             if group.motor is not None:
-                motors.append(families.build("motor", group.motor, context.at_joint(f"joint_{number}"), Motor))
+                motors.append(families.build("motor", group.motor, context.at_joint(f"joint_{number}"), Drive))
             initial.append(group.initial)
             reach = group.length_m
     if config.initial_deg is not None:

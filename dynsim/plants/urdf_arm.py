@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from dynsim import families
 from dynsim.config import BodyPoint, NonNegative, StrictConfig, Vector3, error_at
 from dynsim.errors import ModelError
-from dynsim.model.description import Motor, Robot
+from dynsim.model.description import Drive, Robot
 from dynsim.model.protocols import BuildContext
 
 ENGINE = "dynamics"
@@ -99,7 +99,7 @@ def build(config: Config, context: BuildContext) -> Robot:
         robot,
         links=links,
         motors=tuple(
-            families.build("motor", motor, context.at_joint(joint), Motor)
+            families.build("motor", motor, context.at_joint(joint), Drive)
             for joint, motor in chosen.items()
             if motor is not None
         ),

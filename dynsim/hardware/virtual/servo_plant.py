@@ -12,12 +12,15 @@ friction is left out.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.hardware.bus.control_table import MX_106, ServoModel
+
+if TYPE_CHECKING:
+    from dynsim.model.description import Servo
 
 Array = NDArray[np.float64]
 
@@ -51,7 +54,7 @@ class Drive:
 
 
 class MotorLaw:
-    """Torque of N servos from their set points, with constants of their models.
+    """Torque of N servos from their set points: the servo law of the simulation, with constants of their models.
 
     Attributes
     ----------
@@ -66,16 +69,32 @@ class MotorLaw:
         self.damping = self.stall_torque / np.array([model.no_load_speed for model in models])
         self.stiffness = STIFFNESS_PER_STALL_TORQUE * self.stall_torque
         self.inertia = self.damping**2 / (4 * self.stiffness)
+        # Replaying on real servos imports this module and nothing of the simulation.
+        from dynsim.model.servo import ServoBank
+
+        self._bank = ServoBank([self._servo(a, model) for a, model in enumerate(models)])
 
     def torque(self, position: Array, velocity: Array, drive: Drive) -> Array:
         """Output torque [N·m], shape (N,), at an angle [rad] and speed [rad/s]."""
-        position_loop = self.stiffness * (drive.set_position - position)
-        velocity_loop = (
-            self.inertia / VELOCITY_TIME_CONSTANT * (drive.set_velocity - velocity) + self.damping * velocity
+        self._bank.command(drive.enabled, drive.in_position_mode, drive.set_position, drive.set_velocity)
+        self._bank.supply(drive.voltage)
+        return self._bank.torque(position, velocity)
+
+    def _servo(self, a: int, model: ServoModel) -> Servo:
+        """K_m = V/ω_no_load and R = V K_m/τ_stall at 12 V, so that d = K_m²/R; a torque per volt is K_m/R."""
+        from dynsim.model.description import Servo
+
+        torque_constant = 12.0 / model.no_load_speed
+        resistance = 12.0 * torque_constant / model.stall_torque
+        volts = resistance / torque_constant
+        return Servo(
+            joint=model.name,
+            torque_constant=torque_constant,
+            resistance=resistance,
+            k_p=float(self.stiffness[a]) * volts,
+            k_v=float(self.inertia[a]) / VELOCITY_TIME_CONSTANT * volts,
+            free_drag=FREE_DAMPING * float(self.damping[a]),
         )
-        available = self.stall_torque * max(drive.voltage, 0.0) / 12.0
-        driven = np.clip(np.where(drive.in_position_mode, position_loop, velocity_loop), -available, available)
-        return np.where(drive.enabled, driven - self.damping * velocity, -FREE_DAMPING * self.damping * velocity)
 
 
 class ServoPlant(Protocol):

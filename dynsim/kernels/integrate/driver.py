@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from dynsim.kernels.arrays import Workspace
 from dynsim.kernels.constraint.uniqueness import clearly_unique
+from dynsim.kernels.drive.law import take_commands
 from dynsim.kernels.integrate.dense import sample_step
 from dynsim.kernels.integrate.events import arm_events, cut_step, fire_events, take_ticks
 from dynsim.kernels.integrate.explicit import step_explicit
@@ -142,7 +143,7 @@ def ready(system: System, ws: Workspace, run: Run):
     due = take_ticks(run)
     if due & TAKE_COMMANDS:
         settle(system, run.clock[TIME], run.y, ws, run.stage[0], run)
-        # PLACEHOLDER take_commands
+        take_commands(system.drives, system.reference, run.clock[TIME], ws)
         count[STARTED] = 0
     if count[STARTED] == 0:
         start(system, ws, run)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dynsim.kernels.arrays import BLOCK_SIZE
 from dynsim.kernels.constraint.uniqueness import ROOM
 from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.state import OUTPUTS_PER_CONTACT, OutputLayout, StateLayout, block
@@ -62,7 +63,7 @@ class Run(NamedTuple):
     jacobian: np.ndarray  # (layout.tracked + 1, m) finite differences along q, v, i, t (rodas4)
     matrix: np.ndarray  # (n, n) factored stage matrix (rodas4)
     pivot: np.ndarray  # (n,) int (rodas4)
-    gain: np.ndarray  # (na, 2) k_p and k_d where the voltage is not at its limit, else 0 (rodas4)
+    linear: np.ndarray  # (na, BLOCK_SIZE) linear blocks of the drives (rodas4)
     clock: np.ndarray  # (CLOCK_SIZE,)
     count: np.ndarray  # (COUNT_SIZE,) int
     extremes: np.ndarray  # (c, EXTREMES_SIZE)
@@ -129,7 +130,7 @@ def new_run(
         jacobian=np.zeros((layout.tracked + 1, m) if rodas else (0, 0)),
         matrix=np.zeros((n, n) if rodas else (0, 0)),
         pivot=np.zeros(n if rodas else 0, dtype=np.int64),
-        gain=np.zeros((na, 2)),
+        linear=np.zeros((na, BLOCK_SIZE)),
         clock=clock,
         count=np.zeros(COUNT_SIZE, dtype=np.int64),
         extremes=extremes,

@@ -132,7 +132,7 @@ def _advance(prepared: Prepared) -> None:
 
 def _dynsim_job(name: str, reference: Prepared, paths: dict[str, tuple[Array, Array]]) -> Callable[[int], int]:
     method, step, rtol, atol = _INTEGRATORS[name]
-    n, na, c = reference.model.n, len(reference.system.drives.link), len(reference.contacts)
+    n, na, c = reference.model.n, len(reference.system.drives.table), len(reference.contacts)
     y = np.zeros_like(reference.run.y)
     y[block(reference.run.layout, "q")] = reference.model.robot.initial
     run = ki.new_run(

@@ -182,7 +182,7 @@ def _add_bodies(spec: Any, system: System) -> list[Any]:
 def _add_motors(spec: Any, system: System) -> None:
     import mujoco
 
-    for a, link in enumerate(system.drives.link):
+    for a, link in enumerate(system.drives.table[:, ka.DRIVEN]):
         motor = system.drives.motor[a]
         K, R = motor[ka.K_M], motor[ka.RESISTANCE]
         limit = motor[ka.U_MAX] if np.isfinite(motor[ka.U_MAX]) else 0.0

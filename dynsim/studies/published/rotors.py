@@ -12,8 +12,9 @@ import dataclasses
 
 import numpy as np
 
+from dynsim.errors import ModelError
 from dynsim.model.control import JointControl
-from dynsim.model.description import Array, Contact, Inertia, Link
+from dynsim.model.description import Array, Contact, Inertia, Link, Motor
 from dynsim.model.model import Model
 from dynsim.scenario import Scenario, build, build_model
 
@@ -36,7 +37,10 @@ class RotorModel:
         n = model.n
         self.model, self.contacts, self.control, self.duration = model, contacts, control, duration
         self.joint = np.array([model.joint_names.index(motor.joint) for motor in robot.motors])
-        of = [(motor.gear_ratio, motor) for motor in robot.motors]
+        motors = [motor for motor in robot.motors if isinstance(motor, Motor)]
+        if len(motors) < len(robot.motors):
+            raise ModelError(f"{robot.name}: only DC motors have rotors here")
+        of = [(motor.gear_ratio, motor) for motor in motors]
         self.torque_constant = np.array([k * motor.torque_constant for k, motor in of])
         self.resistance = np.array([motor.resistance for _, motor in of])
         self.inductance = np.array([motor.inductance for _, motor in of])
