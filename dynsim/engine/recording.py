@@ -18,7 +18,7 @@ from dynsim.scenario import Scenario, build
 
 
 def make_record(scenario: Scenario, prepared: Prepared, wall: float, *, pushed: bool = False) -> Record:
-    """Name the columns that the kernels have written; ``pushed``: wrenches besides those of the scenario did work too."""
+    """Name the columns that the kernels wrote; ``pushed``: wrenches besides those of the scenario did work too."""
     model, run, contacts = prepared.model, prepared.run, prepared.contacts
     robot = model.robot
     rows = int(run.count[ki.SAMPLE])

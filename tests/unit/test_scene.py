@@ -9,9 +9,11 @@ import pytest
 
 from dynsim.errors import RecordError
 from dynsim.model.description import Quadric
+from dynsim.model.protocols import BuildContext
 from dynsim.record.scene import Body, Joint, Point, Scene, Shape, Surface, quaternion
 from dynsim.surfaces import cylinder, plane, sphere
 
+CONTEXT = BuildContext(1.0)
 HINGE = Joint("j", "revolute", (0.0, 1.0, 0.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), "q", ("j",))
 
 
@@ -22,7 +24,7 @@ def surface(quadric: Quadric) -> Surface:
 def test_round_trip_and_unknown_keys():
     scene = Scene(
         (Body("a", -1, HINGE), Body("b", 0, HINGE, (Shape("cylinder", (0.1, 1.0), colour=(1.0, 0.0, 0.0, 0.5)),))),
-        (surface(plane.build(plane.Config(type="plane"))),),
+        (surface(plane.build(plane.Config(type="plane"), CONTEXT)),),
         (Point("hand", "hand", 1, (0.0, 0.0, 1.0)), Point("e", "contact", 0, (0.0, 0.0, 0.5), "s")),
     )
     assert Scene.from_json(scene.to_json()) == scene
@@ -43,13 +45,13 @@ def test_bodies_come_after_their_parents():
 
 
 def test_planes_spheres_and_cylinders_are_recognised():
-    found = surface(plane.build(plane.Config(type="plane", point_m=[1.0, 2.0, 3.0], normal=[0.0, 0.6, 0.8])))
+    found = surface(plane.build(plane.Config(type="plane", point_m=[1.0, 2.0, 3.0], normal=[0.0, 0.6, 0.8]), CONTEXT))
     assert (found.kind, found.radius) == ("plane", None)
     np.testing.assert_allclose(found.direction, [0.0, 0.6, 0.8], atol=1e-15)
     np.testing.assert_allclose(found.position, 3.6 * np.array([0.0, 0.6, 0.8]), atol=1e-15)
     for inside, sign in ((False, 1.0), (True, -1.0)):
         found = surface(
-            sphere.build(sphere.Config(type="sphere", center_m=[1.0, -2.0, 0.5], radius_m=0.7, inside=inside))
+            sphere.build(sphere.Config(type="sphere", center_m=[1.0, -2.0, 0.5], radius_m=0.7, inside=inside), CONTEXT)
         )
         assert found.kind == "sphere"
         np.testing.assert_allclose(found.position, [1.0, -2.0, 0.5], atol=1e-13)
@@ -57,7 +59,7 @@ def test_planes_spheres_and_cylinders_are_recognised():
         made = cylinder.Config(
             type="cylinder", point_m=[1.0, 0.0, 2.0], axis=[1.0, 1.0, 0.0], radius_m=0.3, inside=inside
         )
-        found = surface(cylinder.build(made))
+        found = surface(cylinder.build(made, CONTEXT))
         assert (found.kind, found.radius) == ("cylinder", pytest.approx(sign * 0.3, rel=1e-12))
         axis = np.array(found.direction)
         np.testing.assert_allclose(np.abs(axis), [0.5**0.5, 0.5**0.5, 0.0], atol=1e-12)
@@ -75,9 +77,11 @@ def test_planes_spheres_and_cylinders_are_recognised():
 def test_distances_are_those_of_the_model():
     rng = np.random.default_rng(3)
     for quadric in (
-        plane.build(plane.Config(type="plane", normal=[0.0, 0.6, 0.8])),
-        sphere.build(sphere.Config(type="sphere", center_m=[0.0, 0.0, 1.0], radius_m=0.5)),
-        cylinder.build(cylinder.Config(type="cylinder", point_m=[0.0, 0.0, 1.0], axis=[1.0, 0.0, 0.0], radius_m=2.0)),
+        plane.build(plane.Config(type="plane", normal=[0.0, 0.6, 0.8]), CONTEXT),
+        sphere.build(sphere.Config(type="sphere", center_m=[0.0, 0.0, 1.0], radius_m=0.5), CONTEXT),
+        cylinder.build(
+            cylinder.Config(type="cylinder", point_m=[0.0, 0.0, 1.0], axis=[1.0, 0.0, 0.0], radius_m=2.0), CONTEXT
+        ),
     ):
         for point in rng.standard_normal((20, 3)):
             assert surface(quadric).gap(point) == pytest.approx(quadric.gap(point), rel=1e-12, abs=1e-15)
