@@ -116,7 +116,7 @@ def build(config: Config, context: BuildContext) -> JointControl:
             raise ModelError(f"controller: {name!r} is prismatic; waypoints in angles_deg are for revolute joints")
     path, times, columns = None, np.zeros(0), []
     if config.hand is not None:
-        path = families.build("path", config.hand.path, context, HandPath)  # type: ignore[type-abstract]
+        path = families.build("path", config.hand.path, context, HandPath)
     if named:
         segments = duration / config.knot_spacing_s
         if segments > SEGMENTS_MAX:

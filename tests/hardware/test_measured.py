@@ -12,7 +12,7 @@ import dynsim
 from dynsim import cli, figures
 from dynsim.figures import measured as measured_figures
 from dynsim.figures import style
-from dynsim.hardware.check import check_motion
+from dynsim.hardware.replay.check import check_motion
 from dynsim.record import Record
 from dynsim.record.scene import HERE, WORLD, Body, Joint, Point, Scene
 from dynsim.scenario import build_model, load_scenario
