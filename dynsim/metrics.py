@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dynsim._version import __version__
 from dynsim.kernels.integrate.run import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, LOCAL_SINCE, PULLING
+from dynsim.measures import RESIDUAL_LIMIT, SINKS, STORES, energy_turnover, hand_error
 from dynsim.model.clearance import Sinking, sinking
 from dynsim.model.description import Contact, Drive, Robot, Servo, TorqueSource
 from dynsim.record import Record
@@ -28,11 +29,7 @@ INTEGRALS = {
     "work_mechanical": "∫ Σ tau v dt, tau of [WM] eq 25",
     "energy_electrical_supply": "∫ max(Σ u i, 0) dt, one supply for all motors that takes nothing back",
 }
-# Where the electrical energy goes, in the order in which it is drawn and printed.
-SINKS = ("heat_joule", "loss_gear", "loss_joint", "heat_friction")
-STORES = ("energy_kinetic", "energy_potential", "energy_magnetic")
 
-RESIDUAL_LIMIT = 1e-6
 DRIFT_LIMIT_M = 1e-9
 # Limits in files are rounded: a joint that starts at 1.5707963 = 90° is not beyond it.
 LIMIT_SLACK = 1e-6
@@ -93,16 +90,6 @@ def energy_residual(record: Record) -> NDArray[np.float64]:
     return residual
 
 
-def energy_turnover(record: Record) -> float:
-    """Energy that changed hands: the largest over time of half the sum of all terms' sizes [J]."""
-    total = np.abs(record["energy_electrical"]) + np.abs(record["work_constraint"])
-    for name in SINKS:
-        total = total + np.abs(record[name])
-    for name in STORES:
-        total = total + np.abs(record[name] - record[name][:1])
-    return float(0.5 * total.max(initial=0.0))
-
-
 def residual_floor(record: Record, robot: Robot, tolerance: float) -> float:
     """Least denominator of the relative residual [J]: ``tolerance`` times the energy that the arm can have about it.
 
@@ -118,22 +105,6 @@ def residual_floor(record: Record, robot: Robot, tolerance: float) -> float:
         lever += link.inertia.mass * (reach[link.name] + float(np.linalg.norm(link.inertia.com)))
     lever *= float(np.linalg.norm(robot.gravity))
     return tolerance * max(lever, *(float(np.abs(store).max(initial=0.0)) for store in stores))
-
-
-def hand_error(record: Record, settle: float) -> dict[str, float | None]:
-    """Root mean square, maximum and vertical root mean square of the hand's distance from its target [m].
-
-    Counted from t = ``settle`` on; None without a target or when the run is shorter.
-    """
-    names = ("hand_error_rms_m", "hand_error_max_m", "hand_error_z_rms_m")
-    window = record.time >= settle
-    if "target_position" not in record or window.sum() < 2:
-        return dict.fromkeys(names)
-    error = (record["hand_position"] - record["target_position"])[window]
-    time = record.time[window]
-    square = (error**2).sum(axis=1)
-    values = (_mean(square, time) ** 0.5, square.max() ** 0.5, _mean(error[:, 2] ** 2, time) ** 0.5)
-    return dict(zip(names, map(float, values), strict=True))
 
 
 def summarise(
@@ -309,7 +280,3 @@ def _passed_limits(record: Record, robot: Robot) -> list[str]:
                     f"first at t = {first:.4g} s; limits of joints are not enforced"
                 )
     return found
-
-
-def _mean(values: NDArray[np.float64], time: NDArray[np.float64]) -> float:
-    return float(np.trapezoid(values, time) / (time[-1] - time[0]))

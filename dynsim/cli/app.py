@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from enum import StrEnum
 from typing import Annotated, TextIO
 
 import typer
@@ -33,6 +34,15 @@ SetOption = Annotated[
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 FiguresOption = Annotated[bool, typer.Option("--no-figures", help="Do not draw figures.")]
+
+
+class FigureFormat(StrEnum):
+    png = "png"
+    pdf = "pdf"
+    svg = "svg"
+
+
+FormatOption = Annotated[FigureFormat, typer.Option("--format", help="Files that figures are drawn to.")]
 
 
 def _print_version(wanted: bool) -> None:

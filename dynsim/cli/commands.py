@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dynsim import completion, interruption
-from dynsim.cli.app import FiguresOption, QuietOption, ScenarioArgument, SetOption, app
+from dynsim.cli.app import FigureFormat, FiguresOption, FormatOption, QuietOption, ScenarioArgument, SetOption, app
 from dynsim.cli.display import console, draw_comparison, draw_run, errors, progress
 from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
 from dynsim.hardware.cli import export, hw
@@ -34,6 +34,7 @@ def run(
         Path | None, typer.Option(metavar="FOLDER", help="For the files; default: results/SCENARIO/VARIANT.")
     ] = None,
     no_figures: FiguresOption = False,
+    format_: FormatOption = FigureFormat.png,
     quiet: QuietOption = False,
 ) -> None:
     """Simulate one scenario and write its record, summary and figures."""
@@ -57,7 +58,7 @@ def run(
     interruption.heed()
     interruption.check()
     if not no_figures:
-        draw_run(record, folder / "figures", quiet)
+        draw_run(record, folder / "figures", quiet, format_)
     if not quiet:
         from dynsim.tables import print_summary
 
@@ -74,6 +75,7 @@ def compare(
     ] = None,
     jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Processes that simulate variants.")] = 1,
     no_figures: FiguresOption = False,
+    format_: FormatOption = FigureFormat.png,
     quiet: QuietOption = False,
 ) -> None:
     """Simulate all variants of a scenario and compare them in a table and in figures."""
@@ -120,8 +122,8 @@ def compare(
         interruption.check()
         if not no_figures:
             for name, record in records.items():
-                draw_run(record, folder / name / "figures", quiet)
-            draw_comparison(records, folder, quiet)
+                draw_run(record, folder / name / "figures", quiet, format_)
+            draw_comparison(records, folder, quiet, format_)
         if not quiet:
             from dynsim.tables import print_comparison
 
@@ -189,6 +191,7 @@ def plot(
         Path | None,
         typer.Option(metavar="FOLDER", help="For the figures; default: figures/ beside each record."),
     ] = None,
+    format_: FormatOption = FigureFormat.png,
 ) -> None:
     """Draw the figures of records; two or more are also laid over each other."""
     from dynsim.record import Record
@@ -200,11 +203,11 @@ def plot(
         labelled[label] = record
         folder = path.parent / "figures" if out is None else out if len(records) == 1 else out / label
         try:
-            draw_run(record, folder, quiet=False)
+            draw_run(record, folder, quiet=False, format_=format_)
         except RecordError as error:
             raise RecordError(f"{path}: {error}") from error
     if len(labelled) > 1:
-        draw_comparison(labelled, out or Path("figures"), quiet=False)
+        draw_comparison(labelled, out or Path("figures"), quiet=False, format_=format_)
 
 
 @app.command(epilog="Example: dynsim bench --quick --json bench.json")

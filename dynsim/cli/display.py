@@ -24,18 +24,18 @@ errors = Terminal(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 _TITLE_WIDTH = 22
 
 
-def draw_run(record: Record, folder: Path, quiet: bool) -> None:
-    """Figures of one record into ``folder``."""
+def draw_run(record: Record, folder: Path, quiet: bool, format_: str) -> None:
+    """Figures of one record into ``folder``; ``format_`` is that of the files."""
     from dynsim import figures
 
-    _drawing(lambda: figures.draw(record, folder), folder, quiet)
+    _drawing(lambda: figures.draw(record, folder, format_), folder, quiet)
 
 
-def draw_comparison(records: dict[str, Record], folder: Path, quiet: bool) -> None:
-    """Figures of several records over each other into ``folder``."""
+def draw_comparison(records: dict[str, Record], folder: Path, quiet: bool, format_: str) -> None:
+    """Figures of several records over each other into ``folder``; ``format_`` is that of the files."""
     from dynsim import figures
 
-    _drawing(lambda: figures.draw_comparison(records, folder), folder, quiet)
+    _drawing(lambda: figures.draw_comparison(records, folder, format_), folder, quiet)
 
 
 def _drawing(draw: Callable[[], Any], folder: Path, quiet: bool) -> None:

@@ -17,6 +17,7 @@ from dynsim.engine.provenance import provenance
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.families import member
 from dynsim.kernels.jit import integers, reals
+from dynsim.model.scene import snake_scene
 from dynsim.model.snake import (
     FIXING,
     NO_REQUEST,
@@ -27,6 +28,7 @@ from dynsim.model.snake import (
     SnakeDescription,
 )
 from dynsim.record import Record
+from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, build
 from dynsim.snake.kinematics import pose_of_point
 from dynsim.snake.state import MODE, PLACE, TICKS, State, new_rig, new_state, new_trace
@@ -65,7 +67,8 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> Run:
         raise ScenarioError(f"duration_s = {scenario.duration_s:g} is shorter than controller.period_s = {period:g}")
     stride = _stride(scenario.record.rate_hz, period)
     rows = -(-ticks // stride) + 1
-    check_size(scenario, rows, sum(array[0].size for array in new_trace(model, 1)))
+    bodies = len(snake_scene(description).bodies)
+    check_size(scenario, rows, sum(array[0].size for array in new_trace(model, 1)) + pose_columns(bodies))
 
     state, rig = new_state(model), new_rig(model)
     state.base[:], state.phi[:] = description.initial_base_pose, description.initial_joints

@@ -11,8 +11,10 @@ from dynsim._version import __version__
 from dynsim.engine.kinematic_run import Run
 from dynsim.engine.mode_switching import ModeSwitcher
 from dynsim.kernels.jit import reals
-from dynsim.model.snake import SnakeDescription, TaskSpaceController, conditioning
+from dynsim.model.scene import snake_scene
+from dynsim.model.snake import conditioning
 from dynsim.record import Record
+from dynsim.record.poses import add_body_poses
 from dynsim.scenario import Scenario
 from dynsim.snake.kinematics import new_chain, posture_points
 from dynsim.snake.state import CLAMPED, NULL_REDUCED, SLOWED, TICKS, WAITED, WAITED_FOR, Trace
@@ -82,7 +84,7 @@ def make_record(
 
     names, wheels = description.joint_names, description.wheel_names
     pairs = tuple(f"pair{i + 1}" for i in range(description.pairs))
-    record = Record(time, provenance={**provenance, "snake": _geometry(description, run.controller)})
+    record = Record(time, provenance=provenance)
     add = record.add
     add("phi", trace.phi, "rad", labels=names, description="joint angles, head to tail")
     add("rho", trace.rho, "rad", labels=wheels, description="angles of the active wheels")
@@ -107,27 +109,10 @@ def make_record(
     add("at_limit", trace.at_limit, "1", labels=names, description="1 joint out of the allocation, 2 clamped")
     labels = tuple(f"point{i}" for i in range(points.shape[1]))
     add("posture", points, "m", labels=labels, description="polyline: controlled point, joints, axles to the tail")
+    record.scene = snake_scene(description)
+    add_body_poses(record)
     record.summary = _summary(run, scenario, switcher, record, wall)
     return record
-
-
-def _geometry(description: SnakeDescription, controller: TaskSpaceController) -> dict[str, Any]:
-    """What figures and hardware need besides the signals."""
-    return {
-        "head_joints": description.head_joints,
-        "base_joints": description.base_joints,
-        "joint_names": list(description.joint_names),
-        "pitch": description.pitch.tolist(),
-        "lower_rad": description.lower.tolist(),
-        "upper_rad": description.upper.tolist(),
-        "wheel_radius_m": description.wheel_radius,
-        "half_track_m": description.half_track.tolist(),
-        "driven_side": description.driven_side.tolist(),
-        "lifted": {
-            str(number): [i + 1 for i, down in enumerate(row) if not down]
-            for number, row in zip(controller.modes.numbers, controller.modes.grounded.tolist(), strict=True)
-        },
-    }
 
 
 def _waiting_for(counts: NDArray[np.int64], period: float) -> dict[str, float]:

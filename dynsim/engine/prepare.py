@@ -22,6 +22,7 @@ from dynsim.model.clearance import poses
 from dynsim.model.control import JointControl
 from dynsim.model.description import Array, Contact, Load, Motor, Robot
 from dynsim.model.model import Model
+from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, build, build_model
 
 log = logging.getLogger(__name__)
@@ -74,7 +75,7 @@ def prepare(
     n, na, c = model.n, len(robot.motors), len(contacts)
     layout, columns = state_layout(model.nq, n, robot.circuits, c, len(loads)), output_layout(n, na, c)
     if times is None:
-        times = sample_times(scenario, columns=layout.size + columns.size)
+        times = sample_times(scenario, columns=layout.size + columns.size + pose_columns(n))
     _check_coordinates(scenario, robot)
     _check_stiffness(scenario, robot)
     _check_work(scenario, n, c)

@@ -11,12 +11,14 @@ from dynsim.engine.uniqueness import motion_spread
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.state import CONTACT_SIZE, IMPULSE, OUT_FORCE, OUT_GAP, OUT_SLIP, OUT_VECTOR, SLIP
 from dynsim.model.description import Link
+from dynsim.model.scene import robot_scene
 from dynsim.record import Record
-from dynsim.scenario import Scenario
+from dynsim.record.poses import add_body_poses
+from dynsim.scenario import Scenario, build
 
 
 def make_record(scenario: Scenario, prepared: Prepared, wall: float, *, pushed: bool = False) -> Record:
-    """Name the columns that the kernels have written; ``pushed``: wrenches besides the scenario's did work too."""
+    """Name the columns that the kernels wrote; ``pushed``: wrenches besides those of the scenario did work too."""
     model, run, contacts = prepared.model, prepared.run, prepared.contacts
     robot = model.robot
     rows = int(run.count[ki.SAMPLE])
@@ -52,6 +54,8 @@ def make_record(scenario: Scenario, prepared: Prepared, wall: float, *, pushed: 
     integrals = run.states("contact").reshape(rows, len(contacts), CONTACT_SIZE)
     record.add("contact_impulse", integrals[:, :, IMPULSE], "N s", labels=names, description="∫ f_n dt")
     record.add("contact_slip_distance", integrals[:, :, SLIP], "m", labels=names, description="∫ |v_t| dt")
+    record.scene = robot_scene(robot, contacts, build.surfaces(scenario))
+    add_body_poses(record)
     deficient, spread = int(prepared.workspace.deficient[0]), None
     if deficient and rows and any(contact.friction > 0.0 for contact in contacts):
         joint_units = [(link.joint, link.units[2]) for link in robot.links]

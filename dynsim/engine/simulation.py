@@ -29,6 +29,7 @@ from dynsim.kernels.integrate.dense import state_within
 from dynsim.kernels.state import block
 from dynsim.kernels.tree import loads as kl
 from dynsim.record import Record
+from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, require_scenario
 from dynsim.scenario.build import START_TOLERANCE
 
@@ -157,7 +158,8 @@ class Simulation:
         self._times = None
         if state is None and self._end == scenario.duration_s and trace is None:
             # The very samples of simulate; its limit of size holds here too.
-            self._times = sample_times(scenario, self._prepared.run.layout.size + self._prepared.run.columns.size)
+            run, bodies = self._prepared.run, len(self.robot.links)
+            self._times = sample_times(scenario, run.layout.size + run.columns.size + pose_columns(bodies))
         run = self._prepared.run
         if state is not None:
             self._take(state)

@@ -1,4 +1,7 @@
-"""Figures of a record, or of several side by side: PNG files in a folder. Matplotlib is loaded on the first drawing."""
+"""Figures of a record, or of several side by side: files in a folder, drawn from the records and nothing else.
+
+Matplotlib is loaded on the first drawing.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +14,18 @@ from types import ModuleType
 from dynsim.errors import DynsimError, RecordError
 from dynsim.record import Record
 
-# Engine that made a record → module with ``draw`` and ``draw_comparison``.
-MODULES = {"dynamics": "dynsim.figures.arm", "kinematic": "dynsim.figures.snake"}
+MEASURED, SIMULATED = "dynsim.figures.measured", "dynsim.figures.arm"
+# Module with ``draw`` and ``draw_comparison`` → sets of signals, any of which tells its records; the first module that
+# finds one draws.
+MODULES: dict[str, tuple[set[str], ...]] = {
+    "dynsim.figures.snake": ({"posture"}, {"base_pose"}, {"w", "w_target"}),
+    MEASURED: ({"q_goal"}, {"record_time"}, {"torque_estimate"}),
+    SIMULATED: ({"hand_position"}, {"current"}, {"energy_residual"}),
+}
 
 
-def draw(record: Record, folder: Path) -> list[Path]:
-    """Draw every figure that the record has data for.
+def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
+    """Draw every figure that the record has data for, as files of a kind: "png", "pdf" or "svg".
 
     Returns
     -------
@@ -26,30 +35,34 @@ def draw(record: Record, folder: Path) -> list[Path]:
     Raises
     ------
     RecordError
-        Nobody draws records of this engine, the record lacks what the figures need, or a file cannot be written.
+        Nobody draws records of such signals, the record lacks what the figures need, or a file cannot be written.
     """
     if not len(record):
         return []
     with _drawable():
-        return list(_module(record).draw(record, Path(folder)))
+        return list(_module(record).draw(record, Path(folder), kind))
 
 
-def draw_comparison(records: Mapping[str, Record], folder: Path) -> list[Path]:
+def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
     """Draw variants over each other, in the order of ``records``; those without samples are left out.
 
     Raises
     ------
     RecordError
-        See :func:`draw`; or the records come from different engines.
+        See :func:`draw`; or the records are of different kinds.
     """
     drawn = {name: record for name, record in records.items() if len(record)}
     modules = {_module(record) for record in drawn.values()}
     if not modules:
         return []
+    arms = {MEASURED, SIMULATED} & {module.__name__ for module in modules}
+    if len(arms) == len(modules) > 1:
+        # Measured beside simulated: what both have is drawn.
+        modules = {importlib.import_module(SIMULATED)}
     if len(modules) > 1:
-        raise RecordError("records of different engines cannot be drawn over each other")
+        raise RecordError("records of different kinds cannot be drawn over each other")
     with _drawable():
-        return list(modules.pop().draw_comparison(drawn, Path(folder)))
+        return list(modules.pop().draw_comparison(drawn, Path(folder), kind))
 
 
 @contextmanager
@@ -65,7 +78,7 @@ def _drawable() -> Iterator[None]:
 
 
 def _module(record: Record) -> ModuleType:
-    engine = record.provenance.get("engine")
-    if not isinstance(engine, str) or engine not in MODULES:
-        raise RecordError(f"no figures for records of engine {engine!r}; known: {', '.join(MODULES)}")
-    return importlib.import_module(MODULES[engine])
+    for name, needed in MODULES.items():
+        if any(signals <= set(record) for signals in needed):
+            return importlib.import_module(name)
+    raise RecordError(f"no figures for a record of these signals: {', '.join(record) or 'none'}")

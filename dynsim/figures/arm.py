@@ -29,21 +29,21 @@ COMPARISONS: dict[str, Callable[[Mapping[str, Record]], Figure | None]] = {
 }
 
 
-def draw(record: Record, folder: Path) -> list[Path]:
+def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
     """See :func:`dynsim.figures.draw`."""
     with style.look():
         return [
-            style.save(figure, folder / f"{name}.png")
+            style.save(figure, folder / f"{name}.{kind}")
             for name, draw_one in FIGURES.items()
             if (figure := draw_one(record)) is not None
         ]
 
 
-def draw_comparison(records: Mapping[str, Record], folder: Path) -> list[Path]:
+def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
     """See :func:`dynsim.figures.draw_comparison`."""
     with style.look():
         return [
-            style.save(figure, folder / f"{name}.png")
+            style.save(figure, folder / f"{name}.{kind}")
             for name, draw_all in COMPARISONS.items()
             if (figure := draw_all(records)) is not None
         ]

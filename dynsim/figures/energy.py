@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from dynsim import metrics
 from dynsim.figures import style
 from dynsim.figures.style import Array
+from dynsim.measures import RESIDUAL_LIMIT, energy_turnover
 from dynsim.record import Record
 
 # Terms of the ledger in the order in which they are stacked.
@@ -95,7 +95,7 @@ def ledger(record: Record) -> Figure | None:
         return None
     terms = {name: record[name] - record[name][:1] for name in TERMS}
     supplied = record["energy_electrical"] + record["work_constraint"]
-    turnover = metrics.energy_turnover(record)
+    turnover = energy_turnover(record)
     dominant = bool(np.abs(terms["heat_joule"]).max() > DOMINANT * turnover > 0.0)
     figure = style.new_figure(6.6 if dominant else 5.0, style.title(record, "energy ledger"))
     panels = figure.subplots(2 + dominant, 1, sharex=True, height_ratios=[*[2.0] * (1 + dominant), 1.0])
@@ -140,7 +140,7 @@ def _residual(axes: Axes, record: Record, turnover: float) -> None:
     if np.isfinite(shown).any():
         style.line(axes, record.time, np.where(np.isnan(shown), np.nanmin(shown), shown), color=style.BLACK, lw=0.9)
     if turnover > 0.0:
-        limit = metrics.RESIDUAL_LIMIT * turnover
+        limit = RESIDUAL_LIMIT * turnover
         axes.axhline(limit, color=style.PULLING, linestyle="--", linewidth=0.9)
         axes.annotate(
             "limit: $10^{-6}$ of the turnover",

@@ -9,13 +9,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dynsim import metrics
 from dynsim.figures import style
 from dynsim.figures.style import Array
+from dynsim.measures import hand_error, hand_target
 from dynsim.record import Record
 
 PLANES = ((0, 1), (0, 2), (1, 2))
 MILLI = 1e3
+# Legends: where the path has the hand, and where the goals of the joints have it.
+TARGET, GOALS = "target", "goals"
 # Where a hand starts: the same mark for all variants, so that the legend shows what is drawn.
 START: dict[str, Any] = {
     "linestyle": "none",
@@ -58,18 +60,19 @@ def path_comparison(records: Mapping[str, Record]) -> Figure | None:
 
 def error(record: Record) -> Figure | None:
     """Tracking error over time, components and norm; None without a target."""
-    if "target_position" not in record:
+    target = hand_target(record)
+    if target is None:
         return None
-    deviation = MILLI * (record["hand_position"] - record["target_position"])
+    deviation = MILLI * (record["hand_position"] - target)
     norm = np.linalg.norm(deviation, axis=1)
     figure = style.new_figure(4.1, style.title(record, "tracking error"))
     top, bottom = figure.subplots(2, 1, sharex=True)
     for k, name in enumerate("xyz"):
         style.line(top, record.time, deviation[:, k], label=f"$e_{name}$", color=style.AXIS_COLOURS[name])
-    top.set_ylabel("hand − target [mm]")
+    top.set_ylabel(f"hand − {target_name(record)} [mm]")
     style.legend_above(top)
     style.line(bottom, record.time, norm, label=_error_label("|e|", record), color=style.BLACK)
-    bottom.set_ylabel("distance from target [mm]")
+    bottom.set_ylabel(f"distance from {target_name(record)} [mm]")
     bottom.set_ylim(bottom=0.0)
     bottom.set_xlabel("time [s]")
     for axes in (top, bottom):
@@ -80,14 +83,14 @@ def error(record: Record) -> Figure | None:
 
 def error_comparison(records: Mapping[str, Record]) -> Figure | None:
     """Tracking errors of all variants: distance from the target, logarithmic, and the vertical part."""
-    shown = {name: record for name, record in records.items() if "target_position" in record}
+    shown = {name: record for name, record in records.items() if hand_target(record) is not None}
     if not shown:
         return None
     figure = style.new_figure(4.4, style.comparison_title(list(shown.values()), "tracking error"))
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[1.3, 1.0])
     styles = style.variant_styles(list(records))
     for name, record in shown.items():
-        deviation = MILLI * (record["hand_position"] - record["target_position"])
+        deviation = MILLI * (record["hand_position"] - hand_target(record))
         norm = np.linalg.norm(deviation, axis=1)
         style.line(top, record.time, norm, label=_error_label(name, record), **styles[name])
         style.line(bottom, record.time, deviation[:, 2], **styles[name])
@@ -104,7 +107,8 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
 
 def _planes(figure: Figure, records: list[Record]) -> list[Axes]:
     """Three square panels of one scale, large enough for hands and targets."""
-    points = [record[name] for record in records for name in ("hand_position", "target_position") if name in record]
+    points = [record["hand_position"] for record in records]
+    points += [target for record in records if (target := hand_target(record)) is not None]
     everything = np.concatenate(points)
     everything = everything[np.isfinite(everything).all(axis=1)]
     low, high = (everything.min(axis=0), everything.max(axis=0)) if len(everything) else (np.zeros(3), np.zeros(3))
@@ -129,11 +133,17 @@ def _draw_path(axes: Axes, record: Record, plane: tuple[int, int], label: str, *
 
 
 def _draw_target(axes: Axes, record: Record, plane: tuple[int, int]) -> None:
-    if "target_position" not in record:
+    wanted = hand_target(record)
+    if wanted is None:
         return
-    target = record["target_position"][:, plane]
-    axes.plot(*edge_on(target).T, label="target", color=style.BLACK, linestyle=(0, (4, 2)), zorder=3, lw=0.9)
+    target = wanted[:, plane]
+    axes.plot(*edge_on(target).T, label=target_name(record), color=style.BLACK, linestyle=(0, (4, 2)), zorder=3, lw=0.9)
     axes.plot(*target[0], "x", color=style.BLACK, markersize=5, zorder=4)
+
+
+def target_name(record: Record) -> str:
+    """What a legend calls :func:`dynsim.measures.hand_target`."""
+    return TARGET if "target_position" in record else GOALS
 
 
 def edge_on(points: Array) -> Array:
@@ -156,21 +166,22 @@ def _legend_below(figure: Figure, axes: Axes) -> None:
     handles, labels = axes.get_legend_handles_labels()
     start = axes.plot([], [], **START)
     handles, labels = [*handles, *start], [*labels, "start of the hand"]
-    if "target" in labels:
-        handles += axes.plot([], [], "x", color=style.BLACK, markersize=5)
-        labels.append("start of the target")
+    for target in (TARGET, GOALS):
+        if target in labels:
+            handles += axes.plot([], [], "x", color=style.BLACK, markersize=5)
+            labels.append(f"start of the {target}")
     figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 4))
 
 
 def _error_label(name: str, record: Record) -> str:
     settle = style.settle_time(record)
-    rms = metrics.hand_error(record, settle)["hand_error_rms_m"]
-    return name if rms is None else f"{name}: rms {MILLI * rms:.3g} mm from {settle:g} s on"
+    rms = hand_error(record, settle)["hand_error_rms_m"]
+    return name if rms is None or not np.isfinite(rms) else f"{name}: rms {MILLI * rms:.3g} mm from {settle:g} s on"
 
 
 def _mark_settle(axes: Axes, record: Record) -> None:
     settle = style.settle_time(record)
-    if record.time[0] < settle < record.time[-1]:
+    if max(0.0, record.time[0]) < settle < record.time[-1]:
         axes.axvline(settle, color=style.GREY, linestyle=":", linewidth=1.0)
         axes.annotate(
             "settled",

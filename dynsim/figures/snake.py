@@ -16,7 +16,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from PIL import Image
 
-from dynsim.figures import tanaka2019
+from dynsim.figures import style, tanaka2019
 from dynsim.figures.snake_view import (
     BODY,
     GROUND,
@@ -39,6 +39,7 @@ from dynsim.figures.snake_view import (
 )
 from dynsim.files import replacing
 from dynsim.record import Record
+from dynsim.snake_geometry import snake_geometry
 from dynsim.studies.published.tanaka2019 import used_limit
 
 # Postures of an animation, in a row, and over each other in one picture.
@@ -47,7 +48,7 @@ FRAMES, IN_A_ROW, IN_A_PICTURE = 50, 6, 7
 SHADES = LinearSegmentedColormap.from_list("shades", ["#CFCFCF", "#000000"])
 
 
-def draw(record: Record, folder: Path) -> list[Path]:
+def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
     """Write all figures of one run and the animation into ``folder``; returns the files."""
     folder = Path(folder)
     written = []
@@ -60,12 +61,12 @@ def draw(record: Record, folder: Path) -> list[Path]:
             "redundancy": redundancy,
         }
         for name, make in (makers | tanaka2019.figures_of_run(record)).items():
-            written.append(_save(make(record), folder / f"{name}.png"))
+            written.append(_save(make(record), folder / f"{name}.{kind}"))
         written.append(animate(record, folder / "animation.gif"))
     return written
 
 
-def draw_comparison(records: Mapping[str, Record], folder: Path) -> list[Path]:
+def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
     """Variants over each other, and figures and tables beside [T] where its experiments were run; returns the files."""
     folder = Path(folder)
     makers: dict[str, Callable[[Mapping[str, Record]], Figure]] = {
@@ -79,13 +80,12 @@ def draw_comparison(records: Mapping[str, Record], folder: Path) -> list[Path]:
         written += tanaka2019.write_tables(scenario, records, folder)
     with plt.rc_context(STYLE):
         for name, make in makers.items():
-            written.append(_save(make(records), folder / f"{name}.png"))
+            written.append(_save(make(records), folder / f"{name}.{kind}"))
     return written
 
 
 def _save(figure: Figure, path: Path) -> Path:
-    with replacing(path) as stream:
-        figure.savefig(stream, format="png")
+    style.write(figure, path)
     plt.close(figure)
     return path
 
@@ -178,9 +178,8 @@ def tracking(record: Record) -> Figure:
 
 def joints(record: Record) -> Figure:
     """Joint angles of head and base part with their limits; marks show where a joint left the allocation."""
-    geometry = record.provenance["snake"]
-    n_h, pitch = geometry["head_joints"], np.array(geometry["pitch"])
-    upper, lower = np.array(geometry["upper_rad"]), np.array(geometry["lower_rad"])
+    geometry = snake_geometry(record)
+    n_h, pitch, upper, lower = geometry.head_joints, geometry.pitch, geometry.upper, geometry.lower
     phi, labels = record["phi"], record.labels["phi"]
     parts = [
         ("head yaw", np.flatnonzero(~pitch[:n_h])),

@@ -21,6 +21,7 @@ from matplotlib.ticker import Locator
 from numpy.typing import NDArray
 
 from dynsim.record import Record
+from dynsim.snake_geometry import snake_geometry
 
 # Okabe and Ito's palette: distinct for colour-blind readers.
 BODY, HEAD, GROUND, LIFT, TARGET, SUPPORT = "#444444", "#D55E00", "#0072B2", "#FFFFFF", "#009E73", "#56B4E9"
@@ -71,21 +72,19 @@ class View:
     """One posture, ready to be drawn."""
 
     def __init__(self, record: Record, row: int) -> None:
-        geometry = record.provenance["snake"]
+        geometry = snake_geometry(record)
         self.row, self.time, self.mode = row, float(record.time[row]), int(record["mode"][row])
         self.points: NDArray[np.float64] = record["posture"][row]
         self.path: NDArray[np.float64] = record["w"][:, :2]
         self.centre = record["centre_of_mass"][row]
         self.grounded = record["grounded"][row].astype(bool)
-        self.radius = geometry["wheel_radius_m"]
-        half = np.array(geometry["half_track_m"])
-        n_h = geometry["head_joints"]
+        self.radius = geometry.wheel_radius
+        n_h = geometry.head_joints
         self.axles = self.points[n_h::2]
         x, y, yaw = record["base_pose"][row]
         headings = yaw + np.concatenate([[0.0], np.cumsum(record["phi"][row, n_h:])])
         self.along = np.stack([np.cos(headings), np.sin(headings)], axis=1)
-        self.across = np.stack([-np.sin(headings), np.cos(headings)], axis=1) * half[:, None]
-        self.driven = np.array(geometry["driven_side"])
+        self.across = np.stack([-np.sin(headings), np.cos(headings)], axis=1) * geometry.half_track[:, None]
         # Side view: along the heading of the base part, from wheel pair 1.
         forward = np.array([np.cos(yaw), np.sin(yaw)])
         self.side = np.stack([(self.points[:, :2] - [x, y]) @ forward, self.points[:, 2]], axis=1)

@@ -30,6 +30,7 @@ from dynsim.figures.snake_view import (
 )
 from dynsim.files import write_text
 from dynsim.record import Record
+from dynsim.snake_geometry import snake_geometry
 from dynsim.studies.published.tanaka2019 import (
     COORDINATES,
     HEAD_ERROR,
@@ -150,18 +151,18 @@ def head_and_cost(record: Record) -> Figure:
 
 def joint_angles(record: Record) -> Figure:
     """Fig 10: every joint angle over time with its limits, lines as there."""
-    geometry, phi = record.provenance["snake"], record["phi"]
+    geometry, phi = snake_geometry(record), record["phi"]
     names, count = record.labels["phi"], phi.shape[1]
     figure, axes = plt.subplots(-(-count // 3), 3, figsize=(7.2, 1.55 * -(-count // 3) + 0.4), sharex=True)
     for axis in axes.ravel()[count:]:
         axis.set_visible(False)
     for j, axis in enumerate(axes.ravel()[:count]):
         (actual,) = axis.plot(record.time, phi[:, j], color=GROUND)
-        for bound in (geometry["lower_rad"][j], geometry["upper_rad"][j]):
+        for bound in (geometry.lower[j], geometry.upper[j]):
             limit = axis.axhline(bound, color="black", ls="-.", lw=0.8)
         out = record["at_limit"][:, j] > 0
         (held,) = axis.plot(record.time[out], phi[out, j], ".", color=HEAD, ms=3)
-        reach = 1.15 * geometry["upper_rad"][j]
+        reach = 1.15 * geometry.upper[j]
         axis.set(ylim=(-reach, reach), ylabel=f"{greek(names[j])} [rad]")
     figure.supxlabel("t [s]", fontsize=8)
     figure.legend(

@@ -79,7 +79,8 @@ def joint_motion(
     angles, rates = [], []
     for name, rate in RATES.items():
         if name in record and rate in record:
-            if record[name].ndim != 2 or record[rate].shape != record[name].shape:
+            rows = {len(record), len(record[name]), len(record[rate])}
+            if record[name].ndim != 2 or record[rate].shape != record[name].shape or len(rows) > 1:
                 raise RecordError(
                     f"signals {name!r} {record[name].shape} and {rate!r} {record[rate].shape} of the record must both "
                     "have a row per sample and a column per joint"

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from dynsim.errors import ModelError
 from dynsim.model.joints import Row, rows
+from dynsim.record.scene import Shape
 
 Array = NDArray[np.float64]
 WORLD = "world"
@@ -117,6 +118,7 @@ class Link:
     radius : of a cylinder about the body's axis [m], zero when unknown: deeper than that below a surface, a run warns
     tip : (3,) or None
         Other end of the axis in B [m], the first is the joint; None: the joints that the body carries, and the hand.
+    shapes : what the body looks like, in B; empty: a cylinder about its axis, if ``radius`` and ``tip`` are known
     """
 
     name: str
@@ -134,6 +136,7 @@ class Link:
     effort_limit: float = np.inf
     radius: float = 0.0
     tip: Array | None = None
+    shapes: tuple[Shape, ...] = ()
     parameter: float = 0.0
     joint_of_rows: str | None = None
 
@@ -180,6 +183,7 @@ def in_rows(link: Link, rows: Sequence[tuple[str, str, Array]]) -> tuple[Link, .
                 p_PJ=link.p_PJ if first else np.zeros(3),
                 radius=link.radius if last else 0.0,
                 tip=link.tip if last else None,
+                shapes=link.shapes if last else (),
                 joint_of_rows=link.joint,
             )
         )
@@ -391,7 +395,7 @@ class Robot:
     """A tree of links with its motors.
 
     ``hand`` is the controlled point (body name, point in its frame [m]); ``q0`` the initial configuration [rad or m],
-    zero unless given; ``frames`` further names to attach points to.
+    zero unless given; ``frames`` further names to attach points to; ``fixed_shapes`` what stands still in the world.
     """
 
     name: str
@@ -401,6 +405,7 @@ class Robot:
     gravity: Array = field(default_factory=lambda: vector(0.0, 0.0, -9.81))
     q0: Array | None = None
     frames: tuple[Frame, ...] = ()
+    fixed_shapes: tuple[Shape, ...] = ()
 
     @property
     def carriers(self) -> frozenset[str]:

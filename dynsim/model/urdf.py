@@ -23,6 +23,7 @@ from dynsim.model.description import WORLD, Array, Frame, Inertia, Link, Robot
 from dynsim.model.joints.ball import floating
 from dynsim.model.joints.planar import planar
 from dynsim.model.urdf_reader import MOVING, SEVERAL, UNLIMITED, UrdfJoint, UrdfTree, read_tree, suggestion
+from dynsim.record.scene import Shape, quaternion
 
 HAND = "hand"
 _ROWS = {"floating": floating, "planar": planar}
@@ -80,7 +81,14 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
     _warn(locked, places, links)
     frames = [Frame(name, place.body, place.R, place.p) for name, place in places.items() if place.body != name]
     rows = tuple(row for link in links for row in (_ROWS[link.kind](link) if link.kind in _ROWS else (link,)))
-    return Robot(name=tree.name, links=rows, motors=(), hand=_hand(tree, places), frames=tuple(frames))
+    return Robot(
+        name=tree.name,
+        links=rows,
+        motors=(),
+        hand=_hand(tree, places),
+        frames=tuple(frames),
+        fixed_shapes=_shapes(locked, places).get(None, ()),
+    )
 
 
 def write_urdf(robot: Robot) -> str:
@@ -220,6 +228,7 @@ def _links(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[Link, ...]:
             own = name == place.body
             parts.setdefault(place.body, []).append(inertia if own else inertia.placed(place.R, place.p))
     joint_to = {joint.child: joint for joint in tree.joints.values()}
+    shapes = _shapes(tree, places)
     links = []
     for name, place in places.items():
         if place.body != name:
@@ -241,6 +250,7 @@ def _links(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[Link, ...]:
                 upper=joint.upper,
                 velocity_limit=joint.velocity_limit,
                 effort_limit=joint.effort_limit,
+                shapes=shapes.get(name, ()),
             )
         )
     return tuple(links)
@@ -267,6 +277,16 @@ def _whole_joint(name: str, rows: list[Link]) -> Link:
                 raise ModelError(f"{name}: has losses; URDF has no unit for those of a {kind} joint")
             return replace(whole, kind=kind)
     raise ModelError(f"{name}: is made of {', '.join(row.kind for row in rows)}; URDF has no such joint")
+
+
+def _shapes(tree: UrdfTree, places: Mapping[str, _Place]) -> dict[str | None, tuple[Shape, ...]]:
+    """What each moving body, and the world (None), looks like, with all that is fixed to it."""
+    found: dict[str | None, tuple[Shape, ...]] = {}
+    for name, place in places.items():
+        turn = quaternion(place.R)
+        shapes = tuple(shape.placed(place.p, turn) for shape in tree.links[name].shapes)
+        found[place.body] = (*found.get(place.body, ()), *shapes)
+    return found
 
 
 def _hand(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[str, Array]:

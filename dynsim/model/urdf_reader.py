@@ -7,14 +7,16 @@ mass, a joint without ``<axis>`` turns about x); what else is missing, misspelt,
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from dynsim.errors import ModelError
 from dynsim.model.description import Array, Inertia
+from dynsim.model.urdf_visual import materials, visual_shapes
 from dynsim.model.urdf_xml import MOMENTS, Element, UrdfFile, cut, plain_text, shown, suggestion
+from dynsim.record.scene import Shape
 
 # The largest robots in use have some 100 links. Pinocchio walks the tree by recursion: some 5000 links in a chain
 # overflow its stack.
@@ -28,12 +30,16 @@ UNLIMITED = 1e9
 
 @dataclass(frozen=True)
 class UrdfLink:
-    """A link as the file has it; ``inertia`` is None without ``<inertial>``, ``shaped`` means visual or collision."""
+    """A link as the file has it; ``inertia`` is None without ``<inertial>``, ``shaped`` means visual or collision.
+
+    ``shapes`` are its visuals, as far as they can be drawn.
+    """
 
     name: str
     line: int
     inertia: Inertia | None
     shaped: bool
+    shapes: tuple[Shape, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -102,9 +108,10 @@ class _Reader:
         self.file.check_children(root, "the robot")
         links: dict[str, UrdfLink] = {}
         joints: dict[str, UrdfJoint] = {}
+        colours = materials(root)
         for element in root.children:
             if element.tag == "link":
-                link = self.link(element, links)
+                link = replace(self.link(element, links), shapes=visual_shapes(element, colours))
                 links[link.name] = link
                 if len(links) > LINKS_MAX:
                     raise self.file.error(link.line, f"more than {LINKS_MAX} links; simplify the model")

@@ -124,6 +124,20 @@ def test_plot_keeps_apart_records_of_the_same_variant(tmp_path: Path):
     assert (tmp_path / "figures" / "compare_hand_path.png").is_file()
 
 
+def test_figures_in_another_format_replace_those_of_the_run_before(tmp_path: Path):
+    arguments = ["run", "single_pendulum", "--set", "duration_s=0.2", "--set", "metrics.settle_s=0.05", "--out", "out"]
+    assert dynsim(*arguments, folder=tmp_path).returncode == 0
+    figures = tmp_path / "out" / "figures"
+    names = {"hand_path", "energy_ledger", "posture"}
+    assert {path.name for path in figures.iterdir()} == {f"{name}.png" for name in names}
+    assert dynsim(*arguments, "--format", "svg", folder=tmp_path).returncode == 0
+    assert {path.name for path in figures.iterdir()} == {f"{name}.svg" for name in names}
+    result = dynsim("plot", "out/record.h5", "--format", "pdf", "--out", "pdf", folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert {path.name for path in (tmp_path / "pdf").iterdir()} == {f"{name}.pdf" for name in names}
+    assert dynsim("plot", "out/record.h5", "--format", "gif", folder=tmp_path).returncode == 2
+
+
 def test_plot_writes_nothing_outside_of_its_folder_and_shows_names_as_they_are(tmp_path: Path):
     evil = "\x1b[31m[red]x[/]"
     for name, variant in (("a", "../../../outside"), ("b", str(tmp_path / "outside")), ("c", ".."), ("d", evil)):

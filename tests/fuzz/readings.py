@@ -318,7 +318,9 @@ def record_losses(sound: Any, loaded: Any) -> list[str]:
             lost.append(f"signal {name!r} changed")
         elif (signal.unit, signal.labels) != (loaded.units[name], loaded.labels[name]):
             lost.append(f"unit or labels of {name!r} changed: {loaded.units[name]!r} {loaded.labels[name]}")
-    for name in ("summary", "provenance", "complete"):
+        elif not np.array_equal(sound.times(name), loaded.times(name)):
+            lost.append(f"instants of {name!r} changed")
+    for name in ("summary", "provenance", "complete", "events", "scene"):
         if getattr(sound, name) != getattr(loaded, name):
             lost.append(f"{name} changed")
     return lost

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,8 @@ from matplotlib.figure import Figure
 
 import dynsim
 from dynsim import figures, metrics
-from dynsim.errors import ModelError, RecordError
-from dynsim.figures import arm, contacts, energy, hand, motors, posture, style
+from dynsim.errors import RecordError
+from dynsim.figures import arm, contacts, energy, hand, motors, posture, skeleton, style
 from dynsim.record import Record
 from dynsim.scenario import load_scenario
 
@@ -59,6 +60,7 @@ def shortened(record: Record, samples: int) -> Record:
     for name, signal in record.signals.items():
         result.add(name, signal.data[:samples].copy(), signal.unit, labels=signal.labels)
     result.complete = False
+    result.scene = record.scene
     return result
 
 
@@ -68,6 +70,7 @@ def stretched(record: Record, samples: int) -> Record:
     result = Record(np.arange(samples) * 1e-3, provenance=record.provenance)
     for name, signal in record.signals.items():
         result.add(name, signal.data[index], signal.unit, labels=signal.labels)
+    result.scene = record.scene
     return result
 
 
@@ -147,11 +150,37 @@ def test_drawing_leaves_matplotlib_settings_alone(pendulum: Record, tmp_path: Pa
     assert settings() == before
 
 
-def test_unknown_engine_is_refused(braced: Record, tmp_path: Path) -> None:
-    record = copy.copy(braced)
-    record.provenance = {"engine": "steam"}
-    with pytest.raises(RecordError, match=r"'steam'; known: dynamics"):
+def test_a_record_of_signals_that_nobody_draws_is_refused(tmp_path: Path) -> None:
+    record = Record([0.0, 1.0])
+    record.add("pressure", [1.0, 2.0], "Pa")
+    with pytest.raises(RecordError, match="no figures for a record of these signals: pressure"):
         figures.draw(record, tmp_path)
+
+
+def test_what_is_drawn_depends_on_the_signals_not_on_the_engine(pendulum: Record, tmp_path: Path) -> None:
+    record = copy.copy(pendulum)
+    record.provenance = {}
+    assert_pngs(figures.draw(record, tmp_path), tmp_path, {"hand_path", "energy_ledger", "posture"})
+
+
+@pytest.mark.parametrize(("kind", "start"), [("pdf", b"%PDF-"), ("svg", b"<?xml")])
+def test_figures_as_pdf_and_svg(pendulum: Record, tmp_path: Path, kind: str, start: bytes) -> None:
+    names = {"hand_path", "energy_ledger", "posture"}
+    paths = figures.draw(pendulum, tmp_path / "a", kind)
+    assert {path.name for path in paths} == {f"{name}.{kind}" for name in names}
+    again = figures.draw(pendulum, tmp_path / "b", kind)
+    for path, other in zip(paths, again, strict=True):
+        assert path.read_bytes().startswith(start)
+        assert path.read_bytes() == other.read_bytes()
+    paths = figures.draw_comparison({"a": pendulum, "b": pendulum}, tmp_path, kind)
+    assert {path.name for path in paths} == {f"compare_hand_path.{kind}", f"compare_posture.{kind}"}
+
+
+def test_record_of_version_0_1_is_drawn(tmp_path: Path) -> None:
+    old = Record.load(Path(__file__).parents[1] / "data" / "record_0_1.h5")
+    assert_pngs(figures.draw(old, tmp_path), tmp_path, {"hand_path", "energy_ledger", "posture"})
+    titles = [axes.get_title() for axes in drawn(posture.posture(old)).axes]
+    assert "posture not drawn: the record has no scene" in titles
 
 
 def test_a_folder_that_cannot_be_written_is_a_record_error(pendulum: Record, tmp_path: Path) -> None:
@@ -270,14 +299,19 @@ def test_values_that_are_not_finite_are_drawn_around(braced: Record, tmp_path: P
     assert figures.draw(record, tmp_path)
 
 
-def test_posture_of_a_plant_that_is_gone_is_left_out(braced: Record, monkeypatch: pytest.MonkeyPatch) -> None:
-    def gone(_: object) -> None:
-        raise ModelError("arm.urdf: no such file")
-
-    monkeypatch.setattr(posture, "build_model", gone)
-    figure = drawn(posture.posture(braced))
-    assert any("no such file" in axes.get_title() for axes in figure.axes)
-    assert posture.posture_comparison({"a": braced}) is None
+@pytest.mark.parametrize("lost", ["scene", "poses", "bodies"])
+def test_posture_that_the_record_does_not_tell_is_left_out(braced: Record, lost: str) -> None:
+    record = copy.copy(braced)
+    if lost == "scene":
+        record.scene, expected = None, "has no scene"
+    elif lost == "poses":
+        record, expected = without(record, "body_orientation"), "not every joint was recorded"
+    else:
+        record.scene = dataclasses.replace(braced.scene, bodies=braced.scene.bodies[:3], points=())
+        expected = "other bodies than the record"
+    figure = drawn(posture.posture(record))
+    assert any(expected in axes.get_title() for axes in figure.axes)
+    assert posture.posture_comparison({"a": record}) is None
 
 
 def test_side_view_shows_the_arm_and_which_contact_pulls(braced: Record) -> None:
@@ -288,24 +322,24 @@ def test_side_view_shows_the_arm_and_which_contact_pulls(braced: Record) -> None
     assert marks == ["v" if force < 0.0 else "^" for force in forces]
     # The arm stands in the plane x = y: seen from the side, all its 0.3 m links have their true length at the start.
     first = np.array(side.collections[0].get_segments())
-    np.testing.assert_allclose(np.linalg.norm(first[1:, 1] - first[1:, 0], axis=1)[1:], 0.3, rtol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(first[1:, 1] - first[1:, 0], axis=1)[1:], 0.3, rtol=1e-6)
 
 
 def test_labels_of_contacts_do_not_overprint_each_other(braced: Record) -> None:
-    body, _ = posture._body(braced)
-    plane = posture.SidePlane(np.zeros(3), np.array([1.0, 0.0, 0.0]))
-    assert [label.level for label in posture._labels(braced, body, plane, 1000.0)] == [0, 0]
-    close = posture._labels(braced, body, plane, 10.0)
+    body, _ = skeleton.skeleton(braced)
+    plane = skeleton.SidePlane(np.zeros(3), np.array([1.0, 0.0, 0.0]))
+    assert [label.level for label in skeleton.contact_labels(body, plane, 1000.0)] == [0, 0]
+    close = skeleton.contact_labels(body, plane, 10.0)
     assert [label.level for label in close] == [0, 1]
-    low, _ = posture._with_labels((np.zeros(2), np.ones(2)), close, 10.0)
-    assert low[1] < close[1].z - (close[1].offset + posture.LABEL_HEIGHT) / 10.0
+    low, _ = skeleton.with_labels((np.zeros(2), np.ones(2)), close, 10.0)
+    assert low[1] < close[1].z - (close[1].offset + skeleton.LABEL_HEIGHT) / 10.0
 
 
 def test_side_plane_of_an_arm_along_minus_y() -> None:
     record = Record([0.0])
     record.add("hand_position", [[0.0, -2.0, 0.1]], "m", labels=("x", "y", "z"))
     segments = np.array([[[0.0, 0.0, 0.0], [0.0, -1.0, 0.3]], [[0.0, -1.0, 0.3], [0.0, -2.0, 0.1]]])
-    plane = posture._side_plane(record, [segments])
+    plane = skeleton.side_plane(record, [segments])
     np.testing.assert_allclose(plane.project(np.array([0.0, -2.0, 0.1])), [2.0, 0.1], atol=1e-12)
 
 

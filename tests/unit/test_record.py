@@ -40,6 +40,71 @@ def test_wrong_length_and_labels_are_refused(record: Record):
         record.add("x", np.zeros((5, 2)), "m", labels=("only",))
 
 
+def test_signals_on_further_time_axes(record: Record):
+    record.add_axis("camera", [0.05, 0.4, 0.9])
+    record.add("marker", np.arange(6.0).reshape(3, 2), "m", labels=("x", "y"), axis="camera")
+    assert record.times("marker").tolist() == [0.05, 0.4, 0.9]
+    assert record.times("q") is record.time
+    assert (len(record), record["marker"].shape) == (5, (3, 2))
+    with pytest.raises(RecordError, match="signal 'x' has 5 samples, its time axis 'camera' has 3"):
+        record.add("x", np.zeros(5), "m", axis="camera")
+    with pytest.raises(RecordError, match="on time axis 'kamera'; this record has: time, camera"):
+        record.add("x", np.zeros(3), "m", axis="kamera")
+    with pytest.raises(RecordError, match="no signal 'markr'"):
+        record.times("markr")
+    with pytest.raises(RecordError, match="a time axis has that name"):
+        record.add("camera", np.zeros(5), "m")
+
+
+@pytest.mark.parametrize(
+    ("name", "times", "expected"),
+    [
+        ("time", [0.0], "taken"),
+        ("q", [0.0], "taken"),
+        ("a/b", [0.0], "slash"),
+        ("late", [0.0, -1.0], "backwards after sample 0"),
+        ("late", [0.0, np.nan], "not finite"),
+        ("late", [[0.0]], "shape"),
+    ],
+)
+def test_a_time_axis_that_is_none_is_refused(record: Record, name: str, times: list, expected: str):
+    with pytest.raises(RecordError, match=expected):
+        record.add_axis(name, times)
+    assert record.axes == {}
+
+
+def test_events_are_in_the_order_of_their_times(record: Record):
+    for time, name in ((0.5, "b"), (0.1, "a"), (0.5, "c")):
+        record.add_event(time, "contact opens", name, value=np.float64(2.0))
+    assert [(event.time, event.name, event.value) for event in record.events] == [
+        (0.1, "a", 2.0),
+        (0.5, "b", 2.0),
+        (0.5, "c", 2.0),
+    ]
+    assert "3 events" in repr(record)
+    with pytest.raises(RecordError, match="event 'x' at nan s"):
+        record.add_event(np.nan, "x")
+
+
+def test_tables_take_one_time_axis_and_data_sets_all(record: Record):
+    pytest.importorskip("pandas")
+    pytest.importorskip("xarray")
+    record.add_axis("camera", [0.05, 0.4])
+    record.add("marker", np.arange(8.0).reshape(2, 1, 4), "1", labels=("m",), axis="camera")
+    frame = record.to_dataframe()
+    assert list(frame.columns[:2]) == ["q.a", "q.b"]
+    assert not [name for name in frame.columns if name.startswith("marker")]
+    frame = record.to_dataframe("camera")
+    assert list(frame.columns) == ["marker.m.w", "marker.m.x", "marker.m.y", "marker.m.z"]
+    assert (frame.index.name, frame.index.tolist()) == ("camera [s]", [0.05, 0.4])
+    with pytest.raises(RecordError, match="no time axis 'kamera'; this record has: time, camera"):
+        record.to_dataframe("kamera")
+    dataset = record.to_xarray()
+    assert dataset["marker"].dims == ("camera", "marker_label", "axis_4")
+    assert dataset["camera"].values.tolist() == [0.05, 0.4]
+    assert dataset["q"].dims == ("time", "q_label")
+
+
 def test_unknown_signal_lists_what_there_is(record: Record):
     with pytest.raises(KeyError) as error:
         record["qq"]

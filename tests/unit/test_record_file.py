@@ -19,9 +19,9 @@ import h5py
 import numpy as np
 import pytest
 
-from dynsim import record_file
 from dynsim.errors import RecordError
-from dynsim.record import Record
+from dynsim.record import Record, reader
+from dynsim.record.scene import Body, Joint, Point, Scene, Shape, Surface
 
 
 def sample() -> Record:
@@ -30,6 +30,33 @@ def sample() -> Record:
     record.add("force", np.arange(30.0).reshape(5, 2, 3), "N", labels=("c", "d"))
     record.add("closed", [True, False, True, True, False], "1")
     record.summary = {"energy": 1.5}
+    return record
+
+
+SCENE = Scene(
+    bodies=(
+        Body("a", -1, Joint("j", "revolute", (0.0, 0.0, 1.0), (0.0, 0.0, 0.1), (1.0, 0.0, 0.0, 0.0), "q", ("a",))),
+        Body(
+            "b",
+            0,
+            Joint("k", "prismatic", (1.0, 0.0, 0.0), (0.0, 0.3, 0.0), (0.6, 0.8, 0.0, 0.0), "q", ("b",), upper=0.5),
+            (Shape("box", (0.1, 0.2, 0.3), colour=(1.0, 0.5, 0.0, 1.0)), Shape("mesh", (1.0, 1.0, 1.0), file="b.stl")),
+        ),
+    ),
+    surfaces=(Surface.of_quadric("floor", np.zeros((3, 3)), [0.0, 0.0, 2.0], 1.0),),
+    points=(Point("hand", "hand", 1, (0.0, 0.0, 0.5)), Point("elbow", "contact", 0, (0.0, 0.0, 0.1), "floor")),
+    fixed=(Shape("cylinder", (0.1, 0.4), (0.0, 0.0, -0.2)),),
+)
+
+
+def told() -> Record:
+    """The sample with all that a record can hold beside signals."""
+    record = sample()
+    record.add_axis("camera", [0.1, 0.2])
+    record.add("marker", np.ones((2, 1, 3)), "m", labels=("m",), axis="camera")
+    record.add_event(0.7, "contact opens", "elbow", value=0.0, description="of its own")
+    record.add_event(0.2, "contact closes", "elbow")
+    record.scene = SCENE
     return record
 
 
@@ -56,6 +83,9 @@ def same(one: Record, other: Record) -> bool:
         np.array_equal(one.time, other.time)
         and sorted(one) == sorted(other)
         and all(np.array_equal(one[name], other[name]) for name in one)
+        and one.axes.keys() == other.axes.keys()
+        and all(np.array_equal(one.times(name), other.times(name)) for name in one)
+        and (one.events, one.scene) == (other.events, other.scene)
         and (one.units, one.labels) == (other.units, other.labels)
         and (one.summary, one.provenance, one.complete) == (other.summary, other.provenance, other.complete)
     )
@@ -64,6 +94,45 @@ def same(one: Record, other: Record) -> bool:
 def test_files_of_version_0_1_are_read(tmp_path: Path):
     (tmp_path / "old.h5").write_bytes(of_version_0_1(sample()))
     assert same(Record.load(tmp_path / "old.h5"), sample())
+
+
+def test_a_file_that_version_0_1_has_written_is_read():
+    record = Record.load(Path(__file__).parents[1] / "data" / "record_0_1.h5")
+    assert record.provenance["dynsim_version"] == "0.1.0"
+    assert (len(record), record["q"][0].tolist(), record.units["q"]) == (41, [pytest.approx(2.0 * np.pi / 3.0)], "rad")
+    assert (record.axes, record.events, record.scene) == ({}, [], None)
+    assert np.array_equal(record.times("q"), record.time)
+
+
+def test_axes_events_and_scene_come_back(tmp_path: Path):
+    again = Record.load(told().save(tmp_path / "record.h5"))
+    assert same(again, told())
+    assert again.times("marker").tolist() == [0.1, 0.2]
+    assert [(event.time, event.kind, event.value) for event in again.events] == [
+        (0.2, "contact closes", None),
+        (0.7, "contact opens", 0.0),
+    ]
+    # As of a file without its last line, which another process reads and hands over.
+    (tmp_path / "bare.h5").write_bytes((tmp_path / "record.h5").read_bytes()[:-80])
+    assert same(Record.load(tmp_path / "bare.h5"), told())
+
+
+@pytest.mark.parametrize("part", ["axes/camera", "events/time", "events/kind", "scene", "signals/marker"])
+def test_a_changed_part_is_found_by_the_checksum_of_the_content(tmp_path: Path, part: str):
+    path = told().save(tmp_path / "record.h5")
+    with h5py.File(path, "r+") as file:
+        value = file[part][()]
+        del file[part]
+        if part == "scene":
+            file[part] = value.decode().replace("elbow", "ankle")
+        elif part == "events/kind":
+            file.create_dataset(part, data=["x", "y"], dtype=h5py.string_dtype())
+        else:
+            one = file.create_dataset(part, data=0.5 * value)
+            for name, text in (("unit", "m"), ("labels", ["m"]), ("description", ""), ("axis", "camera")):
+                one.attrs[name] = text
+    with pytest.raises(RecordError, match="does not agree with its checksum"):
+        reader.decode(path, path)
 
 
 def test_large_signals_are_packed_and_unpacked(tmp_path: Path):
@@ -268,6 +337,44 @@ FOREIGN: list[tuple[Change, str]] = [
 ]
 
 
+TOLD: list[tuple[Change, str]] = [
+    (replaced("axes", 1.0), "group axes is no group"),
+    (replaced("axes/camera", [0.2, 0.1]), "time axis 'camera' runs backwards"),
+    (replaced("axes/camera", [0.1, 0.2, 0.3]), "has 2 samples, its time axis 'camera' has 3"),
+    (replaced("axes/time", [0.1]), "name of the record's own axis"),
+    (removed("axes/camera"), "is on time axis 'camera'; this record has: time"),
+    (attribute("signals/marker", "axis", "moon"), "is on time axis 'moon'; this record has: time, camera"),
+    (attribute("signals/marker", "axis", 3), "no text as axis"),
+    (replaced("events", 1.0), "group events is no group"),
+    (removed("events/kind"), "lacks parts: no kind of the events"),
+    (replaced("events/time", [0.1]), "kind of the events has 2 entries, their times 1"),
+    (replaced("events/time", [0.1, np.nan]), "time of the events is not finite"),
+    (replaced("events/name", [1.0, 2.0]), "events has name that are no texts"),
+    (replaced("events/value", ["x", "y"]), "not real numbers"),
+    (replaced("scene", 1.0), "scene is not a text"),
+    (replaced("scene", "{"), "scene: Invalid JSON"),
+    (replaced("scene", "[]"), "scene: Input should be an object"),
+    (replaced("scene", "[" * 100_000), "scene: Invalid JSON"),
+    (replaced("scene", '{"points": [{"name": "p", "role": "hand", "body": 0, "position": [0, 0, 0]}]}'), "on body 0"),
+    (replaced("scene", '{"points": [{"name": "p", "role": "x", "body": -1, "position": [0, 0, 0]}]}'), "points.0.role"),
+    (replaced("scene", '{"points": [{"name": "p", "role": "hand", "body": -1, "position": [0, 1]}]}'), "position.2"),
+    (replaced("scene", '{"fixed": [{"kind": "box", "size": [1, 2]}]}'), "a box has 3 numbers as its size, not 2"),
+    (replaced("scene", '{"fixed": [{"kind": "sphere", "size": [NaN]}]}'), "finite number"),
+    (replaced("scene", '{"fixed": [{"kind": "sphere", "size": [1e999]}]}'), "finite number"),
+]
+
+
+@pytest.mark.parametrize(("change", "expected"), TOLD, ids=itertools.count())
+def test_axes_events_and_scenes_that_are_none_are_refused(tmp_path: Path, change: Change, expected: str):
+    path = told().save(tmp_path / "record.h5")
+    with h5py.File(path, "r+") as file:
+        change(file, tmp_path)
+    with pytest.raises(RecordError, match=expected) as error:
+        reader.decode(path, path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
+
+
 def foreign(change: Change, folder: Path) -> Path:
     """A file of version 0.1 that somebody has changed."""
     path = folder / "foreign.h5"
@@ -281,7 +388,7 @@ def foreign(change: Change, folder: Path) -> Path:
 def test_a_file_that_is_no_record_is_refused_with_the_reason(tmp_path: Path, change: Change, expected: str):
     path = foreign(change, tmp_path)
     with pytest.raises(RecordError, match=expected) as error:
-        record_file.decode(path, path)
+        reader.decode(path, path)
     assert str(error.value).startswith(f"{path}: ")
     assert "\n" not in str(error.value)
 
@@ -342,15 +449,15 @@ def mangled(whole: bytes, seed: int) -> bytes:
     return bytes(data)
 
 
-def load_all(folder: Path, contents: list[bytes]) -> list[str]:
-    """Load files in a child; gives "same", "refused" or what else came of it, for each."""
+def load_all(folder: Path, contents: list[bytes], written: str = "told") -> list[str]:
+    """Load files in a child; gives "same" (as ``written()``), "refused" or what else came of it, for each."""
     for number, content in enumerate(contents):
         (folder / f"{number}.h5").write_bytes(content)
     code = (
         "import sys; from dynsim.record import Record; from dynsim.errors import RecordError\n"
-        "sys.path.insert(0, sys.argv[1]); from test_record_file import same, sample\n"
+        f"sys.path.insert(0, sys.argv[1]); from test_record_file import same, {written}\n"
         "for number in range(int(sys.argv[2])):\n"
-        "    try: print('same' if same(Record.load(f'{number}.h5'), sample()) else 'other', flush=True)\n"
+        f"    try: print('same' if same(Record.load(f'{{number}}.h5'), {written}()) else 'other', flush=True)\n"
         "    except RecordError as error:\n"
         "        print('refused' if str(error).startswith(f'{number}.h5: ') else repr(error), flush=True)\n"
         "    except BaseException as error: print(repr(error), flush=True)\n"
@@ -362,7 +469,7 @@ def load_all(folder: Path, contents: list[bytes]) -> list[str]:
 
 
 def test_damage_is_found_or_does_no_harm(tmp_path: Path):
-    whole = bytes(sample().to_hdf5())
+    whole = bytes(told().to_hdf5())
     # The rest is read in a process each, which takes its time.
     contents = [flipped(whole[:-80], seed) + whole[-80:] for seed in range(400)]
     contents += [whole[:-80] + flipped(whole[-80:], seed) for seed in range(3)]
@@ -378,7 +485,7 @@ def test_damage_is_found_or_does_no_harm(tmp_path: Path):
 def test_damage_of_files_without_checksum_crashes_nothing(tmp_path: Path):
     whole = of_version_0_1(sample())
     contents = [flipped(whole, seed) for seed in range(300)]
-    found = load_all(tmp_path, contents)
+    found = load_all(tmp_path, contents, "sample")
     assert len(found) == len(contents)
     # Without a checksum, damaged numbers are numbers.
     assert set(found) == {"same", "refused", "other"}
@@ -401,6 +508,6 @@ def test_a_reader_that_dies_is_a_damaged_file(
     (tmp_path / "python").write_text(f"#!/bin/sh\n{script}\n")
     (tmp_path / "python").chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
-    monkeypatch.setattr(record_file, "READING_TIME", 0.1 if "sleep" in script else 10.0)
+    monkeypatch.setattr(reader, "READING_TIME", 0.1 if "sleep" in script else 10.0)
     with pytest.raises(RecordError, match=f"^{tmp_path}/old.h5: {expected}"):
         Record.load(tmp_path / "old.h5")

@@ -8,10 +8,12 @@ import pytest
 from PIL import Image
 
 from dynsim.engine import simulate
+from dynsim.errors import RecordError
 from dynsim.figures import snake as figures
 from dynsim.figures import tanaka2019
 from dynsim.record import Record
 from dynsim.scenario import load_scenario
+from dynsim.snake_geometry import snake_geometry
 from dynsim.studies.published.tanaka2019 import TABLE_III, table_iii, tables
 
 
@@ -31,6 +33,33 @@ def test_draw_writes_every_figure_from_a_record_on_disk(record, tmp_path, monkey
             assert len(np.unique(np.asarray(image.convert("L")))) > 10
     with Image.open(written[-1]) as animation:
         assert animation.n_frames == 4
+
+
+OLD = {"head_joints": 6, "base_joints": 6, "wheel_radius_m": 0.05, "driven_side": [1, -1, 1, -1, 1, -1, 1]}
+
+
+def test_geometry_of_the_scene_is_that_of_records_of_version_0_1(record):
+    geometry = snake_geometry(record)
+    old = Record(record.time, provenance={"snake": OLD | {
+        "pitch": [False, True] * 3 + [False] * 6,
+        "lower_rad": [-np.deg2rad(65), -np.deg2rad(113)] * 3 + [-np.deg2rad(65)] * 6,
+        "upper_rad": [np.deg2rad(65), np.deg2rad(113)] * 3 + [np.deg2rad(65)] * 6,
+        "half_track_m": [0.075, 0.06, 0.075, 0.06, 0.075, 0.06, 0.06],
+    }})  # fmt: skip
+    expected = snake_geometry(old)
+    assert (geometry.head_joints, geometry.wheel_radius) == (expected.head_joints, expected.wheel_radius) == (6, 0.05)
+    for name in ("pitch", "lower", "upper", "half_track"):
+        np.testing.assert_allclose(getattr(geometry, name), getattr(expected, name), atol=1e-15)
+    with pytest.raises(RecordError, match="'snake'"):
+        snake_geometry(Record(record.time))
+
+
+def test_figures_as_svg(record, tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "FRAMES", 2)
+    written = figures.draw(record, tmp_path, "svg")
+    assert [path.name for path in written[:2]] == ["postures.svg", "overview.svg"]
+    assert written[-1].name == "animation.gif"
+    assert all(path.read_bytes().startswith(b"<?xml") for path in written[:-1])
 
 
 def test_comparison(record, tmp_path):

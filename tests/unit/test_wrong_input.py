@@ -197,14 +197,26 @@ def test_a_record_that_lacks_a_signal_is_drawn_without_or_refused(scenario: str,
         except RecordError as error:
             outcomes.add(repr(name) in str(error) and "refused")
     assert outcomes == {True, "refused"}
-    engine = record.provenance["engine"]
-    for odd in ({}, {"engine": ["?"]}, {"engine": engine, "scenario": "x", "snake": []}):
+    # Who made it does not count.
+    for odd in ({}, {"engine": ["?"], "robot": "x"}):
         other = copy.copy(record)
         other.provenance = odd
+        assert figures.draw(other, tmp_path)
+        assert figures.draw_comparison({"a": other}, tmp_path)
+
+
+def test_odd_provenance_of_records_is_one_error(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(style, "save", lambda figure, path: path)
+    record = dynsim.simulate(load_scenario("single_pendulum", overrides={"duration_s": 0.2, "metrics.settle_s": 0.0}))
+    record.provenance = {"scenario": "x"}
+    with pytest.raises(RecordError, match="the record cannot be drawn"):
+        figures.draw(record, tmp_path)
+    snake = dynsim.simulate(load_scenario("snake_circle", overrides={"duration_s": 0.2, "record.rate_hz": 50}))
+    snake.scene = None
+    for odd in ({}, {"snake": []}, {"snake": {"head_joints": 6}}):
+        snake.provenance = odd
         with pytest.raises(RecordError):
-            figures.draw(other, tmp_path)
-        with pytest.raises(RecordError):
-            figures.draw_comparison({"a": other}, tmp_path)
+            figures.draw(snake, tmp_path)
 
 
 def test_plot_names_the_record_that_lacks_something(tmp_path: Path, monkeypatch, capfd) -> None:

@@ -17,6 +17,7 @@ from dynsim.hardware.errors import CheckRefused
 from dynsim.hardware.replay.trajectory import Path, column_of, path_of_record
 from dynsim.hardware.servo_map import Servo, ServoMap
 from dynsim.record import Record
+from dynsim.record.scene import Scene
 
 BITS_PER_BYTE = 10
 TURNAROUND = 50e-6
@@ -98,6 +99,8 @@ class CheckedMotion:
     margins : tuple of Margin
         Tightest place per joint and limit.
     warnings : tuple of str
+    scene : Scene or None
+        What the record says of the robot's looks; the measured record takes it over.
     """
 
     path: Path
@@ -105,6 +108,7 @@ class CheckedMotion:
     plan: CyclePlan
     margins: tuple[Margin, ...]
     warnings: tuple[str, ...]
+    scene: Scene | None = None
 
 
 def check_motion(
@@ -139,7 +143,7 @@ def check_motion(
             lines.append(f"  --speed {math.floor(100 * slower) / 100:g} would pass")
         raise CheckRefused("\n".join(lines))
     warnings = [] if record.complete else ["the record is marked incomplete: it ends before its scenario does"]
-    return CheckedMotion(path, speed, plan, tuple(margins), tuple(warnings))
+    return CheckedMotion(path, speed, plan, tuple(margins), tuple(warnings), record.scene)
 
 
 def plan_cycle(servo_map: ServoMap, rate: float) -> CyclePlan:

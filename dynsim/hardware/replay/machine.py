@@ -23,6 +23,7 @@ from dynsim.hardware.replay.check import CheckedMotion, velocity_limit
 from dynsim.hardware.replay.ending import Ending
 from dynsim.hardware.replay.journal import Journal
 from dynsim.hardware.replay.loop import FIELDS, Loop
+from dynsim.hardware.replay.measured import describe
 from dynsim.hardware.replay.motion import Approach
 from dynsim.hardware.replay.rules import Cause, Fault
 from dynsim.hardware.replay.run_log import Recorder, RunLog
@@ -260,12 +261,14 @@ class Replay:
             held = self.map.safety.at_end == "hold"
             result.end_state = "not armed" if not self.live else "holding" if held else "off"
         started = self.loop.path_started if self.loop.path_started is not None else self.loop.origin
-        result.record = self._recorder.record(started, self._provenance)
+        result.record = describe(self._recorder.record(started, self._provenance), self.motion.scene, State)
         result.record.complete = result.fault is None
         result.timing = self._recorder.timing()
         summary: dict[str, Any] = {"end_state": result.end_state}
         if result.fault is not None:
-            summary |= {"fault": result.fault.cause.value, "fault_text": result.fault.text}
+            fault = result.fault
+            result.record.add_event(result.fault_time - started, "fault", fault.cause.value, description=fault.text)
+            summary |= {"fault": fault.cause.value, "fault_text": fault.text}
         result.record.summary |= summary
         if result.timing:
             timing = ", ".join(f"{name} {value:.6g}" for name, value in result.timing.as_dict().items())

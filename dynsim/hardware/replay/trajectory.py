@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dynsim.hardware.errors import CheckRefused
 from dynsim.hardware.servo_map import Servo, ServoMap
-from dynsim.record import Record
+from dynsim.record import TIME, Record
 
 REST = 1e-6
 """Joint speed [rad/s] below which a record counts as at rest."""
@@ -148,6 +148,10 @@ def column_of(record: Record, signal: str, servo: Servo, unit: str) -> NDArray[n
     if record[signal].ndim != 2:
         raise CheckRefused(
             f"signal {signal!r} must have one column for each joint, not the shape {record[signal].shape}"
+        )
+    if record.signals[signal].axis != TIME:
+        raise CheckRefused(
+            f"signal {signal!r} is on time axis {record.signals[signal].axis!r}, not on the record's own"
         )
     data = np.asarray(record[signal][:, labels.index(servo.label)], dtype=np.float64)
     if not np.all(np.isfinite(data)):

@@ -11,12 +11,14 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dynsim.record.scene import JointKind
 
 if TYPE_CHECKING:
     from dynsim.model.description import Link
@@ -37,6 +39,7 @@ class Row:
     neutral : coordinates of the whole joint where its frames coincide; of its later rows empty
     names : of these coordinates, where there are several
     offset : where the row's own coordinates begin among those of the joint
+    drawn : kind of joint, in the scene of a record, that moves the row's body as this row does
     motion : (link, coordinates (k, T)) → rotation (3, 3, T) and origin (3, T) of the body in the joint's frame
     """
 
@@ -45,6 +48,7 @@ class Row:
     neutral: tuple[float, ...] = (0.0,)
     names: tuple[str, ...] = ()
     offset: int = 0
+    drawn: JointKind = field(kw_only=True)
     motion: Callable[[Link, Array], tuple[Array, Array]] | None = None
 
 

@@ -49,9 +49,11 @@ def quaternion(R: Array) -> Array:
 
 
 ROWS = {
-    "ball_x": Row(BALL_X, ("1", *ANGLE[1:]), (1.0, 0.0, 0.0, 0.0), ("qw", "qx", "qy", "qz"), motion=motion),
-    "ball_y": Row(BALL_Y, ("1", *ANGLE[1:]), (), offset=2),
-    "ball_z": Row(BALL_Z, ("1", *ANGLE[1:]), (), offset=3),
+    "ball_x": Row(
+        BALL_X, ("1", *ANGLE[1:]), (1.0, 0.0, 0.0, 0.0), ("qw", "qx", "qy", "qz"), drawn="ball", motion=motion
+    ),
+    "ball_y": Row(BALL_Y, ("1", *ANGLE[1:]), (), offset=2, drawn="fixed"),
+    "ball_z": Row(BALL_Z, ("1", *ANGLE[1:]), (), offset=3, drawn="fixed"),
 }
 
 
@@ -73,6 +75,6 @@ def floating(link: Link) -> tuple[Link, ...]:
     """
     from dynsim.model.description import Inertia, in_rows
 
-    carrier = replace(link, name=f"{link.name}.position", inertia=Inertia(0.0), radius=0.0, tip=None)
+    carrier = replace(link, name=f"{link.name}.position", inertia=Inertia(0.0), radius=0.0, tip=None, shapes=())
     sliding = in_rows(carrier, [(axis, "prismatic", np.eye(3)[k]) for k, axis in enumerate("xyz")])
     return (*sliding, *ball(replace(link, parent=carrier.name, R_PJ=np.eye(3), p_PJ=np.zeros(3))))

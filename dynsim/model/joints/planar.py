@@ -19,8 +19,8 @@ def motion(link: Link, q: Array) -> tuple[Array, Array]:
 
 
 ROWS = {
-    "roll": Row(ROLL, DISTANCE, (0.0, 0.0, 0.0), ("x", "y", "heading"), motion=motion),
-    "turn": Row(TURN, ANGLE, (), offset=2),
+    "roll": Row(ROLL, DISTANCE, (0.0, 0.0, 0.0), ("x", "y", "heading"), drawn="planar", motion=motion),
+    "turn": Row(TURN, ANGLE, (), offset=2, drawn="fixed"),
 }
 
 

@@ -16,4 +16,4 @@ def motion(link: Link, q: Array) -> tuple[Array, Array]:
     return unturned(q.shape[1]), link.axis[:, None] * q[0]
 
 
-ROWS = {"prismatic": Row(PRISMATIC, DISTANCE, motion=motion)}
+ROWS = {"prismatic": Row(PRISMATIC, DISTANCE, drawn="prismatic", motion=motion)}

@@ -18,4 +18,4 @@ def motion(link: Link, q: Array) -> tuple[Array, Array]:
     return turned(link.axis, q[0]), np.zeros((3, q.shape[1]))
 
 
-ROWS = {"revolute": Row(REVOLUTE, ANGLE, motion=motion)}
+ROWS = {"revolute": Row(REVOLUTE, ANGLE, drawn="revolute", motion=motion)}

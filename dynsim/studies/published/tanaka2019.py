@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.record import Record
+from dynsim.snake_geometry import snake_geometry
 
 Table = list[list[str]]  # head line first
 
@@ -98,7 +99,7 @@ HEAD_ERROR = (0.030, 0.1)  # [m], [rad]
 
 def base_joints(record: Record) -> np.ndarray:
     """Joint angles of the base part, (T, n_b) [rad]."""
-    return record["phi"][:, record.provenance["snake"]["head_joints"] :]
+    return record["phi"][:, snake_geometry(record).head_joints :]
 
 
 def mode_sequence(record: Record) -> list[tuple[float, int]]:
@@ -110,9 +111,9 @@ def mode_sequence(record: Record) -> list[tuple[float, int]]:
 
 def used_limit(record: Record) -> np.ndarray:
     """Largest yaw angle of each sample in parts of its limit, (T,); pitch is mostly set by the shape point."""
-    geometry = record.provenance["snake"]
-    yaw = ~np.array(geometry["pitch"])
-    return np.abs(record["phi"][:, yaw] / np.array(geometry["upper_rad"])[yaw]).max(axis=1)
+    geometry = snake_geometry(record)
+    yaw = ~geometry.pitch
+    return np.asarray(np.abs(record["phi"][:, yaw] / geometry.upper[yaw]).max(axis=1))
 
 
 def _largest_base_angle(record: Record) -> str:
@@ -132,11 +133,10 @@ def _straightening(record: Record) -> str:
 
 
 def _same_wheels(record: Record) -> str:
-    lifted = record.provenance["snake"]["lifted"]
     shown = {
         (int(m), tuple(np.flatnonzero(g == 0) + 1)) for m, g in zip(record["mode"], record["grounded"], strict=True)
     }
-    return "; ".join(f"mode {m}: {', '.join(map(str, pairs))}" for m, pairs in sorted(shown) if lifted[str(m)])
+    return "; ".join(f"mode {m}: {', '.join(map(str, pairs))}" for m, pairs in sorted(shown) if pairs)
 
 
 def _cost(record: Record) -> str:

@@ -33,6 +33,9 @@ def make_records(folder: Path) -> None:
         record.summary = {
             key: item for key, item in record.summary.items() if "wall" not in key and key != "real_time_factor"
         }
+        record.add_axis("camera", [0.0, 0.02, 0.04])
+        record.add("marker", np.ones((3, 1, 3)), "m", labels=("m",), axis="camera")
+        record.add_event(0.01, "contact opens", "elbow", value=1.0)
         record.save(folder / f"{name}.h5")
 
 
@@ -95,11 +98,19 @@ def read(record: Any) -> None:
     len(record), repr(record), record.units, record.labels, bool(record.complete)
     record.summary.get("variant"), record.summary.get("warnings"), record.provenance.get("scenario")
     json.dumps([record.summary, record.provenance], default=str)
+    for event in record.events:
+        f"{event.time:g} {event.kind} {event.name} {event.value} {event.description}"
+    if record.scene is not None:
+        (
+            record.scene.to_json(),
+            record.scene.hand,
+            [record.scene.surface(point.surface) for point in record.scene.points],
+        )
     for name in record:
         signal = record.signals[name]
         np.isfinite(signal.data).all(), signal.data[:1].sum(), f"{signal.unit} {signal.description}"
-        if record[name].shape[:1] != record.time.shape:
-            raise AssertionError(f"signal {name!r} has {record[name].shape} samples, the time {record.time.shape}")
+        if record[name].shape[:1] != record.times(name).shape:
+            raise AssertionError(f"signal {name!r} has {record[name].shape} samples, not {record.times(name).shape}")
         if signal.labels and [name for name in signal.labels if not isinstance(name, str)]:
             raise AssertionError(f"signal {name!r} has labels that are no texts: {signal.labels}")
         for column, _ in enumerate(signal.labels):
@@ -110,7 +121,7 @@ def _mutate(rng: Random, file: h5py.File) -> str:
     """Break one object of the file; the answer says how."""
     names: list[str] = []
     file.visit(names.append)
-    path = rng.choice([*names, "time", "signals", "summary", "provenance", "signals/q"])
+    path = rng.choice([*names, "time", "signals", "summary", "provenance", "scene", "events", "axes", "signals/q"])
     if path not in file:
         return f"{path} is gone already"
     ways: dict[str, Callable[[], Any]] = {
@@ -154,6 +165,9 @@ def _mutate(rng: Random, file: h5py.File) -> str:
                     '{"variant": "\\u001b[31m"}',
                     '{"contacts": 1}',
                     '{"warnings": 1}',
+                    '{"bodies": []}',
+                    '{"bodies": [{"name": "b", "parent": 5}]}',
+                    '{"fixed": [{"kind": "box", "size": [1, 1]}]}',
                 )
             ),
         ),

@@ -1,31 +1,30 @@
-"""Columnar signals over time, with units and provenance; HDF5 in and out.
+"""Columnar signals over time, events, the scene, with units and provenance; HDF5 in and out.
 
 A record knows nothing of the engine that made it: simulated and measured runs look the same.
 """
 
 from __future__ import annotations
 
+import bisect
 import difflib
-import importlib
-import json
+import math
 import os
-from collections.abc import Iterator, KeysView, Mapping, Sequence
+from collections.abc import Iterator, KeysView, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dynsim import record_file
 from dynsim.errors import MissingEntry, RecordError, shown
 from dynsim.files import replacing
-from dynsim.record_file import FORMAT, Signal
+from dynsim.record import export, reader, writer
+from dynsim.record.content import TIME, Content, Event, Signal, check_name, check_signal, check_time
+from dynsim.record.scene import Scene
 
 if TYPE_CHECKING:
     import pandas
     import xarray
-
-__all__ = ["FORMAT", "Record", "Signal"]
 
 # Signals named in the repr.
 _SHOWN = 6
@@ -43,9 +42,12 @@ class Entries(dict[str, Any]):
 
 
 class Record:
-    """Signals of one run on one time axis.
+    """Signals of one run, what happened in it, and what it looked like.
 
-    ``record["q"]`` is the array, ``record.units["q"]`` its unit, ``record.labels["q"]`` its column names.
+    ``record["q"]`` is the array, ``record.units["q"]`` its unit, ``record.labels["q"]`` its column names,
+    ``record.times("q")`` its instants: those of ``time``, or of one of the further time axes ``axes``. ``events`` are
+    in the order of their times; ``scene`` (None: not known) is what figures and viewers draw.
+
     ``summary`` holds the numbers of ``summary.json``; ``provenance`` says what made the record (resolved scenario,
     version, commit, libraries). ``complete`` is False when the run was interrupted or stopped.
     """
@@ -56,27 +58,87 @@ class Record:
         self.summary = {}
         self.provenance = provenance or {}
         self.complete = True
+        self.axes: dict[str, NDArray[np.float64]] = {}
+        self.events: list[Event] = []
+        self.scene: Scene | None = None
 
     def add(
-        self, name: str, data: ArrayLike, unit: str, *, labels: tuple[str, ...] = (), description: str = ""
+        self,
+        name: str,
+        data: ArrayLike,
+        unit: str,
+        *,
+        labels: tuple[str, ...] = (),
+        description: str = "",
+        axis: str = TIME,
     ) -> None:
         """Add a signal; its first axis is time, its second (if any) is named by ``labels``.
+
+        ``axis`` is the name of its time axis: that of the record, or one that :meth:`add_axis` has added.
 
         Raises
         ------
         RecordError
-            No real numbers, another number of samples than the record has, or of labels than columns.
+            No real numbers, no such time axis, another number of samples than that has, or of labels than columns.
         """
-        signal = Signal(np.asarray(data), unit, tuple(labels), description)
-        record_file.check_signal(name, signal, len(self.time))
+        if name in self.axes:
+            raise RecordError(f"signal {name!r}: a time axis has that name")
+        signal = Signal(np.asarray(data), unit, tuple(labels), description, axis)
+        samples = {TIME: len(self.time), **{one: len(times) for one, times in self.axes.items()}}
+        check_signal(name, signal, samples)
         self.signals[name] = signal
 
+    def add_axis(self, name: str, times: ArrayLike) -> None:
+        """Add a further time axis [s], for signals that have instants of their own.
+
+        Raises
+        ------
+        RecordError
+            The name is taken, or the times are not finite or run backwards.
+        """
+        check_name("time axis", name)
+        if name == TIME or name in self.axes or name in self.signals:
+            raise RecordError(f"the name {name!r} is taken by another time axis or by a signal")
+        axis = np.asarray(times, dtype=np.float64)
+        check_time(axis, f"time axis {name!r}")
+        self.axes[name] = axis
+
+    def times(self, name: str) -> NDArray[np.float64]:
+        """Instants of a signal's samples, (T,) [s].
+
+        Raises
+        ------
+        MissingEntry
+            No such signal.
+        """
+        axis = self._signal(name).axis
+        return self.time if axis == TIME else self.axes[axis]
+
+    def add_event(
+        self, time: float, kind: str, name: str = "", *, value: float | None = None, description: str = ""
+    ) -> None:
+        """Add what happened at an instant [s], see :class:`Event`; events stay in the order of their times.
+
+        Raises
+        ------
+        RecordError
+            The time is not finite.
+        """
+        if not math.isfinite(time):
+            raise RecordError(f"event {kind!r} at {time} s: the time must be finite")
+        number = None if value is None or math.isnan(value) else float(value)
+        event = Event(float(time), kind, name, number, description)
+        bisect.insort(self.events, event, key=lambda one: one.time)
+
     def __getitem__(self, name: str) -> NDArray[Any]:
+        return self._signal(name).data
+
+    def _signal(self, name: str) -> Signal:
         if not isinstance(name, str) or name not in self.signals:
             near = difflib.get_close_matches(str(name), self.signals, 1)
             hint = f" (did you mean {near[0]!r}?)" if near else ""
             raise MissingEntry(f"no signal {shown(name)}{hint}; this record has: {', '.join(self.signals) or 'none'}")
-        return self.signals[name].data
+        return self.signals[name]
 
     def __repr__(self) -> str:
         scenario = self.provenance.get("scenario")
@@ -85,6 +147,7 @@ class Record:
         span = f", {self.time[0]:g} to {self.time[-1]:g} s" if len(self) else ""
         first = ", ".join(list(self.signals)[:_SHOWN]) + (", …" if len(self.signals) > _SHOWN else "")
         parts = [f"{len(self)} samples{span}", f"{len(self.signals)} signals{f' ({first})' if first else ''}"]
+        parts += [f"{len(self.events)} event{'s' if len(self.events) > 1 else ''}"] if self.events else []
         parts += [] if self.complete else ["incomplete"]
         return f"<Record {f'{title}: ' if title else ''}{', '.join(parts)}>"
 
@@ -146,13 +209,22 @@ class Record:
 
     def to_hdf5(self) -> memoryview:
         """The bytes of the file that :meth:`save` writes."""
-        return record_file.encode(
-            record_file.Content(self.time, self.signals, self.summary, self.provenance, self.complete)
+        return writer.encode(
+            Content(
+                time=self.time,
+                signals=self.signals,
+                summary=self.summary,
+                provenance=self.provenance,
+                complete=self.complete,
+                axes=self.axes,
+                events=self.events,
+                scene=self.scene,
+            )
         )
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Record:
-        """Read a record written by :meth:`save`. What lies in the file is checked, not believed.
+        """Read a record written by :meth:`save`, or by dynsim 0.1. What lies in the file is checked, not believed.
 
         Raises
         ------
@@ -160,89 +232,23 @@ class Record:
             No such file, damaged, or not a dynsim record; or it lies beside the file ``INCOMPLETE`` of a run that died
             while it was saved. The message has the file and the reason.
         """
-        content = record_file.read(Path(path))
+        content = reader.read(Path(path))
         record = cls(content.time, provenance=content.provenance)
         record.signals.update(content.signals)
         record.summary.update(content.summary)
         record.complete = content.complete
+        record.axes.update(content.axes)
+        record.events.extend(content.events)
+        record.scene = content.scene
         return record
 
-    def to_dataframe(self) -> pandas.DataFrame:
-        """A pandas DataFrame: time [s] is the index, every column of every signal a column.
-
-        Columns are called ``signal``, ``signal.label`` or, of vectors, ``signal.label.x``; their units are in
-        ``attrs["units"]``.
-
-        Raises
-        ------
-        RecordError
-            pandas is not installed.
-        """
-        pandas = _optional("pandas")
-        columns, names, units = [], [], {}
-        for name, signal in self.signals.items():
-            for column in np.ndindex(signal.data.shape[1:]):
-                parts = [name]
-                if column:
-                    parts.append(signal.labels[column[0]])
-                    parts += [_axes(signal.data.shape[2])[k] for k in column[1:]]
-                names.append(".".join(parts))
-                columns.append(signal.data[:, *column])
-                units[names[-1]] = signal.unit
-        frame = (
-            pandas.concat([pandas.Series(column) for column in columns], axis=1, keys=names)
-            if columns
-            else pandas.DataFrame(index=range(len(self)))
-        )
-        frame.index = pandas.Index(self.time, name="time [s]")
-        frame.attrs["units"] = units
-        return frame
+    def to_dataframe(self, axis: str = TIME) -> pandas.DataFrame:
+        """A pandas DataFrame of the signals on one time axis, see :func:`dynsim.record.export.to_dataframe`."""
+        return export.to_dataframe(self, axis)
 
     def to_xarray(self) -> xarray.Dataset:
-        """An xarray Dataset: signals over ``time``, with ``units`` and ``long_name`` as attributes.
-
-        Signals with the same labels share a dimension, which is called after the first of them (``q_label``); the third
-        axis of vectors is ``axis`` (x, y, z). Summary and provenance are attributes, as JSON.
-
-        Raises
-        ------
-        RecordError
-            xarray is not installed.
-        """
-        xarray = _optional("xarray")
-        dimensions: dict[tuple[str, ...], str] = {}
-        coordinates: dict[str, Any] = {"time": ("time", self.time, {"units": "s"})}
-        variables = {}
-        for name, signal in self.signals.items():
-            axes = ["time"]
-            if signal.data.ndim > 1:
-                label = dimensions.setdefault(signal.labels, f"{name}_label")
-                coordinates[label] = list(signal.labels)
-                axes.append(label)
-            if signal.data.ndim > 2:
-                count = signal.data.shape[2]
-                axis = "axis" if count == 3 else f"axis_{count}"
-                coordinates[axis] = list(_axes(count))
-                axes.append(axis)
-            variables[name] = (axes, signal.data, {"units": signal.unit, "long_name": signal.description})
-        attributes = {
-            "complete": int(self.complete),
-            "summary": json.dumps(self.summary),
-            "provenance": json.dumps(self.provenance, default=str),
-        }
-        return xarray.Dataset(variables, coordinates, attributes)
-
-
-def _axes(count: int) -> Sequence[str]:
-    """Names of the components of a vector."""
-    return "xyz" if count == 3 else [str(k) for k in range(count)]
-
-
-def _optional(package: str) -> Any:
-    try:
-        return importlib.import_module(package)
-    except ImportError as error:
-        raise RecordError(f"{package} is not installed: pip install {package}") from error
+        """An xarray Dataset of all signals, see :func:`dynsim.record.export.to_xarray`."""
+        return export.to_xarray(self)
 
 
 def _entries(what: str, entries: Mapping[str, Any]) -> Entries:

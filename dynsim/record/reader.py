@@ -1,4 +1,4 @@
-"""Records as HDF5 files: written with checksums, read as if they came from an enemy.
+"""Records as HDF5 files, the reading half: read as if they came from an enemy.
 
 A file is HDF5 and, after its end, one line with the SHA-256 of all bytes before it. HDF5 ignores the line; with it,
 damage is found before the HDF5 library, which may crash or never return on a damaged file, has seen it. A file without
@@ -18,8 +18,7 @@ import re
 import signal
 import sys
 import zlib
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -29,8 +28,21 @@ from numpy.typing import NDArray
 from dynsim.errors import RecordError
 from dynsim.files import check_complete
 from dynsim.inputs import is_file
+from dynsim.record.content import (
+    FORMAT,
+    OLDER,
+    TIME,
+    Content,
+    Event,
+    Signal,
+    check_signal,
+    check_time,
+    checksum,
+    is_numeric,
+)
+from dynsim.record.scene import Scene
+from dynsim.record.writer import CHECKSUM, EVENT_COLUMNS, encode
 
-FORMAT = "dynsim-record-1"
 SIZE_LIMIT = 2 << 30
 """A file may unpack to this many bytes, or to ``RATIO_LIMIT`` times its own size if that is more."""
 RATIO_LIMIT = 100
@@ -38,136 +50,9 @@ READING_TIME = 10.0
 """Of the process that reads a file without a checksum, and as much again for every 50 MB [s of processor time]."""
 _PATIENCE = 6.0
 """Wall time that it gets, in times of its processor time: the machine may be busy."""
-_LABELS_IN_ATTRIBUTE = 1000
-"""More labels are a data set: HDF5 attributes end at 64 kB, which is 4090 labels."""
-_CHECKSUM = "sha256"
 _LAST_LINE = re.compile(rb"\ndynsim-sha256:([0-9a-f]{64})\n")
 _LAST_LINE_SIZE = 80
 _CHUNK_LIMIT = 64 << 20
-_NUMBERS = "biuf"
-
-
-@dataclass(frozen=True)
-class Signal:
-    """One quantity over time.
-
-    Attributes
-    ----------
-    data : array, shape (T,) or (T, k) or (T, k, 3)
-    unit : str
-        SI unit as text, "1" for pure numbers.
-    labels : tuple of str
-        Names of the k columns, empty for a scalar signal.
-    description : str
-    """
-
-    data: NDArray[Any]
-    unit: str
-    labels: tuple[str, ...] = ()
-    description: str = ""
-
-
-@dataclass(frozen=True)
-class Content:
-    """All that a file holds."""
-
-    time: NDArray[np.float64]
-    signals: Mapping[str, Signal] = field(default_factory=dict)
-    summary: Mapping[str, Any] = field(default_factory=dict)
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-    complete: bool = True
-
-
-def check_time(time: NDArray[Any]) -> None:
-    """Refuse a time axis that is none.
-
-    Raises
-    ------
-    RecordError
-        Not one-dimensional, not finite, or running backwards.
-    """
-    if time.ndim != 1:
-        raise RecordError(f"time has the shape {time.shape}; it must have one axis")
-    if not np.isfinite(time).all():
-        raise RecordError(f"time is not finite at sample {int(np.flatnonzero(~np.isfinite(time))[0])}")
-    if (backwards := np.flatnonzero(np.diff(time) < 0.0)).size:
-        raise RecordError(f"time runs backwards after sample {int(backwards[0])}")
-
-
-def check_signal(name: str, signal: Signal, samples: int) -> None:
-    """Refuse a signal that no record can hold.
-
-    Raises
-    ------
-    RecordError
-        Its name, type, shape or labels.
-    """
-    data = signal.data
-    if name in ("", ".") or "/" in name or "\0" in name:
-        raise RecordError(f"signal {name!r}: a name must not be empty, a dot, or hold a slash")
-    if data.dtype.kind not in _NUMBERS or data.dtype.itemsize > 8:
-        raise RecordError(f"signal {name!r} holds {data.dtype}, not real numbers")
-    if not 1 <= data.ndim <= 3:
-        raise RecordError(f"signal {name!r} has {data.ndim} axes; one to three can be kept")
-    if data.shape[0] != samples:
-        raise RecordError(f"signal {name!r} has {data.shape[0]} samples, the record has {samples}")
-    if data.ndim > 1 and len(signal.labels) != data.shape[1]:
-        raise RecordError(f"signal {name!r} has {data.shape[1]} columns and {len(signal.labels)} labels")
-
-
-def encode(content: Content) -> memoryview:
-    """The bytes of a file.
-
-    Raises
-    ------
-    RecordError
-        The time axis, or a text that HDF5 cannot keep.
-    """
-    import h5py
-
-    check_time(content.time)
-    summary, provenance = json.dumps(content.summary), json.dumps(content.provenance, default=str)
-    # Made in memory: HDF5 crashes the process when the disk is full while it closes a file.
-    image = io.BytesIO()
-    with h5py.File(image, "w") as file:
-        file.attrs["format"] = FORMAT
-        file.attrs["complete"] = content.complete
-        file.attrs[_CHECKSUM] = _checksum(content, summary, provenance)
-        # Long texts as data sets: HDF5 attributes end at 64 kB.
-        file["summary"] = summary
-        file["provenance"] = provenance
-        _write(file, "time", Signal(content.time, "s"))
-        for name, one in content.signals.items():
-            try:
-                _write(file, f"signals/{name}", one)
-                if len(one.labels) > _LABELS_IN_ATTRIBUTE:
-                    file.create_dataset(f"labels/{name}", data=list(one.labels), dtype=h5py.string_dtype())
-            except ValueError as error:
-                raise RecordError(f"signal {name!r} cannot be saved: {error}") from error
-    image.seek(0, os.SEEK_END)
-    image.write(b"\ndynsim-sha256:%s\n" % hashlib.sha256(image.getbuffer()).hexdigest().encode("ascii"))
-    return image.getbuffer()
-
-
-def _write(file: Any, name: str, one: Signal) -> None:
-    # gzip only where it pays: it costs time on every run, and short records are small anyway.
-    options = {"compression": "gzip", "compression_opts": 1} if one.data.nbytes > 1 << 22 else {}
-    data = file.create_dataset(name, data=one.data, **options)
-    data.attrs["unit"] = one.unit
-    if len(one.labels) <= _LABELS_IN_ATTRIBUTE:
-        data.attrs["labels"] = list(one.labels)
-    data.attrs["description"] = one.description
-
-
-def _checksum(content: Content, summary: str, provenance: str) -> str:
-    """SHA-256 of everything that counts, in hexadecimal digits."""
-    total = hashlib.sha256(json.dumps([bool(content.complete), summary, provenance]).encode("ascii"))
-    for name, one in [("", Signal(content.time, "s")), *sorted(content.signals.items())]:
-        data = np.ascontiguousarray(one.data)
-        header = [name, data.dtype.str, data.shape, one.unit, one.labels, one.description]
-        total.update(json.dumps(header).encode("ascii"))
-        total.update(data.data if data.size else b"")
-    return total.hexdigest()
 
 
 def read(path: Path) -> Content:
@@ -223,7 +108,7 @@ def _read_apart(path: Path) -> bytes:
 
     size = path.stat().st_size
     seconds = READING_TIME * (1.0 + size / 50e6)
-    code = "from dynsim.record_file import _hand_over; _hand_over()"
+    code = "from dynsim.record.reader import _hand_over; _hand_over()"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "HDF5_PLUGIN_PRELOAD": "::"}
     try:
         result = subprocess.run(
@@ -320,8 +205,8 @@ class _Reader:
 
         file = self._file
         found = self._attribute(file, "format")
-        if not isinstance(found, str) or found != FORMAT:
-            raise RecordError(f"an HDF5 file, but not a dynsim record ({FORMAT})")
+        if not isinstance(found, str) or found not in (FORMAT, *OLDER):
+            raise RecordError(f"an HDF5 file, but not a dynsim record ({', '.join((FORMAT, *OLDER))})")
         complete = self._attribute(file, "complete")
         if complete is None:
             raise RecordError("a dynsim record that lacks parts: no attribute complete")
@@ -329,8 +214,12 @@ class _Reader:
             raise RecordError("attribute complete is neither true nor false")
         time = self._numbers(self._child(file, "time", "time", h5py.Dataset), "time")
         check_time(time)
+        axes = self._axes()
+        samples = {TIME: len(time), **{name: len(times) for name, times in axes.items()}}
         texts = [self._text(name) for name in ("summary", "provenance")]
         summary, provenance = self._mapping("summary", texts[0]), self._mapping("provenance", texts[1])
+        drawn = self._text("scene") if "scene" in file else ""
+        scene = Scene.from_json(drawn) if drawn else None
         signals = {}
         if "signals" in file:
             group = self._child(file, "signals", "group signals", h5py.Group)
@@ -342,20 +231,61 @@ class _Reader:
                     self._string(data, "unit", what),
                     self._labels(data, name, what),
                     self._string(data, "description", what),
+                    self._string(data, "axis", what) if "axis" in data.attrs else TIME,
                 )
-                check_signal(name, one, len(time))
+                check_signal(name, one, samples)
                 signals[name] = one
-        content = Content(time, signals, summary, provenance, bool(complete))
-        wanted = self._attribute(file, _CHECKSUM)
-        if wanted is not None and not (isinstance(wanted, str) and wanted == _checksum(content, *texts)):
+        content = Content(time, signals, summary, provenance, bool(complete), axes, self._events(), scene)
+        wanted = self._attribute(file, CHECKSUM)
+        if wanted is not None and not (
+            isinstance(wanted, str) and wanted == checksum(content, texts[0], texts[1], drawn)
+        ):
             raise RecordError(
                 "damaged: its content does not agree with its checksum; if you have changed it yourself, delete the "
-                f"attribute {_CHECKSUM}"
+                f"attribute {CHECKSUM}"
             )
-        native = {
-            name: Signal(_native(one.data), one.unit, one.labels, one.description) for name, one in signals.items()
-        }
-        return Content(_native(time).astype(np.float64, copy=False), native, summary, provenance, bool(complete))
+        return replace(
+            content,
+            time=_native(time).astype(np.float64, copy=False),
+            signals={name: replace(one, data=_native(one.data)) for name, one in signals.items()},
+            axes={name: _native(times).astype(np.float64, copy=False) for name, times in axes.items()},
+        )
+
+    def _axes(self) -> dict[str, NDArray[Any]]:
+        """Further time axes."""
+        import h5py
+
+        if "axes" not in self._file:
+            return {}
+        found = {}
+        group = self._child(self._file, "axes", "group axes", h5py.Group)
+        for name in group:
+            what = f"time axis {name!r}"
+            found[name] = self._numbers(self._child(group, name, what, h5py.Dataset), what)
+            check_time(found[name], what)
+        if TIME in found:
+            raise RecordError(f"{TIME} is the name of the record's own axis")
+        return found
+
+    def _events(self) -> list[Event]:
+        import h5py
+
+        if "events" not in self._file:
+            return []
+        group = self._child(self._file, "events", "group events", h5py.Group)
+        columns: dict[str, list[Any]] = {}
+        for name, kind in EVENT_COLUMNS.items():
+            what = f"{name} of the events"
+            data = self._child(group, name, what, h5py.Dataset)
+            texts = kind is str
+            columns[name] = list(self._column(data, "events", name) if texts else self._numbers(data, what).ravel())
+            if len(columns[name]) != len(columns["time"]):
+                raise RecordError(f"{what} has {len(columns[name])} entries, their times {len(columns['time'])}")
+        columns["value"] = [None if np.isnan(value) else float(value) for value in columns["value"]]
+        columns["time"] = [float(time) for time in columns["time"]]
+        if not all(map(math.isfinite, columns["time"])):
+            raise RecordError("time of the events is not finite")
+        return [Event(*entries) for entries in zip(*(columns[name] for name in EVENT_COLUMNS), strict=True)]
 
     def _child(self, parent: Any, name: str, what: str, kind: type) -> Any:
         """A group or data set that lies in the file itself."""
@@ -374,7 +304,7 @@ class _Reader:
     def _numbers(self, data: Any, what: str) -> NDArray[Any]:
         """An array of real numbers."""
         dtype = data.dtype
-        if dtype.kind not in _NUMBERS or dtype.itemsize > 8:
+        if not is_numeric(dtype):
             raise RecordError(f"{what} holds {dtype}, not real numbers")
         self._check_storage(data, what)
         if data.chunks is None:
@@ -445,22 +375,29 @@ class _Reader:
         import h5py
 
         if "labels" in data.attrs:
-            found = np.asarray(self._attribute(data, "labels"))
-        elif "labels" in self._file:
-            kept = self._child(self._file, "labels", "group labels", h5py.Group)
-            labels = self._child(kept, name, f"labels of {what}", h5py.Dataset)
-            if h5py.check_string_dtype(labels.dtype) is None:
-                raise RecordError(f"{what} has labels that are no texts")
-            self._check_storage(labels, f"labels of {what}")
-            found = np.asarray(labels[()])
-        else:
+            return _texts(np.asarray(self._attribute(data, "labels")), f"{what} has labels")
+        if "labels" not in self._file:
             raise RecordError(f"a dynsim record that lacks parts: no labels of {what}")
-        if found.ndim != 1:
-            raise RecordError(f"{what} has labels that are no list")
-        texts = tuple(label.decode("utf-8") if isinstance(label, bytes) else label for label in found.tolist())
-        if not all(isinstance(text, str) for text in texts):
-            raise RecordError(f"{what} has labels that are no texts")
-        return texts
+        kept = self._child(self._file, "labels", "group labels", h5py.Group)
+        return self._column(self._child(kept, name, f"labels of {what}", h5py.Dataset), what, "labels")
+
+    def _column(self, data: Any, what: str, name: str) -> tuple[str, ...]:
+        """Texts, kept as a data set."""
+        import h5py
+
+        if h5py.check_string_dtype(data.dtype) is None:
+            raise RecordError(f"{what} has {name} that are no texts")
+        self._check_storage(data, f"{name} of {what}")
+        return _texts(np.asarray(data[()]), f"{what} has {name}")
+
+
+def _texts(found: NDArray[Any], what: str) -> tuple[str, ...]:
+    if found.ndim != 1:
+        raise RecordError(f"{what} that are no list")
+    texts = tuple(text.decode("utf-8") if isinstance(text, bytes) else text for text in found.tolist())
+    if not all(isinstance(text, str) for text in texts):
+        raise RecordError(f"{what} that are no texts")
+    return texts
 
 
 def _unpacked(data: Any, what: str) -> NDArray[Any]:

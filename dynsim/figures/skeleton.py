@@ -1,0 +1,194 @@
+"""The arm as lines and points, from scene and body poses of its record: what a posture is drawn from, and how large."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dynsim.figures import style
+from dynsim.figures.style import Array
+from dynsim.measures import hand_target
+from dynsim.record import Record
+from dynsim.record.poses import ORIENTATION, POSITION, point_positions
+from dynsim.record.scene import WORLD, Point, Scene, Surface
+
+# Postures drawn faintly, evenly over the run, besides the last one.
+FAINT = 6
+# Text at the contacts: size and height of its two lines [point].
+LABEL_SIZE, LABEL_HEIGHT = 7.0, 19.0
+# Body poses are in single precision: what spreads no further than this does not spread [m].
+NOTHING = 1e-6
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """A robot whose bodies were placed over time."""
+
+    record: Record
+    scene: Scene
+
+    def segments(self, row: int) -> Array:
+        """From each body's parent to the body, and from the hand's body to the hand, (m, 2, 3) [m]."""
+        points = self.record[POSITION][row].astype(np.float64)
+        bodies = list(enumerate(self.scene.bodies))
+        # A sliding joint at the root moves its body away from where it is mounted.
+        lines = [(np.array(body.joint.position), points[k]) for k, body in bodies if body.parent == WORLD]
+        lines += [(points[body.parent], points[k]) for k, body in bodies if body.parent != WORLD]
+        hand = self.scene.hand
+        if hand is not None and hand.body != WORLD:
+            lines.append((points[hand.body], point_positions(self.record, hand, row)))
+        return np.array(lines)
+
+    def postures(self) -> list[Array]:
+        """Segments at some samples, those of the last one last; a run that diverged may end in some without poses."""
+        rows = np.flatnonzero(np.isfinite(self.record[POSITION]).all(axis=(1, 2)))
+        if not len(rows):
+            return []
+        return [self.segments(k) for k in dict.fromkeys(rows[np.linspace(0, len(rows) - 1, FAINT + 1).astype(int)])]
+
+    def contacts(self) -> list[tuple[Point, Surface, Array, float]]:
+        """Contact, its surface, position and normal force at the end; NaN for a force that is not known."""
+        record = self.record
+        if not np.isfinite(record[POSITION][-1]).all():
+            return []
+        forces: dict[str, float] = {}
+        if "contact_normal_force" in record:
+            forces = dict(zip(record.labels["contact_normal_force"], record["contact_normal_force"][-1], strict=True))
+        return [
+            (point, surface, point_positions(record, point, len(record) - 1), float(forces.get(point.name, np.nan)))
+            for point in self.scene.contacts
+            if (surface := self.scene.surface(point.surface)) is not None
+        ]
+
+
+def skeleton(record: Record) -> tuple[Skeleton | None, str]:
+    """The robot of a record, or why it cannot be drawn."""
+    scene = record.scene
+    if scene is None or not scene.bodies:
+        return None, "posture not drawn: the record has no scene"
+    if POSITION not in record or ORIENTATION not in record:
+        return None, "posture not drawn: not every joint was recorded"
+    if record[POSITION].shape != (len(record), len(scene.bodies), 3):
+        return None, "posture not drawn: the scene has other bodies than the record"
+    return Skeleton(record, scene), ""
+
+
+@dataclass(frozen=True)
+class SidePlane:
+    """A vertical plane through ``origin`` along the horizontal unit vector ``direction``."""
+
+    origin: Array
+    direction: Array
+
+    def project(self, points: Array) -> Array:
+        """(…, 3) world → (…, 2): along the plane and z [m]."""
+        return np.stack([(points - self.origin) @ self.direction, points[..., 2]], axis=-1)
+
+    def world(self, along: Array, z: Array) -> Array:
+        """Points in the plane, (…, 3) [m]."""
+        points = self.origin * np.array([1.0, 1.0, 0.0]) + along[..., None] * self.direction
+        points[..., 2] = z
+        return points
+
+    @property
+    def label(self) -> str:
+        """Label of the plane's horizontal axis."""
+        azimuth = np.degrees(np.arctan2(self.direction[1], self.direction[0]))
+        return f"distance from the base, azimuth {azimuth:.0f}° [m]"
+
+
+def side_plane(record: Record, drawn: Sequence[Array]) -> SidePlane:
+    """The vertical plane that the arm spans: from the base in the horizontal direction of its greatest extent."""
+    points = drawn[0].reshape(-1, 3) if drawn else record["hand_position"]
+    origin = points[0]
+    spread = (points - origin)[:, :2]
+    spread = spread[np.isfinite(spread).all(axis=1)]
+    if not len(spread) or np.abs(spread).max() < NOTHING:
+        # It stands upright at first; where does it go from there?
+        spread = np.concatenate([segments.reshape(-1, 3) for segments in drawn] or [points])[:, :2] - origin[:2]
+    if np.abs(spread).max(initial=0.0) < NOTHING:
+        return SidePlane(origin, np.array([1.0, 0.0, 0.0]))
+    first = np.linalg.svd(spread, full_matrices=False)[2][0]
+    if (spread @ first).sum() < 0.0:
+        first = -first
+    return SidePlane(origin, np.array([*first, 0.0]))
+
+
+@dataclass(frozen=True)
+class Label:
+    """What is written at a contact: at (x, z) [m] in the side plane, ``level`` labels away from it."""
+
+    text: str
+    x: float
+    z: float
+    below: bool
+    level: int
+
+    @property
+    def offset(self) -> float:
+        """Distance of the text from the contact [point]."""
+        return 7.0 + LABEL_HEIGHT * self.level
+
+
+def contact_labels(body: Skeleton | None, plane: SidePlane, scale: float) -> list[Label]:
+    """Names and forces of the contacts, on the far side of the surface, where there is no arm.
+
+    Labels that would overprint each other at ``scale`` [point/m] are moved away from the surface.
+    """
+    found: list[Label] = []
+    ends: dict[tuple[bool, int], float] = {}
+    points = [(*one, plane.project(one[2])) for one in ([] if body is None else body.contacts())]
+    for contact, surface, position, force, at in sorted(points, key=lambda one: float(one[4][0])):
+        below = bool(surface.gradient(position)[2] >= 0.0)
+        text = contact.name if np.isnan(force) else f"{contact.name}\n{style.number(force, 3)} N"
+        half = 0.5 * LABEL_SIZE * 0.65 * max(len(line) for line in text.splitlines())
+        level, place = 0, float(at[0]) * scale
+        while place - half < ends.get((below, level), -np.inf):
+            level += 1
+        ends[below, level] = place + half + 2.0
+        found.append(Label(text, float(at[0]), float(at[1]), below, level))
+    return found
+
+
+def with_labels(extent: tuple[Array, Array], labels: Sequence[Label], scale: float) -> tuple[Array, Array]:
+    """The extent with room for the labels."""
+    low, high = extent[0].copy(), extent[1].copy()
+    for label in labels:
+        room = (label.offset + LABEL_HEIGHT + 3.0) / scale
+        if label.below:
+            low[1] = min(low[1], label.z - room)
+        else:
+            high[1] = max(high[1], label.z + room)
+    return low, high
+
+
+def bounds(records: Sequence[Record], drawn: Sequence[Array]) -> tuple[Array, Array]:
+    """Corners of the box that a 3D view shows [m]."""
+    points = _points(records, drawn)
+    if not len(points):
+        return np.zeros(3), np.ones(3)
+    low, high = points.min(axis=0), points.max(axis=0)
+    # A flat picture still needs some depth to stand in.
+    extra = np.maximum(0.15 * float((high - low).max() or 1.0) - 0.5 * (high - low), 0.0)
+    return low - extra, high + extra
+
+
+def extent_of(plane: SidePlane, drawn: Sequence[Array], records: Sequence[Record]) -> tuple[Array, Array]:
+    """Corners of what a side view shows [m]."""
+    flat = plane.project(_points(records, drawn))
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    span = float((high - low).max() or 1.0)
+    # An upright arm would leave no width for the axis.
+    extra = np.maximum(np.array([0.3, 0.05]) * span - 0.5 * (high - low), 0.0) + 0.05 * span
+    return low - extra, high + extra
+
+
+def _points(records: Sequence[Record], drawn: Sequence[Array]) -> Array:
+    """Everything that must be in the picture, (N, 3)."""
+    points = [record["hand_position"] for record in records]
+    points += [target for record in records if (target := hand_target(record)) is not None]
+    points += [segments.reshape(-1, 3) for segments in drawn]
+    pooled = np.concatenate(points)
+    return pooled[np.isfinite(pooled).all(axis=1)]

@@ -1,0 +1,51 @@
+"""Numbers that follow from the signals of a record alone: for summaries, for figures, for measured runs too."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.record import Record
+
+# Where the electrical energy goes, in the order in which it is drawn and printed.
+SINKS = ("heat_joule", "loss_gear", "loss_joint", "heat_friction")
+STORES = ("energy_kinetic", "energy_potential", "energy_magnetic")
+
+RESIDUAL_LIMIT = 1e-6
+
+
+def energy_turnover(record: Record) -> float:
+    """Energy that changed hands: the largest over time of half the sum of all terms' sizes [J]."""
+    total = np.abs(record["energy_electrical"]) + np.abs(record["work_constraint"])
+    for name in SINKS:
+        total = total + np.abs(record[name])
+    for name in STORES:
+        total = total + np.abs(record[name] - record[name][:1])
+    return float(0.5 * total.max(initial=0.0))
+
+
+def hand_target(record: Record) -> NDArray[np.float64] | None:
+    """Where the hand should be, (T, 3) [m]: the target of the path or, of a measured run, where the goals have it."""
+    return next((record[name] for name in ("target_position", "hand_position_goal") if name in record), None)
+
+
+def hand_error(record: Record, settle: float) -> dict[str, float | None]:
+    """Root mean square, maximum and vertical root mean square of the hand's distance from its target [m].
+
+    Counted from t = ``settle`` on; None without a target or when the run is shorter.
+    """
+    names = ("hand_error_rms_m", "hand_error_max_m", "hand_error_z_rms_m")
+    window = record.time >= settle
+    target = hand_target(record)
+    if target is None or window.sum() < 2:
+        return dict.fromkeys(names)
+    error = (record["hand_position"] - target)[window]
+    time = record.time[window]
+    square = (error**2).sum(axis=1)
+    values = (_mean(square, time) ** 0.5, square.max() ** 0.5, _mean(error[:, 2] ** 2, time) ** 0.5)
+    return dict(zip(names, map(float, values), strict=True))
+
+
+def _mean(values: NDArray[np.float64], time: NDArray[np.float64]) -> float:
+    """Mean over time, by trapezoids."""
+    return float(np.trapezoid(values, time) / (time[-1] - time[0]))

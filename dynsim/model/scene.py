@@ -1,0 +1,137 @@
+"""From robots to scenes: what a record keeps of bodies, joints, surfaces and points, to be drawn and placed later."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from dynsim.model.description import Array, Contact, Link, Quadric, Robot
+from dynsim.model.snake import SnakeDescription
+from dynsim.record.quaternion import of_turn
+from dynsim.record.scene import HERE, WORLD, Body, Joint, Point, Quaternion, Scene, Shape, Surface, quaternion, vector3
+
+# Of a wheel, in parts of its radius; a snake's description has no width.
+WHEEL_WIDTH = 0.48
+# Thickness of the snake's body, likewise.
+BODY_RADIUS = 0.5
+_ALONG_X: Quaternion = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
+_ALONG_Y: Quaternion = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)
+
+
+def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str, Quadric]) -> Scene:
+    """The scene of a tree of bodies whose joint positions are the signal ``q``."""
+    index = {link.name: k for k, link in enumerate(robot.links)}
+    bodies = tuple(
+        Body(link.name, WORLD if link.parent is None else index[link.parent], _joint(link), link.shapes or _rod(link))
+        for link in robot.links
+    )
+    hand_body, hand_point = robot.hand
+    points = [Point("hand", "hand", index[hand_body], vector3(hand_point))]
+    for contact in contacts:
+        body, point = robot.attach(contact.body, contact.point)
+        points.append(Point(contact.name, "contact", body, vector3(point), contact.surface_name))
+    return Scene(
+        bodies,
+        tuple(Surface.of_quadric(name, one.Q, one.b, one.c) for name, one in surfaces.items()),
+        tuple(points),
+        robot.fixed_shapes,
+    )
+
+
+def _joint(link: Link) -> Joint:
+    return Joint(
+        name=link.joint,
+        kind=link.row.drawn,
+        axis=vector3(link.axis),
+        position=vector3(link.p_PJ),
+        orientation=quaternion(link.R_PJ),
+        signal="q",
+        labels=link.coordinates,
+        lower=_limit(link.lower),
+        upper=_limit(link.upper),
+    )
+
+
+def _limit(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _rod(link: Link) -> tuple[Shape, ...]:
+    """The cylinder about the body's axis; nothing where its radius or its end is not known."""
+    if link.tip is None or not link.radius > 0.0:
+        return ()
+    length = float(np.linalg.norm(link.tip))
+    if not length > 0.0:
+        return ()
+    turn = _from_z(link.tip / length)
+    return (Shape("cylinder", (link.radius, length), vector3(0.5 * link.tip), turn),)
+
+
+def _from_z(direction: Array) -> Quaternion:
+    """A turn that takes z to a unit vector."""
+    axis = np.cross([0.0, 0.0, 1.0], direction)
+    size = float(np.linalg.norm(axis))
+    if size == 0.0:
+        return HERE if direction[2] > 0.0 else (0.0, 1.0, 0.0, 0.0)
+    w, x, y, z = of_turn(axis / size, math.atan2(size, float(direction[2]))).tolist()
+    return w, x, y, z
+
+
+def snake_scene(description: SnakeDescription) -> Scene:
+    """The scene of an articulated mobile robot on the ground z = 0.
+
+    Its base part starts at wheel pair 1, which is placed by the signal ``base_pose``; joints are those of ``phi``, a
+    joint of the head part turns its head side by −phi. Active wheels turn by ``rho``. That a pair is lifted the model
+    has no height for ([T] II.A).
+    """
+    d, l, n_h = description, description.link_length, description.head_joints
+    base = Joint("base", "planar", (0.0, 0.0, 1.0), (0.0, 0.0, d.wheel_radius), HERE, "base_pose", ("x", "y", "yaw"))
+    bodies = [Body("pair1", WORLD, base, _passive_wheels(d, 0, 0.0))]
+    wheels = [_active_wheel(d, 0, 0, 0.0)]
+    for j in reversed(range(n_h)):
+        forward = 0.0 if j == n_h - 1 else l
+        axis = (0.0, -1.0, 0.0) if d.pitch[j] else (0.0, 0.0, -1.0)
+        joint = _snake_joint(d, j, axis, forward)
+        bodies.append(Body(f"head_{d.joint_names[j]}", len(bodies) - 1, joint, (_tube(d, 0.0, l),)))
+    head = len(bodies) - 1
+    for pair in range(1, d.pairs):
+        joint = _snake_joint(d, n_h + pair - 1, (0.0, 0.0, 1.0), -l if pair == 1 else -2.0 * l)
+        parent = 0 if pair == 1 else len(bodies) - 1
+        tube = _tube(d, -2.0 * l if pair < d.pairs - 1 else -l, 0.0)
+        bodies.append(Body(f"pair{pair + 1}", parent, joint, (tube, *_passive_wheels(d, pair, -l))))
+        wheels.append(_active_wheel(d, pair, len(bodies) - 1, -l))
+    if d.pairs > 1:
+        bodies[0] = Body("pair1", WORLD, base, (_tube(d, -l, 0.0), *bodies[0].shapes))
+    ground = Surface.of_quadric("ground", np.zeros((3, 3)), [0.0, 0.0, 1.0], 0.0)
+    hand = Point("controlled point", "hand", head, (l + d.point_offset, 0.0, 0.0))
+    return Scene((*bodies, *(wheel for wheel in wheels if wheel is not None)), (ground,), (hand,))
+
+
+def _snake_joint(d: SnakeDescription, j: int, axis: tuple[float, float, float], x: float) -> Joint:
+    name = d.joint_names[j]
+    lower, upper = float(d.lower[j]), float(d.upper[j])
+    return Joint(name, "revolute", axis, (x, 0.0, 0.0), HERE, "phi", (name,), lower, upper)
+
+
+def _tube(d: SnakeDescription, start: float, end: float) -> Shape:
+    return Shape("cylinder", (BODY_RADIUS * d.wheel_radius, end - start), (0.5 * (start + end), 0.0, 0.0), _ALONG_X)
+
+
+def _passive_wheels(d: SnakeDescription, pair: int, x: float) -> tuple[Shape, ...]:
+    """Wheels that follow the ground: their angle is not recorded."""
+    sides = [side for side in (1, -1) if side != d.driven_side[pair]]
+    size = (d.wheel_radius, WHEEL_WIDTH * d.wheel_radius)
+    return tuple(Shape("cylinder", size, (x, side * float(d.half_track[pair]), 0.0), _ALONG_Y) for side in sides)
+
+
+def _active_wheel(d: SnakeDescription, pair: int, parent: int, x: float) -> Body | None:
+    side = int(d.driven_side[pair])
+    if not side:
+        return None
+    name = d.wheel_names[int(np.count_nonzero(d.driven_side[:pair]))]
+    place = (x, side * float(d.half_track[pair]), 0.0)
+    joint = Joint(name, "revolute", (0.0, 1.0, 0.0), place, HERE, "rho", (name,))
+    shape = Shape("cylinder", (d.wheel_radius, WHEEL_WIDTH * d.wheel_radius), orientation=_ALONG_Y)
+    return Body(f"wheel_{name}", parent, joint, (shape,))

@@ -1,0 +1,99 @@
+"""What the links of a URDF file look like: ``<visual>``, read with good will.
+
+Shapes have no part in the mechanics, and files in use hold many that are broken or of other programs: what cannot be
+drawn is passed over without a word. Meshes keep the name that the file gives them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from dynsim.record.quaternion import of_turn, product
+from dynsim.record.scene import Shape, ShapeKind
+
+Colour = tuple[float, float, float, float]
+# As in urdf_reader: larger numbers are no lengths.
+_LARGEST = 1e15
+
+
+class Element(Protocol):
+    """An element of XML."""
+
+    tag: str
+    attributes: dict[str, str]
+
+    @property
+    def children(self) -> Sequence[Element]:
+        """Elements within."""
+
+
+def materials(robot: Element) -> dict[str, Colour]:
+    """Colours that the file defines by name, outside of its links."""
+    found = {
+        child.attributes.get("name", ""): _colour(child, {}) for child in robot.children if child.tag == "material"
+    }
+    return {name: colour for name, colour in found.items() if colour is not None}
+
+
+def visual_shapes(link: Element, known: Mapping[str, Colour]) -> tuple[Shape, ...]:
+    """Shapes of a link in its frame; ``known`` are colours by name."""
+    found = [_shape(child, known) for child in link.children if child.tag == "visual"]
+    return tuple(shape for shape in found if shape is not None)
+
+
+def _shape(visual: Element, known: Mapping[str, Colour]) -> Shape | None:
+    geometry = _child(visual, "geometry")
+    if geometry is None or len(geometry.children) != 1:
+        return None
+    solid = geometry.children[0]
+    material = _child(visual, "material")
+    colour = None if material is None else _colour(material, known)
+    place = _child(visual, "origin")
+    xyz = (0.0, 0.0, 0.0) if place is None else _numbers(place, "xyz", 3, "0 0 0")
+    rpy = (0.0, 0.0, 0.0) if place is None else _numbers(place, "rpy", 3, "0 0 0")
+    kind: ShapeKind
+    file = ""
+    match solid.tag:
+        case "box":
+            kind, size = "box", _numbers(solid, "size", 3)
+        case "sphere":
+            kind, size = "sphere", _numbers(solid, "radius", 1)
+        case "cylinder" | "capsule":
+            kind = "cylinder" if solid.tag == "cylinder" else "capsule"
+            size = _numbers(solid, "radius", 1) + _numbers(solid, "length", 1)
+            size = size if len(size) == 2 else ()
+        case "mesh":
+            kind, size, file = "mesh", _numbers(solid, "scale", 3, "1 1 1"), solid.attributes.get("filename", "")
+            size = size if file else ()
+        case _:
+            return None
+    if not (size and xyz and rpy) or (kind != "mesh" and min(size) <= 0.0):
+        return None
+    roll, pitch, yaw = rpy
+    turn = product(of_turn((0, 0, 1), yaw), product(of_turn((0, 1, 0), pitch), of_turn((1, 0, 0), roll)))
+    return Shape(kind, size, file=file, colour=colour).placed(np.array(xyz), turn)
+
+
+def _child(element: Element, tag: str) -> Element | None:
+    return next((child for child in element.children if child.tag == tag), None)
+
+
+def _colour(material: Element, known: Mapping[str, Colour]) -> Colour | None:
+    stated = _child(material, "color")
+    numbers = () if stated is None else _numbers(stated, "rgba", 4)
+    if not numbers or not all(0.0 <= number <= 1.0 for number in numbers):
+        return known.get(material.attributes.get("name", ""))
+    red, green, blue, opacity = numbers
+    return red, green, blue, opacity
+
+
+def _numbers(element: Element, key: str, count: int, default: str = "") -> tuple[float, ...]:
+    """So many numbers of an attribute; empty where there are others."""
+    try:
+        numbers = tuple(map(float, element.attributes.get(key, default).split()))
+    except ValueError:
+        return ()
+    return numbers if len(numbers) == count and all(abs(number) < _LARGEST for number in numbers) else ()

@@ -1,0 +1,160 @@
+"""What a record holds: signals on time axes, events, the scene; and what no record may hold."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.errors import RecordError
+from dynsim.record.scene import Scene
+
+FORMAT = "dynsim-record-2"
+OLDER = ("dynsim-record-1",)
+"""Formats that are read too. 1 (dynsim 0.1) has one time axis, no events and no scene."""
+TIME = "time"
+"""Name of the axis that signals are on unless they name another."""
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One quantity over time.
+
+    Attributes
+    ----------
+    data : array, shape (T,) or (T, k) or (T, k, m)
+    unit : str
+        SI unit as text, "1" for pure numbers.
+    labels : tuple of str
+        Names of the k columns, empty for a scalar signal.
+    description : str
+    axis : str
+        Name of its time axis, which has T instants.
+    """
+
+    data: NDArray[Any]
+    unit: str
+    labels: tuple[str, ...] = ()
+    description: str = ""
+    axis: str = TIME
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened at an instant.
+
+    Attributes
+    ----------
+    time : float
+        [s]
+    kind : str
+        What kind of thing, such as "contact opens"; the same word for all of its kind.
+    name : str
+        What it happened to: a contact, a joint, …; empty for the whole run.
+    value : float or None
+        A number that belongs to it, in SI units.
+    description : str
+    """
+
+    time: float
+    kind: str
+    name: str = ""
+    value: float | None = None
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class Content:
+    """All that a file holds."""
+
+    time: NDArray[np.float64]
+    signals: Mapping[str, Signal] = field(default_factory=dict)
+    summary: Mapping[str, Any] = field(default_factory=dict)
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    complete: bool = True
+    axes: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    events: Sequence[Event] = ()
+    scene: Scene | None = None
+
+
+def check_name(what: str, name: str) -> None:
+    """Refuse a name that HDF5 would take for something else.
+
+    Raises
+    ------
+    RecordError
+    """
+    if name in ("", ".") or "/" in name or "\0" in name:
+        raise RecordError(f"{what} {name!r}: a name must not be empty, a dot, or hold a slash")
+
+
+def check_time(time: NDArray[Any], what: str = TIME) -> None:
+    """Refuse a time axis that is none.
+
+    Raises
+    ------
+    RecordError
+        Not one-dimensional, not finite, or running backwards.
+    """
+    if time.ndim != 1:
+        raise RecordError(f"{what} has the shape {time.shape}; it must have one axis")
+    if not np.isfinite(time).all():
+        raise RecordError(f"{what} is not finite at sample {int(np.flatnonzero(~np.isfinite(time))[0])}")
+    if (backwards := np.flatnonzero(np.diff(time) < 0.0)).size:
+        raise RecordError(f"{what} runs backwards after sample {int(backwards[0])}")
+
+
+def check_signal(name: str, signal: Signal, samples: Mapping[str, int]) -> None:
+    """Refuse a signal that no record can hold.
+
+    Parameters
+    ----------
+    samples : number of instants of every time axis
+
+    Raises
+    ------
+    RecordError
+        Its name, type, shape, labels or axis.
+    """
+    data = signal.data
+    check_name("signal", name)
+    if not is_numeric(data.dtype):
+        raise RecordError(f"signal {name!r} holds {data.dtype}, not real numbers")
+    if not 1 <= data.ndim <= 3:
+        raise RecordError(f"signal {name!r} has {data.ndim} axes; one to three can be kept")
+    if signal.axis not in samples:
+        raise RecordError(f"signal {name!r} is on time axis {signal.axis!r}; this record has: {', '.join(samples)}")
+    if data.shape[0] != samples[signal.axis]:
+        where = "the record" if signal.axis == TIME else f"its time axis {signal.axis!r}"
+        raise RecordError(f"signal {name!r} has {data.shape[0]} samples, {where} has {samples[signal.axis]}")
+    if data.ndim > 1 and len(signal.labels) != data.shape[1]:
+        raise RecordError(f"signal {name!r} has {data.shape[1]} columns and {len(signal.labels)} labels")
+
+
+def is_numeric(dtype: Any) -> bool:
+    """Whether arrays of this type hold real numbers that a record can keep."""
+    return bool(dtype.kind in "biuf" and dtype.itemsize <= 8)
+
+
+def checksum(content: Content, summary: str, provenance: str, scene: str) -> str:
+    """SHA-256 of everything that counts, in hexadecimal digits; the texts are those of the file.
+
+    What a record of format 1 cannot hold is left out where there is none of it, so that their checksums are the same.
+    """
+    total = hashlib.sha256(json.dumps([bool(content.complete), summary, provenance]).encode("ascii"))
+    axes = [(f"axes/{name}", Signal(times, "s")) for name, times in sorted(content.axes.items())]
+    for name, one in [("", Signal(content.time, "s")), *sorted(content.signals.items()), *axes]:
+        data = np.ascontiguousarray(one.data)
+        header = [name, data.dtype.str, data.shape, one.unit, one.labels, one.description]
+        header += [] if one.axis == TIME else [one.axis]
+        total.update(json.dumps(header).encode("ascii"))
+        total.update(data.data if data.size else b"")
+    if content.events:
+        total.update(json.dumps([astuple(event) for event in content.events]).encode("ascii"))
+    total.update(scene.encode("utf-8", errors="surrogatepass"))
+    return total.hexdigest()

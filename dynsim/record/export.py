@@ -1,0 +1,109 @@
+"""Records as tables of pandas and as data sets of xarray."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dynsim.errors import MissingEntry, RecordError, shown
+from dynsim.record.content import TIME
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
+
+    from dynsim.record.record import Record
+
+
+def to_dataframe(record: Record, axis: str) -> pandas.DataFrame:
+    """A pandas DataFrame: time [s] is the index, every column of every signal on the time axis ``axis`` a column.
+
+    Columns are called ``signal``, ``signal.label`` or, of vectors, ``signal.label.x``; their units are in
+    ``attrs["units"]``.
+
+    Raises
+    ------
+    RecordError
+        pandas is not installed.
+    MissingEntry
+        No such time axis.
+    """
+    pandas = _optional("pandas")
+    axes = {TIME: record.time, **record.axes}
+    if axis not in axes:
+        raise MissingEntry(f"no time axis {shown(axis)}; this record has: {', '.join(axes)}")
+    times = axes[axis]
+    columns, names, units = [], [], {}
+    for name, signal in record.signals.items():
+        for column in () if signal.axis != axis else np.ndindex(signal.data.shape[1:]):
+            parts = [name]
+            if column:
+                parts.append(signal.labels[column[0]])
+                parts += [_components(signal.data.shape[2])[k] for k in column[1:]]
+            names.append(".".join(parts))
+            columns.append(signal.data[:, *column])
+            units[names[-1]] = signal.unit
+    frame = (
+        pandas.concat([pandas.Series(column) for column in columns], axis=1, keys=names)
+        if columns
+        else pandas.DataFrame(index=range(len(times)))
+    )
+    frame.index = pandas.Index(times, name=f"{axis} [s]")
+    frame.attrs["units"] = units
+    return frame
+
+
+def to_xarray(record: Record) -> xarray.Dataset:
+    """An xarray Dataset: signals over ``time`` or their own time axes, with ``units`` and ``long_name`` as attributes.
+
+    Signals with the same labels share a dimension, which is called after the first of them (``q_label``); the third
+    axis of vectors is ``axis`` (x, y, z), of quaternions ``axis_4`` (w, x, y, z). Summary, provenance, events and scene
+    are attributes, as JSON.
+
+    Raises
+    ------
+    RecordError
+        xarray is not installed.
+    """
+    xarray = _optional("xarray")
+    dimensions: dict[tuple[str, ...], str] = {}
+    coordinates: dict[str, Any] = {
+        name: (name, times, {"units": "s"}) for name, times in {TIME: record.time, **record.axes}.items()
+    }
+    variables = {}
+    for name, signal in record.signals.items():
+        axes = [signal.axis]
+        if signal.data.ndim > 1:
+            label = dimensions.setdefault(signal.labels, f"{name}_label")
+            coordinates[label] = list(signal.labels)
+            axes.append(label)
+        if signal.data.ndim > 2:
+            count = signal.data.shape[2]
+            axis = "axis" if count == 3 else f"axis_{count}"
+            coordinates[axis] = list(_components(count))
+            axes.append(axis)
+        variables[name] = (axes, signal.data, {"units": signal.unit, "long_name": signal.description})
+    attributes = {
+        "complete": int(record.complete),
+        "summary": json.dumps(record.summary),
+        "provenance": json.dumps(record.provenance, default=str),
+        "events": json.dumps(record.events, default=vars),
+        "scene": "" if record.scene is None else record.scene.to_json(),
+    }
+    return xarray.Dataset(variables, coordinates, attributes)
+
+
+def _components(count: int) -> Sequence[str]:
+    """Names of the components of a vector or quaternion."""
+    return {3: "xyz", 4: "wxyz"}.get(count) or [str(k) for k in range(count)]
+
+
+def _optional(package: str) -> Any:
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise RecordError(f"{package} is not installed: pip install {package}") from error

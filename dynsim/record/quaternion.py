@@ -1,0 +1,62 @@
+"""Unit quaternions (w, x, y, z) as arrays of shape (4,) or, of many instants, (4, T)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def of_turn(axis: ArrayLike, angle: ArrayLike) -> Array:
+    """Turn by an angle, () or (T,) [rad], about a unit axis, (3,): (cos q/2, a sin q/2)."""
+    half = 0.5 * np.asarray(angle, dtype=np.float64)
+    s = np.sin(half)
+    x, y, z = np.asarray(axis, dtype=np.float64)
+    return np.stack([np.cos(half), x * s, y * s, z * s])
+
+
+def of_matrix(R: ArrayLike) -> Array:
+    """The quaternion with w ≥ 0 of a rotation matrix, (3, 3) → (4,)."""
+    R = np.asarray(R, dtype=np.float64)
+    # 4 q_k q of the largest component q_k: to divide by a small one would cost digits.
+    trace = float(np.trace(R))
+    squares = np.array([1.0 + trace, *(1.0 - trace + 2.0 * np.diag(R))])
+    k = int(squares.argmax())
+    cross = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    row = np.array([squares[0], *cross] if k == 0 else [cross[k - 1], *(R + R.T)[k - 1]])
+    row[k] = squares[k]
+    return np.asarray(np.copysign(1.0, row[0]) * row / np.linalg.norm(row))
+
+
+def product(a: Array, b: Array) -> Array:
+    """The turn b, then the turn a."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ]
+    )
+
+
+def rotated(q: Array, vector: Array) -> Array:
+    """A vector, (3,) or (3, T), turned: v + 2 w u × v + 2 u × (u × v) of q = (w, u)."""
+    w, u = q[0], q[1:]
+    twice = 2.0 * _cross(u, vector)
+    along = w * twice + _cross(u, twice)
+    return np.stack([v + a for v, a in zip(vector, along, strict=True)])
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def continuous(q: Array) -> Array:
+    """The same turns, (4, T), each with the sign that is nearest to the one before; the first has w ≥ 0."""
+    flips = np.where((q[:, 1:] * q[:, :-1]).sum(axis=0) < 0.0, -1.0, 1.0)
+    first = -1.0 if q.shape[1] and q[0, 0] < 0.0 else 1.0
+    return q * np.concatenate([[first], first * np.cumprod(flips)])[: q.shape[1]]

@@ -1,0 +1,298 @@
+"""What a record's robot looks like and where it stands: plain data, from which figures and viewers draw.
+
+Placements are a position [m] and an orientation, a unit quaternion (w, x, y, z). A body's frame moves with its joint;
+at joint position zero it is the joint's frame, which is placed in the parent's frame.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dynsim.errors import RecordError
+from dynsim.record.quaternion import of_matrix, product, rotated
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
+
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+ShapeKind = Literal["cylinder", "capsule", "box", "sphere", "mesh"]
+JointKind = Literal["revolute", "prismatic", "planar", "ball", "fixed"]
+Matrix3 = tuple[Vector3, Vector3, Vector3]
+
+WORLD = -1
+"""Index of the world among the bodies."""
+HERE: Quaternion = (1.0, 0.0, 0.0, 0.0)
+"""The orientation of what is not turned."""
+_CHECKS: Any = {"allow_inf_nan": False}
+"""What pydantic is told of every class when it reads one."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A solid on a body, for the eye; it has no part in the mechanics.
+
+    Attributes
+    ----------
+    kind : "cylinder", "capsule", "box", "sphere" or "mesh"
+        Cylinders and capsules lie along z, all kinds about the origin of their placement.
+    size : tuple of float
+        Cylinder and capsule: radius and length [m], that of a capsule between the centres of its ends. Box: edges along
+        x, y and z. Sphere: radius. Mesh: scale along x, y and z.
+    position, orientation : placement in the body's frame
+    file : of a mesh, as the robot's file names it
+    colour : red, green, blue and opacity from 0 to 1, None: not stated
+    """
+
+    __pydantic_config__: ClassVar[Any] = _CHECKS
+    kind: ShapeKind
+    size: tuple[float, ...]
+    position: Vector3 = (0.0, 0.0, 0.0)
+    orientation: Quaternion = HERE
+    file: str = ""
+    colour: tuple[float, float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        count = {"cylinder": 2, "capsule": 2, "box": 3, "sphere": 1, "mesh": 3}[self.kind]
+        if len(self.size) != count:
+            raise RecordError(f"a {self.kind} has {count} numbers as its size, not {len(self.size)}")
+
+    def placed(self, position: ArrayLike, orientation: ArrayLike) -> Shape:
+        """The same shape seen from a frame in which the body's has a position [m] and an orientation."""
+        turn = np.asarray(orientation, dtype=np.float64)
+        where = np.asarray(position) + rotated(turn, np.array(self.position))
+        return replace(self, position=vector3(where), orientation=_four(product(turn, np.array(self.orientation))))
+
+
+@dataclass(frozen=True)
+class Joint:
+    """How a body moves against its parent.
+
+    Attributes
+    ----------
+    kind : "revolute", "prismatic", "planar", "ball" or "fixed"
+        Planar: along x and y of the joint's frame, then about z. Ball: the body's orientation in the joint's frame.
+    axis : unit vector in the joint's frame (and the body's)
+    position, orientation : placement of the joint in the parent's frame
+    signal, labels : str, tuple of str
+        Where the record has the joint's position: columns of a signal, one [rad or m], of a planar joint three [m, m,
+        rad], of a ball joint the four of a quaternion w, x, y, z of any length; none of what is fixed.
+    lower, upper : limits [rad or m], None for none
+    """
+
+    __pydantic_config__: ClassVar[Any] = _CHECKS
+    name: str
+    kind: JointKind
+    axis: Vector3
+    position: Vector3
+    orientation: Quaternion
+    signal: str
+    labels: tuple[str, ...]
+    lower: float | None = None
+    upper: float | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.labels) != {"planar": 3, "ball": 4, "fixed": 0}.get(self.kind, 1):
+            raise RecordError(f"joint {self.name!r} is {self.kind} and has {len(self.labels)} columns")
+
+
+@dataclass(frozen=True)
+class Body:
+    """A rigid body; ``parent`` is the index of the body that carries it, ``WORLD`` for none."""
+
+    __pydantic_config__: ClassVar[Any] = _CHECKS
+    name: str
+    parent: int
+    joint: Joint
+    shapes: tuple[Shape, ...] = ()
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A surface C(r) = r·Q r/2 + b·r + c = 0 in the world; C > 0 is the free side, where ∇C points.
+
+    Attributes
+    ----------
+    kind : "plane", "sphere", "cylinder" or "quadric"
+    position : on a plane, next to the world's origin; centre of a sphere; on the axis of a cylinder [m]
+    direction : normal of a plane, axis of a cylinder
+    radius : of a sphere or cylinder [m], negative where the free side is inside
+    """
+
+    __pydantic_config__: ClassVar[Any] = _CHECKS
+    name: str
+    Q: Matrix3
+    b: Vector3
+    c: float
+    kind: Literal["plane", "sphere", "cylinder", "quadric"] = "quadric"
+    position: Vector3 | None = None
+    direction: Vector3 | None = None
+    radius: float | None = None
+
+    @classmethod
+    def of_quadric(cls, name: str, Q: ArrayLike, b: ArrayLike, c: float) -> Surface:
+        """A surface by its coefficients, with the parameters of the simple kind that it is of, if any."""
+        Q, b = np.asarray(Q, dtype=np.float64), np.asarray(b, dtype=np.float64)
+        with np.errstate(all="ignore"):
+            kind, parameters = _simple_kind(Q, b, float(c))
+        if not all(np.isfinite(value).all() for value in parameters.values()):
+            kind, parameters = "quadric", {}
+        return cls(name, _matrix(Q), vector3(b), float(c), kind, **parameters)
+
+    def value(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """C at points, (…, 3) → (…)."""
+        bent = np.einsum("...i,ij,...j", points, np.array(self.Q), points)
+        return np.asarray(0.5 * bent + points @ np.array(self.b) + self.c)
+
+    def gradient(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
+        """∇C at a point, (3,)."""
+        return np.asarray(np.array(self.Q) @ point + np.array(self.b))
+
+    def gap(self, point: NDArray[np.float64]) -> float:
+        """Signed distance [m] of a point along ∇C, exact for plane, sphere and cylinder."""
+        gradient = self.gradient(point)
+        slope = float(np.linalg.norm(gradient))
+        normal = gradient / slope
+        value, curvature = float(self.value(point)), float(normal @ np.array(self.Q) @ normal)
+        inner = slope * slope - 2.0 * curvature * value
+        return 2.0 * value / (slope + inner**0.5) if inner > 0.0 else value / slope
+
+
+@dataclass(frozen=True)
+class Point:
+    """A named point on a body.
+
+    Attributes
+    ----------
+    role : "hand" or "contact"
+    body : index, ``WORLD`` for a point in the world
+    position : in the body's frame [m]
+    surface : name of the surface that holds a contact point
+    """
+
+    __pydantic_config__: ClassVar[Any] = _CHECKS
+    name: str
+    role: Literal["hand", "contact"]
+    body: int
+    position: Vector3
+    surface: str = ""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Bodies, each after the one that carries it, surfaces, named points, and what stands still in the world.
+
+    Raises
+    ------
+    RecordError
+        A body comes before its parent, or a point is on none.
+    """
+
+    __pydantic_config__: ClassVar[Any] = _CHECKS
+    bodies: tuple[Body, ...] = ()
+    surfaces: tuple[Surface, ...] = ()
+    points: tuple[Point, ...] = ()
+    fixed: tuple[Shape, ...] = ()
+
+    def __post_init__(self) -> None:
+        for k, body in enumerate(self.bodies):
+            if not WORLD <= body.parent < k:
+                raise RecordError(f"body {body.name!r} ({k}) does not come after its parent ({body.parent})")
+        for point in self.points:
+            if not WORLD <= point.body < len(self.bodies):
+                raise RecordError(f"point {point.name!r} is on body {point.body}, there are {len(self.bodies)}")
+
+    @property
+    def hand(self) -> Point | None:
+        """The controlled point."""
+        return next((point for point in self.points if point.role == "hand"), None)
+
+    @property
+    def contacts(self) -> tuple[Point, ...]:
+        """The contact points."""
+        return tuple(point for point in self.points if point.role == "contact")
+
+    def surface(self, name: str) -> Surface | None:
+        """The surface of a name."""
+        return next((surface for surface in self.surfaces if surface.name == name), None)
+
+    def to_json(self) -> str:
+        """The scene as a text of JSON; :meth:`from_json` reads it."""
+        return json.dumps(self, default=vars)
+
+    @classmethod
+    def from_json(cls, text: str) -> Scene:
+        """Read :meth:`to_json`; every part is checked. Keys of later versions are passed over.
+
+        Raises
+        ------
+        RecordError
+            The text describes no scene.
+        """
+        # Imported here: only who reads a scene needs it.
+        from pydantic import ValidationError
+
+        try:
+            return _adapter().validate_json(text)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            place = ".".join(map(str, first["loc"]))
+            raise RecordError(f"scene{f': {place}' if place else ''}: {first['msg']}") from error
+
+
+@cache
+def _adapter() -> TypeAdapter[Scene]:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(Scene)
+
+
+def vector3(values: ArrayLike) -> Vector3:
+    """Three numbers as plain floats."""
+    x, y, z = np.asarray(values, dtype=np.float64).tolist()
+    return x, y, z
+
+
+def quaternion(R: ArrayLike) -> Quaternion:
+    """Unit quaternion, w ≥ 0, of a rotation matrix, as plain floats."""
+    return _four(of_matrix(R))
+
+
+def _four(values: ArrayLike) -> Quaternion:
+    w, x, y, z = np.asarray(values, dtype=np.float64).tolist()
+    return w, x, y, z
+
+
+def _matrix(values: NDArray[np.float64]) -> Matrix3:
+    return vector3(values[0]), vector3(values[1]), vector3(values[2])
+
+
+def _simple_kind(Q: NDArray[np.float64], b: NDArray[np.float64], c: float) -> tuple[Any, dict[str, Any]]:
+    """Plane, sphere or cylinder, and its parameters."""
+    if not Q.any():
+        slope = np.linalg.norm(b)
+        return "plane", {"position": vector3(-c / slope**2 * b), "direction": vector3(b / slope)}
+    sizes, axes = np.linalg.eigh(Q)
+    small = 1e-9 * float(np.abs(sizes).max())
+    if np.ptp(sizes) <= small:
+        s = float(sizes.mean())
+        centre = -b / s
+        square = float(centre @ centre) - 2.0 * c / s
+        if square > 0.0:
+            return "sphere", {"position": vector3(centre), "radius": float(np.copysign(square**0.5, s))}
+    flat = np.abs(sizes) <= small
+    if flat.sum() == 1:
+        s, axis = float(sizes[~flat].mean()), axes[:, flat][:, 0]
+        if np.ptp(sizes[~flat]) <= small and abs(float(axis @ b)) <= 1e-9 * max(1.0, float(np.linalg.norm(b))):
+            centre = -(b - axis * float(axis @ b)) / s
+            square = float(centre @ centre) - 2.0 * c / s
+            if square > 0.0:
+                place, radius = vector3(centre), float(np.copysign(square**0.5, s))
+                return "cylinder", {"position": place, "direction": vector3(axis), "radius": radius}
+    return "quadric", {}

@@ -1,0 +1,89 @@
+"""Records as HDF5 files, the writing half: everything with its checksum, made in memory."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import os
+from collections.abc import Sequence
+from typing import Any
+
+from dynsim.errors import RecordError
+from dynsim.record.content import FORMAT, TIME, Content, Event, Signal, check_name, check_time, checksum
+
+EVENT_COLUMNS = {"time": float, "kind": str, "name": str, "value": float, "description": str}
+"""Attributes of events; each is a data set of the group ``events``."""
+CHECKSUM = "sha256"
+"""Attribute of the file with the checksum of its content."""
+_LABELS_IN_ATTRIBUTE = 1000
+"""More labels are a data set: HDF5 attributes end at 64 kB, which is 4090 labels."""
+
+
+def encode(content: Content) -> memoryview:
+    """The bytes of a file.
+
+    Raises
+    ------
+    RecordError
+        The time axis, or a text that HDF5 cannot keep.
+    """
+    import h5py
+
+    check_time(content.time)
+    for name, times in content.axes.items():
+        check_name("time axis", name)
+        check_time(times, f"time axis {name!r}")
+    summary, provenance = json.dumps(content.summary), json.dumps(content.provenance, default=str)
+    scene = "" if content.scene is None else content.scene.to_json()
+    # Made in memory: HDF5 crashes the process when the disk is full while it closes a file.
+    image = io.BytesIO()
+    with h5py.File(image, "w") as file:
+        file.attrs["format"] = FORMAT
+        file.attrs["complete"] = content.complete
+        file.attrs[CHECKSUM] = checksum(content, summary, provenance, scene)
+        # Long texts as data sets: HDF5 attributes end at 64 kB.
+        file["summary"] = summary
+        file["provenance"] = provenance
+        if scene:
+            file["scene"] = scene
+        _write(file, "time", Signal(content.time, "s"))
+        for name, times in content.axes.items():
+            _write(file, f"axes/{name}", Signal(times, "s"))
+        _write_events(file, content.events)
+        for name, one in content.signals.items():
+            try:
+                _write(file, f"signals/{name}", one)
+                if len(one.labels) > _LABELS_IN_ATTRIBUTE:
+                    file.create_dataset(f"labels/{name}", data=list(one.labels), dtype=h5py.string_dtype())
+            except ValueError as error:
+                raise RecordError(f"signal {name!r} cannot be saved: {error}") from error
+    image.seek(0, os.SEEK_END)
+    image.write(b"\ndynsim-sha256:%s\n" % hashlib.sha256(image.getbuffer()).hexdigest().encode("ascii"))
+    return image.getbuffer()
+
+
+def _write(file: Any, name: str, one: Signal) -> None:
+    # gzip only where it pays: it costs time on every run, and short records are small anyway.
+    options = {"compression": "gzip", "compression_opts": 1} if one.data.nbytes > 1 << 22 else {}
+    data = file.create_dataset(name, data=one.data, **options)
+    data.attrs["unit"] = one.unit
+    if len(one.labels) <= _LABELS_IN_ATTRIBUTE:
+        data.attrs["labels"] = list(one.labels)
+    data.attrs["description"] = one.description
+    if one.axis != TIME:
+        data.attrs["axis"] = one.axis
+
+
+def _write_events(file: Any, events: Sequence[Event]) -> None:
+    """A column for each attribute; a file without events has no group of them."""
+    import h5py
+
+    if not events:
+        return
+    for name, kind in EVENT_COLUMNS.items():
+        column = [getattr(event, name) for event in events]
+        if kind is float:
+            column = [math.nan if entry is None else entry for entry in column]
+        file.create_dataset(f"events/{name}", data=column, dtype="f8" if kind is float else h5py.string_dtype())

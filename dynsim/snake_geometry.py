@@ -1,0 +1,72 @@
+"""Lengths, limits and wheels of a snake, from the scene of its record: for figures and studies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.record import Record
+from dynsim.record.scene import Scene
+
+
+@dataclass(frozen=True)
+class SnakeGeometry:
+    """What figures and studies need of a snake besides its signals.
+
+    Attributes
+    ----------
+    head_joints : joints of the head part, the first columns of ``phi``
+    pitch : (n_phi,) where a joint pitches; the others yaw
+    lower, upper : (n_phi,) limits of the joints [rad]
+    wheel_radius : [m]
+    half_track : (pairs,) axle middle to wheel [m]
+    """
+
+    head_joints: int
+    pitch: NDArray[np.bool_]
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    wheel_radius: float
+    half_track: NDArray[np.float64]
+
+
+def snake_geometry(record: Record) -> SnakeGeometry:
+    """Geometry of the snake of a record; one of version 0.1 has no scene, but has it in its provenance.
+
+    Raises
+    ------
+    MissingEntry
+        It is in neither.
+    """
+    if record.scene is None:
+        old = record.provenance["snake"]
+        return SnakeGeometry(
+            head_joints=old["head_joints"],
+            pitch=np.array(old["pitch"], dtype=bool),
+            lower=np.array(old["lower_rad"]),
+            upper=np.array(old["upper_rad"]),
+            wheel_radius=old["wheel_radius_m"],
+            half_track=np.array(old["half_track_m"]),
+        )
+    names = record.labels["phi"]
+    joints = {body.joint.name: body.joint for body in record.scene.bodies}
+    lower, upper = np.array([[joints[name].lower, joints[name].upper] for name in names], dtype=np.float64).T
+    wheels = [_wheels(record.scene, pair) for pair in record.labels["grounded"]]
+    return SnakeGeometry(
+        head_joints=len(names) - len(wheels) + 1,
+        pitch=np.array([abs(joints[name].axis[1]) > 0.5 for name in names]),
+        lower=lower,
+        upper=upper,
+        wheel_radius=wheels[0][0][0],
+        half_track=np.array([max(side for _, side in pair) for pair in wheels]),
+    )
+
+
+def _wheels(scene: Scene, pair: str) -> list[tuple[float, float]]:
+    """Radius and distance from the middle of the axle of the wheels on a body: its own, and bodies that turn on it."""
+    index = {body.name: k for k, body in enumerate(scene.bodies)}[pair]
+    own = [(shape.size[0], abs(shape.position[1])) for shape in scene.bodies[index].shapes if shape.position[1] != 0.0]
+    turning = [body for body in scene.bodies if body.parent == index and body.joint.signal == "rho"]
+    return own + [(body.shapes[0].size[0], abs(body.joint.position[1])) for body in turning]

@@ -1,0 +1,99 @@
+"""Scenes: what is written is what is read; surfaces know what they are."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from dynsim.errors import RecordError
+from dynsim.model.description import Quadric
+from dynsim.model.protocols import BuildContext
+from dynsim.record.scene import Body, Joint, Point, Scene, Shape, Surface, quaternion
+from dynsim.surfaces import cylinder, plane, sphere
+
+CONTEXT = BuildContext(1.0)
+HINGE = Joint("j", "revolute", (0.0, 1.0, 0.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), "q", ("j",))
+
+
+def surface(quadric: Quadric) -> Surface:
+    return Surface.of_quadric("s", quadric.Q, quadric.b, quadric.c)
+
+
+def test_round_trip_and_unknown_keys():
+    scene = Scene(
+        (Body("a", -1, HINGE), Body("b", 0, HINGE, (Shape("cylinder", (0.1, 1.0), colour=(1.0, 0.0, 0.0, 0.5)),))),
+        (surface(plane.build(plane.Config(type="plane"), CONTEXT)),),
+        (Point("hand", "hand", 1, (0.0, 0.0, 1.0)), Point("e", "contact", 0, (0.0, 0.0, 0.5), "s")),
+    )
+    assert Scene.from_json(scene.to_json()) == scene
+    later = json.loads(scene.to_json()) | {"lights": []}
+    later["bodies"][0]["mass"] = 1.0
+    assert Scene.from_json(json.dumps(later)) == scene
+    assert (scene.hand, scene.contacts) == (scene.points[0], scene.points[1:])
+    assert (scene.surface("s"), scene.surface("none")) == (scene.surfaces[0], None)
+
+
+def test_bodies_come_after_their_parents():
+    with pytest.raises(RecordError, match=r"body 'a' .0. does not come after its parent .0."):
+        Scene((Body("a", 0, HINGE),))
+    with pytest.raises(RecordError, match="point 'p' is on body 1, there are 1"):
+        Scene((Body("a", -1, HINGE),), points=(Point("p", "hand", 1, (0.0, 0.0, 0.0)),))
+    with pytest.raises(RecordError, match="planar and has 1 columns"):
+        Joint("j", "planar", (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), "base", ("x",))
+
+
+def test_planes_spheres_and_cylinders_are_recognised():
+    found = surface(plane.build(plane.Config(type="plane", point_m=[1.0, 2.0, 3.0], normal=[0.0, 0.6, 0.8]), CONTEXT))
+    assert (found.kind, found.radius) == ("plane", None)
+    np.testing.assert_allclose(found.direction, [0.0, 0.6, 0.8], atol=1e-15)
+    np.testing.assert_allclose(found.position, 3.6 * np.array([0.0, 0.6, 0.8]), atol=1e-15)
+    for inside, sign in ((False, 1.0), (True, -1.0)):
+        found = surface(
+            sphere.build(sphere.Config(type="sphere", center_m=[1.0, -2.0, 0.5], radius_m=0.7, inside=inside), CONTEXT)
+        )
+        assert found.kind == "sphere"
+        np.testing.assert_allclose(found.position, [1.0, -2.0, 0.5], atol=1e-13)
+        assert found.radius == pytest.approx(sign * 0.7, rel=1e-12)
+        made = cylinder.Config(
+            type="cylinder", point_m=[1.0, 0.0, 2.0], axis=[1.0, 1.0, 0.0], radius_m=0.3, inside=inside
+        )
+        found = surface(cylinder.build(made, CONTEXT))
+        assert (found.kind, found.radius) == ("cylinder", pytest.approx(sign * 0.3, rel=1e-12))
+        axis = np.array(found.direction)
+        np.testing.assert_allclose(np.abs(axis), [0.5**0.5, 0.5**0.5, 0.0], atol=1e-12)
+        off = np.array(found.position) - [1.0, 0.0, 2.0]
+        np.testing.assert_allclose(off - axis * (axis @ off), 0.0, atol=1e-12)
+    cone = Surface.of_quadric("s", np.diag([1.0, 1.0, -1.0]), np.zeros(3), 0.0)
+    assert (cone.kind, cone.position) == ("quadric", None)
+    # No direction is its normal, so it has no parameters that a file could not hold.
+    nowhere = Surface.of_quadric("s", np.zeros((3, 3)), np.zeros(3), 1.0)
+    assert (nowhere.kind, nowhere.direction) == ("quadric", None)
+    # No point is on it.
+    assert Surface.of_quadric("s", np.eye(3), np.zeros(3), 1.0).kind == "quadric"
+
+
+def test_distances_are_those_of_the_model():
+    rng = np.random.default_rng(3)
+    for quadric in (
+        plane.build(plane.Config(type="plane", normal=[0.0, 0.6, 0.8]), CONTEXT),
+        sphere.build(sphere.Config(type="sphere", center_m=[0.0, 0.0, 1.0], radius_m=0.5), CONTEXT),
+        cylinder.build(
+            cylinder.Config(type="cylinder", point_m=[0.0, 0.0, 1.0], axis=[1.0, 0.0, 0.0], radius_m=2.0), CONTEXT
+        ),
+    ):
+        for point in rng.standard_normal((20, 3)):
+            assert surface(quadric).gap(point) == pytest.approx(quadric.gap(point), rel=1e-12, abs=1e-15)
+
+
+def test_quaternions_of_rotations():
+    rng = np.random.default_rng(1)
+    half_turns = [np.diag(d) for d in ([1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0])]
+    turns = [np.linalg.qr(rng.standard_normal((3, 3)))[0] for _ in range(50)]
+    for R in [np.eye(3), *half_turns, *(R * np.sign(np.linalg.det(R)) for R in turns)]:
+        w, *v = quaternion(R)
+        x = np.array(v)
+        cross = np.array([[0.0, -x[2], x[1]], [x[2], 0.0, -x[0]], [-x[1], x[0], 0.0]])
+        np.testing.assert_allclose(np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross, R, atol=1e-15)
+        assert w >= 0.0
