@@ -1,7 +1,8 @@
 """Constraint rows: the small dense systems of their forces, also when rows depend on each other.
 
-One row format for every constraint: a link, ROW (the constrained motion is ROW · V), TARGET (what J vdot must be) and
-DIRECTION (the wrench of a unit force). Row and direction differ under friction, so the p×p matrix is not symmetric.
+One row format for every constraint: up to two links, ROW (the constrained motion is ROW · V), TARGET (what J vdot must
+be) and DIRECTION (the wrench of a unit force). Row and direction differ under sliding friction, so the p×p matrix is
+not symmetric.
 """
 
 from __future__ import annotations
@@ -17,19 +18,18 @@ RANK_TOLERANCE = 1e-11
 
 
 @inlined_kernel
-def solve_small(small, state):
-    """Solve ``small[0]`` f = RHS for the constraint forces f, into the FORCE column of ``state``.
+def solve_small(small, state, active, p):
+    """Solve the leading p×p of ``small[0]`` f = RHS for the constraint forces f, into the FORCE column of ``state``.
 
     Gaussian elimination with partial pivoting; a vanishing pivot switches to the solution of least norm, which is the
     split of forces among dependent rows. Returns 1 in that case, else 0.
 
     Parameters
     ----------
-    small : (4, p, p)
+    small : (4, p or more, p or more)
         Matrix, not symmetric under friction, and scratch.
-    state : (p, CONTACT_STATE_SIZE)
+    state, active : (p or more, ROW_STATE_SIZE), (p or more, ACTIVE_SIZE) int
     """
-    p = state.shape[0]
     if p == 1 and small[0, 0, 0] != 0.0:
         state[0, FORCE] = state[0, RHS] / small[0, 0, 0]
         return 0
@@ -54,7 +54,7 @@ def solve_small(small, state):
                 best = i
         # Written so that NaN falls through to the plain elimination and is seen by the integrator.
         if abs(small[1, best, k]) <= RANK_TOLERANCE * largest:
-            least_norm(small, state)
+            least_norm(small, state, p)
             return 1
         if best != k:
             for j in range(k, p):
@@ -75,9 +75,8 @@ def solve_small(small, state):
 
 
 @internal_kernel
-def least_norm(small, state):
+def least_norm(small, state, p):
     """Least-squares solution of least norm by a one-sided Jacobi singular value decomposition, W = A V."""
-    p = state.shape[0]
     for i in range(p):
         for j in range(p):
             small[1, i, j] = small[0, i, j]

@@ -6,17 +6,21 @@ from dynsim.kernels.arrays import (
     APPLIED,
     ARMATURE,
     BIAS,
+    BODY_A,
+    BODY_B,
+    DEPENDENT,
     DIDT,
     DIRECTION,
     FORCE,
     INDUCTANCE,
-    LINK,
+    JOINT_ROW,
     PARENT,
     QDD,
     RHS,
     ROW,
+    ROW_KIND,
+    ROWS,
     TARGET,
-    ContactArrays,
     DriveArrays,
     ModelArrays,
     S,
@@ -29,18 +33,18 @@ from dynsim.kernels.tree.sweep import mass_matrix, newton_euler
 
 
 @internal_kernel
-def solve_m_star(K, model: ModelArrays, drives: DriveArrays, contacts: ContactArrays, ws: Workspace):
+def solve_m_star(K, model: ModelArrays, drives: DriveArrays, ws: Workspace):
     """Fill M* and b and solve for vdot, contact forces and di/dt.
 
-    K : (n + p + na, n + p + na + 1), room for M* with b as its last column.
+    K : (n + p + na, n + p + na + 1) or more, room for M* with b as its last column.
 
     [M + J_m, −Fᵀ, 0; J, 0, 0; 0, 0, L] [vdot; f; di/dt] = [applied; target; u − R i − K_m v]. F (force directions)
     differs from J (rows) under friction: the paper's −J_tᵀ f_t with f_t = μ f_n has moved to the left side. Call after
     ``contact_rows``: the mass matrix overwrites velocities and wrenches of the sweep.
     """
-    n, p, na = model.tree.shape[0], contacts.link.shape[0], drives.link.shape[0]
+    n, p, na = model.tree.shape[0], ws.counts[ROWS], drives.link.shape[0]
     size = n + p + na
-    links, joints, state = ws.links, ws.joints, ws.contacts
+    links, joints, state = ws.links, ws.joints, ws.rows
     for i in range(size):
         for j in range(size + 1):
             K[i, j] = 0.0
@@ -52,12 +56,17 @@ def solve_m_star(K, model: ModelArrays, drives: DriveArrays, contacts: ContactAr
         K[i, i] += model.body[i, ARMATURE]
     for k in range(p):
         K[n + k, size] = state[k, TARGET]
-        j = contacts.link[k, LINK]
-        while j >= 0:
-            for s in range(6):
-                K[n + k, j] += links[j, S + s] * state[k, ROW + s]
-                K[j, n + k] -= links[j, S + s] * state[k, DIRECTION + s]
-            j = model.tree[j, PARENT]
+        for end in range(2):
+            j, sign = (ws.active[k, BODY_A], 1.0) if end == 0 else (ws.active[k, BODY_B], -1.0)
+            if ws.active[k, ROW_KIND] == JOINT_ROW:
+                K[n + k, j] += state[k, ROW + end]
+                K[j, n + k] -= state[k, DIRECTION + end]
+                continue
+            while j >= 0:
+                for s in range(6):
+                    K[n + k, j] += sign * links[j, S + s] * state[k, ROW + s]
+                    K[j, n + k] -= sign * links[j, S + s] * state[k, DIRECTION + s]
+                j = model.tree[j, PARENT]
     for a in range(na):
         K[n + p + a, size] = emf_balance(drives, ws, a)
         K[n + p + a, n + p + a] = drives.motor[a, INDUCTANCE]
@@ -75,7 +84,7 @@ def solve_m_star(K, model: ModelArrays, drives: DriveArrays, contacts: ContactAr
         state[k, RHS] = K[n + k, size]
         for m in range(p):
             ws.small[0, k, m] = K[n + k, n + m]
-    ws.deficient[0] += solve_small(ws.small, state)
+    ws.counts[DEPENDENT] += solve_small(ws.small, state, ws.active, p)
     for a in range(na):
         ws.motors[a, DIDT] = K[n + p + a, size] / K[n + p + a, n + p + a]
     for i in range(n - 1, -1, -1):
