@@ -11,8 +11,8 @@ from dynsim.kernels.integrate.driver import advance
 from dynsim.kernels.integrate.run import FINISHED, METHODS, STATUS, Run, new_run
 from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.state import block, output_layout, state_layout
-from dynsim.kernels.system import System, derivative
-from dynsim.model.arrays import compile_contacts, compile_drives, compile_model
+from dynsim.kernels.system import System, derivative, new_workspace
+from dynsim.model.arrays import compile_contacts, compile_couplings, compile_drives, compile_model
 from dynsim.model.description import Contact, Inertia, Link, Motor, Quadric, Robot
 from dynsim.model.model import Model
 
@@ -178,6 +178,7 @@ class Bench:
             n=n,
             na=na,
             c=c,
+            couplings=len(self.robot.couplings),
             sample_time=times,
             hand=(n - 1, self.robot.hand[1]),
             end=float(times[-1]),
@@ -205,13 +206,14 @@ def bench(
     na = len(robot.motors)
     contact_arrays = compile_contacts(robot, contacts or [])
     n, c = len(robot.links), len(contacts or [])
+    size = n + na + ka.row_limit(c, len(robot.couplings))
     system = System(
         layout=state_layout(n, n, na, c),
         model=compile_model(robot),
         drives=compile_drives(robot, k_p=[k_p] * na, k_d=[k_d] * na),
         reference=held_reference(np.zeros(na) if held is None else held),
         contacts=contact_arrays,
-        dense=np.zeros((n + na + c, n + na + c + 1)) if m_star else None,
+        dense=np.zeros((size, size + 1)) if m_star else None,
+        couplings=compile_couplings(robot),
     )
-    ws = ka.workspace(n, na, c)
-    return Bench(robot, system, ws)
+    return Bench(robot, system, new_workspace(system))

@@ -31,8 +31,8 @@ from dynsim.kernels.state import (
     output_layout,
     state_layout,
 )
-from dynsim.kernels.system import System
-from dynsim.model.arrays import compile_contacts, compile_drives
+from dynsim.kernels.system import System, new_workspace
+from dynsim.model.arrays import compile_contacts, compile_couplings, compile_drives
 from dynsim.model.clearance import poses
 from dynsim.model.control import JointControl
 from dynsim.model.description import Array, Contact, Link, Robot
@@ -73,23 +73,25 @@ def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
     model = build_model(scenario)
     robot, contacts = model.robot, scenario.contacts()
     scenario.check_start(model)
-    n, na, c = model.n, len(robot.motors), len(contacts)
+    n, na, c, couplings = model.n, len(robot.motors), len(contacts), len(robot.couplings)
     layout, columns = state_layout(n, n, na, c), output_layout(n, na, c)
     times = _sample_times(scenario, columns=layout.size + columns.size)
     _check_stiffness(scenario, robot)
-    _check_work(scenario, n, c)
+    _check_work(scenario, n, c + couplings)
     control = _control(scenario, model, progress)
     _check_references(scenario, robot, contacts, control)
     options = scenario.integrator
     method = ki.METHODS[options.method]
     step = options.step_s or (1e-3 if method == ki.RK4 else 0.0)
+    size = n + ka.row_limit(c, couplings) + na
     system = System(
         layout=layout,
         model=model.arrays,
         drives=compile_drives(robot, k_p=list(control.k_p), k_d=list(control.k_d)),
         reference=control.reference,
         contacts=compile_contacts(robot, contacts),
-        dense=np.zeros((n + c + na, n + c + na + 1)) if options.solver == "m_star" else None,
+        dense=np.zeros((size, size + 1)) if options.solver == "m_star" else None,
+        couplings=compile_couplings(robot),
     )
     y = np.zeros(layout.size)
     y[block(layout, "q")] = robot.initial
@@ -101,6 +103,7 @@ def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
         n=n,
         na=na,
         c=c,
+        couplings=couplings,
         sample_time=times,
         hand=(model.body_index(robot.hand[0]), robot.hand[1]),
         end=scenario.duration_s,
@@ -109,8 +112,7 @@ def prepare(scenario: Scenario, progress: Progress | None = None) -> Prepared:
         rtol=options.rtol,
         atol=options.atol,
     )
-    workspace = ka.workspace(n, na, c)
-    return Prepared(model, contacts, control, system, run, workspace)
+    return Prepared(model, contacts, control, system, run, new_workspace(system))
 
 
 def start(prepared: Prepared) -> Start:
@@ -319,7 +321,7 @@ def _record(scenario: Scenario, prepared: Prepared, wall: float) -> Record:
     integrals = run.states("contact").reshape(rows, len(contacts), CONTACT_SIZE)
     record.add("contact_impulse", integrals[:, :, IMPULSE], "N s", labels=names, description="∫ f_n dt")
     record.add("contact_slip_distance", integrals[:, :, SLIP], "m", labels=names, description="∫ |v_t| dt")
-    deficient, spread = int(prepared.workspace.deficient[0]), None
+    deficient, spread = int(prepared.workspace.counts[ka.DEPENDENT]), None
     if deficient and rows and any(contact.friction > 0.0 for contact in contacts):
         joint_units = [(link.joint, link.units[2]) for link in robot.links]
         spread = motion_spread(prepared.system, run.sample_time[:rows], run.sample[:rows], joint_units)
@@ -368,10 +370,15 @@ def _reason(status: int, scenario: Scenario, prepared: Prepared) -> str:
         return (
             f"{where}: the step size fell to {run.clock[ki.STEP]:.1e} s; try integrator.method rodas4 or a larger rtol"
         )
-    gaps = prepared.workspace.contacts[:, ka.GAP]
+    ws = prepared.workspace
+    gaps = ws.rows[: ws.counts[ka.ROWS], ka.ROW_GAP]
     worst = int(np.argmax(np.abs(gaps)))
-    return (
-        f"{where}: contact {prepared.contacts[worst].name} cannot be kept on its surface (gap {gaps[worst]:+.2e} m); "
-        "the contacts contradict each other or the arm is singular here"
-        + (", or integrator.step_s is too long (try integrator.method: rk43)" if method == "rk4" else "")
+    owner = int(ws.active[worst, ka.OWNER])
+    if ws.active[worst, ka.ROW_KIND] == ka.JOINT_ROW:
+        coupling = prepared.model.robot.couplings[owner]
+        what = f"joint {coupling.joint} cannot be kept where {coupling.leader} leads it (off by {gaps[worst]:+.2e})"
+    else:
+        what = f"contact {prepared.contacts[owner].name} cannot be kept on its surface (gap {gaps[worst]:+.2e} m)"
+    return f"{where}: {what}; the contacts contradict each other or the arm is singular here" + (
+        ", or integrator.step_s is too long (try integrator.method: rk43)" if method == "rk4" else ""
     )

@@ -9,10 +9,12 @@ import numpy as np
 from dynsim.errors import ModelError, shown
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.jit import integers, reals
-from dynsim.model.description import Contact, Link, Motor, Robot
+from dynsim.model.description import Contact, Coupling, Link, Motor, Robot
 
 # Beyond it the reduction of an angle to a quarter turn leaves too few digits (dynsim.kernels.tree.sweep.sine_cosine).
 ANGLE_LIMIT = 1e6
+# Further than this from its leader [rad or m] the initial position of a joint is another one, and no rounding of it.
+COUPLING_TOLERANCE = 1e-6
 
 _FRICTION = {"signed": ka.FRICTION_SIGNED, "dissipative": ka.FRICTION_DISSIPATIVE}
 
@@ -24,11 +26,13 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
     ------
     ModelError
         Duplicate names, a parent that does not come first, an impossible inertia, a joint that nothing can accelerate,
-        a hand on a body that there is not, or vectors of another shape or with what is no finite number.
+        a hand on a body that there is not, an impossible coupling or an initial configuration that breaks one, or
+        vectors of another shape or with what is no finite number.
     """
     links = robot.links
     if not links:
         raise ModelError(f"{robot.name}: a robot needs at least one link")
+    _check_couplings(robot)
     _check_shapes(robot)
     index: dict[str, int] = {}
     joints: dict[str, int] = {}
@@ -81,6 +85,7 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         body[i, ka.ARMATURE] += motor.rotor_inertia * motor.gear_ratio**2
         body[i, ka.GEAR_DAMPING] += motor.gear_damping * motor.gear_ratio**2
     _check_movable(robot, tree, body)
+    _check_start(robot, joints)
     return ka.ModelArrays(tree=integers(tree), body=reals(body), gravity=reals(robot.gravity))
 
 
@@ -129,6 +134,58 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArr
         point[k, ka.QUADRIC + 9] = scale * surface.c
         point[k, ka.MU], point[k, ka.V_S] = contact.friction, contact.slip_smoothing
     return ka.ContactArrays(link=integers(link), point=reals(point))
+
+
+def compile_couplings(robot: Robot) -> ka.CouplingArrays:
+    """Tables of the couplings of a robot that :func:`compile_model` has accepted."""
+    joints = {link.joint: i for i, link in enumerate(robot.links)}
+    joint = np.zeros((len(robot.couplings), ka.COUPLING_JOINT_SIZE), dtype=np.int64)
+    law = np.zeros((len(robot.couplings), ka.COUPLING_SIZE))
+    for k, coupling in enumerate(robot.couplings):
+        joint[k, ka.FOLLOWER], joint[k, ka.LEADER] = joints[coupling.joint], joints[coupling.leader]
+        law[k, ka.RATIO], law[k, ka.OFFSET] = coupling.ratio, coupling.offset
+    return ka.CouplingArrays(joint=integers(joint), law=reals(law))
+
+
+def _check_couplings(robot: Robot) -> None:
+    """Refuse couplings of unknown joints, two of one joint, circles, and numbers that are none."""
+    joints = robot.joint_names
+    leads: dict[str, Coupling] = {}
+    for coupling in robot.couplings:
+        name = f"coupling of {coupling.joint}"
+        for joint in (coupling.joint, coupling.leader):
+            if joint not in joints:
+                raise ModelError(f"{name}: no joint {joint!r}; joints: {', '.join(joints)}")
+        if coupling.joint in leads:
+            raise ModelError(
+                f"{name}: the joint follows {leads[coupling.joint].leader!r} already; it can follow only one"
+            )
+        for quantity in ("ratio", "offset"):
+            value = getattr(coupling, quantity)
+            if not (isinstance(value, (int, float, np.floating)) and np.isfinite(value)):
+                raise ModelError(f"{name}: {quantity} {shown(value)} must be a finite number")
+        leads[coupling.joint] = coupling
+    for start in leads:
+        circle, joint = [start], leads[start].leader
+        while joint in leads and joint not in circle:
+            circle.append(joint)
+            joint = leads[joint].leader
+        if joint in circle:
+            raise ModelError(
+                f"coupling of {start}: joints follow each other in a circle: {' → '.join([*circle, joint])}"
+            )
+
+
+def _check_start(robot: Robot, joints: dict[str, int]) -> None:
+    """Refuse an initial configuration that breaks a coupling."""
+    for coupling in robot.couplings:
+        q, leader = (robot.initial[joints[joint]] for joint in (coupling.joint, coupling.leader))
+        wanted = coupling.ratio * leader + coupling.offset
+        if not abs(q - wanted) <= COUPLING_TOLERANCE:
+            raise ModelError(
+                f"coupling of {coupling.joint}: it starts at {q:.6g}, but {coupling.leader} at {leader:.6g} leads it "
+                f"to {coupling.ratio:g} · {leader:.6g} + {coupling.offset:g} = {wanted:.6g}; leave its position away"
+            )
 
 
 def _check_shapes(robot: Robot) -> None:

@@ -7,7 +7,7 @@ moves with the joint; at q = 0 it is the joint frame J, placed in the parent's b
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -237,11 +237,24 @@ class Contact:
 
 
 @dataclass(frozen=True)
+class Coupling:
+    """A joint that follows another one, q = ratio q_leader + offset: a gear, a belt, a URDF mimic joint.
+
+    It is a constraint without losses: it holds exactly, and takes whatever force that needs.
+    """
+
+    joint: str
+    leader: str
+    ratio: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True)
 class Robot:
     """A tree of links with its motors.
 
     ``hand`` is the controlled point (body name, point in its frame [m]); ``q0`` the initial configuration [rad or m],
-    zero unless given; ``frames`` further names to attach points to.
+    zero unless given; ``frames`` further names to attach points to; ``couplings`` of joints to joints.
     """
 
     name: str
@@ -251,6 +264,7 @@ class Robot:
     gravity: Array = field(default_factory=lambda: vector(0.0, 0.0, -9.81))
     q0: Array | None = None
     frames: tuple[Frame, ...] = ()
+    couplings: tuple[Coupling, ...] = ()
 
     def attach(self, name: str, point: Array) -> tuple[int, Array]:
         """Index of the body that has a name, or a frame of that name, and a point of that frame in the body's [m].
@@ -277,7 +291,24 @@ class Robot:
     @property
     def initial(self) -> Array:
         """Initial configuration, (n,)."""
-        return np.zeros(len(self.links)) if self.q0 is None else np.asarray(self.q0, dtype=np.float64)
+        return self.configuration({}) if self.q0 is None else np.asarray(self.q0, dtype=np.float64)
+
+    def configuration(self, given: Mapping[str, float]) -> Array:
+        """Positions of all joints [rad or m], (n,): as given, followers where their leaders have them, others zero."""
+        leads = {coupling.joint: coupling for coupling in self.couplings if coupling.joint not in given}
+
+        def position(joint: str) -> float:
+            chain: list[Coupling] = []
+            # A cycle of couplings has no position; the compilation refuses it.
+            while joint in leads and len(chain) <= len(leads):
+                chain.append(leads[joint])
+                joint = chain[-1].leader
+            q = float(given.get(joint, 0.0))
+            for coupling in reversed(chain):
+                q = coupling.ratio * q + coupling.offset
+            return q
+
+        return np.array([position(joint) for joint in self.joint_names])
 
     def with_motors_mounted(self) -> Robot:
         """The robot whose motors weigh nothing any more: their masses are part of the links that they sit on."""

@@ -72,7 +72,8 @@ class UrdfLink:
 class UrdfJoint:
     """A joint as the file states it: placement of the child in the parent's frame, unit axis in the child's frame.
 
-    ``kind`` is URDF's type, ``mimics`` the name of the joint that leads this one. Limits [rad or m, rad/s or m/s, N m
+    ``kind`` is URDF's type, ``mimics`` the name of the joint that leads this one, at ``multiplier`` times its position
+    and ``offset`` [rad or m]. Limits [rad or m, rad/s or m/s, N m
     or N] are infinite where the file has none, ``damping`` and ``friction`` zero.
     """
 
@@ -91,6 +92,8 @@ class UrdfJoint:
     damping: float
     friction: float
     mimics: str | None
+    multiplier: float = 1.0
+    offset: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -284,11 +287,10 @@ class _Reader:
         if damping < 0.0 or friction < 0.0:
             line = element.line if dynamics is None else dynamics.line
             raise self.error(line, f"{who}: damping {damping:g} and friction {friction:g}; a loss is zero or positive")
-        mimics = None
+        mimics, multiplier, offset = None, 1.0, 0.0
         if mimic is not None:
             mimics = self.text(mimic, "joint", who)
-            for key, default in (("multiplier", 1.0), ("offset", 0.0)):
-                self.number(mimic, key, who, default)
+            multiplier, offset = self.number(mimic, "multiplier", who, 1.0), self.number(mimic, "offset", who, 0.0)
         return UrdfJoint(
             name=name,
             line=element.line,
@@ -305,6 +307,8 @@ class _Reader:
             damping=damping,
             friction=friction,
             mimics=mimics,
+            multiplier=multiplier,
+            offset=offset,
         )
 
     def limits(self, element: _Element, kind: str, who: str) -> tuple[float, float, float, float]:

@@ -29,7 +29,9 @@ class Config(StrictConfig):
     type: Literal["urdf_arm"]
     file: str = Field(description="URDF file, relative to the scenario file")
     gravity_m_s2: Vector3 = [0.0, 0.0, -9.81]
-    motor: MotorChoice | None = Field(default=None, description="motor of every joint that `motors` does not name")
+    motor: MotorChoice | None = Field(
+        default=None, description="motor of every joint that `motors` does not name and that follows no other"
+    )
     motors: dict[str, MotorChoice] = Field(default={}, description="motors by joint name")
     damping_N_m_s_per_rad: NonNegative | None = Field(
         default=None, description="loss of every revolute joint; default: the URDF's"
@@ -37,7 +39,9 @@ class Config(StrictConfig):
     damping_N_s_per_m: NonNegative | None = Field(
         default=None, description="loss of every prismatic joint; default: the URDF's"
     )
-    initial_deg: dict[str, float] = Field(default={}, description="initial angles of revolute joints by name; others 0")
+    initial_deg: dict[str, float] = Field(
+        default={}, description="initial angles of revolute joints by name; others 0, or where a leader has them"
+    )
     initial_m: dict[str, float] = Field(default={}, description="initial positions of prismatic joints; others 0")
     lock_deg: dict[str, float] = Field(default={}, description="revolute joints that are fixed, at these angles")
     lock_m: dict[str, float] = Field(default={}, description="prismatic joints that are fixed, at these positions")
@@ -90,7 +94,10 @@ def build(config: Config) -> Robot:
     links = tuple(
         link if (loss := given[link.kind]) is None else dataclasses.replace(link, damping=loss) for link in robot.links
     )
-    chosen = {joint: config.motors.get(joint, config.motor) for joint in robot.joint_names}
+    followers = {coupling.joint for coupling in robot.couplings}
+    chosen = {
+        joint: config.motors.get(joint, None if joint in followers else config.motor) for joint in robot.joint_names
+    }
     hand = robot.hand
     if config.hand is not None:
         try:
@@ -104,5 +111,5 @@ def build(config: Config) -> Robot:
         motors=tuple(motor.motor(joint) for joint, motor in chosen.items() if motor is not None),
         hand=hand,
         gravity=np.array(config.gravity_m_s2),
-        q0=np.array([initial.get(joint, 0.0) for joint in robot.joint_names]),
+        q0=robot.configuration(initial),
     )
