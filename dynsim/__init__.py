@@ -16,6 +16,7 @@ from dynsim.errors import DynsimError
 
 if TYPE_CHECKING:
     from dynsim.engine import check, simulate
+    from dynsim.engine.simulation import Simulation, State
     from dynsim.model.model import Model
     from dynsim.record import Record
     from dynsim.scenario import Scenario, build_model, load_scenario
@@ -26,6 +27,8 @@ __all__ = [
     "Model",
     "Record",
     "Scenario",
+    "Simulation",
+    "State",
     "__version__",
     "build_model",
     "check",
@@ -39,6 +42,8 @@ _HOME = {
     "Model": "dynsim.model.model",
     "Record": "dynsim.record",
     "Scenario": "dynsim.scenario",
+    "Simulation": "dynsim.engine.simulation",
+    "State": "dynsim.engine.simulation",
     "build_model": "dynsim.scenario",
     "check": "dynsim.engine",
     "compare": "dynsim.studies.compare",

@@ -21,6 +21,10 @@ class ScenarioError(DynsimError):
     """A scenario cannot be read or is not valid: the message names file, line, key, value and the fix."""
 
 
+class PluginError(DynsimError):
+    """A member of a family that is not there, or is in a package outside dynsim and does not work."""
+
+
 class ModelError(DynsimError):
     """A description of bodies, joints, motors or contacts that no physics can be made of.
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from dynsim._version import __version__
 from dynsim.kernels.integrate.run import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, LOCAL_SINCE, PULLING
 from dynsim.model.clearance import Sinking, sinking
-from dynsim.model.description import Contact, Robot
+from dynsim.model.description import Contact, Drive, Robot, Servo, TorqueSource
 from dynsim.record import Record
-from dynsim.scenario import Scenario
+from dynsim.scenario import Scenario, build
 
 # Integrals that the integrator carries, in the order of the state (dynsim.kernels.ledger).
 INTEGRALS = {
@@ -148,7 +148,7 @@ def summarise(
     turnover = energy_turnover(record)
     residual = float(np.abs(record["energy_residual"]).max(initial=0.0))
     denominator = max(turnover, residual_floor(record, robot, scenario.integrator.rtol))
-    sunk = sinking(robot, scenario.surfaces(), record["q"])
+    sunk = sinking(robot, build.surfaces(scenario), record["q"])
     summary: dict[str, Any] = {
         "scenario": scenario.name,
         "variant": scenario.variant,
@@ -227,12 +227,13 @@ def _warnings(
             "normal force (contacts.pulling_friction: dissipative takes μ |f_n|)"
         )
     for a, motor in enumerate(robot.motors):
-        saturated = np.abs(record["voltage"][:, a]) >= motor.voltage_limit
-        if saturated.any():
-            found.append(
-                f"{motor.joint}: voltage at its limit of {motor.voltage_limit:g} V for "
-                f"{100 * saturated.mean():.1f} % of the run"
-            )
+        for what, signal, limit, unit in _limits_of(motor):
+            saturated = np.abs(record[signal][:, a]) >= limit
+            if saturated.any():
+                found.append(
+                    f"{motor.joint}: {what} at its limit of {limit:g} {unit} for "
+                    f"{100 * saturated.mean():.1f} % of the run"
+                )
     found.extend(_passed_limits(record, robot))
     if summary["energy_residual_relative"] > RESIDUAL_LIMIT:
         found.append(
@@ -253,6 +254,16 @@ def _warnings(
             f"that keep their signs (this run: {s.taken:.4g}); take away braces until the rest are independent"
         )
     return found
+
+
+def _limits_of(motor: Drive) -> list[tuple[str, str, float, str]]:
+    """Limits of a motor: what is limited, its signal, the limit and its unit."""
+    if isinstance(motor, TorqueSource):
+        return [("torque", "current", motor.torque_limit, "N m")]
+    limits = [("voltage", "voltage", motor.voltage_limit, "V")]
+    if isinstance(motor, Servo):
+        limits.append(("current", "current", motor.greatest_current, "A"))
+    return limits
 
 
 def _sunk(record: Record, sunk: Sequence[Sinking]) -> list[str]:

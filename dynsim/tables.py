@@ -116,8 +116,8 @@ def _print_columns(console: Console, summaries: Mapping[str, Summary], names: Se
 
 def print_choices(console: Console) -> None:
     """Shipped scenarios and the members of every family, with the first line of what they say of themselves."""
-    from dynsim.families import member
-    from dynsim.scenario import choices, load_scenario, shipped_scenarios, variant_names
+    from dynsim.families import FAMILIES, member, members
+    from dynsim.scenario import load_scenario, shipped_scenarios, variant_names
 
     table = Table(title="scenarios", box=box.SIMPLE_HEAD, title_justify="left")
     table.add_column("name", no_wrap=True)
@@ -128,10 +128,11 @@ def print_choices(console: Console) -> None:
         sentence = re.split(r"(?<!et al)\.\s", description, maxsplit=1)[0].strip().removesuffix(".")
         table.add_row(escaped_line(path.stem), escaped_line(", ".join(variant_names(path))), escaped_line(sentence))
     console.print(table)
-    for family, names in choices().items():
+    for family in FAMILIES:
         table = Table(title=f"{family}s", box=box.SIMPLE_HEAD, show_header=False, title_justify="left")
-        for name in names:
-            table.add_row(name, escaped_line((member(family, name).__doc__ or "").strip().splitlines()[0]))
+        for name in members(family):
+            first = (member(family, name).__doc__ or "").strip().partition("\n")[0]
+            table.add_row(escaped_line(name), escaped_line(first))
         console.print(table)
 
 

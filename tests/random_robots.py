@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,8 +13,8 @@ from dynsim.kernels.integrate.run import FINISHED, METHODS, STATUS, Run, new_run
 from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.state import block, output_layout, state_layout
 from dynsim.kernels.system import System, derivative, new_workspace
-from dynsim.model.arrays import compile_contacts, compile_couplings, compile_drives, compile_model
-from dynsim.model.description import Contact, Inertia, Link, Motor, Quadric, Robot
+from dynsim.model.arrays import compile_contacts, compile_couplings, compile_drives, compile_loads, compile_model
+from dynsim.model.description import Contact, Inertia, Link, Load, Motor, Quadric, Robot
 from dynsim.model.model import Model
 
 SURFACES = ("plane", "sphere", "cylinder")
@@ -140,7 +141,7 @@ class Bench:
         return len(self.robot.links), len(self.robot.motors), len(self.system.contacts.link)
 
     def state(self, q: np.ndarray, v: np.ndarray, current: np.ndarray | None = None) -> np.ndarray:
-        """State vector with empty ledger, (layout.size,)."""
+        """State vector whose integrals are zero, (layout.size,)."""
         y = np.zeros(self.system.layout.size)
         self.part(y, "q")[:], self.part(y, "v")[:] = q, v
         if current is not None:
@@ -157,7 +158,7 @@ class Bench:
         derivative(self.system, t, reals(y), self.ws, dy)
         return dy
 
-    def simulate(
+    def new_run(
         self,
         y: np.ndarray,
         times: np.ndarray,
@@ -168,9 +169,12 @@ class Bench:
         rtol: float = 1e-6,
         atol: float | None = None,
     ) -> Run:
-        """Integrate to the last of ``times`` and record there; ``fixed`` holds adaptive methods at ``step`` too."""
+        """A run from y to the last of ``times``, recorded there, that has not begun.
+
+        ``step`` 0 leaves the first step to the method; ``fixed`` holds adaptive methods at ``step`` too.
+        """
         n, na, c = self.sizes
-        run = new_run(
+        return new_run(
             METHODS[method],
             y,
             self.system.layout,
@@ -188,7 +192,15 @@ class Bench:
             # With an absolute tolerance out of reach every step is accepted and the next one is as long as allowed.
             atol=1e12 if fixed else rtol * 1e-2 if atol is None else atol,
         )
-        advance(self.system, self.ws, run, 10**7)
+
+    def advance(self, run: Run, limit: int = 10**7) -> Run:
+        """Take up to ``limit`` steps; 0 only starts the run, on its contacts."""
+        advance(self.system, self.ws, run, limit)
+        return run
+
+    def simulate(self, y: np.ndarray, times: np.ndarray, method: str = "dopri5", **options: Any) -> Run:
+        """Integrate to the last of ``times``, which must be reached; ``options`` are those of :meth:`new_run`."""
+        run = self.advance(self.new_run(y, times, method, **options))
         assert run.count[STATUS] == FINISHED
         return run
 
@@ -198,6 +210,7 @@ def bench(
     contacts: list[Contact] | None = None,
     *,
     m_star: bool = False,
+    loads: list[Load] | None = None,
     held: np.ndarray | None = None,
     k_p: float = 30.0,
     k_d: float = 1.0,
@@ -205,14 +218,15 @@ def bench(
     """Compile a robot and its contacts, with a voltage PD that holds ``held`` (zero by default)."""
     na = len(robot.motors)
     contact_arrays = compile_contacts(robot, contacts or [])
-    n, c = len(robot.links), len(contacts or [])
-    size = n + na + ka.row_limit(c, len(robot.couplings))
+    n, c, circuits = len(robot.links), len(contacts or []), robot.circuits
+    size = n + ka.row_limit(c, len(robot.couplings)) + circuits
     system = System(
-        layout=state_layout(n, n, na, c),
+        layout=state_layout(robot.nq, n, circuits, c, len(loads or ())),
         model=compile_model(robot),
         drives=compile_drives(robot, k_p=[k_p] * na, k_d=[k_d] * na),
         reference=held_reference(np.zeros(na) if held is None else held),
         contacts=contact_arrays,
+        loads=compile_loads(robot, loads or ()),
         dense=np.zeros((size, size + 1)) if m_star else None,
         couplings=compile_couplings(robot),
     )

@@ -2,6 +2,7 @@
 
 from hypothesis import strategies as st
 
+from dynsim.model.protocols import BuildContext
 from dynsim.plants.snake import Config, build
 
 
@@ -22,5 +23,6 @@ def robots(draw):
             driven_side=sides,
             gripper_length_m=draw(size),
             controlled_point=draw(st.sampled_from(["head", "gripper"])),
-        )
+        ),
+        BuildContext(1.0),
     )

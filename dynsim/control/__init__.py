@@ -1,1 +1,1 @@
-"""Controllers, one file each: ``Config`` for the scenario and ``build``."""
+"""Controllers, one file each: ``Config``, ``build(config, context)``, and ``ENGINE`` of the plants it controls."""

@@ -1,4 +1,4 @@
-"""Joint references for a hand path, on the joints that the scenario names; and their quintic splines."""
+"""Joint references for a hand path, on the joints that the scenario names."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import make_interp_spline
 
 from dynsim.errors import UnreachableReference
 from dynsim.model.model import Model
@@ -86,21 +85,3 @@ def follow(
             )
         result[k] = q[columns]
     return result
-
-
-def spline_coefficients(times: Array, values: Array) -> Array:
-    """Quintic spline through ``values`` at equally spaced ``times`` as (segments, columns, 6) ascending powers.
-
-    Inside a segment the polynomial is the one that the spline's value, slope and curvature at both ends determine.
-    """
-    spline = make_interp_spline(times, values, k=5)
-    h = float(times[1] - times[0])
-    y, s, c = spline(times), spline(times, 1) * h, spline(times, 2) * h**2
-    dy = y[1:] - y[:-1] - s[:-1] - 0.5 * c[:-1]
-    ds = s[1:] - s[:-1] - c[:-1]
-    dc = c[1:] - c[:-1]
-    a3 = 10.0 * dy - 4.0 * ds + 0.5 * dc
-    a4 = -15.0 * dy + 7.0 * ds - dc
-    a5 = 6.0 * dy - 3.0 * ds + 0.5 * dc
-    powers = np.stack([y[:-1], s[:-1], 0.5 * c[:-1], a3, a4, a5], axis=-1)
-    return powers / h ** np.arange(6)

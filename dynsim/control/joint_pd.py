@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -10,16 +9,17 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy.interpolate import CubicSpline
 
+from dynsim import families
 from dynsim.config import NonNegative, Positive, StrictConfig
-from dynsim.control.inverse_kinematics import follow, spline_coefficients
+from dynsim.control.inverse_kinematics import follow
 from dynsim.errors import ModelError
-from dynsim.families import union
-from dynsim.kernels.arrays import ReferenceArrays
-from dynsim.kernels.jit import integers, reals
-from dynsim.model.control import JointControl
-from dynsim.model.model import Model
+from dynsim.model.control import HandPath, JointControl
+from dynsim.model.description import Motor, Robot, Servo, TorqueSource
+from dynsim.model.protocols import BuildContext
 
-PathChoice: Any = union("path")
+ENGINE = "dynamics"
+
+PathChoice: Any = families.union("path")
 
 # Of the reference splines: half a gigabyte for each joint.
 SEGMENTS_MAX = 10_000_000
@@ -33,6 +33,13 @@ class HandReference(StrictConfig):
     tolerance_m: Positive = Field(default=1e-6, description="a target further off than this is unreachable")
 
 
+def _check_waypoints(times: list[float], values: list[float], key: str) -> None:
+    if len(times) != len(values):
+        raise ValueError(f"{len(times)} times_s and {len(values)} {key}: there must be as many")
+    if np.any(np.diff(times) <= 0.0):
+        raise ValueError("times_s must increase")
+
+
 class JointPath(StrictConfig):
     """Waypoints of one joint: a cubic spline, at rest at both ends and held beyond them."""
 
@@ -41,23 +48,34 @@ class JointPath(StrictConfig):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if len(self.times_s) != len(self.angles_deg):
-            raise ValueError(
-                f"{len(self.times_s)} times_s and {len(self.angles_deg)} angles_deg: there must be as many"
-            )
-        if np.any(np.diff(self.times_s) <= 0.0):
-            raise ValueError("times_s must increase")
+        _check_waypoints(self.times_s, self.angles_deg, "angles_deg")
+        return self
+
+
+class TorquePath(StrictConfig):
+    """Waypoints of one torque: a cubic spline with level ends, held beyond them."""
+
+    times_s: list[float] = Field(min_length=2)
+    torques_N_m: list[float] = Field(min_length=2, description="N at a prismatic joint")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _check_waypoints(self.times_s, self.torques_N_m, "torques_N_m")
         return self
 
 
 class Config(StrictConfig):
-    """Gains for all motors or one per motor; joints without a reference hold their initial position."""
+    """Gains for all DC motors or one per DC motor; joints without a reference hold their initial position.
+
+    Servos follow the same references with gains of their own; torque sources have ``torques``.
+    """
 
     type: Literal["joint_pd"]
     k_p_V_per_rad: NonNegative | list[NonNegative] = Field(default=500.0, description="V/m at a prismatic joint")
     k_d_V_s_per_rad: NonNegative | list[NonNegative] = Field(default=20.0, description="V s/m at a prismatic joint")
     hand: HandReference | None = Field(default=None, description="a path for the hand")
     joints: dict[str, JointPath] = Field(default={}, description="waypoints by joint name")
+    torques: dict[str, TorquePath] = Field(default={}, description="torques of motors of type torque by joint name")
     knot_spacing_s: Positive = Field(default=0.02, description="distance of the knots of the reference splines")
 
     @model_validator(mode="after")
@@ -68,10 +86,8 @@ class Config(StrictConfig):
         return self
 
 
-def build(
-    config: Config, model: Model, duration: float, progress: Callable[[float], None] | None = None
-) -> JointControl:
-    """Resolve gains and references for a robot, over ``duration`` [s]; long inverse kinematics report to ``progress``.
+def build(config: Config, context: BuildContext) -> JointControl:
+    """Resolve gains and references for the model of the context; long inverse kinematics report to its ``progress``.
 
     Raises
     ------
@@ -80,18 +96,27 @@ def build(
     UnreachableReference
         The hand cannot follow its path.
     """
+    model, duration = context.model, context.duration
     robot = model.robot
     driven = [motor.joint for motor in robot.motors]
-    named = [*config.joints, *(config.hand.joints if config.hand else ())]
+    in_hand = config.hand.joints if config.hand else []
+    named = [*config.joints, *config.torques, *in_hand]
     for name in named:
         if name not in driven:
             raise ModelError(f"controller: {name!r} is no joint with a motor; those are: {', '.join(driven) or 'none'}")
+    sources = {motor.joint for motor in robot.motors if isinstance(motor, TorqueSource)}
+    for name in [*config.joints, *in_hand]:
+        if name in sources:
+            raise ModelError(f"controller: {name!r} has a motor of type torque; give it controller.torques.{name}")
+    for name in config.torques:
+        if name not in sources:
+            raise ModelError(f"controller: torques.{name}: only motors of type torque take torques")
     for name in config.joints:
         if robot.links[model.joint_names.index(name)].kind != "revolute":
             raise ModelError(f"controller: {name!r} is prismatic; waypoints in angles_deg are for revolute joints")
-    held = np.array([robot.initial[model.joint_names.index(name)] for name in driven])
-    spline = np.full(len(driven), -1)
-    grid, coefficients = [0.0, 1.0], np.zeros((1, 0, 6))
+    path, times, columns = None, np.zeros(0), []
+    if config.hand is not None:
+        path = families.build("path", config.hand.path, context, HandPath)  # type: ignore[type-abstract]
     if named:
         segments = duration / config.knot_spacing_s
         if segments > SEGMENTS_MAX:
@@ -101,35 +126,38 @@ def build(
             )
         # A quintic spline needs six knots.
         times = np.linspace(0.0, duration, max(int(np.ceil(segments)), 6) + 1)
-        columns = [_waypoints(path, times) for path in config.joints.values()]
-        if config.hand is not None:
-            targets = config.hand.path.position(times)
-            hand = config.hand
-            followed = follow(model, times, targets, hand.joints, robot.initial, hand.tolerance_m, progress)
+        columns = [_waypoints(joint.times_s, np.deg2rad(joint.angles_deg), times) for joint in config.joints.values()]
+        columns += [_waypoints(one.times_s, np.array(one.torques_N_m), times) for one in config.torques.values()]
+        if config.hand is not None and path is not None:
+            hand, targets = config.hand, path.position(times)
+            followed = follow(model, times, targets, hand.joints, robot.initial, hand.tolerance_m, context.progress)
             columns.extend(followed.T)
-        coefficients = spline_coefficients(times, np.stack(columns, axis=1))
-        grid = [0.0, float(times[1])]
-        for k, name in enumerate(named):
-            spline[driven.index(name)] = k
-    reference = ReferenceArrays(
-        spline=integers(spline), held=reals(held), grid=reals(grid), coefficients=reals(coefficients)
-    )
-    return JointControl(
-        k_p=_per_motor(config.k_p_V_per_rad, driven, "k_p_V_per_rad"),
-        k_d=_per_motor(config.k_d_V_s_per_rad, driven, "k_d_V_s_per_rad"),
-        reference=reference,
-        path=config.hand.path if config.hand else None,
+    return JointControl.following(
+        robot,
+        k_p=_gains(config, robot, "k_p"),
+        k_d=_gains(config, robot, "k_d"),
+        times=times,
+        positions=dict(zip(named, columns, strict=True)),
+        path=path,
     )
 
 
-def _waypoints(path: JointPath, times: NDArray[np.float64]) -> NDArray[np.float64]:
-    spline = CubicSpline(path.times_s, np.deg2rad(path.angles_deg), bc_type="clamped")
-    return spline(np.clip(times, path.times_s[0], path.times_s[-1]))
+def _waypoints(at: list[float], values: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:
+    return CubicSpline(at, values, bc_type="clamped")(np.clip(times, at[0], at[-1]))
 
 
-def _per_motor(gain: float | list[float], driven: list[str], key: str) -> NDArray[np.float64]:
-    if isinstance(gain, list):
-        if len(gain) != len(driven):
-            raise ModelError(f"controller: {key} has {len(gain)} values, there are {len(driven)} motors")
-        return np.array(gain)
-    return np.full(len(driven), gain)
+_KEYS = {"k_p": "k_p_V_per_rad", "k_d": "k_d_V_s_per_rad"}
+
+
+def _gains(config: Config, robot: Robot, name: str) -> NDArray[np.float64]:
+    """One gain of every motor: the controller's for DC motors, a servo's own, none of a torque source."""
+    key, motors = _KEYS[name], robot.motors
+    gain, circuits = getattr(config, key), [isinstance(motor, Motor) for motor in motors]
+    if key in config.model_fields_set and motors and not any(circuits):
+        raise ModelError(f"controller: {key} has no effect: it is for DC motors, servos have gains of their own")
+    if isinstance(gain, list) and len(gain) != sum(circuits):
+        kind = "motors" if all(circuits) else "DC motors"
+        raise ModelError(f"controller: {key} has {len(gain)} values, there are {sum(circuits)} {kind}")
+    found = np.array([getattr(motor, name) if isinstance(motor, Servo) else 0.0 for motor in motors])
+    found[np.array(circuits, dtype=bool)] = gain
+    return found

@@ -18,8 +18,9 @@ from dynsim.control.commands import Script, ScriptedSource
 from dynsim.control.modes import TABLE_II, Switching
 from dynsim.errors import ModelError
 from dynsim.kernels.jit import integers, reals
-from dynsim.kernels.snake import SnakeModel, pose_of_point
-from dynsim.kernels.snake_control import (
+from dynsim.model.protocols import BuildContext
+from dynsim.model.snake import ModeTable, SnakeDescription, TaskSpaceController, conditioning
+from dynsim.snake.control import (
     LIMITS_ALLOCATE,
     LIMITS_NONE,
     LIMITS_SATURATE,
@@ -29,9 +30,9 @@ from dynsim.kernels.snake_control import (
     control_input,
     new_work,
 )
-from dynsim.kernels.snake_plant import ESTIMATED, FEEDFORWARD, MEASURED, Schedule
-from dynsim.kernels.snake_support import COST_ANGLES, COST_SUPPORT_MIN, COST_SUPPORT_NORM, Cost
-from dynsim.model.snake import ModeTable, SnakeDescription, TaskSpaceController, conditioning
+from dynsim.snake.kinematics import SnakeModel, pose_of_point
+from dynsim.snake.state import ESTIMATED, FEEDFORWARD, MEASURED, Schedule
+from dynsim.snake.support import COST_ANGLES, COST_SUPPORT_MIN, COST_SUPPORT_NORM, Cost
 
 ENGINE = "kinematic"
 
@@ -111,8 +112,8 @@ class Config(Script):
         return self
 
 
-def build(config: Config, plant: SnakeDescription) -> TaskSpaceController:
-    """Controller for a robot.
+def build(config: Config, context: BuildContext) -> TaskSpaceController:
+    """Controller for the snake of the context.
 
     Raises
     ------
@@ -120,6 +121,7 @@ def build(config: Config, plant: SnakeDescription) -> TaskSpaceController:
         Lists or names that do not fit the robot, or a mode in which the robot cannot be controlled (see
         :func:`check_controllable`).
     """
+    plant = context.snake
     model = plant.arrays()
     joints, inputs = len(plant.joint_names), len(plant.joint_names) + model.wheels
     shape_joints, shape_target = _shape_points(config, plant, model)

@@ -22,6 +22,7 @@ from dynsim.scenario import Scenario, require_scenario
 logging.getLogger("dynsim").addHandler(logging.NullHandler())
 log = logging.getLogger(__name__)
 
+ENGINES = ("dynamics", "kinematic")
 REFERENCES, SIMULATION = "references", "simulation"
 
 
@@ -127,4 +128,7 @@ def _named(scenario: Scenario) -> Iterator[None]:
 
 
 def _module(scenario: Scenario) -> ModuleType:
+    if scenario.engine not in ENGINES:
+        known = ", ".join(ENGINES)
+        raise ModelError(f"plant {scenario.plant.type!r} wants the engine {scenario.engine!r}; there are: {known}")
     return importlib.import_module(f"dynsim.engine.{scenario.engine}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time as clock
-from types import ModuleType
 
 import numpy as np
 
@@ -18,18 +17,6 @@ from dynsim.engine.provenance import provenance
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.families import member
 from dynsim.kernels.jit import integers, reals
-from dynsim.kernels.snake import pose_of_point
-from dynsim.kernels.snake_plant import (
-    MODE,
-    PLACE,
-    TICKS,
-    State,
-    new_rig,
-    new_state,
-    new_trace,
-    record_row,
-    run_ticks,
-)
 from dynsim.model.snake import (
     FIXING,
     NO_REQUEST,
@@ -38,10 +25,12 @@ from dynsim.model.snake import (
     CommandSource,
     Feedback,
     SnakeDescription,
-    TaskSpaceController,
 )
 from dynsim.record import Record
-from dynsim.scenario import Scenario
+from dynsim.scenario import Scenario, build
+from dynsim.snake.kinematics import pose_of_point
+from dynsim.snake.state import MODE, PLACE, TICKS, State, new_rig, new_state, new_trace
+from dynsim.snake.ticks import record_row, run_ticks
 
 log = logging.getLogger(__name__)
 
@@ -61,12 +50,15 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> Run:
     ScenarioError
         The recording rate does not divide the control rate, or the record would be too large.
     """
-    if scenario.controller is None or getattr(_controller_module(scenario), "ENGINE", "") != "kinematic":
+    if scenario.controller is None or member("controller", scenario.controller.type).ENGINE != "kinematic":
         raise ModelError(f"plant {scenario.plant.type!r} (kinematic) needs controller.type: task_space")
     if scenario.config.contacts.points:
         raise ModelError(f"plant {scenario.plant.type!r} (kinematic) takes no contacts.points: it stands on its wheels")
-    description: SnakeDescription = member("plant", scenario.plant.type).build(scenario.plant)
-    controller: TaskSpaceController = _controller_module(scenario).build(scenario.controller, description)
+    if scenario.config.loads:
+        raise ModelError(f"plant {scenario.plant.type!r} (kinematic) takes no loads: it has no forces", keys=("loads",))
+    description = build.machine(scenario)
+    assert isinstance(description, SnakeDescription)
+    controller = build.controller(scenario, description)
     model, period = description.arrays(), controller.schedule.period
     ticks = round(scenario.duration_s / period)
     if ticks < 1:
@@ -144,10 +136,6 @@ def simulate(scenario: Scenario, progress: Progress | None = None, source: Comma
     if stop is not None:
         raise_stopped(stop, record)
     return record
-
-
-def _controller_module(scenario: Scenario) -> ModuleType:
-    return member("controller", scenario.controller.type)
 
 
 def _named(state: State) -> dict[str, list[float]]:

@@ -11,22 +11,14 @@ from dynsim._version import __version__
 from dynsim.engine.kinematic_run import Run
 from dynsim.engine.mode_switching import ModeSwitcher
 from dynsim.kernels.jit import reals
-from dynsim.kernels.snake import new_chain, posture_points
-from dynsim.kernels.snake_plant import (
-    CLAMPED,
-    NULL_REDUCED,
-    SLOWED,
-    TICKS,
-    WAITED,
-    WAITED_FOR,
-    Trace,
-    record_row,
-)
 from dynsim.model.snake import SnakeDescription, TaskSpaceController, conditioning
 from dynsim.record import Record
 from dynsim.scenario import Scenario
+from dynsim.snake.kinematics import new_chain, posture_points
+from dynsim.snake.state import CLAMPED, NULL_REDUCED, SLOWED, TICKS, WAITED, WAITED_FOR, Trace
+from dynsim.snake.ticks import record_row
 
-# Why the target waited, in the order of the counters of dynsim.kernels.snake_plant.State; the last is the rest: after
+# Why the target waited, in the order of the counters of dynsim.snake.state.State; the last is the rest: after
 # an obstacle, until switching has brought the joints below switching.release_fraction of their limits.
 OBSTACLES = ("joint limit", "rate limit", "singular posture", "attitude at beta = 90 deg", "release of the joints")
 COORDINATES = ("x", "y", "z", "alpha", "beta", "gamma")

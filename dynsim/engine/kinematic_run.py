@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.kernels.snake import SnakeModel
-from dynsim.kernels.snake_plant import Rig, State, Trace
 from dynsim.model.snake import CommandBlock, CommandSource, SnakeDescription, TaskSpaceController
+from dynsim.snake.kinematics import SnakeModel
+from dynsim.snake.state import Rig, State, Trace
 
 
 @dataclass

@@ -8,6 +8,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from dynsim import families
 from dynsim._version import __version__
 from dynsim.scenario import Scenario
 
@@ -21,7 +22,7 @@ def provenance(scenario: Scenario) -> dict[str, Any]:
         "engine": scenario.engine,
         "dynsim_version": __version__,
         "commit": commit(),
-        "libraries": {name: _version(name) for name in LIBRARIES},
+        "libraries": {name: _version(name) for name in LIBRARIES} | families.libraries(),
         "python": platform.python_version(),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
     }

@@ -21,7 +21,7 @@ from dynsim.figures.style import Array
 from dynsim.model.description import Contact, Quadric
 from dynsim.model.model import Model
 from dynsim.record import Record
-from dynsim.scenario import build_model, scenario_from_resolved
+from dynsim.scenario import build, build_model, scenario_from_resolved
 
 # Postures drawn faintly, evenly over the run, besides the last one.
 FAINT = 6
@@ -215,7 +215,7 @@ def _body(record: Record) -> tuple[Body | None, str]:
         index = {link.name: k for k, link in enumerate(links)}
         parents = [-1 if link.parent in (None, "world") else index[str(link.parent)] for link in links]
         parents.append(model.body_index(model.robot.hand[0]))
-        return Body(model, scenario.contacts(), scenario.surfaces(), tuple(parents)), ""
+        return Body(model, build.contacts(scenario), build.surfaces(scenario), tuple(parents)), ""
     except (DynsimError, KeyError, OSError) as error:
         return None, f"posture not drawn: {str(error).splitlines()[0][:90]}"
 

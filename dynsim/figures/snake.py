@@ -39,7 +39,7 @@ from dynsim.figures.snake_view import (
 )
 from dynsim.files import replacing
 from dynsim.record import Record
-from dynsim.studies.tanaka2019 import used_limit
+from dynsim.studies.published.tanaka2019 import used_limit
 
 # Postures of an animation, in a row, and over each other in one picture.
 FRAMES, IN_A_ROW, IN_A_PICTURE = 50, 6, 7

@@ -30,7 +30,7 @@ from dynsim.figures.snake_view import (
 )
 from dynsim.files import write_text
 from dynsim.record import Record
-from dynsim.studies.tanaka2019 import (
+from dynsim.studies.published.tanaka2019 import (
     COORDINATES,
     HEAD_ERROR,
     POLICIES,

@@ -12,8 +12,8 @@ from ruamel.yaml import YAML
 
 from dynsim.errors import RecordError
 from dynsim.files import write_text
-from dynsim.hardware.bus import Bus
-from dynsim.hardware.control_table import MX_106, STATE_BLOCK
+from dynsim.hardware.bus.control_table import MX_106, STATE_BLOCK
+from dynsim.hardware.bus.protocol import Bus
 from dynsim.hardware.errors import ServoMapError, VerificationFailed
 from dynsim.hardware.servo_map import Servo, ServoMap, load_servo_map
 

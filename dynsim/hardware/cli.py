@@ -64,13 +64,13 @@ def scan(
 ) -> None:
     """List the servos that answer, at every usual bit rate. Reads only."""
     with _client_library():
-        from dynsim.hardware import session
+        from dynsim.hardware.bus import scan as survey
         from dynsim.hardware.errors import VerificationFailed
         from dynsim.hardware.servo_map import load_servo_map
 
         servo_map = load_servo_map(map_file) if map_file else None
-        bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else session.SCAN_BAUD_RATES
-        found = session.scan(port, bauds)
+        bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else survey.SCAN_BAUD_RATES
+        found = survey.scan(port, bauds)
     if not found:
         raise VerificationFailed(
             f"{port}: no servo answered at {', '.join(f'{b}' for b in bauds)} bit/s. Is the power on, the cable right? "
@@ -121,7 +121,7 @@ def check(record: RecordFile, map_file: MapFile, rate: Rate = None, speed: Speed
 
 
 def _checked(record_file: Path, map_file: Path, rate: float | None, speed: float) -> tuple[Any, Any, Any]:
-    from dynsim.hardware.check import check_motion
+    from dynsim.hardware.replay.check import check_motion
     from dynsim.hardware.servo_map import load_servo_map
     from dynsim.record import Record
 
@@ -172,12 +172,13 @@ def replay(
     Ctrl-C once: controlled stop. Twice: torque off.
     """
     with _client_library():
-        from dynsim.hardware import session
         from dynsim.hardware.errors import ServoMapError
-        from dynsim.hardware.replay import StopRequest
-        from dynsim.hardware.virtual_faults import load_fault_script
+        from dynsim.hardware.ports import VIRTUAL, bus_on
+        from dynsim.hardware.replay.session import run_replay, stop_on_signals
+        from dynsim.hardware.replay.states import StopRequest
+        from dynsim.hardware.virtual.faults import load_fault_script
 
-        if (faults or plant) and port != session.VIRTUAL:
+        if (faults or plant) and port != VIRTUAL:
             raise ServoMapError("--faults and --plant are for virtual servos: --port virtual")
         simulated, servo_map, motion = _checked(record, map_file, rate, speed)
         script = load_fault_script(faults) if faults else None
@@ -185,24 +186,22 @@ def replay(
         folder = out or Path("results") / file_name(f"{servo_map.robot}_replay")
         for warning in motion.warnings:
             console.print(f"warning: {warning}")
-        moves = live or port == session.VIRTUAL
-        if live and port != session.VIRTUAL and not yes:
+        moves = live or port == VIRTUAL
+        if live and port != VIRTUAL and not yes:
             _confirm(servo_map, motion)
         stop = StopRequest()
-        with session.stop_on_signals(stop), _progress(enabled=not quiet) as observer:
-            result = session.run_replay(
+        with stop_on_signals(stop), _progress(enabled=not quiet) as observer:
+            result = run_replay(
                 motion,
                 servo_map,
-                port,
+                bus_on(port, servo_map, script=script, plant=robot),
                 folder,
                 policy=policy.value if policy else None,
-                live=live,
+                live=moves,
                 write_eeprom=configure,
-                script=script,
-                plant=robot,
                 stop=stop,
                 observer=observer,
-                provenance={"record": str(record), "simulated": simulated.provenance},
+                provenance={"port": port, "record": str(record), "simulated": simulated.provenance},
             )
     _print_timing(result)
     if not moves:
@@ -215,7 +214,7 @@ def replay(
 
 
 def _plant(scenario: str, variant: str | None, servo_map: Any, motion: Any) -> Any:
-    from dynsim.hardware.simulated_plant import simulated_arm
+    from dynsim.hardware.virtual.simulated_plant import simulated_arm
 
     posture = dict(zip((servo.label for servo in servo_map.servos), motion.path.position[0], strict=True))
     return simulated_arm(scenario, variant, servo_map, posture)
@@ -290,7 +289,7 @@ def compare(
     out: Annotated[Path | None, typer.Option("--out", help="folder [that of MEASURED]")] = None,
 ) -> None:
     """Delay, rms and largest error between a simulated and a measured run, with a figure."""
-    from dynsim.hardware.compare import check_gate, compare_records, draw_comparison, load_gate
+    from dynsim.hardware.replay.compare import check_gate, compare_records, draw_comparison, load_gate
     from dynsim.record import Record
 
     bounds = load_gate(gate) if gate else None
@@ -322,12 +321,12 @@ def virtual(
 ) -> None:
     """Virtual servos behind a pseudo-terminal, for any Dynamixel tool. Ctrl-C ends it."""
     with _client_library():
-        from dynsim.hardware.pseudo_terminal import PseudoTerminal
-        from dynsim.hardware.replay import StopRequest
+        from dynsim.hardware.replay.session import stop_on_signals
+        from dynsim.hardware.replay.states import StopRequest
         from dynsim.hardware.servo_map import load_servo_map
-        from dynsim.hardware.session import stop_on_signals
-        from dynsim.hardware.virtual_bus import line_for_map
-        from dynsim.hardware.virtual_faults import load_fault_script
+        from dynsim.hardware.virtual.faults import load_fault_script
+        from dynsim.hardware.virtual.line import line_for_map
+        from dynsim.hardware.virtual.pseudo_terminal import PseudoTerminal
 
         servo_map = load_servo_map(map_file)
         script = load_fault_script(faults) if faults else None
@@ -353,13 +352,13 @@ def stop_servos(
 ) -> None:
     """Torque off for every servo at every usual bit rate, beside a replay too; no substitute for a power cut."""
     with _client_library():
-        from dynsim.hardware import session
+        from dynsim.hardware.bus import scan as survey
         from dynsim.hardware.errors import VerificationFailed
         from dynsim.hardware.servo_map import load_servo_map
 
         servo_map = load_servo_map(map_file) if map_file else None
-        bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else session.STOP_BAUD_RATES
-        torque = session.stop_all(port, bauds, servo_map.ids if servo_map else ())
+        bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else survey.STOP_BAUD_RATES
+        torque = survey.stop_all(port, bauds, servo_map.ids if servo_map else ())
     on = [id_ for id_, still_on in torque.items() if still_on]
     if on or not torque:
         who = f"ID {', '.join(map(str, on))}" if on else "any servo"
@@ -384,9 +383,9 @@ def calibrate(
 ) -> None:
     """Write the zero ticks: put the robot into its zero posture by hand (torque off), then run this."""
     with _client_library():
-        from dynsim.hardware import session
         from dynsim.hardware.calibrate import read_zero_ticks, write_zero_ticks
         from dynsim.hardware.errors import ServoMapError
+        from dynsim.hardware.ports import bus_on
         from dynsim.hardware.servo_map import SHIPPED, load_servo_map
 
         servo_map = load_servo_map(map_file)
@@ -397,7 +396,7 @@ def calibrate(
         if unknown:
             raise ServoMapError(f"{map_file} has no joint {', '.join(unknown)}; it has {', '.join(servo_map.joints)}")
         chosen = [servo for servo in servo_map.servos if (servo.joint in joint if joint else servo.in_position_mode)]
-        with session.bus_on(port, servo_map) as (bus, _):
+        with bus_on(port, servo_map) as (bus, _):
             ticks = read_zero_ticks(bus, chosen)
         write_zero_ticks(servo_map, ticks, target)
     table = Table("joint", "ID", "old zero", "new zero")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from dynsim.errors import RecordError
 from dynsim.files import replacing
-from dynsim.hardware.trajectory import Path as JointPath
+from dynsim.hardware.replay.trajectory import Path as JointPath
 from dynsim.record import Record
 
 Format = Literal["csv", "joint-trajectory", "urdf-log"]

@@ -15,9 +15,9 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError, model_validator
 
-from dynsim.config import forbid_conversion
+from dynsim.config import error_at, forbid_conversion
 from dynsim.errors import shown
-from dynsim.hardware.control_table import (
+from dynsim.hardware.bus.control_table import (
     BAUD_RATES,
     MAX_ID,
     MODELS,
@@ -29,6 +29,7 @@ from dynsim.hardware.control_table import (
 )
 from dynsim.hardware.errors import ServoMapError
 from dynsim.inputs import is_file, parse_yaml, read_text
+from dynsim.problems import Origin, explain, unknown_keys
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent / "scenarios" / "hardware"
@@ -130,9 +131,9 @@ class Kind(StrictModel):
     def _position_limits_fit_the_mode(self) -> Kind:
         limits = self.limits.position_deg
         if self.mode == "position" and limits is None:
-            raise ValueError("a servo in position mode needs limits.position_deg: [lowest, highest]")
+            raise error_at("limits", "a servo in position mode needs limits.position_deg: [lowest, highest]")
         if limits is not None and not limits[0] < limits[1]:
-            raise ValueError(f"limits.position_deg: {limits[0]} is not below {limits[1]}")
+            raise error_at("limits.position_deg", f"{limits[0]} is not below {limits[1]}")
         return self
 
 
@@ -174,7 +175,7 @@ class Bus(StrictModel):
     @model_validator(mode="after")
     def _baud_is_one_of_the_servos(self) -> Bus:
         if self.baud not in _BAUD_CHOICES:
-            raise ValueError(f"baud {self.baud} is not one of {', '.join(map(str, _BAUD_CHOICES))}")
+            raise error_at("baud", f"is not one of {', '.join(map(str, _BAUD_CHOICES))}")
         return self
 
 
@@ -237,13 +238,13 @@ class _MapFile(StrictModel):
     @model_validator(mode="after")
     def _servos_are_consistent(self) -> _MapFile:
         if not self.servos:
-            raise ValueError("servos: the map names none")
+            raise error_at("servos", "the map names none")
         owner: dict[int, str] = {}
         for joint, entry in self.servos.items():
             if entry.kind not in self.kinds:
-                raise ValueError(f"servos.{joint}.kind: {entry.kind!r} is not one of {', '.join(self.kinds)}")
+                raise error_at(f"servos.{joint}.kind", f"is not one of {', '.join(self.kinds)}")
             if entry.id in owner:
-                raise ValueError(f"servos.{joint}.id: {entry.id} is also the ID of {owner[entry.id]}")
+                raise error_at(f"servos.{joint}.id", f"is also the ID of {owner[entry.id]}")
             owner[entry.id] = joint
         return self
 
@@ -387,55 +388,5 @@ def read_yaml(path: Path, schema: type[_Schema]) -> _Schema:
     try:
         return schema.model_validate(data)
     except ValidationError as error:
-        raise ServoMapError(_explain(error, path, data, schema)) from error
-
-
-# Unknown keys that one message names.
-_UNKNOWN_SHOWN = 20
-
-
-def _explain(error: ValidationError, path: Path, data: Any, schema: type[BaseModel]) -> str:
-    """One line: all unknown keys, else the first problem."""
-    problems = error.errors(include_url=False, include_input=False)
-    # A misspelt key makes two errors: the wrong one says more than the missing one.
-    unknown = [problem for problem in problems if problem["type"] == "extra_forbidden"]
-    texts = []
-    for problem in unknown[:_UNKNOWN_SHOWN] or problems[:1]:
-        where = ".".join(str(part) for part in problem["loc"])
-        message = " ".join(problem["msg"].removeprefix("Value error, ").split())
-        if unknown:
-            known = _known_keys(schema, problem["loc"])
-            message = f"unknown key; known are {', '.join(known)}" if known else "unknown key"
-        texts.append(f"{path}:{_line(data, problem['loc'])}: {where + ': ' if where else ''}{message}")
-    more = f" (and {len(problems) - len(texts)} more)" if len(problems) > len(texts) else ""
-    return "; ".join(texts) + more
-
-
-def _line(data: Any, location: tuple[int | str, ...]) -> int:
-    line = 1
-    for key in location:
-        lines = getattr(data, "lines", {})
-        if key not in lines:
-            break
-        line, data = lines[key], data[key]
-    return line
-
-
-def _known_keys(schema: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    """Keys a mapping at the parent of ``location`` may hold."""
-    current: Any = schema
-    parts = iter(location[:-1])
-    for part in parts:
-        if not _is_schema(current) or part not in current.model_fields:
-            return []
-        annotation = current.model_fields[part].annotation
-        members = [argument for argument in getattr(annotation, "__args__", ()) if _is_schema(argument)]
-        if members:
-            # A mapping or list of entries: the next part is a key or an index.
-            next(parts, None)
-        current = members[0] if members else annotation
-    return list(current.model_fields) if _is_schema(current) else []
-
-
-def _is_schema(candidate: Any) -> bool:
-    return isinstance(candidate, type) and issubclass(candidate, BaseModel)
+        origin = Origin(path, (data,))
+        raise ServoMapError(explain(error, data, origin, unknown_keys(error, data, origin, schema))) from None

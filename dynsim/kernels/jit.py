@@ -38,6 +38,9 @@ config.SLP_VECTORIZE = 1
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}, "_nrt": False}
 _NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
+# The packages whose functions are compiled into each other: an edit in one makes all compiled code stale.
+_PACKAGES = tuple(Path(__file__).parents[1] / name for name in ("kernels", "snake"))
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -146,7 +149,7 @@ class _KernelCache(_Cache):
     def _path(self, sig: Any, codegen: Any) -> Path:
         """Named by what may differ for the same sources: processor, signature, and a function of another package."""
         source = Path(self._function.__code__.co_filename)
-        content = b"" if source.parent == Path(__file__).parent else source.read_bytes()
+        content = b"" if _names_the_folder(source) else source.read_bytes()
         key = repr((sig, codegen.magic_tuple())).encode() + content
         name = f"{self._function.__module__}.{self._function.__qualname__}"
         return cache_folder() / f"{name}-{hashlib.sha256(key).hexdigest()[:16]}{_SUFFIX}"
@@ -156,6 +159,11 @@ class _KernelCache(_Cache):
     def disable(self) -> None: ...
 
     def flush(self) -> None: ...
+
+
+def _names_the_folder(source: Path) -> bool:
+    """Whether the source is in the name of :func:`cache_folder` already."""
+    return any(source.is_relative_to(package) for package in _PACKAGES)
 
 
 _SUFFIX = ".kernel"
@@ -173,7 +181,7 @@ def cache_folder() -> Path:
     Loading machine code runs it, so a folder that belongs to somebody else, or that others can write to, is not used.
     """
     digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__} {np.__version__}".encode())
-    for source in sorted(Path(__file__).parent.rglob("*.py")):
+    for source in (file for package in _PACKAGES for file in sorted(package.rglob("*.py"))):
         digest.update(source.read_bytes())
     name = Path("dynsim", digest.hexdigest()[:16])
     roots = [os.environ.get(variable) for variable in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")]

@@ -11,6 +11,8 @@ from dynsim.kernels.arrays import (
     D_M,
     DAMPING,
     DIRECTION,
+    DRAG,
+    DRIVEN,
     FIRST_ROW,
     FORCE,
     GAP_RATE,
@@ -59,19 +61,22 @@ def ledger_rates(model: ModelArrays, drives: DriveArrays, ws: Workspace, out, la
     """Rates of all integrals, into the blocks ledger and contact of ``out`` [W; N, m/s], and the normal forces.
 
     Electrical Σ u i; drawn Σ max(u i, 0), a supply for each motor; supply max(Σ u i, 0), one for all; Joule Σ R i²;
-    gear Σ D_m v²; joint Σ D v²; friction −Σ f_n (d − n)·v of what slides, d the force direction; constraint
-    Σ f J v of all rows (zero on the constraint); mechanical Σ tau v with tau = K_m i − J_m vdot − D_m v ([WM] eq 25).
+    gear Σ D_m v² and the drag of servos; joint Σ D v²; friction −Σ f_n (d − n)·v of what slides, d the force direction;
+    constraint Σ f J v of all rows (zero on the constraint); mechanical Σ tau v with tau = K_m i − J_m vdot − D_m v −
+    drag ([WM] eq 25).
     """
     joints, motors, motor, state = ws.joints, ws.motors, drives.motor, ws.contacts
-    electrical, drawn, joule, mechanical = 0.0, 0.0, 0.0, 0.0
+    electrical, drawn, joule, mechanical, drag = 0.0, 0.0, 0.0, 0.0, 0.0
     for a in range(motors.shape[0]):
-        i = drives.link[a]
+        i = drives.table[a, DRIVEN]
         current, v = motors[a, CURRENT], joints[i, QD]
         power = motors[a, VOLTAGE] * current
         electrical += power
         drawn += max(power, 0.0)
         joule += motor[a, RESISTANCE] * current * current
-        mechanical += (motor[a, K_M] * current - motor[a, J_M] * joints[i, QDD] - motor[a, D_M] * v) * v
+        shaft = motor[a, K_M] * current - motor[a, J_M] * joints[i, QDD] - motor[a, D_M] * v - motors[a, DRAG]
+        mechanical += shaft * v
+        drag += motors[a, DRAG] * v
     gear, joint = 0.0, 0.0
     for i in range(joints.shape[0]):
         square = joints[i, QD] * joints[i, QD]
@@ -101,7 +106,7 @@ def ledger_rates(model: ModelArrays, drives: DriveArrays, ws: Workspace, out, la
     out[start + ELECTRICAL] = electrical
     out[start + DRAWN] = drawn
     out[start + JOULE] = joule
-    out[start + GEAR] = gear
+    out[start + GEAR] = gear + drag
     out[start + JOINT] = joint
     out[start + FRICTION] = friction
     out[start + CONSTRAINT] = constraint

@@ -27,7 +27,7 @@ CONTACT_SIZE = 2
 
 
 class StateLayout(NamedTuple):
-    """First index of each block of the state; kernels use only these."""
+    """First index of each block of the state, and what else kernels need to know of it."""
 
     q: int
     v: int
@@ -36,12 +36,15 @@ class StateLayout(NamedTuple):
     contact: int
     load: int
     size: int
+    tracked: int  # how many entries, from the first on, error control looks at: all that derivatives depend on
+    extra: int  # nq − n
 
 
 def state_layout(nq: int, n: int, circuits: int, contacts: int, loads: int = 0) -> StateLayout:
     """The layout for nq positions, n rates, and so many circuits, contact points and external wrenches."""
     starts = np.cumsum([0, nq, n, circuits, LEDGER_SIZE, CONTACT_SIZE * contacts, loads])
-    return StateLayout(*(int(start) for start in starts))
+    q, v, current, ledger, contact, load, size = (int(start) for start in starts)
+    return StateLayout(q, v, current, ledger, contact, load, size, tracked=ledger, extra=nq - n)
 
 
 class OutputLayout(NamedTuple):

@@ -4,7 +4,7 @@ State y, all in one vector:
 
     q  (n,)   joint positions [rad or m]
     v  (n,)   joint rates
-    i  (na,)  motor currents [A]
+    i  (k,)   currents of the motors that have a circuit [A]
     ledger (LEDGER_SIZE,), then impulse and slip of each contact (2 c,): see dynsim.kernels.ledger
 """
 
@@ -16,15 +16,13 @@ import numpy as np
 
 from dynsim.kernels.arrays import (
     APPLIED,
+    CIRCUIT,
     COUPLING_JOINT_SIZE,
     COUPLING_SIZE,
-    CURRENT,
     DAMPING,
     DEPENDENT,
     DIDT,
     GEAR_DAMPING,
-    INDUCTANCE,
-    K_M,
     QD,
     QDD,
     ROWS,
@@ -42,11 +40,13 @@ from dynsim.kernels.constraint.delassus import solve_small
 from dynsim.kernels.constraint.m_star import solve_m_star
 from dynsim.kernels.constraint.rows import set_modes
 from dynsim.kernels.constraint.surface import contact_rows, sign_changed
-from dynsim.kernels.drive.law import emf_balance, motor_voltage
+from dynsim.kernels.drive.law import drive
 from dynsim.kernels.jit import inlined_kernel, integers, internal_kernel, kernel, reals
 from dynsim.kernels.ledger import ledger_rates
 from dynsim.kernels.state import StateLayout
 from dynsim.kernels.tree.articulated import accelerate, add_row_forces, factor, row_system
+from dynsim.kernels.tree.joints import position_rates, read_positions
+from dynsim.kernels.tree.loads import LoadArrays, add_loads
 from dynsim.kernels.tree.sweep import forward_sweep
 
 
@@ -58,9 +58,8 @@ class System(NamedTuple):
     drives: DriveArrays
     reference: ReferenceArrays
     contacts: ContactArrays
-    dense: (
-        np.ndarray | None
-    )  # room for M* and b, see dynsim.kernels.constraint.m_star; None for the articulated solve alone
+    loads: LoadArrays
+    dense: np.ndarray | None  # room for M* and b, see constraint.m_star; None for the articulated solve alone
     couplings: CouplingArrays = CouplingArrays(
         integers(np.zeros((0, COUPLING_JOINT_SIZE))), reals(np.zeros((0, COUPLING_SIZE)))
     )
@@ -70,7 +69,7 @@ def new_workspace(system: System) -> Workspace:
     """The workspace of a system: every candidate slides, every coupling holds."""
     contacts, couplings = system.contacts, system.couplings
     c = contacts.link.shape[0]
-    ws = workspace(system.model.tree.shape[0], system.drives.link.shape[0], c, couplings.joint.shape[0])
+    ws = workspace(system.model.tree.shape[0], system.drives.table.shape[0], c, couplings.joint.shape[0])
     set_modes(contacts, couplings, ws, integers(np.full(c, SLIDING)))
     return ws
 
@@ -111,30 +110,36 @@ def m_star_acceleration(dense, model: ModelArrays, drives: DriveArrays, ws: Work
 def derivative(system: System, t, y, ws: Workspace, dy):
     """dy/dt of the whole coupled system at time t; y, dy: see dynsim.kernels.state."""
     model, drives, contacts, layout = system.model, system.drives, system.contacts, system.layout
-    joints, motors, motor = ws.joints, ws.motors, drives.motor
+    joints, motors = ws.joints, ws.motors
     n, na = joints.shape[0], motors.shape[0]
+    # Most robots have a position for each rate; the others read and write their positions by kind of joint.
+    plain = layout.extra == 0
+    if not plain:
+        read_positions(model, y, layout.q, ws)
     for i in range(n):
-        joints[i, Q] = y[layout.q + i]
+        if plain:
+            joints[i, Q] = y[layout.q + i]
         joints[i, QD] = y[layout.v + i]
         # The sweep multiplies it by zero, which would keep a NaN of a state without solution for ever.
         joints[i, QDD] = 0.0
         joints[i, APPLIED] = -(model.body[i, DAMPING] + model.body[i, GEAR_DAMPING]) * joints[i, QD]
-    for a in range(na):
-        motors[a, CURRENT] = y[layout.current + a]
-        joints[drives.link[a], APPLIED] += motor[a, K_M] * motors[a, CURRENT]
+    drive(drives, system.reference, t, y, layout, ws)
 
     forward_sweep(model, ws, 1.0, 0.0, 1.0)
+    if system.loads.table.shape[0] > 0:
+        add_loads(model, system.loads, t, ws, dy, layout.load)
     contact_rows(model, contacts, ws)
-    motor_voltage(drives, system.reference, t, ws)
     found = ws.counts[DEPENDENT]
     constrained_acceleration(model, ws)
-    for a in range(na):
-        motors[a, DIDT] = emf_balance(drives, ws, a) / motor[a, INDUCTANCE]
     m_star_acceleration(system.dense, model, drives, ws, found)
 
+    if not plain:
+        position_rates(model, ws, dy, layout.q)
     for i in range(n):
-        dy[layout.q + i] = joints[i, QD]
+        if plain:
+            dy[layout.q + i] = joints[i, QD]
         dy[layout.v + i] = joints[i, QDD]
     for a in range(na):
-        dy[layout.current + a] = motors[a, DIDT]
+        if drives.table[a, CIRCUIT] >= 0:
+            dy[layout.current + drives.table[a, CIRCUIT]] = motors[a, DIDT]
     ledger_rates(model, drives, ws, dy, layout)

@@ -9,7 +9,10 @@ import numpy as np
 from dynsim.errors import ModelError, shown
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.jit import integers, reals
-from dynsim.model.description import Contact, Coupling, Link, Motor, Robot
+from dynsim.kernels.tree import loads as kl
+from dynsim.kernels.tree.loads import LoadArrays
+from dynsim.model.description import Contact, Coupling, Drive, Link, Load, Motor, Robot, Servo, TorqueSource
+from dynsim.model.servo import servo_row
 
 # Beyond it the reduction of an angle to a quarter turn leaves too few digits (dynsim.kernels.tree.sweep.sine_cosine).
 ANGLE_LIMIT = 1e6
@@ -34,14 +37,15 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         raise ModelError(f"{robot.name}: a robot needs at least one link")
     _check_couplings(robot)
     _check_shapes(robot)
+    initial, position = robot.initial, robot.position_index
     index: dict[str, int] = {}
     joints: dict[str, int] = {}
     tree = np.zeros((len(links), ka.TREE_SIZE), dtype=np.int64)
     body = np.zeros((len(links), ka.BODY_SIZE))
     for i, link in enumerate(links):
-        if link.kind == "revolute" and abs(robot.initial[i]) > ANGLE_LIMIT:
+        if link.kind == "revolute" and abs(initial[position[i]]) > ANGLE_LIMIT:
             raise ModelError(
-                f"{link.joint}: an initial angle of {robot.initial[i]:.3g} rad; more than {ANGLE_LIMIT:g} rad "
+                f"{link.joint}: an initial angle of {initial[position[i]]:.3g} rad; more than {ANGLE_LIMIT:g} rad "
                 "cannot be told from other angles, take it modulo a turn"
             )
         if link.name in index or link.joint in joints:
@@ -61,6 +65,9 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         index[link.name], joints[link.joint] = i, i
         tree[i, ka.PARENT] = parent
         tree[i, ka.KIND] = _joint_kind(link)
+        tree[i, ka.POSITION_INDEX] = position[i]
+        # Later rows of a joint are mounted where its first one is.
+        tree[i, ka.BASE] = parent if link.row.neutral else tree[parent, ka.BASE]
         tree[i, ka.TURNED] = int(not np.array_equal(R_PJ, np.eye(3)))
         if parent >= 0 and parent != i - 1:
             tree[parent, ka.BRANCHES] += 1
@@ -72,6 +79,7 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         body[i, ka.COM : ka.COM + 3] = link.inertia.com
         body[i, ka.INERTIA : ka.INERTIA + 6] = tensor[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
         body[i, ka.DAMPING] = link.damping
+        body[i, ka.PARAMETER] = link.parameter
     names = set(index)
     for frame in robot.frames:
         if frame.name in names:
@@ -79,30 +87,57 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         if frame.body is not None and frame.body not in index:
             raise ModelError(f"frame {frame.name}: no body {frame.body!r}")
         names.add(frame.name)
+    by_joint = {link.joint: link for link in links}
     for motor in robot.motors:
-        _check_motor(motor, joints)
+        _check_motor(motor, by_joint)
         i = joints[motor.joint]
-        body[i, ka.ARMATURE] += motor.rotor_inertia * motor.gear_ratio**2
-        body[i, ka.GEAR_DAMPING] += motor.gear_damping * motor.gear_ratio**2
+        if not isinstance(motor, TorqueSource):
+            body[i, ka.ARMATURE] += motor.armature
+            body[i, ka.GEAR_DAMPING] += motor.reflected_damping
     _check_movable(robot, tree, body)
-    _check_start(robot, joints)
+    _check_start(robot, {joint: i for i, joint in enumerate(robot.joint_names)})
     return ka.ModelArrays(tree=integers(tree), body=reals(body), gravity=reals(robot.gravity))
 
 
-def compile_drives(robot: Robot, *, k_p: Sequence[float], k_d: Sequence[float]) -> ka.DriveArrays:
-    """Tables of the motors with the gains of the voltage PD, one per motor [V/rad, V s/rad]."""
+def compile_drives(
+    robot: Robot, *, k_p: Sequence[float], k_d: Sequence[float], sampled: bool = False
+) -> ka.DriveArrays:
+    """Tables of the motors.
+
+    Parameters
+    ----------
+    k_p, k_d : gains of the voltage PD, one per motor [V/rad, V s/rad]; only DC motors take them
+    sampled : commands are held between ticks, see :func:`dynsim.kernels.drive.law.take_commands`
+    """
     joints = {link.joint: i for i, link in enumerate(robot.links)}
+    table = np.zeros((len(robot.motors), ka.DRIVE_SIZE), dtype=np.int64)
     motor = np.zeros((len(robot.motors), ka.MOTOR_SIZE))
+    given = np.zeros((len(robot.motors), ka.INPUT_SIZE))
+    circuits = 0
     for a, m in enumerate(robot.motors):
-        k = m.gear_ratio
-        motor[a, ka.K_M] = m.torque_constant * k
-        motor[a, ka.RESISTANCE] = m.resistance
-        motor[a, ka.INDUCTANCE] = m.inductance
-        motor[a, ka.J_M] = m.rotor_inertia * k**2
-        motor[a, ka.D_M] = m.gear_damping * k**2
-        motor[a, ka.K_P], motor[a, ka.K_D] = k_p[a], k_d[a]
-        motor[a, ka.U_MAX] = m.voltage_limit
-    return ka.DriveArrays(link=integers([joints[m.joint] for m in robot.motors]), motor=reals(motor))
+        table[a, ka.DRIVEN], table[a, ka.CIRCUIT], table[a, ka.SAMPLED] = joints[m.joint], -1, sampled
+        if isinstance(m, Motor):
+            table[a, ka.DRIVE_KIND], table[a, ka.CIRCUIT] = ka.DC_MOTOR, circuits
+            circuits += 1
+            motor[a] = _dc_motor(m, k_p[a], k_d[a])
+        elif isinstance(m, Servo):
+            table[a, ka.DRIVE_KIND] = ka.POSITION_SERVO
+            given[a, ka.MODE] = ka.VELOCITY_MODE if m.velocity_mode else ka.POSITION_MODE
+            motor[a] = servo_row(m)
+        else:
+            table[a, ka.DRIVE_KIND] = ka.OPEN_TORQUE
+            motor[a, ka.K_M], motor[a, ka.I_MAX], motor[a, ka.U_MAX] = 1.0, m.torque_limit, np.inf
+    return ka.DriveArrays(table=integers(table), motor=reals(motor), input=reals(given))
+
+
+def _dc_motor(m: Motor, k_p: float, k_d: float) -> np.ndarray:
+    row, k = np.zeros(ka.MOTOR_SIZE), m.gear_ratio
+    row[ka.K_M] = m.torque_constant * k
+    row[ka.RESISTANCE], row[ka.INDUCTANCE] = m.resistance, m.inductance
+    row[ka.J_M], row[ka.D_M] = m.armature, m.reflected_damping
+    row[ka.K_P], row[ka.K_D] = k_p, k_d
+    row[ka.U_MAX], row[ka.I_MAX] = m.voltage_limit, np.inf
+    return row
 
 
 def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArrays:
@@ -136,6 +171,29 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArr
     return ka.ContactArrays(link=integers(link), point=reals(point))
 
 
+def compile_loads(robot: Robot, loads: Sequence[Load]) -> LoadArrays:
+    """Tables of the external wrenches.
+
+    Raises
+    ------
+    ModelError
+        A body that the robot does not have.
+    """
+    table = np.zeros((len(loads), kl.TABLE_SIZE), dtype=np.int64)
+    parts: list[np.ndarray] = []
+    place = 0
+    for k, load in enumerate(loads):
+        try:
+            body, on_body = robot.attach(load.body, load.point)
+        except ModelError as error:
+            raise ModelError(f"load {load.name}: {error}") from None
+        segments = np.column_stack([load.knots[:-1], load.coefficients.reshape(len(load.coefficients), 24)])
+        table[k] = body, load.in_body, load.hold, place, len(segments)
+        parts += [on_body, np.zeros(6), segments.ravel(), load.knots[-1:]]
+        place += kl.FIRST_SEGMENT + segments.size + 1
+    return LoadArrays(table=integers(table), data=reals(np.concatenate(parts) if parts else np.zeros(0)))
+
+
 def compile_couplings(robot: Robot) -> ka.CouplingArrays:
     """Tables of the couplings of a robot that :func:`compile_model` has accepted."""
     joints = {link.joint: i for i, link in enumerate(robot.links)}
@@ -149,13 +207,17 @@ def compile_couplings(robot: Robot) -> ka.CouplingArrays:
 
 def _check_couplings(robot: Robot) -> None:
     """Refuse couplings of unknown joints, two of one joint, circles, and numbers that are none."""
-    joints = robot.joint_names
+    joints = {link.joint: link for link in robot.links}
     leads: dict[str, Coupling] = {}
     for coupling in robot.couplings:
         name = f"coupling of {coupling.joint}"
         for joint in (coupling.joint, coupling.leader):
             if joint not in joints:
                 raise ModelError(f"{name}: no joint {joint!r}; joints: {', '.join(joints)}")
+            if joints[joint].kind not in ("revolute", "prismatic"):
+                raise ModelError(
+                    f"{name}: {joint} is {joints[joint].kind}; only revolute and prismatic joints are coupled"
+                )
         if coupling.joint in leads:
             raise ModelError(
                 f"{name}: the joint follows {leads[coupling.joint].leader!r} already; it can follow only one"
@@ -178,8 +240,9 @@ def _check_couplings(robot: Robot) -> None:
 
 def _check_start(robot: Robot, joints: dict[str, int]) -> None:
     """Refuse an initial configuration that breaks a coupling."""
+    initial, position = robot.initial, robot.position_index
     for coupling in robot.couplings:
-        q, leader = (robot.initial[joints[joint]] for joint in (coupling.joint, coupling.leader))
+        q, leader = (initial[position[joints[joint]]] for joint in (coupling.joint, coupling.leader))
         wanted = coupling.ratio * leader + coupling.offset
         if not abs(q - wanted) <= COUPLING_TOLERANCE:
             raise ModelError(
@@ -197,7 +260,7 @@ def _check_shapes(robot: Robot) -> None:
     quantities: list[tuple[str, object, tuple[int, ...]]] = [
         (f"{robot.name}: gravity", robot.gravity, (3,)),
         (f"{robot.name}: the hand's point", point, (3,)),
-        (f"{robot.name}: q0", robot.initial, (len(names),)),
+        (f"{robot.name}: q0", robot.initial, (robot.nq,)),
     ]
     for link in robot.links:
         inertia = link.inertia
@@ -220,32 +283,46 @@ def _check_shapes(robot: Robot) -> None:
 
 
 def _joint_kind(link: Link) -> int:
-    if link.kind == "prismatic":
-        return ka.PRISMATIC
-    if link.kind != "revolute":
-        raise ModelError(f"{link.joint}: joint kind {link.kind!r}; known: revolute, prismatic")
-    for kind, axis in ((ka.REVOLUTE_X, (1, 0, 0)), (ka.REVOLUTE_Y, (0, 1, 0)), (ka.REVOLUTE_Z, (0, 0, 1))):
-        if np.array_equal(link.axis, axis):
-            return kind
-    return ka.REVOLUTE
+    if link.kind == "revolute":
+        for kind, axis in ((ka.REVOLUTE_X, (1, 0, 0)), (ka.REVOLUTE_Y, (0, 1, 0)), (ka.REVOLUTE_Z, (0, 0, 1))):
+            if np.array_equal(link.axis, axis):
+                return kind
+    return link.row.code
 
 
-def _check_motor(motor: Motor, joints: dict[str, int]) -> None:
+# What must be positive, and what zero or positive, of each kind of motor.
+_POSITIVE: dict[type, dict[str, str]] = {
+    Motor: {"torque_constant": "N m/A", "resistance": "ohm", "gear_ratio": "1"},
+    Servo: {"torque_constant": "N m/A", "resistance": "ohm", "coulomb_speed": "rad/s", "current_limit": "A"},
+    TorqueSource: {},
+}
+_NOT_NEGATIVE: dict[type, tuple[str, ...]] = {
+    Motor: ("rotor_inertia", "gear_damping"),
+    Servo: ("k_p", "k_d", "k_v", "armature", "reflected_damping", "coulomb_friction", "free_drag"),
+    TorqueSource: (),
+}
+
+
+def _check_motor(motor: Drive, joints: dict[str, Link]) -> None:
     if motor.joint not in joints:
         raise ModelError(f"motor: no joint {motor.joint!r}; joints: {', '.join(joints)}")
-    for quantity, unit in (("torque_constant", "N m/A"), ("resistance", "ohm"), ("gear_ratio", "1")):
+    for quantity, unit in _POSITIVE[type(motor)].items():
         if not getattr(motor, quantity) > 0.0:
             raise ModelError(f"motor of {motor.joint}: {quantity} {getattr(motor, quantity)} {unit} must be positive")
-    if not motor.inductance > 0.0:
+    if isinstance(motor, Motor) and not motor.inductance > 0.0:
         raise ModelError(
             f"motor of {motor.joint}: inductance {motor.inductance} H must be positive; "
             "for a circuit without inductance take a small one (1e-6 H) and `integrator: {method: rodas4}`"
         )
-    for quantity in ("rotor_inertia", "gear_damping"):
+    for quantity in _NOT_NEGATIVE[type(motor)]:
         if not getattr(motor, quantity) >= 0.0:
             raise ModelError(f"motor of {motor.joint}: {quantity} {getattr(motor, quantity)} must be zero or positive")
-    if not motor.voltage_limit > 0.0:
+    if not isinstance(motor, TorqueSource) and not motor.voltage_limit > 0.0:
         raise ModelError(f"motor of {motor.joint}: voltage limit {motor.voltage_limit} V must be positive")
+    if not isinstance(motor, Motor) and not motor.torque_limit > 0.0:
+        raise ModelError(f"motor of {motor.joint}: torque limit {motor.torque_limit} N m must be positive")
+    if isinstance(motor, Servo) and joints[motor.joint].kind != "revolute":
+        raise ModelError(f"motor of {motor.joint}: a servo turns, the joint is {joints[motor.joint].kind}")
 
 
 def _check_movable(robot: Robot, tree: np.ndarray, body: np.ndarray) -> None:

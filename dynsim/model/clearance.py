@@ -32,7 +32,7 @@ class Sinking:
 
 
 def poses(robot: Robot, q: Array, bodies: Collection[str] | None = None) -> Iterator[tuple[Link, Array, Array]]:
-    """R_WB, (3, 3, T), and p_WB, (3, T) [m], of each body in turn at joint positions q, (T, n).
+    """R_WB, (3, 3, T), and p_WB, (3, T) [m], of each body in turn at joint positions q, (T, nq).
 
     Vectorised over the samples, which lie together in memory: thousands of them cost a millisecond. ``bodies``: only
     these and those that carry them.
@@ -48,6 +48,7 @@ def poses(robot: Robot, q: Array, bodies: Collection[str] | None = None) -> Iter
             waiting[parent] += 1
     count = len(q)
     known: dict[str, tuple[Array, Array]] = {}
+    index = robot.position_index
     for i, link in enumerate(robot.links):
         if link.name not in wanted:
             continue
@@ -59,20 +60,27 @@ def poses(robot: Robot, q: Array, bodies: Collection[str] | None = None) -> Iter
             waiting[link.parent] -= 1
             if not waiting[link.parent]:
                 del known[link.parent]
+        k, row = index[i], link.row
         if link.kind == "prismatic":
-            p = p + q[:, i] * (link.axis @ R)
+            p = p + q[:, k] * (link.axis @ R)
+        elif link.kind != "revolute":
+            # Later rows of a joint stay where its first one has put the body.
+            if row.motion is not None:
+                turn, shift = row.motion(link, q[:, k : k + len(row.neutral)].T)
+                p = p + np.einsum("ijt,it->jt", R, shift)
+                R = np.einsum("jit,jkt->ikt", turn, R)
         else:
             x, y, z = link.axis
             K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
             # R (1 + sin q K + (1 − cos q) K²); a product from the right is K'ᵀ from the left on the middle axis.
-            R = R + np.sin(q[:, i]) * (K.T @ R) + (1.0 - np.cos(q[:, i])) * ((K @ K).T @ R)
+            R = R + np.sin(q[:, k]) * (K.T @ R) + (1.0 - np.cos(q[:, k])) * ((K @ K).T @ R)
         if waiting[link.name]:
             known[link.name] = R, p
         yield link, R, p
 
 
 def sinking(robot: Robot, surfaces: Mapping[str, Quadric], q: Array) -> list[Sinking]:
-    """Bodies whose axes lie below a surface by more than their radius, at samples q, (T, n).
+    """Bodies whose axes lie below a surface by more than their radius, at samples q, (T, nq).
 
     The axis of a body is the straight line from its joint to :attr:`Link.tip`; without one the lines to the joints that
     it carries, and to the hand. A body of unknown radius has radius zero.

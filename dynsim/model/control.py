@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import make_interp_spline
 
-from dynsim.kernels.arrays import ReferenceArrays
+from dynsim.errors import ModelError
+from dynsim.kernels.arrays import HELD_POSITION, ReferenceArrays
 from dynsim.kernels.jit import integers, reals
+from dynsim.model.description import Robot, TorqueSource
 
 # Samples in a segment of the reference splines, and segments that are looked at together.
 _PER_SEGMENT = 4
 _PIECE = 4096
 
+# Positions of a joint: samples, (T,) [rad or m], or a function of times, (T,) [s], that gives them.
+JointMotion = ArrayLike | Callable[[NDArray[np.float64]], ArrayLike]
 
+
+@runtime_checkable
 class HandPath(Protocol):
     """A path in space."""
 
@@ -24,9 +31,19 @@ class HandPath(Protocol):
         """Positions at times t [s], shape (T,) → (T, 3) [m]."""
 
 
+def held_values(robot: Robot) -> NDArray[np.float64]:
+    """What motors without a moving reference hold, (na,): the initial position of the joint; no torque of a source."""
+    initial = dict(zip(robot.joint_names, robot.initial, strict=True))
+    return np.array([0.0 if isinstance(m, TorqueSource) else initial[m.joint] for m in robot.motors])
+
+
 @dataclass(frozen=True)
 class JointControl:
-    """Gains of the voltage PD per motor [V/rad, V s/rad], joint references, and the path the hand is to follow."""
+    """Gains of the voltage PD per motor [V/rad, V s/rad], joint references, and the path the hand is to follow.
+
+    Only DC motors take the gains; ``k_p`` of a servo says whether it follows its position. References of a torque
+    source are its torques [N m].
+    """
 
     k_p: NDArray[np.float64]
     k_d: NDArray[np.float64]
@@ -34,15 +51,71 @@ class JointControl:
     path: HandPath | None
 
     @classmethod
-    def short_circuit(cls, motors: int) -> JointControl:
-        """No controller: every motor has zero volts on its terminals, so it brakes."""
-        reference = ReferenceArrays(
-            spline=integers(np.full(motors, -1)),
-            held=reals(np.zeros(motors)),
-            grid=reals([0.0, 1.0]),
-            coefficients=reals(np.zeros((1, 0, 6))),
-        )
-        return cls(np.zeros(motors), np.zeros(motors), reference, None)
+    def absent(cls, robot: Robot) -> JointControl:
+        """No controller: DC motors have zero volts and brake, servos hold where they start, torque sources rest."""
+        motors = len(robot.motors)
+        return cls(np.zeros(motors), np.zeros(motors), _reference(held_values(robot)), None)
+
+    @classmethod
+    def following(
+        cls,
+        robot: Robot,
+        k_p: ArrayLike,
+        k_d: ArrayLike,
+        times: ArrayLike = (),
+        positions: Mapping[str, JointMotion] | None = None,
+        path: HandPath | None = None,
+    ) -> JointControl:
+        """The voltage PD u = k_p (q_d − q) + k_d (v_d − v) on joint positions that are given as samples or functions.
+
+        q_d is a quintic spline through the samples, v_d its derivative. Joints without positions hold their first.
+
+        Parameters
+        ----------
+        robot : whose motors are controlled
+        k_p, k_d : one for all motors, or (na,) in their order [V/rad, V s/rad; V/m, V s/m at prismatic joints]
+        times : (T,) [s], equally spaced, T ≥ 6, from 0 to the end of the run
+        positions : by joint, (T,) positions [rad or m], or a function that gives them for ``times``
+        path : what the hand is to follow, for tracking errors in summary and figures
+
+        Raises
+        ------
+        ModelError
+            A joint that has no motor, or samples, times or gains whose shape or values do not fit.
+        """
+        positions = positions or {}
+        driven = [motor.joint for motor in robot.motors]
+        held = held_values(robot)
+        gains = _gains("k_p", k_p, len(driven)), _gains("k_d", k_d, len(driven))
+        for name in positions:
+            if name not in driven:
+                raise ModelError(f"{name!r} is no joint with a motor; those are: {', '.join(driven) or 'none'}")
+        if not positions:
+            return cls(*gains, _reference(held), path)
+        grid = np.asarray(times, dtype=np.float64)
+        if grid.ndim != 1 or len(grid) < 6 or not np.allclose(np.diff(grid), grid[1] - grid[0], rtol=1e-6, atol=0.0):
+            raise ModelError("references need six or more equally spaced times [s]")
+        if not grid[1] > grid[0]:
+            raise ModelError("the times of references must increase")
+        columns = []
+        for name, motion in positions.items():
+            column = np.asarray(motion(grid) if callable(motion) else motion, dtype=np.float64)
+            if column.shape != grid.shape or not np.isfinite(column).all():
+                raise ModelError(f"the reference of {name} needs {len(grid)} finite positions, one for each time")
+            columns.append(column)
+        spline = np.full(len(driven), HELD_POSITION)
+        for k, name in enumerate(positions):
+            spline[driven.index(name)] = k
+        coefficients = spline_coefficients(grid, np.stack(columns, axis=1))
+        begin, second = float(grid[0]), float(grid[1])
+        return cls(*gains, _reference(held, spline, (begin, second - begin), coefficients), path)
+
+    @property
+    def end(self) -> float:
+        """Time up to which the moving references are known [s]; infinite when all hold."""
+        begin, spacing = self.reference.grid
+        moving = bool((self.reference.spline >= 0).any())
+        return float(begin + spacing * len(self.reference.coefficients)) if moving else np.inf
 
     def positions(self, q: NDArray[np.float64], links: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.float64], ...]]:
         """Times, (T,) [s], and the joint positions, (T, n), of the references, in pieces of some thousand samples.
@@ -70,3 +143,44 @@ class JointControl:
     def target(self, t: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Target of the hand at times t, (T, 3) [m]; None without a path."""
         return None if self.path is None else self.path.position(t)
+
+
+def _gains(name: str, value: ArrayLike, motors: int) -> NDArray[np.float64]:
+    """A gain for each motor, (na,)."""
+    gains = np.asarray(value, dtype=np.float64)
+    if gains.shape not in ((), (motors,)) or not (np.isfinite(gains).all() and (gains >= 0.0).all()):
+        raise ModelError(f"{name} must be one gain, or one for each of {motors} motors, finite and not negative")
+    return np.full(motors, gains) if gains.ndim == 0 else gains
+
+
+def _reference(
+    held: NDArray[np.float64],
+    spline: NDArray[np.int64] | None = None,
+    grid: tuple[float, float] = (0.0, 1.0),
+    coefficients: NDArray[np.float64] | None = None,
+) -> ReferenceArrays:
+    """References as the kernels take them: ``held``, (na,), where ``spline`` is HELD_POSITION, else that column."""
+    return ReferenceArrays(
+        spline=integers(np.full(len(held), HELD_POSITION) if spline is None else spline),
+        held=reals(held),
+        grid=reals(grid),
+        coefficients=reals(np.zeros((1, 0, 6)) if coefficients is None else coefficients),
+    )
+
+
+def spline_coefficients(times: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Quintic spline through ``values`` at equally spaced ``times`` as (segments, columns, 6) ascending powers.
+
+    Inside a segment the polynomial is the one that the spline's value, slope and curvature at both ends determine.
+    """
+    spline = make_interp_spline(times, values, k=5)
+    h = float(times[1] - times[0])
+    y, s, c = spline(times), spline(times, 1) * h, spline(times, 2) * h**2
+    dy = y[1:] - y[:-1] - s[:-1] - 0.5 * c[:-1]
+    ds = s[1:] - s[:-1] - c[:-1]
+    dc = c[1:] - c[:-1]
+    a3 = 10.0 * dy - 4.0 * ds + 0.5 * dc
+    a4 = -15.0 * dy + 7.0 * ds - dc
+    a5 = 6.0 * dy - 3.0 * ds + 0.5 * dc
+    powers = np.stack([y[:-1], s[:-1], 0.5 * c[:-1], a3, a4, a5], axis=-1)
+    return powers / h ** np.arange(6)

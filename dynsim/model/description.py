@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.errors import ModelError
+from dynsim.model.joints import Row, rows
 
 Array = NDArray[np.float64]
 WORLD = "world"
@@ -43,6 +44,11 @@ class Inertia:
     mass: float
     com: Array = field(default_factory=lambda: np.zeros(3))
     tensor: Array = field(default_factory=lambda: np.zeros((3, 3)))
+
+    @classmethod
+    def solid_sphere(cls, mass: float, radius: float, center: Array) -> Inertia:
+        """Sphere about ``center``: I = 2 m r²/5; a point mass when the radius is zero."""
+        return cls(mass, center, np.eye(3) * (0.4 * mass * radius**2))
 
     @classmethod
     def solid_cylinder(cls, mass: float, radius: float, length: float) -> Inertia:
@@ -99,13 +105,15 @@ class Link:
         Names of the body and of its joint.
     parent : str or None
         Name of the parent body, None for the world.
-    kind : "revolute" or "prismatic"
+    kind : "revolute", "prismatic", or another row of :func:`dynsim.model.joints.rows`
     axis : (3,) unit joint axis in J (and B)
     R_PJ, p_PJ : (3, 3), (3,) placement of the joint in the parent's frame [m]
     damping : float
         Viscous loss D of the joint [N m s/rad or N s/m].
     lower, upper, velocity_limit, effort_limit : float
         Limits of the joint [rad or m; rad/s or m/s; N m or N]. Nothing enforces them: a run that passes one warns.
+    parameter : what else its kind of joint needs
+    joint_of_rows : name of the joint with several rows that this is one of, None for a joint of its own
     radius : of a cylinder about the body's axis [m], zero when unknown: deeper than that below a surface, a run warns
     tip : (3,) or None
         Other end of the axis in B [m], the first is the joint; None: the joints that the body carries, and the hand.
@@ -126,11 +134,56 @@ class Link:
     effort_limit: float = np.inf
     radius: float = 0.0
     tip: Array | None = None
+    parameter: float = 0.0
+    joint_of_rows: str | None = None
+
+    @property
+    def row(self) -> Row:
+        """Its kind.
+
+        Raises
+        ------
+        ModelError
+            There is no such kind.
+        """
+        if self.kind not in rows():
+            raise ModelError(f"{self.joint}: joint kind {self.kind!r}; known: {', '.join(rows())}")
+        return rows()[self.kind]
 
     @property
     def units(self) -> tuple[str, str, str, str]:
         """Units of position, velocity, acceleration and force of the joint."""
-        return ("m", "m/s", "m/s²", "N") if self.kind == "prismatic" else ("rad", "rad/s", "rad/s²", "N m")
+        return self.row.units
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """Names of the coordinates that begin with this row: those of its joint, none for a later row."""
+        row = self.row
+        return tuple(f"{self.joint_of_rows}.{name}" for name in row.names) or (self.joint,) * len(row.neutral)
+
+
+def in_rows(link: Link, rows: Sequence[tuple[str, str, Array]]) -> tuple[Link, ...]:
+    """A joint of several rows, (suffix, kind, axis) each, the body of ``link`` on the last; the others are massless."""
+    made: list[Link] = []
+    for suffix, kind, axis in rows:
+        last, first = len(made) == len(rows) - 1, not made
+        made.append(
+            replace(
+                link,
+                name=link.name if last else f"{link.name}.{suffix}",
+                joint=f"{link.joint}.{suffix}",
+                parent=link.parent if first else made[-1].name,
+                kind=kind,
+                axis=np.asarray(axis, dtype=np.float64),
+                inertia=link.inertia if last else Inertia(0.0),
+                R_PJ=link.R_PJ if first else np.eye(3),
+                p_PJ=link.p_PJ if first else np.zeros(3),
+                radius=link.radius if last else 0.0,
+                tip=link.tip if last else None,
+                joint_of_rows=link.joint,
+            )
+        )
+    return tuple(made)
 
 
 @dataclass(frozen=True)
@@ -172,6 +225,71 @@ class Motor:
     voltage_limit: float = np.inf
     mass: float = 0.0
     mass_point: Array | None = None
+
+    @property
+    def armature(self) -> float:
+        """J_m = I_m k² [kg m², or kg at a prismatic joint]."""
+        return self.rotor_inertia * self.gear_ratio**2
+
+    @property
+    def reflected_damping(self) -> float:
+        """D_m = d_m k² [N m s/rad, or N s/m]."""
+        return self.gear_damping * self.gear_ratio**2
+
+
+@dataclass(frozen=True)
+class Servo:
+    """A position servo on a revolute joint, everything at its output shaft; its law: dynsim.kernels.drive.servo.
+
+    Attributes
+    ----------
+    joint : str
+    torque_constant : K_m [N m/A = V s/rad]; resistance : R [Ω]
+    k_p, k_d : gains of the position loop [V/rad, V s/rad]
+    k_v : gain of the velocity loop [V s/rad]
+    velocity_mode : the loop follows the rate of the reference, not its position
+    armature : J_m [kg m²]; reflected_damping : D_m [N m s/rad]
+    coulomb_friction : τ_c [N m]; coulomb_speed : v_s [rad/s], below which it fades
+    voltage_limit, current_limit : [V], [A]; torque_limit : of the current, K_m i [N m]; inf for none
+    free_drag : viscous drag of the gear while the servo is off [N m s/rad]
+    mass, mass_point : as of a :class:`Motor`
+    """
+
+    joint: str
+    torque_constant: float
+    resistance: float
+    k_p: float
+    k_d: float = 0.0
+    k_v: float = 0.0
+    velocity_mode: bool = False
+    armature: float = 0.0
+    reflected_damping: float = 0.0
+    coulomb_friction: float = 0.0
+    coulomb_speed: float = 1e-2
+    voltage_limit: float = np.inf
+    current_limit: float = np.inf
+    torque_limit: float = np.inf
+    free_drag: float = 0.0
+    mass: float = 0.0
+    mass_point: Array | None = None
+
+    @property
+    def greatest_current(self) -> float:
+        """The lower of the limits of current and torque [A]."""
+        return min(self.current_limit, self.torque_limit / self.torque_constant)
+
+
+@dataclass(frozen=True)
+class TorqueSource:
+    """A torque on a joint that is its own reference, within ``torque_limit`` [N m, or N]; mass as of a motor."""
+
+    joint: str
+    torque_limit: float = np.inf
+    mass: float = 0.0
+    mass_point: Array | None = None
+
+
+Drive = Motor | Servo | TorqueSource
 
 
 @dataclass(frozen=True)
@@ -250,6 +368,38 @@ class Coupling:
 
 
 @dataclass(frozen=True)
+class Load:
+    """A force and a torque from outside on a point of a body, as cubic polynomials of time.
+
+    Attributes
+    ----------
+    body : name of a link
+    point : (3,) where the force acts, in the link's frame [m]
+    in_body : whether the components are in the axes of the link, else of the world
+    knots : (K + 1,) increasing times [s]
+    coefficients : (K, 6, 4) ascending powers of t - knots[k], force x, y, z [N], then torque x, y, z [N m]
+    hold : whether the values at the first and the last knot go on beyond them, else it is zero there
+    """
+
+    name: str
+    body: str
+    point: Array
+    in_body: bool
+    knots: Array
+    coefficients: Array
+    hold: bool
+
+    def components(self, t: Array) -> Array:
+        """Force and torque at times t [s], (T,) → (T, 6) [N, N m]."""
+        t = np.asarray(t, dtype=np.float64)
+        inside = np.clip(t, self.knots[0], self.knots[-1])
+        segment = np.minimum(np.searchsorted(self.knots, inside, side="right") - 1, len(self.coefficients) - 1)
+        powers = (inside - self.knots[segment])[:, None] ** np.arange(4)
+        values = np.einsum("tcp,tp->tc", self.coefficients[segment], powers)
+        return values if self.hold else np.where((inside == t)[:, None], values, 0.0)
+
+
+@dataclass(frozen=True)
 class Robot:
     """A tree of links with its motors.
 
@@ -259,7 +409,7 @@ class Robot:
 
     name: str
     links: tuple[Link, ...]
-    motors: tuple[Motor, ...]
+    motors: tuple[Drive, ...]
     hand: tuple[str, Array]
     gravity: Array = field(default_factory=lambda: vector(0.0, 0.0, -9.81))
     q0: Array | None = None
@@ -274,9 +424,18 @@ class Robot:
         ModelError
             No such body or frame, or a frame that is fixed to the world.
         """
+        index, frame = self._find(name)
+        return index, point if frame is None else frame.p + frame.R @ point
+
+    def attached_axes(self, name: str) -> Array:
+        """Axes of the body or frame of that name in the body's, (3, 3); raises what :meth:`attach` does."""
+        _, frame = self._find(name)
+        return np.eye(3) if frame is None else frame.R
+
+    def _find(self, name: str) -> tuple[int, Frame | None]:
         bodies = [link.name for link in self.links]
         if name in bodies:
-            return bodies.index(name), point
+            return bodies.index(name), None
         frame = next((frame for frame in self.frames if frame.name == name), None)
         if frame is None:
             names = [*bodies, *(frame.name for frame in self.frames if frame.body is not None)]
@@ -286,16 +445,17 @@ class Robot:
             raise ModelError(f"no body {name!r}{hint}; bodies: {', '.join(bodies)}{fixed}")
         if frame.body is None:
             raise ModelError(f"{name!r} is fixed to the world and does not move; bodies: {', '.join(bodies)}")
-        return bodies.index(frame.body), frame.p + frame.R @ point
+        return bodies.index(frame.body), frame
 
     @property
     def initial(self) -> Array:
-        """Initial configuration, (n,)."""
+        """Initial configuration, (nq,)."""
         return self.configuration({}) if self.q0 is None else np.asarray(self.q0, dtype=np.float64)
 
     def configuration(self, given: Mapping[str, float]) -> Array:
-        """Positions of all joints [rad or m], (n,): as given, followers where their leaders have them, others zero."""
+        """Coordinates [rad or m], (nq,): as given by joint, followers where their leaders have them, others neutral."""
         leads = {coupling.joint: coupling for coupling in self.couplings if coupling.joint not in given}
+        q = np.array([value for link in self.links for value in link.row.neutral])
 
         def position(joint: str) -> float:
             chain: list[Coupling] = []
@@ -303,12 +463,35 @@ class Robot:
             while joint in leads and len(chain) <= len(leads):
                 chain.append(leads[joint])
                 joint = chain[-1].leader
-            q = float(given.get(joint, 0.0))
+            found = float(given.get(joint, 0.0))
             for coupling in reversed(chain):
-                q = coupling.ratio * q + coupling.offset
-            return q
+                found = coupling.ratio * found + coupling.offset
+            return found
 
-        return np.array([position(joint) for joint in self.joint_names])
+        for joint, k in zip(self.joint_names, self.position_index, strict=True):
+            if joint in given or joint in leads:
+                q[k] = position(joint)
+        return q
+
+    @property
+    def nq(self) -> int:
+        """Number of coordinates: one for each angle or distance, four for a ball joint."""
+        return sum(len(link.row.neutral) for link in self.links)
+
+    @property
+    def position_index(self) -> tuple[int, ...]:
+        """For each link where its own coordinates begin in q."""
+        found, first, beyond = [], 0, 0
+        for link in self.links:
+            if link.row.neutral:
+                first, beyond = beyond, beyond + len(link.row.neutral)
+            found.append(first + link.row.offset)
+        return tuple(found)
+
+    @property
+    def position_names(self) -> tuple[str, ...]:
+        """Names of the coordinates, in the order of q."""
+        return tuple(name for link in self.links for name in link.coordinates)
 
     def with_motors_mounted(self) -> Robot:
         """The robot whose motors weigh nothing any more: their masses are part of the links that they sit on."""
@@ -326,6 +509,11 @@ class Robot:
         )
 
     @property
+    def circuits(self) -> int:
+        """How many motors have a circuit, whose current is a state."""
+        return sum(isinstance(motor, Motor) for motor in self.motors)
+
+    @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints, in the order of q."""
+        """Names of the joints, one for each rate, in the order of v."""
         return tuple(link.joint for link in self.links)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from dynsim.errors import ModelError, shown
 from dynsim.kernels import arrays as ka
 from dynsim.kernels import ledger
-from dynsim.kernels.tree import articulated, points, sweep
+from dynsim.kernels.tree import articulated, joints, points, sweep
 from dynsim.model.arrays import compile_model
 from dynsim.model.description import Array, Robot, listed
 
@@ -47,8 +47,9 @@ class Model:
         robot = robot.with_motors_mounted() if any(motor.mass for motor in robot.motors) else robot
         self.robot = robot
         self.arrays = compile_model(robot)
-        self.n = len(robot.links)
+        self.n, self.nq = len(robot.links), robot.nq
         self._workspace = ka.workspace(self.n, 0, 0)
+        self._q = np.zeros(self.nq)
         # forward_dynamics and mass_matrix are those of the bodies alone: no rotor inertia.
         self._bodies = self.arrays._replace(body=self.arrays.body.copy())
         self._bodies.body[:, ka.ARMATURE] = 0.0
@@ -120,14 +121,14 @@ class Model:
     def inverse_dynamics(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike) -> Array:
         """tau = M v̇ + h + g, (n,) [N m] ([WM] eqs 42–44)."""
         self._set(q, v)
-        self._workspace.joints[:, ka.QDD] = self._vector(vdot, "vdot")
+        self._workspace.joints[:, ka.QDD] = self._vector(vdot, "vdot", self.joint_names)
         sweep.newton_euler(self.arrays, self._workspace, 1.0, 1.0, 1.0)
         return self._workspace.joints[:, ka.BIAS].copy()
 
     def forward_dynamics(self, q: ArrayLike, v: ArrayLike, tau: ArrayLike) -> Array:
         """v̇ = M⁻¹ (tau − h − g), (n,) [rad/s²], by the articulated sweeps."""
         self._set(q, v)
-        self._workspace.joints[:, ka.APPLIED] = self._vector(tau, "tau")
+        self._workspace.joints[:, ka.APPLIED] = self._vector(tau, "tau", self.joint_names)
         articulated.forward_dynamics(self._bodies, self._workspace)
         return self._workspace.joints[:, ka.QDD].copy()
 
@@ -200,17 +201,19 @@ class Model:
         sweep.newton_euler(self.arrays, self._workspace, 1.0, 0.0, 1.0)
 
     def _set(self, q: ArrayLike, v: ArrayLike | None = None) -> None:
-        self._workspace.joints[:, ka.Q] = self._vector(q, "q")
-        self._workspace.joints[:, ka.QD] = 0.0 if v is None else self._vector(v, "v")
+        self._q[:] = self._vector(q, "q", self.robot.position_names)
+        joints.read_positions(self.arrays, self._q, 0, self._workspace)
+        self._workspace.joints[:, ka.QD] = 0.0 if v is None else self._vector(v, "v", self.joint_names)
 
-    def _vector(self, values: ArrayLike, name: str) -> Array:
+    def _vector(self, values: ArrayLike, name: str, labels: tuple[str, ...]) -> Array:
         array = _numbers(values, name)
-        if array.shape != (self.n,):
-            raise ModelError(f"{name} has shape {array.shape}; this model has {self.n} joints")
+        if array.shape != (len(labels),):
+            what = "joints" if self.nq == self.n else "coordinates" if name == "q" else "rates"
+            raise ModelError(f"{name} has shape {array.shape}; this model has {len(labels)} {what}")
         # The sum of Python's numbers first: it neither warns nor takes as long as a look by numpy at every element.
         if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():
             k = int(np.flatnonzero(~np.isfinite(array))[0])
-            raise ModelError(f"{name} is {array[k]} at {self.joint_names[k]}; it must be finite")
+            raise ModelError(f"{name} is {array[k]} at {labels[k]}; it must be finite")
         return array
 
     @staticmethod

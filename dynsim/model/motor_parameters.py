@@ -1,17 +1,45 @@
-"""Parameters of a brushed DC motor with a gear, as a scenario gives them ([WM] eqs 16–25)."""
+"""What every motor of a scenario has, and the parameters of a brushed DC motor with a gear ([WM] eqs 16–25)."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from dynsim.config import NonNegative, Positive, StrictConfig, Vector3, error_at
-from dynsim.model.description import Motor
+from dynsim.model.description import Drive, Motor
 
 
-class MotorParameters(StrictConfig):
+class DriveParameters(StrictConfig):
+    """A motor of any kind: what it weighs, and how it becomes part of a robot."""
+
+    mass_kg: NonNegative = Field(
+        default=0.0, description="of motor and gear, a point mass on the link before the joint"
+    )
+    mass_point_m: Vector3 | None = Field(
+        default=None, description="where, in that link's frame; default: at the motor's joint"
+    )
+
+    @model_validator(mode="after")
+    def _check_mass(self) -> Self:
+        if self.mass_point_m is not None and self.mass_kg == 0.0:
+            raise error_at("mass_point_m", "has no effect without mass_kg")
+        return self
+
+    @property
+    def mass_point(self) -> NDArray[np.float64] | None:
+        """Where its mass is, (3,) [m]; None: at the joint."""
+        return None if self.mass_point_m is None else np.array(self.mass_point_m)
+
+    @abstractmethod
+    def motor(self, joint: str) -> Drive:
+        """The motor on the joint of that name."""
+
+
+class MotorParameters(DriveParameters):
     """L di/dt = u − R i − K k v; joint torque K k i − I_m k² v̇ − d_m k² v."""
 
     torque_constant_N_m_per_A: Positive
@@ -21,12 +49,6 @@ class MotorParameters(StrictConfig):
     gear_ratio: Positive = Field(description="motor turns per joint turn; at a prismatic joint rad of the motor per m")
     gear_damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="on the motor side")
     voltage_limit_V: Positive | None = None
-    mass_kg: NonNegative = Field(
-        default=0.0, description="of motor and gear, a point mass on the link before the joint"
-    )
-    mass_point_m: Vector3 | None = Field(
-        default=None, description="where, in that link's frame; default: at the motor's joint"
-    )
 
     @field_validator("inductance_H", mode="before")
     @classmethod
@@ -35,12 +57,6 @@ class MotorParameters(StrictConfig):
         if value == 0:
             raise ValueError("must be positive; for none take 1e-6 with integrator.method: rodas4")
         return value
-
-    @model_validator(mode="after")
-    def _check_mass(self) -> Self:
-        if self.mass_point_m is not None and self.mass_kg == 0.0:
-            raise error_at("mass_point_m", "has no effect without mass_kg")
-        return self
 
     def motor(self, joint: str) -> Motor:
         """The motor on the joint of that name."""
@@ -54,5 +70,5 @@ class MotorParameters(StrictConfig):
             gear_damping=self.gear_damping_N_m_s_per_rad,
             voltage_limit=np.inf if self.voltage_limit_V is None else self.voltage_limit_V,
             mass=self.mass_kg,
-            mass_point=None if self.mass_point_m is None else np.array(self.mass_point_m),
+            mass_point=self.mass_point,
         )

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from dynsim.errors import ModelError
 from dynsim.kernels.jit import integers, reals
-from dynsim.kernels.snake import (
+from dynsim.snake.control import Law
+from dynsim.snake.kinematics import (
     SnakeModel,
     active_rows,
     constraint_matrices,
@@ -19,8 +20,7 @@ from dynsim.kernels.snake import (
     pose_of_point,
     walk_chain,
 )
-from dynsim.kernels.snake_control import Law
-from dynsim.kernels.snake_plant import Schedule
+from dynsim.snake.state import Schedule
 
 Policy = Literal["fixed", "cyclic", "predictive"]
 

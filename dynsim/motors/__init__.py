@@ -1,1 +1,1 @@
-"""Motors, one file per parameter set: a ``Config`` of motor parameters with the defaults of its source."""
+"""Motors, one file per parameter set or kind: a ``Config`` with the defaults of its source, and ``build``."""

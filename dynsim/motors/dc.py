@@ -4,10 +4,17 @@ from __future__ import annotations
 
 from typing import Literal
 
+from dynsim.model.description import Motor
 from dynsim.model.motor_parameters import MotorParameters
+from dynsim.model.protocols import BuildContext
 
 
 class Config(MotorParameters):
     """All parameters of the motor, none assumed."""
 
     type: Literal["dc"]
+
+
+def build(config: Config, context: BuildContext) -> Motor:
+    """The motor on ``context.joint``."""
+    return config.motor(context.joint)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Literal
 
 from dynsim.config import NonNegative, Positive
+from dynsim.model.description import Motor
 from dynsim.model.motor_parameters import MotorParameters
+from dynsim.model.protocols import BuildContext
 
 
 class Config(MotorParameters):
@@ -18,3 +20,8 @@ class Config(MotorParameters):
     rotor_inertia_kg_m2: NonNegative = 1.64e-4
     gear_ratio: Positive = 3.0
     gear_damping_N_m_s_per_rad: NonNegative = 0.01
+
+
+def build(config: Config, context: BuildContext) -> Motor:
+    """The motor on ``context.joint``."""
+    return config.motor(context.joint)

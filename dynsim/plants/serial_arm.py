@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
+from dynsim import families
 from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig, Vector3, error_at, unit_vector
-from dynsim.families import union
-from dynsim.model.description import Inertia, Link, Motor, Robot, vector
-from dynsim.model.motor_parameters import MotorParameters
+from dynsim.model.description import Drive, Inertia, Link, Robot, vector
+from dynsim.model.protocols import BuildContext
 
 ENGINE = "dynamics"
 
-if TYPE_CHECKING:
-    MotorChoice = MotorParameters
-else:
-    MotorChoice = union("motor")
+MotorChoice: Any = families.union("motor")
 AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
 
 
@@ -161,7 +158,7 @@ def _places(key: str, chain: list[dict[str, Any]]) -> str:
     return ", ".join(owners) or {**ONLY_REVOLUTE, **ONLY_PRISMATIC}[key]
 
 
-def build(config: Config) -> Robot:
+def build(config: Config, context: BuildContext) -> Robot:
     """The chain as a tree of bodies ``link_1``…, with joints ``joint_1``… and initial positions.
 
     The link's own frame sits in its joint, +z along the link; the base is turned by ``base.yaw_deg`` about +z.
@@ -169,7 +166,7 @@ def build(config: Config) -> Robot:
     yaw = np.deg2rad(config.base.yaw_deg)
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
     links: list[Link] = []
-    motors: list[Motor] = []
+    motors: list[Drive] = []
     initial: list[float] = []
     reach = 0.0
     for group in config.chain:
@@ -192,7 +189,7 @@ def build(config: Config) -> Robot:
                 )
             )
             if group.motor is not None:
-                motors.append(group.motor.motor(f"joint_{number}"))
+                motors.append(families.build("motor", group.motor, context.at_joint(f"joint_{number}"), Drive))
             initial.append(group.initial)
             reach = group.length_m
     if config.initial_deg is not None:

@@ -13,6 +13,7 @@ from pydantic import Field
 
 from dynsim.config import NonNegative, Positive, StrictConfig
 from dynsim.errors import ModelError
+from dynsim.model.protocols import BuildContext
 from dynsim.model.snake import SnakeDescription
 
 ENGINE = "kinematic"
@@ -60,7 +61,7 @@ class Config(StrictConfig):
     )
 
 
-def build(config: Config) -> SnakeDescription:
+def build(config: Config, context: BuildContext) -> SnakeDescription:
     """Description of the configured robot.
 
     Raises

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from dynsim import families
 from dynsim.config import BodyPoint, NonNegative, StrictConfig, Vector3, error_at
 from dynsim.errors import ModelError
-from dynsim.families import union
-from dynsim.model.description import Robot
-from dynsim.model.motor_parameters import MotorParameters
+from dynsim.model.description import Drive, Robot
+from dynsim.model.protocols import BuildContext
 
 ENGINE = "dynamics"
 
-if TYPE_CHECKING:
-    MotorChoice = MotorParameters
-else:
-    MotorChoice = union("motor")
+MotorChoice: Any = families.union("motor")
 
 
 class Config(StrictConfig):
@@ -77,7 +74,7 @@ class Config(StrictConfig):
         return self
 
 
-def build(config: Config) -> Robot:
+def build(config: Config, context: BuildContext) -> Robot:
     """The robot of the file with the scenario's motors.
 
     Raises
@@ -108,7 +105,11 @@ def build(config: Config) -> Robot:
     return dataclasses.replace(
         robot,
         links=links,
-        motors=tuple(motor.motor(joint) for joint, motor in chosen.items() if motor is not None),
+        motors=tuple(
+            families.build("motor", motor, context.at_joint(joint), Drive)
+            for joint, motor in chosen.items()
+            if motor is not None
+        ),
         hand=hand,
         gravity=np.array(config.gravity_m_s2),
         q0=robot.configuration(initial),

@@ -13,13 +13,12 @@ import numpy as np
 from dynsim._version import __version__
 from dynsim.engine import simulate
 from dynsim.files import write_json
-from dynsim.model.clearance import poses
 from dynsim.record import Record
 from dynsim.scenario import Scenario, load_scenario, scenario_from_resolved, shipped_scenarios, variant_names
 from dynsim.studies.compare import compare
-from dynsim.studies.rotors import rotor_energies
+from dynsim.studies.published.rotors import rotor_energies
+from dynsim.studies.published.wang_minami import ELBOWS, elbow_forces, elbow_numbers
 
-ELBOWS = "elbow_comparison"
 # Fine enough for what happens in the first tenth of a second.
 RATE_HZ = 2000.0
 
@@ -82,40 +81,6 @@ def residuals() -> dict[str, float]:
     for name in FREE:
         found[name] = simulate(free_scenario(name)).summary["energy_residual_relative"]
     return found
-
-
-def elbow_numbers(record: Record, scenario: Scenario) -> dict[str, float]:
-    """Energies, works and the depth of the lowest joint of one variant."""
-    summary, time = record.summary, record.time
-    keys = ("electrical_energy_J", "electrical_energy_supply_J", "electrical_energy_drawn_J", "mechanical_work_J")
-    row = {key: summary[key] for key in keys}
-    row["sum_of_absolute_power_J"] = float(np.trapezoid(np.abs(record["torque"] * record["v"]).sum(axis=1), time))
-    lowest = np.min([p[2] for _, _, p in poses(scenario.robot(), record["q"])], axis=0)
-    row["joint_depth_max_m"] = float(-lowest.min())
-    row["joint_depth_from_2_s_min_m"] = float(-lowest[time >= 2.0].max())
-    row["joint_depth_from_2_s_max_m"] = float(-lowest[time >= 2.0].min())
-    row["joint_depth_end_m"] = float(-lowest[-1])
-    return row
-
-
-def elbow_forces(record: Record) -> dict[str, float]:
-    """How the floor pushes and then pulls at elbow 4, and when it pulls at elbow 7, with both elbows held."""
-    time, names = record.time, record.labels["contact_normal_force"]
-    force, other = (record["contact_normal_force"][:, names.index(name)] for name in ("elbow_4", "elbow_7"))
-    pulled = time[other < 0.0]
-    turn = int(np.flatnonzero(force < 0.0)[0])
-    settled = force[time >= 0.17]
-    return {
-        "pushes_until_s": float(time[turn]),
-        "push_max_N": float(force[:turn].max()),
-        "at_0.1_s_N": float(np.interp(0.1, time, force)),
-        "pull_max_N": float(-force.min()),
-        "pull_from_0.17_s_min_N": float(-settled.max()),
-        "pull_from_0.17_s_max_N": float(-settled.min()),
-        "elbow_7_pulls_from_s": float(pulled[0]),
-        "elbow_7_pulls_until_s": float(pulled[-1]),
-        "hand_starts_off_m": float(np.linalg.norm(record["hand_position"][0] - record["target_position"][0])),
-    }
 
 
 def _elbows(variant: str = "two_elbows", **integrator: Any) -> Record:

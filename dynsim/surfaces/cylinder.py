@@ -9,6 +9,7 @@ from pydantic import model_validator
 
 from dynsim.config import Positive, StrictConfig, Vector3, unit_vector
 from dynsim.model.description import Quadric
+from dynsim.model.protocols import BuildContext
 
 
 class Config(StrictConfig):
@@ -26,7 +27,7 @@ class Config(StrictConfig):
         return self
 
 
-def build(config: Config) -> Quadric:
+def build(config: Config, context: BuildContext) -> Quadric:
     """The cylinder as a quadric with |∇C| = 1 on it."""
     sign = -1.0 if config.inside else 1.0
     axis, point, radius = unit_vector(config.axis, "axis"), np.array(config.point_m), config.radius_m

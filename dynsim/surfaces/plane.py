@@ -9,6 +9,7 @@ from pydantic import model_validator
 
 from dynsim.config import StrictConfig, Vector3, unit_vector
 from dynsim.model.description import Quadric
+from dynsim.model.protocols import BuildContext
 
 
 class Config(StrictConfig):
@@ -24,7 +25,7 @@ class Config(StrictConfig):
         return self
 
 
-def build(config: Config) -> Quadric:
+def build(config: Config, context: BuildContext) -> Quadric:
     """The plane as a quadric with Q = 0."""
     normal = unit_vector(config.normal, "normal")
     return Quadric(np.zeros((3, 3)), normal, -float(normal @ config.point_m))

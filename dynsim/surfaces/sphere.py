@@ -8,6 +8,7 @@ import numpy as np
 
 from dynsim.config import Positive, StrictConfig, Vector3
 from dynsim.model.description import Quadric
+from dynsim.model.protocols import BuildContext
 
 
 class Config(StrictConfig):
@@ -19,7 +20,7 @@ class Config(StrictConfig):
     inside: bool = False
 
 
-def build(config: Config) -> Quadric:
+def build(config: Config, context: BuildContext) -> Quadric:
     """The sphere as a quadric with |∇C| = 1 on it."""
     sign = -1.0 if config.inside else 1.0
     center, radius = np.array(config.center_m), config.radius_m

@@ -15,7 +15,7 @@ from dynsim.cli import main
 from dynsim.engine import check
 from dynsim.kernels.jit import cache_folder
 from dynsim.record import FORMAT, Record
-from dynsim.scenario import SHIPPED, build_model, load_scenario
+from dynsim.scenario import SHIPPED, build, build_model, load_scenario
 
 SHORT = ["--set", "duration_s=0.2", "--set", "metrics.settle_s=0.05"]
 
@@ -223,7 +223,7 @@ def test_check_prints_positions_that_can_be_copied_into_a_surface(tmp_path: Path
     """What is printed reads back to the same doubles, and the surface through it is accepted."""
     scenario = load_scenario("elbow_comparison", "two_elbows")
     start = check(scenario)
-    model, robot = build_model(scenario), scenario.robot()
+    model, robot = build_model(scenario), build.robot(scenario)
     assert start.hand.tolist() == model.point_position(*robot.hand, robot.initial).tolist()
     assert list(start.contacts) == ["elbow_4", "elbow_7"]
     shown = dynsim("check", "elbow_comparison", "snake_operator", folder=tmp_path).stdout.splitlines()

@@ -30,7 +30,7 @@ import os, sys
 from pathlib import Path
 
 import dynsim.control.joint_pd as joint_pd
-import dynsim.kernels.integrate.driver as integrate
+import dynsim.kernels.integrate.driver as driver
 from dynsim.cli import main
 
 def mark(what, function):
@@ -40,8 +40,8 @@ def mark(what, function):
     return marked
 
 # The first call of advance takes no step: it loads the kernels.
-advance, watched = integrate.advance, mark("simulating", integrate.advance)
-integrate.advance = lambda *arguments: (watched if arguments[-1] else advance)(*arguments)
+advance, watched = driver.advance, mark("simulating", driver.advance)
+driver.advance = lambda *arguments: (watched if arguments[-1] else advance)(*arguments)
 joint_pd.follow = mark("planning", joint_pd.follow)
 
 if __name__ == "__main__":
@@ -247,12 +247,12 @@ def test_a_signal_after_the_last_step_loses_nothing(
 # A signal whose KeyboardInterrupt Python drops, because it comes while a callback of the garbage collector runs.
 LOST = """
 import os, signal, weakref
-import dynsim.engine.dynamics as dynamics
+import dynsim.kernels.integrate.driver as driver
 from dynsim.cli import main
 
 class Thing: ...
 
-advance, calls = dynamics.advance, []
+advance, calls = driver.advance, []
 
 def lose(*arguments):
     calls.append(1)
@@ -262,7 +262,7 @@ def lose(*arguments):
         del thing
     return advance(*arguments)
 
-dynamics.advance = lose
+driver.advance = lose
 main()
 """
 

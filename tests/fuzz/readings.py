@@ -143,11 +143,13 @@ def _model_losses(said: Mapping[str, Any], plant: Mapping[str, Any], scenario: A
     lost: list[str] = []
     if scenario.engine != "dynamics":
         return lost
+    from dynsim.scenario import build
+
     if plant.get("type") == "serial_arm":
         masses = [
             float(entry.get("mass_kg", 0.1)) for entry in plant["chain"] for _ in range(int(entry.get("count", 1)))
         ]
-        built = [link.inertia.mass for link in scenario.robot().links]
+        built = [link.inertia.mass for link in build.robot(scenario).links]
         if masses != built:
             lost.append(f"masses {masses[:5]}… became {built[:5]}…")
     contacts = said.get("contacts") or {}
@@ -157,7 +159,7 @@ def _model_losses(said: Mapping[str, Any], plant: Mapping[str, Any], scenario: A
         for name, point in points.items()
         if point is not None and point.get("enabled", True)
     }
-    held = {contact.name: contact.friction for contact in scenario.contacts()}
+    held = {contact.name: contact.friction for contact in build.contacts(scenario)}
     if friction != held:
         lost.append(f"friction {friction} became {held}")
     return lost

@@ -10,14 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dynsim.hardware.check import CheckedMotion, check_motion, velocity_limit
-from dynsim.hardware.clock import VirtualClock
-from dynsim.hardware.dynamixel_bus import DynamixelBus
-from dynsim.hardware.packet import Instruction, Packet
-from dynsim.hardware.replay import Replay, ReplayResult, StopRequest
+from dynsim.hardware.bus.clock import VirtualClock
+from dynsim.hardware.bus.dynamixel_bus import DynamixelBus
+from dynsim.hardware.bus.packet import Instruction, Packet
+from dynsim.hardware.replay.check import CheckedMotion, check_motion, velocity_limit
+from dynsim.hardware.replay.machine import Replay
+from dynsim.hardware.replay.states import ReplayResult, StopRequest
 from dynsim.hardware.servo_map import ServoMap, load_servo_map
-from dynsim.hardware.virtual_bus import VirtualLine, VirtualPort, line_for_map
-from dynsim.hardware.virtual_faults import FaultScript
+from dynsim.hardware.virtual.faults import FaultScript
+from dynsim.hardware.virtual.line import VirtualLine, line_for_map
+from dynsim.hardware.virtual.port import VirtualPort
 from dynsim.record import Record
 
 MAP = """\

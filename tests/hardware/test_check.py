@@ -9,11 +9,11 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
-from dynsim.hardware.check import check_motion, plan_cycle, velocity_limit
-from dynsim.hardware.control_table import RAD_PER_TICK
+from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.errors import CheckRefused
+from dynsim.hardware.replay.check import check_motion, plan_cycle, velocity_limit
+from dynsim.hardware.replay.trajectory import path_of_record
 from dynsim.hardware.servo_map import load_servo_map
-from dynsim.hardware.trajectory import path_of_record
 from dynsim.record import Record
 
 from .conftest import Rig, check_goals_within_limits, swing
@@ -191,5 +191,5 @@ def test_what_is_sent_never_violates_a_limit(rig: Rig, knots, interval: float, s
         assert len(sent) > 2
         times, ticks = np.array([t for t, _ in sent]), np.array([v for _, v in sent])
         # One tick of rounding at each end of the step.
-        allowed = velocity_limit(servo) * np.maximum(np.diff(times), run.replay._period) / RAD_PER_TICK + 1
+        allowed = velocity_limit(servo) * np.maximum(np.diff(times), run.replay.loop.period) / RAD_PER_TICK + 1
         assert np.all(np.abs(np.diff(ticks)) <= allowed)

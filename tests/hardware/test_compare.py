@@ -11,12 +11,12 @@ import pytest
 from ruamel.yaml import YAML
 
 from dynsim.errors import RecordError
-from dynsim.hardware.compare import Gate, check_gate, compare_records, draw_comparison, load_gate
-from dynsim.hardware.control_table import MX_106
+from dynsim.hardware.bus.control_table import MX_106
 from dynsim.hardware.errors import ComparisonGateFailed, ServoMapError
 from dynsim.hardware.export import export_record
-from dynsim.hardware.servo_plant import MotorLaw
-from dynsim.hardware.virtual_bus import ADAPTER_LATENCY
+from dynsim.hardware.replay.compare import Gate, check_gate, compare_records, draw_comparison, load_gate
+from dynsim.hardware.virtual.line import ADAPTER_LATENCY
+from dynsim.hardware.virtual.servo_plant import MotorLaw
 from dynsim.record import Record
 
 from .conftest import swing
@@ -65,7 +65,7 @@ def test_the_gate_fails_with_every_bound_exceeded(rig, clean_run, tmp_path) -> N
         check_gate(comparison, Gate(rms_rad=0.001, delay_s=0.01))
     assert failure.value.exit_code == 5
     (tmp_path / "gate.yaml").write_text("rms: 0.1\n", encoding="utf-8")
-    with pytest.raises(ServoMapError, match="rms: unknown key; known are rms_rad"):
+    with pytest.raises(ServoMapError, match="rms: unknown key; did you mean 'rms_rad'"):
         load_gate(tmp_path / "gate.yaml")
     assert draw_comparison(comparison, tmp_path / "figures" / "comparison.png").stat().st_size > 10_000
     assert json.loads(json.dumps(comparison.summary()))["rms_rad"] == comparison.worst.rms
@@ -148,7 +148,7 @@ def test_a_late_loop_skips_samples_and_sends_no_burst(rig) -> None:
         if calls == 150:
             run.clock.sleep_until(run.clock.now() + 0.055)
 
-    run.replay._observer = hiccup
+    run.replay.journal.observer = hiccup
     result = run.replay.run()
     assert result.fault is None
     assert result.timing.skipped_cycles in (4, 5)
@@ -158,10 +158,10 @@ def test_a_late_loop_skips_samples_and_sends_no_burst(rig) -> None:
 
 
 def test_a_loop_that_stays_late_aborts_within_its_bound(rig) -> None:
-    from dynsim.hardware.rules import Cause
+    from dynsim.hardware.replay.rules import Cause
 
     run = rig.prepare()
-    run.replay._observer = lambda progress: run.clock.sleep_until(run.clock.now() + 0.025)
+    run.replay.journal.observer = lambda progress: run.clock.sleep_until(run.clock.now() + 0.025)
     result = run.replay.run()
     assert result.fault.cause == Cause.DEADLINE
     late = (result.record["lateness"] > 1 / run.map.bus.rate).sum()

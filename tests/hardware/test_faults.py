@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dynsim.hardware.check import velocity_limit
-from dynsim.hardware.control_table import RAD_PER_TICK
-from dynsim.hardware.packet import Instruction
-from dynsim.hardware.replay import State
-from dynsim.hardware.rules import Cause, reaction_bound
-from dynsim.hardware.virtual_bus import PHYSICS_STEP
+from dynsim.hardware.bus.control_table import RAD_PER_TICK
+from dynsim.hardware.bus.packet import Instruction
+from dynsim.hardware.replay.check import velocity_limit
+from dynsim.hardware.replay.rules import Cause, reaction_bound
+from dynsim.hardware.replay.states import State
+from dynsim.hardware.virtual.servos import PHYSICS_STEP
 
 from .conftest import check_goals_within_limits
 
@@ -78,7 +78,7 @@ def check_case(rig, case: Case, seed: int) -> None:
     if not case.causes:
         assert result.fault is None, what
         assert result.end_state == "off"
-        assert not any(servo["torque_enable"] for servo in run.line.servos.values())
+        assert not any(servo["torque_enable"] for servo in run.line.servos.registers.values())
         return
     assert result.fault is not None, what
     assert result.fault.cause in case.causes, what
@@ -86,7 +86,7 @@ def check_case(rig, case: Case, seed: int) -> None:
     check_end_state(run, policy, entry, what)
     if case.scripted_onset:
         # A fault strikes at the first physics step after its onset.
-        check_reaction(run, run.line.torque_since + onset + PHYSICS_STEP, case, what)
+        check_reaction(run, run.line.servos.torque_since + onset + PHYSICS_STEP, case, what)
 
 
 def check_nothing_but_the_policy_after(run) -> None:
@@ -128,24 +128,24 @@ def check_end_state(run, policy: str, entry: dict[str, Any], what: str) -> None:
     end, line = run.result.end_state, run.line
     if run.result.fault.cause == Cause.VERIFICATION:
         assert end == "not armed", what
-        assert not any(servo["torque_enable"] for servo in line.servos.values())
+        assert not any(servo["torque_enable"] for servo in line.servos.registers.values())
         assert not run.goals()
         return
     if run.result.fault.cause == Cause.PORT:
         assert end == "unreachable", what
         line.advance(line.time + 2.0)
         # Nobody can be told anything: the servos' own watchdogs stop them.
-        assert all(servo["bus_watchdog"] == -1 for servo in line.servos.values())
-        assert np.abs(line.plant.velocity).max() < 1e-3
+        assert all(servo["bus_watchdog"] == -1 for servo in line.servos.registers.values())
+        assert np.abs(line.servos.plant.velocity).max() < 1e-3
         return
     assert end == ("off" if policy == "off" else "holding"), what
     if end == "off":
-        alive = [id_ for id_ in line.ids if line.servos[id_]["torque_enable"]]
+        alive = [id_ for id_ in line.servos.ids if line.servos.registers[id_]["torque_enable"]]
         assert not alive, what
         return
     line.advance(line.time + 2.0)
-    assert np.abs(line.plant.velocity).max() < 1e-2, what
-    for id_, servo in line.servos.items():
+    assert np.abs(line.servos.plant.velocity).max() < 1e-2, what
+    for id_, servo in line.servos.registers.items():
         if id_ == entry.get("id"):
             continue
         assert servo["torque_enable"], what
@@ -166,9 +166,9 @@ def check_reaction(run, onset: float, case: Case, what: str) -> None:
         run_length = len(over) if over.all() else int(np.argmin(over[::-1]))
         assert run_length == bound, f"{what}: {run_length} cycles, bound {bound}"
         return
-    starts = (record.time + run.replay._replay_started)[before] if run.replay._replay_started else None
+    starts = (record.time + run.replay.loop.path_started)[before] if run.replay.loop.path_started else None
     if starts is None:
-        starts = (record.time + run.replay._origin)[before]
+        starts = (record.time + run.replay.loop.origin)[before]
     cycles = int((starts >= onset + case.visible_after).sum())
     assert cycles <= bound, f"{what}: {cycles} cycles, bound {bound}"
     # No cycle at all only where the fault struck within the one that declared it: the clock says so too.
@@ -211,7 +211,7 @@ def test_without_faults_the_replay_ends_off_with_nothing_missed_or_skipped(clean
 def test_every_listed_fault_has_a_case() -> None:
     from typing import get_args
 
-    from dynsim.hardware import virtual_faults
+    from dynsim.hardware.virtual import faults as virtual_faults
 
     kinds = {
         kind
@@ -225,38 +225,38 @@ def test_torque_taken_away_by_another_program_is_noticed_in_turn(rig) -> None:
     run = rig.prepare(policy="decelerate")
 
     def take_away(progress) -> None:
-        if progress.state == State.REPLAY and run.line.servos[2]["torque_enable"] and run.clock.now() > 1.9:
-            run.line._write(2, 64, b"\0")
+        if progress.state == State.REPLAY and run.line.servos.registers[2]["torque_enable"] and run.clock.now() > 1.9:
+            run.line.servos.write(2, 64, b"\0")
 
-    run.replay._observer = take_away
+    run.replay.journal.observer = take_away
     result = run.replay.run()
     assert result.fault.cause in (Cause.TORQUE_LOST, Cause.FOLLOWING_ERROR)
     assert result.end_state == "holding"
-    assert not run.line.servos[2]["torque_enable"], "nobody may switch it on again"
+    assert not run.line.servos.registers[2]["torque_enable"], "nobody may switch it on again"
 
 
 def test_overload_integrator_shuts_a_jammed_joint_down() -> None:
     """A joint pressed against a stop overloads after OVERLOAD_TIME; only a reboot brings it back."""
-    from dynsim.hardware.control_table import MX_106
-    from dynsim.hardware.packet import StatusError
-    from dynsim.hardware.virtual_bus import VirtualLine
-    from dynsim.hardware.virtual_faults import FaultScript
-    from dynsim.hardware.virtual_servo import ServoRegisters
+    from dynsim.hardware.bus.control_table import MX_106
+    from dynsim.hardware.bus.packet import StatusError
+    from dynsim.hardware.virtual.faults import FaultScript
+    from dynsim.hardware.virtual.line import VirtualLine
+    from dynsim.hardware.virtual.registers import ServoRegisters
 
     script = FaultScript.model_validate({"faults": [{"kind": "stuck", "id": 1, "at": 0.0}]})
     line = VirtualLine({1: ServoRegisters(MX_106, 1, 3)}, positions=[np.pi], script=script)
-    line._write(1, 64, b"\1")
-    line._write(1, 116, (3000).to_bytes(4, "little"))
+    line.servos.write(1, 64, b"\1")
+    line.servos.write(1, 116, (3000).to_bytes(4, "little"))
     line.advance(0.9)
-    assert line.servos[1]["torque_enable"] == 1
+    assert line.servos.registers[1]["torque_enable"] == 1
     line.advance(1.5)
-    assert line.servos[1]["torque_enable"] == 0
-    assert line.servos[1]["hardware_error"] == 1 << 5
-    assert line._write(1, 64, b"\1") == StatusError.RESULT_FAIL
-    line._reboot(1)
+    assert line.servos.registers[1]["torque_enable"] == 0
+    assert line.servos.registers[1]["hardware_error"] == 1 << 5
+    assert line.servos.write(1, 64, b"\1") == StatusError.RESULT_FAIL
+    line.servos.reboot(1)
     line.advance(3.0)
-    assert line.servos[1]["hardware_error"] == 0
-    assert line._write(1, 64, b"\1") == StatusError.NONE
+    assert line.servos.registers[1]["hardware_error"] == 0
+    assert line.servos.write(1, 64, b"\1") == StatusError.NONE
 
 
 def test_noise_is_never_read_as_a_state(rig, clean_run) -> None:

@@ -12,10 +12,14 @@ import pytest
     ("module", "absent"),
     [
         # `dynsim run` mounts the commands: no serial port, no servo.
-        ("dynsim.cli", ("serial", "dynamixel_sdk", "dynsim.hardware.session", "numba", "matplotlib", "logging")),
-        ("dynsim.hardware.cli", ("serial", "dynamixel_sdk", "dynsim.hardware.session", "numba", "matplotlib")),
-        # Replaying knows nothing of how a record was made.
-        ("dynsim.hardware.session", ("numba", "dynsim.kernels", "dynsim.model", "dynsim.scenario", "matplotlib")),
+        ("dynsim.cli", ("serial", "dynamixel_sdk", "dynsim.hardware.ports", "numba", "matplotlib", "logging")),
+        ("dynsim.hardware.cli", ("serial", "dynamixel_sdk", "dynsim.hardware.ports", "numba", "matplotlib")),
+        # Replaying knows nothing of how a record was made, nor of what is on the bus.
+        (
+            "dynsim.hardware.replay.session",
+            ("numba", "dynsim.kernels", "dynsim.model", "dynsim.scenario", "matplotlib", "dynsim.hardware.virtual"),
+        ),
+        ("dynsim.hardware.ports", ("numba", "dynsim.kernels", "dynsim.model", "dynsim.scenario", "matplotlib")),
     ],
 )
 def test_imports_stay_in_their_layer(module: str, absent: tuple[str, ...]) -> None:

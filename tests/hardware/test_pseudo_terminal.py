@@ -16,10 +16,10 @@ import pytest
 from dynamixel_sdk import COMM_SUCCESS, PortHandler, Protocol2PacketHandler
 from processes import Child, started, wait_for
 
-from dynsim.hardware.control_table import MX_106
-from dynsim.hardware.dynamixel_bus import DynamixelBus, open_serial_port
+from dynsim.hardware.bus.control_table import MX_106
+from dynsim.hardware.bus.dynamixel_bus import DynamixelBus, open_serial_port
 from dynsim.hardware.errors import PortError
-from dynsim.hardware.replay import State
+from dynsim.hardware.replay.states import State
 from dynsim.record import Record
 
 from .conftest import MAP, swing

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from dynsim.hardware.run_log import RunLog
+from dynsim.hardware.replay.run_log import RunLog
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")

@@ -1,6 +1,6 @@
 """Canaries: defects of dynamixel-sdk 4.1.0 the bus works around, each with the proof that the bus survives it.
 
-When the first half of a test fails, the library was mended: the detour in dynsim/hardware/dynamixel_bus.py may go.
+When the first half of a test fails, the library was mended: the detour in dynsim/hardware/bus/dynamixel_bus.py may go.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from dynamixel_sdk import (
     Protocol2PacketHandler,
 )
 
-from dynsim.hardware.control_table import BROADCAST_ID, MX_106, STATE_BLOCK
-from dynsim.hardware.dynamixel_bus import WRITE_TIMEOUT, DynamixelBus, open_serial_port
+from dynsim.hardware.bus.control_table import BROADCAST_ID, MX_106, STATE_BLOCK
+from dynsim.hardware.bus.dynamixel_bus import WRITE_TIMEOUT, DynamixelBus, open_serial_port
+from dynsim.hardware.bus.packet import STATUS, Decoder, Packet, encode
 from dynsim.hardware.errors import PortError
-from dynsim.hardware.packet import STATUS, Decoder, Packet, encode
-from dynsim.hardware.virtual_bus import VirtualPort
+from dynsim.hardware.virtual.port import VirtualPort
 
 F = MX_106.fields
 
@@ -89,7 +89,7 @@ def test_1_an_interrupted_read_blocks_every_later_write(stock) -> None:
 
 
 def test_2_one_lost_status_hides_the_servos_behind_it(bus, stock) -> None:
-    line_of(bus)._dead.add(1)
+    line_of(bus).servos.dead.add(1)
     group = GroupSyncRead(bus.port, stock, *STATE_BLOCK)
     for id_ in (1, 2, 7):
         group.addParam(id_)
@@ -111,7 +111,7 @@ def test_2_a_cut_status_takes_the_next_one_with_it(stock) -> None:
 
 
 def test_3_group_reads_drop_the_alert_bit(bus, stock) -> None:
-    line_of(bus).servos[2]["hardware_error"] = 1
+    line_of(bus).servos.registers[2]["hardware_error"] = 1
     group = GroupSyncRead(bus.port, stock, *STATE_BLOCK)
     group.addParam(2)
     assert group.txRxPacket() == COMM_SUCCESS
@@ -167,18 +167,18 @@ def test_4_fast_sync_read_does_not_unstuff(stock) -> None:
 
 def test_5_data_is_unsigned_and_refused_goals_go_unnoticed(bus, stock) -> None:
     line = line_of(bus)
-    line.servos[1]["homing_offset"] = -4000
+    line.servos.registers[1]["homing_offset"] = -4000
     group = GroupSyncRead(bus.port, stock, 132, 4)
     group.addParam(1)
     assert group.txRxPacket() == COMM_SUCCESS
     assert group.getData(1, 132, 4) > 1 << 31
     assert bus.read(1, F["present_position"]) < 0
 
-    before = line.servos[2]["goal_position"]
+    before = line.servos.registers[2]["goal_position"]
     write = GroupSyncWrite(bus.port, stock, 116, 4)
     write.addParam(2, list((5000).to_bytes(4, "little")))
     assert write.txPacket() == COMM_SUCCESS
-    assert line.servos[2]["goal_position"] == before
+    assert line.servos.registers[2]["goal_position"] == before
 
 
 def test_6_a_dead_terminal_raises_more_than_serial_errors() -> None:

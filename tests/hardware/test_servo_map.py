@@ -58,16 +58,20 @@ def test_sense_zero_and_limits(rig) -> None:
 
 # What is replaced in the rig's map, by what, and the error.
 MISTAKES = [
-    ("robot: rig", "robott: rig", r"map.yaml:1: robott: unknown key; known are robot, bus, safety, kinds, servos"),
-    ("id: 7", "id: 2", r"servos.wheel.id: 2 is also the ID of elbow"),
-    ("kind: wheel, id: 7", "kind: whel, id: 7", r"servos.wheel.kind: 'whel' is not one of joint, wheel"),
-    ("baud: 1000000", "baud: 1234", r"map.yaml:2: bus: baud 1234 is not one of 9600, 57600"),
-    ("[-60, 60]", "[60, -60]", r"limits.position_deg: 60.0 is not below -60.0"),
+    ("robot: rig", "robott: rig", r"map.yaml:1: robott: unknown key; did you mean .robot.\?"),
+    ("id: 7", "id: 2", r"map.yaml:\d+: servos.wheel.id = 2: is also the ID of elbow"),
+    (
+        "kind: wheel, id: 7",
+        "kind: whel, id: 7",
+        r"servos.wheel.kind = .whel.: is not one of joint, wheel",
+    ),
+    ("baud: 1000000", "baud: 1234", r"map.yaml:2: bus.baud = 1234: is not one of 9600, 57600"),
+    ("[-60, 60]", "[60, -60]", r"map.yaml:\d+: kinds.joint.limits.position_deg: 60.0 is not below -60.0"),
     ("position_deg: [-60, 60], ", "", r"a servo in position mode needs limits.position_deg"),
     ("sign: -1", "sign: 2", r"map.yaml:19: servos.elbow.sign"),
     ("velocity: 3.0, torque: 6.0}", "velocity: -3.0, torque: 6.0}", r"map.yaml:9: kinds.joint.limits.velocity"),
     ("policy: decelerate", "policy: panic", r"map.yaml:3: safety.policy"),
-    ("torque: 6.0}", "torque: 6.0, torqe: 1}", r"torqe: unknown key; known are position_deg, velocity, torque"),
+    ("torque: 6.0}", "torque: 6.0, torqe: 1}", r"torqe: unknown key; did you mean .torque.\?"),
     ("kinds:", "kinds: [", r"map.yaml:\d+: not YAML"),
     ("id: 1}", "id: 254}", r"servos.shoulder.id"),
 ]
@@ -125,11 +129,11 @@ def test_calibration_writes_zero_ticks_and_keeps_the_rest(rig, write_map) -> Non
 
 def test_calibration_refuses_torque_movement_and_impossible_zeros(rig, write_map) -> None:
     run = rig.prepare()
-    run.line._write(1, 64, b"\1")
+    run.line.servos.write(1, 64, b"\1")
     with pytest.raises(VerificationFailed, match="torque is on"):
         read_zero_ticks(run.replay.bus, rig.map.servos[:2])
     run = rig.prepare()
-    run.line.plant.velocity[0] = 2.0
+    run.line.servos.plant.velocity[0] = 2.0
     with pytest.raises(VerificationFailed, match="shoulder moves"):
         read_zero_ticks(run.replay.bus, rig.map.servos[:2])
     path = write_map()

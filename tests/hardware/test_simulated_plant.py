@@ -10,9 +10,9 @@ import pytest
 import dynsim
 from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.servo_map import load_servo_map
-from dynsim.hardware.servo_plant import MotorLaw
-from dynsim.hardware.simulated_plant import CONTACT_STIFFNESS, SimulatedArm, simulated_arm
-from dynsim.hardware.virtual_bus import VirtualLine, line_for_map
+from dynsim.hardware.virtual.line import VirtualLine, line_for_map
+from dynsim.hardware.virtual.servo_plant import MotorLaw
+from dynsim.hardware.virtual.simulated_plant import CONTACT_STIFFNESS, SimulatedArm, simulated_arm
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
@@ -23,7 +23,7 @@ def armed(variant: str, posture: dict[str, float] | None = None) -> tuple[Virtua
     plant = simulated_arm(str(SCENARIOS / "elbow_comparison.yaml"), variant, servo_map, posture or {})
     line = line_for_map(servo_map, plant=plant)
     for id_ in servo_map.ids:
-        assert not line._write(id_, 64, b"\1")
+        assert not line.servos.write(id_, 64, b"\1")
         line.advance(line.time + 0.01)
     line.advance(line.time + 2.0)
     model = dynsim.build_model(dynsim.load_scenario(SCENARIOS / "elbow_comparison.yaml", variant=variant))
@@ -63,8 +63,8 @@ def test_braced_elbows_rest_on_the_floor_and_unload_the_servos() -> None:
 def test_a_limp_arm_falls_and_stays_above_the_floor_with_its_elbows() -> None:
     line, plant, model = armed("two_elbows")
     before = model.point_position(*model.robot.hand, plant.joint_positions)[2]
-    for id_ in line.ids:
-        line._write(id_, 64, b"\0")
+    for id_ in line.servos.ids:
+        line.servos.write(id_, 64, b"\0")
     line.advance(line.time + 0.5)
     assert np.isfinite(plant.position).all()
     elbows = [model.point_position(body, np.zeros(3), plant.joint_positions)[2] for body in ("link_4", "link_7")]

@@ -8,10 +8,10 @@ import signal
 import numpy as np
 import pytest
 
-from dynsim.hardware.packet import Instruction
-from dynsim.hardware.replay import Progress, State, StopRequest
-from dynsim.hardware.rules import Cause
-from dynsim.hardware.session import stop_on_signals
+from dynsim.hardware.bus.packet import Instruction
+from dynsim.hardware.replay.rules import Cause
+from dynsim.hardware.replay.session import stop_on_signals
+from dynsim.hardware.replay.states import Progress, State, StopRequest
 
 ON_THE_WAY = [State.CONNECT, State.VERIFY, State.ARM, State.MOVE_TO_START, State.SETTLE, State.REPLAY, State.DISARM]
 
@@ -30,7 +30,7 @@ def interrupted(rig, state: State, signals: list[int], *, policy: str = "deceler
                 for number in signals:
                     os.kill(os.getpid(), number)
 
-    run.replay._observer = observe
+    run.replay.journal.observer = observe
     with stop_on_signals(stop):
         run.result = run.replay.run()
     assert stop.count == len(signals)
@@ -53,14 +53,14 @@ def test_second_ctrl_c_switches_the_torque_off_at_every_state(rig, state: State,
     assert len(broadcast_torque_off(run)) >= 3
     assert run.result.end_state == "off"
     assert run.result.torque_still_on == ()
-    assert not any(servo["torque_enable"] for servo in run.line.servos.values())
+    assert not any(servo["torque_enable"] for servo in run.line.servos.registers.values())
     assert not run.result.policy_goals or run.result.fault_state == State.DISARM
 
 
 @pytest.mark.parametrize("state", ON_THE_WAY, ids=lambda state: state.name)
 def test_first_ctrl_c_is_a_controlled_stop(rig, state: State) -> None:
     run = interrupted(rig, state, [signal.SIGINT])
-    torque = [servo["torque_enable"] for servo in run.line.servos.values()]
+    torque = [servo["torque_enable"] for servo in run.line.servos.registers.values()]
     if state == State.DISARM:
         # The motion is over: disarming goes on to its end.
         assert run.result.fault is None
@@ -79,7 +79,7 @@ def test_first_ctrl_c_is_a_controlled_stop(rig, state: State) -> None:
         assert run.result.end_state == "holding"
         assert all(torque)
         run.line.advance(run.line.time + 1.0)
-        assert np.abs(run.line.plant.velocity).max() < 1e-2
+        assert np.abs(run.line.servos.plant.velocity).max() < 1e-2
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
@@ -111,10 +111,10 @@ def test_second_ctrl_c_during_the_controlled_stop_releases_at_once(rig) -> None:
             if progress.state == State.FAULT and stop.count == 1 and reports > 36:
                 stop()
 
-    run.replay._observer = observe
+    run.replay.journal.observer = observe
     result = run.replay.run()
     assert result.end_state == "off"
-    assert not any(servo["torque_enable"] for servo in run.line.servos.values())
+    assert not any(servo["torque_enable"] for servo in run.line.servos.registers.values())
     last_goal = max(time for time, _, _ in run.goals())
     assert min(broadcast_torque_off(run)) > last_goal
     assert last_goal - result.fault_time < run.map.safety.stop_time / 2
@@ -134,7 +134,7 @@ def test_an_exception_out_of_the_blue_still_stops_the_robot(rig, error) -> None:
     read = run.replay.bus.port.readPort
 
     def read_port(length: int) -> bytes:
-        if run.replay.state == State.REPLAY and run.clock.now() > 1.9 and run.replay.result.fault is None:
+        if run.replay.journal.state == State.REPLAY and run.clock.now() > 1.9 and run.replay.result.fault is None:
             raise error("out of the blue")
         return read(length)
 
@@ -143,16 +143,16 @@ def test_an_exception_out_of_the_blue_still_stops_the_robot(rig, error) -> None:
         run.replay.run()
     assert run.result.fault.cause == Cause.PROGRAM
     assert run.result.end_state == "off"
-    assert not any(servo["torque_enable"] for servo in run.line.servos.values())
+    assert not any(servo["torque_enable"] for servo in run.line.servos.registers.values())
 
 
 def test_a_robot_found_holding_is_not_dropped_by_a_ctrl_c_while_arming(rig) -> None:
     stop = StopRequest()
     run = rig.prepare(stop=stop)
     for id_ in run.map.ids:
-        run.line._write(id_, 64, b"\1")
-    run.replay._observer = lambda progress: stop() if progress.state == State.ARM else None
+        run.line.servos.write(id_, 64, b"\1")
+    run.replay.journal.observer = lambda progress: stop() if progress.state == State.ARM else None
     result = run.replay.run()
     assert result.fault_state == State.ARM
     assert result.end_state == "holding"
-    assert all(servo["torque_enable"] for servo in run.line.servos.values())
+    assert all(servo["torque_enable"] for servo in run.line.servos.registers.values())

@@ -6,9 +6,9 @@ import json
 
 import pytest
 
-from dynsim.hardware.control_table import OperatingMode
-from dynsim.hardware.rules import Cause
-from dynsim.hardware.virtual_bus import ServoRegisters
+from dynsim.hardware.bus.control_table import OperatingMode
+from dynsim.hardware.replay.rules import Cause
+from dynsim.hardware.virtual.registers import ServoRegisters
 
 
 @pytest.mark.parametrize(
@@ -26,7 +26,7 @@ from dynsim.hardware.virtual_bus import ServoRegisters
 )
 def test_an_unfit_servo_is_not_armed(rig, name: str, value: int, message: str) -> None:
     run = rig.prepare()
-    run.line.servos[1][name] = value
+    run.line.servos.registers[1][name] = value
     result = run.replay.run()
     assert result.fault.cause == Cause.VERIFICATION
     assert message in result.fault.text
@@ -37,23 +37,23 @@ def test_an_unfit_servo_is_not_armed(rig, name: str, value: int, message: str) -
 
 def test_a_robot_outside_of_its_limits_is_not_armed(rig) -> None:
     run = rig.prepare()
-    run.line.plant.position[0] += 2.0
+    run.line.servos.plant.position[0] += 2.0
     result = run.replay.run()
     assert "outside of its limits -1.047 to 1.047 rad; move it by hand" in result.fault.text
 
 
 def test_an_unknown_servo_on_the_bus_is_reported(rig) -> None:
     run = rig.prepare()
-    stranger = ServoRegisters(run.line.servos[1].model, 9, 3)
-    run.line.servos[9] = stranger
-    run.line.ids.append(9)
+    stranger = ServoRegisters(run.line.servos.registers[1].model, 9, 3)
+    run.line.servos.registers[9] = stranger
+    run.line.servos.ids.append(9)
     result = run.replay.run()
     assert "ID 9: MX-106 (firmware 45) is on the bus but not in the map" in result.fault.text
 
 
 def test_a_silent_servo_comes_with_a_hint_at_protocol_1(rig) -> None:
     run = rig.prepare()
-    run.line._dead.add(2)
+    run.line.servos.dead.add(2)
     result = run.replay.run()
     assert "elbow: ID 2: no answer" in result.fault.text
     assert "Protocol 1 firmware does not answer" in result.fault.text
@@ -61,27 +61,27 @@ def test_a_silent_servo_comes_with_a_hint_at_protocol_1(rig) -> None:
 
 def test_too_low_a_supply_is_reported(rig) -> None:
     run = rig.prepare()
-    run.line.supply = 10.0
+    run.line.servos.supply = 10.0
     assert "supply is 10.0 V" in run.replay.run().fault.text
 
 
 def test_configure_writes_what_differs_and_nothing_else(rig) -> None:
     run = rig.prepare(write_eeprom=True)
-    run.line.servos[1]["return_delay"] = 250
-    run.line.servos[7]["operating_mode"] = OperatingMode.POSITION
+    run.line.servos.registers[1]["return_delay"] = 250
+    run.line.servos.registers[7]["operating_mode"] = OperatingMode.POSITION
     result = run.replay.run()
     assert result.fault is None
-    assert run.line.servos[1]["return_delay"] == 0
-    assert run.line.servos[7]["operating_mode"] == OperatingMode.VELOCITY
+    assert run.line.servos.registers[1]["return_delay"] == 0
+    assert run.line.servos.registers[7]["operating_mode"] == OperatingMode.VELOCITY
     written = [packet for _, packet in run.sent if packet.instruction == 3 and packet.parameters[0] < 64]
     assert len(written) == 2
-    assert any("return_delay 250 -> 0" in line for line in run.replay.log.lines)
+    assert any("return_delay 250 -> 0" in line for line in run.replay.journal.log.lines)
 
 
 def test_configure_is_refused_while_torque_is_on(rig) -> None:
     run = rig.prepare(write_eeprom=True)
-    run.line.servos[1]["return_delay"] = 250
-    run.line._write(1, 64, b"\1")
+    run.line.servos.registers[1]["return_delay"] = 250
+    run.line.servos.write(1, 64, b"\1")
     result = run.replay.run()
     assert result.fault.cause == Cause.VERIFICATION
     assert "not available" in result.fault.text

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 from dynamixel_sdk import Protocol2PacketHandler
 
-from dynsim.hardware.clock import VirtualClock
-from dynsim.hardware.control_table import MX_28, MX_106, RAD_PER_TICK, OperatingMode, describe_hardware_error
-from dynsim.hardware.dynamixel_bus import DynamixelBus
-from dynsim.hardware.packet import StatusError
-from dynsim.hardware.servo_plant import MotorLaw
-from dynsim.hardware.virtual_bus import BOOT_TIME, PHYSICS_STEP, VirtualLine, VirtualPort
-from dynsim.hardware.virtual_servo import ServoRegisters
+from dynsim.hardware.bus.clock import VirtualClock
+from dynsim.hardware.bus.control_table import MX_28, MX_106, RAD_PER_TICK, OperatingMode, describe_hardware_error
+from dynsim.hardware.bus.dynamixel_bus import DynamixelBus
+from dynsim.hardware.bus.packet import StatusError
+from dynsim.hardware.virtual.line import VirtualLine
+from dynsim.hardware.virtual.port import VirtualPort
+from dynsim.hardware.virtual.registers import ServoRegisters
+from dynsim.hardware.virtual.servo_plant import MotorLaw
+from dynsim.hardware.virtual.servos import BOOT_TIME, PHYSICS_STEP
 
 F = MX_106.fields
 BAUD_CODE = 3
@@ -31,54 +33,54 @@ def bus(line: VirtualLine) -> DynamixelBus:
 
 
 def write(line: VirtualLine, id_: int, name: str, value: int) -> StatusError:
-    field = line.servos[id_].model.fields[name]
-    return line._write(id_, field.address, field.encode(value))
+    field = line.servos.registers[id_].model.fields[name]
+    return line.servos.write(id_, field.address, field.encode(value))
 
 
 def test_eeprom_is_locked_while_torque_is_on(line) -> None:
     assert write(line, 1, "return_delay", 0) == StatusError.NONE
     write(line, 1, "torque_enable", 1)
     assert write(line, 1, "return_delay", 5) == StatusError.ACCESS
-    assert line.servos[1]["return_delay"] == 0
+    assert line.servos.registers[1]["return_delay"] == 0
 
 
 def test_read_only_unknown_and_out_of_range_writes_are_refused(line) -> None:
     assert write(line, 1, "present_position", 7) == StatusError.ACCESS
-    assert line._write(1, 64, b"\2") == StatusError.DATA_RANGE
-    assert line._write(1, 117, b"\2") == StatusError.ACCESS
-    assert line._write(1, 116, b"\2\0") == StatusError.DATA_LENGTH
-    assert line._write(1, 660, b"\0\0\0") == StatusError.ACCESS
+    assert line.servos.write(1, 64, b"\2") == StatusError.DATA_RANGE
+    assert line.servos.write(1, 117, b"\2") == StatusError.ACCESS
+    assert line.servos.write(1, 116, b"\2\0") == StatusError.DATA_LENGTH
+    assert line.servos.write(1, 660, b"\0\0\0") == StatusError.ACCESS
     assert write(line, 2, "operating_mode", OperatingMode.CURRENT) == StatusError.DATA_RANGE
 
 
 def test_goals_beyond_the_servos_own_limits_are_refused_and_ignored(line) -> None:
     write(line, 1, "max_position", 3000)
-    before = line.servos[1]["goal_position"]
+    before = line.servos.registers[1]["goal_position"]
     assert write(line, 1, "goal_position", 3001) == StatusError.DATA_LIMIT
-    assert line.servos[1]["goal_position"] == before
+    assert line.servos.registers[1]["goal_position"] == before
     assert write(line, 1, "operating_mode", OperatingMode.CURRENT_BASED_POSITION) == StatusError.NONE
     assert write(line, 1, "goal_position", 3001) == StatusError.NONE, "mode 5 knows no position limits"
-    assert write(line, 2, "goal_velocity", line.servos[2]["velocity_limit"] + 1) == StatusError.DATA_LIMIT
+    assert write(line, 2, "goal_velocity", line.servos.registers[2]["velocity_limit"] + 1) == StatusError.DATA_LIMIT
 
 
 def test_a_write_of_several_items_is_all_or_nothing(line) -> None:
     data = F["profile_velocity"].encode(50) + F["goal_position"].encode(9999)
-    assert line._write(1, 112, data) == StatusError.DATA_LIMIT
-    assert line.servos[1]["profile_velocity"] == 0
+    assert line.servos.write(1, 112, data) == StatusError.DATA_LIMIT
+    assert line.servos.registers[1]["profile_velocity"] == 0
 
 
 def test_the_watchdog_stops_the_servo_and_makes_goals_read_only(line) -> None:
     write(line, 1, "torque_enable", 1)
     write(line, 1, "bus_watchdog", 5)
     write(line, 1, "goal_position", 3000)
-    line._last_packet = line.time
+    line.servos.heard = line.time
     line.advance(line.time + 0.11)
-    stopped_at = line.servos[1]["goal_position"]
+    stopped_at = line.servos.registers[1]["goal_position"]
     line.advance(line.time + 1.0)
-    assert line.servos[1]["bus_watchdog"] == -1
+    assert line.servos.registers[1]["bus_watchdog"] == -1
     assert write(line, 1, "goal_position", 2000) == StatusError.DATA_RANGE
-    assert abs(line.plant.velocity[0]) < 1e-3
-    assert line.servos[1]["goal_position"] == stopped_at
+    assert abs(line.servos.plant.velocity[0]) < 1e-3
+    assert line.servos.registers[1]["goal_position"] == stopped_at
     assert write(line, 1, "bus_watchdog", 0) == StatusError.NONE
     assert write(line, 1, "goal_position", 2000) == StatusError.NONE
 
@@ -95,43 +97,43 @@ def test_reboot_clears_ram_and_answers_after_a_while(line, bus) -> None:
 
 
 def test_indirect_data_reads_what_its_pointer_names(line) -> None:
-    line._measure(0)
+    line.servos.measure(0)
     for k in range(4):
-        assert line._write(1, 168 + 2 * k, (132 + k).to_bytes(2, "little")) == StatusError.NONE
-    assert line.servos[1].read(224, 4) == line.servos[1].read(132, 4)
-    assert int.from_bytes(line.servos[1].read(224, 4), "little") == 2048
+        assert line.servos.write(1, 168 + 2 * k, (132 + k).to_bytes(2, "little")) == StatusError.NONE
+    assert line.servos.registers[1].read(224, 4) == line.servos.registers[1].read(132, 4)
+    assert int.from_bytes(line.servos.registers[1].read(224, 4), "little") == 2048
 
 
 def test_turns_are_counted_until_the_mode_changes(line) -> None:
     write(line, 2, "torque_enable", 1)
     write(line, 2, "goal_velocity", 200)
     line.advance(line.time + 2.0)
-    line._measure(1)
-    assert line.servos[2]["present_position"] > 4096
+    line.servos.measure(1)
+    assert line.servos.registers[2]["present_position"] > 4096
     write(line, 2, "torque_enable", 0)
     line.advance(line.time + 1.0)
     write(line, 2, "operating_mode", OperatingMode.EXTENDED_POSITION)
-    line._measure(1)
-    assert 0 <= line.servos[2]["present_position"] < 4096
+    line.servos.measure(1)
+    assert 0 <= line.servos.registers[2]["present_position"] < 4096
 
 
 def test_reverse_mode_turns_the_shaft_but_not_the_homing_offset(line) -> None:
     write(line, 1, "homing_offset", 100)
-    line._measure(0)
-    assert line.servos[1]["present_position"] == 2148
+    line.servos.measure(0)
+    assert line.servos.registers[1]["present_position"] == 2148
     write(line, 1, "drive_mode", 1)
-    line._measure(0)
-    assert line.servos[1]["present_position"] == -2048 + 100
+    line.servos.measure(0)
+    assert line.servos.registers[1]["present_position"] == -2048 + 100
 
 
 def test_voltage_sags_with_current(line) -> None:
     write(line, 1, "torque_enable", 1)
     write(line, 1, "goal_position", 4000)
     line.advance(line.time + 0.003)
-    line._measure(0)
-    assert line.servos[1]["present_voltage"] < 120
-    assert line.servos[1]["present_current"] != 0
-    assert line.servos[1]["moving"] == 1
+    line.servos.measure(0)
+    assert line.servos.registers[1]["present_voltage"] < 120
+    assert line.servos.registers[1]["present_current"] != 0
+    assert line.servos.registers[1]["moving"] == 1
 
 
 def test_the_profile_velocity_limits_the_set_point(line) -> None:
@@ -139,7 +141,7 @@ def test_the_profile_velocity_limits_the_set_point(line) -> None:
     write(line, 1, "profile_velocity", 20)  # 0.48 rad/s
     write(line, 1, "goal_position", 3000)
     line.advance(line.time + 1.0)
-    speed = line.plant.velocity[0]
+    speed = line.servos.plant.velocity[0]
     assert speed == pytest.approx(20 * 0.229 * 2 * np.pi / 60, rel=0.02)
 
 
@@ -148,14 +150,14 @@ def test_the_step_response_is_that_of_the_motor_law(line) -> None:
     law = MotorLaw([MX_106])
     omega = 2 * law.stiffness[0] / law.damping[0]
     write(line, 1, "torque_enable", 1)
-    start = line.plant.position[0]
+    start = line.servos.plant.position[0]
     write(line, 1, "goal_position", 2048 + 50)
     t = 0.05
     line.advance(line.time + t)
     step = 50 * RAD_PER_TICK
     expected = step * (1 - (1 + omega * t) * np.exp(-omega * t))
     # Semi-implicit Euler at 2 ms: error of order ω·dt = 9 %.
-    assert line.plant.position[0] - start == pytest.approx(expected, rel=0.09)
+    assert line.servos.plant.position[0] - start == pytest.approx(expected, rel=0.09)
 
 
 def test_no_servo_exceeds_its_no_load_speed(line) -> None:
@@ -164,19 +166,19 @@ def test_no_servo_exceeds_its_no_load_speed(line) -> None:
     fastest = 0.0
     for _ in range(200):
         line.advance(line.time + 2.5 * PHYSICS_STEP)
-        fastest = max(fastest, abs(line.plant.velocity[0]))
+        fastest = max(fastest, abs(line.servos.plant.velocity[0]))
     assert 0.8 * MX_106.no_load_speed < fastest <= MX_106.no_load_speed
 
 
 def test_status_return_level_silences_acknowledgements(line, bus) -> None:
-    from dynsim.hardware.bus import NoAnswer
+    from dynsim.hardware.bus.protocol import NoAnswer
 
-    line.servos[1]["status_return_level"] = 1
+    line.servos.registers[1]["status_return_level"] = 1
     assert bus.read(1, F["id"]) == 1
     with pytest.raises(NoAnswer):
         bus.write(1, F["led"], 1)
-    assert line.servos[1]["led"] == 1
-    line.servos[1]["status_return_level"] = 0
+    assert line.servos.registers[1]["led"] == 1
+    line.servos.registers[1]["status_return_level"] = 0
     with pytest.raises(NoAnswer):
         bus.read(1, F["id"])
     assert Protocol2PacketHandler().ping(bus.port, 1)[0] == 321
@@ -185,10 +187,10 @@ def test_status_return_level_silences_acknowledgements(line, bus) -> None:
 def test_registered_writes_wait_for_the_action(line, bus) -> None:
     library = Protocol2PacketHandler()
     library.regWriteTxRx(bus.port, 1, 65, 1, [1])
-    assert line.servos[1]["led"] == 0
+    assert line.servos.registers[1]["led"] == 0
     bus.port.is_using = False
     library.action(bus.port, 254)
-    assert line.servos[1]["led"] == 1
+    assert line.servos.registers[1]["led"] == 1
 
 
 def test_the_bits_of_the_error_register_have_names() -> None:
@@ -202,7 +204,7 @@ def test_effort_registers_convert_both_ways() -> None:
 
 
 def test_a_packet_may_come_in_pieces_but_not_for_ever(line) -> None:
-    from dynsim.hardware.packet import Packet, encode
+    from dynsim.hardware.bus.packet import Packet, encode
 
     ping = encode(Packet(1, 1))
     assert line.transmit(ping[:6], 0.0, 1_000_000) == []

@@ -18,13 +18,14 @@ from dynsim.kernels import arrays as ka  # noqa: E402
 from dynsim.kernels.integrate import run as ki  # noqa: E402
 from dynsim.kernels.integrate.driver import advance  # noqa: E402
 from dynsim.kernels.jit import integers, reals  # noqa: E402
+from dynsim.kernels.state import OUT_FORCE, OUT_SLIP, OUT_VECTOR, state_layout  # noqa: E402
 from dynsim.kernels.system import System  # noqa: E402
-from dynsim.model.arrays import compile_contacts, compile_drives  # noqa: E402
+from dynsim.model.arrays import compile_contacts, compile_drives, compile_loads  # noqa: E402
 from dynsim.model.description import Inertia, Link, Robot  # noqa: E402
 from dynsim.model.model import Model  # noqa: E402
 from dynsim.scenario import load_scenario  # noqa: E402
-from dynsim.studies.bench import CASES, prepare_case  # noqa: E402
-from dynsim.studies.mujoco_peer import build_mujoco, roll_out, setpoints, state_of  # noqa: E402
+from dynsim.studies.bench.job import CASES, prepare_case  # noqa: E402
+from dynsim.studies.bench.mujoco_peer import build_mujoco, roll_out, setpoints, state_of  # noqa: E402
 
 TIGHT = {"integrator.rtol": 1e-11, "integrator.atol": 1e-13}
 
@@ -62,7 +63,10 @@ def test_accelerations_of_random_trees(seed: int, n: int) -> None:
     robot = random_tree(seed, n)
     model = Model(robot)
     nothing = ka.ReferenceArrays(integers([]), reals([]), reals([0, 1]), reals(np.zeros((1, 0, 6))))
-    system = System(model.arrays, compile_drives(robot, k_p=[], k_d=[]), nothing, compile_contacts(robot, []), None)
+    drives, contacts = compile_drives(robot, k_p=[], k_d=[]), compile_contacts(robot, [])
+    system = System(
+        state_layout(n, n, 0, 0), model.arrays, drives, nothing, contacts, compile_loads(model.robot, ()), None
+    )
     peer = build_mujoco(system, step=1e-3, motors=False)
     # MuJoCo numbers joints depth first, dynsim in the order of the description.
     order = [mujoco.mj_name2id(peer, mujoco.mjtObj.mjOBJ_JOINT, f"joint_{i}") for i in range(n)]
@@ -85,8 +89,8 @@ def integrate(prepared: Prepared) -> ki.Run:
 def test_free_arm_with_motors_converges_to_dynsim() -> None:
     """Angles and currents of the whole start transient: error ∝ h, and nothing left at h → 0."""
     prepared = prepare(load_scenario("elbow_comparison", "no_elbow", {**TIGHT, "duration_s": 0.5}))
-    run, n = integrate(prepared), prepared.model.n
-    q, i = run.sample[1:, :n], run.sample[1:, 2 * n : 3 * n]
+    run = integrate(prepared)
+    q, i = run.states("q")[1:], run.states("current")[1:]
     angle_errors, current_errors = [], []
     for step in (4e-5, 2e-5, 1e-5):
         peer = build_mujoco(prepared.system, step=step)
@@ -109,8 +113,8 @@ def test_free_arm_with_motors_converges_to_dynsim() -> None:
 def test_force_of_two_braces_held_by_equality_constraints() -> None:
     """Both elbows on spheres, without friction: MuJoCo's equality on a tendon is the same one-row constraint."""
     prepared = prepare_case(CASES["two elbows held, no friction"], {**TIGHT, "duration_s": 1.0})
-    run, n, na = integrate(prepared), prepared.model.n, len(prepared.system.drives.link)
-    force = run.output[:, n + 2 * na + 6 :].reshape(-1, 2, 8)[:, :, 0]
+    run = integrate(prepared)
+    force = run.outputs("contact")[:, :, OUT_FORCE]
     worst = []
     for step in (5e-4, 2.5e-4):
         peer = build_mujoco(prepared.system, step=step, contacts="equality")
@@ -129,8 +133,8 @@ def test_force_of_a_soft_contact_without_friction() -> None:
     """Elbow 7 alone presses on the floor: MuJoCo's contact gives the force of the hard one, its softness ∝ h²."""
     options = {**TIGHT, "duration_s": 2.0, "contacts.friction": 0.0}
     prepared = prepare(load_scenario("elbow_comparison", "elbow_7", options))
-    run, n, na = integrate(prepared), prepared.model.n, len(prepared.system.drives.link)
-    force = run.output[:, n + 2 * na + 6]
+    run = integrate(prepared)
+    force = run.outputs("contact")[:, 0, OUT_FORCE]
     errors = []
     for step in (1e-3, 5e-4):
         peer = build_mujoco(prepared.system, step=step, contacts="soft")
@@ -148,10 +152,11 @@ def test_force_of_a_soft_contact_with_friction() -> None:
     dynsim's smoothed friction is μ f_n |v_t|/√(|v_t|² + v_s²), MuJoCo's μ f_n once it slides.
     """
     prepared = prepare(load_scenario("elbow_comparison", "elbow_4", {**TIGHT, "duration_s": 3.0}))
-    run, n, na = integrate(prepared), prepared.model.n, len(prepared.system.drives.link)
+    run = integrate(prepared)
     peer = build_mujoco(prepared.system, step=1e-3, contacts="soft", cone="elliptic")
     sample = _forces(peer, prepared, 1e-3, 3.0, _contact_force)[-1]
-    f, fx, fy, fz, _, *slip = run.output[-1, n + 2 * na + 6 :]
+    touch = run.outputs("contact")[-1, 0]
+    f, (fx, fy, fz), slip = touch[OUT_FORCE], touch[OUT_VECTOR : OUT_VECTOR + 3], touch[OUT_SLIP : OUT_SLIP + 3]
     assert sample[0] == pytest.approx(f, rel=2e-3)
     assert np.hypot(sample[1], sample[2]) == pytest.approx(0.1 * sample[0], rel=1e-4)
     speed = float(np.linalg.norm(slip))

@@ -112,7 +112,7 @@ def test_constrained_dynamics_without_friction(seed):
     assume(np.linalg.matrix_rank(J, tol=1e-3) == p)
     body_table, motor = b.system.model.body, b.system.drives.motor
     tau = -(body_table[:, ka.DAMPING] + body_table[:, ka.GEAR_DAMPING]) * v
-    np.add.at(tau, b.system.drives.link, motor[:, ka.K_M] * current)
+    np.add.at(tau, b.system.drives.table[:, ka.DRIVEN], motor[:, ka.K_M] * current)
     bias = oracle.back(pin.nonLinearEffects(oracle.model, oracle.data, oracle.to(q), oracle.to(v)))
     M = oracle.mass_matrix(q) + np.diag(body_table[:, ka.ARMATURE])
     K = np.block([[M, -J.T], [J, np.zeros((p, p))]])

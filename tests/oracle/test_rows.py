@@ -33,7 +33,7 @@ def free_motion(b: Bench, oracle: Oracle, q: np.ndarray, v: np.ndarray, current:
     """M + J_m and what the joints are driven with, less the bias."""
     body, motor = b.system.model.body, b.system.drives.motor
     tau = -(body[:, ka.DAMPING] + body[:, ka.GEAR_DAMPING]) * v
-    np.add.at(tau, b.system.drives.link, motor[:, ka.K_M] * current)
+    np.add.at(tau, b.system.drives.table[:, ka.DRIVEN], motor[:, ka.K_M] * current)
     bias = oracle.back(pin.nonLinearEffects(oracle.model, oracle.data, oracle.to(q), oracle.to(v)))
     return oracle.mass_matrix(q) + np.diag(body[:, ka.ARMATURE]), tau - bias
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from random_snakes import robots
 
 from dynsim.kernels.jit import integers, reals
-from dynsim.kernels.snake import active_rows, constraint_matrices, new_chain, walk_chain
+from dynsim.snake.kinematics import active_rows, constraint_matrices, new_chain, walk_chain
 
 LOCAL_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 

@@ -10,10 +10,11 @@ import pytest
 from dynsim.control import task_space
 from dynsim.control.modes import TABLE_II
 from dynsim.engine import simulate
-from dynsim.kernels.snake import pose_of_point
+from dynsim.model.protocols import BuildContext
 from dynsim.model.snake import conditioning
 from dynsim.plants import snake
 from dynsim.scenario import load_scenario
+from dynsim.snake.kinematics import pose_of_point
 
 SCENARIOS = {
     "snake_positioning": ["x", "y", "z", "alpha", "beta", "gamma"],
@@ -27,7 +28,7 @@ SCENARIOS = {
 
 def test_initial_posture_gives_the_head_pose():
     """V.A: "we set phi = [0, -0.8, 0, -1.1, 0, 1.9, 0, ..., 0]"; base straight, wheel pair 1 at the origin."""
-    plant, w = snake.build(snake.Config()), np.zeros(6)
+    plant, w = snake.build(snake.Config(), BuildContext(1.0)), np.zeros(6)
     pose_of_point(plant.arrays(), np.zeros(3), plant.initial_joints, np.zeros((3, 3)), w)
     # two ψ-to-ψ distances of 181 mm at 1.9 and 0.8 rad, one level, on wheels of 50 mm
     x = 0.181 * (np.cos(1.9) + np.cos(0.8) + 1)
@@ -38,8 +39,8 @@ def test_initial_posture_gives_the_head_pose():
 
 def test_dimensions():
     """eqs 5, 6, 10, 11 with n = 9, n_h = 6, n_b = 6, n_w = 7; III.A: redundancy n_h + n_lifted + ñ_lifted - 4."""
-    plant = snake.build(snake.Config())
-    controller = task_space.build(task_space.Config(), plant)
+    plant = snake.build(snake.Config(), BuildContext(1.0))
+    controller = task_space.build(task_space.Config(), BuildContext(1.0, plant))
     law, model = controller.law, plant.arrays()
     assert (model.base_joints + 4 + model.wheels, 6) == (17, 6)
     assert len(law.root_weight_inverse) == 19
@@ -52,7 +53,7 @@ def test_dimensions():
 
 def test_straight_length():
     """Table I: total length 1729 mm, which adds two wheel radii to the 1.629 m from head point to tail axle."""
-    plant, w = snake.build(snake.Config()), np.zeros(6)
+    plant, w = snake.build(snake.Config(), BuildContext(1.0)), np.zeros(6)
     pose_of_point(plant.arrays(), np.zeros(3), np.zeros(12), np.zeros((3, 3)), w)
     tail = -6 * 0.181
     assert w[0] - tail == pytest.approx(1.729 - 2 * 0.05, abs=1e-12)

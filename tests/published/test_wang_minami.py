@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import dynsim
-from dynsim.studies.validation import elbow_forces, elbow_numbers
+from dynsim.studies.published.wang_minami import elbow_forces, elbow_numbers
 
 
 @pytest.fixture(scope="module")

@@ -10,18 +10,19 @@ import sys
 import pytest
 from rich.console import Console
 
-from dynsim.studies import bench
+from dynsim.studies.bench import job, programs, run
+from dynsim.studies.bench.table import format_table
 
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench, "SIZES", (10,))
-    monkeypatch.setattr(bench, "CASES", {"free arm": bench.CASES["free arm"]})
+    monkeypatch.setattr(run, "SIZES", (10,))
+    monkeypatch.setattr(job, "CASES", {"free arm": job.CASES["free arm"]})
 
 
 def text(result: dict) -> str:
     console = Console(width=80, record=True, file=io.StringIO())
-    for table in bench.format_table(result):
+    for table in format_table(result):
         console.print(table)
     return console.export_text()
 
@@ -29,18 +30,18 @@ def text(result: dict) -> str:
 def test_quick_run(small: None) -> None:
     pytest.importorskip("mujoco", minversion="4.0")
     told: list[float] = []
-    result = json.loads(json.dumps(bench.run_bench(quick=True, progress=lambda what, done: told.append(done))))
+    result = json.loads(json.dumps(run.run_bench(quick=True, progress=lambda what, done: told.append(done))))
     assert told == sorted(told)
     assert told[-1] == 1.0
-    assert set(result["right_hand_side"][0]["median_us"]) == set(bench.CONTENDERS)
+    assert set(result["right_hand_side"][0]["median_us"]) == set(programs.CONTENDERS)
     assert result["machine"]["cpu"]
     assert result["versions"]["mujoco"]
     errors = {row["program"]: row["hand_error_max_m"] for row in result["job"]}
     # RK4 at 1 ms is near its stability limit in the first milliseconds; the adaptive run is held small by stability.
-    assert errors[bench.DYNSIM_DEFAULT] < 1e-7
-    assert errors[bench.DYNSIM_RK4] < 2e-5
+    assert errors[programs.DYNSIM_DEFAULT] < 1e-7
+    assert errors[programs.DYNSIM_RK4] < 2e-5
     # First order at 1 ms, but the same arm: a millimetre, not a centimetre.
-    assert 1e-5 < errors[bench.MUJOCO_EULER] < 3e-3
+    assert 1e-5 < errors[programs.MUJOCO_EULER] < 3e-3
     ratios = [row["time"] for row in result["ratios"] if "time" in row]
     assert ratios
     assert all(map(math.isfinite, ratios))
@@ -49,7 +50,7 @@ def test_quick_run(small: None) -> None:
 
 def test_without_mujoco(small: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    result = bench.run_bench(quick=True)
+    result = run.run_bench(quick=True)
     assert "not installed" in result["unavailable"]["mujoco"]
     rows = [line for line in text(result).splitlines() if line.strip().startswith("MuJoCo ")]
     # Two each: times, the job of the one case, ratios of times, ratios of the job.

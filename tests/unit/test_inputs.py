@@ -13,7 +13,7 @@ import pytest
 from dynsim.errors import RecordError, ScenarioError
 from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.servo_map import load_servo_map
-from dynsim.hardware.virtual_faults import load_fault_script
+from dynsim.hardware.virtual.faults import load_fault_script
 from dynsim.inputs import DEPTH_LIMIT, NODE_LIMIT, SIZE_LIMIT, check_file, parse_yaml, read_text
 from dynsim.record import Record
 from dynsim.scenario import build_model, find_scenario, load_scenario

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
+import shutil
 import struct
 import subprocess
 import sys
@@ -146,3 +148,37 @@ def test_folders_of_others_are_not_used(tmp_path: Path, monkeypatch) -> None:
 
 def test_every_kernel_is_compiled_by_the_one_place_that_knows_how() -> None:
     assert isinstance(newton_euler._cache, jit._KernelCache)  # type: ignore[attr-defined]
+
+
+def _folder(packages: tuple[Path, ...], monkeypatch: pytest.MonkeyPatch) -> str:
+    monkeypatch.setattr(jit, "_PACKAGES", packages)
+    return str(jit.cache_folder.__wrapped__().name)
+
+
+def test_an_edit_of_any_compiled_source_names_another_folder(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    originals = jit._PACKAGES
+    copies = tuple(tmp_path / package.name for package in originals)
+    for original, copy in zip(originals, copies, strict=True):
+        shutil.copytree(original, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    folders = {_folder(originals, monkeypatch)}
+    assert _folder(copies, monkeypatch) in folders
+    sources = [source for copy in copies for source in copy.rglob("*.py")]
+    for source in sources:
+        with source.open("a") as file:
+            file.write("# edited\n")
+        folders.add(_folder(copies, monkeypatch))
+    assert len(folders) == 1 + len(sources)
+
+
+def test_every_file_with_kernels_is_in_a_package_that_names_the_folder() -> None:
+    """Or holds none that another file compiles in: the benchmark's loop, whose file names its machine code."""
+    decorators = re.compile(r"^@(kernel|merged_kernel|internal_kernel|inlined_kernel|exact_kernel)$", re.MULTILINE)
+    package = Path(dynsim.__file__).parent
+    elsewhere = {
+        str(source.relative_to(package))
+        for source in package.rglob("*.py")
+        if not jit._names_the_folder(source) and decorators.search(source.read_text(encoding="utf-8"))
+    }
+    assert elsewhere == {"studies/bench/right_hand_side.py"}

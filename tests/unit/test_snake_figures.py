@@ -12,7 +12,7 @@ from dynsim.figures import snake as figures
 from dynsim.figures import tanaka2019
 from dynsim.record import Record
 from dynsim.scenario import load_scenario
-from dynsim.studies.tanaka2019 import TABLE_III, table_iii, tables
+from dynsim.studies.published.tanaka2019 import TABLE_III, table_iii, tables
 
 
 @pytest.fixture(scope="module")

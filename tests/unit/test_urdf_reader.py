@@ -282,8 +282,8 @@ def test_two_readers_that_differ_are_an_error(
 ) -> None:
     """Pinocchio is given a text that is not what the strict reader has read."""
     (tmp_path / "robot.urdf").write_text(GOOD)
-    plain = urdf_reader._plain_text
-    monkeypatch.setattr(urdf_reader, "_plain_text", lambda root, name: plain(root, name).replace(old, new))
+    plain = urdf_reader.plain_text
+    monkeypatch.setattr(urdf_reader, "plain_text", lambda root, name: plain(root, name).replace(old, new))
     message = refused(tmp_path / "robot.urdf")
     assert words in message
     assert words.startswith("hinge") or "robot.urdf:3: link 'arm' (joint 'hinge')" in message

@@ -18,15 +18,15 @@ from dynsim.engine import provenance
 from dynsim.errors import DynsimError, MissingEntry, ModelError, RecordError, ScenarioError
 from dynsim.figures import snake as snake_figures
 from dynsim.figures import style
-from dynsim.hardware.check import check_motion
-from dynsim.hardware.compare import compare_records
 from dynsim.hardware.errors import CheckRefused, ServoMapError
 from dynsim.hardware.export import export_record
+from dynsim.hardware.replay.check import check_motion
+from dynsim.hardware.replay.compare import compare_records
 from dynsim.hardware.servo_map import load_servo_map
 from dynsim.model.description import Inertia, Link, Robot
 from dynsim.model.model import Model
 from dynsim.record import Record
-from dynsim.scenario import build_model, load_scenario, scenario_from_resolved, variant_names
+from dynsim.scenario import build, build_model, load_scenario, scenario_from_resolved, variant_names
 
 Q = np.zeros(10)
 ORIGIN = [0.0, 0.0, 0.0]
@@ -116,7 +116,7 @@ def test_a_description_by_hand_is_refused_with_the_quantity(link: Any, robot: An
         (lambda: dynsim.compare("elbow_comparison", jobs="2"), ScenarioError, "jobs = '2': must be a whole number"),
         (lambda: build_model(load_scenario("snake_operator")), ModelError, "is kinematic: it has no rigid-body model"),
         (
-            lambda: (s := load_scenario("single_pendulum")).build_controller(build_model(s)),
+            lambda: build.controller(s := load_scenario("single_pendulum"), build_model(s)),
             ModelError,
             "the scenario has no controller",
         ),

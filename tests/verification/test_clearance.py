@@ -16,7 +16,7 @@ from dynsim.errors import ModelError
 from dynsim.model.clearance import poses, sinking
 from dynsim.model.description import Inertia, Link, Quadric, Robot
 from dynsim.model.model import Model
-from dynsim.scenario import load_scenario, scenario_from_resolved
+from dynsim.scenario import build, load_scenario, scenario_from_resolved
 from dynsim.tables import print_comparison, print_summary
 
 seeds = st.integers(0, 2**32 - 1)
@@ -38,7 +38,7 @@ def test_poses_of_many_samples_are_those_of_the_model(seed):
 
 
 def test_only_the_bodies_asked_for_and_what_carries_them():
-    robot = load_scenario("elbow_comparison").robot()
+    robot = build.robot(load_scenario("elbow_comparison"))
     named = [link.name for link, _, _ in poses(robot, np.zeros((1, 10)), ["link_3"])]
     assert named == ["link_1", "link_2", "link_3"]
 
@@ -53,7 +53,7 @@ def surface(kind: str, inside: bool = False, scale: float = 1.0) -> Quadric:
     scenario = scenario_from_resolved(
         {"name": "", "duration_s": 1, "plant": {"type": "serial_arm", "chain": [{}]}, "surfaces": {"s": given}}
     )
-    plain = scenario.surfaces()["s"]
+    plain = build.surfaces(scenario)["s"]
     return Quadric(scale * plain.Q, scale * plain.b, scale * plain.c)
 
 
@@ -99,7 +99,7 @@ def test_depth_of_a_link_is_that_of_its_deepest_point(kind, inside):
 def test_elbows_without_a_contact_sink_and_it_is_said(simulated):
     record = simulated("elbow_comparison", "no_elbow")
     summary = record.summary
-    model = Model(load_scenario("elbow_comparison", "no_elbow").robot())
+    model = Model(build.robot(load_scenario("elbow_comparison", "no_elbow")))
     lowest = np.array([model.joint_positions(q)[:, 2] for q in record["q"]])
     by_body = {entry["body"]: entry for entry in summary["sinking"]}
     assert set(by_body) == {"link_3", "link_4", "link_6", "link_7", "link_8", "link_9"}
@@ -143,7 +143,7 @@ def test_a_urdf_body_has_no_radius_and_reaches_to_its_joints_and_the_hand(tmp_pa
         overrides={"duration_s": 0.05, "controller": None, "surfaces": {"ceiling": {
             "type": "plane", "point_m": [0, 0, 0.56], "normal": [0, 0, -1]}}},
     )  # fmt: skip
-    robot = scenario.robot()
+    robot = build.robot(scenario)
     model = Model(robot)
     summary = dynsim.simulate(scenario).summary
     heights = {link.name: [] for link in robot.links}
@@ -172,7 +172,7 @@ def test_a_run_that_diverged_has_finite_depths():
         }
     )
     q = np.array([[0.0], [-3.0], [-1e200], [1e308], [-np.inf], [np.nan]])
-    found = {s.surface: s for s in sinking(scenario.robot(), scenario.surfaces(), q)}
+    found = {s.surface: s for s in sinking(build.robot(scenario), build.surfaces(scenario), q)}
     assert set(found) == {"floor"}
     assert found["floor"].sample == 1
     assert found["floor"].depth == pytest.approx(1e200 / np.sqrt(3.0))
@@ -184,7 +184,7 @@ TEARING = {"controller.joints": {"joint_3": {"times_s": [0, 2], "angles_deg": [9
 def test_references_that_tear_a_brace_off_are_refused():
     """Joint 3 raises what lies beyond it by 10° within 2 s, as 3 s² − 2 s³ of the time; yaw does not change heights."""
     scenario = load_scenario("elbow_comparison", "two_elbows", TEARING)
-    model = Model(scenario.robot())
+    model = Model(build.robot(scenario))
 
     def height(t: float) -> float:
         q, s = model.robot.initial.copy(), min(t / 2.0, 1.0)

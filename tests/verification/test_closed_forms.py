@@ -9,6 +9,7 @@ from scipy.special import ellipk
 
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate.run import DRIFT_MAX, METHODS
+from dynsim.kernels.state import FRICTION, OUT_FORCE
 from dynsim.model.description import Contact, Inertia, Link, Motor, Quadric, Robot
 
 G = 9.81
@@ -48,7 +49,7 @@ def test_pendulum_period(amplitude, method):
         b.state([amplitude], [0.0]), np.array([0.25, 0.5, 1.0]) * period, method, step=step_of(method, 2e-4), rtol=1e-11
     )
     # A thousand times the tolerance: near the top the swing magnifies errors.
-    np.testing.assert_allclose(run.sample[:, 0], [0.0, -amplitude, amplitude], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(run.states("q")[:, 0], [0.0, -amplitude, amplitude], rtol=0, atol=1e-8)
 
 
 @every_method
@@ -61,7 +62,7 @@ def test_current_in_a_blocked_motor_rises_exponentially(method):
     run = b.simulate(b.state([0.0], [0.0]), t, method, step=step_of(method, 1e-4), rtol=1e-9)
     expected = 30.0 * 0.4 / 1.1 * (1.0 - np.exp(-1.1 / 1.7e-3 * t))
     # RK4: (h R/L)^5/120 per step = 1e-8; cubic dense output at grid points adds nothing. The others: 10 rtol |i|.
-    np.testing.assert_allclose(run.sample[:, 2], expected, rtol=0, atol=1e-6 if method == "rk4" else 1e-7)
+    np.testing.assert_allclose(run.states("current")[:, 0], expected, rtol=0, atol=1e-6 if method == "rk4" else 1e-7)
 
 
 @every_method
@@ -71,7 +72,8 @@ def test_current_with_a_voltage_limit_rises_as_if_the_limit_were_the_voltage(met
     b = bench(robot(heavy, motors=(motor,)), held=np.array([0.4]), k_p=30.0)
     t = np.array([1e-3, 5e-3])
     run = b.simulate(b.state([0.0], [0.0]), t, method, step=step_of(method, 2e-5), rtol=1e-9)
-    np.testing.assert_allclose(run.sample[:, 2], 5.0 / 1.1 * (1.0 - np.exp(-1.1 / 1.7e-3 * t)), rtol=0, atol=1e-7)
+    expected = 5.0 / 1.1 * (1.0 - np.exp(-1.1 / 1.7e-3 * t))
+    np.testing.assert_allclose(run.states("current")[:, 0], expected, rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("speed", [-2.0, 0.5e-3, 3.0])
@@ -82,7 +84,7 @@ def test_block_on_an_incline(speed):
     b = bead(mass, Quadric(PLANE, normal, 0.0), friction=mu, v_s=v_s)
     dy = b.derivative(b.state(np.zeros(3), speed * down))
     expected = G * np.sin(alpha) - mu * G * np.cos(alpha) * speed / np.hypot(speed, v_s)
-    np.testing.assert_allclose(dy[3:6], expected * down, rtol=0, atol=1e-13)  # rounding
+    np.testing.assert_allclose(b.part(dy, "v"), expected * down, rtol=0, atol=1e-13)  # rounding
     assert b.ws.contacts[0, ka.NORMAL_FORCE] == pytest.approx(mass * G * np.cos(alpha), rel=1e-13)
 
 
@@ -96,8 +98,8 @@ def test_block_slides_down_an_incline(method):
     run = b.simulate(b.state(np.zeros(3), v0 * down), t, method, step=step_of(method, 1e-3), rtol=1e-9)
     s = v0 * t + 0.5 * G * (np.sin(alpha) - mu * np.cos(alpha)) * t**2
     # v_s²/v² = 1e-12 and the tolerance of the integration.
-    np.testing.assert_allclose(run.sample[:, :3] @ down, s, rtol=1e-8)
-    np.testing.assert_allclose(run.sample[:, 6 + 5], mu * mass * G * np.cos(alpha) * s, rtol=1e-8)
+    np.testing.assert_allclose(run.states("q") @ down, s, rtol=1e-8)
+    np.testing.assert_allclose(run.states("ledger")[:, FRICTION], mu * mass * G * np.cos(alpha) * s, rtol=1e-8)
 
 
 @every_method
@@ -109,13 +111,12 @@ def test_bead_on_a_sphere_is_held_by_weight_less_centrifugal_force(method):
     run = b.simulate(
         b.state(start, np.zeros(3)), np.linspace(0.1, 1.0, 10), method, step=step_of(method, 5e-4), rtol=1e-10
     )
-    r, v = run.sample[:, :3], run.sample[:, 3:6]
+    r, v = run.states("q"), run.states("v")
     square = 2.0 * G * (start[2] - r[:, 2])
     # A hundred times the tolerance of the integration.
     np.testing.assert_allclose((v**2).sum(axis=1), square, rtol=0, atol=1e-8)
     force = mass * (G * r[:, 2] / radius - square / radius)
-    columns = 3 + 6  # vdot, hand and energies come first, no motors
-    np.testing.assert_allclose(run.output[:, columns], force, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(run.outputs("contact")[:, 0, OUT_FORCE], force, rtol=0, atol=1e-8)
     assert force.min() < 0.0 < force.max()
     assert 0.0 < run.extremes[0, DRIFT_MAX] <= 1e-9
 
@@ -131,5 +132,5 @@ def test_bead_on_a_cylinder_without_weight_runs_along_a_helix(method):
     )
     angle = around / radius * t
     expected = np.stack([radius * np.cos(angle), radius * np.sin(angle), along * t], axis=1)
-    np.testing.assert_allclose(run.sample[:, :3], expected, rtol=0, atol=1e-8)  # a hundred tolerances
-    np.testing.assert_allclose(run.output[:, 9], -mass * around**2 / radius, rtol=1e-8)
+    np.testing.assert_allclose(run.states("q"), expected, rtol=0, atol=1e-8)  # a hundred tolerances
+    np.testing.assert_allclose(run.outputs("contact")[:, 0, OUT_FORCE], -mass * around**2 / radius, rtol=1e-8)

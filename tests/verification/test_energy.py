@@ -5,7 +5,7 @@ import pytest
 
 import dynsim
 from dynsim import metrics
-from dynsim.scenario import scenario_from_resolved
+from dynsim.scenario import build, scenario_from_resolved
 from dynsim.studies.validation import FREE, free_scenario
 
 MOTOR = {
@@ -94,7 +94,7 @@ def test_an_immobile_arm_has_no_residual_to_speak_of():
 def test_the_floor_is_far_below_what_a_run_turns_over():
     scenario = dynsim.load_scenario("elbow_comparison", overrides={"duration_s": 1})
     record = dynsim.simulate(scenario)
-    floor = metrics.residual_floor(record, scenario.robot(), 1e-6)
+    floor = metrics.residual_floor(record, build.robot(scenario), 1e-6)
     # Weights of 0.1 kg along 2.7 m, at the middles of nine links: 0.981 N · Σ (k − ½) 0.3 m = 11.9 J.
     assert floor == pytest.approx(1e-6 * 0.981 * 0.3 * 40.5)
     summary = record.summary

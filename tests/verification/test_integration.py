@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from random_robots import Bench, bench
 
-from dynsim.kernels import energy
-from dynsim.kernels.integrate.driver import advance
-from dynsim.kernels.integrate.run import DRIFT_MAX, FINISHED, METHODS, REJECTED, STATUS, STEPS, new_run
+from dynsim.kernels.integrate.run import DRIFT_MAX, FINISHED, METHODS, REJECTED, STATUS, STEPS, Run
+from dynsim.kernels.state import CONSTRAINT, ELECTRICAL, FRICTION, GEAR, JOINT, JOULE, OUT_GAP
 from dynsim.model.description import Contact, Inertia, Link, Motor, Quadric, Robot
 
 Y, Z = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
@@ -48,13 +47,15 @@ def arm(inductance: float = 1.7e-3, *, braced: bool = False, v_s: float = 0.05) 
     return b, b.state(angles, np.zeros(5))
 
 
+def motion(run: Run) -> np.ndarray:
+    """q and v of the samples, (T, 2 n)."""
+    return np.hstack([run.states("q"), run.states("v")])
+
+
 def errors(b: Bench, y: np.ndarray, method: str, steps: list[float], times: np.ndarray) -> np.ndarray:
     """Largest error of q, v at ``times`` for each step."""
-    n = b.sizes[0]
-    reference = b.simulate(y, times, "dopri5", rtol=1e-12).sample[:, : 2 * n]
-    return np.array(
-        [np.abs(b.simulate(y, times, method, step=h, fixed=True).sample[:, : 2 * n] - reference).max() for h in steps]
-    )
+    reference = motion(b.simulate(y, times, "dopri5", rtol=1e-12))
+    return np.array([np.abs(motion(b.simulate(y, times, method, step=h, fixed=True)) - reference).max() for h in steps])
 
 
 def slopes(values: np.ndarray) -> np.ndarray:
@@ -85,10 +86,9 @@ def test_rodas4_keeps_its_order_when_the_inductance_vanishes():
     own, which steps of this size pass over (and then with order 3).
     """
     b, y = arm(inductance=1e-8)
-    n = b.sizes[0]
-    y[2 * n : 3 * n] = 40.0 * (b.system.reference.held - y[:n]) / 1.1
+    b.part(y, "current")[:] = 40.0 * (b.system.reference.held - b.part(y, "q")) / 1.1
     times = np.array([0.08])
-    runs = [b.simulate(y, times, "rodas4", step=h, fixed=True).sample[:, : 2 * n] for h in (4e-3, 2e-3, 1e-3, 1e-4)]
+    runs = [motion(b.simulate(y, times, "rodas4", step=h, fixed=True)) for h in (4e-3, 2e-3, 1e-3, 1e-4)]
     found = slopes(np.array([np.abs(r - runs[-1]).max() for r in runs[:-1]]))
     assert found.min() >= 3.5, found
 
@@ -114,13 +114,12 @@ def test_every_method_is_in_these_tests():
 @pytest.mark.parametrize("rtol", [1e-4, 1e-6, 1e-8])
 def test_adaptive_runs_meet_their_tolerance(method, rtol):
     b, y = arm(braced=True)
-    times, n = np.linspace(0.05, 0.5, 10), b.sizes[0]
-    reference = b.simulate(y, times, rtol=1e-12).sample
-    run = b.simulate(y, times, method, rtol=rtol)
-    error = np.abs(run.sample - reference)
+    times = np.linspace(0.05, 0.5, 10)
+    reference, run = b.simulate(y, times, rtol=1e-12), b.simulate(y, times, method, rtol=rtol)
     # Local control: the sum of all local errors, damped by the motors, stays within 20 tolerances of unit-sized states.
-    assert error[:, :n].max() <= 20.0 * rtol
-    assert error[:, n : 3 * n].max() <= 20.0 * rtol * np.abs(reference[:, n : 3 * n]).max()
+    assert np.abs(run.states("q") - reference.states("q")).max() <= 20.0 * rtol
+    expected, found = (np.hstack([r.states("v"), r.states("current")]) for r in (reference, run))
+    assert np.abs(found - expected).max() <= 20.0 * rtol * np.abs(expected).max()
 
 
 def double_pendulum() -> Bench:
@@ -146,7 +145,7 @@ def test_where_accuracy_sets_the_step_the_error_is_about_the_tolerance(method, r
     """Measured: rk43 0.9 to 1.4 rtol (5.5 with its error weight at 0.03), dopri5 0.2 to 1.0, rodas4 0.1."""
     b, times = double_pendulum(), np.array([2.0])
     y = b.state([0.5, 0.5], [0.0, 0.0])
-    error = b.simulate(y, times, method, rtol=rtol).sample[0, :2] - b.simulate(y, times, rtol=1e-13).sample[0, :2]
+    error = b.simulate(y, times, method, rtol=rtol).states("q") - b.simulate(y, times, rtol=1e-13).states("q")
     assert 1e-3 * rtol < np.abs(error).max() <= 2.0 * rtol
 
 
@@ -155,7 +154,7 @@ def test_passive_chaos_keeps_its_energy(method):
     """10 s of tumbling, per m g l of both rods. Measured in rtol: rk43 3.9 (21 with 0.03), dopri5 5.0, rodas4 0.9."""
     b, rtol = double_pendulum(), 1e-6
     run = b.simulate(b.state([1.5, 0.5], [0.0, 0.0]), np.linspace(0.0, 10.0, 101), method, rtol=rtol)
-    energies = run.output[:, 5:7].sum(axis=1)
+    energies = run.outputs("energy").sum(axis=1)
     assert 0.0 < np.abs(energies - energies[0]).max() / (3.0 * 9.81) <= 8.0 * rtol
 
 
@@ -170,20 +169,17 @@ def test_explicit_steps_at_the_stability_limit_are_hardly_ever_rejected():
 def test_contacts_do_not_drift(method):
     b, y = arm(braced=True, v_s=1e-3)
     run = b.simulate(y, np.linspace(0.0, 2.0, 41), method, step=1e-3 if method == "rk4" else 0.0)
-    gap = 5 + 2 * 5 + 6 + 4
     # The promise; rounding is left, so zero would be a column that nobody writes.
     assert 0.0 < run.extremes[0, DRIFT_MAX] <= 1e-9
-    assert 0.0 < np.abs(run.output[:, gap]).max() <= 1e-9
+    assert 0.0 < np.abs(run.outputs("contact")[:, :, OUT_GAP]).max() <= 1e-9
 
 
-def ledger_residual(run) -> float:
+def ledger_residual(run: Run) -> float:
     """Everything that went in minus everything that came out or is stored, over the turnover."""
-    n, na = 5, 5
-    stored = run.output[:, n + 2 * na + 3 : n + 2 * na + 6].sum(axis=1)
-    ledger = run.sample[-1, 2 * n + na :]
-    spent = ledger[[energy.JOULE, energy.GEAR, energy.JOINT, energy.FRICTION]]
-    residual = ledger[energy.ELECTRICAL] + ledger[energy.CONSTRAINT] - spent.sum() - (stored[-1] - stored[0])
-    return residual / (abs(ledger[energy.ELECTRICAL]) + spent.sum())
+    stored, ledger = run.outputs("energy").sum(axis=1), run.states("ledger")[-1]
+    spent = ledger[[JOULE, GEAR, JOINT, FRICTION]]
+    residual = ledger[ELECTRICAL] + ledger[CONSTRAINT] - spent.sum() - (stored[-1] - stored[0])
+    return residual / (abs(ledger[ELECTRICAL]) + spent.sum())
 
 
 @pytest.mark.parametrize("braced", [False, True])
@@ -208,10 +204,7 @@ def test_a_run_in_pieces_is_the_same_run(method):
     b, y = arm(braced=True)
     step = 1e-3 if method == "rk4" else 0.0
     whole = b.simulate(y, np.array([0.3]), method, step=step)
-    run = new_run(
-        METHODS[method], y, n=5, na=5, c=1, sample_time=np.array([0.3]), hand=(4, np.zeros(3)), end=0.3, step=step,
-        step_max=np.inf, rtol=1e-6, atol=1e-8,
-    )  # fmt: skip
+    run = b.new_run(y, np.array([0.3]), method, step=step)
     while run.count[STATUS] != FINISHED:
-        advance(b.system, b.ws, run, 7)
+        b.advance(run, 7)
     np.testing.assert_array_equal(run.y, whole.y)

@@ -12,7 +12,9 @@ import pytest
 from numba import config
 from random_robots import bench, random_contacts, random_robot
 
-from dynsim.kernels import articulated, coupled, energy, integrate, kinematics, newton_euler
+from dynsim.kernels import ledger, system
+from dynsim.kernels.integrate import driver
+from dynsim.kernels.tree import articulated, points, sweep
 from dynsim.model.model import Model
 
 PLAIN_PYTHON = """
@@ -29,7 +31,7 @@ for m_star in (False, True):
     b = bench(robot, contacts, m_star=m_star)
     rows.append(b.derivative(b.state(q, v, i)))
 free = bench(robot)
-rows += [free.simulate(free.state(q, v, i), np.array([4e-3]), m, step=1e-3).sample[0] for m in ("rk4", "rodas4")]
+rows += [free.simulate(free.state(q, v, i), np.array([4e-3]), m, step=1e-3).y for m in ("rk4", "rodas4")]
 np.savez(sys.argv[1], *rows)
 """
 
@@ -58,17 +60,17 @@ def run_everything() -> None:
 def test_every_public_kernel_has_one_compiled_signature():
     run_everything()
     # Every one was called above, from Python: none at all would mean that this test looks at the wrong function.
-    assert len(coupled.derivative.signatures) == 2  # one program per solver
-    for kernel in (integrate.advance_explicit, integrate.advance_rodas4):
+    assert len(system.derivative.signatures) == 2  # one program per solver
+    for kernel in (driver.advance_explicit, driver.advance_rodas4):
         assert 1 <= len(kernel.signatures) <= 2, kernel  # for m_star in slow tests only
     for kernel in (
-        newton_euler.newton_euler,
-        newton_euler.mass_matrix,
+        sweep.newton_euler,
+        sweep.mass_matrix,
         articulated.forward_dynamics,
-        kinematics.point_position,
-        kinematics.point_jacobian,
-        energy.kinetic_energy,
-        energy.potential_energy,
+        points.point_position,
+        points.point_jacobian,
+        ledger.kinetic_energy,
+        ledger.potential_energy,
     ):
         assert len(kernel.signatures) == 1, kernel
 

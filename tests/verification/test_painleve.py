@@ -10,15 +10,16 @@ import pytest
 from random_robots import Bench, bench, random_contacts, random_robot, random_unit
 
 import dynsim
-from dynsim.engine import dynamics
+from dynsim.engine import dynamics, recording
 from dynsim.engine.uniqueness import acceleration_range, contact_matrices, motion_spread, paradox
 from dynsim.errors import SimulationStopped
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.constraint.uniqueness import ROOM, UNIQUE, force_verdict
+from dynsim.kernels.integrate import driver
 from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.integrate.driver import advance
 from dynsim.kernels.system import new_workspace
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
+from dynsim.scenario import build
 
 X, Y, Z = np.eye(3)
 FLOOR = Quadric(np.zeros((3, 3)), Z, 0.0)
@@ -50,13 +51,8 @@ def rod_state(b: Bench, lean: float, turn: float, slide: float = 3.0) -> np.ndar
 
 def started(b: Bench, y: np.ndarray, method: str, *, end: float = 0.3, rtol: float = 1e-6) -> ki.Run:
     """A run to its end or stop."""
-    n, na, c = b.sizes
-    run = ki.new_run(
-        ki.METHODS[method], y, n=n, na=na, c=c, sample_time=np.linspace(0.0, end, 4), hand=(n - 1, np.zeros(3)),
-        end=end, step=2e-4 if method == "rk4" else 0.0, step_max=np.inf, rtol=rtol, atol=1e-2 * rtol,
-    )  # fmt: skip
-    advance(b.system, b.ws, run, 10**6)
-    return run
+    step = 2e-4 if method == "rk4" else 0.0
+    return b.advance(b.new_run(y, np.linspace(0.0, end, 4), method, step=step, rtol=rtol))
 
 
 def test_the_critical_angle_is_where_the_diagonal_vanishes():
@@ -80,9 +76,9 @@ def test_a_signed_rod_is_stopped_where_its_diagonal_vanishes(method, rtol, turn)
     assert "lower contacts.friction" in words
     assert run.clock[ki.TIME] <= t
     # The steps collapse where the determinant is 2e-5, which is 5e-6 rad before it vanishes.
-    assert y[2] == pytest.approx(CRITICAL, abs=1e-5)
+    assert b.part(y, "q")[2] == pytest.approx(CRITICAL, abs=1e-5)
     # What was recorded lies before it.
-    assert (run.sample[: run.count[ki.SAMPLE], 2] > CRITICAL).all()
+    assert (run.states("q")[:, 2] > CRITICAL).all()
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -111,7 +107,7 @@ def test_a_dissipative_rod_is_stopped_where_a_second_solution_appears(method):
     assert "two consistent solutions (Painlevé's paradox) at tip" in words
     assert run.clock[ki.TIME] < t <= run.clock[ki.NOT_UNIQUE]
     # The smoothing speed turns the slip by 5e-8 of its direction, μ by as much; the state is linear over the step.
-    assert y[2] == pytest.approx(-CRITICAL, abs=2e-6)
+    assert b.part(y, "q")[2] == pytest.approx(-CRITICAL, abs=2e-6)
     solutions = contact_matrices(b.system, b.ws, 0.0, rod_state(b, 0.6, 0.0)).solutions()
     assert len(solutions) == 2
     assert solutions[0] * solutions[1] < 0.0
@@ -122,7 +118,7 @@ def test_signed_friction_goes_where_dissipative_friction_has_two_solutions():
     b, _ = rod("signed")
     run = started(b, rod_state(b, 0.3, 0.5), "rk43", end=0.1)
     assert run.count[ki.STATUS] == ki.FINISHED
-    assert run.y[2] > -CRITICAL
+    assert b.part(run.y, "q")[2] > -CRITICAL
 
 
 def random_case(seed: int, friction: float, most: int = 3) -> tuple[Bench, np.ndarray]:
@@ -147,12 +143,7 @@ def test_the_compiled_watch_agrees_with_its_definition():
         values = [matrices.determinant(signs) for signs in matrices.choices()]
         if min(map(abs, values)) < 1e-6:
             continue
-        n, na, c = b.sizes
-        run = ki.new_run(
-            ki.RK43, y, n=n, na=na, c=c, sample_time=np.array([1.0]), hand=(n - 1, np.zeros(3)), end=1.0, step=1e-3,
-            step_max=np.inf, rtol=1e-6, atol=1e-8,
-        )  # fmt: skip
-        advance(b.system, b.ws, run, 0)
+        run = b.advance(b.new_run(y, np.array([1.0]), "rk43", step=1e-3), 0)
         if run.count[ki.STATUS] in (ki.NOT_PROJECTED, ki.NO_FORCES, ki.NOT_FINITE):
             continue
         matrices = contact_matrices(b.system, b.ws, 0.0, run.y)
@@ -173,7 +164,8 @@ def test_a_right_hand_side_does_not_depend_on_earlier_calls():
         b, y = random_case(seed, friction=0.8)
         fresh, other = random_case(seed, friction=0.8)
         rng = np.random.default_rng(seed)
-        other[: len(y) // 2] += rng.normal(size=len(y) // 2)
+        for name in ("q", "v"):
+            b.part(other, name)[:] += rng.normal(size=b.sizes[0])
         first = b.derivative(y).copy()
         signs = b.ws.rows[:, ka.SIGN].copy()
         b.derivative(other)
@@ -255,7 +247,7 @@ def test_the_motion_of_a_table_on_four_legs_is_open(law):
     b = table(0.5, law)
     y = sliding(b)
     taken, low, high = acceleration_range(b.system, 0.0, y)
-    np.testing.assert_array_equal(taken, b.derivative(y)[6:12])
+    np.testing.assert_array_equal(taken, b.part(b.derivative(y), "v"))
     assert b.ws.counts[ka.DEPENDENT] > 0
     # By hand: the splits are f0 + z (1, −1, 1, −1) to first order in friction; sampled along the null vector.
     matrices = contact_matrices(b.system, b.ws, 0.0, y)
@@ -320,12 +312,7 @@ def test_a_contact_given_twice_is_stopped_like_one():
     b, (tip,) = rod("signed")
     twice = bench(b.robot, [tip, replace(tip, name="tip again")])
     for lean, status in ((0.3, ki.RUNNING), (-0.6, ki.FORCES_REVERSED)):
-        y = np.append(rod_state(b, lean, 0.0), [0.0, 0.0])
-        run = ki.new_run(
-            ki.RK43, y, n=3, na=0, c=2, sample_time=np.array([1.0]), hand=(2, np.zeros(3)), end=1.0, step=1e-3,
-            step_max=np.inf, rtol=1e-6, atol=1e-8,
-        )  # fmt: skip
-        advance(twice.system, twice.ws, run, 0)
+        run = twice.advance(twice.new_run(rod_state(twice, lean, 0.0), np.array([1.0]), "rk43", step=1e-3), 0)
         assert run.count[ki.STATUS] == status
 
 
@@ -396,17 +383,19 @@ def test_a_reversed_diagonal_beside_a_positive_determinant_is_a_warning():
     """The forces are unique, and the summary says what they rest on."""
     scenario = dynsim.load_scenario("elbow_comparison", overrides={"duration_s": 0.02})
     prepared = dynamics.prepare(scenario)
-    advance(prepared.system, prepared.workspace, prepared.run, 10**6)
+    driver.advance(prepared.system, prepared.workspace, prepared.run, 10**6)
     for since, expected in ((np.inf, []), (0.013, ["elbow_4: from t = 0.013 s on"])):
         prepared.run.extremes[0, ki.LOCAL_SINCE] = since  # as the watch does, see the random cases above
-        warnings = dynamics._record(scenario, prepared, 1.0).summary["warnings"]
+        warnings = recording.make_record(scenario, prepared, 1.0).summary["warnings"]
         assert [text[: len("elbow_4: from t = 0.013 s on")] for text in warnings if "Painlevé" in text] == expected
 
 
 def test_dissipative_is_the_default_and_the_published_comparisons_name_their_own_law():
     for name in ("elbow_comparison", "elbow_comparison_vertical"):
-        assert {contact.pulling_friction for contact in dynsim.load_scenario(name).contacts()} == {"signed"}
-    assert {contact.pulling_friction for contact in dynsim.load_scenario("thirty_links").contacts()} == {"dissipative"}
+        assert {contact.pulling_friction for contact in build.contacts(dynsim.load_scenario(name))} == {"signed"}
+    assert {contact.pulling_friction for contact in build.contacts(dynsim.load_scenario("thirty_links"))} == {
+        "dissipative"
+    }
     assert Contact("c", "b", np.zeros(3), FLOOR).pulling_friction == "dissipative"
 
 

@@ -6,9 +6,10 @@ import pytest
 import dynsim
 from dynsim.engine.dynamics import prepare
 from dynsim.errors import ScenarioError
+from dynsim.kernels.state import ELECTRICAL, block
 from dynsim.kernels.system import derivative
 from dynsim.scenario import build_model, load_scenario
-from dynsim.studies.rotors import rotor_energies, rotor_model
+from dynsim.studies.published.rotors import rotor_energies, rotor_model
 
 ARM = """
 duration_s: 1
@@ -23,17 +24,19 @@ def test_the_independent_dynamics_are_dynsims_when_rotors_are_armature():
     scenario = load_scenario("elbow_comparison", "two_elbows")
     prepared, model = prepare(scenario), rotor_model(scenario, spinning=False)
     n, rng = 10, np.random.default_rng(1)
+    q, v, current, ledger = (block(prepared.system.layout, name) for name in ("q", "v", "current", "ledger"))
     for t in (0.0, 0.013, 3.3):
         y = prepared.run.y.copy()
-        y[:n] += rng.normal(scale=0.1, size=n)
-        y[n : 2 * n] = rng.normal(size=n)
-        y[2 * n : 3 * n] = rng.normal(size=n)
+        y[q] += rng.normal(scale=0.1, size=n)
+        y[v], y[current] = rng.normal(size=n), rng.normal(size=n)
         dy = np.zeros_like(y)
         derivative(prepared.system, t, y, prepared.workspace, dy)
-        mine = model.derivative(t, np.append(y[: 3 * n], 0.0))
+        # The model's own state is q, v, i and the electrical energy.
+        *mine, power = model.derivative(t, np.concatenate([y[q], y[v], y[current], [0.0]]))
+        expected = np.concatenate([dy[q], dy[v], dy[current]])
         # J̇ v there is a central difference.
-        np.testing.assert_allclose(mine[: 3 * n], dy[: 3 * n], rtol=1e-7, atol=1e-7 * np.abs(dy[n : 2 * n]).max())
-        assert mine[-1] == pytest.approx(dy[3 * n], rel=1e-12)
+        np.testing.assert_allclose(mine, expected, rtol=1e-7, atol=1e-7 * np.abs(dy[v]).max())
+        assert power == pytest.approx(dy[ledger][ELECTRICAL], rel=1e-12)
 
 
 def test_a_spinning_rotor_turns_with_its_link_and_its_joint():

@@ -11,8 +11,9 @@ from random_snakes import robots
 
 from dynsim.errors import ModelError
 from dynsim.kernels.jit import integers, reals
-from dynsim.kernels.snake import active_rows, constraint_matrices, new_chain, pose_of_point, walk_chain
+from dynsim.model.protocols import BuildContext
 from dynsim.plants.snake import Config, build
+from dynsim.snake.kinematics import active_rows, constraint_matrices, new_chain, pose_of_point, walk_chain
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -127,4 +128,4 @@ def test_pose_from_the_base_and_chain_from_the_pose_agree(robot, seed):
 )
 def test_impossible_robots_are_refused_with_the_reason(settings, reason):
     with pytest.raises(ModelError, match=reason):
-        build(Config(**settings))
+        build(Config(**settings), BuildContext(1.0))

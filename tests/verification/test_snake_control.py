@@ -8,10 +8,11 @@ from hypothesis import strategies as st
 from dynsim.control import task_space
 from dynsim.errors import ModelError
 from dynsim.kernels.jit import reals
-from dynsim.kernels.snake import constraint_matrices, new_chain, pose_of_point, walk_chain
-from dynsim.kernels.snake_control import control_input, new_work, sigma_min
+from dynsim.model.protocols import BuildContext
 from dynsim.model.snake import conditioning
 from dynsim.plants import snake
+from dynsim.snake.control import control_input, new_work, sigma_min
+from dynsim.snake.kinematics import constraint_matrices, new_chain, pose_of_point, walk_chain
 
 seeds = st.integers(0, 2**32 - 1)
 forms = st.sampled_from(["safe", "paper"])
@@ -27,10 +28,11 @@ def case(random, **options):
             wheel_gap_m=random.uniform(0.08, 0.2, 7).tolist(),
             driven_side=random.choice(["left", "right"], 7).tolist(),
             controlled_point=str(random.choice(["head", "gripper"])),
-        )
+        ),
+        BuildContext(1.0),
     )
     config = {"limit_policy": "none", "damping_sigma": 0.0} | options
-    controller = task_space.build(task_space.Config(**config), plant)
+    controller = task_space.build(task_space.Config(**config), BuildContext(1.0, plant))
     phi = plant.initial_joints + random.uniform(-0.3, 0.3, 12)
     return plant.arrays(), controller, phi
 
@@ -115,9 +117,9 @@ def test_joint_rates_do_not_depend_on_wheel_side_or_track_as_wheel_weights_vanis
     for weight in (1e-2, 1e-6, 1e-8):
         rates: list[np.ndarray] = []
         for side, gap in zip(sides, gaps, strict=True):
-            plant = snake.build(snake.Config(driven_side=side, wheel_gap_m=gap))
+            plant = snake.build(snake.Config(driven_side=side, wheel_gap_m=gap), BuildContext(1.0))
             config = task_space.Config(weight_wheel=weight, limit_policy="none", damping_sigma=0.0)
-            law = task_space.build(config, plant).law
+            law = task_space.build(config, BuildContext(1.0, plant)).law
             rates.append(evaluate(plant.arrays(), law, phi, np.zeros(3), np.zeros(6), velocity, row, 0.1)[1].u[:12])
         assert np.abs(rates[0]).max() > 0.01  # it moves
         difference.append(np.abs(rates[0] - rates[1]).max())
@@ -144,8 +146,8 @@ def test_smallest_singular_value_of_every_sample(simulated):
     """Along a motion the smallest singular vector turns and is orthogonal to any fixed one somewhere: no sample may
     show the second smallest value instead. Singular values by numpy."""
     record = simulated("snake_operator", None)
-    plant = snake.build(snake.Config(controlled_point="gripper"))
-    controller = task_space.build(task_space.Config(), plant)
+    plant = snake.build(snake.Config(controlled_point="gripper"), BuildContext(1.0))
+    controller = task_space.build(task_space.Config(), BuildContext(1.0, plant))
     model, numbers = plant.arrays(), controller.modes.numbers
     dense = [
         conditioning(model, controller.law, numbers.index(mode), base, phi).sigma_min_B
@@ -157,8 +159,8 @@ def test_smallest_singular_value_of_every_sample(simulated):
 
 def test_singularity_is_of_B_where_psi2_and_psi3_make_a_right_angle():
     """[T] does not consider singularities "because the robot in the paper has many active wheels": true of A only."""
-    plant = snake.build(snake.Config())
-    law, model = task_space.build(task_space.Config(), plant).law, plant.arrays()
+    plant = snake.build(snake.Config(), BuildContext(1.0))
+    law, model = task_space.build(task_space.Config(), BuildContext(1.0, plant)).law, plant.arrays()
     phi = plant.initial_joints.copy()
     phi[3] = np.pi / 2 - phi[5]
     found = conditioning(model, law, 0, np.zeros(3), phi)
@@ -169,8 +171,8 @@ def test_singularity_is_of_B_where_psi2_and_psi3_make_a_right_angle():
 
 
 def test_damping_keeps_rates_finite_at_the_singularity_and_leaves_the_null_space_alone():
-    plant = snake.build(snake.Config())
-    law, model = task_space.build(task_space.Config(limit_policy="none"), plant).law, plant.arrays()
+    plant = snake.build(snake.Config(), BuildContext(1.0))
+    law, model = task_space.build(task_space.Config(limit_policy="none"), BuildContext(1.0, plant)).law, plant.arrays()
     phi = plant.initial_joints.copy()
     phi[3] = np.pi / 2 - phi[5]
     phi[5] = law.shape_target[0]
@@ -227,10 +229,12 @@ def test_allocation_keeps_joints_within_limits_without_head_error(seed, row):
 )  # fmt: skip
 def test_what_cannot_be_controlled_is_refused_with_the_reason(plant, controller, reason):
     with pytest.raises(ModelError, match=reason):
-        task_space.build(task_space.Config(**controller), snake.build(snake.Config(**plant)))
+        task_space.build(
+            task_space.Config(**controller), BuildContext(1.0, snake.build(snake.Config(**plant), BuildContext(1.0)))
+        )
 
 
 def test_four_head_joints_are_enough_without_shape_points():
     """[T] eq 1 itself: n_h = 4 is controllable as long as no shape controllable point is used."""
-    plant = snake.build(snake.Config(head_joints=4, yaw_joints=8))
-    assert task_space.build(task_space.Config(shape_points_rad={}), plant).law.shape_joints.size == 0
+    plant = snake.build(snake.Config(head_joints=4, yaw_joints=8), BuildContext(1.0))
+    assert task_space.build(task_space.Config(shape_points_rad={}), BuildContext(1.0, plant)).law.shape_joints.size == 0

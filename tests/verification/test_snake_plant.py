@@ -13,10 +13,9 @@ from numba import config
 from dynsim.engine import kinematic, simulate
 from dynsim.engine.kinematic_record import attitude, attitude_distance
 from dynsim.errors import ModelError, ScenarioError
-from dynsim.kernels import snake as snake_kernels
-from dynsim.kernels import snake_control, snake_plant
 from dynsim.model.snake import NO_REQUEST, SWITCHING, CommandBlock
 from dynsim.scenario import Scenario, ScenarioConfig, load_scenario
+from dynsim.snake import control, kinematics, ticks
 
 GAMMA = {"type": "ramp", "start_s": 0.1, "duration_s": 1.0, "displacement": [0.02, 0.03, -0.03, 0.1, 0.1, 0.3]}
 
@@ -311,8 +310,8 @@ def test_every_kernel_has_one_compiled_signature():
     """A second one means an array of another layout or a literal slipped in: twice the compile time, silently."""
     run(duration_s=0.05)
     # Those that a run calls from Python: what only kernels call has none here when it comes from the cache.
-    entry = [snake_plant.run_ticks, snake_plant.record_row, snake_control.control_input]
-    entry += [snake_kernels.pose_of_point, snake_kernels.walk_chain, snake_kernels.constraint_matrices]
+    entry = [ticks.run_ticks, ticks.record_row, control.control_input]
+    entry += [kinematics.pose_of_point, kinematics.walk_chain, kinematics.constraint_matrices]
     for kernel in entry:
         assert len(kernel.signatures) == 1, kernel
 

@@ -8,8 +8,11 @@ from scipy.spatial import ConvexHull
 
 from dynsim.control.modes import TABLE_II
 from dynsim.kernels.jit import reals
-from dynsim.kernels.snake import new_chain, pose_of_point, walk_chain
-from dynsim.kernels.snake_support import (
+from dynsim.model.protocols import BuildContext
+from dynsim.model.snake import ModeTable
+from dynsim.plants.snake import Config, build
+from dynsim.snake.kinematics import new_chain, pose_of_point, walk_chain
+from dynsim.snake.support import (
     Cost,
     cost_gradient,
     cost_value,
@@ -18,11 +21,9 @@ from dynsim.kernels.snake_support import (
     smooth_margin,
     support_polygon,
 )
-from dynsim.model.snake import ModeTable
-from dynsim.plants.snake import Config, build
 
 seeds = st.integers(0, 2**32 - 1)
-ROBOT = build(Config())
+ROBOT = build(Config(), BuildContext(1.0))
 MODEL = ROBOT.arrays()
 MODES = ModeTable.from_lifted(TABLE_II, 7)
 K_V = reals([15, 0.015] * 3 + [9.6, 4.8, 2.4, 1.2, 0.6, 0.3])

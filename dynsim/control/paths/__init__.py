@@ -1,1 +1,1 @@
-"""Hand paths, one file each: ``Config`` with ``position(t)``, shape (T,) → (T, 3) [s → m]."""
+"""Hand paths, one file each: ``Config`` for the scenario and ``build(config, context) -> HandPath``."""

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from dynsim.config import Positive, StrictConfig, Vector3, unit_vector
+from dynsim.model.control import HandPath
+from dynsim.model.protocols import BuildContext
 
 
 class Config(StrictConfig):
@@ -40,3 +42,8 @@ class Config(StrictConfig):
         return np.array(self.center_m) + self.radius_m * (
             np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
         )
+
+
+def build(config: Config, context: BuildContext) -> HandPath:
+    """The path, which its configuration is."""
+    return config

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import re
-from pathlib import Path
 from typing import Literal, Self
 
 import numpy as np
@@ -13,14 +10,11 @@ from pydantic import Field, PrivateAttr, model_validator
 from scipy.interpolate import PchipInterpolator
 
 from dynsim.config import StrictConfig
-from dynsim.errors import ModelError
-from dynsim.inputs import read_text
+from dynsim.csv_rows import read_rows
+from dynsim.model.control import HandPath
+from dynsim.model.protocols import BuildContext
 
 COLUMNS = ("t_s", "x_m", "y_m", "z_m")
-# Of a file [bytes]: some million rows.
-SIZE_LIMIT = 100_000_000
-# float() takes more: "1_0", digits of other scripts. No other program would read the file so.
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 
 
 class Config(StrictConfig):
@@ -33,7 +27,7 @@ class Config(StrictConfig):
 
     @model_validator(mode="after")
     def _read(self) -> Self:
-        self._rows = _rows(self.file)
+        self._rows = read_rows(self.file, COLUMNS, what="a path")
         _check_curve(self._rows, self.file)
         return self
 
@@ -43,37 +37,9 @@ class Config(StrictConfig):
         return curve(np.clip(t, curve.x[0], curve.x[-1]))
 
 
-def _rows(file: str) -> list[list[float]]:
-    """Rows t, x, y, z of the file; ValueError names what is wrong with it."""
-    try:
-        text = read_text(Path(file), ModelError, SIZE_LIMIT)
-    except ModelError as error:
-        raise ValueError(str(error)) from error
-    header, *lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    if tuple(name.strip() for name in header.split(",")) != COLUMNS:
-        raise ValueError(f"{file}:1: the first line is {_shown(header)}; it must be {','.join(COLUMNS)!r}")
-    rows: list[list[float]] = []
-    for number, line in enumerate(lines, 2):
-        content = line.partition("#")[0].strip(" \t")
-        if not content:
-            continue
-        rows.append(_row(content, f"{file}:{number}"))
-        if len(rows) > 1 and not rows[-1][0] > rows[-2][0]:
-            raise ValueError(
-                f"{file}:{number}: t_s = {rows[-1][0]:g} after {rows[-2][0]:g}; it must increase from row to row"
-            )
-    if len(rows) < 2:
-        raise ValueError(f"{file}: {len(rows)} rows below the header; a path needs two or more")
-    return rows
-
-
-def _row(line: str, place: str) -> list[float]:
-    cells = [cell.strip(" \t") for cell in line.split(",")]
-    if len(cells) != len(COLUMNS):
-        raise ValueError(f"{place}: {len(cells)} values; there must be {len(COLUMNS)}: {','.join(COLUMNS)}")
-    if not all(_NUMBER.fullmatch(cell) and math.isfinite(float(cell)) for cell in cells):
-        raise ValueError(f"{place}: {_shown(line)} is not {len(COLUMNS)} numbers, finite and in digits 0 to 9")
-    return [float(cell) for cell in cells]
+def build(config: Config, context: BuildContext) -> HandPath:
+    """The path, which its configuration is."""
+    return config
 
 
 def _curve(rows: list[list[float]]) -> PchipInterpolator:
@@ -92,8 +58,3 @@ def _check_curve(rows: list[list[float]], file: str) -> None:
         met = False
     if not (met and np.isfinite(curve.c).all()):
         raise ValueError(f"{file}: numbers too large, or rows too close in time, for a curve through them")
-
-
-def _shown(line: str) -> str:
-    """A line of the file for a message: one line, no control characters, not a page long."""
-    return repr(line if len(line) <= 80 else line[:79] + "…")

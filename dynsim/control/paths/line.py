@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.config import NonNegative, Positive, StrictConfig, Vector3
+from dynsim.model.control import HandPath
+from dynsim.model.protocols import BuildContext
 
 
 class Config(StrictConfig):
@@ -25,3 +27,8 @@ class Config(StrictConfig):
         s = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
         a, b = np.array(self.from_m), np.array(self.to_m)
         return a + np.outer(s, b - a)
+
+
+def build(config: Config, context: BuildContext) -> HandPath:
+    """The path, which its configuration is."""
+    return config

@@ -10,6 +10,8 @@ from pydantic import Field, model_validator
 from scipy.interpolate import CubicSpline
 
 from dynsim.config import StrictConfig, Vector3
+from dynsim.model.control import HandPath
+from dynsim.model.protocols import BuildContext
 
 
 class Config(StrictConfig):
@@ -31,3 +33,8 @@ class Config(StrictConfig):
         """The spline at times t [s], shape (T, 3) [m]."""
         spline = CubicSpline(self.times_s, np.array(self.points_m), bc_type="clamped")
         return spline(np.clip(t, self.times_s[0], self.times_s[-1]))
+
+
+def build(config: Config, context: BuildContext) -> HandPath:
+    """The path, which its configuration is."""
+    return config

@@ -8,26 +8,31 @@ from dynsim.kernels.arrays import (
     BIAS,
     BODY_A,
     BODY_B,
+    CIRCUIT,
+    CURRENT,
     DEPENDENT,
     DIDT,
     DIRECTION,
+    DRIVEN,
     FORCE,
     INDUCTANCE,
     JOINT_ROW,
     PARENT,
+    QD,
     QDD,
     RHS,
     ROW,
     ROW_KIND,
     ROWS,
     TARGET,
+    VOLTAGE,
     DriveArrays,
     ModelArrays,
     S,
     Workspace,
 )
 from dynsim.kernels.constraint.delassus import solve_small
-from dynsim.kernels.drive.law import emf_balance
+from dynsim.kernels.drive.dc import dc_balance
 from dynsim.kernels.jit import internal_kernel
 from dynsim.kernels.tree.sweep import mass_matrix, newton_euler
 
@@ -36,15 +41,15 @@ from dynsim.kernels.tree.sweep import mass_matrix, newton_euler
 def solve_m_star(K, model: ModelArrays, drives: DriveArrays, ws: Workspace):
     """Fill M* and b and solve for vdot, contact forces and di/dt.
 
-    K : (n + p + na, n + p + na + 1) or more, room for M* with b as its last column.
+    K : (n + p + k, n + p + k + 1) or more, room for M* with b as its last column; k motors have a circuit.
 
     [M + J_m, −Fᵀ, 0; J, 0, 0; 0, 0, L] [vdot; f; di/dt] = [applied; target; u − R i − K_m v]. F (force directions)
     differs from J (rows) under friction: the paper's −J_tᵀ f_t with f_t = μ f_n has moved to the left side. Call after
     ``contact_rows``: the mass matrix overwrites velocities and wrenches of the sweep.
     """
-    n, p, na = model.tree.shape[0], ws.counts[ROWS], drives.link.shape[0]
-    size = n + p + na
-    links, joints, state = ws.links, ws.joints, ws.rows
+    n, p, na = model.tree.shape[0], ws.counts[ROWS], drives.table.shape[0]
+    size = K.shape[0]
+    links, joints, motors, state = ws.links, ws.joints, ws.motors, ws.rows
     for i in range(size):
         for j in range(size + 1):
             K[i, j] = 0.0
@@ -68,8 +73,11 @@ def solve_m_star(K, model: ModelArrays, drives: DriveArrays, ws: Workspace):
                     K[j, n + k] -= sign * links[j, S + s] * state[k, DIRECTION + s]
                 j = model.tree[j, PARENT]
     for a in range(na):
-        K[n + p + a, size] = emf_balance(drives, ws, a)
-        K[n + p + a, n + p + a] = drives.motor[a, INDUCTANCE]
+        row = n + p + drives.table[a, CIRCUIT]
+        if row >= n + p:
+            v = joints[drives.table[a, DRIVEN], QD]
+            K[row, size] = dc_balance(drives.motor, a, motors[a, VOLTAGE], v, motors[a, CURRENT])
+            K[row, row] = drives.motor[a, INDUCTANCE]
     # Gaussian elimination. The positive definite mass block needs no pivoting; what it leaves of the constraint block
     # is J (M + J_m)⁻¹ F, not symmetric and perhaps of deficient rank.
     for k in range(n):
@@ -86,7 +94,9 @@ def solve_m_star(K, model: ModelArrays, drives: DriveArrays, ws: Workspace):
             ws.small[0, k, m] = K[n + k, n + m]
     ws.counts[DEPENDENT] += solve_small(ws.small, state, ws.active, p)
     for a in range(na):
-        ws.motors[a, DIDT] = K[n + p + a, size] / K[n + p + a, n + p + a]
+        row = n + p + drives.table[a, CIRCUIT]
+        if row >= n + p:
+            motors[a, DIDT] = K[row, size] / K[row, row]
     for i in range(n - 1, -1, -1):
         total = K[i, size]
         for k in range(p):

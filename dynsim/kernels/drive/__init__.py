@@ -1,1 +1,6 @@
-"""What drives the joints: motors with circuits, position servos, open torques."""
+"""What drives the joints, one file per kind: ``dc``, ``servo``, ``torque``; ``law`` tells them apart for the kernels.
+
+The laws themselves are plain scalar functions of (table of parameters, row, reference, state). ``law`` hands the very
+same source to the compiler. The virtual servos call it without numba, and tests with complex numbers, whose imaginary
+parts are derivatives: so comparisons look at real parts, and nothing here imports more than column names.
+"""

@@ -1,15 +1,38 @@
-"""DC motors: joint references and the continuous voltage PD."""
+"""All drives of a system, told apart by kind: references, commands, torques, and the linear blocks of implicit methods.
+
+A drive kind is a constant in ``kernels.arrays``, a file of plain functions, a branch in each function below, and a
+line of ``model.arrays.compile_drives``.
+"""
 
 from __future__ import annotations
 
 from dynsim.kernels.arrays import (
+    APPLIED,
+    CIRCUIT,
     CURRENT,
-    K_D,
+    DC_MOTOR,
+    DIDT,
+    DRAG,
+    DRIVE_KIND,
+    DRIVEN,
+    HELD,
+    INDUCTANCE,
     K_M,
-    K_P,
+    LINE_RATE,
+    LINE_SINCE,
+    LINE_START,
+    MODE,
+    POSITION_SERVO,
     Q_REF,
     QD,
-    RESISTANCE,
+    RATE_I,
+    RATE_Q,
+    RATE_V,
+    REWRITTEN,
+    SAMPLED,
+    TORQUE_I,
+    TORQUE_Q,
+    TORQUE_V,
     U_MAX,
     V_REF,
     VOLTAGE,
@@ -18,20 +41,33 @@ from dynsim.kernels.arrays import (
     ReferenceArrays,
     Workspace,
 )
-from dynsim.kernels.jit import inlined_kernel
+from dynsim.kernels.drive.dc import dc_balance, dc_block, dc_command, dc_torque
+from dynsim.kernels.drive.limit import clipped
+from dynsim.kernels.drive.servo import servo_block, servo_circuit, servo_command, servo_drag, servo_torque
+from dynsim.kernels.drive.torque import open_torque
+from dynsim.kernels.jit import inlined_kernel, internal_kernel
+from dynsim.kernels.state import StateLayout
+
+for _law in (clipped, dc_balance, dc_block, dc_command, dc_torque, open_torque):
+    inlined_kernel(_law)
+for _law in (servo_block, servo_circuit, servo_command, servo_drag, servo_torque):
+    inlined_kernel(_law)
 
 
 @inlined_kernel
-def evaluate_reference(reference: ReferenceArrays, t, ws: Workspace):
-    """Reference angles q_d and rates v_d of all motors at time t, into ``ws.motors`` [rad, rad/s]."""
-    motors, c = ws.motors, reference.coefficients
+def evaluate_reference(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace):
+    """References q_d and rates v_d of all drives at time t, into ``ws.motors`` [rad, rad/s; N m of an open torque]."""
+    motors, c, line = ws.motors, reference.coefficients, drives.input
     spacing = reference.grid[1]
     x = t - reference.grid[0]
     segment = min(max(int(x / spacing), 0), c.shape[0] - 1)
     x -= segment * spacing
     for a in range(motors.shape[0]):
         s = reference.spline[a]
-        if s < 0:
+        if s == REWRITTEN:
+            motors[a, Q_REF] = line[a, LINE_START] + line[a, LINE_RATE] * (t - line[a, LINE_SINCE])
+            motors[a, V_REF] = line[a, LINE_RATE]
+        elif s < 0:
             motors[a, Q_REF] = reference.held[a]
             motors[a, V_REF] = 0.0
         else:
@@ -42,21 +78,83 @@ def evaluate_reference(reference: ReferenceArrays, t, ws: Workspace):
 
 
 @inlined_kernel
-def motor_voltage(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace):
-    """u = k_p (q_d − q) + k_d (v_d − v), within ±u_max, into ``ws.motors`` [V] ([WM] eq 56)."""
-    evaluate_reference(reference, t, ws)
-    motors, joints, motor = ws.motors, ws.joints, drives.motor
-    for a in range(motors.shape[0]):
-        i = drives.link[a]
-        u = motor[a, K_P] * (motors[a, Q_REF] - joints[i, Q]) + motor[a, K_D] * (motors[a, V_REF] - joints[i, QD])
-        limit = motor[a, U_MAX]
-        motors[a, VOLTAGE] = min(max(u, -limit), limit)
+def command(drives: DriveArrays, ws: Workspace, a):
+    """What drive a is told to do, by its law at the present state, before limits [V; N m for an open torque]."""
+    motor, i, kind = drives.motor, drives.table[a, DRIVEN], drives.table[a, DRIVE_KIND]
+    q_ref, v_ref = ws.motors[a, Q_REF], ws.motors[a, V_REF]
+    if kind == DC_MOTOR:
+        return dc_command(motor, a, q_ref, v_ref, ws.joints[i, Q], ws.joints[i, QD])
+    if kind == POSITION_SERVO:
+        return servo_command(motor, a, drives.input[a, MODE], q_ref, v_ref, ws.joints[i, Q], ws.joints[i, QD])
+    return q_ref
 
 
 @inlined_kernel
-def emf_balance(drives: DriveArrays, ws: Workspace, a):
-    """L di/dt = u − R i − K_m v of motor a [V] ([WM] eqs 24, 26)."""
-    motors, motor = ws.motors, drives.motor
-    return (
-        motors[a, VOLTAGE] - motor[a, RESISTANCE] * motors[a, CURRENT] - motor[a, K_M] * ws.joints[drives.link[a], QD]
-    )
+def drive_dc(drives: DriveArrays, asked, i, ws: Workspace, a):
+    """The DC motor a at a command [V] and a current [A]."""
+    motors, motor, j = ws.motors, drives.motor, drives.table[a, DRIVEN]
+    u = clipped(drives.input[a, HELD] if drives.table[a, SAMPLED] else asked, motor[a, U_MAX])
+    motors[a, CURRENT], motors[a, VOLTAGE] = i, u
+    motors[a, DIDT] = dc_balance(motor, a, u, ws.joints[j, QD], i) / motor[a, INDUCTANCE]
+    ws.joints[j, APPLIED] += dc_torque(motor, a, i)
+
+
+@inlined_kernel
+def drive(drives: DriveArrays, reference: ReferenceArrays, t, y, layout: StateLayout, ws: Workspace):
+    """Currents, voltages and rates of current of all drives into ``ws.motors``; their torques onto ``ws.joints``.
+
+    Positions and rates of the joints must be in ``ws.joints``, and the other applied forces.
+    """
+    table, motor, motors, joints = drives.table, drives.motor, ws.motors, ws.joints
+    na = motors.shape[0]
+    evaluate_reference(drives, reference, t, ws)
+    if layout.ledger - layout.current == na:  # every drive has a circuit, its own: the loop that most robots take
+        for a in range(na):
+            j = table[a, DRIVEN]
+            asked = dc_command(motor, a, motors[a, Q_REF], motors[a, V_REF], joints[j, Q], joints[j, QD])
+            drive_dc(drives, asked, y[layout.current + a], ws, a)
+        return
+    for a in range(na):
+        j, kind = table[a, DRIVEN], table[a, DRIVE_KIND]
+        v = joints[j, QD]
+        asked = drives.input[a, HELD] if table[a, SAMPLED] else command(drives, ws, a)
+        if kind == DC_MOTOR:
+            drive_dc(drives, asked, y[layout.current + table[a, CIRCUIT]], ws, a)
+        elif kind == POSITION_SERVO:
+            mode = drives.input[a, MODE]
+            motors[a, VOLTAGE], motors[a, CURRENT] = servo_circuit(motor, a, mode, asked, v)
+            motors[a, DRAG] = servo_drag(motor, a, mode, v)
+            joints[j, APPLIED] += motor[a, K_M] * motors[a, CURRENT] - motors[a, DRAG]
+        else:
+            motors[a, VOLTAGE], motors[a, CURRENT] = v, open_torque(motor, a, asked)
+            joints[j, APPLIED] += motors[a, CURRENT]
+
+
+@internal_kernel
+def take_commands(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace):
+    """At a tick: the commands of all sampled drives at the state in ``ws.joints``, held from now on."""
+    evaluate_reference(drives, reference, t, ws)
+    for a in range(ws.motors.shape[0]):
+        if drives.table[a, SAMPLED]:
+            drives.input[a, HELD] = command(drives, ws, a)
+
+
+@internal_kernel
+def drive_block(drives: DriveArrays, ws: Workspace, a, block):
+    """∂τ/∂(q, v, i) and ∂(di/dt)/∂(q, v, i) of drive a, into the row ``block``, (BLOCK_SIZE,).
+
+    After ``derivative``: references, voltages and states are those in the workspace.
+    """
+    motors, motor, kind, mode = ws.motors, drives.motor, drives.table[a, DRIVE_KIND], drives.input[a, MODE]
+    sampled = drives.table[a, SAMPLED] != 0
+    for s in range(block.shape[0]):
+        block[s] = 0.0
+    if kind == DC_MOTOR:
+        follows = 1.0 if not sampled and abs(motors[a, VOLTAGE]) < motor[a, U_MAX] else 0.0
+        found = dc_block(motor, a, follows)
+        block[TORQUE_Q], block[TORQUE_V], block[TORQUE_I] = found[0], found[1], found[2]
+        block[RATE_Q], block[RATE_V], block[RATE_I] = found[3], found[4], found[5]
+    elif kind == POSITION_SERVO:
+        asked = drives.input[a, HELD] if sampled else command(drives, ws, a)
+        v = ws.joints[drives.table[a, DRIVEN], QD]
+        block[TORQUE_Q], block[TORQUE_V] = servo_block(motor, a, mode, sampled, asked, v)

@@ -7,8 +7,9 @@ from dynsim.kernels.integrate.output import write_output
 from dynsim.kernels.integrate.project import settle
 from dynsim.kernels.integrate.run import DOPRI5, END, RODAS4, SAMPLE, STEP, TIME, Run
 from dynsim.kernels.integrate.tableaux import D_RODAS
-from dynsim.kernels.jit import internal_kernel, merged_kernel
+from dynsim.kernels.jit import internal_kernel, kernel, merged_kernel
 from dynsim.kernels.system import System
+from dynsim.kernels.tree.joints import normalise
 
 
 @internal_kernel
@@ -37,6 +38,16 @@ def fill_dense(run: Run):
                 )
 
 
+@kernel
+def state_within(run: Run, t, out):
+    """State at a time within the step that is pending, by the dense output, into out: (m,)."""
+    fill_dense(run)
+    d, x = run.dense, (t - run.clock[TIME]) / run.clock[STEP]
+    z = 1.0 - x
+    for j in range(out.shape[0]):
+        out[j] = run.y[j] + x * (d[0, j] + z * (d[1, j] + x * (d[2, j] + z * d[3, j])))
+
+
 @merged_kernel
 def sample_step(system: System, ws: Workspace, run: Run):
     """Record every sample time within the step from TIME to TIME + STEP, from the dense output.
@@ -57,6 +68,8 @@ def sample_step(system: System, ws: Workspace, run: Run):
         row = run.sample[last]
         for j in range(row.shape[0]):
             row[j] = run.y[j] + x * (d[0, j] + z * (d[1, j] + x * (d[2, j] + z * d[3, j])))
+        if system.layout.extra > 0:
+            normalise(system.model, row, system.layout.q)
         settle(system, run.sample_time[last], row, ws, run.stage[7], run)
         write_output(system, ws, run, last)
         last += 1

@@ -19,31 +19,44 @@ from __future__ import annotations
 
 from dynsim.kernels.arrays import CONTRADICTORY, Workspace
 from dynsim.kernels.constraint.uniqueness import clearly_unique
+from dynsim.kernels.drive.law import take_commands
 from dynsim.kernels.integrate.dense import sample_step
+from dynsim.kernels.integrate.events import arm_events, cut_step, fire_events, take_ticks
 from dynsim.kernels.integrate.explicit import step_explicit
 from dynsim.kernels.integrate.project import off_surface, settle
 from dynsim.kernels.integrate.rosenbrock import step_rodas4
 from dynsim.kernels.integrate.run import (
+    CALLER,
     DOPRI5,
     END,
+    ERROR,
     FINISHED,
+    FIRED,
+    HOLD,
     NO_FORCES,
     NOT_FINITE,
     NOT_PROJECTED,
+    PENDING,
+    PROPOSED,
     RK4,
     RODAS4,
     RUNNING,
+    SEARCHING,
     STARTED,
     STATUS,
     STEP,
     STEPS,
+    TAKE_COMMANDS,
+    TICKED,
     TIME,
+    TRIMMED,
     Run,
 )
 from dynsim.kernels.integrate.steps import choose_step, finite, first_step, next_step, rejected
 from dynsim.kernels.integrate.watch import forces_unique, watch
-from dynsim.kernels.jit import kernel, merged_kernel
+from dynsim.kernels.jit import internal_kernel, kernel, merged_kernel
 from dynsim.kernels.system import System
+from dynsim.kernels.tree.joints import normalise
 
 
 @merged_kernel
@@ -56,7 +69,7 @@ def start(system: System, ws: Workspace, run: Run):
     elif forces_unique(system, ws, run, run.clock[TIME]):
         watch(ws, run, 0.0)
         if run.clock[STEP] <= 0.0:
-            first_step(run, system.layout.ledger)
+            first_step(run, system.layout.tracked)
     run.count[STARTED] = 1
 
 
@@ -70,6 +83,8 @@ def accept(system: System, ws: Workspace, run: Run):
     if not (clearly_unique(ws) or forces_unique(system, ws, run, t + h)):
         return
     watch(ws, run, h)
+    if system.layout.extra > 0:
+        normalise(system.model, run.y_new, system.layout.q)
     sample_step(system, ws, run)
     for j in range(run.y.shape[0]):
         run.y[j] = run.y_new[j]
@@ -87,45 +102,112 @@ def finished(run: Run):
     return run.count[STATUS] != RUNNING
 
 
+@merged_kernel
+def take_step(ws: Workspace, run: Run, error):
+    """What becomes of a step that has been taken: True when it is accepted by error control, events and HOLD."""
+    clock, count = run.clock, run.count
+    if run.event.shape[0] > 0 and cut_step(ws, run):
+        return False
+    clock[ERROR] = error
+    if clock[TIME] + clock[STEP] > clock[HOLD]:
+        count[PENDING] = 1
+        return False
+    return True
+
+
+@internal_kernel
+def propose(run: Run):
+    """The step to try next; while a root is searched it is given."""
+    if run.count[SEARCHING] == 0:
+        run.clock[PROPOSED] = run.clock[STEP]
+        choose_step(run)
+
+
+@internal_kernel
+def go_on(run: Run, order, beta):
+    """The step size after an accepted step."""
+    clock, count = run.clock, run.count
+    if run.method == RK4 or count[FIRED] == 1:
+        clock[STEP] = clock[PROPOSED]
+    else:
+        next_step(run, clock[ERROR], order, beta)
+        # A step that was cut short says nothing against the one proposed before.
+        if count[TRIMMED] == 1:
+            clock[STEP] = max(clock[STEP], clock[PROPOSED])
+
+
+@merged_kernel
+def ready(system: System, ws: Workspace, run: Run):
+    """Start or restart where that is due, and do what is due at this time; False when the caller is to look."""
+    count = run.count
+    due = take_ticks(run)
+    if due & TAKE_COMMANDS:
+        settle(system, run.clock[TIME], run.y, ws, run.stage[0], run)
+        take_commands(system.drives, system.reference, run.clock[TIME], ws)
+        count[STARTED] = 0
+    if count[STARTED] == 0:
+        start(system, ws, run)
+        arm_events(ws, run)
+    count[TICKED] = due & CALLER
+    return count[TICKED] == 0
+
+
 @kernel
 def advance_explicit(system: System, ws: Workspace, run: Run, limit):
     """:func:`advance` of the explicit methods."""
     order = 5.0 if run.method == DOPRI5 else 4.0
-    if run.count[STARTED] == 0:
-        start(system, ws, run)
-    for _ in range(limit):
-        if finished(run):
+    count, taken = run.count, 0
+    while (count[STARTED] == 1 and run.tick.shape[0] == 0) or ready(system, ws, run):
+        if taken >= limit or finished(run):
             return
-        proposed = run.clock[STEP]
-        choose_step(run)
-        error = step_explicit(system, ws, run)
-        if rejected(ws, run, error, order):
-            continue
+        taken += 1
+        if count[PENDING] == 0:
+            propose(run)
+            error = step_explicit(system, ws, run)
+            if rejected(ws, run, error, order):
+                count[SEARCHING] = 0
+                continue
+            if not take_step(ws, run, error):
+                if count[PENDING] == 1:
+                    return
+                continue
+        count[PENDING] = 0
         accept(system, ws, run)
-        if run.method == RK4:
-            run.clock[STEP] = proposed
-        else:
-            next_step(run, error, order, 0.04)
+        go_on(run, order, 0.04)
+        if run.event.shape[0] > 0 and fire_events(run):
+            return
 
 
 @kernel
 def advance_rodas4(system: System, ws: Workspace, run: Run, limit):
     """:func:`advance` of RODAS4."""
-    if run.count[STARTED] == 0:
-        start(system, ws, run)
-    for _ in range(limit):
-        if finished(run):
+    count, taken = run.count, 0
+    while (count[STARTED] == 1 and run.tick.shape[0] == 0) or ready(system, ws, run):
+        if taken >= limit or finished(run):
             return
-        choose_step(run)
-        error = step_rodas4(system, ws, run)
-        if rejected(ws, run, error, 4.0):
-            continue
+        taken += 1
+        if count[PENDING] == 0:
+            propose(run)
+            error = step_rodas4(system, ws, run)
+            if rejected(ws, run, error, 4.0):
+                count[SEARCHING] = 0
+                continue
+            if not take_step(ws, run, error):
+                if count[PENDING] == 1:
+                    return
+                continue
+        count[PENDING] = 0
         accept(system, ws, run)
-        next_step(run, error, 4.0, 0.04)
+        go_on(run, 4.0, 0.04)
+        if run.event.shape[0] > 0 and fire_events(run):
+            return
 
 
 def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:
     """Take up to ``limit`` steps towards END; run.count[STATUS] says how it ended.
+
+    Returns before that when an event or a tick wants the caller to look (LOGGED, TICKED), and when the next step would
+    end beyond HOLD: it is kept, PENDING, and accepted by the next call unless the caller drops it.
 
     Two compiled functions behind one name, so that the linearly implicit method is only compiled when it is used.
     """

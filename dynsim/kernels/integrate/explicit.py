@@ -72,11 +72,11 @@ def step_explicit(system: System, ws: Workspace, run: Run):
     if run.method == RK4:
         return 0.0
     if run.method == RK43:
-        weight = weight_rk43(run, system.layout.ledger)
+        weight = weight_rk43(run, system.layout.tracked)
         for j in range(y.shape[0]):
             k[7, j] = weight * h * (k[6, j] - k[3, j])
     else:
         for j in range(y.shape[0]):
             k[7, j] = 0.0
         combine(k[7], h, ERROR_DOPRI5, 7, k, k[7])
-    return error_norm(run, system.layout.ledger, k[7])
+    return error_norm(system, ws, run, k[7])

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dynsim.kernels.arrays import (
     CURRENT,
     D_M,
+    DRAG,
+    DRIVEN,
     FORCE_VECTOR,
     GAP,
     J_M,
@@ -34,11 +36,14 @@ def write_output(system: System, ws: Workspace, run: Run, row):
     for i in range(joints.shape[0]):
         out[row, columns.vdot + i] = joints[i, QDD]
     for a in range(motors.shape[0]):
-        i = system.drives.link[a]
+        i = system.drives.table[a, DRIVEN]
         out[row, columns.current + a] = motors[a, CURRENT]
         out[row, columns.voltage + a] = motors[a, VOLTAGE]
         out[row, columns.torque + a] = (
-            motor[a, K_M] * motors[a, CURRENT] - motor[a, J_M] * joints[i, QDD] - motor[a, D_M] * joints[i, QD]
+            motor[a, K_M] * motors[a, CURRENT]
+            - motor[a, J_M] * joints[i, QDD]
+            - motor[a, D_M] * joints[i, QD]
+            - motors[a, DRAG]
         )
     point_position(ws, run.hand_link, run.hand_point, out[row, columns.hand : columns.hand + 3])
     out[row, columns.energy] = kinetic_energy(system.model, ws)

@@ -31,6 +31,7 @@ from dynsim.kernels.integrate.run import EVALUATIONS, PROJECTIONS, Run
 from dynsim.kernels.jit import internal_kernel, merged_kernel
 from dynsim.kernels.system import System, derivative
 from dynsim.kernels.tree.articulated import accelerate
+from dynsim.kernels.tree.joints import displace
 
 # Projection: a tenth of the drift that is promised (1e-9 m), and a rate that adds less than that in a step.
 GAP_TOLERANCE = 1e-10
@@ -65,6 +66,7 @@ def project(system: System, ws: Workspace, y):
     """
     state, active, column, small = ws.rows, ws.active, ws.column, ws.small
     n, p = ws.joints.shape[0], ws.counts[ROWS]
+    plain = system.layout.extra == 0
     for level in range(2):
         start = system.layout.q if level == 0 else system.layout.v
         for k in range(p):
@@ -79,8 +81,11 @@ def project(system: System, ws: Workspace, y):
             for k in range(p):
                 column[i, 0] -= state[k, FORCE] * column[i, 1 + 2 * k]
         accelerate(system.model, ws)
-        for i in range(n):
-            y[start + i] += ws.joints[i, QDD]
+        if level == 0 and not plain:
+            displace(system.model, ws, y, start)
+        else:
+            for i in range(n):
+                y[start + i] += ws.joints[i, QDD]
 
 
 @merged_kernel

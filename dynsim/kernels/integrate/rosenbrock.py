@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dynsim.kernels.arrays import INDUCTANCE, K_D, K_M, K_P, RESISTANCE, U_MAX, VOLTAGE, Workspace
+from dynsim.kernels.arrays import CIRCUIT, DRIVEN, RATE_I, RATE_Q, RATE_V, Workspace
+from dynsim.kernels.drive.law import drive_block
 from dynsim.kernels.integrate.run import EVALUATIONS, STEP, TIME, Run
 from dynsim.kernels.integrate.steps import error_norm
 from dynsim.kernels.integrate.tableaux import A_RODAS, C_RODAS, GAMMA, GAMMA_RODAS, NODE_RODAS
@@ -15,18 +16,16 @@ def differentiate(system: System, ws: Workspace, run: Run):
     """Finite differences of the right-hand side along q, v, i and t at (TIME, y), into ``run.jacobian``.
 
     Currents enter linearly, so their differences are exact; the stiff electrical rows are not taken from here but
-    written out in :func:`step_rodas4`.
+    are the drives' own, in ``run.linear``. What drives without a circuit do is part of the differences along q and v.
     """
     t, y, y_new, k = run.clock[TIME], run.y, run.y_new, run.stage
-    m, states = y.shape[0], system.layout.ledger
+    m, states = y.shape[0], system.layout.tracked
     for j in range(m):
         y_new[j] = y[j]
     # The workspace may still hold a sample or a rejected step.
     derivative(system, t, y, ws, k[7])
     for a in range(ws.motors.shape[0]):
-        follows = 1.0 if abs(ws.motors[a, VOLTAGE]) < system.drives.motor[a, U_MAX] else 0.0
-        run.gain[a, 0] = follows * system.drives.motor[a, K_P]
-        run.gain[a, 1] = follows * system.drives.motor[a, K_D]
+        drive_block(system.drives, ws, a, run.linear[a])
     for s in range(states):
         delta = 1e-7 * max(abs(y[s]), 1.0)
         y_new[s] = y[s] + delta
@@ -46,10 +45,10 @@ def differentiate(system: System, ws: Workspace, run: Run):
 def factor_stage_matrix(system: System, ws: Workspace, run: Run, h):
     """Reduced stage matrix of RODAS4 in the rates alone, LU-factored with partial pivoting, into ``run.matrix``.
 
-    With g = 1/(γ h): u_q = (r_q + u_v)/g and u_i = (r_i − (k_p u_q + (k_d + K_m) u_v)/L) / (g + R/L) are exact, which
-    leaves (g − ∂v̇/∂v − ∂v̇/∂q/g + ∂v̇/∂i (k_p/g + k_d + K_m)/L/(g + R/L)) u_v = r. A saturated motor has k_p = k_d = 0.
+    With g = 1/(γ h), and a, b, c for ∂(di/dt)/∂(q, v, i): u_q = (r_q + u_v)/g and u_i = (r_i + a u_q + b u_v)/(g − c)
+    are exact, which leaves (g − ∂v̇/∂v − ∂v̇/∂q/g − ∂v̇/∂i (a/g + b)/(g − c)) u_v = r.
     """
-    W, jacobian, motor = run.matrix, run.jacobian, system.drives.motor
+    W, jacobian, block, table = run.matrix, run.jacobian, run.linear, system.drives.table
     n, na = ws.joints.shape[0], ws.motors.shape[0]
     q, v, current = system.layout.q, system.layout.v, system.layout.current
     g = 1.0 / (GAMMA * h)
@@ -58,12 +57,11 @@ def factor_stage_matrix(system: System, ws: Workspace, run: Run, h):
             W[i, j] = -jacobian[v + j, v + i] - jacobian[q + j, v + i] / g
         W[i, i] += g
     for a in range(na):
-        j = system.drives.link[a]
-        slope = (run.gain[a, 0] / g + run.gain[a, 1] + motor[a, K_M]) / (
-            motor[a, INDUCTANCE] * g + motor[a, RESISTANCE]
-        )
-        for i in range(n):
-            W[i, j] += jacobian[current + a, v + i] * slope
+        j, row = table[a, DRIVEN], current + table[a, CIRCUIT]
+        if row >= current:
+            slope = (block[a, RATE_Q] / g + block[a, RATE_V]) / (g - block[a, RATE_I])
+            for i in range(n):
+                W[i, j] -= jacobian[row, v + i] * slope
     for k in range(n):
         best = k
         for i in range(k + 1, n):
@@ -88,11 +86,11 @@ def step_rodas4(system: System, ws: Workspace, run: Run):
     """
     t, h, y, y_new, k = run.clock[TIME], run.clock[STEP], run.y, run.y_new, run.stage
     n, na, m = ws.joints.shape[0], ws.motors.shape[0], run.y.shape[0]
-    q, v, current, states = system.layout.q, system.layout.v, system.layout.current, system.layout.ledger
+    q, v, current, states = system.layout.q, system.layout.v, system.layout.current, system.layout.tracked
     differentiate(system, ws, run)
     factor_stage_matrix(system, ws, run, h)
     g = 1.0 / (GAMMA * h)
-    motor, jacobian, W, r = system.drives.motor, run.jacobian, run.matrix, k[7]
+    block, table, jacobian, W, r = run.linear, system.drives.table, run.jacobian, run.matrix, k[7]
     for s in range(6):
         u = k[1 + s]
         for j in range(m):
@@ -109,11 +107,11 @@ def step_rodas4(system: System, ws: Workspace, run: Run):
             for j in range(n):
                 u[v + i] += jacobian[q + j, v + i] * r[q + j] / g
         for a in range(na):
-            j = system.drives.link[a]
-            free = r[current + a] - run.gain[a, 0] / motor[a, INDUCTANCE] * r[q + j] / g
-            free /= g + motor[a, RESISTANCE] / motor[a, INDUCTANCE]
-            for i in range(n):
-                u[v + i] += jacobian[current + a, v + i] * free
+            j, row = table[a, DRIVEN], current + table[a, CIRCUIT]
+            if row >= current:
+                free = (r[row] + block[a, RATE_Q] * r[q + j] / g) / (g - block[a, RATE_I])
+                for i in range(n):
+                    u[v + i] += jacobian[row, v + i] * free
         for i in range(n):
             p = run.pivot[i]
             u[v + i], u[v + p] = u[v + p], u[v + i]
@@ -127,11 +125,10 @@ def step_rodas4(system: System, ws: Workspace, run: Run):
         for i in range(n):
             u[q + i] = (r[q + i] + u[v + i]) / g
         for a in range(na):
-            j = system.drives.link[a]
-            pull = run.gain[a, 0] * u[q + j] + (run.gain[a, 1] + motor[a, K_M]) * u[v + j]
-            u[current + a] = (r[current + a] - pull / motor[a, INDUCTANCE]) / (
-                g + motor[a, RESISTANCE] / motor[a, INDUCTANCE]
-            )
+            j, row = table[a, DRIVEN], current + table[a, CIRCUIT]
+            if row >= current:
+                pull = block[a, RATE_Q] * u[q + j] + block[a, RATE_V] * u[v + j]
+                u[row] = (r[row] + pull) / (g - block[a, RATE_I])
         for j in range(states, m):
             total = r[j]
             for p in range(states):
@@ -140,7 +137,7 @@ def step_rodas4(system: System, ws: Workspace, run: Run):
     for j in range(m):
         y_new[j] += k[6, j]
         k[7, j] = k[6, j]
-    error = error_norm(run, states, k[7])
+    error = error_norm(system, ws, run, k[7])
     derivative(system, t + h, y_new, ws, k[6])
     run.count[EVALUATIONS] += 7
     return error

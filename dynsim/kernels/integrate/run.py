@@ -6,24 +6,44 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.arrays import row_limit
+from dynsim.kernels.arrays import BLOCK_SIZE, row_limit
 from dynsim.kernels.constraint.uniqueness import ROOM
-from dynsim.kernels.jit import reals
+from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.state import OUTPUTS_PER_CONTACT, OutputLayout, StateLayout, block
 
 DOPRI5, RK4, RODAS4, RK43 = 0, 1, 2, 3
 METHODS = {"rk43": RK43, "dopri5": DOPRI5, "rk4": RK4, "rodas4": RODAS4}
 
 RUNNING, FINISHED, NOT_FINITE, STEP_TOO_SMALL, NOT_PROJECTED, NO_FORCES = 0, 1, 2, 3, 4, 5
-FORCES_REVERSED, SEVERAL_FORCES = 6, 7
+FORCES_REVERSED, SEVERAL_FORCES, STOPPED = 6, 7, 8
 
 # Run.clock
 TIME, STEP, LAST_ERROR, END, RTOL, ATOL, STEP_MAX = 0, 1, 2, 3, 4, 5, 6
 NOT_UNIQUE = 7  # end of the step at which the contact forces were not unique, which was not accepted [s]
-CLOCK_SIZE = 8
+# A step that would end beyond HOLD is left pending, not accepted; the step size proposed before a cut; error norm of
+# the step taken; the bracket of the root that is searched, from TIME on [s].
+HOLD, PROPOSED, ERROR, LOW, HIGH = 8, 9, 10, 11, 12
+CLOCK_SIZE = 13
 # Run.count, int
 STEPS, REJECTED, EVALUATIONS, PROJECTIONS, SAMPLE, STATUS, STARTED = 0, 1, 2, 3, 4, 5, 6
-COUNT_SIZE = 7
+# A step waits to be accepted; trials of a root; which end of the bracket moved last; the step ends at an event; it ends
+# at a tick; events in the log; bits of the ticks that the caller is to look at.
+PENDING, SEARCHING, TURNED_BACK, FIRED, TRIMMED, LOGGED, TICKED = 7, 8, 9, 10, 11, 12, 13
+COUNT_SIZE = 14
+# Run.event, and Run.event_table, int
+EVENT_LEVEL, SIDE, START_VALUE, VALUE, AT_LOW, AT_HIGH = 0, 1, 2, 3, 4, 5
+EVENT_SIZE = 6
+EVENT_KIND, EVENT_INDEX, DIRECTION, ON_EVENT = 0, 1, 2, 3
+EVENT_TABLE_SIZE = 4
+# What an event does besides being logged: nothing, the caller looks, the run ends.
+LOG, RETURN, STOP = 0, 1, 2
+# Run.tick, and Run.tick_table, int. Kinds are bits.
+TICK_PERIOD, TICK_NEXT, TICK_PHASE = 0, 1, 2
+TICK_SIZE = 3
+TICK_KIND, TICK_COUNT = 0, 1
+TICK_TABLE_SIZE = 2
+TAKE_COMMANDS, CALLER = 1, 2
+LOG_LENGTH = 1024
 # Run.extremes, per contact
 FORCE_MIN, FORCE_MAX, DRIFT_MAX = 0, 1, 2
 PULLING, LAST_FORCE = 3, 4  # time with a negative normal force [s]; normal force at the last accepted step [N]
@@ -40,10 +60,10 @@ class Run(NamedTuple):
     y_new: np.ndarray  # (m,)
     stage: np.ndarray  # (8, m) stage derivatives; stage[0] belongs to y
     dense: np.ndarray  # (4, m) y(θ) = y + θ (d0 + (1−θ)(d1 + θ (d2 + (1−θ) d3)))
-    jacobian: np.ndarray  # (layout.ledger + 1, m) finite differences along q, v, i, t (rodas4)
+    jacobian: np.ndarray  # (layout.tracked + 1, m) finite differences along q, v, i, t (rodas4)
     matrix: np.ndarray  # (n, n) factored stage matrix (rodas4)
     pivot: np.ndarray  # (n,) int (rodas4)
-    gain: np.ndarray  # (na, 2) k_p and k_d where the voltage is not at its limit, else 0 (rodas4)
+    linear: np.ndarray  # (na, BLOCK_SIZE) linear blocks of the drives (rodas4)
     clock: np.ndarray  # (CLOCK_SIZE,)
     count: np.ndarray  # (COUNT_SIZE,) int
     extremes: np.ndarray  # (c, EXTREMES_SIZE)
@@ -52,6 +72,13 @@ class Run(NamedTuple):
     hand_point: np.ndarray  # (3,) in the body's frame
     sample_time: np.ndarray  # (T,)
     sample: np.ndarray  # (T, m) states
+    event: np.ndarray  # (e, EVENT_SIZE)
+    event_table: np.ndarray  # (e, EVENT_TABLE_SIZE) int
+    tick: np.ndarray  # (k, TICK_SIZE)
+    tick_table: np.ndarray  # (k, TICK_TABLE_SIZE) int
+    log_time: np.ndarray  # (LOG_LENGTH,) of events [s]
+    log_event: np.ndarray  # (LOG_LENGTH,) int: which
+    hand: np.ndarray  # (3,) room
     columns: OutputLayout
     output: np.ndarray  # (T, columns.size)
 
@@ -82,11 +109,16 @@ def new_run(
     step_max: float,
     rtol: float,
     atol: float,
+    events: tuple[np.ndarray, np.ndarray] | None = None,
+    ticks: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Run:
     """Allocate a :class:`Run` from t = 0 at state y, (layout.size,)."""
     m, p, rodas = len(y), row_limit(c, couplings), method == RODAS4
     clock = np.zeros(CLOCK_SIZE)
     clock[[STEP, LAST_ERROR, END, RTOL, ATOL, STEP_MAX]] = step, 1e-4, end, rtol, atol, step_max
+    clock[HOLD] = np.inf
+    event, event_table = events or (np.zeros((0, EVENT_SIZE)), np.zeros((0, EVENT_TABLE_SIZE)))
+    tick, tick_table = ticks or (np.zeros((0, TICK_SIZE)), np.zeros((0, TICK_TABLE_SIZE)))
     extremes = np.zeros((c, EXTREMES_SIZE))
     extremes[:, FORCE_MIN], extremes[:, FORCE_MAX], extremes[:, LOCAL_SINCE] = np.inf, -np.inf, np.inf
     return Run(
@@ -96,10 +128,10 @@ def new_run(
         y_new=np.zeros(m),
         stage=np.zeros((8, m)),
         dense=np.zeros((4, m)),
-        jacobian=np.zeros((layout.ledger + 1, m) if rodas else (0, 0)),
+        jacobian=np.zeros((layout.tracked + 1, m) if rodas else (0, 0)),
         matrix=np.zeros((n, n) if rodas else (0, 0)),
         pivot=np.zeros(n if rodas else 0, dtype=np.int64),
-        gain=np.zeros((na, 2)),
+        linear=np.zeros((na, BLOCK_SIZE)),
         clock=clock,
         count=np.zeros(COUNT_SIZE, dtype=np.int64),
         extremes=extremes,
@@ -108,6 +140,13 @@ def new_run(
         hand_point=reals(hand[1]),
         sample_time=reals(sample_time),
         sample=np.zeros((len(sample_time), m)),
+        event=reals(event),
+        event_table=integers(event_table),
+        tick=reals(tick),
+        tick_table=integers(tick_table),
+        log_time=np.zeros(LOG_LENGTH),
+        log_event=np.zeros(LOG_LENGTH, dtype=np.int64),
+        hand=np.zeros(3),
         columns=columns,
         output=np.zeros((len(sample_time), columns.size)),
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from dynsim.kernels.arrays import CONTRADICTORY, Workspace
+from dynsim.kernels.integrate.events import next_tick
 from dynsim.kernels.integrate.run import (
     ATOL,
     END,
@@ -20,20 +21,32 @@ from dynsim.kernels.integrate.run import (
     STEP_MAX,
     STEP_TOO_SMALL,
     TIME,
+    TRIMMED,
     Run,
 )
 from dynsim.kernels.jit import internal_kernel, kernel
+from dynsim.kernels.system import System
+from dynsim.kernels.tree.joints import position_error
 
 
 @internal_kernel
-def error_norm(run: Run, size, error):
-    """Root mean square of error / (atol + rtol |y|) over positions, rates and currents, the first ``size`` states."""
-    y, y_new, atol, rtol = run.y, run.y_new, run.clock[ATOL], run.clock[RTOL]
+def error_norm(system: System, ws: Workspace, run: Run, error):
+    """Root mean square of error / (atol + rtol |y|) over positions, rates and currents; quaternions count as angles."""
+    y, y_new, atol, rtol, layout = run.y, run.y_new, run.clock[ATOL], run.clock[RTOL], system.layout
     total = 0.0
-    for j in range(size):
+    if layout.extra > 0:
+        total, size = position_error(system.model, y, y_new, error, layout.q, rtol, atol)
+        beyond = layout.q + ws.joints.shape[0] + layout.extra
+        for j in range(layout.tracked):
+            if j < layout.q or j >= beyond:
+                x = error[j] / (atol + rtol * max(abs(y[j]), abs(y_new[j])))
+                total += x * x
+                size += 1
+        return math.sqrt(total / size)
+    for j in range(layout.tracked):
         x = error[j] / (atol + rtol * max(abs(y[j]), abs(y_new[j])))
         total += x * x
-    return math.sqrt(total / size)
+    return math.sqrt(total / layout.tracked)
 
 
 @kernel
@@ -60,9 +73,11 @@ def first_step(run: Run, states):
 
 @internal_kernel
 def choose_step(run: Run):
-    """Trim STEP so that END is met exactly: halve the way there rather than leave a sliver for the last step."""
+    """Trim STEP so that END, or a tick, is met exactly: halve the way rather than leave a sliver for the last step."""
     clock = run.clock
-    remaining = clock[END] - clock[TIME]
+    until = next_tick(run, clock[END])
+    remaining = until - clock[TIME]
+    run.count[TRIMMED] = 1 if until < clock[END] and remaining < 2.0 * clock[STEP] else 0
     if run.method == RK4:
         if remaining < clock[STEP] * (1.0 + 1e-9):
             clock[STEP] = remaining

@@ -34,6 +34,7 @@ from dynsim.kernels.arrays import (
     Workspace,
 )
 from dynsim.kernels.jit import inlined_kernel, kernel
+from dynsim.kernels.tree.joints import sweep_row
 
 TWO_OVER_PI = 2.0 / math.pi
 HALF_PI_HIGH, HALF_PI_MIDDLE = 1.57079632673412561417, 6.07710050630396597660e-11
@@ -213,6 +214,9 @@ def forward_sweep(model: ModelArrays, ws: Workspace, velocity, acceleration, gra
             fy,
             fz,
         )
+        if k > PRISMATIC:
+            # Apart from the rest, which keeps its values in registers.
+            sweep_row(model, ws, i, vi, ai, gx, gy, gz)
 
 
 @inlined_kernel

@@ -1,0 +1,77 @@
+"""The application, the options of all commands, and those that several share."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated, TextIO
+
+import typer
+
+from dynsim import completion
+from dynsim._version import __version__
+from dynsim.cli.display import console
+
+app = typer.Typer(
+    name="dynsim",
+    help="Dynamic simulator of braced hyper-redundant manipulators: energy, tracking, contact and motors.",
+    epilog="Example: dynsim run single_pendulum",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+)
+
+ScenarioArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="SCENARIO",
+        help="Scenario file, or the name of a shipped one.",
+        autocompletion=completion.scenarios,
+    ),
+]
+SetOption = Annotated[
+    list[str] | None, typer.Option("--set", metavar="a.b.c=VALUE", help="Override a value; may be repeated.")
+]
+QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+FiguresOption = Annotated[bool, typer.Option("--no-figures", help="Do not draw figures.")]
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        console.print(__version__, highlight=False)
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Say on stderr what takes long, and the warnings of runs.")
+    ] = False,
+) -> None:
+    if verbose:
+        _log_to_stderr()
+
+
+def _log_to_stderr() -> None:
+    # Imported here: --help and --version need not wait for it.
+    import logging
+
+    class OnStderr(logging.StreamHandler[TextIO]):
+        """Stderr; on a terminal the one of the moment: a progress bar puts what is written there above itself."""
+
+        def __init__(self) -> None:
+            super().__init__(sys.stderr)
+            self.on_terminal = sys.stderr.isatty()
+
+        def emit(self, record: logging.LogRecord) -> None:
+            if self.on_terminal:
+                self.setStream(sys.stderr)
+            super().emit(record)
+
+    handler = OnStderr()
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    library = logging.getLogger("dynsim")
+    library.addHandler(handler)
+    library.setLevel(logging.INFO)

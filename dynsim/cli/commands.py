@@ -1,0 +1,263 @@
+"""The commands; what they need is imported when they are called, so that ``--help`` waits for nothing."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Container, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from dynsim import completion, interruption
+from dynsim.cli.app import FiguresOption, QuietOption, ScenarioArgument, SetOption, app
+from dynsim.cli.display import console, draw_comparison, draw_run, errors, progress
+from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
+from dynsim.hardware.cli import export, hw
+from dynsim.terminal import escaped
+
+if TYPE_CHECKING:
+    from dynsim.record import Record
+
+
+@app.command(epilog="Example: dynsim run elbow_comparison --variant two_elbows --set integrator.rtol=1e-8")
+def run(
+    scenario: ScenarioArgument,
+    variant: Annotated[
+        str | None,
+        typer.Option(metavar="VARIANT", help="Variant to run; default: the first.", autocompletion=completion.variants),
+    ] = None,
+    overrides: SetOption = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="For the files; default: results/SCENARIO/VARIANT.")
+    ] = None,
+    no_figures: FiguresOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Simulate one scenario and write its record, summary and figures."""
+    from dynsim.engine import simulate
+    from dynsim.files import check_writable
+    from dynsim.results import RUN_FILES, save_run
+    from dynsim.scenario import load_scenario
+
+    loaded = load_scenario(scenario, variant, _overrides(overrides))
+    folder = out or Path("results", loaded.name, loaded.variant)
+    check_writable(folder, RUN_FILES)
+    try:
+        with progress([loaded], quiet) as report:
+            record = simulate(loaded, partial(report, loaded.variant))
+    except SimulationStopped as stop:
+        if stop.record is not None:
+            save_run(stop.record, folder)
+            errors.print(f"what was simulated until then is in {escaped(folder)}, marked incomplete")
+        raise
+    save_run(record, folder)
+    interruption.heed()
+    interruption.check()
+    if not no_figures:
+        draw_run(record, folder / "figures", quiet)
+    if not quiet:
+        from dynsim.tables import print_summary
+
+        print_summary(console, record.summary)
+        console.print(f"Written to {escaped(folder)}", highlight=False, soft_wrap=True)
+
+
+@app.command(epilog="Example: dynsim compare scenarios/elbow_comparison.yaml --jobs 2")
+def compare(
+    scenario: ScenarioArgument,
+    overrides: SetOption = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="For the files; default: results/SCENARIO.")
+    ] = None,
+    jobs: Annotated[int, typer.Option(metavar="N", min=1, help="Processes that simulate variants.")] = 1,
+    no_figures: FiguresOption = False,
+    quiet: QuietOption = False,
+) -> None:
+    """Simulate all variants of a scenario and compare them in a table and in figures."""
+    from dynsim.files import check_writable, discard
+    from dynsim.results import COMPARISON_FILES, RUN_FILES, save_run
+    from dynsim.scenario import load_scenario, variant_names
+    from dynsim.studies.compare import compare as compare_variants
+    from dynsim.studies.compare import save_comparison
+
+    given = _overrides(overrides)
+    loaded = [load_scenario(scenario, name, given) for name in variant_names(scenario)]
+    folder = out or Path("results", loaded[0].name if loaded else "")
+    check_writable(folder, COMPARISON_FILES[:2])
+    for one in loaded:
+        check_writable(folder / one.variant, RUN_FILES)
+    records: dict[str, Record] = {}
+
+    def finished(name: str, record: Record) -> None:
+        # What described the old records goes before the first of them does.
+        discard(folder, COMPARISON_FILES)
+        save_run(record, folder / name)
+        records[name] = record
+
+    def stopped(name: str, stop: SimulationStopped) -> None:
+        if stop.record is not None:
+            discard(folder, COMPARISON_FILES)
+            save_run(stop.record, folder / name)
+            where = escaped(folder / name)
+            errors.print(f"what was simulated of {escaped(name)} until then is in {where}, marked incomplete")
+
+    failure: SimulationStopped | None = None
+    try:
+        with progress(loaded, quiet) as report:
+            compare_variants(scenario, overrides=given, jobs=jobs, progress=report, finished=finished, stopped=stopped)
+    except SimulationInterrupted:
+        raise
+    except SimulationStopped as stop:
+        failure = stop
+    # In the order of the file, whichever was ready first.
+    records = {s.variant: records[s.variant] for s in loaded if s.variant in records}
+    if records:
+        save_comparison(records, folder)
+        interruption.heed()
+        interruption.check()
+        if not no_figures:
+            for name, record in records.items():
+                draw_run(record, folder / name / "figures", quiet)
+            draw_comparison(records, folder, quiet)
+        if not quiet:
+            from dynsim.tables import print_comparison
+
+            print_comparison(console, {name: record.summary for name, record in records.items()})
+            console.print(f"Written to {escaped(folder)}", highlight=False, soft_wrap=True)
+    if failure is not None:
+        raise failure
+
+
+@app.command(epilog="Example: dynsim check elbow_comparison six_axis_arm")
+def check(
+    scenarios: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SCENARIO",
+            help="Scenario files, or names of shipped ones.",
+            autocompletion=completion.scenarios,
+        ),
+    ],
+    overrides: SetOption = None,
+) -> None:
+    """Validate scenarios without running them: schema, model, contacts at the start, reachable references.
+
+    Prints where hand and contact points start, in full digits, to be copied into a surface or a path.
+    """
+    from dynsim.engine import check as check_scenario
+    from dynsim.scenario import load_scenario, variant_names
+    from dynsim.tables import print_starts
+
+    failed = False
+    for name in scenarios:
+        try:
+            variants: Sequence[str | None] = variant_names(name) or [None]
+            starts = {}
+            for variant in variants:
+                with console.status(f"checking {escaped(name)} {escaped(variant or '')}"):
+                    starts[variant or ""] = check_scenario(load_scenario(name, variant, _overrides(overrides)))
+        except SimulationInterrupted:
+            raise
+        except DynsimError as error:
+            failed = True
+            errors.print(f"[red]error:[/] {escaped(str(error))}")
+        else:
+            count = f"{len(variants)} variants" if len(variants) > 1 else "1 variant"
+            console.print(f"{escaped(name)}: ok ({count})", highlight=False, soft_wrap=True)
+            print_starts(console, starts)
+    _warn_of_plugins()
+    if failed:
+        raise typer.Exit(2)
+
+
+@app.command("list", epilog="Example: dynsim list")
+def list_() -> None:
+    """Show shipped scenarios, plants, surfaces, controllers, paths and motors."""
+    from dynsim.tables import print_choices
+
+    print_choices(console)
+    _warn_of_plugins()
+
+
+@app.command(epilog="Example: dynsim plot results/elbow_comparison/two_elbows/record.h5")
+def plot(
+    records: Annotated[list[Path], typer.Argument(metavar="RECORD", help="Records (HDF5).")],
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="For the figures; default: figures/ beside each record."),
+    ] = None,
+) -> None:
+    """Draw the figures of records; two or more are also laid over each other."""
+    from dynsim.record import Record
+
+    labelled: dict[str, Record] = {}
+    for path in records:
+        record = Record.load(path)
+        label = _label(path, record, labelled)
+        labelled[label] = record
+        folder = path.parent / "figures" if out is None else out if len(records) == 1 else out / label
+        try:
+            draw_run(record, folder, quiet=False)
+        except RecordError as error:
+            raise RecordError(f"{path}: {error}") from error
+    if len(labelled) > 1:
+        draw_comparison(labelled, out or Path("figures"), quiet=False)
+
+
+@app.command(epilog="Example: dynsim bench --quick --json bench.json")
+def bench(
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer sizes and repetitions.")] = False,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures as JSON.")] = None,
+) -> None:
+    """Time right-hand sides and the whole job beside Pinocchio and MuJoCo (where installed)."""
+    from dynsim.files import write_json
+    from dynsim.studies.bench.run import run_bench
+    from dynsim.studies.bench.table import format_table
+
+    with console.status("measuring"):
+        result = run_bench(quick)
+    for table in format_table(result):
+        console.print(table)
+    if json_file is not None:
+        write_json(json_file, result)
+
+
+@app.command(epilog="Example: dynsim schema > scenario.schema.json")
+def schema() -> None:
+    """Print the JSON schema of scenario files, for editors."""
+    from dynsim.scenario import json_schema
+
+    print(json.dumps(json_schema(), indent=2))
+    _warn_of_plugins()
+
+
+# These load serial ports and servos only when called.
+app.add_typer(hw, name="hw")
+app.command(
+    epilog="Example: dynsim export results/elbow_comparison/two_elbows/record.h5 --format joint-trajectory --rate 100"
+)(export)
+
+
+def _warn_of_plugins() -> None:
+    """Say on stderr which plug-ins do not work; a run says so only of those that it needs."""
+    from dynsim.families import faults
+
+    for fault in faults():
+        errors.print(f"[yellow]warning:[/] {escaped(fault)}")
+
+
+def _overrides(given: list[str] | None) -> dict[str, Any]:
+    from dynsim.scenario import SetOptions, parse_override
+
+    return SetOptions(parse_override(text) for text in given or ())
+
+
+def _label(path: Path, record: Record, taken: Container[str]) -> str:
+    """A name for a record and its folder among others: its variant, numbered where another has the same."""
+    from dynsim.files import file_name
+
+    name = file_name(record.summary.get("variant") or path.parent.name or path.stem)
+    return next(label for k in itertools.count(1) if (label := name if k == 1 else f"{name}_{k}") not in taken)

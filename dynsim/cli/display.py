@@ -1,0 +1,87 @@
+"""What the commands show: console, progress bars, and that figures are being drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dynsim.terminal import Terminal, escaped
+
+if TYPE_CHECKING:
+    from rich.progress import TaskID
+
+    from dynsim.record import Record
+    from dynsim.scenario import Scenario
+    from dynsim.studies.compare import VariantProgress
+
+# emoji: rich would turn the ":b:" of a path or key into a picture.
+console = Terminal(emoji=False)
+errors = Terminal(stderr=True, soft_wrap=True, highlight=False, emoji=False)
+
+# Of a progress bar.
+_TITLE_WIDTH = 22
+
+
+def draw_run(record: Record, folder: Path, quiet: bool) -> None:
+    """Figures of one record into ``folder``."""
+    from dynsim import figures
+
+    _drawing(lambda: figures.draw(record, folder), folder, quiet)
+
+
+def draw_comparison(records: dict[str, Record], folder: Path, quiet: bool) -> None:
+    """Figures of several records over each other into ``folder``."""
+    from dynsim import figures
+
+    _drawing(lambda: figures.draw_comparison(records, folder), folder, quiet)
+
+
+def _drawing(draw: Callable[[], Any], folder: Path, quiet: bool) -> None:
+    if quiet:
+        draw()
+    else:
+        with console.status(f"drawing {escaped(folder)}"):
+            draw()
+
+
+@contextmanager
+def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProgress]:
+    """A progress bar per scenario, with time and time to go, and one while references take long; yields its report."""
+    if quiet:
+        yield lambda variant, time, stage="": None
+        return
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.table import Column
+
+    from dynsim.engine import REFERENCES, SIMULATION
+    from dynsim.kernels.jit import is_cached
+
+    if not is_cached():
+        console.print("Compiling the kernels: once after an installation or an edit, about half a minute.")
+    # In 80 columns all fits up to 9999 s: the bar gives way, the times do not.
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.2f} / {task.total:g} s {task.fields[what]}"),
+        TimeElapsedColumn(table_column=Column(no_wrap=True)),
+        TextColumn("to go"),
+        TimeRemainingColumn(table_column=Column(no_wrap=True)),
+    )
+    with Progress(*columns, console=console, transient=not console.is_terminal) as bars:
+
+        def add(scenario: Scenario, what: str, visible: bool) -> TaskID:
+            title = scenario.variant or scenario.name
+            title = title if len(title) <= _TITLE_WIDTH else title[: _TITLE_WIDTH - 1] + "…"
+            return bars.add_task(escaped(title), total=scenario.duration_s, what=what, visible=visible)
+
+        preparing = {s.variant: add(s, "references", False) for s in scenarios}
+        simulating = {s.variant: add(s, "simulated", True) for s in scenarios}
+
+        def report(variant: str, time: float, stage: str = SIMULATION) -> None:
+            bars.update(preparing[variant], completed=time, visible=stage == REFERENCES, refresh=stage == REFERENCES)
+            if stage == SIMULATION:
+                bars.update(simulating[variant], completed=time)
+
+        yield report

@@ -1,0 +1,104 @@
+"""From the arguments to an exit code: errors become one line, warnings too, and lost output is noticed."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+
+from dynsim import interruption
+from dynsim.cli.commands import app
+from dynsim.cli.display import errors
+from dynsim.errors import DynsimError, SimulationInterrupted
+from dynsim.standard_streams import lenient_streams
+from dynsim.terminal import escaped
+
+# Of a process that a signal ended: this and the number of the signal.
+_SIGNAL_EXIT = 128
+
+
+def main() -> None:
+    """Entry point: errors become one line and an exit code. Ctrl-C where nothing can be saved is typer's: 130."""
+    with interruption.heeded() as received, lenient_streams() as output, _plain_warnings():
+        code = _exit_code()
+        if output is not None:
+            output.flush()
+            if code == 0 and output.failure is not None:
+                code = _explain_lost_output(output.failure)
+    sys.exit(_SIGNAL_EXIT + received[0] if received and code == SimulationInterrupted.exit_code else code)
+
+
+def _exit_code() -> int:
+    """Run the command that the arguments name; print its error, if any."""
+    try:
+        _command()(prog_name="dynsim")
+    except SystemExit as finished:
+        return finished.code if isinstance(finished.code, int) else 0 if finished.code is None else 1
+    except DynsimError as error:
+        problem, code = str(error), error.exit_code
+    except MemoryError as error:
+        problem, code = f"not enough memory: {error}".removesuffix(": "), DynsimError.exit_code
+    except OSError as error:
+        # What nobody could name better: of the system, not of dynsim.
+        problem, code = _explain_system(error), DynsimError.exit_code
+    except KeyboardInterrupt:
+        return SimulationInterrupted.exit_code
+    else:
+        return 0
+    errors.print(f"[red]error:[/] {escaped(problem)}")
+    return code
+
+
+def _command() -> Any:
+    """The command of ``app``; its flags do not show a type, which they do not take."""
+    command = typer.main.get_command(app)
+    waiting = [command]
+    while waiting:
+        group = waiting.pop()
+        waiting += getattr(group, "commands", {}).values()
+        for parameter in (*group.params, group.get_help_option(typer.Context(group))):
+            if parameter is not None and getattr(parameter, "is_flag", False):
+                parameter.metavar = ""
+    return command
+
+
+def _explain_system(error: OSError) -> str:
+    if error.errno == errno.ENOENT and error.filename is None:
+        try:
+            os.getcwd()
+        except OSError:
+            return "the working directory is no longer there; change to another folder"
+    return f"{error.filename}: {error.strerror}" if error.filename is not None else str(error.strerror or error)
+
+
+def _explain_lost_output(failure: OSError) -> int:
+    """Exit code when not all could be printed; a reader that wants no more (``| head``) is no error to speak of."""
+    if failure.errno == errno.EPIPE:
+        return _SIGNAL_EXIT + signal.SIGPIPE if hasattr(signal, "SIGPIPE") else 1
+    errors.print(f"[red]error:[/] standard output cannot be written ({failure.strerror})")
+    return DynsimError.exit_code
+
+
+@contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Warnings about what the user gave, or keeps on disk, are a line on stderr without the place in dynsim's code."""
+    shown = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *place: Any, **options: Any) -> None:
+        if issubclass(category, UserWarning):
+            errors.print(f"[yellow]warning:[/] {escaped(str(message))}")
+        else:
+            shown(message, category, *place, **options)
+
+    warnings.showwarning = show
+    try:
+        yield
+    finally:
+        warnings.showwarning = shown

@@ -1,0 +1,67 @@
+"""Tables of numbers in CSV files: read as any other program reads them, or refused with file, line and reason."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from dynsim.errors import DynsimError
+from dynsim.inputs import read_text
+
+# Of a file [bytes]: some million rows.
+SIZE_LIMIT = 100_000_000
+# float() takes more: "1_0", digits of other scripts. No other program would read the file so.
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
+
+
+def read_rows(file: str, *headers: Sequence[str], what: str) -> list[list[float]]:
+    """Two or more rows of a file whose first line is one of ``headers``, the first column increasing.
+
+    Parameters
+    ----------
+    what : what needs the rows, for the message
+
+    Raises
+    ------
+    ValueError
+        With file, line and reason: for validators of a scenario.
+    """
+    try:
+        text = read_text(Path(file), DynsimError, SIZE_LIMIT)
+    except DynsimError as error:
+        raise ValueError(str(error)) from error
+    first, *lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    columns = tuple(name.strip() for name in first.split(","))
+    if columns not in [tuple(header) for header in headers]:
+        wanted = " or ".join(repr(",".join(header)) for header in headers)
+        raise ValueError(f"{file}:1: the first line is {_shown(first)}; it must be {wanted}")
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines, 2):
+        content = line.partition("#")[0].strip(" \t")
+        if not content:
+            continue
+        rows.append(_row(content, columns, f"{file}:{number}"))
+        if len(rows) > 1 and not rows[-1][0] > rows[-2][0]:
+            raise ValueError(
+                f"{file}:{number}: {columns[0]} = {rows[-1][0]:g} after {rows[-2][0]:g}; "
+                "it must increase from row to row"
+            )
+    if len(rows) < 2:
+        raise ValueError(f"{file}: {len(rows)} rows below the header; {what} needs two or more")
+    return rows
+
+
+def _row(line: str, columns: Sequence[str], place: str) -> list[float]:
+    cells = [cell.strip(" \t") for cell in line.split(",")]
+    if len(cells) != len(columns):
+        raise ValueError(f"{place}: {len(cells)} values; there must be {len(columns)}: {','.join(columns)}")
+    if not all(_NUMBER.fullmatch(cell) and math.isfinite(float(cell)) for cell in cells):
+        raise ValueError(f"{place}: {_shown(line)} is not {len(columns)} numbers, finite and in digits 0 to 9")
+    return [float(cell) for cell in cells]
+
+
+def _shown(line: str) -> str:
+    """A line of the file for a message: one line, no control characters, not a page long."""
+    return repr(line if len(line) <= 80 else line[:79] + "…")

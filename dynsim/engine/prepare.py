@@ -1,0 +1,233 @@
+"""A scenario compiled to the arrays of the kernels, after everything that can be refused before the first step."""
+
+from __future__ import annotations
+
+import logging
+import time as clock
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from dynsim.engine import REFERENCES, Progress
+from dynsim.engine.outcome import check_size
+from dynsim.errors import ModelError, ScenarioError
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.state import block, output_layout, state_layout
+from dynsim.kernels.system import System, new_workspace
+from dynsim.model.arrays import compile_contacts, compile_couplings, compile_drives, compile_loads
+from dynsim.model.clearance import poses
+from dynsim.model.control import JointControl
+from dynsim.model.description import Array, Contact, Load, Motor, Robot
+from dynsim.model.model import Model
+from dynsim.scenario import Scenario, build, build_model
+
+log = logging.getLogger(__name__)
+
+# Steps that an explicit method may be held to by the electrical poles alone: a quarter of an hour for ten joints.
+STEPS_LIMIT = 2e8
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A scenario compiled to kernel arrays, at its initial state."""
+
+    model: Model
+    contacts: list[Contact]
+    control: JointControl
+    system: System
+    run: ki.Run
+    workspace: ka.Workspace
+
+
+def prepare(
+    scenario: Scenario,
+    progress: Progress | None = None,
+    *,
+    pushable: bool = False,
+    times: np.ndarray | None = None,
+    end: float | None = None,
+) -> Prepared:
+    """Compile a scenario; references that take long report to ``progress``.
+
+    Parameters
+    ----------
+    pushable : with an external wrench on every body, zero at first, after those of the scenario
+    times : of samples [s]; default: those of the whole record
+    end : of the run [s]; default: the scenario's duration
+
+    Raises
+    ------
+    ModelError, UnreachableReference
+        See :func:`dynsim.engine.simulate`.
+    ScenarioError
+        The record would be larger than ``record.size_limit_GB``, or the explicit method would need too many steps.
+    """
+    model = build_model(scenario)
+    robot, contacts = model.robot, build.contacts(scenario)
+    build.check_start(scenario, model)
+    loads = build.loads(scenario, robot)
+    if pushable:
+        loads = [*loads, *(_push(link.name) for link in robot.links)]
+    n, na, c = model.n, len(robot.motors), len(contacts)
+    layout, columns = state_layout(model.nq, n, robot.circuits, c, len(loads)), output_layout(n, na, c)
+    if times is None:
+        times = sample_times(scenario, columns=layout.size + columns.size)
+    _check_stiffness(scenario, robot)
+    couplings = len(robot.couplings)
+    _check_work(scenario, n, c + couplings)
+    control = _control(scenario, model, progress)
+    _check_references(scenario, robot, contacts, control)
+    options, size = scenario.integrator, n + ka.row_limit(c, couplings) + robot.circuits
+    method = ki.METHODS[options.method]
+    step = options.step_s or (1e-3 if method == ki.RK4 else 0.0)
+    system = System(
+        layout=layout,
+        model=model.arrays,
+        drives=compile_drives(robot, k_p=list(control.k_p), k_d=list(control.k_d)),
+        reference=control.reference,
+        contacts=compile_contacts(robot, contacts),
+        loads=compile_loads(robot, loads),
+        dense=np.zeros((size, size + 1)) if options.solver == "m_star" else None,
+        couplings=compile_couplings(robot),
+    )
+    y = np.zeros(layout.size)
+    y[block(layout, "q")] = robot.initial
+    run = ki.new_run(
+        method,
+        y,
+        layout,
+        columns,
+        n=n,
+        na=na,
+        c=c,
+        couplings=couplings,
+        sample_time=times,
+        hand=(model.body_index(robot.hand[0]), robot.hand[1]),
+        end=scenario.duration_s if end is None else end,
+        step=step,
+        step_max=options.step_max_s or np.inf,
+        rtol=options.rtol,
+        atol=options.atol,
+    )
+    return Prepared(model, contacts, control, system, run, new_workspace(system))
+
+
+def _push(body: str) -> Load:
+    """A wrench on a body that only its caller writes."""
+    return Load(body, body, np.zeros(3), False, np.zeros(1), np.zeros((0, 6, 4)), False)
+
+
+def sample_times(scenario: Scenario, columns: int) -> np.ndarray:
+    """Times of a whole record of so many columns, (T,) [s]; ScenarioError when it would be too large."""
+    rate = scenario.record.rate_hz
+    count = int(np.floor(scenario.duration_s * rate * (1.0 + 1e-12))) + 1
+    check_size(scenario, count, columns)
+    times = np.arange(count) / rate
+    if scenario.duration_s - times[-1] > 1e-9 * scenario.duration_s:
+        times = np.append(times, scenario.duration_s)
+    return times
+
+
+def _check_stiffness(scenario: Scenario, robot: Robot) -> None:
+    """Refuse an explicit method where the circuits' own poles R/L already ask for too many steps."""
+    method, duration = scenario.integrator.method, scenario.duration_s
+    circuits = [motor for motor in robot.motors if isinstance(motor, Motor)]
+    if method not in ("rk43", "dopri5") or not circuits:
+        return
+    motor = max(circuits, key=lambda motor: motor.resistance / motor.inductance)
+    pole = motor.resistance / motor.inductance
+    # Explicit methods of these orders are stable up to |h pole| of about 3.
+    steps = duration * pole / 3.0
+    if steps > STEPS_LIMIT:
+        raise ScenarioError(
+            f"{motor.joint}: R/L = {pole:.2g} 1/s holds integrator.method {method} to about {steps:.1g} steps for "
+            f"{duration:g} s; take integrator.method: rodas4, or a larger inductance than {motor.inductance:g} H"
+        )
+
+
+def _check_work(scenario: Scenario, n: int, p: int) -> None:
+    """Refuse what would integrate for longer than ``integrator.time_limit_h``, by an estimate from its size."""
+    options = scenario.integrator
+    # Measured from 10 to 1000 links with up to 250 contacts, right to a factor of two: the sweeps, the p × p system of
+    # chains as long as n, its elimination, and the decomposition that dependent rows need (p > n always are).
+    seconds = 1e-7 * n + 4e-10 * n * p**2 + (8e-8 if p > n else 2e-10) * p**3
+    if options.solver == "m_star":
+        seconds += 3e-10 * (n + p) ** 3
+    # A Jacobian by differences, and its factors.
+    per_step = (2 * n + 6) * seconds + 3e-10 * n**3 if options.method == "rodas4" else 4.0 * seconds
+    # Motors and friction hold the step at about a millisecond.
+    steps = scenario.duration_s / (options.step_s if options.step_s and options.method == "rk4" else 1e-3)
+    hours = steps * per_step / 3600.0
+    if hours > options.time_limit_h:
+        raise ScenarioError(
+            f"{n} joints with {p} contacts: a right-hand side takes about {seconds:.1g} s, so "
+            f"{scenario.duration_s:g} s would integrate for about {hours:.2g} hours, the limit "
+            f"(integrator.time_limit_h) is {options.time_limit_h:g}; "
+            "take fewer contacts or links, a shorter duration_s, or a higher limit"
+        )
+
+
+def _control(scenario: Scenario, model: Model, progress: Progress | None) -> JointControl:
+    if scenario.controller is None:
+        return JointControl.absent(model.robot)
+    log.info("%s: planning references over %g s", scenario.title, scenario.duration_s)
+    started = clock.perf_counter()
+    control = build.controller(scenario, model, None if progress is None else partial(progress, stage=REFERENCES))
+    log.info("%s: planned references in %.3f s", scenario.title, clock.perf_counter() - started)
+    if not isinstance(control, JointControl):
+        raise ModelError(f"controller {scenario.controller.type!r} cannot drive a {scenario.plant.type!r}")
+    return control
+
+
+def _check_references(scenario: Scenario, robot: Robot, contacts: Sequence[Contact], control: JointControl) -> None:
+    """Refuse references that, followed exactly, would take a contact point off the surface that holds it."""
+    links = {link.name: link for link in robot.links}
+    motor_of = {motor.joint: a for a, motor in enumerate(robot.motors)}
+    held: dict[str, list[tuple[Contact, Array]]] = {}
+    for contact in contacts:
+        index, point = robot.attach(contact.body, contact.point)
+        carrier = body = robot.links[index].name
+        chain = []
+        while True:
+            chain.append(motor_of.get(links[body].joint, -1))
+            parent = links[body].parent
+            if parent is None:
+                break
+            body = parent
+        # A joint that follows nothing gives way, so the references do not say where the point is. Where no reference
+        # moves, the point stays where it starts, which has its own check.
+        follows = all(a >= 0 and control.k_p[a] > 0.0 for a in chain)
+        if follows and any(control.reference.spline[a] >= 0 for a in chain):
+            held.setdefault(carrier, []).append((contact, point))
+    if not held:
+        return
+    tolerance = scenario.config.contacts.reference_tolerance_m
+    joints = {link.joint: i for i, link in enumerate(robot.links)}
+    driven = np.array([joints[motor.joint] for motor in robot.motors])
+    worst: dict[str, tuple[float, float, np.ndarray]] = {}
+    first: dict[str, float] = {}
+    for times, q in control.positions(robot.initial, driven):
+        for link, R, p in poses(robot, q, held):
+            for contact, point in held.get(link.name, ()):
+                position = (p + point @ R).T
+                gap = contact.surface.gaps(position)
+                k = int(np.abs(gap).argmax())
+                if abs(gap[k]) > tolerance:
+                    first.setdefault(contact.name, float(times[np.abs(gap) > tolerance][0]))
+                    if abs(gap[k]) > abs(worst.get(contact.name, (0.0,))[0]):
+                        worst[contact.name] = float(gap[k]), float(times[k]), position[k]
+    if not worst:
+        return
+    name, (gap_max, time, place) = max(worst.items(), key=lambda item: abs(item[1][0]))
+    surface = next(contact.surface_name for contact in contacts if contact.name == name)
+    others = ", ".join(other for other in worst if other != name)
+    raise ModelError(
+        f"contact {name}: the references of the joints take its point {gap_max:+.4g} m off surface {surface!r} at "
+        f"t = {time:.3f} s, at ({place[0]:.4g}, {place[1]:.4g}, {place[2]:.4g}) m, and beyond "
+        f"contacts.reference_tolerance_m = {tolerance:g} m from t = {first[name]:.3f} s on"
+        f"{f' (also {others})' if others else ''}; "
+        "let the joints before the contact hold, change their path, or disable the contact"
+    )

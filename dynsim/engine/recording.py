@@ -1,0 +1,77 @@
+"""The record of a run: columns that the kernels have written, by their names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from dynsim import metrics
+from dynsim.engine.prepare import Prepared
+from dynsim.engine.provenance import provenance
+from dynsim.engine.uniqueness import motion_spread
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.state import CONTACT_SIZE, IMPULSE, OUT_FORCE, OUT_GAP, OUT_SLIP, OUT_VECTOR, SLIP
+from dynsim.model.description import Link
+from dynsim.record import Record
+from dynsim.scenario import Scenario
+
+
+def make_record(scenario: Scenario, prepared: Prepared, wall: float, *, pushed: bool = False) -> Record:
+    """Name the columns that the kernels have written; ``pushed``: wrenches besides those of the scenario did work too."""
+    model, run, contacts = prepared.model, prepared.run, prepared.contacts
+    robot = model.robot
+    rows = int(run.count[ki.SAMPLE])
+    joints, driven = robot.joint_names, tuple(motor.joint for motor in robot.motors)
+    names = tuple(contact.name for contact in contacts)
+    record = Record(run.sample_time[:rows], provenance=provenance(scenario))
+    angle, rate, acceleration, _ = _joint_units(robot.links)
+    with_motor = set(driven)
+    *_, force = _joint_units([link for link in robot.links if link.joint in with_motor] or robot.links)
+    record.add("q", run.states("q"), angle, labels=robot.position_names, description="joint positions")
+    record.add("v", run.states("v"), rate, labels=joints, description="joint rates")
+    record.add("vdot", run.outputs("vdot"), acceleration, labels=joints, description="joint accelerations")
+    current, voltage = run.outputs("current"), run.outputs("voltage")
+    record.add("current", current, "A", labels=driven, description="motor currents")
+    record.add("voltage", voltage, "V", labels=driven, description="motor terminal voltages")
+    record.add("torque", run.outputs("torque"), force, labels=driven, description="shaft torques, [WM] eq 25")
+    record.add("power", current * voltage, "W", labels=driven, description="electrical power u i")
+    record.add("hand_position", run.outputs("hand"), "m", labels=("x", "y", "z"))
+    target = prepared.control.target(record.time)
+    if target is not None:
+        record.add("target_position", target, "m", labels=("x", "y", "z"))
+    for integral, (name, text) in zip(run.states("ledger").T, metrics.INTEGRALS.items(), strict=True):
+        record.add(name, integral, "J", description=text)
+    for store, name in zip(run.outputs("energy").T, metrics.STORES, strict=True):
+        record.add(name, store, "J", description=f"{name.removeprefix('energy_')} energy")
+    record.add("energy_residual", metrics.energy_residual(record), "J", description="what the ledger does not explain")
+    touch = run.outputs("contact")
+    vector, slip = slice(OUT_VECTOR, OUT_VECTOR + 3), slice(OUT_SLIP, OUT_SLIP + 3)
+    record.add("contact_normal_force", touch[:, :, OUT_FORCE], "N", labels=names, description="f_n; negative: pulling")
+    record.add("contact_force", touch[:, :, vector], "N", labels=names, description="normal and friction force, W")
+    record.add("contact_gap", touch[:, :, OUT_GAP], "m", labels=names, description="distance from the surface")
+    record.add("contact_slip_velocity", touch[:, :, slip], "m/s", labels=names)
+    integrals = run.states("contact").reshape(rows, len(contacts), CONTACT_SIZE)
+    record.add("contact_impulse", integrals[:, :, IMPULSE], "N s", labels=names, description="∫ f_n dt")
+    record.add("contact_slip_distance", integrals[:, :, SLIP], "m", labels=names, description="∫ |v_t| dt")
+    deficient, spread = int(prepared.workspace.counts[ka.DEPENDENT]), None
+    if deficient and rows and any(contact.friction > 0.0 for contact in contacts):
+        joint_units = [(link.joint, link.units[2]) for link in robot.links]
+        spread = motion_spread(prepared.system, run.sample_time[:rows], run.sample[:rows], joint_units)
+    counts = metrics.Counts(
+        wall=wall,
+        steps=int(run.count[ki.STEPS]),
+        rejected=int(run.count[ki.REJECTED]),
+        evaluations=int(run.count[ki.EVALUATIONS]),
+        projections=int(run.count[ki.PROJECTIONS]),
+        deficient=deficient,
+        extremes=run.extremes,
+        spread=spread,
+    )
+    record.summary = metrics.summarise(record, scenario, contacts, robot, counts)
+    return record
+
+
+def _joint_units(links: Iterable[Link]) -> Sequence[str]:
+    """Units of position, velocity, acceleration and force of joints; "rad or m" when there are both kinds."""
+    units = sorted({link.units for link in links}, reverse=True)
+    return [" or ".join(kinds) for kinds in zip(*units, strict=True)]

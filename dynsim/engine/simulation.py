@@ -1,0 +1,564 @@
+"""A simulation in the hands of its caller: advance, look, rewrite references and wrenches, go back.
+
+Steps are those of :func:`dynsim.simulate`, bit for bit, as long as nothing is rewritten: ``advance`` does not cut them.
+The step that would pass the time asked for is kept back, and the state there is taken from its dense output. Only when
+something is rewritten it is dropped, and a shorter one ends at that very time.
+"""
+
+from __future__ import annotations
+
+import math
+import time as clock
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dynsim.engine.outcome import raise_stopped
+from dynsim.engine.prepare import prepare, sample_times
+from dynsim.engine.recording import make_record
+from dynsim.engine.stopping import stopped
+from dynsim.errors import ModelError, ScenarioError, shown
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.integrate import driver, events
+from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.integrate.dense import state_within
+from dynsim.kernels.state import block
+from dynsim.kernels.tree import loads as kl
+from dynsim.record import Record
+from dynsim.scenario import Scenario, require_scenario
+from dynsim.scenario.build import START_TOLERANCE
+
+Array = NDArray[np.float64]
+
+# Rows of the buffer that kernels sample into before it is emptied, and steps in one compiled piece.
+_ROWS = 256
+_PIECE = 100_000
+# End of a run without end [s]: far beyond any, and still a number to reckon with.
+_FAR = 1e300
+# Guards of events by name: number in the kernels, and what they are about.
+GUARDS = {
+    "joint_position": (events.JOINT_POSITION, "joint"),
+    "joint_rate": (events.JOINT_RATE, "joint"),
+    "motor_current": (events.MOTOR_CURRENT, "motor"),
+    "motor_voltage": (events.MOTOR_VOLTAGE, "motor"),
+    "contact_force": (events.CONTACT_FORCE, "contact"),
+    "contact_gap": (events.CONTACT_GAP, "contact"),
+    "hand_position": (events.HAND_X, "axis"),
+}
+
+
+@dataclass(frozen=True)
+class State:
+    """The state of a simulation.
+
+    Attributes
+    ----------
+    time : [s]
+    q : (nq,) positions [rad or m]; v : (n,) rates; current : of the motors that have a circuit [A]
+    """
+
+    time: float
+    q: Array
+    v: Array
+    current: Array
+
+    @classmethod
+    def of(cls, record: Record, sample: int = -1) -> State:
+        """The state at a sample of a record, by default the last.
+
+        Raises
+        ------
+        MissingEntry
+            The record has no positions, rates or currents.
+        """
+        names = ("q", "v", "current")
+        return cls(float(record.time[sample]), *(np.array(record[name][sample], dtype=np.float64) for name in names))
+
+
+class Happening(NamedTuple):
+    """An event that has happened: when [s], which guard, of what."""
+
+    time: float
+    kind: str
+    subject: str
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Everything that the future of a simulation depends on; made by :meth:`Simulation.snapshot`."""
+
+    arrays: dict[str, NDArray[Any]]
+    time: float
+    rows: tuple[tuple[Array, Array, Array], ...]
+    next_sample: int
+    happened: tuple[Happening, ...]
+    frozen: bool
+
+
+class Simulation:
+    """A scenario that is advanced by its caller.
+
+    >>> simulation = dynsim.Simulation(dynsim.load_scenario("elbow_comparison", "two_elbows"))
+    >>> simulation.advance(0.5).q
+    >>> simulation.set_wrench("link_10", force=[0.0, 0.0, -5.0])
+    >>> simulation.advance(1.0)
+    >>> record = simulation.record()
+
+    Parameters
+    ----------
+    scenario : of a plant with dynamics
+    state : to start from, at its time; default: the scenario's, at t = 0. ``State.of(record)`` is that of a record's
+        last sample. The ledger starts at zero.
+    duration : end of the run [s], ``math.inf`` for none; default: the scenario's. References hold where they end.
+    trace : samples that are kept: all (None), the last so many, or none (0)
+
+    Raises
+    ------
+    ModelError, UnreachableReference, ScenarioError
+        See :func:`dynsim.simulate`; a state of another robot, or one whose contact points are off their surfaces.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        *,
+        state: State | None = None,
+        duration: float | None = None,
+        trace: int | None = None,
+    ) -> None:
+        require_scenario(scenario)
+        if scenario.engine != "dynamics":
+            raise ModelError(f"plant {scenario.plant.type!r} is kinematic: only plants with dynamics can be stepped")
+        start = 0.0 if state is None else float(state.time)
+        end = scenario.duration_s if duration is None else float(duration)
+        if not end > start:
+            raise ScenarioError(f"a simulation from t = {start:g} s cannot end at {end:g} s")
+        self._scenario = scenario
+        self._end = min(end, _FAR)
+        self._prepared = prepare(scenario, pushable=True, times=np.full(_ROWS, np.inf), end=self._end)
+        self._start, self._time, self._trace = start, start, trace
+        self._rows: deque[tuple[Array, Array, Array]] = deque()
+        self._next_sample, self._wall = 0, 0.0
+        self._happened: list[Happening] = []
+        self._guards: list[tuple[str, str, Callable[[Simulation], None] | None]] = []
+        self._calls: list[Callable[[Simulation], None]] = []
+        robot = self.robot
+        self._joints = {link.joint: i for i, link in enumerate(robot.links)}
+        self._motors = {motor.joint: a for a, motor in enumerate(robot.motors)}
+        first = len(self._prepared.system.loads.table) - len(robot.links)
+        self._pushes = {link.name: first + i for i, link in enumerate(robot.links)}
+        self._splines = self._prepared.system.reference.spline.copy()
+        self._frozen = not math.isfinite(self._prepared.control.end)
+        self._pushed = False
+        self._times = None
+        if state is None and self._end == scenario.duration_s and trace is None:
+            # The very samples of simulate; its limit of size holds here too.
+            self._times = sample_times(scenario, self._prepared.run.layout.size + self._prepared.run.columns.size)
+        run = self._prepared.run
+        if state is not None:
+            self._take(state)
+        run.clock[ki.TIME] = start
+        self._refill()
+
+    @property
+    def scenario(self) -> Scenario:
+        """What is simulated."""
+        return self._scenario
+
+    @property
+    def robot(self) -> Any:
+        """The robot, with the names of its joints, motors and bodies."""
+        return self._prepared.model.robot
+
+    @property
+    def time(self) -> float:
+        """Time that was last advanced to [s]."""
+        return self._time
+
+    @property
+    def finished(self) -> bool:
+        """True at the end of the run, or after an event that ends it."""
+        return bool(self._prepared.run.count[ki.STATUS] != ki.RUNNING)
+
+    @property
+    def happened(self) -> tuple[Happening, ...]:
+        """Events so far."""
+        return tuple(self._happened)
+
+    @property
+    def state(self) -> State:
+        """The state at :attr:`time`."""
+        run = self._prepared.run
+        y = run.y.copy()
+        if run.count[ki.PENDING] == 1 and self._time > run.clock[ki.TIME]:
+            state_within(run, self._time, y)
+        q, v, current = (y[block(run.layout, name)].copy() for name in ("q", "v", "current"))
+        return State(self._time, q, v, current)
+
+    def advance(self, until: float) -> State:
+        """Integrate up to a time [s], or to the end of the run when that comes first, and return the state there.
+
+        Callbacks of :meth:`every` and :meth:`watch` are called on the way.
+
+        Raises
+        ------
+        ScenarioError
+            A time that is past, or not a number.
+        SimulationStopped
+            Divergence or no solution; ``error.record`` holds the trace until then.
+        """
+        if not until >= self._time:
+            raise ScenarioError(f"cannot advance to t = {shown(until)} s: the simulation is at {self._time:g} s")
+        until = min(float(until), self._end)
+        last = self._prepared.control.end
+        if not self._frozen and until > last:
+            self._reach(last)
+            if not self.finished:
+                self._freeze()
+        self._reach(until)
+        return self.state
+
+    def every(self, period: float, call: Callable[[Simulation], None], *, first: float | None = None) -> None:
+        """Call back every ``period`` [s] from ``first`` on (default: now): a sampled controller.
+
+        Steps end there, and what ``call`` rewrites holds until it is rewritten again.
+        """
+        first = self._time if first is None else float(first)
+        if not (period > 0.0 and math.isfinite(period) and first >= self._time):
+            raise ScenarioError(f"a tick needs a period > 0 and a first time from now on, not {period!r} and {first!r}")
+        run = self._prepared.run
+        tick = np.zeros((1, ki.TICK_SIZE))
+        tick[0, [ki.TICK_PERIOD, ki.TICK_NEXT, ki.TICK_PHASE]] = period, first, first
+        table = np.array([[ki.CALLER << len(self._calls), 0]])
+        self._settle_now()
+        self._calls.append(call)
+        self._swap(tick=np.vstack([run.tick, tick]), tick_table=np.vstack([run.tick_table, table]))
+
+    def watch(
+        self,
+        kind: str,
+        subject: str,
+        level: float = 0.0,
+        *,
+        direction: int = 0,
+        call: Callable[[Simulation], None] | None = None,
+        stop: bool = False,
+    ) -> None:
+        """Locate where a quantity passes a level: an event.
+
+        Parameters
+        ----------
+        kind : ``joint_position``, ``joint_rate``, ``motor_current``, ``motor_voltage``, ``contact_force``,
+            ``contact_gap`` or ``hand_position``
+        subject : joint, joint of the motor, contact, or x, y, z of the hand
+        level : [rad, m, rad/s, A, V, N]
+        direction : +1 rising only, −1 falling only, 0 both
+        call : called at the event, may rewrite; ``stop`` ends the run there
+
+        Raises
+        ------
+        ModelError
+            No such kind or subject.
+        """
+        if kind not in GUARDS:
+            raise ModelError(f"no event {shown(kind)}; events: {', '.join(GUARDS)}")
+        number, family = GUARDS[kind]
+        contacts = {contact.name: k for k, contact in enumerate(self._prepared.contacts)}
+        choices = {"joint": self._joints, "motor": self._motors, "contact": contacts, "axis": {"x": 0, "y": 1, "z": 2}}
+        index = _index(choices[family], subject, family)
+        action = ki.STOP if stop else ki.LOG if call is None else ki.RETURN
+        run = self._prepared.run
+        event = np.zeros((1, ki.EVENT_SIZE))
+        event[0, ki.EVENT_LEVEL] = level
+        axis = family == "axis"
+        table = np.array([[number + (index if axis else 0), 0 if axis else index, int(np.sign(direction)), action]])
+        self._settle_now()
+        self._guards.append((kind, subject, call))
+        self._swap(event=np.vstack([run.event, event]), event_table=np.vstack([run.event_table, table]))
+        self._restart()
+
+    def set_reference(self, joint: str, position: float, rate: float = 0.0) -> None:
+        """From now on the motor of a joint follows q_d(t) = position + rate (t − now) [rad, rad/s; m, m/s].
+
+        Of an open torque ``position`` is the torque [N m].
+        """
+        a = self._motor(joint)
+        values = _finite("reference", [position, rate])
+        self._settle_now()
+        drives, reference = self._prepared.system.drives, self._prepared.system.reference
+        reference.spline[a] = ka.REWRITTEN
+        drives.input[a, [ka.LINE_START, ka.LINE_RATE, ka.LINE_SINCE]] = values[0], values[1], self._time
+        self._restart()
+
+    def set_command(self, joint: str, command: float) -> None:
+        """Hold the command of a motor: the voltage of a motor or servo [V], the torque of an open torque [N m]."""
+        a = self._motor(joint)
+        value = _finite("command", [command])[0]
+        self._settle_now()
+        drives = self._prepared.system.drives
+        drives.table[a, ka.SAMPLED], drives.input[a, ka.HELD] = 1, value
+        self._restart()
+
+    def release(self, joint: str) -> None:
+        """Give a motor back to the controller and references of the scenario."""
+        a = self._motor(joint)
+        self._settle_now()
+        self._prepared.system.reference.spline[a] = self._splines[a]
+        self._restart()
+
+    def set_wrench(
+        self,
+        body: str,
+        force: ArrayLike = (0.0, 0.0, 0.0),
+        torque: ArrayLike = (0.0, 0.0, 0.0),
+        *,
+        point: ArrayLike = (0.0, 0.0, 0.0),
+        in_body: bool = False,
+    ) -> None:
+        """From now on a force [N] and a torque [N m] act on a point of a body, instead of what was set before.
+
+        Parameters
+        ----------
+        point : in the body's frame [m]
+        in_body : components are in the axes of the body, else of the world
+        """
+        k = _index(self._pushes, body, "body")
+        values = _finite("wrench", [*np.ravel(point), *np.ravel(force), *np.ravel(torque)])
+        if len(values) != 9:
+            raise ModelError("point, force and torque have three components each")
+        self._settle_now()
+        loads = self._prepared.system.loads
+        place = loads.table[k, kl.DATA]
+        loads.table[k, kl.IN_BODY] = int(in_body)
+        loads.data[place + kl.POINT : place + kl.POINT + 9] = values
+        self._pushed = self._pushed or bool(values[3:].any())
+        self._restart()
+
+    def snapshot(self) -> Snapshot:
+        """What :meth:`restore` needs to go on from here."""
+        arrays = {name: array.copy() for name, array in self._arrays().items()}
+        return Snapshot(arrays, self._time, tuple(self._rows), self._next_sample, tuple(self._happened), self._frozen)
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Go back to a snapshot of this simulation: the same future, bit for bit.
+
+        Raises
+        ------
+        ScenarioError
+            Events or ticks were added since, or the snapshot is of another simulation.
+        """
+        own = self._arrays()
+        sizes = {name: array.shape for name, array in snapshot.arrays.items() if not name.startswith("trace.")}
+        if sizes != {name: array.shape for name, array in own.items() if not name.startswith("trace.")}:
+            raise ScenarioError("the snapshot is of another simulation, or ticks or events were added since")
+        buffers = {name: snapshot.arrays[f"trace.{name}"].copy() for name in ("sample_time", "sample", "output")}
+        self._swap(**buffers)
+        for name, array in self._arrays().items():
+            array[...] = snapshot.arrays[name]
+        self._time, self._next_sample, self._frozen = snapshot.time, snapshot.next_sample, snapshot.frozen
+        self._rows, self._happened = deque(snapshot.rows), list(snapshot.happened)
+
+    def record(self) -> Record:
+        """Record of the trace so far; of a ring, energies and losses count from its first sample on.
+
+        ``complete`` is True for a run that has come to its end.
+        """
+        rows = [*self._rows, self._sampled()]
+        times, states, outputs = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+        if self._trace is not None and len(times) > self._trace:
+            times, states, outputs = (part[len(part) - self._trace :] for part in (times, states, outputs))
+        run = self._prepared.run
+        if len(times) and (self._trace is not None or self._start > 0.0):
+            states = states.copy()
+            integrals = slice(run.layout.tracked, run.layout.size)
+            states[:, integrals] -= states[0, integrals]
+        count = run.count.copy()
+        count[ki.SAMPLE] = len(times)
+        whole = run._replace(sample_time=times, sample=states, output=outputs, count=count)
+        record = make_record(self._scenario, replace(self._prepared, run=whole), self._wall, pushed=self._pushed)
+        for happening in self._happened:
+            record.add_event(*happening)
+        record.complete = self.finished
+        return record
+
+    def _motor(self, joint: str) -> int:
+        return _index(self._motors, joint, "motor")
+
+    def _take(self, state: State) -> None:
+        """Start at a given state."""
+        run, model = self._prepared.run, self._prepared.model
+        for name in ("q", "v", "current"):
+            part = block(run.layout, name)
+            values = _finite(name, np.ravel(getattr(state, name)))
+            if values.shape != run.y[part].shape:
+                raise ModelError(
+                    f"the state has {len(values)} values of {name}, {model.robot.name} has {part.stop - part.start}"
+                )
+            run.y[part] = values
+        for contact in self._prepared.contacts:
+            gap = contact.surface.gap(model.point_position(contact.body, contact.point, run.y[block(run.layout, "q")]))
+            if not abs(gap) <= START_TOLERANCE:
+                raise ModelError(
+                    f"contact {contact.name}: in the state to start from its point is {gap:+.4g} m from surface "
+                    f"{contact.surface_name!r} (limit {START_TOLERANCE:g} m)"
+                )
+
+    def _reach(self, until: float) -> None:
+        """Integrate until the step that would pass a time is pending, or ends there."""
+        run = self._prepared.run
+        while not self.finished and self._time < until:
+            if run.count[ki.PENDING] == 1 and run.clock[ki.TIME] + run.clock[ki.STEP] > until:
+                break
+            self._piece(until)
+            run = self._prepared.run
+            if run.count[ki.STARTED] == 1 and run.clock[ki.TIME] >= until:
+                break
+        self._time = min(until, self._end) if not self.finished else float(run.clock[ki.TIME])
+
+    def _piece(self, until: float) -> None:
+        """One compiled piece, and what it wants its caller to look at."""
+        prepared = self._prepared
+        run = prepared.run
+        if run.count[ki.PENDING] == 1:
+            self._refill(run.clock[ki.TIME] + run.clock[ki.STEP])
+            run = self._prepared.run
+        run.clock[ki.HOLD] = min(until, run.sample_time[-1])
+        begun = clock.perf_counter()
+        driver.advance(prepared.system, prepared.workspace, run, _PIECE)
+        self._wall += clock.perf_counter() - begun
+        self._take_events()
+        if run.count[ki.STATUS] not in (ki.RUNNING, ki.FINISHED, ki.STOPPED):
+            self._time = float(run.clock[ki.TIME])
+            raise_stopped(stopped(self._scenario, self._prepared), self.record())
+        due = int(run.count[ki.TICKED])
+        if due:
+            self._time = float(run.clock[ki.TIME])
+            for k, call in enumerate(self._calls):
+                if due & (ki.CALLER << k):
+                    call(self)
+
+    def _take_events(self) -> None:
+        """Empty the log of the kernels."""
+        run = self._prepared.run
+        logged = int(run.count[ki.LOGGED])
+        run.count[ki.LOGGED] = 0
+        for time, e in zip(run.log_time[:logged].tolist(), run.log_event[:logged].tolist(), strict=True):
+            kind, subject, call = self._guards[e]
+            self._happened.append(Happening(time, kind, subject))
+            if call is not None:
+                self._time = time
+                call(self)
+
+    def _settle_now(self) -> None:
+        """End a step at the present time, when it lies within one."""
+        run = self._prepared.run
+        if run.count[ki.PENDING] == 0 or self.finished:
+            return
+        clock_, count = run.clock, run.count
+        count[[ki.PENDING, ki.SEARCHING, ki.FIRED]] = 0
+        step = clock_[ki.STEP] = max(clock_[ki.PROPOSED], clock_[ki.STEP])
+        if self._time > clock_[ki.TIME]:
+            clock_[ki.END] = self._time
+            while count[ki.STATUS] == ki.RUNNING:
+                if count[ki.PENDING] == 1:
+                    self._refill(clock_[ki.TIME] + clock_[ki.STEP])
+                    run = self._prepared.run
+                run.clock[ki.HOLD] = run.sample_time[-1]
+                driver.advance(self._prepared.system, self._prepared.workspace, run, _PIECE)
+            clock_[ki.END] = self._end
+            if count[ki.STATUS] != ki.FINISHED:
+                raise_stopped(stopped(self._scenario, self._prepared), self.record())
+            count[ki.STATUS] = ki.RUNNING
+            clock_[ki.TIME] = self._time
+            clock_[ki.STEP] = max(clock_[ki.STEP], step)
+
+    def _restart(self) -> None:
+        """Derivatives have jumped: the next step starts anew from the present state, with the step size that it had."""
+        self._prepared.run.count[ki.STARTED] = 0
+
+    def _freeze(self) -> None:
+        """Let moving references hold where they end."""
+        self._frozen = True
+        reference = self._prepared.system.reference
+        ends = {motor.joint: a for motor, a in zip(self.robot.motors, range(len(self._motors)), strict=True)}
+        for joint, a in ends.items():
+            if reference.spline[a] >= 0:
+                powers = reference.grid[1] ** np.arange(6)
+                self.set_reference(joint, float(reference.coefficients[-1, reference.spline[a]] @ powers))
+
+    def _sampled(self) -> tuple[Array, Array, Array]:
+        """Times, states and outputs of the buffer so far."""
+        run = self._prepared.run
+        rows = int(run.count[ki.SAMPLE])
+        return run.sample_time[:rows].copy(), run.sample[:rows].copy(), run.output[:rows].copy()
+
+    def _refill(self, until: float = -np.inf) -> None:
+        """Move what was sampled to the trace, and give the buffer the times from there on, at least up to ``until``."""
+        run = self._prepared.run
+        taken = self._sampled()
+        if len(taken[0]):
+            self._rows.append(taken)
+            kept = sum(len(times) for times, _, _ in self._rows)
+            while self._trace is not None and kept - len(self._rows[0][0]) >= self._trace:
+                kept -= len(self._rows.popleft()[0])
+        self._next_sample += len(taken[0])
+        times = self._sample_block(until)
+        if len(times) != len(run.sample_time):
+            self._swap(
+                sample_time=times,
+                sample=np.zeros((len(times), run.layout.size)),
+                output=np.zeros((len(times), run.columns.size)),
+            )
+        else:
+            run.sample_time[:] = times
+        run.count[ki.SAMPLE] = 0
+
+    def _sample_block(self, until: float) -> Array:
+        """The next times of samples [s]; infinite ones are never reached."""
+        if self._trace == 0:
+            return np.full(1, np.inf)
+        first, count = self._next_sample, _ROWS
+        if self._times is not None:
+            more = int(np.searchsorted(self._times, until, side="right")) - first
+            found = self._times[first : first + max(count, more + 1)]
+        else:
+            rate = self._scenario.record.rate_hz
+            if math.isfinite(until):
+                count = max(count, int((until - self._start) * rate) + 2 - first)
+            found = self._start + np.arange(first, first + count) / rate
+            found = found[found <= self._end * (1.0 + 1e-12)]
+        # After the last sample the buffer must not hold steps back.
+        return np.concatenate([found, np.full(max(count - len(found), 0) + 1, np.inf)]) if len(found) < count else found
+
+    def _swap(self, **arrays: Any) -> None:
+        """Take other arrays for some of those of the run."""
+        self._prepared = replace(self._prepared, run=self._prepared.run._replace(**arrays))
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """Everything that changes in a run, by name."""
+        prepared, buffers = self._prepared, ("sample_time", "sample", "output")
+        system, found = prepared.system, {}
+        for name, array in prepared.run._asdict().items():
+            if isinstance(array, np.ndarray):
+                found[f"trace.{name}" if name in buffers else f"run.{name}"] = array
+        found |= {f"workspace.{name}": array for name, array in prepared.workspace._asdict().items()}
+        for owner, part in (("drives", system.drives), ("reference", system.reference), ("loads", system.loads)):
+            found |= {f"{owner}.{name}": array for name, array in part._asdict().items()}
+        return found
+
+
+def _index(choices: dict[str, int], name: str, what: str) -> int:
+    if name not in choices:
+        raise ModelError(f"no {what} {shown(name)}; those are: {', '.join(choices) or 'none'}")
+    return choices[name]
+
+
+def _finite(what: str, values: Sequence[Any] | Array) -> Array:
+    array = np.asarray(values, dtype=np.float64)
+    if not np.isfinite(array).all():
+        raise ModelError(f"{what} {array.tolist()} must be finite")
+    return array

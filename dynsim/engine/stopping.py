@@ -1,0 +1,70 @@
+"""Why an integration has stopped before its end, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dynsim.engine.prepare import Prepared
+from dynsim.engine.uniqueness import paradox
+from dynsim.errors import SimulationStopped
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.state import block
+from dynsim.scenario import Scenario
+
+
+def stopped(scenario: Scenario, prepared: Prepared) -> SimulationStopped:
+    """The stop of a run whose STATUS says that it has not come to its end."""
+    run = prepared.run
+    if found := paradox(prepared.system, prepared.workspace, run, prepared.contacts):
+        reached, y, words = found
+        if scenario.integrator.method == "rk4":
+            words += "; a shorter integrator.step_s or an adaptive method (rk43) tells whether the step is to blame"
+        return SimulationStopped(
+            f"stopped at t = {reached:.6g} s: {words}", time=reached, state=last_state(prepared, y)
+        )
+    return SimulationStopped(
+        _reason(scenario, prepared), time=float(run.clock[ki.TIME]), state=last_state(prepared, run.y)
+    )
+
+
+def last_state(prepared: Prepared, y: np.ndarray) -> dict[str, Sequence[float]]:
+    """Positions, rates and currents by name, for a message."""
+    return {name: y[block(prepared.system.layout, name)].tolist() for name in ("q", "v", "current")}
+
+
+def _reason(scenario: Scenario, prepared: Prepared) -> str:
+    run, status = prepared.run, int(prepared.run.count[ki.STATUS])
+    t, method = float(run.clock[ki.TIME]), scenario.integrator.method
+    where = f"stopped at t = {t:.6g} s"
+    if status == ki.NOT_FINITE:
+        advice = (
+            f"take a smaller integrator.step_s than {run.clock[ki.STEP]:g}, or an adaptive method (rk43, rodas4)"
+            if method == "rk4"
+            else "look at the last state for a joint that runs away"
+        )
+        return f"{where}: the state is no longer finite (divergence); {advice}"
+    if status == ki.NO_FORCES:
+        names = ", ".join(contact.name for contact in prepared.contacts)
+        return (
+            f"{where}: no signs of the normal forces at {names} agree with dissipative friction (Painlevé's paradox); "
+            "lower contacts.friction, or take contacts.pulling_friction: signed"
+        )
+    if status == ki.STEP_TOO_SMALL:
+        return (
+            f"{where}: the step size fell to {run.clock[ki.STEP]:.1e} s; try integrator.method rodas4 or a larger rtol"
+        )
+    ws = prepared.workspace
+    gaps = ws.rows[: ws.counts[ka.ROWS], ka.ROW_GAP]
+    worst = int(np.argmax(np.abs(gaps)))
+    owner = int(ws.active[worst, ka.OWNER])
+    if ws.active[worst, ka.ROW_KIND] == ka.JOINT_ROW:
+        coupling = prepared.model.robot.couplings[owner]
+        what = f"joint {coupling.joint} cannot be kept where {coupling.leader} leads it (off by {gaps[worst]:+.2e})"
+    else:
+        what = f"contact {prepared.contacts[owner].name} cannot be kept on its surface (gap {gaps[worst]:+.2e} m)"
+    return f"{where}: {what}; the contacts contradict each other or the arm is singular here" + (
+        ", or integrator.step_s is too long (try integrator.method: rk43)" if method == "rk4" else ""
+    )

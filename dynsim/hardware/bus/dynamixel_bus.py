@@ -1,0 +1,236 @@
+"""Dynamixel servos through the unmodified client library (dynamixel-sdk 4.1.0), on real and virtual ports alike.
+
+What the library does not survive, and what is done about it here (tests/hardware/test_sdk_defects.py holds a canary for
+each: when one fails, the library was mended and the detour can go):
+
+- A read that is interrupted leaves ``port.is_using`` set, and every later write is dropped: it is cleared before each
+  transaction, and signals only set a flag.
+- One lost status costs a time-out and hides all servos behind it: the sync read takes the bytes itself, decodes all
+  that come, and keys them by ID. The library's receive loop would also swallow the status after a cut one.
+- Group reads drop the error byte: the decoder keeps it.
+- Byte stuffing of requests is lost, some stuffed answers are mangled: a request whose body holds FF FF FD is rejected
+  here, answers of a wrong length count as garbled, and Fast Sync Read is never used.
+- ``getData`` knows no negative numbers: fields decode themselves.
+- A dead port raises termios.error or OSError beside SerialException; a stalled one blocks: all become PortError, and
+  writes have a time-out.
+"""
+
+from __future__ import annotations
+
+import errno
+import select
+import termios
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import serial
+from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PortHandler, Protocol2PacketHandler
+
+from dynsim.hardware.bus.control_table import BROADCAST_ID, Field
+from dynsim.hardware.bus.packet import ALERT, HEADER, STATUS, Decoder, StatusError
+from dynsim.hardware.bus.protocol import BlockRead, NoAnswer, RequestRefused, ServoReply
+from dynsim.hardware.errors import PortError
+
+WRITE_TIMEOUT = 0.25
+READ_WAIT = 5e-4
+"""Longest wait for a byte before time-outs are looked at [s]."""
+RETRIES = 2
+"""Further attempts of a single read or write; the timed loop makes none."""
+TORQUE_ENABLE = 64
+
+
+class SerialPort(PortHandler):
+    """The library's port, opened with a write time-out and (by default) for this process alone."""
+
+    def __init__(self, name: str, *, exclusive: bool = True) -> None:
+        super().__init__(name)
+        self.is_open = False
+        self.exclusive = exclusive
+
+    def setupPort(self, cflag_baud: int) -> bool:
+        if self.is_open:
+            self.closePort()
+        self.ser = serial.Serial(
+            port=self.port_name,
+            baudrate=self.baudrate,
+            bytesize=serial.EIGHTBITS,
+            timeout=0,
+            write_timeout=WRITE_TIMEOUT,
+            exclusive=self.exclusive or None,
+        )
+        self.is_open = True
+        self.ser.reset_input_buffer()
+        self.tx_time_per_byte = 1e3 / self.baudrate * 10.0
+        return True
+
+    def readPort(self, length: int) -> bytes:
+        # A short wait instead of the library's busy loop: it leaves the processor to others.
+        select.select([self.ser.fileno()], [], [], READ_WAIT)
+        return self.ser.read(length)
+
+
+def open_serial_port(name: str, baud: int, *, exclusive: bool = True) -> SerialPort:
+    """Open a serial port.
+
+    Raises
+    ------
+    PortError
+        No such port, no permission, held by another process, or a baud rate the library refuses.
+    """
+    port = SerialPort(name, exclusive=exclusive)
+    try:
+        opened = port.setBaudRate(baud)
+    except (OSError, termios.error, ValueError) as error:
+        raise PortError(f"{name}: {_why_not_opened(error)}") from error
+    if not opened:
+        raise PortError(f"{name}: the client library refuses {baud} bit/s")
+    return port
+
+
+def _why_not_opened(error: Exception) -> str:
+    text = str(error).lower()
+    number = getattr(error, "errno", None)
+    if "exclusively lock" in text or number == errno.EAGAIN:
+        return "in use by another process (a replay? `dynsim hw stop` works beside it)"
+    if number == errno.ENOENT or "no such file" in text:
+        return "no such port; is the adapter plugged in?"
+    if number == errno.EACCES or "permission denied" in text:
+        return "permission denied; on Linux join the group dialout"
+    return f"cannot be opened ({error})"
+
+
+def latency_timer(port_name: str) -> int | None:
+    """Latency timer of a USB serial adapter [ms], None where the system does not say (Linux FTDI driver only)."""
+    entry = Path("/sys/bus/usb-serial/devices") / Path(port_name).resolve().name / "latency_timer"
+    try:
+        return int(entry.read_text())
+    except (OSError, ValueError):
+        return None
+
+
+class DynamixelBus:
+    """Servos on one port.
+
+    Parameters
+    ----------
+    port : dynamixel_sdk.PortHandler
+        Open; a :class:`SerialPort` or a virtual one.
+    latency : float
+        What adapter and operating system may add to an answer [s].
+    return_delay : float
+        Longest return delay of a servo [s].
+    """
+
+    def __init__(self, port: Any, *, latency: float = 2e-3, return_delay: float = 508e-6) -> None:
+        self.port = port
+        self.latency = latency
+        self.return_delay = return_delay
+        self._library = Protocol2PacketHandler()
+
+    @property
+    def name(self) -> str:
+        return str(self.port.getPortName())
+
+    def ping_all(self) -> dict[int, tuple[int, int]]:
+        with self._transaction():
+            found, _ = self._library.broadcastPing(self.port)
+        return {id_: (model, firmware) for id_, (model, firmware) in found.items()}
+
+    def read(self, id_: int, field: Field) -> int:
+        return field.decode(self.read_block(id_, field.address, field.size).data)
+
+    def read_block(self, id_: int, address: int, length: int, *, retries: int = RETRIES) -> ServoReply:
+        for _ in range(retries + 1):
+            with self._transaction():
+                data, result, error = self._library.readTxRx(self.port, id_, address, length)
+            if result == COMM_SUCCESS and len(data) == length:
+                break
+        else:
+            raise NoAnswer(id_, garbled=result != COMM_RX_TIMEOUT)
+        self._raise_refusal(id_, error)
+        return ServoReply(bytes(data), bool(error & ALERT))
+
+    def write(self, id_: int, field: Field, value: int) -> None:
+        data = list(field.encode(value))
+        self._reject_header(bytes([field.address & 0xFF, field.address >> 8, *data]))
+        for _ in range(RETRIES + 1):
+            with self._transaction():
+                result, error = self._library.writeTxRx(self.port, id_, field.address, field.size, data)
+            if result == COMM_SUCCESS:
+                self._raise_refusal(id_, error)
+                return
+        raise NoAnswer(id_, garbled=result != COMM_RX_TIMEOUT)
+
+    def sync_write(self, field: Field, values: dict[int, int]) -> None:
+        body = b"".join(bytes([id_]) + field.encode(value) for id_, value in values.items())
+        head = field.address.to_bytes(2, "little") + field.size.to_bytes(2, "little")
+        self._reject_header(head + body)
+        with self._transaction():
+            result = self._library.syncWriteTxOnly(self.port, field.address, field.size, list(body), len(body))
+        if result != COMM_SUCCESS:
+            raise PortError(f"{self.name}: {self._library.getTxRxResult(result)}")
+
+    def sync_read(self, ids: Sequence[int], address: int, length: int) -> BlockRead:
+        with self._transaction():
+            stray = self.port.getBytesAvailable()
+            result = self._library.syncReadTx(self.port, address, length, list(ids), len(ids), False)
+            if result != COMM_SUCCESS:
+                raise PortError(f"{self.name}: {self._library.getTxRxResult(result)}")
+            answer_bytes = len(ids) * (11 + length)
+            milliseconds = self.port.tx_time_per_byte * (answer_bytes + 14 + len(ids))
+            milliseconds += 1e3 * (len(ids) * (self.return_delay + 50e-6) + self.latency)
+            self.port.setPacketTimeoutMillis(milliseconds)
+            replies: dict[int, ServoReply] = {}
+            decoder = Decoder()
+            while len(replies) < len(ids) and not self.port.isPacketTimeout():
+                for packet in decoder.feed(self.port.readPort(answer_bytes)):
+                    self._sort_in(packet, ids, length, replies)
+            # What came while this process was not running is here, however late it is.
+            late = self.port.getBytesAvailable()
+            arrived = [*decoder.feed(self.port.readPort(late))] if late else []
+            for packet in [*arrived, *decoder.flush()]:
+                self._sort_in(packet, ids, length, replies)
+        return BlockRead(replies, stray + decoder.garbage)
+
+    @staticmethod
+    def _sort_in(packet: Any, ids: Sequence[int], length: int, replies: dict[int, ServoReply]) -> None:
+        # Requests echoed by the adapter are no status; a wrong length is a stale answer to another request.
+        if packet.instruction == STATUS and packet.id in ids and len(packet.parameters) == length:
+            replies[packet.id] = ServoReply(packet.parameters, bool(packet.error & ALERT))
+
+    def torque_off_all(self) -> None:
+        for _ in range(3):
+            with self._transaction():
+                self._library.write1ByteTxOnly(self.port, BROADCAST_ID, TORQUE_ENABLE, 0)
+
+    def close(self) -> None:
+        try:
+            self.port.closePort()
+        except (OSError, termios.error):
+            # A port that is gone needs no closing.
+            return
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        self.port.is_using = False
+        try:
+            yield
+        except (serial.SerialException, OSError, termios.error, TypeError) as error:
+            # pyserial raises TypeError where its descriptor was closed under it.
+            raise PortError(f"{self.name}: the port died ({error})") from error
+        finally:
+            self.port.is_using = False
+
+    def _raise_refusal(self, id_: int, error: int) -> None:
+        code = error & ~ALERT
+        if code != StatusError.NONE:
+            raise RequestRefused(id_, code, self._library.getRxPacketError(code))
+
+    @staticmethod
+    def _reject_header(body: bytes) -> None:
+        if HEADER in body:
+            raise ValueError(
+                f"a request must not hold FF FF FD, the client library would send it unstuffed: {body.hex(' ')}"
+            )

@@ -1,0 +1,99 @@
+"""What the replay needs of a bus, and what a servo answers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from dynsim.hardware.bus.control_table import Field
+
+
+@dataclass(frozen=True)
+class ServoReply:
+    """Contents of one status packet.
+
+    Attributes
+    ----------
+    data : bytes
+    alert : bool
+        The servo's hardware error register is not zero.
+    """
+
+    data: bytes
+    alert: bool
+
+
+@dataclass(frozen=True)
+class BlockRead:
+    """What one sync read brought in.
+
+    Attributes
+    ----------
+    replies : dict[int, ServoReply]
+        By ID; a servo that did not answer in time is absent.
+    stray_bytes : int
+        Bytes that were already waiting before the request, and garbage between the answers.
+    """
+
+    replies: dict[int, ServoReply]
+    stray_bytes: int
+
+
+class NoAnswer(Exception):
+    """A servo did not answer a request, or its answer was garbled.
+
+    Attributes
+    ----------
+    id : int
+    garbled : bool
+        Something came, but no valid packet: two servos with one ID look like this.
+    """
+
+    def __init__(self, id_: int, *, garbled: bool) -> None:
+        super().__init__(f"ID {id_}: {'garbled answer' if garbled else 'no answer'}")
+        self.id = id_
+        self.garbled = garbled
+
+
+class RequestRefused(Exception):
+    """A servo answered with an error code (:class:`dynsim.hardware.bus.packet.StatusError`)."""
+
+    def __init__(self, id_: int, code: int, text: str) -> None:
+        super().__init__(f"ID {id_}: {text}")
+        self.id = id_
+        self.code = code
+
+
+class Bus(Protocol):
+    """A line with servos. Every method may raise PortError when the port itself is gone."""
+
+    def ping_all(self) -> dict[int, tuple[int, int]]:
+        """Model number and firmware by ID of everything that answers a broadcast ping."""
+        ...
+
+    def read(self, id_: int, field: Field) -> int:
+        """One item. Raises NoAnswer or RequestRefused."""
+        ...
+
+    def read_block(self, id_: int, address: int, length: int) -> ServoReply:
+        """Consecutive bytes. Raises NoAnswer or RequestRefused."""
+        ...
+
+    def write(self, id_: int, field: Field, value: int) -> None:
+        """Write one item and wait for the acknowledgement. Raises NoAnswer or RequestRefused."""
+        ...
+
+    def sync_write(self, field: Field, values: dict[int, int]) -> None:
+        """Write one item of many servos at once; nobody acknowledges."""
+        ...
+
+    def sync_read(self, ids: Sequence[int], address: int, length: int) -> BlockRead:
+        """Read the same bytes of many servos; whoever does not answer in time is absent."""
+        ...
+
+    def torque_off_all(self) -> None:
+        """Broadcast torque off, three times, whatever the state of the port."""
+        ...
+
+    def close(self) -> None: ...

@@ -1,0 +1,57 @@
+"""The bus behind the name of a port."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from dynsim.hardware.bus.clock import Clock, VirtualClock, WallClock
+from dynsim.hardware.bus.dynamixel_bus import DynamixelBus, latency_timer, open_serial_port
+from dynsim.hardware.errors import VerificationFailed
+from dynsim.hardware.servo_map import ServoMap
+from dynsim.hardware.virtual.faults import FaultScript
+from dynsim.hardware.virtual.line import line_for_map
+from dynsim.hardware.virtual.port import VirtualPort
+
+VIRTUAL = "virtual"
+PSEUDO_TERMINAL_LATENCY = 0.05
+"""Servos behind a pseudo-terminal are a program, which a busy computer may not run for a while [s]."""
+
+
+@contextmanager
+def bus_on(
+    port: str, servo_map: ServoMap, *, script: FaultScript | None = None, plant: Any = None
+) -> Iterator[tuple[DynamixelBus, Clock]]:
+    """The bus behind a port name, "virtual" being servos in memory on a virtual clock.
+
+    Raises
+    ------
+    PortError
+        The port cannot be opened.
+    VerificationFailed
+        The adapter's latency timer is too long for the loop.
+    """
+    clock: Clock
+    if port == VIRTUAL:
+        clock = VirtualClock()
+        line = line_for_map(servo_map, script=script, plant=plant)
+        handler: Any = VirtualPort(line, clock, baud=servo_map.bus.baud)
+    else:
+        clock = WallClock()
+        timer = latency_timer(port)
+        if timer is not None and timer > 1:
+            raise VerificationFailed(
+                f"{port}: the adapter's latency timer is {timer} ms, the loop needs 1 ms: "
+                f"echo 1 | sudo tee /sys/bus/usb-serial/devices/{Path(port).resolve().name}/latency_timer"
+            )
+        handler = open_serial_port(port, servo_map.bus.baud)
+    latency = servo_map.bus.latency
+    if port != VIRTUAL and str(Path(port).resolve()).startswith("/dev/pts/"):
+        latency = max(latency, PSEUDO_TERMINAL_LATENCY)
+    bus = DynamixelBus(handler, latency=latency, return_delay=servo_map.bus.return_delay)
+    try:
+        yield bus, clock
+    finally:
+        bus.close()

@@ -1,0 +1,228 @@
+"""The offline check: would this record, at this speed and rate, ask anything of a servo that it must not do?
+
+Every interval between samples is examined for the extremes of its interpolant. Nothing is ever clamped: a motion
+outside of the limits is refused as a whole, before a port is opened.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from dynsim.hardware.bus.control_table import HEALTH_BLOCK, STATE_BLOCK, TICKS_PER_TURN
+from dynsim.hardware.errors import CheckRefused
+from dynsim.hardware.replay.trajectory import Path, column_of, path_of_record
+from dynsim.hardware.servo_map import Servo, ServoMap
+from dynsim.record import Record
+
+BITS_PER_BYTE = 10
+TURNAROUND = 50e-6
+"""Planned time per status beyond its bytes and return delay [s] (unverified; servos and adapter both contribute)."""
+USB_TRANSACTION = 1e-3
+"""Planned cost of waiting for an answer through a USB adapter with its latency timer at 1 ms [s]."""
+BUS_SHARE = 0.97
+"""Largest part of the period the bus may be busy."""
+
+
+ROUNDING = 1e-9
+"""A joint of a record that rests at its very limit may be off by rounding of this size; a tick is 1.5e-3 rad."""
+
+
+@dataclass(frozen=True)
+class Margin:
+    """The tightest place of one joint against one limit.
+
+    Attributes
+    ----------
+    quantity : "position", "velocity" or "torque"
+    value, limit, margin : float
+        SI; a negative margin is a violation.
+    time : float
+        Where [s of record time].
+    """
+
+    joint: str
+    quantity: Literal["position", "velocity", "torque"]
+    value: float
+    limit: float
+    margin: float
+    time: float
+
+    @property
+    def unit(self) -> str:
+        return {"position": "rad", "velocity": "rad/s", "torque": "N m"}[self.quantity]
+
+    def __str__(self) -> str:
+        unit = self.unit
+        return (
+            f"{self.joint}: {self.quantity} {self.value:.4f} {unit} at t = {self.time:.3f} s, "
+            f"limit {self.limit:.4f} {unit}, margin {self.margin:+.4f} {unit}"
+        )
+
+
+@dataclass(frozen=True)
+class CyclePlan:
+    """How the bus's time is spent.
+
+    Attributes
+    ----------
+    rate : float
+        Cycles per second [Hz].
+    cycle_time : float
+        Planned duration of writing all goals and reading all states [s].
+    health_time : float
+        Planned duration of one health read [s].
+    health_every : int
+        One servo's health is read every so many cycles.
+    """
+
+    rate: float
+    cycle_time: float
+    health_time: float
+    health_every: int
+
+
+@dataclass(frozen=True)
+class CheckedMotion:
+    """A motion that passed: what the replay runs on.
+
+    Attributes
+    ----------
+    path : Path
+    speed : float
+        Path seconds per second.
+    plan : CyclePlan
+    margins : tuple of Margin
+        Tightest place per joint and limit.
+    warnings : tuple of str
+    """
+
+    path: Path
+    speed: float
+    plan: CyclePlan
+    margins: tuple[Margin, ...]
+    warnings: tuple[str, ...]
+
+
+def check_motion(
+    record: Record, servo_map: ServoMap, *, rate: float | None = None, speed: float = 1.0
+) -> CheckedMotion:
+    """Examine a whole record against the limits of the map, the servos' data sheets and the bus.
+
+    Parameters
+    ----------
+    record : Record
+    servo_map : ServoMap
+    rate : float, optional
+        Goal rate [Hz]; the map's if not given.
+    speed : float
+        1 replays in the record's own time, 0.5 takes twice as long.
+
+    Raises
+    ------
+    CheckRefused
+        With every violated limit: joint, value, time and margin.
+    """
+    if not (math.isfinite(speed) and speed > 0):
+        raise CheckRefused(f"--speed must be positive, not {speed}")
+    plan = plan_cycle(servo_map, rate if rate is not None else servo_map.bus.rate)
+    path = path_of_record(record, servo_map)
+    margins = _motion_margins(path, servo_map, speed) + _torque_margins(record, servo_map)
+    violations = [margin for margin in margins if margin.margin < -ROUNDING]
+    if violations:
+        lines = [f"{len(violations)} limit(s) violated, nothing was sent:", *(f"  {entry}" for entry in violations)]
+        if all(entry.quantity == "velocity" for entry in violations):
+            slower = speed * min(entry.limit / abs(entry.value) for entry in violations)
+            lines.append(f"  --speed {math.floor(100 * slower) / 100:g} would pass")
+        raise CheckRefused("\n".join(lines))
+    warnings = [] if record.complete else ["the record is marked incomplete: it ends before its scenario does"]
+    return CheckedMotion(path, speed, plan, tuple(margins), tuple(warnings))
+
+
+def plan_cycle(servo_map: ServoMap, rate: float) -> CyclePlan:
+    """Time budget of one cycle.
+
+    Raises
+    ------
+    CheckRefused
+        The bus cannot carry that rate.
+    """
+    if not (math.isfinite(rate) and rate > 0):
+        raise CheckRefused(f"--rate must be positive, not {rate}")
+    count = len(servo_map.servos)
+    groups = [sum(servo.in_position_mode is mode for servo in servo_map.servos) for mode in (True, False)]
+    written = sum(14 + 5 * members for members in groups if members)
+    read = 14 + count + count * (11 + STATE_BLOCK[1])
+    byte_time = BITS_PER_BYTE / servo_map.bus.baud
+    per_status = servo_map.bus.return_delay + TURNAROUND
+    cycle_time = (written + read) * byte_time + count * per_status + USB_TRANSACTION
+    health_time = (14 + 11 + HEALTH_BLOCK[1]) * byte_time + per_status + USB_TRANSACTION
+    available = BUS_SHARE / rate - cycle_time
+    if available <= 0:
+        highest = math.floor(BUS_SHARE / (cycle_time + 0.1 * health_time))
+        raise CheckRefused(
+            f"{count} servos at {servo_map.bus.baud / 1e6:g} Mbit/s need {cycle_time * 1e3:.2f} ms a cycle; "
+            f"{rate:g} Hz leaves {1e3 / rate:.2f} ms. Use --rate {highest} or less, or a higher baud rate"
+        )
+    return CyclePlan(rate, cycle_time, health_time, max(1, math.ceil(health_time / available)))
+
+
+def _motion_margins(path: Path, servo_map: ServoMap, speed: float) -> list[Margin]:
+    extremes = path.extremes()
+    margins = []
+    for column, servo in enumerate(servo_map.servos):
+        if servo.in_position_mode:
+            position, at = extremes.position[..., column].ravel(), extremes.position_time[..., column].ravel()
+            low, high = _position_limits(servo)
+            below, above = int(position.argmin()), int(position.argmax())
+            if position[below] - low < high - position[above]:
+                margins.append(_margin(servo, "position", position[below], low, position[below] - low, at[below]))
+            else:
+                margins.append(_margin(servo, "position", position[above], high, high - position[above], at[above]))
+        velocity = extremes.velocity[..., column].ravel() * speed
+        at = extremes.velocity_time[..., column].ravel()
+        fastest = int(np.abs(velocity).argmax())
+        limit = velocity_limit(servo)
+        margins.append(
+            _margin(servo, "velocity", velocity[fastest], limit, limit - abs(velocity[fastest]), at[fastest])
+        )
+    return margins
+
+
+def _margin(
+    servo: Servo,
+    quantity: Literal["position", "velocity", "torque"],
+    value: float,
+    limit: float,
+    margin: float,
+    at: float,
+) -> Margin:
+    return Margin(servo.joint, quantity, float(value), float(limit), float(margin), float(at))
+
+
+def _position_limits(servo: Servo) -> tuple[float, float]:
+    """Limits of the map, narrowed to the single turn position mode knows [rad]."""
+    turn = sorted((servo.to_angle(0), servo.to_angle(TICKS_PER_TURN - 1)))
+    return max(servo.position_limits[0], turn[0]), min(servo.position_limits[1], turn[1])
+
+
+def velocity_limit(servo: Servo) -> float:
+    """Joint speed limit [rad/s]: the map's, or the model's no-load speed where that is lower."""
+    return min(servo.kind.limits.velocity, servo.model.no_load_speed / servo.gear)
+
+
+def _torque_margins(record: Record, servo_map: ServoMap) -> list[Margin]:
+    margins = []
+    for servo in servo_map.servos:
+        signal = servo.kind.follows.torque
+        if signal is None or servo.hold_at is not None:
+            continue
+        torque = column_of(record, signal, servo, "N m")
+        highest = int(np.abs(torque).argmax())
+        limit = servo.kind.limits.torque
+        at = record.time[highest] - record.time[0]
+        margins.append(_margin(servo, "torque", torque[highest], limit, limit - abs(torque[highest]), at))
+    return margins

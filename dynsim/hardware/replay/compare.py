@@ -1,0 +1,267 @@
+"""How far a measured run is from the simulated one: delay, error with and without it, joint by joint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.optimize import minimize_scalar
+
+from dynsim.errors import RecordError, shown
+from dynsim.files import replacing
+from dynsim.hardware.errors import ComparisonGateFailed
+from dynsim.hardware.replay.states import State
+from dynsim.hardware.servo_map import StrictModel, read_yaml
+from dynsim.record import Record
+
+Array = NDArray[np.float64]
+MAX_DELAY = 0.5
+"""Longest delay looked for [s]."""
+MOVING = 1e-3
+"""A joint that moves less than this [rad] says nothing about delay."""
+Bound = Annotated[float, Field(gt=0)]
+
+
+class Gate(StrictModel):
+    """What a comparison must not exceed.
+
+    Attributes
+    ----------
+    rms_rad, max_rad : float or None
+        Error of the worst joint, delay not taken out [rad].
+    rms_delay_removed_rad : float or None
+        The same with the common delay taken out [rad].
+    delay_s : float or None
+    """
+
+    rms_rad: Bound | None = None
+    max_rad: Bound | None = None
+    rms_delay_removed_rad: Bound | None = None
+    delay_s: Bound | None = None
+
+
+@dataclass(frozen=True)
+class JointError:
+    """Measured minus simulated angle of one joint [rad]; ``delay`` [s] is NaN where none explains the error."""
+
+    joint: str
+    rms: float
+    max: float
+    time_of_max: float
+    rms_delay_removed: float
+    delay: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Simulated and measured angles on the measured run's times.
+
+    Attributes
+    ----------
+    delay : float
+        By which the measured run lags, common to all joints [s]; 0 where no delay explains the error.
+    joints : tuple of JointError
+    time : array, shape (T,)
+        Record time [s].
+    simulated, measured : array, shape (T, N)
+        [rad].
+    """
+
+    delay: float
+    joints: tuple[JointError, ...]
+    time: Array
+    simulated: Array
+    measured: Array
+
+    @property
+    def worst(self) -> JointError:
+        """The joint with the largest rms."""
+        return max(self.joints, key=lambda joint: joint.rms)
+
+    def summary(self) -> dict[str, Any]:
+        """Numbers for JSON; units in the names."""
+        joints = {
+            joint.joint: {
+                "rms_rad": joint.rms,
+                "max_rad": joint.max,
+                "rms_delay_removed_rad": joint.rms_delay_removed,
+                "delay_s": None if np.isnan(joint.delay) else joint.delay,
+            }
+            for joint in self.joints
+        }
+        return {
+            "delay_s": self.delay,
+            "rms_rad": self.worst.rms,
+            "max_rad": max(joint.max for joint in self.joints),
+            "rms_delay_removed_rad": max(joint.rms_delay_removed for joint in self.joints),
+            "worst_joint": self.worst.joint,
+            "joints": joints,
+        }
+
+
+def compare_records(simulated: Record, measured: Record) -> Comparison:
+    """Compare every joint angle the two records share.
+
+    ``measured`` may be a measured run (its ``record_time`` ties it to the simulated one) or any other record. Wheels
+    are left out: where they stand after a run says nothing about the replay.
+
+    Raises
+    ------
+    RecordError
+        No common angles, no sample of the replayed motion, or a measured run that is not as a replay makes them.
+    """
+    for name in ("state", "record_time"):
+        if name in measured and measured[name].shape != measured.time.shape:
+            raise RecordError(
+                f"signal {name!r} of the measured run has shape {measured[name].shape}; it has one column"
+            )
+    speed = measured.provenance.get("speed", 1.0)
+    if not isinstance(speed, (int, float)) or not 0.0 < speed < np.inf:
+        raise RecordError(f"the provenance of the measured run says speed {shown(speed)}; a replay has a positive one")
+    rows = measured["state"] == State.REPLAY if "state" in measured else np.ones(len(measured), dtype=bool)
+    time = measured["record_time"] if "record_time" in measured else measured.time  # noqa: SIM401
+    rows &= np.isfinite(time) & (time >= 0) & (time <= simulated.time[-1] - simulated.time[0])
+    if rows.sum() < 2:
+        raise RecordError("the measured record holds no sample of the replayed motion")
+    pairs = _common_angles(simulated, measured)
+    if not pairs:
+        raise RecordError("the records share no joint angles: signals in rad with the same name and column labels")
+    labels = tuple(label for label, _, _ in pairs)
+    actual = np.column_stack([data[rows] for _, _, data in pairs])
+    reference = np.column_stack([data for _, data, _ in pairs])
+    own_time, time = simulated.time - simulated.time[0], time[rows]
+
+    def at(times: Array) -> Array:
+        return np.column_stack([np.interp(times, own_time, column) for column in reference.T])
+
+    moving = np.ptp(reference, axis=0) > MOVING
+    common = _delay(at, time, actual, moving)
+    delay = 0.0 if np.isnan(common) else common
+    joints = []
+    for column, label in enumerate(labels):
+        error = actual[:, column] - at(time)[:, column]
+        shifted = actual[:, column] - at(time - delay)[:, column]
+        only = np.zeros_like(moving)
+        only[column] = moving[column]
+        worst = int(np.nanargmax(np.abs(error)))
+        joints.append(
+            JointError(
+                joint=label,
+                rms=float(np.sqrt(np.nanmean(error**2))),
+                max=float(abs(error[worst])),
+                time_of_max=float(time[worst]),
+                rms_delay_removed=float(np.sqrt(np.nanmean(shifted**2))),
+                delay=_delay(at, time, actual, only) / speed,
+            )
+        )
+    return Comparison(delay / speed, tuple(joints), time, at(time), actual)
+
+
+def _common_angles(simulated: Record, measured: Record) -> list[tuple[str, Array, Array]]:
+    pairs = []
+    for name, signal in simulated.signals.items():
+        if signal.unit != "rad" or name not in measured or name == "rho":
+            continue
+        if signal.data.ndim != 2 or measured[name].ndim != 2:
+            continue
+        theirs = measured.labels[name]
+        for column, label in enumerate(signal.labels):
+            if label in theirs:
+                data = np.asarray(measured[name][:, theirs.index(label)], dtype=np.float64)
+                if np.isfinite(data).any():
+                    pairs.append((label, np.asarray(signal.data[:, column], dtype=np.float64), data))
+    return pairs
+
+
+def _delay(at: Any, time: Array, actual: Array, columns: NDArray[np.bool_]) -> float:
+    """Shift of the simulated angles that fits the measured ones best [s of record time].
+
+    NaN where none in the range explains half of the mean square error: then the error is sag or play, not delay.
+    """
+    if not columns.any():
+        return float("nan")
+
+    def misfit(delay: float) -> float:
+        error = (actual - at(time - delay))[:, columns]
+        # A joint that sags under its load is off by a constant; that is no delay.
+        return float(np.nanmean((error - np.nanmean(error, axis=0)) ** 2))
+
+    grid = np.linspace(-0.1, MAX_DELAY, 61)
+    nearest = int(np.argmin([misfit(delay) for delay in grid]))
+    if nearest in (0, len(grid) - 1):
+        return float("nan")
+    best, step = grid[nearest], grid[1] - grid[0]
+    return float(
+        minimize_scalar(misfit, bounds=(best - step, best + step), method="bounded", options={"xatol": 1e-5}).x
+    )
+
+
+def load_gate(path: str | Path) -> Gate:
+    """Read a gate file.
+
+    Raises
+    ------
+    ServoMapError
+        Missing file, bad YAML or bad entry, with file and line.
+    """
+    return read_yaml(Path(path), Gate)
+
+
+def check_gate(comparison: Comparison, gate: Gate) -> None:
+    """Hold a comparison against a gate.
+
+    Raises
+    ------
+    ComparisonGateFailed
+        With every bound exceeded.
+    """
+    found = comparison.summary()
+    exceeded = [
+        f"{name} {found[name]:.4g} > {bound:.4g}"
+        for name, bound in gate.model_dump().items()
+        if bound is not None and found[name] > bound
+    ]
+    if exceeded:
+        raise ComparisonGateFailed(f"gate failed (worst joint {comparison.worst.joint}): {', '.join(exceeded)}")
+
+
+def draw_comparison(comparison: Comparison, path: Path) -> Path:
+    """Figure: angles of the four worst joints, and every joint's error over time."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 7), layout="constrained")
+    FigureCanvasAgg(figure)
+    angles, errors = figure.subplots(2, 1, sharex=True)
+    ranking = sorted(range(len(comparison.joints)), key=lambda k: -comparison.joints[k].rms)
+    for colour, k in enumerate(ranking[:4]):
+        label = comparison.joints[k].joint
+        angles.plot(comparison.time, comparison.simulated[:, k], "--", color=f"C{colour}", linewidth=1)
+        angles.plot(comparison.time, comparison.measured[:, k], color=f"C{colour}", linewidth=1.2, label=label)
+    angles.set_ylabel("joint angle [rad]")
+    angles.set_title(
+        f"measured (solid) and simulated (dashed); delay {comparison.delay * 1e3:.1f} ms, worst joint "
+        f"{comparison.worst.joint}: rms {comparison.worst.rms:.4f} rad",
+        fontsize=10,
+    )
+    angles.legend(loc="upper right", fontsize=8)
+    for k in reversed(ranking):
+        strong = k in ranking[:4]
+        colour_name = f"C{ranking.index(k)}" if strong else "0.75"
+        errors.plot(
+            comparison.time,
+            1e3 * (comparison.measured[:, k] - comparison.simulated[:, k]),
+            color=colour_name,
+            linewidth=1.1 if strong else 0.7,
+        )
+    errors.set_ylabel("measured − simulated [mrad]")
+    errors.set_xlabel("record time [s]")
+    for axes in (angles, errors):
+        axes.grid(alpha=0.3)
+    with replacing(path) as stream:
+        figure.savefig(stream, format="png", dpi=140)
+    return path

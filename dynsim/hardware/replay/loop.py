@@ -1,0 +1,227 @@
+"""The cycle of a replay: at every deadline all goals are written and all states read, recorded and examined.
+
+Cycles start at absolute deadlines; one that is more than a period late is skipped, never made up for.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.hardware.bus.clock import Clock
+from dynsim.hardware.bus.control_table import HEALTH_BLOCK, MX_106, RAD_PER_TICK, STATE_BLOCK
+from dynsim.hardware.bus.protocol import Bus
+from dynsim.hardware.replay.check import CheckedMotion, velocity_limit
+from dynsim.hardware.replay.journal import Journal
+from dynsim.hardware.replay.motion import Motion
+from dynsim.hardware.replay.rules import AbortRules, Cause, Cycle, Fault, decode_health
+from dynsim.hardware.replay.run_log import Recorder
+from dynsim.hardware.replay.states import State, Stopped, StopRequest
+from dynsim.hardware.servo_map import ServoMap
+
+Array = NDArray[np.float64]
+
+FIELDS = MX_106.fields
+"""Items the two models share have the same address in both."""
+
+
+class Loop:
+    """Goals out, measurements in, cycle by cycle.
+
+    Attributes
+    ----------
+    map : ServoMap
+    bus : Bus
+    stop : StopRequest
+    rules : AbortRules
+    period : float
+        [s].
+    goal, goal_rate : array, shape (N,)
+        Commanded last [rad], [rad/s].
+    measured : array, shape (N,)
+        Where every joint was seen last [rad].
+    origin, tick :
+        Clock time [s] of the first deadline, and the number of the last one.
+    following, following_time, following_end, following_speed :
+        The motion that is followed, its time reached and its last [s], and how much of it passes per second.
+    path_started : float or None
+        Clock time [s] of path time 0, once the replay of the path began.
+    policy_goals : list
+        (clock time, ID, register value) of every goal sent after a fault.
+    """
+
+    def __init__(
+        self,
+        motion: CheckedMotion,
+        servo_map: ServoMap,
+        bus: Bus,
+        clock: Clock,
+        stop: StopRequest,
+        recorder: Recorder,
+        journal: Journal,
+    ) -> None:
+        self.map = servo_map
+        self.bus = bus
+        self.stop = stop
+        self.rules = AbortRules(servo_map, motion.plan)
+        self.period = 1.0 / motion.plan.rate
+        count = len(servo_map.servos)
+        self.goal, self.goal_rate = np.zeros(count), np.zeros(count)
+        self.measured = np.zeros(count)
+        self.origin = clock.now()
+        self.tick = 0
+        self.following: Motion | None = None
+        self.following_time = self.following_end = self.following_speed = 0.0
+        self.path_started: float | None = None
+        self.policy_goals: list[tuple[float, int, int]] = []
+        self._clock = clock
+        self._recorder = recorder
+        self._journal = journal
+        self._in_position_mode = np.array([servo.in_position_mode for servo in servo_map.servos])
+        self._health_every = motion.plan.health_every
+        self._cycles = 0
+        self._sent: dict[int, int] = {}
+        self._sent_at = math.nan
+
+    def take_over(self, index: int, register: int, angle: float) -> None:
+        """A servo was armed where it is: at the goal ``register``, at a joint angle [rad]."""
+        self._sent[self.map.servos[index].id] = register
+        self.goal[index] = self.measured[index] = angle
+
+    def all_taken_over(self) -> None:
+        self._sent_at = self._clock.now()
+
+    def begin(self) -> None:
+        """Deadlines count from now."""
+        self.origin, self.tick = self._clock.now(), 0
+
+    def deadline_of(self, tick: int) -> float:
+        return self.origin + tick * self.period
+
+    def wait_for_deadline(self) -> tuple[float, int]:
+        """Sleep until the next cycle is due; its lateness [s] and the number of cycles skipped."""
+        self.tick += 1
+        behind = math.floor((self._clock.now() - self.deadline_of(self.tick)) / self.period)
+        skipped = max(0, behind)
+        self.tick += skipped
+        self._clock.sleep_until(self.deadline_of(self.tick))
+        return self._clock.now() - self.deadline_of(self.tick) + skipped * self.period, skipped
+
+    def follow(self, motion: Motion, start: float, end: float, *, speed: float) -> None:
+        """Run along a motion from its time ``start`` to ``end`` [s], ``speed`` of it per second."""
+        first = self.tick + 1
+        self.following, self.following_end, self.following_speed = motion, end, speed
+        self.following_time = start
+        while self.following_time < end:
+            lateness, skipped = self.wait_for_deadline()
+            # Scheduled, not actual time: jitter of the loop must not enter the goals.
+            self.following_time = min(end, start + speed * self.period * (self.tick - first + 1))
+            position, rate = motion.at(self.following_time)
+            self.stop.check()
+            self._cycle(position, speed * rate, lateness, skipped)
+
+    def stay(self, position: Array) -> Cycle:
+        """One cycle at rest."""
+        lateness, skipped = self.wait_for_deadline()
+        self.stop.check()
+        return self._cycle(position, np.zeros_like(position), lateness, skipped)
+
+    def look(self) -> None:
+        """One cycle that only reads."""
+        lateness, skipped = self.wait_for_deadline()
+        self.stop.check()
+        self.exchange(lateness, skipped, write=False)
+
+    def _cycle(self, position: Array, velocity: Array, lateness: float, skipped: int) -> Cycle:
+        self.goal, self.goal_rate = position, velocity
+        cycle = self.exchange(lateness, skipped, write=True)
+        fault = self.rules.examine(cycle)
+        if fault:
+            raise Stopped(fault)
+        return cycle
+
+    def exchange(self, lateness: float, skipped: int, *, write: bool) -> Cycle:
+        """Write all goals, read all states (and one servo's health in turn), record."""
+        began = self._clock.now()
+        if write:
+            self._send(self.goal, self.goal_rate)
+        block = self.bus.sync_read(self.map.ids, *STATE_BLOCK)
+        exchange = self._clock.now() - began
+        servos = self.map.servos
+        count = len(servos)
+        cycle = Cycle(
+            self.goal.copy(),
+            self.goal_rate.copy(),
+            np.full(count, np.nan),
+            np.full(count, np.nan),
+            np.full(count, np.nan),
+            np.zeros(count, dtype=bool),
+            lateness,
+        )
+        for index, servo in enumerate(servos):
+            reply = block.replies.get(servo.id)
+            if reply is None:
+                continue
+            data = reply.data
+            cycle.torque[index] = servo.to_torque(int.from_bytes(data[0:2], "little", signed=True))
+            cycle.velocity[index] = servo.to_velocity(int.from_bytes(data[2:6], "little", signed=True))
+            cycle.position[index] = servo.to_angle(int.from_bytes(data[6:10], "little", signed=True))
+            cycle.alert[index] = reply.alert
+        self.measured = np.where(cycle.missed, self.measured, cycle.position)
+        self._cycles += 1
+        if self._cycles % self._health_every == 0:
+            servo = servos[self._cycles // self._health_every % count]
+            # Like a sync read of one: a servo that is silent costs one time-out and no retry.
+            answer = self.bus.sync_read((servo.id,), *HEALTH_BLOCK).replies.get(servo.id)
+            if answer is not None:
+                cycle.health[servo.id] = decode_health(servo, answer.data)
+        self._recorder.add(
+            time=began,
+            path_time=self.following_time if self.path_started is not None else math.nan,
+            state=int(self._journal.state),
+            exchange=exchange,
+            stray=block.stray_bytes,
+            skipped=skipped,
+            cycle=cycle,
+        )
+        self._report(cycle)
+        return cycle
+
+    def _report(self, cycle: Cycle) -> None:
+        error = self.rules.following_error(cycle)[self._in_position_mode]
+        worst = float(np.nanmax(np.abs(error))) if np.isfinite(error).any() else 0.0
+        span = self.following_end or 1.0
+        self._journal.report(worst, min(1.0, max(0.0, self.following_time / span)))
+
+    def _send(self, position: Array, velocity: Array) -> None:
+        """The only place goals of a motion leave through. Refuses what no checked motion can ask for."""
+        now = self._clock.now()
+        elapsed = max(now - self._sent_at, 0.0) + self.period
+        goals: dict[str, dict[int, int]] = {"goal_position": {}, "goal_velocity": {}}
+        for index, servo in enumerate(self.map.servos):
+            ticks, units = servo.to_ticks(float(position[index])), servo.to_velocity_units(float(velocity[index]))
+            if servo.in_position_mode:
+                low, high = servo.tick_limits
+                step = velocity_limit(servo) * servo.gear * elapsed / RAD_PER_TICK + 2
+                if not low <= ticks <= high or abs(ticks - self._sent[servo.id]) > step:
+                    raise Stopped(Fault(Cause.GOAL_GUARD, f"{servo.joint}: goal {ticks} was not sent", (servo.id,)))
+                goals["goal_position"][servo.id] = ticks
+            else:
+                if abs(units) > abs(servo.to_velocity_units(velocity_limit(servo))):
+                    raise Stopped(Fault(Cause.GOAL_GUARD, f"{servo.joint}: goal {units} was not sent", (servo.id,)))
+                goals["goal_velocity"][servo.id] = units
+        self.write_goals(goals)
+
+    def write_goals(self, goals: dict[str, dict[int, int]]) -> None:
+        """Goal registers by name and ID, as they are."""
+        for name, values in goals.items():
+            if not values:
+                continue
+            self.bus.sync_write(FIELDS[name], values)
+            self._sent.update(values)
+            if self._journal.state == State.FAULT:
+                now = self._clock.now()
+                self.policy_goals += [(now, id_, value) for id_, value in values.items()]
+        self._sent_at = self._clock.now()

@@ -1,0 +1,272 @@
+"""The replay: a checked motion on a bus of servos.
+
+CONNECT → VERIFY → ARM → MOVE_TO_START → SETTLE → REPLAY → SETTLE → DISARM, and from everywhere → FAULT. The offline
+check (:mod:`dynsim.hardware.replay.check`) has been passed before. After a fault nothing is sent but what the fault
+policy says.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+
+from dynsim.errors import RecordError
+from dynsim.hardware.bus.clock import Clock
+from dynsim.hardware.bus.control_table import RAD_S2_PER_UNIT, RAD_S_PER_UNIT, WATCHDOG_SECONDS_PER_UNIT
+from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused
+from dynsim.hardware.errors import PortError
+from dynsim.hardware.replay.check import CheckedMotion, velocity_limit
+from dynsim.hardware.replay.ending import Ending
+from dynsim.hardware.replay.journal import Journal
+from dynsim.hardware.replay.loop import FIELDS, Loop
+from dynsim.hardware.replay.motion import Approach
+from dynsim.hardware.replay.rules import Cause, Fault
+from dynsim.hardware.replay.run_log import Recorder, RunLog
+from dynsim.hardware.replay.states import UNARMED, Progress, ReplayResult, State, Stopped, StopRequest
+from dynsim.hardware.replay.trajectory import Path
+from dynsim.hardware.replay.verify import configure, dump_registers, verify
+from dynsim.hardware.servo_map import FaultPolicy, Servo, ServoMap
+
+APPROACH_ACCELERATION = 10.0
+"""Profile acceleration the firmware is given for the move to the start [rad/s²]."""
+SETTLE_CYCLES = 10
+SETTLE_TIME = 3.0
+"""Longest wait for the servos to come to rest [s]."""
+SETTLE_VELOCITY = 0.1
+"""[rad/s], a few units of the velocity register."""
+DRY_RUN_TIME = 1.0
+"""Reading without moving, to time the bus [s]."""
+
+
+class Replay:
+    """One run of one motion.
+
+    Parameters
+    ----------
+    motion : CheckedMotion
+    servo_map : ServoMap
+    bus : Bus
+    clock : Clock
+    policy : "hold", "decelerate" or "off"
+        Instead of the map's.
+    live : bool
+        False: verify and time the bus, move nothing.
+    write_eeprom : bool
+        Configure servos that are set up differently.
+    stop : StopRequest
+    log : RunLog
+    dump_folder : path, optional
+        Where register dumps go.
+    observer : callable, optional
+        Called with a Progress after every cycle and on every change of state.
+    provenance : dict
+        Kept in the measured record.
+    """
+
+    def __init__(
+        self,
+        motion: CheckedMotion,
+        servo_map: ServoMap,
+        bus: Bus,
+        clock: Clock,
+        *,
+        policy: FaultPolicy | None = None,
+        live: bool = True,
+        write_eeprom: bool = False,
+        stop: StopRequest | None = None,
+        log: RunLog | None = None,
+        dump_folder: FilePath | None = None,
+        observer: Callable[[Progress], None] | None = None,
+        provenance: dict[str, Any] | None = None,
+    ) -> None:
+        self.motion = motion
+        self.map = servo_map
+        self.bus = bus
+        self.clock = clock
+        self.policy: FaultPolicy = policy or servo_map.safety.policy
+        self.live = live
+        self.write_eeprom = write_eeprom
+        self.stop = stop or StopRequest()
+        self._dump_folder = dump_folder
+        self._provenance = {"robot": servo_map.robot, "speed": motion.speed, "rate_Hz": motion.plan.rate}
+        self._provenance |= provenance or {}
+        self._servos = servo_map.servos
+        self._found_holding = False
+        self._recorder = Recorder(servo_map)
+        self.journal = Journal(clock, self._recorder, log or RunLog(None), observer)
+        self.loop = Loop(motion, servo_map, bus, clock, self.stop, self._recorder, self.journal)
+        self.result = ReplayResult(policy_goals=self.loop.policy_goals)
+        self._ending = Ending(self.loop, self.journal, self.result, self.policy)
+
+    def run(self) -> ReplayResult:
+        """Carry the replay through, to its end or to a fault; never raises for trouble on the bus.
+
+        An exception of another kind (of the observer, a KeyboardInterrupt without :class:`StopRequest`) is raised again
+        after the fault policy was carried out.
+        """
+        try:
+            self._verify()
+            if self.live:
+                self._arm()
+                self._move_to_start()
+                self._replay_path()
+                self._disarm()
+            else:
+                self._dry_run()
+        except Stopped as stopped:
+            self._fault(stopped.fault)
+        except PortError as error:
+            self._fault(Fault(Cause.PORT, str(error)))
+        except (NoAnswer, RequestRefused) as error:
+            cause = Cause.ARMING if self.journal.state == State.ARM else Cause.VERIFICATION
+            self._fault(Fault(cause, str(error), (error.id,)))
+        except BaseException as error:
+            # A robot with its torque on must not be left to itself, whatever went wrong.
+            self._fault(Fault(Cause.PROGRAM, repr(error)))
+            raise
+        self._finish()
+        return self.result
+
+    def _verify(self) -> None:
+        self.journal.enter(State.CONNECT)
+        self.stop.check()
+        self.journal.enter(State.VERIFY)
+        if self.write_eeprom:
+            configure(self.bus, self.map, self.journal.say)
+        problems = verify(self.bus, self.map, self.motion, poll=self.stop.check)
+        if self._dump_folder:
+            dump_registers(self.bus, self.map, self._dump_folder / "registers.json")
+        if problems:
+            raise Stopped(Fault(Cause.VERIFICATION, "\n  ".join([f"{len(problems)} problem(s):", *problems])))
+        self.journal.say(f"{len(self._servos)} servos as the map says")
+
+    def _dry_run(self) -> None:
+        self.journal.enter(State.DRY_RUN)
+        self.loop.goal = self.loop.goal_rate = np.full(len(self._servos), np.nan)
+        self.loop.begin()
+        for _ in range(math.ceil(DRY_RUN_TIME / self.loop.period)):
+            self.loop.look()
+        self.journal.say("dry run: nothing was moved (--live moves)")
+
+    def _arm(self) -> None:
+        self.journal.enter(State.ARM)
+        self._found_holding = any(self.bus.read(servo.id, FIELDS["torque_enable"]) for servo in self._servos)
+        for index, servo in enumerate(self._servos):
+            self.stop.check()
+            # A watchdog that tripped in an earlier run keeps goals read-only until it is cleared.
+            self.bus.write(servo.id, FIELDS["bus_watchdog"], 0)
+            present = self.bus.read(servo.id, FIELDS["present_position"])
+            name, goal = ("goal_position", present) if servo.in_position_mode else ("goal_velocity", 0)
+            for item, value in self._profile(servo, approaching=True).items():
+                self.bus.write(servo.id, FIELDS[item], value)
+            self.bus.write(servo.id, FIELDS[name], goal)
+            if self.bus.read(servo.id, FIELDS[name]) != goal:
+                raise Stopped(Fault(Cause.ARMING, f"{servo.joint} (ID {servo.id}) did not take its goal", (servo.id,)))
+            self.bus.write(servo.id, FIELDS["torque_enable"], 1)
+            if not self.bus.read(servo.id, FIELDS["torque_enable"]):
+                raise Stopped(Fault(Cause.ARMING, f"{servo.joint} (ID {servo.id}): torque stays off", (servo.id,)))
+            self.loop.take_over(index, goal, servo.to_angle(present))
+        units = math.ceil(self.map.safety.watchdog / WATCHDOG_SECONDS_PER_UNIT)
+        for servo in self._servos:
+            self.bus.write(servo.id, FIELDS["bus_watchdog"], units)
+        self.loop.all_taken_over()
+        self.journal.say(f"torque on, bus watchdogs at {units * WATCHDOG_SECONDS_PER_UNIT * 1e3:.0f} ms")
+
+    def _move_to_start(self) -> None:
+        here = self.loop.goal.copy()
+        in_position_mode = np.array([servo.in_position_mode for servo in self._servos])
+        goal = np.where(in_position_mode, self.motion.path.position[0], here)
+        distance = float(np.abs(goal - here).max())
+        duration = max(1.875 * distance / self.map.safety.approach_velocity, self.loop.period)
+        self.journal.enter(State.MOVE_TO_START)
+        self.journal.say(f"{distance:.3f} rad in {duration:.1f} s")
+        self.loop.begin()
+        self.loop.follow(Approach(here, goal, duration), 0.0, duration, speed=1.0)
+        self._settle()
+
+    def _settle(self) -> None:
+        self.journal.enter(State.SETTLE)
+        loop, quiet, cycles = self.loop, 0, 0
+        goal = loop.goal.copy()
+        while quiet < SETTLE_CYCLES:
+            cycle = loop.stay(goal)
+            error = np.abs(loop.rules.following_error(cycle))
+            limit = np.array([servo.kind.following_error for servo in self._servos])
+            still = (error < limit) & (np.abs(cycle.velocity) < SETTLE_VELOCITY)
+            quiet = quiet + 1 if np.all(still | cycle.missed) else 0
+            cycles += 1
+            if cycles * loop.period > SETTLE_TIME:
+                moving = [servo for servo, at_rest in zip(self._servos, still, strict=True) if not at_rest]
+                names = ", ".join(servo.joint for servo in moving)
+                text = f"not at rest {SETTLE_TIME:g} s after the motion: {names}"
+                raise Stopped(Fault(Cause.NOT_SETTLED, text, tuple(servo.id for servo in moving)))
+
+    def _replay_path(self) -> None:
+        path: Path = self.motion.path
+        for name in ("profile_velocity", "profile_acceleration"):
+            values = {servo.id: self._profile(servo, approaching=False)[name] for servo in self._servos}
+            self.bus.sync_write(FIELDS[name], values)
+        self.journal.enter(State.REPLAY)
+        self.loop.path_started = self.loop.deadline_of(self.loop.tick + 1) - path.start / self.motion.speed
+        self.loop.follow(path, path.start, path.end, speed=self.motion.speed)
+        self._settle()
+
+    def _disarm(self) -> None:
+        self.journal.enter(State.DISARM)
+        self._ending.regular()
+
+    def _profile(self, servo: Servo, *, approaching: bool) -> dict[str, int]:
+        """The firmware's own limits: slow towards the start, the joint's speed limit during the replay.
+
+        0 would mean "no limit" and is never written as a velocity; as an acceleration it leaves shaping to the path.
+        """
+        velocity = (
+            min(2 * self.map.safety.approach_velocity, velocity_limit(servo)) if approaching else velocity_limit(servo)
+        )
+        acceleration = APPROACH_ACCELERATION if approaching else 0.0
+        return {
+            "profile_velocity": max(1, math.ceil(velocity * servo.gear / RAD_S_PER_UNIT)),
+            "profile_acceleration": math.ceil(acceleration * servo.gear / RAD_S2_PER_UNIT),
+        }
+
+    def _fault(self, fault: Fault) -> None:
+        struck = self.journal.state
+        self.result.fault, self.result.fault_state, self.result.fault_time = fault, struck, self.clock.now()
+        self.journal.enter(State.FAULT)
+        self.journal.say(f"in {struck.name}: {fault.cause}: {fault.text}")
+        try:
+            self.result.end_state = self._ending.after_fault(fault, struck, found_holding=self._found_holding)
+        except PortError as error:
+            self.result.end_state = "not armed" if struck in UNARMED else "unreachable"
+            self.journal.say(f"{error}; armed servos stop by their bus watchdog")
+        self.journal.say(f"end state: {self.result.end_state}")
+        self._dump_after_fault()
+
+    def _dump_after_fault(self) -> None:
+        if not self._dump_folder or self.result.end_state in ("not armed", "unreachable"):
+            return
+        try:
+            dump_registers(self.bus, self.map, self._dump_folder / "registers_after_fault.json")
+        except (PortError, RecordError) as error:
+            self.journal.say(f"no register dump: {error}")
+
+    def _finish(self) -> None:
+        result = self.result
+        if result.fault is None:
+            held = self.map.safety.at_end == "hold"
+            result.end_state = "not armed" if not self.live else "holding" if held else "off"
+        started = self.loop.path_started if self.loop.path_started is not None else self.loop.origin
+        result.record = self._recorder.record(started, self._provenance)
+        result.record.complete = result.fault is None
+        result.timing = self._recorder.timing()
+        summary: dict[str, Any] = {"end_state": result.end_state}
+        if result.fault is not None:
+            summary |= {"fault": result.fault.cause.value, "fault_text": result.fault.text}
+        result.record.summary |= summary
+        if result.timing:
+            timing = ", ".join(f"{name} {value:.6g}" for name, value in result.timing.as_dict().items())
+            self.journal.say(f"timing: {timing}")

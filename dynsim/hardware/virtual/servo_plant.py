@@ -1,0 +1,137 @@
+"""What the virtual servos move: a motor law shared by all, and the mechanics behind it.
+
+The position loop of an MX servo is (by default) proportional, and the motor brakes itself through its back-EMF:
+
+    τ = clip(k (θ_set − θ), ±τ_stall V/12) − d ω        d = τ_stall / ω_no_load
+
+so that a constant speed ω is followed with the lag d/k, in time as well as in angle per speed, and ω_no_load is never
+exceeded. k is the MX-106's stiffness at its default gain, 41 N·m/rad, scaled with stall torque for other models. Gear
+friction is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.hardware.bus.control_table import MX_106, ServoModel
+
+if TYPE_CHECKING:
+    from dynsim.model.description import Servo
+
+Array = NDArray[np.float64]
+
+STIFFNESS_PER_STALL_TORQUE = 41.0 / MX_106.stall_torque  # 1/rad
+VELOCITY_TIME_CONSTANT = 0.02
+"""Closed loop of the velocity mode on the servo's own inertia [s] (unverified)."""
+FREE_DAMPING = 0.1
+"""Damping of an unpowered gear train as a fraction of the back-EMF damping (unverified)."""
+
+
+@dataclass
+class Drive:
+    """What the servos' controllers ask of their motors; all arrays of shape (N,), in servo angles.
+
+    Attributes
+    ----------
+    enabled, in_position_mode : bool arrays
+    set_position : array
+        [rad].
+    set_velocity : array
+        [rad/s].
+    voltage : float
+        Supply at the servos [V].
+    """
+
+    enabled: NDArray[np.bool_]
+    in_position_mode: NDArray[np.bool_]
+    set_position: Array
+    set_velocity: Array
+    voltage: float
+
+
+class MotorLaw:
+    """Torque of N servos from their set points: the servo law of the simulation, with constants of their models.
+
+    Attributes
+    ----------
+    stiffness, damping, stall_torque : array, shape (N,)
+        k [N·m/rad], d [N·m·s/rad], τ_stall at 12 V [N·m].
+    inertia : array, shape (N,)
+        The output inertia at which the position loop is critically damped, d²/(4k) [kg·m²].
+    """
+
+    def __init__(self, models: list[ServoModel]) -> None:
+        self.stall_torque = np.array([model.stall_torque for model in models])
+        self.damping = self.stall_torque / np.array([model.no_load_speed for model in models])
+        self.stiffness = STIFFNESS_PER_STALL_TORQUE * self.stall_torque
+        self.inertia = self.damping**2 / (4 * self.stiffness)
+        # Replaying on real servos imports this module and nothing of the simulation.
+        from dynsim.model.servo import ServoBank
+
+        self._bank = ServoBank([self._servo(a, model) for a, model in enumerate(models)])
+
+    def torque(self, position: Array, velocity: Array, drive: Drive) -> Array:
+        """Output torque [N·m], shape (N,), at an angle [rad] and speed [rad/s]."""
+        self._bank.command(drive.enabled, drive.in_position_mode, drive.set_position, drive.set_velocity)
+        self._bank.supply(drive.voltage)
+        return self._bank.torque(position, velocity)
+
+    def _servo(self, a: int, model: ServoModel) -> Servo:
+        """K_m = V/ω_no_load and R = V K_m/τ_stall at 12 V, so that d = K_m²/R; a torque per volt is K_m/R."""
+        from dynsim.model.description import Servo
+
+        torque_constant = 12.0 / model.no_load_speed
+        resistance = 12.0 * torque_constant / model.stall_torque
+        volts = resistance / torque_constant
+        return Servo(
+            joint=model.name,
+            torque_constant=torque_constant,
+            resistance=resistance,
+            k_p=float(self.stiffness[a]) * volts,
+            k_v=float(self.inertia[a]) / VELOCITY_TIME_CONSTANT * volts,
+            free_drag=FREE_DAMPING * float(self.damping[a]),
+        )
+
+
+class ServoPlant(Protocol):
+    """Mechanics behind the servos' output shafts.
+
+    Attributes
+    ----------
+    position, velocity, torque : array, shape (N,)
+        Servo angle [rad] (0 at tick 0), speed [rad/s], motor torque [N·m].
+    """
+
+    position: Array
+    velocity: Array
+    torque: Array
+
+    def step(self, dt: float, drive: Drive) -> None:
+        """Advance by ``dt`` [s]."""
+        ...
+
+    def stop(self, index: int) -> None:
+        """Bring one shaft to rest where it is (a jammed gear)."""
+        ...
+
+
+class InertialLoad:
+    """Every servo turns an inertia of its own: a second-order response, critically damped."""
+
+    def __init__(self, models: list[ServoModel], position: Array) -> None:
+        self.law = MotorLaw(models)
+        self.position = np.array(position, dtype=np.float64)
+        self.velocity = np.zeros(len(models))
+        self.torque = np.zeros(len(models))
+
+    def step(self, dt: float, drive: Drive) -> None:
+        self.torque = self.law.torque(self.position, self.velocity, drive)
+        self.velocity += dt * self.torque / self.law.inertia
+        self.position += dt * self.velocity
+
+    def stop(self, index: int) -> None:
+        self.velocity[index] = 0.0

@@ -1,0 +1,294 @@
+"""The servos of a virtual line: what their registers do, their motion, heat, supply and watchdogs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from dynsim.hardware.bus.control_table import (
+    RAD_PER_TICK,
+    RAD_S2_PER_UNIT,
+    RAD_S_PER_UNIT,
+    TICKS_PER_TURN,
+    VOLT_PER_UNIT,
+    WATCHDOG_SECONDS_PER_UNIT,
+    OperatingMode,
+)
+from dynsim.hardware.bus.packet import StatusError
+from dynsim.hardware.virtual.faults import AngleFault, Fault, FaultScript, TemperatureRamp, VoltageSag
+from dynsim.hardware.virtual.registers import ServoRegisters
+from dynsim.hardware.virtual.servo_plant import Drive, InertialLoad, ServoPlant
+
+PHYSICS_STEP = 2e-3
+BOOT_TIME = 0.3
+"""Silence after a reboot [s] (unverified)."""
+AMBIENT = 25.0  # °C
+THERMAL_RESISTANCE = 2.0  # K/W (unverified)
+THERMAL_TIME = 300.0  # s (unverified)
+OVERLOAD_FRACTION = 0.9  # of stall torque (unverified)
+OVERLOAD_TIME = 1.0  # s (unverified)
+SUPPLY_RESISTANCE = 0.05  # Ω
+OVERHEATING, OVERLOAD, INPUT_VOLTAGE = 1 << 2, 1 << 5, 1 << 0
+
+
+class VirtualServos:
+    """N servos and what they move.
+
+    Parameters
+    ----------
+    registers : mapping of int to ServoRegisters
+        By ID.
+    positions : iterable of float
+        Initial servo angles [rad], 0 at tick 0.
+    plant : ServoPlant or None
+        What the servos move; every one its own inertia if None.
+    script : FaultScript
+        Its sags, ramps and angle faults act here; :class:`~dynsim.hardware.virtual.injection.Injection` does the rest.
+    supply : float
+        Voltage of the supply without load [V].
+
+    Attributes
+    ----------
+    registers : dict
+        ServoRegisters by ID.
+    ids : list of int
+    time : float
+        [s].
+    torque_since : float
+        When torque was first switched on [s]; infinite before.
+    heard : float
+        Time of the last packet, for the watchdogs [s].
+    dead : set of int
+        IDs without power or cable.
+    temperature, play : array, shape (N,)
+        Of the windings [°C]; the angle behind the backlash [rad].
+    """
+
+    def __init__(
+        self,
+        registers: Mapping[int, ServoRegisters],
+        *,
+        positions: Iterable[float],
+        plant: ServoPlant | None,
+        script: FaultScript,
+        supply: float,
+    ) -> None:
+        self.registers = dict(registers)
+        self.ids = list(registers)
+        self._models = [table.model for table in registers.values()]
+        self.plant: ServoPlant = plant or InertialLoad(self._models, np.array(list(positions), dtype=np.float64))
+        self.supply = supply
+        self.time = 0.0
+        self.torque_since = math.inf
+        self.heard = 0.0
+        self.dead: set[int] = set()
+        self._script = script
+        count = len(self.ids)
+        self._drive = Drive(
+            np.zeros(count, dtype=bool), np.ones(count, dtype=bool), self.plant.position.copy(), np.zeros(count), supply
+        )
+        self._goal_position, self._goal_velocity = self.plant.position.copy(), np.zeros(count)
+        self._profile_velocity, self._profile_acceleration = np.zeros(count), np.zeros(count)
+        self._set_rate = np.zeros(count)
+        self._watchdog = np.zeros(count)
+        self._temperature_limit, self._min_voltage = np.zeros(count), np.zeros(count)
+        self.temperature = np.full(count, AMBIENT + 5.0)
+        self._overload = np.zeros(count)
+        self.play = self.plant.position.copy()
+        self._turns = np.zeros(count, dtype=np.int64)
+        self._boot_until: dict[int, float] = {}
+        self._overload_torque = OVERLOAD_FRACTION * np.array([model.stall_torque for model in self._models])
+        self._resistance = np.array([12.0 / model.stall_current for model in self._models])
+        self._ampere_per_newtonmetre = np.array([1 / model.torque_constant for model in self._models])
+        for index in range(count):
+            self.hold_here(index)
+            self.reload(index)
+
+    def active_faults(self) -> list[Fault]:
+        """Faults of the script that are active now."""
+        if not self._script.faults:
+            return []
+        since = self.time - self.torque_since
+        return [fault for fault in self._script.faults if fault.active(since)]
+
+    # -- requests -----------------------------------------------------------------------------------------------------
+
+    def listens(self, id_: int) -> bool:
+        """Whether a servo hears what is sent."""
+        return id_ in self.registers and id_ not in self.dead and self.time >= self._boot_until.get(id_, 0.0)
+
+    def read(self, id_: int, address: int, length: int) -> bytes | None:
+        """Bytes of a servo's control table as they are now; None outside of it."""
+        self.measure(self.ids.index(id_))
+        return self.registers[id_].read(address, length)
+
+    def write(self, id_: int, address: int, data: bytes) -> StatusError:
+        """Write to a control table, with all that follows from it."""
+        registers, index = self.registers[id_], self.ids.index(id_)
+        torque, mode = registers["torque_enable"], registers["operating_mode"]
+        error = registers.write(address, data)
+        if error:
+            return error
+        if registers["operating_mode"] != mode:
+            self.forget_turns(index)
+        if registers["torque_enable"] and not torque:
+            self.hold_here(index)
+            if self.torque_since == math.inf:
+                self.torque_since = self.time
+        self.reload(index)
+        return StatusError.NONE
+
+    def reboot(self, id_: int) -> None:
+        """Power-on state; the servo is silent for a while."""
+        index = self.ids.index(id_)
+        self.registers[id_].restart()
+        self.forget_turns(index)
+        self._overload[index] = 0.0
+        self._boot_until[id_] = self.time + BOOT_TIME
+        self.reload(index)
+
+    def forget_turns(self, index: int) -> None:
+        """Count turns from here."""
+        self._turns[index] = self._sense(index) * round(self.plant.position[index] / RAD_PER_TICK) // TICKS_PER_TURN
+
+    # -- motion, heat, supply -----------------------------------------------------------------------------------------
+
+    def step(self, until: float) -> None:
+        """One physics step, or when nothing moves all that fit in before ``until`` [s]."""
+        if not self._drive.enabled.any() and np.abs(self.plant.velocity).max(initial=0.0) < 1e-4:
+            # Nothing moves: one long step for the temperatures, so that waiting for pings costs nothing.
+            steps = int((until - self.time) / PHYSICS_STEP)
+            self.time += steps * PHYSICS_STEP
+            self._warm(steps * PHYSICS_STEP)
+        else:
+            self.time += PHYSICS_STEP
+            self._set_points(PHYSICS_STEP)
+            self.plant.step(PHYSICS_STEP, self._drive)
+            self._warm(PHYSICS_STEP)
+            self._watch()
+
+    def _set_points(self, dt: float) -> None:
+        """Profile generator: a set point that runs to the goal with limited speed and acceleration (0: unlimited)."""
+        drive = self._drive
+        to_go = self._goal_position - drive.set_position
+        acceleration = np.where(self._profile_acceleration > 0, self._profile_acceleration, np.inf)
+        speed = np.where(self._profile_velocity > 0, self._profile_velocity, np.inf)
+        distance = np.abs(to_go)
+        # The speed from which it can still brake before the goal; at the goal that is 0, whatever the acceleration.
+        braking = np.sqrt(2 * acceleration * np.maximum(distance, 1e-12))
+        wanted = np.sign(to_go) * np.minimum(np.minimum(speed, braking), distance / dt)
+        change = acceleration * dt
+        self._set_rate = np.minimum(np.maximum(wanted, self._set_rate - change), self._set_rate + change)
+        drive.set_position = drive.set_position + dt * self._set_rate
+        drive.set_velocity = np.minimum(
+            np.maximum(self._goal_velocity, drive.set_velocity - change), drive.set_velocity + change
+        )
+
+    def _warm(self, dt: float) -> None:
+        torque = np.abs(self.plant.torque) * self._drive.enabled
+        current = torque * self._ampere_per_newtonmetre
+        heat = current**2 * self._resistance
+        target = AMBIENT + THERMAL_RESISTANCE * heat
+        self.temperature += (target - self.temperature) * -math.expm1(-dt / THERMAL_TIME)
+        self._overload = np.where(torque > self._overload_torque, self._overload + dt, 0.0)
+        sag = sum(fault.drop for fault in self.active_faults() if isinstance(fault, VoltageSag))
+        self._drive.voltage = self.supply - sag - SUPPLY_RESISTANCE * float(current.sum())
+        for fault in self.active_faults():
+            if isinstance(fault, TemperatureRamp) and fault.id in self.registers:
+                self.temperature[self.ids.index(fault.id)] += dt * fault.heating_rate
+
+    def _watch(self) -> None:
+        enabled = self._drive.enabled
+        low_voltage = self._drive.voltage < self._min_voltage
+        unheard = (self._watchdog > 0) & (self.time - self.heard > self._watchdog)
+        hot = self.temperature > self._temperature_limit
+        overloaded = self._overload > OVERLOAD_TIME
+        if not (enabled & (low_voltage | unheard | hot | overloaded)).any():
+            return
+        for index in map(int, np.flatnonzero(enabled)):
+            if overloaded[index]:
+                self.raise_error(index, OVERLOAD)
+            if hot[index]:
+                self.raise_error(index, OVERHEATING)
+            if low_voltage[index]:
+                self.raise_error(index, INPUT_VOLTAGE)
+            if unheard[index]:
+                self.trip_watchdog(index)
+
+    def raise_error(self, index: int, bit: int) -> None:
+        """Set a bit of the error register; torque off if the servo is to shut down for it."""
+        registers = self.registers[self.ids[index]]
+        registers["hardware_error"] |= bit
+        if registers["hardware_error"] & registers["shutdown"]:
+            registers["torque_enable"] = 0
+            self.reload(index)
+
+    def trip_watchdog(self, index: int) -> None:
+        """Stop, and take no goals until the watchdog is cleared."""
+        self.hold_here(index)
+        self.registers[self.ids[index]]["bus_watchdog"] = -1
+        self.reload(index)
+
+    # -- registers and motion -----------------------------------------------------------------------------------------
+
+    def _sense(self, index: int) -> int:
+        # Reverse mode turns the shaft's sense, not that of the homing offset.
+        return -1 if self.registers[self.ids[index]]["drive_mode"] & 1 else 1
+
+    def _present_ticks(self, index: int, angle: float) -> int:
+        registers = self.registers[self.ids[index]]
+        ticks = self._sense(index) * round(angle / RAD_PER_TICK) - int(self._turns[index]) * TICKS_PER_TURN
+        return ticks + registers["homing_offset"]
+
+    def _angle(self, index: int, ticks: int) -> float:
+        registers = self.registers[self.ids[index]]
+        raw = ticks - registers["homing_offset"] + int(self._turns[index]) * TICKS_PER_TURN
+        return self._sense(index) * raw * RAD_PER_TICK
+
+    def hold_here(self, index: int) -> None:
+        """Set point and goals := where the shaft is."""
+        registers = self.registers[self.ids[index]]
+        registers["goal_position"] = self._present_ticks(index, self.plant.position[index])
+        registers["goal_velocity"] = 0
+        self._drive.set_position[index] = self.plant.position[index]
+        self._drive.set_velocity[index] = 0.0
+        self._set_rate[index] = 0.0
+
+    def reload(self, index: int) -> None:
+        """Take over what the motion needs from the registers."""
+        registers, sense = self.registers[self.ids[index]], self._sense(index)
+        self._drive.enabled[index] = bool(registers["torque_enable"])
+        self._drive.in_position_mode[index] = registers["operating_mode"] != OperatingMode.VELOCITY
+        self._goal_position[index] = self._angle(index, registers["goal_position"])
+        self._goal_velocity[index] = sense * registers["goal_velocity"] * RAD_S_PER_UNIT
+        self._profile_velocity[index] = registers["profile_velocity"] * RAD_S_PER_UNIT
+        self._profile_acceleration[index] = registers["profile_acceleration"] * RAD_S2_PER_UNIT
+        self._temperature_limit[index] = registers["temperature_limit"]
+        self._min_voltage[index] = registers["min_voltage"] * VOLT_PER_UNIT
+        self._watchdog[index] = max(0, registers["bus_watchdog"]) * WATCHDOG_SECONDS_PER_UNIT
+
+    def measure(self, index: int) -> None:
+        """Bring the registers of one servo up to date before they are read."""
+        id_ = self.ids[index]
+        registers, sense = self.registers[id_], self._sense(index)
+        angle = self.plant.position[index]
+        for fault in self.active_faults():
+            if isinstance(fault, AngleFault) and fault.id == id_:
+                if fault.kind == "backlash":
+                    half = fault.angle / 2
+                    self.play[index] = min(max(self.play[index], angle - half), angle + half)
+                    angle = self.play[index]
+                else:
+                    angle = angle + fault.angle
+        model = self._models[index]
+        effort = model.effort(sense * float(self.plant.torque[index]) * bool(self._drive.enabled[index]))
+        velocity = round(sense * float(self.plant.velocity[index]) / RAD_S_PER_UNIT)
+        registers["present_current" if model.measures_current else "present_load"] = effort
+        registers["present_velocity"] = velocity
+        registers["present_position"] = self._present_ticks(index, float(angle))
+        registers["present_voltage"] = max(0, round(self._drive.voltage / VOLT_PER_UNIT))
+        registers["present_temperature"] = min(255, max(0, round(float(self.temperature[index]))))
+        registers["realtime_tick"] = int(self.time * 1e3) % 32768
+        registers["moving"] = int(abs(velocity) > registers["moving_threshold"])

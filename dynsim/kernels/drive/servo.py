@@ -1,0 +1,80 @@
+"""A position servo: voltage loop, motor without inductance, limits of voltage and current, friction of the gear.
+
+    u = k_p (q_d − q) + k_d (v_d − v)     position mode
+    u = k_v (v_d − v) + K_m v             velocity mode
+    i = (u − K_m v) / R                   u within ±U, then i within ±I
+    τ = K_m i − τ_c v / √(v² + v_s²)
+
+all at the output shaft; J_m and D_m belong to the joint, as those of a DC motor. Where the current is at its limit the
+terminal voltage is what drives that current, R i + K_m v. Off, the circuit is open, and a drag of the gear is left.
+"""
+
+from __future__ import annotations
+
+from dynsim.kernels.arrays import (
+    COULOMB,
+    COULOMB_SPEED,
+    FREE_DRAG,
+    I_MAX,
+    K_D,
+    K_M,
+    K_P,
+    K_V,
+    OFF,
+    RESISTANCE,
+    U_MAX,
+    VELOCITY_MODE,
+)
+from dynsim.kernels.drive.limit import clipped
+
+
+def servo_command(motor, a, mode, q_ref, v_ref, q, v):
+    """The voltage that the loop asks for [V], before its limit."""
+    if mode == VELOCITY_MODE:
+        return motor[a, K_V] * (v_ref - v) + motor[a, K_M] * v
+    return motor[a, K_P] * (q_ref - q) + motor[a, K_D] * (v_ref - v)
+
+
+def servo_circuit(motor, a, mode, command, v):
+    """Terminal voltage u [V] and current i [A] of a command, both within their limits."""
+    if mode == OFF:
+        return motor[a, K_M] * v, 0.0 * v
+    u = clipped(command, motor[a, U_MAX])
+    wanted = (u - motor[a, K_M] * v) / motor[a, RESISTANCE]
+    i = clipped(wanted, motor[a, I_MAX])
+    if i != wanted:
+        u = motor[a, RESISTANCE] * i + motor[a, K_M] * v
+    return u, i
+
+
+def servo_drag(motor, a, mode, v):
+    """Friction of the gear against v [N m]: Coulomb's, smoothed below v_s; while off a viscous one comes with it."""
+    drag = motor[a, COULOMB] * v / (v * v + motor[a, COULOMB_SPEED] ** 2) ** 0.5
+    if mode == OFF:
+        drag += motor[a, FREE_DRAG] * v
+    return drag
+
+
+def servo_torque(motor, a, mode, command, v):
+    """K_m i − drag [N m] of a command."""
+    _, i = servo_circuit(motor, a, mode, command, v)
+    return motor[a, K_M] * i - servo_drag(motor, a, mode, v)
+
+
+def servo_block(motor, a, mode, sampled, command, v):
+    """∂τ/∂(q, v) at a command; one that is ``sampled`` does not follow the state."""
+    smoothing = motor[a, COULOMB_SPEED] ** 2
+    by_q, by_v = 0.0, -motor[a, COULOMB] * smoothing / (v * v + smoothing) ** 1.5
+    if mode == OFF:
+        return by_q, by_v - motor[a, FREE_DRAG]
+    _, i = servo_circuit(motor, a, mode, command, v)
+    if abs(i) < motor[a, I_MAX]:
+        slope = motor[a, K_M] / motor[a, RESISTANCE]
+        by_v -= slope * motor[a, K_M]
+        if not sampled and abs(command) < motor[a, U_MAX]:
+            if mode == VELOCITY_MODE:
+                by_v += slope * (motor[a, K_M] - motor[a, K_V])
+            else:
+                by_q -= slope * motor[a, K_P]
+                by_v -= slope * motor[a, K_D]
+    return by_q, by_v

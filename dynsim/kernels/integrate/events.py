@@ -1,0 +1,194 @@
+"""Events: a step is cut where a guard passes zero, and the next one starts there. Ticks: steps end at given times.
+
+The event table has a guard for each event, its value at the last accepted step and the side of zero it was on. After a
+step that error control has accepted the guards are evaluated from what the right-hand side has left in the workspace;
+where one has passed zero the step is repeated, shorter, until it ends within ``event_tolerance`` beyond the root. The
+root is that of the method's own solution, of its full order; that of the dense output, of lower order, would have to be
+followed by such a step anyway.
+"""
+
+from __future__ import annotations
+
+from dynsim.kernels.arrays import CURRENT, FORCE, GAP, QD, VOLTAGE, Q, Workspace
+from dynsim.kernels.integrate.run import (
+    AT_HIGH,
+    AT_LOW,
+    DIRECTION,
+    EVENT_INDEX,
+    EVENT_KIND,
+    EVENT_LEVEL,
+    FIRED,
+    HIGH,
+    LOGGED,
+    LOW,
+    ON_EVENT,
+    RETURN,
+    SEARCHING,
+    SIDE,
+    START_VALUE,
+    STATUS,
+    STEP,
+    STOP,
+    STOPPED,
+    TICK_COUNT,
+    TICK_KIND,
+    TICK_NEXT,
+    TICK_PERIOD,
+    TICK_PHASE,
+    TIME,
+    TURNED_BACK,
+    VALUE,
+    Run,
+)
+from dynsim.kernels.jit import inlined_kernel, internal_kernel
+from dynsim.kernels.tree.points import point_position
+
+# Kinds of guards. A new one is a number here, a branch in ``guard`` and a name in dynsim.engine.events.
+JOINT_POSITION, JOINT_RATE, MOTOR_CURRENT, MOTOR_VOLTAGE, CONTACT_FORCE, CONTACT_GAP = 0, 1, 2, 3, 4, 5
+HAND_X, HAND_Y, HAND_Z = 6, 7, 8
+
+# Steps that a root may take; regula falsi with halving (Illinois) needs about eight.
+SEARCH_LIMIT = 60
+
+
+@inlined_kernel
+def guard(ws: Workspace, run: Run, e):
+    """Value of event e, zero where it happens, right after ``derivative``."""
+    kind, k, value = run.event_table[e, EVENT_KIND], run.event_table[e, EVENT_INDEX], 0.0
+    if kind == JOINT_POSITION:
+        value = ws.joints[k, Q]
+    elif kind == JOINT_RATE:
+        value = ws.joints[k, QD]
+    elif kind == MOTOR_CURRENT:
+        value = ws.motors[k, CURRENT]
+    elif kind == MOTOR_VOLTAGE:
+        value = ws.motors[k, VOLTAGE]
+    elif kind == CONTACT_FORCE:
+        value = ws.contacts[k, FORCE]
+    elif kind == CONTACT_GAP:
+        value = ws.contacts[k, GAP]
+    else:
+        point_position(ws, run.hand_link, run.hand_point, run.hand)
+        value = run.hand[kind - HAND_X]
+    return value - run.event[e, EVENT_LEVEL]
+
+
+@internal_kernel
+def arm_events(ws: Workspace, run: Run):
+    """Values and sides of all guards at the start of a step, right after ``derivative`` there.
+
+    An event that has just happened keeps the side it has gone to, whatever rounding says of its guard.
+    """
+    for e in range(run.event.shape[0]):
+        value = guard(ws, run, e)
+        run.event[e, START_VALUE] = value
+        if run.event[e, SIDE] == 0.0:
+            run.event[e, SIDE] = 1.0 if value > 0.0 else (-1.0 if value < 0.0 else 0.0)
+
+
+@inlined_kernel
+def happened(run: Run, e):
+    """True when the guard of event e has passed zero in its direction within the last step."""
+    side, direction = run.event[e, SIDE], run.event_table[e, DIRECTION]
+    return side != 0.0 and run.event[e, VALUE] * side <= 0.0 and (direction == 0 or direction * side < 0.0)
+
+
+@inlined_kernel
+def event_tolerance(t):
+    """Bracket of a root that is narrow enough [s]: some roundings of the time."""
+    return 1e-13 + 1e-15 * abs(t)
+
+
+@internal_kernel
+def cut_step(ws: Workspace, run: Run):
+    """True when the step just taken must be repeated because an event lies within it: STEP is then the next trial.
+
+    False leaves FIRED at 1 when the step ends at an event.
+    """
+    clock, count, event = run.clock, run.count, run.event
+    h, hit = clock[STEP], False
+    for e in range(event.shape[0]):
+        event[e, VALUE] = guard(ws, run, e)
+        hit = happened(run, e) or hit
+    if count[SEARCHING] == 0:
+        if not hit:
+            return False
+        clock[LOW], clock[HIGH], count[TURNED_BACK] = 0.0, h, 0
+        for e in range(event.shape[0]):
+            event[e, AT_LOW], event[e, AT_HIGH] = event[e, START_VALUE], event[e, VALUE]
+    else:
+        side = 1 if hit else -1
+        repeated = count[TURNED_BACK] == side
+        count[TURNED_BACK] = side
+        if hit:
+            clock[HIGH] = h
+        else:
+            clock[LOW] = h
+        for e in range(event.shape[0]):
+            if hit:
+                event[e, AT_HIGH] = event[e, VALUE]
+                event[e, AT_LOW] *= 0.5 if repeated else 1.0
+            else:
+                event[e, AT_LOW] = event[e, VALUE]
+                event[e, AT_HIGH] *= 0.5 if repeated else 1.0
+    count[SEARCHING] += 1
+    low, high = clock[LOW], clock[HIGH]
+    if high - low <= event_tolerance(clock[TIME]) or count[SEARCHING] > SEARCH_LIMIT:
+        if hit and h == high:
+            count[SEARCHING], count[FIRED] = 0, 1
+            return False
+        clock[STEP] = high
+        return True
+    trial = high
+    for e in range(event.shape[0]):
+        a, b, side, direction = event[e, AT_LOW], event[e, AT_HIGH], event[e, SIDE], run.event_table[e, DIRECTION]
+        if side != 0.0 and b * side <= 0.0 and a * side > 0.0 and (direction == 0 or direction * side < 0.0):
+            trial = min(trial, low + (high - low) * a / (a - b))
+    if not low < trial < high:
+        trial = 0.5 * (low + high)
+    clock[STEP] = trial
+    return True
+
+
+@internal_kernel
+def fire_events(run: Run):
+    """Log the events that the accepted step ends at, and do as they say; True when the caller is to look."""
+    count, event, look = run.count, run.event, False
+    for e in range(event.shape[0]):
+        if count[FIRED] == 1 and happened(run, e):
+            action = run.event_table[e, ON_EVENT]
+            if count[LOGGED] < run.log_time.shape[0]:
+                run.log_time[count[LOGGED]] = run.clock[TIME]
+                run.log_event[count[LOGGED]] = e
+                count[LOGGED] += 1
+            event[e, SIDE] = -event[e, SIDE]
+            if action == STOP:
+                count[STATUS] = STOPPED
+            look = look or action == RETURN
+        elif event[e, VALUE] != 0.0:
+            event[e, SIDE] = 1.0 if event[e, VALUE] > 0.0 else -1.0
+        event[e, START_VALUE] = event[e, VALUE]
+    count[FIRED] = 0
+    return look or count[LOGGED] == run.log_time.shape[0]
+
+
+@internal_kernel
+def next_tick(run: Run, until):
+    """The earliest tick, or ``until`` when that comes first [s]."""
+    for k in range(run.tick.shape[0]):
+        until = min(until, run.tick[k, TICK_NEXT])
+    return until
+
+
+@internal_kernel
+def take_ticks(run: Run):
+    """Kinds of the ticks that are due, as a sum of their bits; moves them on and TIME exactly to where they are."""
+    due, clock, tick = 0, run.clock, run.tick
+    for k in range(tick.shape[0]):
+        if tick[k, TICK_NEXT] - clock[TIME] <= 1e-12 * max(1.0, abs(clock[TIME])):
+            clock[TIME] = tick[k, TICK_NEXT]
+            run.tick_table[k, TICK_COUNT] += 1
+            # Not a sum of periods, whose roundings would add up.
+            tick[k, TICK_NEXT] = tick[k, TICK_PHASE] + run.tick_table[k, TICK_COUNT] * tick[k, TICK_PERIOD]
+            due |= run.tick_table[k, TICK_KIND]
+    return due

@@ -1,0 +1,237 @@
+"""Joints beyond one angle or one sliding distance: what their coordinates mean, row by row.
+
+Every joint is a sequence of one-velocity rows. A row is a link of the tree with a motion axis S and one velocity; all
+rows of a joint but the last are massless. The axes of a joint with several rows are fixed in the body that it carries,
+so with V_J = Σ S_k v_k and V the velocity of that body, d/dt(S_k) = V × S_k, and the bias of the joint is
+V × V_J = V_P × V_J: each row has the bias V_P × S_k v_k, V_P the velocity of what the *joint* is mounted on (``BASE``),
+not of the row before. The sweeps need nothing else.
+
+Positions are not the integrals of such velocities: q̇ = N(q) v, and there may be more of them than velocities. The
+first row takes its pose from the coordinates of the whole joint; the others copy it.
+
+=====================  ===============================  ==================================================
+joint                  coordinates                      rows
+=====================  ===============================  ==================================================
+ball                   quaternion w, x, y, z            angular velocity about the body's x, y, z
+rolling base           x, y, heading in the ground      unit speed along the heading; unit rate of turning
+=====================  ===============================  ==================================================
+
+A free body is three prismatic rows and a ball; a planar joint two prismatic rows and a revolute one.
+"""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.kernels.arrays import (
+    BALL_X,
+    BALL_Y,
+    BALL_Z,
+    BASE,
+    EXTRA,
+    KIND,
+    P_PJ,
+    PARENT,
+    POSITION_INDEX,
+    QD,
+    QDD,
+    R_PJ,
+    ROLL,
+    TURN,
+    A,
+    ModelArrays,
+    P,
+    Q,
+    R,
+    S,
+    V,
+    Workspace,
+)
+from dynsim.kernels.jit import inlined_kernel, internal_kernel, kernel
+
+
+@inlined_kernel
+def row_motion(model: ModelArrays, ws: Workspace, i, b0, b1, b2, b3, b4, b5, b6, b7, b8, px, py, pz):
+    """Pose and motion axis of row i of a joint with several rows.
+
+    Parameters
+    ----------
+    model : tables of the joints' placements, axes and parameters
+    b, p : rotation (row-major) and origin of the joint's frame at q = 0 in the world; of a later row the pose that its
+        predecessor has left
+
+    Returns
+    -------
+    tuple
+        Rotation (9) and origin (3) of the body, axis as a motion vector at the world origin (6).
+    """
+    kind, joints, trig = model.tree[i, KIND], ws.joints, ws.trig
+    sx, sy, sz, lx, ly, lz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    if kind == BALL_X:
+        w, x, y, z = joints[i, Q], joints[i, EXTRA], joints[i + 1, Q], joints[i + 2, Q]
+        # A rotation whatever the length of the quaternion: between two normalisations it drifts.
+        s = 2.0 / (w * w + x * x + y * y + z * z)
+        r0, r1, r2 = 1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)
+        r3, r4, r5 = s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x)
+        r6, r7, r8 = s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y)
+        b0, b1, b2 = b0 * r0 + b1 * r3 + b2 * r6, b0 * r1 + b1 * r4 + b2 * r7, b0 * r2 + b1 * r5 + b2 * r8
+        b3, b4, b5 = b3 * r0 + b4 * r3 + b5 * r6, b3 * r1 + b4 * r4 + b5 * r7, b3 * r2 + b4 * r5 + b5 * r8
+        b6, b7, b8 = b6 * r0 + b7 * r3 + b8 * r6, b6 * r1 + b7 * r4 + b8 * r7, b6 * r2 + b7 * r5 + b8 * r8
+        sx, sy, sz = b0, b3, b6
+    elif kind == BALL_Y:
+        sx, sy, sz = b1, b4, b7
+    elif kind == BALL_Z:
+        sx, sy, sz = b2, b5, b8
+    elif kind == ROLL:
+        x, y, s, c = joints[i, Q], joints[i, EXTRA], trig[0, i + 1], trig[1, i + 1]
+        px, py, pz = px + b0 * x + b1 * y, py + b3 * x + b4 * y, pz + b6 * x + b7 * y
+        b0, b1 = c * b0 + s * b1, c * b1 - s * b0
+        b3, b4 = c * b3 + s * b4, c * b4 - s * b3
+        b6, b7 = c * b6 + s * b7, c * b7 - s * b6
+        lx, ly, lz = b0, b3, b6
+    elif kind == TURN:
+        sx, sy, sz = b2, b5, b8
+    if kind != ROLL:
+        lx, ly, lz = py * sz - pz * sy, pz * sx - px * sz, px * sy - py * sx
+    return b0, b1, b2, b3, b4, b5, b6, b7, b8, px, py, pz, sx, sy, sz, lx, ly, lz
+
+
+@internal_kernel
+def sweep_row(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
+    """R, p, S, V and A of row i into ``ws.links``: what ``forward_sweep`` does for a link (dynsim.kernels.tree.sweep).
+
+    v, vdot : rate and acceleration of the row with the sweep's factors; g : gravity likewise
+    """
+    body, links, j, m = model.body, ws.links, model.tree[i, PARENT], model.tree[i, BASE]
+    b0, b1, b2 = body[i, R_PJ], body[i, R_PJ + 1], body[i, R_PJ + 2]
+    b3, b4, b5 = body[i, R_PJ + 3], body[i, R_PJ + 4], body[i, R_PJ + 5]
+    b6, b7, b8 = body[i, R_PJ + 6], body[i, R_PJ + 7], body[i, R_PJ + 8]
+    px, py, pz = body[i, P_PJ], body[i, P_PJ + 1], body[i, P_PJ + 2]
+    if j >= 0:
+        a0, a1, a2 = links[j, R], links[j, R + 1], links[j, R + 2]
+        a3, a4, a5 = links[j, R + 3], links[j, R + 4], links[j, R + 5]
+        a6, a7, a8 = links[j, R + 6], links[j, R + 7], links[j, R + 8]
+        px, py, pz = (
+            links[j, P] + a0 * px + a1 * py + a2 * pz,
+            links[j, P + 1] + a3 * px + a4 * py + a5 * pz,
+            links[j, P + 2] + a6 * px + a7 * py + a8 * pz,
+        )
+        b0, b3, b6 = a0 * b0 + a1 * b3 + a2 * b6, a3 * b0 + a4 * b3 + a5 * b6, a6 * b0 + a7 * b3 + a8 * b6
+        b1, b4, b7 = a0 * b1 + a1 * b4 + a2 * b7, a3 * b1 + a4 * b4 + a5 * b7, a6 * b1 + a7 * b4 + a8 * b7
+        b2, b5, b8 = a0 * b2 + a1 * b5 + a2 * b8, a3 * b2 + a4 * b5 + a5 * b8, a6 * b2 + a7 * b5 + a8 * b8
+    b0, b1, b2, b3, b4, b5, b6, b7, b8, px, py, pz, sx, sy, sz, lx, ly, lz = row_motion(
+        model, ws, i, b0, b1, b2, b3, b4, b5, b6, b7, b8, px, py, pz
+    )
+    links[i, R], links[i, R + 1], links[i, R + 2] = b0, b1, b2
+    links[i, R + 3], links[i, R + 4], links[i, R + 5] = b3, b4, b5
+    links[i, R + 6], links[i, R + 7], links[i, R + 8] = b6, b7, b8
+    links[i, P], links[i, P + 1], links[i, P + 2] = px, py, pz
+    links[i, S], links[i, S + 1], links[i, S + 2] = sx, sy, sz
+    links[i, S + 3], links[i, S + 4], links[i, S + 5] = lx, ly, lz
+    wx, wy, wz, ox, oy, oz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    if m >= 0:
+        wx, wy, wz = links[m, V], links[m, V + 1], links[m, V + 2]
+        ox, oy, oz = links[m, V + 3], links[m, V + 4], links[m, V + 5]
+    bias = (
+        wy * sz - wz * sy,
+        wz * sx - wx * sz,
+        wx * sy - wy * sx,
+        wy * lz - wz * ly + oy * sz - oz * sy,
+        wz * lx - wx * lz + oz * sx - ox * sz,
+        wx * ly - wy * lx + ox * sy - oy * sx,
+    )
+    # The world's acceleration is −g.
+    root = (0.0, 0.0, 0.0, -gx, -gy, -gz)
+    for s in range(6):
+        links[i, V + s] = links[i, S + s] * v + (links[j, V + s] if j >= 0 else 0.0)
+        links[i, A + s] = links[i, S + s] * vdot + bias[s] * v + (links[j, A + s] if j >= 0 else root[s])
+
+
+@kernel
+def read_positions(model: ModelArrays, y, start, ws: Workspace):
+    """Coordinates of all joints from y[start:] into the workspace."""
+    tree, joints = model.tree, ws.joints
+    for i in range(tree.shape[0]):
+        k = start + tree[i, POSITION_INDEX]
+        joints[i, Q] = y[k]
+        if tree[i, KIND] == BALL_X or tree[i, KIND] == ROLL:
+            joints[i, EXTRA] = y[k + 1]
+
+
+@internal_kernel
+def position_rates(model: ModelArrays, ws: Workspace, dy, start):
+    """q̇ = N(q) v into dy[start:]. Ball: ½ q ∘ (0, ω) with ω in the body; rolling: V (cos ψ, sin ψ), ω."""
+    tree, joints = model.tree, ws.joints
+    for i in range(tree.shape[0]):
+        k, kind = start + tree[i, POSITION_INDEX], tree[i, KIND]
+        if kind == BALL_X:
+            w, x, y, z = joints[i, Q], joints[i, EXTRA], joints[i + 1, Q], joints[i + 2, Q]
+            a, b, c = 0.5 * joints[i, QD], 0.5 * joints[i + 1, QD], 0.5 * joints[i + 2, QD]
+            dy[k] = -(x * a + y * b + z * c)
+            dy[k + 1] = w * a + y * c - z * b
+            dy[k + 2] = w * b + z * a - x * c
+            dy[k + 3] = w * c + x * b - y * a
+        elif kind == ROLL:
+            dy[k] = joints[i, QD] * ws.trig[1, i + 1]
+            dy[k + 1] = joints[i, QD] * ws.trig[0, i + 1]
+        elif kind != BALL_Y and kind != BALL_Z:
+            dy[k] = joints[i, QD]
+
+
+@internal_kernel
+def displace(model: ModelArrays, ws: Workspace, y, start):
+    """Move the positions y[start:] by the small displacement in the QDD column, taken as velocities for a unit time."""
+    tree, joints = model.tree, ws.joints
+    for i in range(tree.shape[0]):
+        k, kind = start + tree[i, POSITION_INDEX], tree[i, KIND]
+        if kind == BALL_X:
+            w, x, y0, z = y[k], y[k + 1], y[k + 2], y[k + 3]
+            a, b, c = 0.5 * joints[i, QDD], 0.5 * joints[i + 1, QDD], 0.5 * joints[i + 2, QDD]
+            y[k] -= x * a + y0 * b + z * c
+            y[k + 1] += w * a + y0 * c - z * b
+            y[k + 2] += w * b + z * a - x * c
+            y[k + 3] += w * c + x * b - y0 * a
+        elif kind == ROLL:
+            y[k] += joints[i, QDD] * ws.trig[1, i + 1]
+            y[k + 1] += joints[i, QDD] * ws.trig[0, i + 1]
+        elif kind != BALL_Y and kind != BALL_Z:
+            y[k] += joints[i, QDD]
+
+
+@internal_kernel
+def normalise(model: ModelArrays, y, start):
+    """Give every quaternion in y[start:] unit length."""
+    tree = model.tree
+    for i in range(tree.shape[0]):
+        if tree[i, KIND] == BALL_X:
+            k = start + tree[i, POSITION_INDEX]
+            scale = 1.0 / math.sqrt(y[k] * y[k] + y[k + 1] * y[k + 1] + y[k + 2] * y[k + 2] + y[k + 3] * y[k + 3])
+            for s in range(4):
+                y[k + s] *= scale
+
+
+@internal_kernel
+def position_error(model: ModelArrays, y, y_new, error, start, rtol, atol):
+    """Sum of squares of the errors of the positions, each per its tolerance, and their number: for the step control.
+
+    The error of a quaternion counts as the three angles 2 vec(q̄ ∘ δq) of the rotation that undoes it, against
+    atol + rtol [rad]: what a revolute joint one radian from zero is held to.
+    """
+    tree, total, count = model.tree, 0.0, 0
+    for i in range(tree.shape[0]):
+        k, kind = start + tree[i, POSITION_INDEX], tree[i, KIND]
+        if kind == BALL_X:
+            w, x, y0, z = y_new[k], y_new[k + 1], y_new[k + 2], y_new[k + 3]
+            dw, dx, dy, dz = error[k], error[k + 1], error[k + 2], error[k + 3]
+            scale = 2.0 / ((w * w + x * x + y0 * y0 + z * z) * (atol + rtol))
+            ex = scale * (w * dx - x * dw - y0 * dz + z * dy)
+            ey = scale * (w * dy - y0 * dw - z * dx + x * dz)
+            ez = scale * (w * dz - z * dw - x * dy + y0 * dx)
+            total += ex * ex + ey * ey + ez * ez
+            count += 3
+        elif kind != BALL_Y and kind != BALL_Z:
+            for s in range(2 if kind == ROLL else 1):
+                e = error[k + s] / (atol + rtol * max(abs(y[k + s]), abs(y_new[k + s])))
+                total += e * e
+                count += 1
+    return total, count

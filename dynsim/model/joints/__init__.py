@@ -1,0 +1,69 @@
+"""Kinds of joints, a module each: the rows that the kernels know them by, and their coordinates.
+
+A module exposes ``ROWS``, its rows by name (:attr:`dynsim.model.description.Link.kind`), and for a joint with several
+of them a function that makes its links. Modules are found by being here. The motion itself is a branch of
+:func:`dynsim.kernels.tree.sweep.forward_sweep` (one angle, one distance) or of
+:func:`dynsim.kernels.tree.joints.row_motion` (everything else).
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from dynsim.model.description import Link
+
+Array = NDArray[np.float64]
+ANGLE = ("rad", "rad/s", "rad/s²", "N m")
+DISTANCE = ("m", "m/s", "m/s²", "N")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One velocity of a joint.
+
+    Attributes
+    ----------
+    code : its number in the kernels (dynsim.kernels.arrays)
+    units : of position, velocity, acceleration and force
+    neutral : coordinates of the whole joint where its frames coincide; of its later rows empty
+    names : of these coordinates, where there are several
+    offset : where the row's own coordinates begin among those of the joint
+    motion : (link, coordinates (k, T)) → rotation (3, 3, T) and origin (3, T) of the body in the joint's frame
+    """
+
+    code: int
+    units: tuple[str, str, str, str]
+    neutral: tuple[float, ...] = (0.0,)
+    names: tuple[str, ...] = ()
+    offset: int = 0
+    motion: Callable[[Link, Array], tuple[Array, Array]] | None = None
+
+
+@cache
+def rows() -> dict[str, Row]:
+    """Rows of all joints by name."""
+    found: dict[str, Row] = {}
+    for info in pkgutil.iter_modules(__path__):
+        found.update(importlib.import_module(f"{__name__}.{info.name}").ROWS)
+    return found
+
+
+def turned(axis: Array, angle: Array) -> Array:
+    """Rotation about a unit axis by angles (T,), (3, 3, T)."""
+    x, y, z = axis
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3)[:, :, None] + np.sin(angle) * K[:, :, None] + (1.0 - np.cos(angle)) * (K @ K)[:, :, None]
+
+
+def unturned(count: int) -> Array:
+    """No rotation, (3, 3, count)."""
+    return np.repeat(np.eye(3)[:, :, None], count, axis=2)

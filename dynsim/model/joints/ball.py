@@ -1,0 +1,57 @@
+"""A ball joint, and a free body: position and attitude as a quaternion, rates of turning about the body's axes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dynsim.kernels.arrays import BALL_X, BALL_Y, BALL_Z
+from dynsim.model.joints import ANGLE, Array, Row
+
+if TYPE_CHECKING:
+    from dynsim.model.description import Link
+
+
+def motion(link: Link, q: Array) -> tuple[Array, Array]:
+    """See :class:`dynsim.model.joints.Row`."""
+    w, x, y, z = q / np.sqrt((q * q).sum(axis=0))
+    R = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    return R, np.zeros((3, q.shape[1]))
+
+
+ROWS = {
+    "ball_x": Row(BALL_X, ("1", *ANGLE[1:]), (1.0, 0.0, 0.0, 0.0), ("qw", "qx", "qy", "qz"), motion=motion),
+    "ball_y": Row(BALL_Y, ("1", *ANGLE[1:]), (), offset=2),
+    "ball_z": Row(BALL_Z, ("1", *ANGLE[1:]), (), offset=3),
+}
+
+
+def ball(link: Link) -> tuple[Link, ...]:
+    """Links of a ball joint that carries the body of ``link``, whose kind and axis do not matter.
+
+    Coordinates: the quaternion w, x, y, z of the body in the joint's frame. Rates: its angular velocity in its axes.
+    """
+    from dynsim.model.description import in_rows
+
+    return in_rows(link, [(f"w{axis}", f"ball_{axis}", np.eye(3)[k]) for k, axis in enumerate("xyz")])
+
+
+def floating(link: Link) -> tuple[Link, ...]:
+    """Links of a body that moves freely from the joint's frame.
+
+    Coordinates: position of its origin in the joint's frame, then the quaternion. Rates: velocity of the origin in the
+    axes of the joint's frame, angular velocity in those of the body.
+    """
+    from dynsim.model.description import Inertia, in_rows
+
+    carrier = replace(link, name=f"{link.name}.position", inertia=Inertia(0.0), radius=0.0, tip=None)
+    sliding = in_rows(carrier, [(axis, "prismatic", np.eye(3)[k]) for k, axis in enumerate("xyz")])
+    return (*sliding, *ball(replace(link, parent=carrier.name, R_PJ=np.eye(3), p_PJ=np.zeros(3))))

@@ -1,0 +1,53 @@
+"""A body that slides in a plane and turns about its normal; or that rolls on it, without sliding sideways."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dynsim.kernels.arrays import ROLL, TURN
+from dynsim.model.joints import ANGLE, DISTANCE, Array, Row, turned
+
+if TYPE_CHECKING:
+    from dynsim.model.description import Link
+
+
+def motion(link: Link, q: Array) -> tuple[Array, Array]:
+    """See :class:`dynsim.model.joints.Row`."""
+    return turned(np.array([0.0, 0.0, 1.0]), q[2]), np.stack([q[0], q[1], np.zeros(q.shape[1])])
+
+
+ROWS = {
+    "roll": Row(ROLL, DISTANCE, (0.0, 0.0, 0.0), ("x", "y", "heading"), motion=motion),
+    "turn": Row(TURN, ANGLE, (), offset=2),
+}
+
+
+def planar(link: Link) -> tuple[Link, ...]:
+    """Links of a body in the plane with normal ``link.axis`` (unit): two distances in the plane, one angle."""
+    from dynsim.model.description import in_rows
+
+    normal = np.asarray(link.axis, dtype=np.float64)
+    # The plane's axes: those of x and y turned the shortest way to the normal, x and y themselves for +z.
+    z = np.array([0.0, 0.0, 1.0])
+    cosine = float(normal[2])
+    if cosine > -1.0 + 1e-12:
+        v = np.cross(z, normal)
+        K = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+        R = np.eye(3) + K + K @ K / (1.0 + cosine)
+    else:
+        R = np.diag([1.0, -1.0, -1.0])
+    return in_rows(link, [("x", "prismatic", R[:, 0]), ("y", "prismatic", R[:, 1]), ("angle", "revolute", normal)])
+
+
+def rolling(link: Link) -> tuple[Link, ...]:
+    """Links of a body that rolls on the plane z = 0 of the joint's frame like a wheelset with its axle along y.
+
+    Coordinates: x, y and heading of the middle of the axle. Rates: speed along the heading, rate of turning. It cannot
+    move sideways.
+    """
+    from dynsim.model.description import in_rows
+
+    x, z = np.eye(3)[0], np.eye(3)[2]
+    return in_rows(link, [("roll", "roll", x), ("turn", "turn", z)])

@@ -1,0 +1,21 @@
+"""One angle about an axis; the axes x, y and z are rows of their own, for speed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dynsim.kernels.arrays import REVOLUTE
+from dynsim.model.joints import ANGLE, Array, Row, turned
+
+if TYPE_CHECKING:
+    from dynsim.model.description import Link
+
+
+def motion(link: Link, q: Array) -> tuple[Array, Array]:
+    """See :class:`dynsim.model.joints.Row`."""
+    return turned(link.axis, q[0]), np.zeros((3, q.shape[1]))
+
+
+ROWS = {"revolute": Row(REVOLUTE, ANGLE, motion=motion)}

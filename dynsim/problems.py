@@ -1,0 +1,207 @@
+"""What is wrong with the content of a file, in one line: place, key, value and fix, from what pydantic found.
+
+Scenarios and servo maps share it, so that errors of both read alike.
+"""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import re
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+# Of what messages show: unknown keys, characters of a value or key.
+UNKNOWN_SHOWN = 20
+SHOWN_LIMIT = 80
+# A list index in a dotted key.
+INDEX = re.compile("[0-9]{1,9}")
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where the values of a scenario come from, so that messages can name the line of a key.
+
+    Attributes
+    ----------
+    file : Path or str
+        The file, or what else is to be called the source.
+    mappings : tuple
+        What was merged, as read: the variant's difference, then the rest of the file.
+    overrides : tuple of str
+        Dotted keys that were set on top, and ``overriding``, how that was done.
+    """
+
+    file: Path | str
+    mappings: tuple[Any, ...] = ()
+    overrides: tuple[str, ...] = ()
+    overriding: str = "overrides"
+
+    def sets(self, keys: Sequence[int | str]) -> bool:
+        """True when an override set the value at ``keys``, something in it or something that it is in."""
+        own = ".".join(map(str, keys))
+        return any(own == key or own.startswith(key + ".") or key.startswith(own + ".") for key in self.overrides)
+
+    def line(self, keys: Sequence[int | str]) -> int:
+        """Line of the last of ``keys`` that the file has; 0 when it has none of them."""
+        # The mapping that has most of the keys; of equals the first, because the variant lies over the rest.
+        found = [_line(mapping, keys) for mapping in self.mappings]
+        return max(found, key=lambda depth_and_line: depth_and_line[0], default=(0, 0))[1]
+
+    def place(self, keys: Sequence[int | str]) -> str:
+        """``file:line`` of a key, or how it was overridden."""
+        if self.sets(keys):
+            return self.overriding
+        return f"{self.file}:{line}" if (line := self.line(keys)) else str(self.file)
+
+
+def unknown_keys(
+    error: ValidationError, data: Any, origin: Origin, schema: type[BaseModel], also: Sequence[str] = ()
+) -> list[str]:
+    """Every unknown key: place, key, and the known one that it is like; at the top, those ``also`` are known."""
+    texts: list[str] = []
+    for problem in error.errors(include_url=False, include_input=False):
+        if problem["type"] != "extra_forbidden" or len(texts) > UNKNOWN_SHOWN:
+            continue
+        keys, _, _ = _locate(data, problem["loc"])
+        known = _fields(schema, problem["loc"][:-1]) + (list(also) if len(keys) == 1 else [])
+        suggestion = suggest(str(keys[-1]), known)
+        if not suggestion and known:
+            suggestion = f"; known here: {', '.join(known)}"
+        texts.append(f"{origin.place(keys)}: {dotted(keys)}: unknown key{suggestion}")
+    return texts
+
+
+def explain(error: ValidationError, data: Any, origin: Origin, unknown: Sequence[str]) -> str:
+    """One line with file:line, key, value and fix: all unknown keys, else the first problem."""
+    problems = error.errors(include_url=False, include_input=False)
+    if unknown:
+        # These first and alone: a misspelt key also makes the right one missing.
+        texts = list(dict.fromkeys(unknown))
+        shown = "; ".join(texts[:UNKNOWN_SHOWN]) + ("; and more" if len(texts) > UNKNOWN_SHOWN else "")
+        return shown + _and_more(sum(problem["type"] != "extra_forbidden" for problem in problems))
+    problem = problems[0]
+    loc = (*problem["loc"], *problem.get("ctx", {}).get("key", "").split("."))
+    keys, value, found = _locate(data, tuple(part for part in loc if part != ""))
+    kind, message = problem["type"], problem["msg"].removeprefix("Value error, ")
+    more = len(problems) - 1
+    if kind == "missing" and isinstance(problem["loc"][-1], int) and isinstance(value, list):
+        # One problem for every entry that a list of fixed length lacks.
+        lacking = sum(p["type"] == kind and p["loc"][:-1] == problem["loc"][:-1] for p in problems)
+        text = f"has {len(value)} entries, {len(value) + lacking} are needed"
+        more -= lacking - 1
+    elif kind == "missing":
+        text = "is missing; add it"
+    elif kind in ("union_tag_invalid", "union_tag_not_found"):
+        expected = problem["ctx"].get("expected_tags", "").replace("'", "") if "ctx" in problem else ""
+        tag = value.get("type", "") if isinstance(value, Mapping) else ""
+        keys = [*keys, "type"]
+        if tag:
+            text = f"unknown type {value_text(tag)}{suggest(str(tag), expected.split(', '))}; known: {expected}"
+        else:
+            text = "is missing; it says which one" + (f": {expected}" if expected else "")
+        found = False
+    elif kind in ("model_type", "dict_type", "model_attributes_type"):
+        text = "must be a mapping of keys to values"
+    else:
+        text = " ".join((message[0].lower() + message[1:]).splitlines())
+    given = f" = {value_text(value)}" if found and not isinstance(value, (Mapping, list)) else ""
+    key = f"{dotted(keys)}{given}: " if keys else ""
+    return f"{origin.place(keys)}: {key}{text}{_and_more(more)}"
+
+
+def _and_more(count: int) -> str:
+    return f" (and {count} more)" if count > 0 else ""
+
+
+def key_text(key: object) -> str:
+    """A key for a message: in one line and not too long."""
+    text = str(key)
+    text = text if len(text) <= SHOWN_LIMIT else text[:SHOWN_LIMIT] + "…"
+    return text if text.isprintable() else repr(text)[1:-1]
+
+
+def dotted(keys: Sequence[int | str]) -> str:
+    return ".".join(key_text(key) if key != "" else "''" for key in keys)
+
+
+def value_text(value: object) -> str:
+    """A value for a message: in one line and not too long."""
+    if isinstance(value, str):
+        return repr(value if len(value) <= SHOWN_LIMIT else value[:SHOWN_LIMIT] + "…")
+    text = repr(value)
+    return text if len(text) <= SHOWN_LIMIT else text[:SHOWN_LIMIT] + "…"
+
+
+def suggest(word: str, known: Any) -> str:
+    if len(word) > SHOWN_LIMIT:
+        return ""  # the comparison takes the square of the length
+    near = difflib.get_close_matches(word, [str(k) for k in itertools.islice(known, 1000)], n=1, cutoff=0.6)
+    return f"; did you mean {near[0]!r}?" if near else ""
+
+
+def _locate(data: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any, bool]:
+    """Keys of a pydantic location without its union tags; the value there, and whether there is one."""
+    keys: list[int | str] = []
+    node, found = data, True
+    for part in loc:
+        if isinstance(node, list) and isinstance(part, str) and INDEX.fullmatch(part):
+            part = int(part)  # of a dotted key
+        in_mapping = isinstance(node, Mapping) and part in node
+        in_list = isinstance(node, list) and isinstance(part, int) and part < len(node)
+        if found and (in_mapping or in_list):
+            node = node[part]
+        elif isinstance(node, Mapping) and node.get("type") == part:
+            continue
+        elif found and isinstance(node, (int, float, str, list)):
+            # Branches of a union of plain types, such as "float" and "list[float]".
+            continue
+        else:
+            found = False
+        keys.append(part)
+    return keys, node, found
+
+
+def _line(mapping: Any, keys: Sequence[int | str]) -> tuple[int, int]:
+    """How many of ``keys`` lead into a mapping of a YAML file, and the line of the last of them; (0, 0) for none."""
+    depth = line = 0
+    node = mapping
+    for key in keys:
+        lines = getattr(node, "lines", {})
+        if key not in lines:
+            break
+        depth, line = depth + 1, lines[key]
+        node = node[key]
+    return depth, line
+
+
+def _fields(schema: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
+    """Keys that data of a schema may have at a pydantic location."""
+    classes = [schema]
+    for part in loc:
+        held = [c.model_fields[part] for c in classes if isinstance(part, str) and part in c.model_fields]
+        if held:
+            classes = [c for field in held for held_in in (field.annotation, *field.metadata) for c in _models(held_in)]
+        else:
+            tagged = [c for c in classes if part in _literals(c)]
+            classes = tagged or classes
+    return [name for c in classes for name in c.model_fields]
+
+
+def _models(annotation: Any) -> list[type[BaseModel]]:
+    """Configurations within an annotation; a choice by ``type`` (``families.Choice``) has them in ``models``."""
+    if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
+        return [annotation] if issubclass(annotation, BaseModel) else []
+    if callable(choices := getattr(annotation, "models", None)):
+        return list(choices())
+    return [model for argument in typing.get_args(annotation) for model in _models(argument)]
+
+
+def _literals(model: type[BaseModel]) -> tuple[Any, ...]:
+    return typing.get_args(model.model_fields["type"].annotation) if "type" in model.model_fields else ()

@@ -1,0 +1,32 @@
+"""Scenarios: YAML in (``reading``), a validated description of one simulation out (``schema``), built by ``build``."""
+
+from dynsim.scenario.build import build_model, require_scenario
+from dynsim.scenario.editors import json_schema
+from dynsim.scenario.reading import (
+    SetOptions,
+    find_scenario,
+    load_scenario,
+    parse_override,
+    scenario_from_resolved,
+    to_yaml,
+    variant_names,
+)
+from dynsim.scenario.schema import Scenario, ScenarioConfig
+from dynsim.shipped import SHIPPED, shipped_scenarios
+
+__all__ = [
+    "SHIPPED",
+    "Scenario",
+    "ScenarioConfig",
+    "SetOptions",
+    "build_model",
+    "find_scenario",
+    "json_schema",
+    "load_scenario",
+    "parse_override",
+    "require_scenario",
+    "scenario_from_resolved",
+    "shipped_scenarios",
+    "to_yaml",
+    "variant_names",
+]

@@ -1,0 +1,214 @@
+"""What a scenario describes, built: its machine, controller, surfaces, contacts and loads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import overload
+
+import numpy as np
+
+from dynsim import families
+from dynsim.config import BodyPoint
+from dynsim.errors import ModelError, ScenarioError, shown
+from dynsim.model.control import JointControl
+from dynsim.model.description import Array, Contact, Inertia, Load, Quadric, Robot
+from dynsim.model.model import Model
+from dynsim.model.protocols import BuildContext
+from dynsim.model.snake import SnakeDescription, TaskSpaceController
+from dynsim.problems import dotted, suggest
+from dynsim.scenario.loads import Payload
+from dynsim.scenario.schema import Scenario
+
+# A contact point must start this close to its surface [m].
+START_TOLERANCE = 1e-6
+
+
+def machine(scenario: Scenario) -> Robot | SnakeDescription:
+    """What the plant of the scenario is, a tree of bodies or a snake."""
+    if scenario.engine == "kinematic":
+        return families.build("plant", scenario.plant, BuildContext(scenario.duration_s), SnakeDescription)
+    return robot(scenario)
+
+
+def robot(scenario: Scenario) -> Robot:
+    """The tree of bodies with its motors and payloads.
+
+    Raises
+    ------
+    ModelError
+        The plant is none or cannot be built, or a payload is on a body that it does not have.
+    """
+    if scenario.engine == "kinematic":
+        raise ModelError(f"plant {scenario.plant.type!r} is kinematic: it has no rigid-body model")
+    bare = families.build("plant", scenario.plant, BuildContext(scenario.duration_s), Robot)
+    inertias: dict[int, list[Inertia]] = {}
+    for name, config in scenario.config.loads.items():
+        if isinstance(config, Payload):
+            body, point, axes = _attached(bare, name, config)
+            inertias.setdefault(body, [bare.links[body].inertia]).append(_payload(name, config, point, axes))
+    links = list(bare.links)
+    for body, parts in inertias.items():
+        links[body] = replace(links[body], inertia=Inertia.merged(parts))
+    return replace(bare, links=tuple(links)) if inertias else bare
+
+
+def build_model(scenario: Scenario) -> Model:
+    """The rigid-body model of a scenario's plant.
+
+    Raises
+    ------
+    ModelError
+        The plant has none, or is not physical.
+    ScenarioError
+        Not a scenario.
+    """
+    require_scenario(scenario)
+    return Model(robot(scenario))
+
+
+@overload
+def controller(scenario: Scenario, machine: Model, progress: Callable[[float], None] | None = None) -> JointControl: ...
+@overload
+def controller(
+    scenario: Scenario, machine: SnakeDescription, progress: Callable[[float], None] | None = None
+) -> TaskSpaceController: ...
+def controller(
+    scenario: Scenario, machine: Model | SnakeDescription, progress: Callable[[float], None] | None = None
+) -> JointControl | TaskSpaceController:
+    """The controller for a machine; ``progress`` is called with the time [s] that its references have come to.
+
+    Raises
+    ------
+    ModelError
+        The scenario has none, it is for other machines, or does not fit this one.
+    UnreachableReference
+        The hand cannot follow its path.
+    """
+    config = scenario.controller
+    if config is None:
+        raise ModelError("the scenario has no controller; its motors are short-circuited")
+    if scenario.engine != families.member("controller", config.type).ENGINE:
+        raise ModelError(f"controller {config.type!r} cannot drive a {scenario.plant.type!r}")
+    context = BuildContext(scenario.duration_s, machine, progress=progress)
+    if isinstance(machine, Model):
+        control = families.build("controller", config, context, JointControl)
+        # The kernels would follow the last polynomial on.
+        if control.end < scenario.duration_s * (1.0 - 1e-6):
+            ends = f"end at {control.end:g} s, the run at {scenario.duration_s:g} s"
+            raise ModelError(f"controller {config.type!r}: its references {ends}")
+        return control
+    return families.build("controller", config, context, TaskSpaceController)
+
+
+def surfaces(scenario: Scenario) -> dict[str, Quadric]:
+    """All surfaces by name, whether anything touches them or not."""
+    context = BuildContext(scenario.duration_s)
+    return {
+        name: families.build("surface", config, context, Quadric) for name, config in scenario.config.surfaces.items()
+    }
+
+
+def contacts(scenario: Scenario) -> list[Contact]:
+    """All enabled contact points with their surfaces.
+
+    Raises
+    ------
+    ModelError
+        A point on a surface that the scenario does not have.
+    """
+    options = scenario.config.contacts
+    known = surfaces(scenario)
+    result = []
+    for name, point in options.points.items():
+        if not point.enabled:
+            continue
+        if point.surface not in known:
+            keys = ("contacts", "points", name, "surface")
+            raise ModelError(
+                f"{dotted(keys)} = {point.surface!r}: no such surface{suggest(point.surface, known)}; "
+                f"surfaces: {', '.join(known) or 'none'}",
+                keys=keys,
+            )
+        result.append(
+            Contact(
+                name=name,
+                body=point.body,
+                point=np.array(point.point_m),
+                surface=known[point.surface],
+                surface_name=point.surface,
+                friction=options.friction if point.friction is None else point.friction,
+                slip_smoothing=options.slip_smoothing_m_s,
+                pulling_friction=options.pulling_friction,
+            )
+        )
+    return result
+
+
+def loads(scenario: Scenario, robot: Robot) -> list[Load]:
+    """Forces and torques from outside on the links of a robot; payloads are part of the links already.
+
+    Raises
+    ------
+    ModelError
+        A load on a body that the robot does not have.
+    """
+    result = []
+    for name, config in scenario.config.loads.items():
+        if isinstance(config, Payload):
+            continue
+        body, point, axes = _attached(robot, name, config)
+        knots, coefficients = config.pieces(scenario.duration_s)
+        in_body = config.frame == "body"
+        if in_body:
+            # The axes of a frame fixed on a link are not the link's.
+            coefficients = np.einsum("ab,kwbp->kwap", axes, coefficients.reshape(-1, 2, 3, 4)).reshape(-1, 6, 4)
+        result.append(Load(name, robot.links[body].name, point, in_body, knots, coefficients, config.hold))
+    return result
+
+
+def _attached(robot: Robot, name: str, config: BodyPoint) -> tuple[int, Array, Array]:
+    """Index of the link that a load is on, its point in the link's frame [m], and the axes that it is given in."""
+    keys = ("loads", name, "body")
+    try:
+        index, point = robot.attach(config.body, np.array(config.point_m))
+        return index, point, robot.attached_axes(config.body)
+    except ModelError as error:
+        raise ModelError(f"{dotted(keys)}: {error}", keys=keys) from error
+
+
+def _payload(name: str, config: Payload, point: Array, axes: Array) -> Inertia:
+    """Mass properties of a payload in its link's frame."""
+    if config.inertia_kg_m2 is None:
+        return Inertia.solid_sphere(config.mass_kg, config.radius_m, point)
+    keys = ("loads", name, "inertia_kg_m2")
+    payload = Inertia(config.mass_kg, np.zeros(3), np.diag(config.inertia_kg_m2)).placed(axes, point)
+    try:
+        payload.check(dotted(keys))
+    except ModelError as error:
+        raise ModelError(str(error), keys=keys) from error
+    return payload
+
+
+def check_start(scenario: Scenario, model: Model) -> None:
+    """Raise :class:`ModelError` unless every contact point is on a body of the robot and starts on its surface."""
+    for contact in contacts(scenario):
+        keys = ("contacts", "points", contact.name)
+        try:
+            position = model.point_position(contact.body, contact.point, model.robot.initial)
+        except ModelError as error:
+            raise ModelError(f"{dotted((*keys, 'body'))}: {error}", keys=(*keys, "body")) from error
+        gap = contact.surface.gap(position)
+        if not abs(gap) <= START_TOLERANCE:
+            raise ModelError(
+                f"{dotted(keys)}: its point starts {gap:+.4g} m from surface {contact.surface_name!r} "
+                f"(limit {START_TOLERANCE:g} m), at {position.tolist()}; "
+                "change the initial configuration or the surface, or disable the contact",
+                keys=keys,
+            )
+
+
+def require_scenario(scenario: object) -> None:
+    """Raise :class:`ScenarioError` for what is none, such as the name of one."""
+    if not isinstance(scenario, Scenario):
+        raise ScenarioError(f"needs a Scenario, not {shown(scenario)}; load_scenario(name or file) gives one")

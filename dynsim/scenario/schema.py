@@ -1,0 +1,188 @@
+"""What a scenario may say: its keys with types, units, limits and defaults, and the scenario as frozen data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, field_validator
+
+from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig
+from dynsim.families import member, union
+from dynsim.model.description import listed
+from dynsim.problems import Origin
+from dynsim.scenario.loads import LoadConfig
+
+# Bytes of the name of a folder on common file systems.
+NAME_LIMIT = 255
+
+
+class ContactPoint(BodyPoint):
+    """A point fixed on a body, held to a surface."""
+
+    surface: str = "floor"
+    friction: NonNegative | None = Field(default=None, description="kinetic coefficient; default: that of contacts")
+    enabled: bool = True
+
+
+class Contacts(StrictConfig):
+    """Contact law and contact points."""
+
+    law: Literal["bilateral"] = Field(
+        default="bilateral", description="the point stays on the surface, f_n of any sign"
+    )
+    friction: NonNegative = 0.1
+    slip_smoothing_m_s: Positive = Field(default=1e-3, description="v_s of the slip direction v_t/√(v_t² + v_s²)")
+    pulling_friction: Literal["signed", "dissipative"] = Field(
+        default="dissipative", description="f_t = μ f_n as printed in the paper, or μ |f_n|"
+    )
+    reference_tolerance_m: Positive = Field(
+        default=2e-3, description="references that take a contact point further off its surface than this are refused"
+    )
+    points: dict[str, ContactPoint] = {}
+
+
+class Integrator(StrictConfig):
+    """Time integration."""
+
+    method: Literal["rk43", "dopri5", "rk4", "rodas4"] = Field(
+        default="rk43",
+        description="adaptive 4(3) or 5(4), fixed step, or adaptive linearly implicit for stiff motors",
+    )
+    solver: Literal["articulated", "m_star"] = Field(default="articulated", description="O(n) sweeps or the dense M*")
+    rtol: float = Field(default=1e-6, ge=1e-13, le=1e-1)
+    atol: float = Field(default=1e-8, ge=1e-16, le=1e-1)
+    step_s: Positive | None = Field(default=None, description="fixed step of rk4 (default 0.001), else the first step")
+    step_max_s: Positive | None = None
+    time_limit_h: Positive = Field(default=24.0, description="runs estimated to integrate for longer are refused [h]")
+
+
+class RecordOptions(StrictConfig):
+    """What is recorded."""
+
+    rate_hz: Positive = 200.0
+    size_limit_GB: Positive = 2.0
+
+
+class Metrics(StrictConfig):
+    """How the summary is computed."""
+
+    settle_s: NonNegative = Field(default=2.0, description="tracking errors count from this time on")
+
+
+class ScenarioConfig(StrictConfig):
+    """A dynsim scenario."""
+
+    name: str = Field(default="", description="default: the name of the file")
+    variant: str = Field(default="", description="written into resolved scenarios")
+    description: str = ""
+    duration_s: Positive
+    plant: union("plant")  # type: ignore[valid-type]
+    controller: union("controller") | None = None  # type: ignore[valid-type]
+    surfaces: dict[str, union("surface")] = {}  # type: ignore[valid-type]
+    contacts: Contacts = Contacts()
+    loads: dict[str, LoadConfig] = Field(default={}, description="forces, torques and payloads by name")
+    integrator: Integrator = Integrator()
+    record: RecordOptions = RecordOptions()
+    metrics: Metrics = Metrics()
+
+    @field_validator("name", "variant")
+    @classmethod
+    def _check_folder(cls, value: str) -> str:
+        """Both name folders of the results: neither may lead out of them."""
+        if value in (".", "..") or any(sign in value for sign in "/\\\0"):
+            raise ValueError("names a folder of the results, so it must not have slashes or be dots")
+        if not value.isprintable():
+            raise ValueError("names a folder of the results, so it must be printable in one line")
+        if len(value.encode()) > NAME_LIMIT:
+            raise ValueError(f"names a folder of the results, so it must not be longer than {NAME_LIMIT} bytes")
+        return value
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One validated simulation.
+
+    Attributes
+    ----------
+    name, variant : str
+        The variant is "" for a scenario without variants.
+    config : ScenarioConfig
+    source : Path or None
+        The file it came from.
+    origin : Origin or None
+        Lines of its keys in that file.
+    """
+
+    name: str
+    variant: str
+    config: ScenarioConfig
+    source: Path | None = None
+    origin: Origin | None = field(default=None, repr=False, compare=False)
+
+    def __repr__(self) -> str:
+        config = self.config
+        parts = [config.plant.type, config.controller.type if config.controller else "no controller"]
+        parts.append(f"{config.duration_s:g} s")
+        contacts = [name for name, point in config.contacts.points.items() if point.enabled]
+        if contacts:
+            parts.append(f"contacts {listed(contacts)}")
+        return f"<Scenario {self.title}: {', '.join(parts)}>"
+
+    @property
+    def title(self) -> str:
+        """Name and variant, for a line of text."""
+        return f"{self.name} ({self.variant})" if self.variant else self.name
+
+    @property
+    def duration_s(self) -> float:
+        """Simulated time [s]."""
+        return self.config.duration_s
+
+    @property
+    def plant(self) -> Any:
+        """Configuration of the machine, the ``Config`` of its module."""
+        return self.config.plant
+
+    @property
+    def controller(self) -> Any:
+        """Configuration of the controller, None without one."""
+        return self.config.controller
+
+    @property
+    def integrator(self) -> Integrator:
+        """Method, solver and tolerances."""
+        return self.config.integrator
+
+    @property
+    def record(self) -> RecordOptions:
+        """Rate [Hz] and size limit [GB] of the record."""
+        return self.config.record
+
+    @property
+    def metrics(self) -> Metrics:
+        """How the summary is computed."""
+        return self.config.metrics
+
+    @property
+    def engine(self) -> str:
+        """What simulates the plant: the ``ENGINE`` of its module."""
+        return str(member("plant", self.plant.type).ENGINE)
+
+    @property
+    def resolved(self) -> dict[str, Any]:
+        """The scenario with every default and override written out; reading it again gives the same simulation."""
+        resolved = self.config.model_dump(mode="json", exclude_none=True)
+        if not self.config.loads:
+            del resolved["loads"]
+        return resolved
+
+    def place(self, keys: Sequence[int | str] = (), variant: str = "") -> str:
+        """``file:line`` of a key, the text for ``variant``, and how the key was overridden."""
+        line, overridden = 0, ""
+        if keys and self.origin is not None:
+            overridden = f": {self.origin.overriding}" if self.origin.sets(keys) else ""
+            line = 0 if overridden else self.origin.line(keys)
+        return f"{self.source or self.name}{f':{line}' if line else ''}{variant}{overridden}"

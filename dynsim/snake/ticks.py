@@ -1,0 +1,259 @@
+"""The compiled tick loop: what the controller believes and asks for, what the plant does, and their recording."""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.kernels.jit import internal_kernel, kernel
+from dynsim.snake.control import (
+    LIMITS_ALLOCATE,
+    LIMITS_NONE,
+    control_input,
+    estimate_from_joints,
+    sigma_min,
+)
+from dynsim.snake.kinematics import constraint_matrices, pose_of_point, walk_chain, wrap_angle
+from dynsim.snake.plant import advance_plant
+from dynsim.snake.state import (
+    ATTITUDE,
+    CLAMPED,
+    FEEDFORWARD,
+    JOINT_LIMIT,
+    MEASURED,
+    MODE,
+    NO_OBSTACLE,
+    NULL_REDUCED,
+    PLACE,
+    RATE_LIMIT,
+    SINGULAR,
+    SLOWED,
+    TICKS,
+    WAITED,
+    WAITED_FOR,
+)
+from dynsim.snake.support import cost_value, polygon_area, support_polygon
+
+# With gain K, damping that withholds this much of a command leaves a head error of WITHHELD / K [m/s, rad/s].
+WITHHELD = 1e-5
+# A target is not turned further than this towards beta = +-90 deg [rad].
+BETA_LIMIT = 0.5 * math.pi - 0.02
+# Steps in which a null-space motion that is too fast is reduced, the last of them to nothing.
+NULL_REDUCTIONS = 4
+
+
+@internal_kernel
+def copy(source, target):
+    """target[:] = source; numba's slice assignment would compile its whole error formatting."""
+    for i in range(source.shape[0]):
+        target[i] = source[i]
+
+
+@internal_kernel
+def believe(model, schedule, state, rig):
+    """What the controller takes for w and phi ([T] IV.C.1 and IV.C.2), into ``state.w_hat`` and ``state.phi_hat``."""
+    if schedule.state_source != FEEDFORWARD:
+        for j in range(state.phi.shape[0]):
+            state.phi_hat[j] = state.phi[j]
+    if schedule.state_source == MEASURED:
+        pose_of_point(model, state.base, state.phi, rig.work.frame, state.w_hat)
+    else:
+        estimate_from_joints(model, state.phi_hat, rig.work.frame, rig.origin, state.w_hat, rig.pose)
+
+
+@internal_kernel
+def obstacle(law, work, joints):
+    """Why ``work.u`` cannot be carried out: SINGULAR, JOINT_LIMIT, RATE_LIMIT or NO_OBSTACLE."""
+    if work.withheld[0] > WITHHELD:
+        return SINGULAR
+    found = NO_OBSTACLE
+    for j in range(joints):
+        if work.at_limit[j] == 2:
+            return JOINT_LIMIT
+        if abs(work.u[j]) > law.rate_limit:
+            found = RATE_LIMIT
+    return found
+
+
+@internal_kernel
+def slow_down(model, law, u, phi):
+    """Scale all rates alike such that no joint passes its rate or comes too fast to its limit.
+
+    The constraints are homogeneous in the rates, so the wheels still roll without slip. Returns True when it had to.
+    """
+    factor = 1.0
+    for j in range(phi.shape[0]):
+        room = law.limit_rate * max(model.upper[j] - phi[j] if u[j] > 0.0 else phi[j] - model.lower[j], 0.0)
+        # what allocation has put on its bound is there to rounding
+        allowed = min(law.rate_limit, room + 1e-9)
+        if abs(u[j]) > allowed:
+            factor = min(factor, allowed / abs(u[j]))
+    for j in range(u.shape[0]):
+        u[j] *= factor
+    return factor < 1.0
+
+
+@internal_kernel
+def tick(model, law, schedule, state, velocity, rig):
+    """One control period: evaluate the controller, hold its rates, move the plant and the controller's beliefs.
+
+    Rates of the beginning of the period, held, miss the constraints by O(period) at its end and leave a head error of
+    that order. Those of its predicted middle (``schedule.midpoint``) make it O(period^2). The prediction is the closed
+    loop itself, w~' = w~_d' - K (w~ - w~_d) ([T] eq 15).
+
+    With the allocating limit policy a command is carried out only as a whole, every joint within its limits and rate;
+    a null-space motion that is too fast is reduced. Otherwise the target waits where it is, and what is left to do
+    (errors, shape points) is slowed down until it fits. A target that would turn over beta = +-90 deg, where the rates
+    of alpha and gamma have no bound, waits too.
+
+    Returns
+    -------
+    slip : float
+        Of the plant [m/s]; the applied rates are in ``rig.work.u``.
+    blocked : bool
+        The command was not carried out.
+    """
+    work, period, mode = rig.work, schedule.period, state.counts[MODE]
+    phi, phi_hat, w_hat, w_target = state.phi, state.phi_hat, state.w_hat, state.w_target
+    pose, target, joints_ahead, u, error, rate = rig.pose, rig.target, rig.phi_stage, work.u, work.error, rig.rate
+    joints = phi.shape[0]
+    full_gain = law.null_gain if state.counts[TICKS] >= schedule.null_start_tick else 0.0
+    null_gain = full_gain
+    allocate = law.limit_policy == LIMITS_ALLOCATE
+    believe(model, schedule, state, rig)
+    copy(velocity, rate)
+    reason, waits, reductions, slowed = NO_OBSTACLE, False, 0, False
+    beta = wrap_angle(w_target[4])
+    if allocate and abs(beta) > BETA_LIMIT and beta * velocity[4] > 0.0:
+        reason, waits = ATTITUDE, True
+        for i in range(6):
+            rate[i] = 0.0
+    while True:
+        copy(w_hat, pose)
+        copy(w_target, target)
+        copy(phi_hat, joints_ahead)
+        for evaluation in range(1 + schedule.midpoint):
+            if evaluation == 1:
+                for i in range(6):  # error is the commanded w'
+                    pose[i] += 0.5 * period * error[i]
+                    target[i] += 0.5 * period * rate[i]
+                for j in range(joints):
+                    joints_ahead[j] += 0.5 * period * u[j]
+            control_input(model, law, work, pose, joints_ahead, target, rate, mode, null_gain)
+        if not allocate:
+            break
+        found = obstacle(law, work, joints)
+        if found == NO_OBSTACLE:
+            break
+        if found == RATE_LIMIT and reductions < NULL_REDUCTIONS and null_gain != 0.0:
+            fastest = 0.0
+            for j in range(joints):
+                fastest = max(fastest, abs(u[j]))
+            reductions += 1
+            null_gain *= 0.0 if reductions == NULL_REDUCTIONS else 0.9 * law.rate_limit / fastest
+        elif not waits:
+            reason, waits, null_gain, reductions = found, True, full_gain, 0
+            for i in range(6):
+                rate[i] = 0.0
+        elif null_gain != 0.0:
+            null_gain, reductions = 0.0, NULL_REDUCTIONS
+        else:
+            slowed = slow_down(model, law, u, phi)
+            break
+    state.counts[SLOWED] += int(slowed)
+    state.counts[NULL_REDUCED] += int(reductions > 0)
+    if law.limit_policy != LIMITS_NONE:  # the mechanical stop, and what is left when no allocation helps
+        for j in range(joints):
+            up = max(model.upper[j] - phi[j], 0.0) / period
+            down = min(model.lower[j] - phi[j], 0.0) / period
+            if u[j] > up or u[j] < down:
+                # rounding of an allocated bound is no event
+                if u[j] > up + 1e-9 or u[j] < down - 1e-9:
+                    state.counts[CLAMPED] += 1
+                u[j] = up if u[j] > up else down
+    slip = advance_plant(model, law.grounded[mode], period, schedule.substeps, state, u, rig)
+    for j in range(joints):
+        phi_hat[j] += period * u[j]  # feedforward; overwritten when the joints are read
+    for i in range(6):
+        w_target[i] += period * rate[i]
+        w_hat[i] += period * rate[i]  # x, y, gamma of the estimated state; the rest is overwritten
+    state.counts[TICKS] += 1
+    commanded = False
+    for i in range(6):
+        commanded = commanded or velocity[i] != 0.0
+    if waits and commanded:
+        state.counts[WAITED_FOR + reason] += 1
+    return slip, waits and commanded
+
+
+@kernel
+def record_row(model, law, state, rig, r, trace):
+    """Write the state, and what follows from it, to row r of the trace."""
+    work, chain, support, pose, mode = rig.work, rig.work.chain, rig.work.support, rig.pose, state.counts[MODE]
+    phi, rho, grounded = state.phi, state.rho, law.grounded[mode]
+    pose_of_point(model, state.base, phi, work.frame, pose)
+    walk_chain(model, pose, phi, work.frame, chain)
+    sides, margin = support_polygon(model, chain, grounded, support)
+    constraint_matrices(model, chain, pose, work.A, work.B)
+    trace.mode[r] = mode
+    trace.cost[r] = cost_value(law.cost, phi, sides, support, margin)
+    trace.margin[r] = margin
+    trace.area[r] = polygon_area(support, sides)
+    trace.sigma[r] = sigma_min(model, law, work, grounded)
+    copy(state.base, trace.base[r])
+    copy(support.centre, trace.centre[r])
+    copy(pose, trace.w[r])
+    copy(state.w_target, trace.w_target[r])
+    copy(phi, trace.phi[r])
+    copy(rho, trace.rho[r])
+
+
+@kernel
+def run_ticks(model, law, schedule, state, velocity, count, moving, stop, stride, rig, trace):
+    """Run control periods in the present mode.
+
+    Parameters
+    ----------
+    velocity : (T, 6) commanded rates of the target, a block of one row per period; zero after its end. The next row is
+        taken only when the last one was carried out (``state.counts[PLACE]`` is the place).
+    count : int, control periods to run.
+    moving : int, 1: follow the script; 0: the target waits.
+    stop : int, 1: return after a period that was blocked.
+    stride : int, ticks 0, stride, 2 stride, ... of the run are recorded.
+
+    Returns
+    -------
+    done : int
+        Periods simulated; -1 when the state is no longer finite.
+    blocked : bool
+        The last period was blocked.
+    """
+    base, phi, counts, at_limit = state.base, state.phi, state.counts, rig.work.at_limit
+    command, blocked = rig.command, False
+    for k in range(count):
+        now, place = counts[TICKS], counts[PLACE]
+        r = now // stride if now % stride == 0 else -1
+        if r >= 0:
+            record_row(model, law, state, rig, r, trace)
+        for i in range(6):
+            command[i] = velocity[place, i] if moving and place < velocity.shape[0] else 0.0
+        slip, blocked = tick(model, law, schedule, state, command, rig)
+        counts[PLACE if moving and not blocked else WAITED] += 1
+        if r >= 0:
+            trace.slip[r] = slip
+            copy(rig.work.u, trace.u[r])
+            copy(state.w_hat, trace.w_hat[r])
+            for j in range(phi.shape[0]):
+                trace.at_limit[r, j] = at_limit[j]
+            # beliefs at the beginning of the period: take back the step that the tick has added
+            for i in range(6):
+                trace.w_hat[r, i] -= schedule.period * rig.rate[i]
+        finite = 0.0
+        for i in range(3):
+            finite += base[i]
+        for j in range(phi.shape[0]):
+            finite += phi[j]
+        if not math.isfinite(finite):
+            return -1, blocked
+        if stop and moving and blocked:
+            return k + 1, blocked
+    return count, blocked

@@ -1,0 +1,163 @@
+"""The benchmark: everything is measured, set side by side, and put into one result for JSON."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+from collections.abc import Callable
+from typing import Any
+
+from dynsim._version import __version__
+from dynsim.studies.bench import job, right_hand_side
+from dynsim.studies.bench.programs import (
+    ABA,
+    CONSTRAINT_DYNAMICS,
+    DYNSIM_CONTACTS,
+    DYNSIM_DEFAULT,
+    DYNSIM_FREE,
+    DYNSIM_RK4,
+    LCABA,
+    MUJOCO_CONTACTS,
+    MUJOCO_EULER,
+    MUJOCO_FREE,
+    MUJOCO_IMPLICIT,
+    STEP,
+)
+
+# Called with what is being measured and the fraction done.
+BenchProgress = Callable[[str, float], None]
+
+SIZES = (10, 30, 100, 300, 1000)
+# Larger sizes are left out, by ``quick``. Pinocchio's Data grows with the square of the links: 0.85 GB at 300.
+PINOCCHIO_LINKS_MAX = {True: 100, False: 300}
+MUJOCO_LINKS_MAX = {True: 300, False: 1000}
+
+
+def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dict[str, Any]:
+    """Measure everything.
+
+    Parameters
+    ----------
+    quick : fewer rounds, and MuJoCo only up to 300 links
+    progress : called with what comes next and the fraction done
+
+    Returns
+    -------
+    dict, ready for JSON
+        ``machine``, ``versions``, ``method`` (how it was measured), ``right_hand_side`` (per size: microseconds by
+        contender, medians and minima), ``job`` (per case and program: wall time and errors), ``ratios`` (how many
+        times longer the other program takes), ``unavailable`` (what is missing and why).
+    """
+    report = progress or (lambda text, fraction: None)
+    mujoco_missing = _why_no_mujoco()
+    # Many short samples: the median then leaves out those in which another process had the core.
+    rounds, share = (25, 2e-3) if quick else (101, 5e-3)
+    sizes: list[dict[str, Any]] = []
+    python_call = None
+    for k, n in enumerate(SIZES):
+        report(f"right-hand side, {n} links", 0.6 * k / len(SIZES))
+        with_mujoco = not mujoco_missing and n <= MUJOCO_LINKS_MAX[quick]
+        samples = right_hand_side.measure(
+            n, rounds, share, with_pinocchio=n <= PINOCCHIO_LINKS_MAX[quick], with_mujoco=with_mujoco
+        )
+        # What a call from Python costs does not depend on the size; where the work is least, it is seen best.
+        if python_call is None:
+            python_call = right_hand_side.python_call_cost(samples)
+        sizes.append(right_hand_side.row(n, samples, python_call or 0.0))
+    jobs: list[dict[str, Any]] = []
+    for k, case in enumerate(job.CASES):
+        report(f"10 s job, {case}", 0.6 + 0.4 * k / len(job.CASES))
+        jobs += job.measure_job(case, 3 if quick else 21, with_mujoco=not mujoco_missing)
+    report("done", 1.0)
+    result: dict[str, Any] = {
+        "machine": _machine(),
+        "versions": _versions(),
+        "method": {
+            "quick": quick,
+            "rounds": rounds,
+            "seconds_per_sample": share,
+            "python_call_us": None if python_call is None else 1e6 * python_call,
+            "statistic": "CPU time of the one thread, median over interleaved rounds; minima, and wall times of the "
+            "whole jobs, beside it",
+            "mujoco_step_s": STEP,
+            "dynsim": "right-hand side with motors, references, friction and all energy integrals, in a compiled loop",
+            "pinocchio": "bodies and rotor inertia only; ABA in its own native loop (abaInParallel, one thread); "
+            "constraintDynamics and lcaba from Python with 2 x 3 rows and no friction, less the cost of a Python call, "
+            "which is that of ABA called from Python less that of ABA in the native loop",
+            "mujoco": "bodies, rotor inertia and damping, no motors; mj_step in mujoco.rollout (one thread)",
+        },
+        "right_hand_side": sizes,
+        "job": jobs,
+        "unavailable": {"mujoco": mujoco_missing} if mujoco_missing else {},
+    }
+    result["ratios"] = _ratios(sizes, jobs)
+    return result
+
+
+def _ratios(sizes: list[dict[str, Any]], jobs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """How many times longer (or less exact) each peer is than dynsim at the same task."""
+    rows: list[dict[str, Any]] = []
+    pairs = (
+        (ABA, DYNSIM_FREE),
+        (CONSTRAINT_DYNAMICS, DYNSIM_CONTACTS),
+        (LCABA, DYNSIM_CONTACTS),
+        (MUJOCO_FREE, DYNSIM_FREE),
+        (MUJOCO_CONTACTS, DYNSIM_CONTACTS),
+    )
+    for peer, ours in pairs:
+        entry: dict[str, Any] = {"task": "right-hand side or step", "peer": peer, "dynsim": ours}
+        for key, kind in (("time_by_links", "median_us"), ("time_by_links_minima", "minimum_us")):
+            entry[key] = {
+                str(row["links"]): row[kind][peer] / row[kind][ours] if peer in row[kind] else None for row in sizes
+            }
+        rows.append(entry)
+    for case in job.CASES:
+        row = {one["program"]: one for one in jobs if one["case"] == case}
+        for peer in (MUJOCO_EULER, MUJOCO_IMPLICIT):
+            for ours in (DYNSIM_DEFAULT, DYNSIM_RK4):
+                entry = {"task": f"10 s job, {case}", "peer": peer, "dynsim": ours}
+                known = peer in row
+                for key, kind in (
+                    ("time", "cpu_median_s"),
+                    ("time_wall", "wall_median_s"),
+                    ("time_wall_minima", "wall_minimum_s"),
+                ):
+                    entry[key] = row[peer][kind] / row[ours][kind] if known else None
+                comparable = known and row[peer]["same_physics"]
+                entry["hand_error"] = (
+                    row[peer]["hand_error_max_m"] / row[ours]["hand_error_max_m"] if comparable else None
+                )
+                rows.append(entry)
+    return rows
+
+
+def _why_no_mujoco() -> str:
+    """Why MuJoCo cannot take part; empty when it can."""
+    try:
+        import mujoco
+    except ImportError:
+        return "mujoco is not installed (pip install 'dynsim[bench]')"
+    if int(mujoco.__version__.split(".")[0]) < 4:
+        return f"mujoco {mujoco.__version__}: its dcmotor takes no position and velocity set-points before 4.0"
+    return ""
+
+
+def _machine() -> dict[str, Any]:
+    model = platform.processor() or platform.machine()
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as lines:
+            model = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), model)
+    except OSError:
+        pass
+    return {"cpu": model, "cores": os.cpu_count(), "system": f"{platform.system()} {platform.machine()}"}
+
+
+def _versions() -> dict[str, str]:
+    found = {"dynsim": __version__, "python": platform.python_version()}
+    for package in ("numba", "numpy", "pin", "mujoco"):
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = "not installed"
+    return found

@@ -1,0 +1,66 @@
+"""Every member of a family in the package is what the protocol of its family says: for mypy, and when it is built."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import get_args
+
+import pytest
+
+from dynsim import families
+from dynsim.config import StrictConfig
+from dynsim.control import joint_pd, task_space
+from dynsim.control.paths import circle, csv, line, waypoints
+from dynsim.errors import ModelError
+from dynsim.model.protocols import (
+    BuildContext,
+    ControllerModule,
+    Member,
+    MotorModule,
+    PathModule,
+    PlantModule,
+    SurfaceModule,
+)
+from dynsim.motors import dc, wang_minami
+from dynsim.plants import serial_arm, snake, urdf_arm
+from dynsim.surfaces import cylinder, plane, sphere
+
+PLANTS: Sequence[PlantModule] = (serial_arm, snake, urdf_arm)
+CONTROLLERS: Sequence[ControllerModule] = (joint_pd, task_space)
+PATHS: Sequence[PathModule] = (circle, csv, line, waypoints)
+SURFACES: Sequence[SurfaceModule] = (cylinder, plane, sphere)
+MOTORS: Sequence[MotorModule] = (dc, wang_minami)
+
+FAMILIES: dict[str, Sequence[Member]] = {
+    "plant": PLANTS,
+    "controller": CONTROLLERS,
+    "path": PATHS,
+    "surface": SURFACES,
+    "motor": MOTORS,
+}
+
+
+@pytest.mark.parametrize("family", families.FAMILIES)
+def test_these_are_all_members_and_each_has_what_its_family_asks_for(family: str) -> None:
+    types = [get_args(module.Config.model_fields["type"].annotation) for module in FAMILIES[family]]
+    assert types == [(name,) for name in families.shipped(family)]
+    for name, module in zip(families.shipped(family), FAMILIES[family], strict=True):
+        assert families._lack(module, families.FAMILIES[family], name) == ""
+
+
+@pytest.mark.parametrize("family", ["surface", "motor", "path"])
+def test_a_member_that_gives_something_else_is_named(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = FAMILIES[family][0]
+    name = families.shipped(family)[0]
+    config = SimpleNamespace(type=name)
+    monkeypatch.setattr(module, "build", lambda config, context: "nothing")
+    with pytest.raises(ModelError, match=rf"{family} '{name}': its build must return a \w+, not 'nothing'"):
+        families.build(family, config, BuildContext(1.0), StrictConfig)
+
+
+def test_a_context_without_a_machine_says_so() -> None:
+    with pytest.raises(ModelError, match="no rigid-body model"):
+        joint_pd.build(joint_pd.Config(type="joint_pd"), BuildContext(1.0))
+    with pytest.raises(ModelError, match="no snake"):
+        task_space.build(task_space.Config(), BuildContext(1.0))
