@@ -152,8 +152,8 @@ def _check_work(scenario: Scenario, n: int, p: int) -> None:
     """Refuse what would integrate for longer than ``integrator.time_limit_h``, by an estimate from its size."""
     options = scenario.integrator
     # Measured from 10 to 1000 links with up to 250 contacts, right to a factor of two: the sweeps, the p × p system of
-    # chains as long as n, its elimination, and the decomposition that dependent rows need (p > n always are).
-    seconds = 1e-7 * n + 4e-10 * n * p**2 + (8e-8 if p > n else 2e-10) * p**3
+    # chains as long as n, its elimination, twice that for dependent rows (p > n always are).
+    seconds = 1e-7 * n + 4e-10 * n * p**2 + (4e-10 if p > n else 2e-10) * p**3
     if options.solver == "m_star":
         seconds += 3e-10 * (n + p) ** 3
     # A Jacobian by differences, and its factors.
