@@ -13,8 +13,8 @@ from dynsim.kernels.integrate.driver import advance
 from dynsim.kernels.integrate.run import FINISHED, METHODS, STATUS, Run, new_run
 from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.state import block, output_layout, state_layout
-from dynsim.kernels.system import System, derivative
-from dynsim.model.arrays import compile_contacts, compile_drives, compile_loads, compile_model
+from dynsim.kernels.system import System, derivative, new_workspace
+from dynsim.model.arrays import compile_contacts, compile_couplings, compile_drives, compile_loads, compile_model
 from dynsim.model.description import Contact, Inertia, Link, Load, Motor, Quadric, Robot
 from dynsim.model.joints.ball import ball, floating
 from dynsim.model.joints.planar import planar, rolling
@@ -227,6 +227,7 @@ class Bench:
             n=n,
             na=na,
             c=c,
+            couplings=len(self.robot.couplings),
             sample_time=times,
             hand=(n - 1, self.robot.hand[1]),
             end=float(times[-1]),
@@ -263,7 +264,7 @@ def bench(
     na = len(robot.motors)
     contact_arrays = compile_contacts(robot, contacts or [])
     n, c, circuits = len(robot.links), len(contacts or []), robot.circuits
-    size = n + c + circuits
+    size = n + ka.row_limit(c, len(robot.couplings)) + circuits
     system = System(
         layout=state_layout(robot.nq, n, circuits, c, len(loads or ())),
         model=compile_model(robot),
@@ -272,6 +273,6 @@ def bench(
         contacts=contact_arrays,
         loads=compile_loads(robot, loads or ()),
         dense=np.zeros((size, size + 1)) if m_star else None,
+        couplings=compile_couplings(robot),
     )
-    ws = ka.workspace(n, na, c)
-    return Bench(robot, system, ws)
+    return Bench(robot, system, new_workspace(system))

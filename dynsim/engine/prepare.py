@@ -16,8 +16,8 @@ from dynsim.errors import ModelError, ScenarioError
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.state import block, output_layout, state_layout
-from dynsim.kernels.system import System
-from dynsim.model.arrays import compile_contacts, compile_drives, compile_loads
+from dynsim.kernels.system import System, new_workspace
+from dynsim.model.arrays import compile_contacts, compile_couplings, compile_drives, compile_loads
 from dynsim.model.clearance import poses
 from dynsim.model.control import JointControl
 from dynsim.model.description import Array, Contact, Load, Motor, Robot
@@ -78,10 +78,11 @@ def prepare(
         times = sample_times(scenario, columns=layout.size + columns.size + pose_columns(n))
     _check_coordinates(scenario, robot)
     _check_stiffness(scenario, robot)
-    _check_work(scenario, n, c)
+    couplings = len(robot.couplings)
+    _check_work(scenario, n, c + couplings)
     control = _control(scenario, model, progress)
     _check_references(scenario, robot, contacts, control)
-    options, size = scenario.integrator, n + c + robot.circuits
+    options, size = scenario.integrator, n + ka.row_limit(c, couplings) + robot.circuits
     method = ki.METHODS[options.method]
     step = options.step_s or (1e-3 if method == ki.RK4 else 0.0)
     system = System(
@@ -92,6 +93,7 @@ def prepare(
         contacts=compile_contacts(robot, contacts),
         loads=compile_loads(robot, loads),
         dense=np.zeros((size, size + 1)) if options.solver == "m_star" else None,
+        couplings=compile_couplings(robot),
     )
     y = np.zeros(layout.size)
     y[block(layout, "q")] = robot.initial
@@ -103,6 +105,7 @@ def prepare(
         n=n,
         na=na,
         c=c,
+        couplings=couplings,
         sample_time=times,
         hand=(model.body_index(robot.hand[0]), robot.hand[1]),
         end=scenario.duration_s if end is None else end,
@@ -111,8 +114,7 @@ def prepare(
         rtol=options.rtol,
         atol=options.atol,
     )
-    workspace = ka.workspace(n, na, c)
-    return Prepared(model, contacts, control, system, run, workspace)
+    return Prepared(model, contacts, control, system, run, new_workspace(system))
 
 
 def _push(body: str) -> Load:
@@ -162,8 +164,8 @@ def _check_work(scenario: Scenario, n: int, p: int) -> None:
     """Refuse what would integrate for longer than ``integrator.time_limit_h``, by an estimate from its size."""
     options = scenario.integrator
     # Measured from 10 to 1000 links with up to 250 contacts, right to a factor of two: the sweeps, the p × p system of
-    # chains as long as n, its elimination, and the decomposition that dependent rows need (p > n always are).
-    seconds = 1e-7 * n + 4e-10 * n * p**2 + (8e-8 if p > n else 2e-10) * p**3
+    # chains as long as n, its elimination, twice that for dependent rows (p > n always are).
+    seconds = 1e-7 * n + 4e-10 * n * p**2 + (4e-10 if p > n else 2e-10) * p**3
     if options.solver == "m_star":
         seconds += 3e-10 * (n + p) ** 3
     # A Jacobian by differences, and its factors.

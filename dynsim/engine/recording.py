@@ -8,6 +8,7 @@ from dynsim import metrics
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.provenance import provenance
 from dynsim.engine.uniqueness import motion_spread
+from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.state import CONTACT_SIZE, IMPULSE, OUT_FORCE, OUT_GAP, OUT_SLIP, OUT_VECTOR, SLIP
 from dynsim.model.description import Link
@@ -56,7 +57,7 @@ def make_record(scenario: Scenario, prepared: Prepared, wall: float, *, pushed: 
     record.add("contact_slip_distance", integrals[:, :, SLIP], "m", labels=names, description="∫ |v_t| dt")
     record.scene = robot_scene(robot, contacts, build.surfaces(scenario))
     add_body_poses(record)
-    deficient, spread = int(prepared.workspace.deficient[0]), None
+    deficient, spread = int(prepared.workspace.counts[ka.DEPENDENT]), None
     if deficient and rows and any(contact.friction > 0.0 for contact in contacts):
         joint_units = [(link.joint, link.units[2]) for link in robot.links]
         spread = motion_spread(prepared.system, run.sample_time[:rows], run.sample[:rows], joint_units)

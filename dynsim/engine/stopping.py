@@ -56,10 +56,15 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
         return (
             f"{where}: the step size fell to {run.clock[ki.STEP]:.1e} s; try integrator.method rodas4 or a larger rtol"
         )
-    gaps = prepared.workspace.contacts[:, ka.GAP]
+    ws = prepared.workspace
+    gaps = ws.rows[: ws.counts[ka.ROWS], ka.ROW_GAP]
     worst = int(np.argmax(np.abs(gaps)))
-    return (
-        f"{where}: contact {prepared.contacts[worst].name} cannot be kept on its surface (gap {gaps[worst]:+.2e} m); "
-        "the contacts contradict each other or the arm is singular here"
-        + (", or integrator.step_s is too long (try integrator.method: rk43)" if method == "rk4" else "")
+    owner = int(ws.active[worst, ka.OWNER])
+    if ws.active[worst, ka.ROW_KIND] == ka.JOINT_ROW:
+        coupling = prepared.model.robot.couplings[owner]
+        what = f"joint {coupling.joint} cannot be kept where {coupling.leader} leads it (off by {gaps[worst]:+.2e})"
+    else:
+        what = f"contact {prepared.contacts[owner].name} cannot be kept on its surface (gap {gaps[worst]:+.2e} m)"
+    return f"{where}: {what}; the contacts contradict each other or the arm is singular here" + (
+        ", or integrator.step_s is too long (try integrator.method: rk43)" if method == "rk4" else ""
     )

@@ -18,7 +18,7 @@ from dynsim.kernels.constraint.delassus import RANK_TOLERANCE
 from dynsim.kernels.constraint.surface import SIGNS_LIMIT
 from dynsim.kernels.constraint.uniqueness import DIAGONAL_TOLERANCE, FORCE_TOLERANCE, IMMOBILE
 from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.system import System, derivative
+from dynsim.kernels.system import System, derivative, new_workspace
 from dynsim.kernels.tree.articulated import accelerate
 from dynsim.metrics import MotionSpread
 from dynsim.model.description import Contact
@@ -41,13 +41,14 @@ SPREAD_TOLERANCE = 1e-7
 
 @dataclass(frozen=True)
 class ContactMatrices:
-    """A(σ) = A0 − B diag(σ) of one state, A(σ) f = rhs.
+    """A(σ) = A0 − B diag(σ) of one state, A(σ) f = rhs, of the p active rows.
 
     Attributes
     ----------
-    frictionless : A0 = J M⁻¹ Jᵀ, (c, c); friction : B, (c, c)
-    rhs : (c,); force : f as the run has it, (c,); signs : σ as the run has it, (c,)
-    free : (c,) bool: dissipative contacts with friction, whose σ is the sign of f
+    frictionless : A0 = J M⁻¹ Jᵀ, (p, p); friction : B, (p, p), zero for rows of sticking points and of joints
+    rhs : (p,); force : f as the run has it, (p,); signs : σ as the run has it, (p,)
+    free : (p,) bool: dissipative contacts with friction, whose σ is the sign of f
+    owner : (p,) the contact of each row that slides, −1 for other rows
     """
 
     frictionless: Array
@@ -56,13 +57,14 @@ class ContactMatrices:
     force: Array
     signs: Array
     free: NDArray[np.bool_]
+    owner: NDArray[np.int64]
 
     def matrix(self, signs: Array) -> Array:
-        """A(σ), (c, c)."""
+        """A(σ), (p, p)."""
         return self.frictionless - self.friction * signs
 
     def basis(self) -> Array:
-        """Orthonormal basis of the range of A0, (c, rank)."""
+        """Orthonormal basis of the range of A0, (p, rank)."""
         values, vectors = np.linalg.eigh(self.frictionless)
         return vectors[:, values > RANK_TOLERANCE * values[-1]]
 
@@ -86,7 +88,7 @@ class ContactMatrices:
         return result
 
     def solutions(self) -> list[Array]:
-        """Forces (c,) of every choice of signs that agrees with them, each once; only for independent rows."""
+        """Forces (p,) of every choice of signs that agrees with them, each once; only for independent rows."""
         found: list[Array] = []
         for signs in self.choices():
             try:
@@ -110,7 +112,7 @@ class ContactMatrices:
         return 1.0 / largest if largest >= 1.0 else None
 
     def reversed(self) -> NDArray[np.bool_]:
-        """Contacts whose own force alone would accelerate them against it: negative diagonal entries, (c,)."""
+        """Rows whose own force alone would accelerate them against it: negative diagonal entries, (p,)."""
         own = np.diag(self.frictionless)
         return (own > 0.0) & (np.diag(self.matrix(self.signs)) < -DIAGONAL_TOLERANCE * own)
 
@@ -130,12 +132,14 @@ class ContactMatrices:
 def contact_matrices(system: System, ws: ka.Workspace, t: float, y: Array) -> ContactMatrices:
     """Evaluate the right-hand side at (t, y) and take A0, B and the forces out of the workspace."""
     derivative(system, t, y, ws, np.zeros_like(y))
-    contacts, state = system.contacts, ws.contacts
-    rows, directions, inverse = ws.column[:, 1::2], ws.column[:, 2::2], ws.links[:, ka.INVERSE_D, None]
+    p = int(ws.counts[ka.ROWS])
+    state, active = ws.rows[:p], ws.active[:p]
+    rows, directions = ws.column[:, 1 : 1 + 2 * p : 2], ws.column[:, 2 : 2 + 2 * p : 2]
+    inverse = ws.links[:, ka.INVERSE_D, None]
     frictionless = rows.T @ (inverse * rows)
     moving = np.diag(frictionless) > IMMOBILE * (inverse * directions**2).sum(axis=0)
     frictionless = frictionless * np.outer(moving, moving)
-    dissipative = contacts.link[:, ka.FRICTION_LAW] == ka.FRICTION_DISSIPATIVE
+    dissipative = active[:, ka.LAW] == ka.FRICTION_DISSIPATIVE
     signs = np.where(dissipative, state[:, ka.SIGN], 1.0)
     return ContactMatrices(
         frictionless=frictionless,
@@ -143,7 +147,8 @@ def contact_matrices(system: System, ws: ka.Workspace, t: float, y: Array) -> Co
         rhs=state[:, ka.RHS].copy(),
         force=state[:, ka.FORCE].copy(),
         signs=signs,
-        free=dissipative & (contacts.point[:, ka.MU] > 0.0),
+        free=dissipative & (state[:, ka.ROW_MU] > 0.0),
+        owner=np.where(active[:, ka.ROW_KIND] == ka.SLIDING_ROW, active[:, ka.OWNER], -1),
     )
 
 
@@ -187,11 +192,13 @@ def paradox(
     value = matrices.determinant(matrices.signs)
     if near and not abs(value) < NEAR_ZERO:
         return None
-    several = matrices.free.any() and not near and matrices.basis().shape[1] == len(contacts)
+    several = matrices.free.any() and not near and matrices.basis().shape[1] == len(matrices.rhs)
     solutions = matrices.solutions() if several else []
-    turned = matrices.reversed()
-    names = ", ".join(contact.name for contact, mark in zip(contacts, turned, strict=True) if mark or not turned.any())
+    turned, sliding = matrices.reversed(), matrices.owner >= 0
+    named = matrices.owner[turned if turned.any() else sliding]
+    names = ", ".join(contacts[k].name for k in named)
     if len(solutions) > 1:
+        solutions = [solution[sliding] for solution in solutions]
         forces = " and ".join(f"({', '.join(f'{force:.4g}' for force in solution)}) N" for solution in solutions)
         count = "two" if len(solutions) == 2 else len(solutions)
         what = (
@@ -262,14 +269,14 @@ def acceleration_range(system: System, t: float, y: Array) -> tuple[Array, Array
     support that pushes never pulls); friction keeps its direction. f = f0 + N z with the null space N of A, and the
     accelerations are linear in z: one linear programme per joint and end. Infinite where the set has no end.
     """
-    n, p = system.model.tree.shape[0], len(system.contacts.link)
-    ws = ka.workspace(n, len(system.drives.table), p)
+    ws = new_workspace(system)
     matrices = contact_matrices(system, ws, t, np.array(y))
+    n, p = ws.joints.shape[0], len(matrices.rhs)
     taken, force = ws.joints[:, ka.QDD].copy(), matrices.force
     _, values, vectors = np.linalg.svd(matrices.matrix(matrices.signs))
     N = vectors[values <= NULL_TOLERANCE * values[0]].T
     response = np.zeros((n, p))
-    directions = ws.column[:, 2::2].copy()
+    directions = ws.column[:, 2 : 2 + 2 * p : 2].copy()
     for k in range(p):
         ws.column[:, 0] = directions[:, k]
         accelerate(system.model, ws)

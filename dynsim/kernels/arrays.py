@@ -1,8 +1,8 @@
 """What the kernels read and write: a few flat tables per concept, in SI units and the world frame W.
 
-n links (one velocity each), na drives (motors), c contact points. A link is one joint and the body it carries; links
-are ordered so that a parent comes before its children. Spatial vectors are (angular, linear) at the world origin, so
-inertias and forces of different bodies simply add.
+n links (one velocity each), na drives (motors), c contact points, p constraint rows. A link is one joint and the body
+it carries; links are ordered so that a parent comes before its children. Spatial vectors are (angular, linear) at the
+world origin, so inertias and forces of different bodies simply add.
 
 A table is one array whose columns are named by the constants below. Few arrays matter: every array of an argument
 costs copying in each compiled call, and what belongs to one link lies together.
@@ -20,6 +20,10 @@ REVOLUTE_X, REVOLUTE_Y, REVOLUTE_Z, REVOLUTE, PRISMATIC = 0, 1, 2, 3, 4
 BALL_X, BALL_Y, BALL_Z, ROLL, TURN = 5, 6, 7, 8, 9
 # Friction of a contact under a negative (pulling) normal force, see dynsim.kernels.constraint.surface.
 FRICTION_SIGNED, FRICTION_DISSIPATIVE = 0, 1
+# What a candidate is at present: off its surface (no row), sliding (one row, friction in its direction), or held at its
+# anchor (three rows). Constant within a step.
+OPEN, SLIDING, STICKING = 0, 1, 2
+MOST_ROWS = 3  # of one candidate
 
 # ModelArrays.tree, int
 PARENT = 0  # index of the parent link, -1 for the world
@@ -89,6 +93,14 @@ QUADRIC = 3  # 10: C(r) = r.Q r/2 + b.r + c: Q xx xy xz yy yz zz, b, c
 MU = 13  # kinetic friction coefficient
 V_S = 14  # smoothing speed of the slip direction [m/s]
 POINT_SIZE = 15
+# CouplingArrays.joint, int
+FOLLOWER = 0  # link whose joint follows
+LEADER = 1
+COUPLING_JOINT_SIZE = 2
+# CouplingArrays.law
+RATIO = 0  # [1, or m/rad and the like]
+OFFSET = 1  # [rad or m]
+COUPLING_SIZE = 2
 
 # Workspace.links
 R = 0  # 9: R_WB, row-major
@@ -117,20 +129,51 @@ V_REF = 3  # [rad/s]
 DIDT = 4  # [A/s]
 DRAG = 5  # gear friction that is not part of GEAR_DAMPING, against v [N m]
 MOTOR_STATE_SIZE = 6
-# Workspace.contacts
-ROW = 0  # 6: the constraint's motion is ROW . V
-DIRECTION = 6  # 6: wrench of a unit constraint force
+# Workspace.contacts: what is known of each candidate, whether it has rows or not
+NORMAL = 0  # 3: surface normal in W
+TANGENT = 3  # 3: smoothed slip direction in W
+POSITION = 6  # 3: in W [m]
+SLIP_VELOCITY = 9  # 3: tangential velocity [m/s]
+GAP = 12  # signed distance from the surface [m]
+GAP_RATE = 13  # [m/s]
+NORMAL_FORCE = 14  # f_n [N], zero without rows
+FORCE_VECTOR = 15  # 3: normal and friction force in W [N]
+ANCHOR = 18  # 3: where a sticking point is held, in W [m]
+FIRST_TANGENT = 21  # 3: directions of a sticking point's tangential rows in W
+SECOND_TANGENT = 24  # 3
+CONTACT_STATE_SIZE = 27
+# Workspace.rows: one scalar constraint each, and its force
+ROW = 0  # 6: the constraint's motion is ROW . (V_A - V_B); of a joint row the coefficients of its two joints
+DIRECTION = 6  # 6: wrench of a unit force on A, its negative on B; of a joint row as ROW
 TARGET = 12  # J vdot must equal this [m/s^2]
 RHS = 13  # right-hand side of the small system
-FORCE = 14  # normal force f_n [N]
-SIGN = 15  # sign of the normal force that DIRECTION was built for
-NORMAL = 16  # 3: surface normal in W
-TANGENT = 19  # 3: smoothed slip direction in W
-POSITION = 22  # 3: in W [m]
-SLIP_VELOCITY = 25  # 3: tangential velocity [m/s]
-GAP = 28  # signed distance from the surface [m]
-GAP_RATE = 29  # [m/s]
-CONTACT_STATE_SIZE = 30
+FORCE = 14  # [N]
+SIGN = 15  # sign of the force that DIRECTION was built for
+ROW_MU = 16  # friction that DIRECTION carries
+ROW_GAP = 17  # what projection takes away from the positions [m or rad], see dynsim.kernels.constraint.rows
+ROW_RATE = 18  # and from the rates [m/s or rad/s]
+ROW_OFFSET = 19  # of a joint row: what its two joints, times its coefficients, must add up to [rad or m]
+ROW_STATE_SIZE = 20
+# Workspace.active, int: of each row
+ROW_KIND = 0
+OWNER = 1  # candidate or coupling
+BODY_A = 2  # link, or the following joint of a joint row
+BODY_B = 3  # link at the other end, -1 for the world; the leading joint of a joint row
+LAW = 4  # FRICTION_SIGNED unless the sign of the force decides about DIRECTION
+ORDER = 5  # scratch of the solve: columns as they were exchanged
+# and, in the same array, of each candidate
+MODE = 6  # OPEN, SLIDING or STICKING
+FIRST_ROW = 7
+ACTIVE_SIZE = 8
+# Kinds of rows: of a point that slides on its surface or is held there, between two bodies, between two joints.
+SLIDING_ROW, STICKING_ROW, BODY_ROW, JOINT_ROW = 0, 1, 2, 3
+# Workspace.counts, int
+ROWS = 0  # active rows p
+DEPENDENT = 1  # right-hand sides whose constraint forces were not unique
+CONTRADICTORY = 2  # right-hand sides for which no signs of the forces agreed with friction
+COUPLED = 3  # joint rows, the first of the active ones
+HELD = 4  # candidates that stick
+COUNTS_SIZE = 5
 
 
 class ModelArrays(NamedTuple):
@@ -159,36 +202,51 @@ class ReferenceArrays(NamedTuple):
 
 
 class ContactArrays(NamedTuple):
-    """Points on bodies held to surfaces. A surface is a quadric C(r) = r.Q r / 2 + b.r + c."""
+    """Candidates: points on bodies, each with the surface that may hold it, a quadric C(r) = r.Q r / 2 + b.r + c."""
 
     link: np.ndarray  # (c, CONTACT_LINK_SIZE) int
     point: np.ndarray  # (c, POINT_SIZE)
 
 
+class CouplingArrays(NamedTuple):
+    """Joints that follow others, q_follower = ratio q_leader + offset."""
+
+    joint: np.ndarray  # (couplings, COUPLING_JOINT_SIZE) int
+    law: np.ndarray  # (couplings, COUPLING_SIZE)
+
+
 class Workspace(NamedTuple):
-    """Everything a right-hand side computes on its way; allocated once."""
+    """Everything a right-hand side computes on its way; allocated once. p is the most rows that there can be."""
 
     links: np.ndarray  # (n, LINK_SIZE)
     joints: np.ndarray  # (n, JOINT_SIZE)
     trig: np.ndarray  # (3, n or more) sine, cosine and q; padded to whole vectors of four, which have no slow remainder
     motors: np.ndarray  # (na, MOTOR_STATE_SIZE)
     contacts: np.ndarray  # (c, CONTACT_STATE_SIZE)
-    column: np.ndarray  # (n, 1 + 2c) eliminated right-hand sides: applied force, then per contact its row and direction
-    small: np.ndarray  # (4, c, c) the p×p system J M^-1 F and the scratch of its solve
-    deficient: np.ndarray  # (2,) int: right-hand sides whose constraint forces were not unique, and that had none
+    rows: np.ndarray  # (p, ROW_STATE_SIZE) the active ones first: couplings, then contacts
+    active: np.ndarray  # (p, ACTIVE_SIZE) int
+    column: np.ndarray  # (n, 1 + 2p) eliminated right-hand sides: applied force, then per row itself and its direction
+    small: np.ndarray  # (4, p, p) the system J M^-1 F of the active rows and the scratch of its solve
+    counts: np.ndarray  # (COUNTS_SIZE,) int
 
 
-def workspace(n: int, na: int, c: int) -> Workspace:
-    """Allocate a :class:`Workspace` for n links, na motors and c contacts."""
-    contacts = np.zeros((c, CONTACT_STATE_SIZE))
-    contacts[:, SIGN] = 1.0
+def row_limit(c: int, couplings: int) -> int:
+    """The most rows that c candidates and so many couplings can have."""
+    return MOST_ROWS * c + couplings
+
+
+def workspace(n: int, na: int, c: int, couplings: int = 0) -> Workspace:
+    """Allocate a :class:`Workspace` for n links, na motors, c candidates and so many couplings; no row is active."""
+    p = row_limit(c, couplings)
     return Workspace(
         links=np.zeros((n, LINK_SIZE)),
         joints=np.zeros((n, JOINT_SIZE)),
         trig=np.zeros((3, 4 * -(-n // 4))),
         motors=np.zeros((na, MOTOR_STATE_SIZE)),
-        contacts=contacts,
-        column=np.zeros((n, 1 + 2 * c)),
-        small=np.zeros((4, c, c)),
-        deficient=np.zeros(2, dtype=np.int64),
+        contacts=np.zeros((c, CONTACT_STATE_SIZE)),
+        rows=np.zeros((p, ROW_STATE_SIZE)),
+        active=np.zeros((p, ACTIVE_SIZE), dtype=np.int64),
+        column=np.zeros((n, 1 + 2 * p)),
+        small=np.zeros((4, p, p)),
+        counts=np.zeros(COUNTS_SIZE, dtype=np.int64),
     )

@@ -81,11 +81,23 @@ class _ToLink(JITCodeLibrary):
         self._finalized = True
 
 
+class _ToCall(_ToLink):
+    """The same for code that must not be merged into its callers."""
+
+    def _optimize_final_module(self) -> None:
+        for function in self._final_module.functions:
+            # What is to be merged into it stays so.
+            if not function.is_declaration and not any(b"alwaysinline" in found for found in function.attributes):
+                function.add_function_attribute("noinline")
+
+
 class _PartCompiler(Compiler):
     """numba's compiler, into :class:`_ToLink`."""
 
+    library = _ToLink
+
     def compile_extra(self, func: Callable[..., Any]) -> Any:
-        self.state.library = _ToLink(self.state.targetctx.codegen(), func.__qualname__)
+        self.state.library = self.library(self.state.targetctx.codegen(), func.__qualname__)
         self.state.flags.no_compile = True
         result = super().compile_extra(func)
         # Nothing to call: numba only asks for an object of the kind.
@@ -94,6 +106,12 @@ class _PartCompiler(Compiler):
         )
         self.state.targetctx.insert_user_function(entry, result.fndesc, [result.library])
         return result._replace(entry_point=entry)
+
+
+class _ApartCompiler(_PartCompiler):
+    """numba's compiler, into :class:`_ToCall`."""
+
+    library = _ToCall
 
 
 class _KernelCache(_Cache):
@@ -233,6 +251,14 @@ def internal_kernel(function: F) -> F:
     Unpacking the tables of a model from Python objects would take longer to compile than most of these functions.
     """
     return numba.extending.register_jitable(pipeline_class=_PartCompiler, **_OPTIONS, **_NO_ENTRY)(function)
+
+
+def apart_kernel(function: F) -> F:
+    """As :func:`internal_kernel`, for what is rarely called from the right-hand side: a call, never merged.
+
+    Merged, it would take registers from what runs every time.
+    """
+    return numba.extending.register_jitable(pipeline_class=_ApartCompiler, **_OPTIONS, **_NO_ENTRY)(function)
 
 
 def inlined_kernel(function: F) -> F:

@@ -6,31 +6,38 @@ import math
 
 from dynsim.kernels.arrays import (
     ARMATURE,
+    COUPLED,
     CURRENT,
     D_M,
     DAMPING,
     DIRECTION,
     DRAG,
     DRIVEN,
+    FIRST_ROW,
     FORCE,
     GAP_RATE,
     GEAR_DAMPING,
     INDUCTANCE,
     J_M,
     K_M,
+    MODE,
+    NORMAL_FORCE,
     PARENT,
     QD,
     QDD,
     RESISTANCE,
+    ROW_RATE,
+    SLIDING,
     SLIP_VELOCITY,
+    STICKING,
     VOLTAGE,
-    ContactArrays,
     DriveArrays,
     ModelArrays,
     S,
     V,
     Workspace,
 )
+from dynsim.kernels.constraint.rows import joint_rate
 from dynsim.kernels.jit import inlined_kernel, internal_kernel, kernel
 from dynsim.kernels.state import (
     CONSTRAINT,
@@ -50,12 +57,13 @@ from dynsim.kernels.tree.sweep import body_inertia
 
 
 @inlined_kernel
-def ledger_rates(model: ModelArrays, drives: DriveArrays, contacts: ContactArrays, ws: Workspace, out, layout):
-    """Rates of all integrals, into the blocks ledger and contact of ``out`` [W; N, m/s].
+def ledger_rates(model: ModelArrays, drives: DriveArrays, ws: Workspace, out, layout):
+    """Rates of all integrals, into the blocks ledger and contact of ``out`` [W; N, m/s], and the normal forces.
 
     Electrical Σ u i; drawn Σ max(u i, 0), a supply for each motor; supply max(Σ u i, 0), one for all; Joule Σ R i²;
-    gear Σ D_m v² and the drag of servos; joint Σ D v²; friction −Σ f_n (d − n)·v, d the force direction; constraint
-    Σ f_n n·v (zero on the constraint); mechanical Σ tau v with tau = K_m i − J_m vdot − D_m v − drag ([WM] eq 25).
+    gear Σ D_m v² and the drag of servos; joint Σ D v²; friction −Σ f_n (d − n)·v of what slides, d the force direction;
+    constraint Σ f J v of all rows (zero on the constraint); mechanical Σ tau v with tau = K_m i − J_m vdot − D_m v −
+    drag ([WM] eq 25).
     """
     joints, motors, motor, state = ws.joints, ws.motors, drives.motor, ws.contacts
     electrical, drawn, joule, mechanical, drag = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -76,15 +84,25 @@ def ledger_rates(model: ModelArrays, drives: DriveArrays, contacts: ContactArray
         joint += model.body[i, DAMPING] * square
     friction, constraint = 0.0, 0.0
     start, first = layout.ledger, layout.contact
-    for k in range(contacts.link.shape[0]):
-        f, rate = state[k, FORCE], state[k, GAP_RATE]
-        x, y, z = state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2]
-        # The slip velocity has no part along n, so d·v_t is the friction alone.
-        friction -= f * (state[k, DIRECTION + 3] * x + state[k, DIRECTION + 4] * y + state[k, DIRECTION + 5] * z)
+    rows = ws.rows
+    for k in range(state.shape[0]):
+        m, mode, slip = ws.active[k, FIRST_ROW], ws.active[k, MODE], 0.0
+        # Zero of a candidate that is off its surface: no solve writes to its row.
+        f, rate = rows[m, FORCE], state[k, GAP_RATE]
+        state[k, NORMAL_FORCE] = f
+        if mode == SLIDING:
+            x, y, z = state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2]
+            # The slip velocity has no part along n, so d·v_t is the friction alone.
+            friction -= f * (rows[m, DIRECTION + 3] * x + rows[m, DIRECTION + 4] * y + rows[m, DIRECTION + 5] * z)
+            slip = math.sqrt(x * x + y * y + z * z)
+        elif mode == STICKING:
+            constraint += rows[m + 1, FORCE] * rows[m + 1, ROW_RATE] + rows[m + 2, FORCE] * rows[m + 2, ROW_RATE]
         constraint += f * rate
         out[first + IMPULSE] = f
-        out[first + SLIP] = math.sqrt(x * x + y * y + z * z)
+        out[first + SLIP] = slip
         first += CONTACT_SIZE
+    for k in range(ws.counts[COUPLED]):
+        constraint += rows[k, FORCE] * joint_rate(ws, k)
     out[start + ELECTRICAL] = electrical
     out[start + DRAWN] = drawn
     out[start + JOULE] = joule

@@ -17,26 +17,34 @@ import numpy as np
 from dynsim.kernels.arrays import (
     APPLIED,
     CIRCUIT,
+    COUPLING_JOINT_SIZE,
+    COUPLING_SIZE,
     DAMPING,
+    DEPENDENT,
     DIDT,
     GEAR_DAMPING,
     QD,
     QDD,
+    ROWS,
+    SLIDING,
     ContactArrays,
+    CouplingArrays,
     DriveArrays,
     ModelArrays,
     Q,
     ReferenceArrays,
     Workspace,
+    workspace,
 )
 from dynsim.kernels.constraint.delassus import solve_small
 from dynsim.kernels.constraint.m_star import solve_m_star
+from dynsim.kernels.constraint.rows import set_modes
 from dynsim.kernels.constraint.surface import contact_rows, sign_changed
 from dynsim.kernels.drive.law import drive
-from dynsim.kernels.jit import inlined_kernel, internal_kernel, kernel
+from dynsim.kernels.jit import inlined_kernel, integers, internal_kernel, kernel, reals
 from dynsim.kernels.ledger import ledger_rates
 from dynsim.kernels.state import StateLayout
-from dynsim.kernels.tree.articulated import accelerate, add_contact_forces, contact_system, factor
+from dynsim.kernels.tree.articulated import accelerate, add_row_forces, factor, row_system
 from dynsim.kernels.tree.joints import position_rates, read_positions
 from dynsim.kernels.tree.loads import LoadArrays, add_loads
 from dynsim.kernels.tree.sweep import forward_sweep
@@ -52,25 +60,37 @@ class System(NamedTuple):
     contacts: ContactArrays
     loads: LoadArrays
     dense: np.ndarray | None  # room for M* and b, see constraint.m_star; None for the articulated solve alone
+    couplings: CouplingArrays = CouplingArrays(
+        integers(np.zeros((0, COUPLING_JOINT_SIZE))), reals(np.zeros((0, COUPLING_SIZE)))
+    )
+
+
+def new_workspace(system: System) -> Workspace:
+    """The workspace of a system: every candidate slides, every coupling holds."""
+    contacts, couplings = system.contacts, system.couplings
+    c = contacts.link.shape[0]
+    ws = workspace(system.model.tree.shape[0], system.drives.table.shape[0], c, couplings.joint.shape[0])
+    set_modes(contacts, couplings, ws, integers(np.full(c, SLIDING)))
+    return ws
 
 
 @inlined_kernel
-def constrained_acceleration(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
-    """vdot and contact forces of the applied forces, by the articulated solve, into ``ws.joints``, ``ws.contacts``."""
+def constrained_acceleration(model: ModelArrays, ws: Workspace):
+    """vdot and row forces of the applied forces, by the articulated solve, into ``ws.joints`` and ``ws.rows``."""
     factor(model, ws)
-    p, passes = ws.contacts.shape[0], 0
+    p, passes = ws.counts[ROWS], 0
     while p > 0:
         passes += 1
-        contact_system(model, contacts, ws)
-        ws.deficient[0] += solve_small(ws.small, ws.contacts)
-        if not sign_changed(contacts, ws, passes):
+        row_system(model, ws)
+        ws.counts[DEPENDENT] += solve_small(ws.small, ws.rows, ws.active, p)
+        if not sign_changed(ws, passes):
             break
-    add_contact_forces(model, contacts, ws)
+    add_row_forces(model, ws)
     accelerate(model, ws)
 
 
 @internal_kernel
-def m_star_acceleration(dense, model: ModelArrays, drives: DriveArrays, contacts: ContactArrays, ws: Workspace, found):
+def m_star_acceleration(dense, model: ModelArrays, drives: DriveArrays, ws: Workspace, found):
     """The same unknowns by the dense M*, where ``dense`` has room for it.
 
     The articulated solve has run before, because projection uses its factors; its rank findings (``found`` before it)
@@ -78,12 +98,12 @@ def m_star_acceleration(dense, model: ModelArrays, drives: DriveArrays, contacts
     """
     if dense is None:  # known to the compiler, which then leaves M* out of the default program
         return
-    ws.deficient[0] = found
+    ws.counts[DEPENDENT] = found
     passes = 1
-    solve_m_star(dense, model, drives, contacts, ws)
-    while sign_changed(contacts, ws, passes):
+    solve_m_star(dense, model, drives, ws)
+    while sign_changed(ws, passes):
         passes += 1
-        solve_m_star(dense, model, drives, contacts, ws)
+        solve_m_star(dense, model, drives, ws)
 
 
 @kernel
@@ -109,9 +129,9 @@ def derivative(system: System, t, y, ws: Workspace, dy):
     if system.loads.table.shape[0] > 0:
         add_loads(model, system.loads, t, ws, dy, layout.load)
     contact_rows(model, contacts, ws)
-    found = ws.deficient[0]
-    constrained_acceleration(model, contacts, ws)
-    m_star_acceleration(system.dense, model, drives, contacts, ws, found)
+    found = ws.counts[DEPENDENT]
+    constrained_acceleration(model, ws)
+    m_star_acceleration(system.dense, model, drives, ws, found)
 
     if not plain:
         position_rates(model, ws, dy, layout.q)
@@ -122,4 +142,4 @@ def derivative(system: System, t, y, ws: Workspace, dy):
     for a in range(na):
         if drives.table[a, CIRCUIT] >= 0:
             dy[layout.current + drives.table[a, CIRCUIT]] = motors[a, DIDT]
-    ledger_rates(model, drives, contacts, ws, dy, layout)
+    ledger_rates(model, drives, ws, dy, layout)

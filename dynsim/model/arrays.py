@@ -11,11 +11,13 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.tree import loads as kl
 from dynsim.kernels.tree.loads import LoadArrays
-from dynsim.model.description import Contact, Drive, Link, Load, Motor, Robot, Servo, TorqueSource
+from dynsim.model.description import Contact, Coupling, Drive, Link, Load, Motor, Robot, Servo, TorqueSource
 from dynsim.model.servo import servo_row
 
 # Beyond it the reduction of an angle to a quarter turn leaves too few digits (dynsim.kernels.tree.sweep.sine_cosine).
 ANGLE_LIMIT = 1e6
+# Further than this from its leader [rad or m] the initial position of a joint is another one, and no rounding of it.
+COUPLING_TOLERANCE = 1e-6
 
 _FRICTION = {"signed": ka.FRICTION_SIGNED, "dissipative": ka.FRICTION_DISSIPATIVE}
 
@@ -27,11 +29,13 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
     ------
     ModelError
         Duplicate names, a parent that does not come first, an impossible inertia, a joint that nothing can accelerate,
-        a hand on a body that there is not, or vectors of another shape or with what is no finite number.
+        a hand on a body that there is not, an impossible coupling or an initial configuration that breaks one, or
+        vectors of another shape or with what is no finite number.
     """
     links = robot.links
     if not links:
         raise ModelError(f"{robot.name}: a robot needs at least one link")
+    _check_couplings(robot)
     _check_shapes(robot)
     initial, position = robot.initial, robot.position_index
     index: dict[str, int] = {}
@@ -97,6 +101,7 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
             body[i, ka.ARMATURE] += motor.armature
             body[i, ka.GEAR_DAMPING] += motor.reflected_damping
     _check_movable(robot, tree, body)
+    _check_start(robot, {joint: i for i, joint in enumerate(robot.joint_names)})
     return ka.ModelArrays(tree=integers(tree), body=reals(body), gravity=reals(robot.gravity))
 
 
@@ -193,6 +198,63 @@ def compile_loads(robot: Robot, loads: Sequence[Load]) -> LoadArrays:
         parts += [on_body, np.zeros(6), segments.ravel(), load.knots[-1:]]
         place += kl.FIRST_SEGMENT + segments.size + 1
     return LoadArrays(table=integers(table), data=reals(np.concatenate(parts) if parts else np.zeros(0)))
+
+
+def compile_couplings(robot: Robot) -> ka.CouplingArrays:
+    """Tables of the couplings of a robot that :func:`compile_model` has accepted."""
+    joints = {link.joint: i for i, link in enumerate(robot.links)}
+    joint = np.zeros((len(robot.couplings), ka.COUPLING_JOINT_SIZE), dtype=np.int64)
+    law = np.zeros((len(robot.couplings), ka.COUPLING_SIZE))
+    for k, coupling in enumerate(robot.couplings):
+        joint[k, ka.FOLLOWER], joint[k, ka.LEADER] = joints[coupling.joint], joints[coupling.leader]
+        law[k, ka.RATIO], law[k, ka.OFFSET] = coupling.ratio, coupling.offset
+    return ka.CouplingArrays(joint=integers(joint), law=reals(law))
+
+
+def _check_couplings(robot: Robot) -> None:
+    """Refuse couplings of unknown joints, two of one joint, circles, and numbers that are none."""
+    joints = {link.joint: link for link in robot.links}
+    leads: dict[str, Coupling] = {}
+    for coupling in robot.couplings:
+        name = f"coupling of {coupling.joint}"
+        for joint in (coupling.joint, coupling.leader):
+            if joint not in joints:
+                raise ModelError(f"{name}: no joint {joint!r}; joints: {', '.join(joints)}")
+            if joints[joint].kind not in ("revolute", "prismatic"):
+                raise ModelError(
+                    f"{name}: {joint} is {joints[joint].kind}; only revolute and prismatic joints are coupled"
+                )
+        if coupling.joint in leads:
+            raise ModelError(
+                f"{name}: the joint follows {leads[coupling.joint].leader!r} already; it can follow only one"
+            )
+        for quantity in ("ratio", "offset"):
+            value = getattr(coupling, quantity)
+            if not (isinstance(value, (int, float, np.floating)) and np.isfinite(value)):
+                raise ModelError(f"{name}: {quantity} {shown(value)} must be a finite number")
+        leads[coupling.joint] = coupling
+    for start in leads:
+        circle, joint = [start], leads[start].leader
+        while joint in leads and joint not in circle:
+            circle.append(joint)
+            joint = leads[joint].leader
+        if joint in circle:
+            raise ModelError(
+                f"coupling of {start}: joints follow each other in a circle: {' → '.join([*circle, joint])}"
+            )
+
+
+def _check_start(robot: Robot, joints: dict[str, int]) -> None:
+    """Refuse an initial configuration that breaks a coupling."""
+    initial, position = robot.initial, robot.position_index
+    for coupling in robot.couplings:
+        q, leader = (initial[position[joints[joint]]] for joint in (coupling.joint, coupling.leader))
+        wanted = coupling.ratio * leader + coupling.offset
+        if not abs(q - wanted) <= COUPLING_TOLERANCE:
+            raise ModelError(
+                f"coupling of {coupling.joint}: it starts at {q:.6g}, but {coupling.leader} at {leader:.6g} leads it "
+                f"to {coupling.ratio:g} · {leader:.6g} + {coupling.offset:g} = {wanted:.6g}; leave its position away"
+            )
 
 
 def _check_shapes(robot: Robot) -> None:

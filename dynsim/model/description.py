@@ -7,7 +7,7 @@ moves with the joint; at q = 0 it is the joint frame J, placed in the parent's b
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -359,6 +359,19 @@ class Contact:
 
 
 @dataclass(frozen=True)
+class Coupling:
+    """A joint that follows another one, q = ratio q_leader + offset: a gear, a belt, a URDF mimic joint.
+
+    It is a constraint without losses: it holds exactly, and takes whatever force that needs.
+    """
+
+    joint: str
+    leader: str
+    ratio: float = 1.0
+    offset: float = 0.0
+
+
+@dataclass(frozen=True)
 class Load:
     """A force and a torque from outside on a point of a body, as cubic polynomials of time.
 
@@ -395,7 +408,8 @@ class Robot:
     """A tree of links with its motors.
 
     ``hand`` is the controlled point (body name, point in its frame [m]); ``q0`` the initial configuration [rad or m],
-    zero unless given; ``frames`` further names to attach points to; ``fixed_shapes`` what stands still in the world.
+    zero unless given; ``frames`` further names to attach points to; ``fixed_shapes`` what stands still in the world;
+    ``couplings`` of joints to joints.
     """
 
     name: str
@@ -406,6 +420,7 @@ class Robot:
     q0: Array | None = None
     frames: tuple[Frame, ...] = ()
     fixed_shapes: tuple[Shape, ...] = ()
+    couplings: tuple[Coupling, ...] = ()
 
     @property
     def carriers(self) -> frozenset[str]:
@@ -450,8 +465,28 @@ class Robot:
     @property
     def initial(self) -> Array:
         """Initial configuration, (nq,)."""
-        neutral = [value for link in self.links for value in link.row.neutral]
-        return np.array(neutral) if self.q0 is None else np.asarray(self.q0, dtype=np.float64)
+        return self.configuration({}) if self.q0 is None else np.asarray(self.q0, dtype=np.float64)
+
+    def configuration(self, given: Mapping[str, float]) -> Array:
+        """Coordinates [rad or m], (nq,): as given by joint, followers where their leaders have them, others neutral."""
+        leads = {coupling.joint: coupling for coupling in self.couplings if coupling.joint not in given}
+        q = np.array([value for link in self.links for value in link.row.neutral])
+
+        def position(joint: str) -> float:
+            chain: list[Coupling] = []
+            # A cycle of couplings has no position; the compilation refuses it.
+            while joint in leads and len(chain) <= len(leads):
+                chain.append(leads[joint])
+                joint = chain[-1].leader
+            found = float(given.get(joint, 0.0))
+            for coupling in reversed(chain):
+                found = coupling.ratio * found + coupling.offset
+            return found
+
+        for joint, k in zip(self.joint_names, self.position_index, strict=True):
+            if joint in given or joint in leads:
+                q[k] = position(joint)
+        return q
 
     @property
     def nq(self) -> int:

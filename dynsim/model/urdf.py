@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from dynsim.errors import ModelError
-from dynsim.model.description import WORLD, Array, Frame, Inertia, Link, Robot
+from dynsim.model.description import WORLD, Array, Coupling, Frame, Inertia, Link, Robot
 from dynsim.model.joints.ball import floating
 from dynsim.model.joints.planar import planar
 from dynsim.model.urdf_reader import MOVING, SEVERAL, UNLIMITED, UrdfJoint, UrdfTree, read_tree, suggestion
@@ -49,7 +49,8 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
     at its moving joint, and every other link is a frame of the body that carries it. Floating and planar joints become
     their rows (:mod:`dynsim.model.joints`). The hand is the link named
     ``hand``, else the tip of the chain with the most moving joints: the last link fixed to its last body, or that
-    body's origin when nothing is fixed to it. The root link is the world.
+    body's origin when nothing is fixed to it. The root link is the world. A mimic joint is a coupling to its leader; a
+    locked leader locks it too.
 
     Parameters
     ----------
@@ -59,8 +60,8 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
     Raises
     ------
     ModelError
-        No such file, not URDF, a number that is none, a mass without inertia and the like; a joint that is mimic and
-        not locked; no joint of a name in ``lock``, or one without a single position; or Pinocchio reads the file
+        No such file, not URDF, a number that is none, a mass without inertia and the like; a mimic joint whose leader
+        there is not; no joint of a name in ``lock``, or one without a single position; or Pinocchio reads the file
         differently. The message names file, line, link or joint, value and what to do.
 
     Warns
@@ -70,9 +71,7 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
         inertia of a link are not those of a body; a joint is locked beyond its limits.
     """
     tree = read_tree(path)
-    locked = _locked(tree, lock or {})
-    for joint in locked.joints.values():
-        _check_joint(tree, joint)
+    locked = _locked(tree, {**_locked_followers(tree, lock or {}), **(lock or {})})
     _compare_with_pinocchio(tree)
     places = _places(locked)
     links = _links(locked, places)
@@ -81,12 +80,18 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
     _warn(locked, places, links)
     frames = [Frame(name, place.body, place.R, place.p) for name, place in places.items() if place.body != name]
     rows = tuple(row for link in links for row in (_ROWS[link.kind](link) if link.kind in _ROWS else (link,)))
+    couplings = tuple(
+        Coupling(joint.name, joint.mimics, joint.multiplier, joint.offset)
+        for joint in locked.joints.values()
+        if joint.mimics is not None and joint.kind in MOVING
+    )
     return Robot(
         name=tree.name,
         links=rows,
         motors=(),
         hand=_hand(tree, places),
         frames=tuple(frames),
+        couplings=couplings,
         fixed_shapes=_shapes(locked, places).get(None, ()),
     )
 
@@ -115,6 +120,7 @@ def write_urdf(robot: Robot) -> str:
         ElementTree.SubElement(inertial, "mass", value=_text(link.inertia.mass))
         moments = {f"i{'xyz'[i]}{'xyz'[j]}": _text(link.inertia.tensor[i, j]) for i in range(3) for j in range(i, 3)}
         ElementTree.SubElement(inertial, "inertia", moments)
+    leads = {coupling.joint: coupling for coupling in robot.couplings}
     for link in links:
         limits = (link.lower, link.upper, link.effort_limit, link.velocity_limit)
         endless = link.kind == "revolute" and math.isinf(link.lower) and math.isinf(link.upper)
@@ -129,6 +135,9 @@ def write_urdf(robot: Robot) -> str:
             ElementTree.SubElement(joint, "limit", dict(list(given.items())[2:]) if endless else given)
         if link.damping:
             ElementTree.SubElement(joint, "dynamics", damping=_text(link.damping), friction="0.0")
+        if coupling := leads.get(link.joint):
+            law = {"multiplier": _text(coupling.ratio), "offset": _text(coupling.offset)}
+            ElementTree.SubElement(joint, "mimic", {"joint": coupling.leader, **law})
     if HAND not in taken:
         body, point = robot.hand
         turned = (f.R for f in robot.frames if f.name == HAND and f.body == body and np.array_equal(f.p, point))
@@ -147,14 +156,28 @@ def write_urdf(robot: Robot) -> str:
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def _check_joint(tree: UrdfTree, joint: UrdfJoint) -> None:
-    if joint.mimics is not None and joint.kind != "fixed":
-        key, unit = ("lock_m", "m") if joint.kind == "prismatic" else ("lock_deg", "rad")
-        raise tree.error(
-            joint.line,
-            f"joint {joint.name!r} mimics joint {joint.mimics!r}; coupled joints are not simulated. Lock it with "
-            f"plant.{key}: {{{joint.name}: 0.0}}, in Python with lock={{{joint.name!r}: 0.0}} [{unit}]",
-        )
+def _locked_followers(tree: UrdfTree, lock: Mapping[str, float]) -> dict[str, float]:
+    """Positions of the mimic joints whose leader is locked or fixed, directly or through others [rad or m]."""
+    found: dict[str, float] = {}
+    for follower in tree.joints.values():
+        chain, joint = [], follower
+        while joint.mimics is not None and joint.name not in lock and joint.kind != "fixed":
+            if joint.mimics not in tree.joints:
+                raise tree.error(
+                    joint.line,
+                    f"joint {joint.name!r} mimics joint {joint.mimics!r}, which is not in the file"
+                    f"{suggestion(joint.mimics, tree.joints)}",
+                )
+            if joint in chain:
+                raise tree.error(joint.line, f"joint {joint.name!r} mimics itself, by way of {joint.mimics!r}")
+            chain.append(joint)
+            joint = tree.joints[joint.mimics]
+        if chain and (joint.name in lock or joint.kind == "fixed"):
+            q = lock.get(joint.name, 0.0)
+            for link in reversed(chain):
+                q = link.multiplier * q + link.offset
+            found[follower.name] = q
+    return found
 
 
 def _locked(tree: UrdfTree, lock: Mapping[str, float]) -> UrdfTree:

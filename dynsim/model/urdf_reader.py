@@ -46,7 +46,8 @@ class UrdfLink:
 class UrdfJoint:
     """A joint as the file states it: placement of the child in the parent's frame, unit axis in the child's frame.
 
-    ``kind`` is URDF's type, ``mimics`` the name of the joint that leads this one. Limits [rad or m, rad/s or m/s, N m
+    ``kind`` is URDF's type, ``mimics`` the name of the joint that leads this one, at ``multiplier`` times its position
+    and ``offset`` [rad or m]. Limits [rad or m, rad/s or m/s, N m
     or N] are infinite where the file has none, ``damping`` and ``friction`` zero.
     """
 
@@ -65,6 +66,8 @@ class UrdfJoint:
     damping: float
     friction: float
     mimics: str | None
+    multiplier: float = 1.0
+    offset: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -187,11 +190,11 @@ class _Reader:
             raise self.file.error(
                 line, f"{who}: damping {damping:g} and friction {friction:g}; a loss is zero or positive"
             )
-        mimics = None
+        mimics, multiplier, offset = None, 1.0, 0.0
         if mimic is not None:
             mimics = self.file.text(mimic, "joint", who)
-            for key, default in (("multiplier", 1.0), ("offset", 0.0)):
-                self.file.number(mimic, key, who, default)
+            multiplier = self.file.number(mimic, "multiplier", who, 1.0)
+            offset = self.file.number(mimic, "offset", who, 0.0)
         return UrdfJoint(
             name=name,
             line=element.line,
@@ -208,6 +211,8 @@ class _Reader:
             damping=damping,
             friction=friction,
             mimics=mimics,
+            multiplier=multiplier,
+            offset=offset,
         )
 
     def limits(self, element: Element, kind: str, who: str) -> tuple[float, float, float, float]:

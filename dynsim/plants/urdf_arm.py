@@ -33,7 +33,9 @@ class Config(StrictConfig):
     type: Literal["urdf_arm"]
     file: str = Field(description="URDF file, relative to the scenario file")
     gravity_m_s2: Vector3 = [0.0, 0.0, -9.81]
-    motor: MotorChoice | None = Field(default=None, description="motor of every joint that `motors` does not name")
+    motor: MotorChoice | None = Field(
+        default=None, description="motor of every joint that `motors` does not name and that follows no other"
+    )
     motors: dict[str, MotorChoice] = Field(default={}, description="motors by joint name")
     damping_N_m_s_per_rad: NonNegative | None = Field(
         default=None, description="loss of every revolute joint; default: the URDF's"
@@ -41,7 +43,9 @@ class Config(StrictConfig):
     damping_N_s_per_m: NonNegative | None = Field(
         default=None, description="loss of every prismatic joint; default: the URDF's"
     )
-    initial_deg: dict[str, float] = Field(default={}, description="initial angles of revolute joints by name; others 0")
+    initial_deg: dict[str, float] = Field(
+        default={}, description="initial angles of revolute joints by name; others 0, or where a leader has them"
+    )
     initial_m: dict[str, float] = Field(default={}, description="initial positions of prismatic joints; others 0")
     initial_pose: dict[str, Pose] = Field(
         default={}, description="initial poses of the bodies of floating and planar joints, by joint name"
@@ -109,7 +113,10 @@ def build(config: Config, context: BuildContext) -> Robot:
         else link
         for link in robot.links
     )
-    chosen = {link.joint: config.motors.get(link.joint, config.motor) for link in single}
+    followers = {coupling.joint for coupling in robot.couplings}
+    chosen = {
+        link.joint: config.motors.get(link.joint, None if link.joint in followers else config.motor) for link in single
+    }
     hand = robot.hand
     if config.hand is not None:
         try:
@@ -133,13 +140,10 @@ def build(config: Config, context: BuildContext) -> Robot:
 
 def _initial(robot: Robot, positions: dict[str, float], poses: dict[str, Pose]) -> Array:
     """Coordinates of all joints, (nq,); those of floating and planar joints from the poses of their bodies."""
-    from dynsim.model.joints.ball import quaternion
     from dynsim.model.urdf_reader import rotation
+    from dynsim.record.scene import quaternion
 
-    q, index = robot.initial, robot.position_index
-    for i, link in enumerate(robot.links):
-        if link.joint in positions:
-            q[index[i]] = positions[link.joint]
+    q, index = robot.configuration(positions), robot.position_index
     for name, pose in poses.items():
         rows = [i for i, link in enumerate(robot.links) if link.joint_of_rows == name]
         p, R = np.array(pose.position_m), rotation(*np.deg2rad(pose.rpy_deg))

@@ -85,7 +85,7 @@ def test_block_on_an_incline(speed):
     dy = b.derivative(b.state(np.zeros(3), speed * down))
     expected = G * np.sin(alpha) - mu * G * np.cos(alpha) * speed / np.hypot(speed, v_s)
     np.testing.assert_allclose(b.part(dy, "v"), expected * down, rtol=0, atol=1e-13)  # rounding
-    assert b.ws.contacts[0, ka.FORCE] == pytest.approx(mass * G * np.cos(alpha), rel=1e-13)
+    assert b.ws.contacts[0, ka.NORMAL_FORCE] == pytest.approx(mass * G * np.cos(alpha), rel=1e-13)
 
 
 @every_method

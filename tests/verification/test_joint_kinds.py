@@ -24,9 +24,9 @@ from dynsim.kernels.state import CONSTRAINT, FRICTION, JOINT
 from dynsim.kernels.tree.joints import position_error
 from dynsim.model.description import Contact, Inertia, Link, Motor, Quadric, Robot
 from dynsim.model.joints.ball import ball, floating
-from dynsim.model.joints.ball import quaternion as ball_quaternion
 from dynsim.model.joints.planar import rolling
 from dynsim.model.model import Model
+from dynsim.record.scene import quaternion as scene_quaternion
 
 DOWN = np.array([0.0, 0.0, -9.81])
 AXES = np.eye(3)
@@ -210,7 +210,7 @@ def test_quaternions_of_all_rotations(angle):
     for turn in (np.eye(3), random_rotation(rng), random_rotation(rng)):
         for axis in range(3):
             R = turn @ about(axis, angle) @ turn.T
-            q = ball_quaternion(R)
+            q = np.array(scene_quaternion(R))
             np.testing.assert_allclose(Model(robot).body_pose("body", q)[0], R, rtol=0, atol=1e-15 * 4)
             assert q[0] >= 0.0
 

@@ -17,6 +17,7 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels.constraint.uniqueness import ROOM, UNIQUE, force_verdict
 from dynsim.kernels.integrate import driver
 from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.system import new_workspace
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.scenario import build
 
@@ -68,7 +69,7 @@ def test_a_signed_rod_is_stopped_where_its_diagonal_vanishes(method, rtol, turn)
     """The floor pulls, leans the rod towards the critical angle, and would carry it through with ±∞."""
     b, contacts = rod("signed")
     run = started(b, rod_state(b, 0.1, turn), method, rtol=rtol)
-    found = paradox(b.system, ka.workspace(3, 0, 1), run, contacts)
+    found = paradox(b.system, new_workspace(b.system), run, contacts)
     assert found is not None, run.count
     t, y, words = found
     assert "Painlevé's paradox at tip" in words
@@ -86,7 +87,7 @@ def test_a_signed_rod_that_starts_beyond_is_stopped_before_its_first_step(method
     run = started(b, rod_state(b, -0.6, 0.0), method)
     assert run.count[ki.STATUS] == ki.FORCES_REVERSED
     assert run.count[ki.STEPS] == 0
-    t, _, words = paradox(b.system, ka.workspace(3, 0, 1), run, contacts)
+    t, _, words = paradox(b.system, new_workspace(b.system), run, contacts)
     assert t == 0.0
     assert "is negative" in words
     # 5 − 3 cos 2θ + 3 μ sin 2θ = 0 solved for μ.
@@ -102,7 +103,7 @@ def test_a_dissipative_rod_is_stopped_where_a_second_solution_appears(method):
     b, contacts = rod("dissipative")
     run = started(b, rod_state(b, 0.0, 0.5), method)
     assert run.count[ki.STATUS] == ki.SEVERAL_FORCES
-    t, y, words = paradox(b.system, ka.workspace(3, 0, 1), run, contacts)
+    t, y, words = paradox(b.system, new_workspace(b.system), run, contacts)
     assert "two consistent solutions (Painlevé's paradox) at tip" in words
     assert run.clock[ki.TIME] < t <= run.clock[ki.NOT_UNIQUE]
     # The smoothing speed turns the slip by 5e-8 of its direction, μ by as much; the state is linear over the step.
@@ -136,7 +137,7 @@ def test_the_compiled_watch_agrees_with_its_definition():
     for seed in range(200):
         b, y = random_case(seed, friction=4.0)
         dy = b.derivative(y)
-        if not np.isfinite(dy).all() or b.ws.deficient[0]:
+        if not np.isfinite(dy).all() or b.ws.counts[ka.DEPENDENT]:
             continue
         matrices = contact_matrices(b.system, b.ws, 0.0, y)
         values = [matrices.determinant(signs) for signs in matrices.choices()]
@@ -166,14 +167,14 @@ def test_a_right_hand_side_does_not_depend_on_earlier_calls():
         for name in ("q", "v"):
             b.part(other, name)[:] += rng.normal(size=b.sizes[0])
         first = b.derivative(y).copy()
-        signs = b.ws.contacts[:, ka.SIGN].copy()
+        signs = b.ws.rows[:, ka.SIGN].copy()
         b.derivative(other)
-        turned += (signs != b.ws.contacts[:, ka.SIGN]).any()
+        turned += (signs != b.ws.rows[:, ka.SIGN]).any()
         again = b.derivative(y)
         if not np.isfinite(first).all() or not contact_matrices(b.system, b.ws, 0.0, y).unique():
             continue
         np.testing.assert_array_equal(first, again)
-        fresh.ws.contacts[:, ka.SIGN] = -1.0
+        fresh.ws.rows[:, ka.SIGN] = -1.0
         np.testing.assert_array_equal(first, fresh.derivative(y))
         compared += 1
     assert compared > 40
@@ -211,9 +212,9 @@ def test_a_contact_without_load_has_no_sign():
         y = b.state(np.zeros(3), np.array([1.0, 0.0, 0.0]))
         results = []
         for sign in (1.0, -1.0):
-            b.ws.contacts[:, ka.SIGN] = sign
+            b.ws.rows[:, ka.SIGN] = sign
             results.append(b.derivative(y).copy())
-        force = b.ws.contacts[:, ka.FORCE]
+        force = b.ws.contacts[:, ka.NORMAL_FORCE]
         unloaded += abs(force[1]) < 1e-12 * abs(force[0])
         np.testing.assert_array_equal(*results)
     assert unloaded == 30
@@ -247,7 +248,7 @@ def test_the_motion_of_a_table_on_four_legs_is_open(law):
     y = sliding(b)
     taken, low, high = acceleration_range(b.system, 0.0, y)
     np.testing.assert_array_equal(taken, b.part(b.derivative(y), "v"))
-    assert b.ws.deficient[0] > 0
+    assert b.ws.counts[ka.DEPENDENT] > 0
     # By hand: the splits are f0 + z (1, −1, 1, −1) to first order in friction; sampled along the null vector.
     matrices = contact_matrices(b.system, b.ws, 0.0, y)
     A = matrices.matrix(matrices.signs)
@@ -271,9 +272,9 @@ def test_the_motion_of_a_table_on_four_legs_is_open(law):
 def _yaw_acceleration(b: Bench, y: np.ndarray, force: np.ndarray) -> float:
     """Newton and Euler about the vertical through the centre of mass of a body that lies level."""
     b.derivative(y)
-    row, centre = b.ws.contacts, np.array([0.05, -0.04])
-    horizontal = force[:, None] * row[:, ka.DIRECTION + 3 : ka.DIRECTION + 5]
-    arm = row[:, ka.POSITION : ka.POSITION + 2] - centre
+    state, rows, centre = b.ws.contacts, b.ws.rows[: len(force)], np.array([0.05, -0.04])
+    horizontal = force[:, None] * rows[:, ka.DIRECTION + 3 : ka.DIRECTION + 5]
+    arm = state[:, ka.POSITION : ka.POSITION + 2] - centre
     return float((arm[:, 0] * horizontal[:, 1] - arm[:, 1] * horizontal[:, 0]).sum() / 0.4)
 
 
@@ -303,7 +304,7 @@ def test_a_point_that_no_joint_moves_along_its_normal_is_no_paradox():
             b = bench(Robot("disc", (link,), (), ("disc", np.zeros(3))), [replace(foot, pulling_friction=law)])
             b.derivative(b.state(np.zeros(1), np.ones(1)))
             since, room = np.full(1, np.inf), np.zeros((ROOM, 1, 1))
-            assert force_verdict(b.system.contacts, b.ws, room, since, 0.0) == UNIQUE
+            assert force_verdict(b.ws, room, since, 0.0) == UNIQUE
             assert np.isinf(since).all()
 
 

@@ -13,9 +13,9 @@ from random_robots import Bench, bench, random_contacts, random_robot
 
 import dynsim
 from dynsim.engine.uniqueness import acceleration_range
-from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate.run import FINISHED, METHODS, PROJECTIONS, STATUS, STEPS, Run
 from dynsim.kernels.state import OutputLayout, StateLayout, block
+from dynsim.kernels.system import new_workspace
 
 PACKAGE, TESTS = Path(dynsim.__file__).parent, Path(__file__).parents[1]
 
@@ -69,7 +69,7 @@ class Pair:
         self.standard = standard
         self.layout = scattered_state(standard.system.layout, gap)
         system = standard.system._replace(layout=self.layout)
-        self.other = replace(standard, system=system, ws=ka.workspace(*standard.sizes))
+        self.other = replace(standard, system=system, ws=new_workspace(system))
         self.gap = gap
 
     def moved(self, y: np.ndarray) -> np.ndarray:

@@ -6,22 +6,26 @@ from dynsim.kernels.arrays import (
     APPLIED,
     ARMATURE,
     BIAS,
+    BODY_A,
+    BODY_B,
     CIRCUIT,
     CURRENT,
+    DEPENDENT,
     DIDT,
     DIRECTION,
     DRIVEN,
     FORCE,
     INDUCTANCE,
-    LINK,
+    JOINT_ROW,
     PARENT,
     QD,
     QDD,
     RHS,
     ROW,
+    ROW_KIND,
+    ROWS,
     TARGET,
     VOLTAGE,
-    ContactArrays,
     DriveArrays,
     ModelArrays,
     S,
@@ -34,18 +38,18 @@ from dynsim.kernels.tree.sweep import mass_matrix, newton_euler
 
 
 @internal_kernel
-def solve_m_star(K, model: ModelArrays, drives: DriveArrays, contacts: ContactArrays, ws: Workspace):
+def solve_m_star(K, model: ModelArrays, drives: DriveArrays, ws: Workspace):
     """Fill M* and b and solve for vdot, contact forces and di/dt.
 
-    K : (n + p + k, n + p + k + 1), room for M* with b as its last column; k motors have a circuit.
+    K : (n + p + k, n + p + k + 1) or more, room for M* with b as its last column; k motors have a circuit.
 
     [M + J_m, −Fᵀ, 0; J, 0, 0; 0, 0, L] [vdot; f; di/dt] = [applied; target; u − R i − K_m v]. F (force directions)
     differs from J (rows) under friction: the paper's −J_tᵀ f_t with f_t = μ f_n has moved to the left side. Call after
     ``contact_rows``: the mass matrix overwrites velocities and wrenches of the sweep.
     """
-    n, p, na = model.tree.shape[0], contacts.link.shape[0], drives.table.shape[0]
+    n, p, na = model.tree.shape[0], ws.counts[ROWS], drives.table.shape[0]
     size = K.shape[0]
-    links, joints, motors, state = ws.links, ws.joints, ws.motors, ws.contacts
+    links, joints, motors, state = ws.links, ws.joints, ws.motors, ws.rows
     for i in range(size):
         for j in range(size + 1):
             K[i, j] = 0.0
@@ -57,12 +61,17 @@ def solve_m_star(K, model: ModelArrays, drives: DriveArrays, contacts: ContactAr
         K[i, i] += model.body[i, ARMATURE]
     for k in range(p):
         K[n + k, size] = state[k, TARGET]
-        j = contacts.link[k, LINK]
-        while j >= 0:
-            for s in range(6):
-                K[n + k, j] += links[j, S + s] * state[k, ROW + s]
-                K[j, n + k] -= links[j, S + s] * state[k, DIRECTION + s]
-            j = model.tree[j, PARENT]
+        for end in range(2):
+            j, sign = (ws.active[k, BODY_A], 1.0) if end == 0 else (ws.active[k, BODY_B], -1.0)
+            if ws.active[k, ROW_KIND] == JOINT_ROW:
+                K[n + k, j] += state[k, ROW + end]
+                K[j, n + k] -= state[k, DIRECTION + end]
+                continue
+            while j >= 0:
+                for s in range(6):
+                    K[n + k, j] += sign * links[j, S + s] * state[k, ROW + s]
+                    K[j, n + k] -= sign * links[j, S + s] * state[k, DIRECTION + s]
+                j = model.tree[j, PARENT]
     for a in range(na):
         row = n + p + drives.table[a, CIRCUIT]
         if row >= n + p:
@@ -83,7 +92,7 @@ def solve_m_star(K, model: ModelArrays, drives: DriveArrays, contacts: ContactAr
         state[k, RHS] = K[n + k, size]
         for m in range(p):
             ws.small[0, k, m] = K[n + k, n + m]
-    ws.deficient[0] += solve_small(ws.small, state)
+    ws.counts[DEPENDENT] += solve_small(ws.small, state, ws.active, p)
     for a in range(na):
         row = n + p + drives.table[a, CIRCUIT]
         if row >= n + p:

@@ -1,26 +1,33 @@
-"""Points held to surfaces: geometry of the contact, slip direction, and its constraint row."""
+"""Points held to surfaces: geometry of the candidates, slip direction, and constraint rows of the active ones."""
 
 from __future__ import annotations
 
 import math
 
 from dynsim.kernels.arrays import (
+    CONTRADICTORY,
     CURVED,
     DIRECTION,
+    FIRST_ROW,
     FORCE,
     FRICTION_DISSIPATIVE,
-    FRICTION_LAW,
     GAP,
     GAP_RATE,
+    HELD,
+    LAW,
     LINK,
-    MU,
+    MODE,
     NORMAL,
+    OWNER,
     POINT,
     POSITION,
     QUADRIC,
     ROW,
+    ROW_MU,
+    ROWS,
     SIGN,
     SLIP_VELOCITY,
+    STICKING,
     TANGENT,
     TARGET,
     V_S,
@@ -32,6 +39,7 @@ from dynsim.kernels.arrays import (
     V,
     Workspace,
 )
+from dynsim.kernels.constraint.rows import sticking_rows
 from dynsim.kernels.jit import exact_kernel, inlined_kernel, kernel
 
 # Tries, beyond two per contact, to find signs of dissipative contacts that agree with their forces.
@@ -66,16 +74,19 @@ def hessian_product(point, k, x, y, z):
 
 @inlined_kernel
 def contact_rows(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
-    """Position, gap, constraint row and force direction of every contact, after ``forward_sweep``.
+    """Position, gap, slip, constraint row and force direction of every candidate, after ``forward_sweep``.
+
+    A candidate that is off its surface has a row too, behind the active ones: geometry without branches.
 
     C(r) = r·Q r/2 + b·r + c, n = ∇C/|∇C| ([WM] eqs 3, 6, 8); a gap > 0 is off the surface. Row:
     n·r̈ = −ṙᵀ(∂²C/∂r²)ṙ / |∇C| ([WM] eqs 15, 30). Force per unit f_n: n − σ μ t with the smoothed slip direction
     t = v_t / √(|v_t|² + v_s²) ([WM] eqs 9, 14 and f_t = μ f_n); v_s is dynsim's assumption, the paper says nothing
     of zero slip. σ is 1 in the paper's law; for the dissipative law it is the sign of f_n, kept between calls.
     """
-    links, state, point, gravity = ws.links, ws.contacts, contacts.point, model.gravity
+    links, state, rows, point, gravity = ws.links, ws.contacts, ws.rows, contacts.point, model.gravity
     for k in range(contacts.link.shape[0]):
-        i = contacts.link[k, LINK]
+        i, m = contacts.link[k, LINK], ws.active[k, FIRST_ROW]
+        mu = signed_friction(ws, m)
         x, y, z = point[k, POINT], point[k, POINT + 1], point[k, POINT + 2]
         rx = links[i, P] + links[i, R] * x + links[i, R + 1] * y + links[i, R + 2] * z
         ry = links[i, P + 1] + links[i, R + 3] * x + links[i, R + 4] * y + links[i, R + 5] * z
@@ -109,72 +120,93 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
         state[k, GAP] = gap
         state[k, GAP_RATE] = rate
         target = -(nx * ax + ny * ay + nz * az)
-        state[k, TARGET] = target - hessian_product(point, k, vx, vy, vz) * inverse if curved else target
+        rows[m, TARGET] = target - hessian_product(point, k, vx, vy, vz) * inverse if curved else target
         state[k, POSITION], state[k, POSITION + 1], state[k, POSITION + 2] = rx, ry, rz
         state[k, NORMAL], state[k, NORMAL + 1], state[k, NORMAL + 2] = nx, ny, nz
         state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2] = tx, ty, tz
-        state[k, TANGENT], state[k, TANGENT + 1], state[k, TANGENT + 2] = tx * scale, ty * scale, tz * scale
-        state[k, ROW], state[k, ROW + 1], state[k, ROW + 2] = ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx
-        state[k, ROW + 3], state[k, ROW + 4], state[k, ROW + 5] = nx, ny, nz
-        force_direction(contacts, ws, k)
+        # From here on nothing is read back: stores to one table keep the compiler from trusting the other.
+        sx, sy, sz = tx * scale, ty * scale, tz * scale
+        state[k, TANGENT], state[k, TANGENT + 1], state[k, TANGENT + 2] = sx, sy, sz
+        rows[m, ROW], rows[m, ROW + 1], rows[m, ROW + 2] = ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx
+        rows[m, ROW + 3], rows[m, ROW + 4], rows[m, ROW + 5] = nx, ny, nz
+        unit_force(rows, m, mu, rx, ry, rz, nx, ny, nz, sx, sy, sz)
+    if ws.counts[HELD] == 0:
+        return
+    for k in range(contacts.link.shape[0]):
+        if ws.active[k, MODE] == STICKING:
+            sticking_rows(model, ws, k, contacts.link[k, LINK])
+
+
+@inlined_kernel
+def signed_friction(ws: Workspace, m):
+    """σ μ of row m."""
+    mu = ws.rows[m, ROW_MU]
+    return mu * ws.rows[m, SIGN] if ws.active[m, LAW] == FRICTION_DISSIPATIVE else mu
 
 
 @exact_kernel
-def force_direction(contacts: ContactArrays, ws: Workspace, k):
-    """Wrench of a unit normal force with its friction at contact k: n − σ μ t through the contact point.
+def unit_force(rows, m, mu, x, y, z, nx, ny, nz, tx, ty, tz):
+    """Wrench of a unit normal force with its friction, n − σ μ t through the contact point, as DIRECTION of row m.
 
     The same bits where it is first made and where a sign has turned, so that a right-hand side does not depend on the
     signs of the one before.
     """
-    state = ws.contacts
-    mu = contacts.point[k, MU]
-    if contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE:
-        mu *= state[k, SIGN]
-    x, y, z = state[k, POSITION], state[k, POSITION + 1], state[k, POSITION + 2]
-    fx = state[k, NORMAL] - mu * state[k, TANGENT]
-    fy = state[k, NORMAL + 1] - mu * state[k, TANGENT + 1]
-    fz = state[k, NORMAL + 2] - mu * state[k, TANGENT + 2]
-    state[k, DIRECTION], state[k, DIRECTION + 1], state[k, DIRECTION + 2] = (
+    fx, fy, fz = nx - mu * tx, ny - mu * ty, nz - mu * tz
+    rows[m, DIRECTION], rows[m, DIRECTION + 1], rows[m, DIRECTION + 2] = (
         y * fz - z * fy,
         z * fx - x * fz,
         x * fy - y * fx,
     )
-    state[k, DIRECTION + 3], state[k, DIRECTION + 4], state[k, DIRECTION + 5] = fx, fy, fz
+    rows[m, DIRECTION + 3], rows[m, DIRECTION + 4], rows[m, DIRECTION + 5] = fx, fy, fz
 
 
 @inlined_kernel
-def sign_changed(contacts: ContactArrays, ws: Workspace, passes):
+def turn_direction(ws: Workspace, m):
+    """DIRECTION of row m for its present SIGN."""
+    state, k = ws.contacts, ws.active[m, OWNER]
+    x, y, z = state[k, POSITION], state[k, POSITION + 1], state[k, POSITION + 2]
+    nx, ny, nz = state[k, NORMAL], state[k, NORMAL + 1], state[k, NORMAL + 2]
+    tx, ty, tz = state[k, TANGENT], state[k, TANGENT + 1], state[k, TANGENT + 2]
+    unit_force(ws.rows, m, signed_friction(ws, m), x, y, z, nx, ny, nz, tx, ty, tz)
+
+
+@inlined_kernel
+def sign_changed(ws: Workspace, passes):
     """True when dissipative contacts' solved forces contradict their assumed signs; turns those directions around.
 
     All at once in the first passes, then only the first of them (least-index pivoting, which cannot cycle while all
     choices have determinants of one sign), at last every choice in turn. Without a consistent choice (Painlevé) the
-    forces become NaN, the count in ``ws.deficient[1]`` goes up and the search ends. Forces that vanish to rounding
-    have no sign and take +. So the result does not depend on the signs that the search began with, unless several
-    choices are consistent (dynsim.kernels.constraint.uniqueness watches for that).
+    forces become NaN, the count of CONTRADICTORY goes up and the search ends. Forces that vanish to rounding have no
+    sign and take +. So the result does not depend on the signs that the search began with, unless several choices are
+    consistent (dynsim.kernels.constraint.uniqueness watches for that).
     """
-    state = ws.contacts
-    p = state.shape[0]
+    rows, active, p = ws.rows, ws.active, ws.counts[ROWS]
     limit = 2 * p + SIGN_PASSES
     changed, largest = False, 0.0
     for k in range(p):
-        largest = max(largest, abs(state[k, FORCE]))
+        largest = max(largest, abs(rows[k, FORCE]))
     for k in range(p):
-        if contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE:
-            agreement = state[k, FORCE] * state[k, SIGN]
-            if agreement < -NO_FORCE * largest or (agreement <= NO_FORCE * largest and state[k, SIGN] < 0.0):
+        if active[k, LAW] == FRICTION_DISSIPATIVE:
+            agreement = rows[k, FORCE] * rows[k, SIGN]
+            if agreement < -NO_FORCE * largest or (agreement <= NO_FORCE * largest and rows[k, SIGN] < 0.0):
                 if passes < limit and not (changed and passes > p):
-                    state[k, SIGN] = -state[k, SIGN]
-                    force_direction(contacts, ws, k)
+                    rows[k, SIGN] = -rows[k, SIGN]
+                    turn_direction(ws, k)
                 changed = True
     if changed and passes >= limit:
-        choice = passes - limit
-        if p > SIGNS_LIMIT or choice >= 1 << p:
-            ws.deficient[1] += 1
-            for k in range(p):
-                state[k, FORCE] = math.nan
-            return False
+        choice, free = passes - limit, 0
         for k in range(p):
-            if contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE:
-                state[k, SIGN] = -1.0 if (choice >> k) & 1 == 1 else 1.0
-                force_direction(contacts, ws, k)
+            if active[k, LAW] == FRICTION_DISSIPATIVE:
+                free += 1
+        if free > SIGNS_LIMIT or choice >= 1 << free:
+            ws.counts[CONTRADICTORY] += 1
+            for k in range(p):
+                rows[k, FORCE] = math.nan
+            return False
+        index = 0
+        for k in range(p):
+            if active[k, LAW] == FRICTION_DISSIPATIVE:
+                rows[k, SIGN] = -1.0 if (choice >> index) & 1 == 1 else 1.0
+                index += 1
+                turn_direction(ws, k)
     return changed

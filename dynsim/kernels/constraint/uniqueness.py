@@ -11,15 +11,17 @@ from __future__ import annotations
 import math
 
 from dynsim.kernels.arrays import (
+    BODY_A,
+    BODY_B,
     FORCE,
     FRICTION_DISSIPATIVE,
-    FRICTION_LAW,
     INVERSE_D,
-    LINK,
-    MU,
+    LAW,
+    OWNER,
     RHS,
+    ROW_MU,
+    ROWS,
     SIGN,
-    ContactArrays,
     Workspace,
 )
 from dynsim.kernels.constraint.delassus import RANK_TOLERANCE
@@ -28,7 +30,7 @@ from dynsim.kernels.jit import inlined_kernel, internal_kernel
 
 UNIQUE, REVERSED, SEVERAL = 0, 1, 2
 
-# Blocks of the scratch ``room``, (ROOM, c, c); of SIGNS and FORCES only the first row is used.
+# Blocks of the scratch ``room``, (ROOM, p, p); of SIGNS and FORCES only the first row is used.
 FRICTIONLESS, FRICTION, BASIS, MATRIX, PRODUCT, SIGNS, FORCES = 0, 1, 2, 3, 4, 5, 6
 ROOM = 7
 # A determinant above this fraction of what its terms would allow is positive without a closer look.
@@ -41,16 +43,16 @@ FORCE_TOLERANCE = 1e-9
 
 
 @inlined_kernel
-def clearly_unique(contacts: ContactArrays, ws: Workspace):
-    """True for no contact, and for one or two of signed friction whose determinant is positive by far.
+def clearly_unique(ws: Workspace):
+    """True for no row, and for one or two without dissipative friction whose determinant is positive by far.
 
     Small, because it is merged into the step: passing the tables to the rest of the watch costs as much as a sweep.
     """
-    small, p = ws.small, ws.contacts.shape[0]
+    small, p = ws.small, ws.counts[ROWS]
     if p == 0 or p > 2:
         return p == 0
     for k in range(p):
-        if contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE or not small[0, k, k] > 0.0:
+        if ws.active[k, LAW] == FRICTION_DISSIPATIVE or not small[0, k, k] > 0.0:
             return False
     if p == 1:
         return True
@@ -59,18 +61,18 @@ def clearly_unique(contacts: ContactArrays, ws: Workspace):
 
 
 @internal_kernel
-def dominant(contacts: ContactArrays, ws: Workspace, room):
+def dominant(ws: Workspace, room):
     """True without friction, and when every A(σ) is strictly diagonally dominant, so that none of them is singular."""
-    point, small, p = contacts.point, ws.small, ws.contacts.shape[0]
+    small, p = ws.small, ws.counts[ROWS]
     frictional = False
     for k in range(p):
-        frictional = frictional or point[k, MU] > 0.0
+        frictional = frictional or ws.rows[k, ROW_MU] > 0.0
     if not frictional:
         return True
     for k in range(p):
         if not small[0, k, k] > 0.0:
             return False
-    split_matrix(contacts, ws, room)
+    split_matrix(ws, room)
     for k in range(p):
         rest = 0.0
         for m in range(p):
@@ -83,28 +85,34 @@ def dominant(contacts: ContactArrays, ws: Workspace, room):
 
 
 @internal_kernel
-def split_matrix(contacts: ContactArrays, ws: Workspace, room):
+def last_link(ws: Workspace, k):
+    """The last link that row k touches."""
+    return max(ws.active[k, BODY_A], ws.active[k, BODY_B])
+
+
+@internal_kernel
+def split_matrix(ws: Workspace, room):
     """A0 and B into ``room``, from the eliminated rows and the matrix that the derivative has left in ``ws``.
 
-    A contact's column is zero beyond its own link, and links come after their parents.
+    A row's column is zero beyond its own links, and links come after their parents.
     """
-    link, column, links, state = contacts.link, ws.column, ws.links, ws.contacts
-    p = state.shape[0]
+    active, column, links, state = ws.active, ws.column, ws.links, ws.rows
+    p = ws.counts[ROWS]
     for k in range(p):
         for m in range(k + 1):
             total = 0.0
-            for i in range(min(link[k, LINK], link[m, LINK]) + 1):
+            for i in range(min(last_link(ws, k), last_link(ws, m)) + 1):
                 total += column[i, 1 + 2 * k] * column[i, 1 + 2 * m] * links[i, INVERSE_D]
             room[FRICTIONLESS, k, m] = total
             room[FRICTIONLESS, m, k] = total
     for k in range(p):
         for m in range(p):
-            sign = state[m, SIGN] if link[m, FRICTION_LAW] == FRICTION_DISSIPATIVE else 1.0
+            sign = state[m, SIGN] if active[m, LAW] == FRICTION_DISSIPATIVE else 1.0
             room[FRICTION, k, m] = sign * (room[FRICTIONLESS, k, m] - ws.small[0, k, m])
 
 
 @internal_kernel
-def force_verdict(contacts: ContactArrays, ws: Workspace, room, since, t):
+def force_verdict(ws: Workspace, room, since, t):
     """UNIQUE, or why the constraint forces at the state of ``ws`` are not determined, right after ``derivative``.
 
     REVERSED: the determinant of J M⁻¹ F with the present signs, per that without friction, is not positive, or every
@@ -112,30 +120,33 @@ def force_verdict(contacts: ContactArrays, ws: Workspace, room, since, t):
 
     Parameters
     ----------
-    room : (ROOM, c, c) scratch
+    room : (ROOM, p, p) scratch, or more
     since : (c,) first time at which the contact's diagonal entry was negative [s], written here; inf: never
     """
-    if dominant(contacts, ws, room):
+    if dominant(ws, room):
         return UNIQUE
-    split_matrix(contacts, ws, room)
-    drop_immobile(contacts, ws, room)
-    rank, p = frictionless_basis(room), ws.contacts.shape[0]
+    split_matrix(ws, room)
+    drop_immobile(ws, room)
+    p = ws.counts[ROWS]
+    rank = frictionless_basis(room, p)
     negative, free = 0, 0
     for k in range(p):
         own = room[FRICTIONLESS, k, k]
         if own > 0.0 and ws.small[0, k, k] < -DIAGONAL_TOLERANCE * own:
             negative += 1
-            since[k] = min(since[k], t)
-        if contacts.point[k, MU] > 0.0 and contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE:
+            # Only a frictional row can have it: that of a sliding point.
+            owner = ws.active[k, OWNER]
+            since[owner] = min(since[owner], t)
+        if ws.rows[k, ROW_MU] > 0.0 and ws.active[k, LAW] == FRICTION_DISSIPATIVE:
             free += 1
     reverse, doubtful, several = negative == p, negative == p, False
     for choice in range(1 << free if free <= SIGNS_LIMIT else free + 1):
         index = 0
         for k in range(p):
             sign = 1.0
-            if contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE:
-                sign = ws.contacts[k, SIGN]
-                if contacts.point[k, MU] > 0.0:
+            if ws.active[k, LAW] == FRICTION_DISSIPATIVE:
+                sign = ws.rows[k, SIGN]
+                if ws.rows[k, ROW_MU] > 0.0:
                     turned = (choice >> index) & 1 == 1 if free <= SIGNS_LIMIT else choice == index + 1
                     sign = -sign if turned else sign
                     index += 1
@@ -144,7 +155,7 @@ def force_verdict(contacts: ContactArrays, ws: Workspace, room, since, t):
         if determinant <= 0.0:
             doubtful = True
             reverse = reverse or choice == 0
-        if choice > 0 and determinant != 0.0 and rank == p and another_solution(contacts, ws, room):
+        if choice > 0 and determinant != 0.0 and rank == p and another_solution(ws, room):
             several = True
     if doubtful and several:
         return SEVERAL
@@ -152,12 +163,12 @@ def force_verdict(contacts: ContactArrays, ws: Workspace, room, since, t):
 
 
 @internal_kernel
-def drop_immobile(contacts: ContactArrays, ws: Workspace, room):
+def drop_immobile(ws: Workspace, room):
     """Zero the rows of points that no joint moves along their normals: what is left there is rounding, of any sign."""
-    p = room.shape[1]
+    p = ws.counts[ROWS]
     for k in range(p):
         along = 0.0
-        for i in range(contacts.link[k, LINK] + 1):
+        for i in range(last_link(ws, k) + 1):
             along += ws.column[i, 2 + 2 * k] * ws.column[i, 2 + 2 * k] * ws.links[i, INVERSE_D]
         if room[FRICTIONLESS, k, k] <= IMMOBILE * along:
             for m in range(p):
@@ -165,9 +176,8 @@ def drop_immobile(contacts: ContactArrays, ws: Workspace, room):
 
 
 @internal_kernel
-def frictionless_basis(room):
-    """A0 = L Lᵀ by Cholesky with pivoting: L, (c, rank), into ``room[BASIS]``; returns the rank."""
-    p = room.shape[1]
+def frictionless_basis(room, p):
+    """A0 = L Lᵀ by Cholesky with pivoting: L, (p, rank), into ``room[BASIS]``; returns the rank."""
     largest = 0.0
     for k in range(p):
         room[FORCES, 0, k] = room[FRICTIONLESS, k, k]
@@ -196,10 +206,10 @@ def solve_choice(ws: Workspace, room, rank):
 
     Dependent rows: of Lᵀ A(σ) L, the forces that supports of equal stiffness have, which lie in the range of A0.
     """
-    p = room.shape[1]
+    p = ws.counts[ROWS]
     target = MATRIX if rank == p else PRODUCT
     for k in range(p):
-        room[FORCES, 0, k] = ws.contacts[k, RHS]
+        room[FORCES, 0, k] = ws.rows[k, RHS]
         for m in range(p):
             room[target, k, m] = room[FRICTIONLESS, k, m] - room[FRICTION, k, m] * room[SIGNS, 0, m]
     if rank < p:
@@ -244,17 +254,17 @@ def eliminate(room, size):
 
 
 @internal_kernel
-def another_solution(contacts: ContactArrays, ws: Workspace, room):
+def another_solution(ws: Workspace, room):
     """True when the forces in ``room`` have the signs that they were solved for and differ from those of ``ws``."""
-    largest, difference, p = 0.0, 0.0, room.shape[1]
+    largest, difference, p = 0.0, 0.0, ws.counts[ROWS]
     for k in range(p):
         force = room[FORCES, 0, k]
-        largest = max(largest, abs(force), abs(ws.contacts[k, FORCE]))
-        difference = max(difference, abs(force - ws.contacts[k, FORCE]))
+        largest = max(largest, abs(force), abs(ws.rows[k, FORCE]))
+        difference = max(difference, abs(force - ws.rows[k, FORCE]))
     if not difference > FORCE_TOLERANCE * largest:
         return False
     for k in range(p):
-        free = contacts.link[k, FRICTION_LAW] == FRICTION_DISSIPATIVE
+        free = ws.active[k, LAW] == FRICTION_DISSIPATIVE
         if free and room[FORCES, 0, k] * room[SIGNS, 0, k] < -FORCE_TOLERANCE * largest:
             return False
     return True

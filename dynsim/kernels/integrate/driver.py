@@ -11,13 +11,13 @@ Methods, all with dense output (so that records do not force steps):
 - ``RODAS4``: a linearly implicit (Rosenbrock) method of order 4(3), stiffly accurate, which keeps its order when the
   inductance goes to zero (Hairer, Wanner: Solving Ordinary Differential Equations II, IV.7 and VI.4); adaptive.
 
-After each accepted step q and v are projected onto the closed contacts when they have left them by more than
+After each accepted step q and v are projected onto the active rows when they have left them by more than
 ``GAP_TOLERANCE`` or ``RATE_TOLERANCE``.
 """
 
 from __future__ import annotations
 
-from dynsim.kernels.arrays import Workspace
+from dynsim.kernels.arrays import CONTRADICTORY, Workspace
 from dynsim.kernels.constraint.uniqueness import clearly_unique
 from dynsim.kernels.drive.law import take_commands
 from dynsim.kernels.integrate.dense import sample_step
@@ -65,7 +65,7 @@ def start(system: System, ws: Workspace, run: Run):
     if not settle(system, run.clock[TIME], run.y, ws, run.stage[0], run):
         run.count[STATUS] = NOT_PROJECTED
     elif not finite(run.stage[0]):
-        run.count[STATUS] = NO_FORCES if ws.deficient[1] > 0 else NOT_FINITE
+        run.count[STATUS] = NO_FORCES if ws.counts[CONTRADICTORY] > 0 else NOT_FINITE
     elif forces_unique(system, ws, run, run.clock[TIME]):
         watch(ws, run, 0.0)
         if run.clock[STEP] <= 0.0:
@@ -80,7 +80,7 @@ def accept(system: System, ws: Workspace, run: Run):
     if off_surface(ws) and not settle(system, t + h, run.y_new, ws, run.stage[6], run):
         run.count[STATUS] = NOT_PROJECTED
         return
-    if not (clearly_unique(system.contacts, ws) or forces_unique(system, ws, run, t + h)):
+    if not (clearly_unique(ws) or forces_unique(system, ws, run, t + h)):
         return
     watch(ws, run, h)
     if system.layout.extra > 0:

@@ -5,19 +5,20 @@ from __future__ import annotations
 from dynsim.kernels.arrays import (
     CURRENT,
     D_M,
-    DIRECTION,
     DRAG,
     DRIVEN,
-    FORCE,
+    FORCE_VECTOR,
     GAP,
     J_M,
     K_M,
+    NORMAL_FORCE,
     QD,
     QDD,
     SLIP_VELOCITY,
     VOLTAGE,
     Workspace,
 )
+from dynsim.kernels.constraint.rows import force_vectors
 from dynsim.kernels.integrate.run import Run
 from dynsim.kernels.jit import internal_kernel
 from dynsim.kernels.ledger import kinetic_energy, magnetic_energy, potential_energy
@@ -31,6 +32,7 @@ def write_output(system: System, ws: Workspace, run: Run, row):
     """Everything worth recording that is not a state, after ``derivative``, into the columns of OutputLayout."""
     out, joints, motors, motor, state = run.output, ws.joints, ws.motors, system.drives.motor, ws.contacts
     columns = run.columns
+    force_vectors(ws)
     for i in range(joints.shape[0]):
         out[row, columns.vdot + i] = joints[i, QDD]
     for a in range(motors.shape[0]):
@@ -49,9 +51,9 @@ def write_output(system: System, ws: Workspace, run: Run, row):
     out[row, columns.energy + 2] = magnetic_energy(system.drives, ws)
     k = columns.contact
     for c in range(state.shape[0]):
-        out[row, k + OUT_FORCE] = state[c, FORCE]
+        out[row, k + OUT_FORCE] = state[c, NORMAL_FORCE]
         out[row, k + OUT_GAP] = state[c, GAP]
         for s in range(3):
-            out[row, k + OUT_VECTOR + s] = state[c, FORCE] * state[c, DIRECTION + 3 + s]
+            out[row, k + OUT_VECTOR + s] = state[c, FORCE_VECTOR + s]
             out[row, k + OUT_SLIP + s] = state[c, SLIP_VELOCITY + s]
         k += OUTPUTS_PER_CONTACT

@@ -1,6 +1,6 @@
 """Projection of positions and rates onto the constraints.
 
-After each accepted step q and v are projected onto the closed contacts when they have left them by more than
+After each accepted step q and v are projected onto the active rows when they have left them by more than
 ``GAP_TOLERANCE`` or ``RATE_TOLERANCE``.
 """
 
@@ -8,8 +8,25 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import FORCE, GAP, GAP_RATE, INVERSE_D, QDD, RHS, SLIP_VELOCITY, Workspace
+from dynsim.kernels.arrays import (
+    BODY_B,
+    FORCE,
+    INVERSE_D,
+    JOINT_ROW,
+    OWNER,
+    QD,
+    QDD,
+    RHS,
+    ROW,
+    ROW_GAP,
+    ROW_KIND,
+    ROW_RATE,
+    ROWS,
+    SLIP_VELOCITY,
+    Workspace,
+)
 from dynsim.kernels.constraint.delassus import solve_small
+from dynsim.kernels.constraint.rows import row_errors
 from dynsim.kernels.integrate.run import EVALUATIONS, PROJECTIONS, Run
 from dynsim.kernels.jit import internal_kernel, merged_kernel
 from dynsim.kernels.system import System, derivative
@@ -24,36 +41,41 @@ PROJECTION_LIMIT = 6
 
 @internal_kernel
 def off_surface(ws: Workspace):
-    """True when a contact has left its surface by more than the projection tolerances."""
-    state = ws.contacts
-    for k in range(state.shape[0]):
+    """True when the state has left an active row by more than the projection tolerances."""
+    state, rows, active = ws.contacts, ws.rows, ws.active
+    row_errors(ws)
+    for r in range(ws.counts[ROWS]):
         # Rounding limits the rate to a fraction of the speed.
-        x, y, z = state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2]
-        rate = RATE_TOLERANCE * (1.0 + math.sqrt(x * x + y * y + z * z))
-        if abs(state[k, GAP]) > GAP_TOLERANCE or abs(state[k, GAP_RATE]) > rate:
+        if active[r, ROW_KIND] == JOINT_ROW:
+            speed = abs(rows[r, ROW + 1] * ws.joints[active[r, BODY_B], QD])
+        else:
+            k = active[r, OWNER]
+            x, y, z = state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2]
+            speed = math.sqrt(x * x + y * y + z * z)
+        if abs(rows[r, ROW_GAP]) > GAP_TOLERANCE or abs(rows[r, ROW_RATE]) > RATE_TOLERANCE * (1.0 + speed):
             return True
     return False
 
 
 @internal_kernel
 def project(system: System, ws: Workspace, y):
-    """One Newton step of q and v onto the contacts, weighted by the mass matrix, right after ``derivative`` at y.
+    """One Newton step of q and v onto the active rows, weighted by the mass matrix, right after :func:`off_surface`.
 
     dq = −M⁻¹ Jᵀ λ with J M⁻¹ Jᵀ λ = gap, and the same for v with J v: the nearest point in the kinetic metric. The
     factors of M + J_m and the eliminated rows are those that the derivative has left in the workspace.
     """
-    state, column, small = ws.contacts, ws.column, ws.small
-    n, p = ws.joints.shape[0], state.shape[0]
+    state, active, column, small = ws.rows, ws.active, ws.column, ws.small
+    n, p = ws.joints.shape[0], ws.counts[ROWS]
     plain = system.layout.extra == 0
     for level in range(2):
         start = system.layout.q if level == 0 else system.layout.v
         for k in range(p):
-            state[k, RHS] = state[k, GAP] if level == 0 else state[k, GAP_RATE]
+            state[k, RHS] = state[k, ROW_GAP] if level == 0 else state[k, ROW_RATE]
             for m in range(p):
                 small[0, k, m] = 0.0
                 for i in range(n):
                     small[0, k, m] += column[i, 1 + 2 * k] * column[i, 1 + 2 * m] * ws.links[i, INVERSE_D]
-        solve_small(small, state)
+        solve_small(small, state, active, p)
         for i in range(n):
             column[i, 0] = 0.0
             for k in range(p):
@@ -68,7 +90,7 @@ def project(system: System, ws: Workspace, y):
 
 @merged_kernel
 def settle(system: System, t, y, ws: Workspace, dy, run: Run):
-    """Derivative at y, projecting y first where needed. Returns False when the contacts cannot be met."""
+    """Derivative at y, projecting y first where needed. Returns False when the rows cannot be met."""
     derivative(system, t, y, ws, dy)
     run.count[EVALUATIONS] += 1
     for _ in range(PROJECTION_LIMIT):

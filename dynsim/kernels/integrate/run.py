@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.arrays import BLOCK_SIZE
+from dynsim.kernels.arrays import BLOCK_SIZE, row_limit
 from dynsim.kernels.constraint.uniqueness import ROOM
 from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.state import OUTPUTS_PER_CONTACT, OutputLayout, StateLayout, block
@@ -67,7 +67,7 @@ class Run(NamedTuple):
     clock: np.ndarray  # (CLOCK_SIZE,)
     count: np.ndarray  # (COUNT_SIZE,) int
     extremes: np.ndarray  # (c, EXTREMES_SIZE)
-    room: np.ndarray  # (ROOM, c, c) scratch, see dynsim.kernels.constraint.uniqueness
+    room: np.ndarray  # (ROOM, p, p) scratch for the most rows p, see dynsim.kernels.constraint.uniqueness
     hand_link: int
     hand_point: np.ndarray  # (3,) in the body's frame
     sample_time: np.ndarray  # (T,)
@@ -101,6 +101,7 @@ def new_run(
     n: int,
     na: int,
     c: int,
+    couplings: int = 0,
     sample_time: np.ndarray,
     hand: tuple[int, np.ndarray],
     end: float,
@@ -112,7 +113,7 @@ def new_run(
     ticks: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Run:
     """Allocate a :class:`Run` from t = 0 at state y, (layout.size,)."""
-    m, rodas = len(y), method == RODAS4
+    m, p, rodas = len(y), row_limit(c, couplings), method == RODAS4
     clock = np.zeros(CLOCK_SIZE)
     clock[[STEP, LAST_ERROR, END, RTOL, ATOL, STEP_MAX]] = step, 1e-4, end, rtol, atol, step_max
     clock[HOLD] = np.inf
@@ -134,7 +135,7 @@ def new_run(
         clock=clock,
         count=np.zeros(COUNT_SIZE, dtype=np.int64),
         extremes=extremes,
-        room=np.zeros((ROOM, c, c)),
+        room=np.zeros((ROOM, p, p)),
         hand_link=hand[0],
         hand_point=reals(hand[1]),
         sample_time=reals(sample_time),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import Workspace
+from dynsim.kernels.arrays import CONTRADICTORY, Workspace
 from dynsim.kernels.integrate.events import next_tick
 from dynsim.kernels.integrate.run import (
     ATOL,
@@ -99,7 +99,7 @@ def rejected(ws: Workspace, run: Run, error, order):
     clock, count, h = run.clock, run.count, run.clock[STEP]
     if count[STATUS] != RUNNING:
         return True
-    broken = NO_FORCES if ws.deficient[1] > 0 else NOT_FINITE
+    broken = NO_FORCES if ws.counts[CONTRADICTORY] > 0 else NOT_FINITE
     if not (finite(run.y_new) and finite(run.stage[6])) or error != error:
         if run.method == RK4:
             count[STATUS] = broken

@@ -10,25 +10,28 @@ from __future__ import annotations
 from dynsim.kernels.arrays import (
     APPLIED,
     ARMATURE,
+    BODY_A,
+    BODY_B,
     BRANCHES,
     DIRECTION,
     FORCE,
     IA,
     INVERSE_D,
-    LINK,
+    JOINT_ROW,
     PARENT,
     QDD,
     RHS,
     ROW,
+    ROW_KIND,
+    ROWS,
     TARGET,
     U_OVER_D,
-    ContactArrays,
     F,
     ModelArrays,
     S,
     Workspace,
 )
-from dynsim.kernels.jit import inlined_kernel, kernel
+from dynsim.kernels.jit import inlined_kernel, internal_kernel, kernel
 from dynsim.kernels.tree.sweep import body_inertia, forward_sweep, inertial_wrench
 
 
@@ -117,15 +120,18 @@ def factor(model: ModelArrays, ws: Workspace):
 
 
 @inlined_kernel
-def contact_system(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
+def row_system(model: ModelArrays, ws: Workspace):
     """The p×p system J M⁻¹ F f = target − J M⁻¹ applied, into ``ws.small[0]`` and the RHS column, after :func:`factor`.
 
-    Row and force direction of contact k leave the columns ``ws.column[:, 1 + 2 k]`` and ``ws.column[:, 2 + 2 k]``. Only
-    joints between the link and the world feel the contact; the rest of a column is zero from the start. Entry (k, m)
-    is Σ column_k column_m / D over the joints that both contacts feel.
+    Row k and its force direction leave the columns ``ws.column[:, 1 + 2 k]`` and ``ws.column[:, 2 + 2 k]``. Only joints
+    between its links and the world feel a row; the rest of a column is zero from the start. Entry (k, m) is
+    Σ column_k column_m / D over the joints that both rows feel.
     """
-    tree, links, column, small, state = model.tree, ws.links, ws.column, ws.small, ws.contacts
-    for k in range(state.shape[0]):
+    tree, links, column, small, state = model.tree, ws.links, ws.column, ws.small, ws.rows
+    for k in range(ws.counts[ROWS]):
+        if ws.active[k, BODY_B] >= 0:
+            two_ended_row(model, ws, k)
+            continue
         r0, r1, r2 = state[k, ROW], state[k, ROW + 1], state[k, ROW + 2]
         r3, r4, r5 = state[k, ROW + 3], state[k, ROW + 4], state[k, ROW + 5]
         w0, w1, w2 = state[k, DIRECTION], state[k, DIRECTION + 1], state[k, DIRECTION + 2]
@@ -134,7 +140,7 @@ def contact_system(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
             small[0, k, m] = 0.0
             small[0, m, k] = 0.0
         own, total = 0.0, state[k, TARGET]
-        i = contacts.link[k, LINK]
+        i = ws.active[k, BODY_A]
         while i >= 0:
             s0, s1, s2 = links[i, S], links[i, S + 1], links[i, S + 2]
             s3, s4, s5 = links[i, S + 3], links[i, S + 4], links[i, S + 5]
@@ -158,14 +164,85 @@ def contact_system(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
         state[k, RHS] = total
 
 
+@internal_kernel
+def two_ended_row(model: ModelArrays, ws: Workspace, k):
+    """Column, own entry and right-hand side of a row with two ends, as :func:`row_system` does them for one end.
+
+    Two accumulators climb from the two ends, the one with the larger index first, so that both meet in the first common
+    ancestor and go on as one. A joint row has no wrench: its coefficients enter at its two joints.
+    """
+    tree, links, column, small, state = model.tree, ws.links, ws.column, ws.small, ws.rows
+    first, last = ws.active[k, BODY_A], ws.active[k, BODY_B]
+    jointed = ws.active[k, ROW_KIND] == JOINT_ROW
+    # Of the sides A and B: what elimination has left of row and direction, six numbers each.
+    ra0, ra1, ra2, ra3, ra4, ra5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    wa0, wa1, wa2, wa3, wa4, wa5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    if not jointed:
+        ra0, ra1, ra2 = state[k, ROW], state[k, ROW + 1], state[k, ROW + 2]
+        ra3, ra4, ra5 = state[k, ROW + 3], state[k, ROW + 4], state[k, ROW + 5]
+        wa0, wa1, wa2 = state[k, DIRECTION], state[k, DIRECTION + 1], state[k, DIRECTION + 2]
+        wa3, wa4, wa5 = state[k, DIRECTION + 3], state[k, DIRECTION + 4], state[k, DIRECTION + 5]
+    rb0, rb1, rb2, rb3, rb4, rb5 = -ra0, -ra1, -ra2, -ra3, -ra4, -ra5
+    wb0, wb1, wb2, wb3, wb4, wb5 = -wa0, -wa1, -wa2, -wa3, -wa4, -wa5
+    for m in range(k):
+        small[0, k, m] = 0.0
+        small[0, m, k] = 0.0
+    own, total = 0.0, state[k, TARGET]
+    # i is the end that moves next, j the other one.
+    i, j = first, last
+    while i >= 0 or j >= 0:
+        if j > i:
+            i, j = j, i
+            ra0, ra1, ra2, ra3, ra4, ra5, rb0, rb1, rb2, rb3, rb4, rb5 = (
+                rb0, rb1, rb2, rb3, rb4, rb5, ra0, ra1, ra2, ra3, ra4, ra5
+            )  # fmt: skip
+            wa0, wa1, wa2, wa3, wa4, wa5, wb0, wb1, wb2, wb3, wb4, wb5 = (
+                wb0, wb1, wb2, wb3, wb4, wb5, wa0, wa1, wa2, wa3, wa4, wa5
+            )  # fmt: skip
+        if i == j:
+            ra0, ra1, ra2, ra3, ra4, ra5 = ra0 + rb0, ra1 + rb1, ra2 + rb2, ra3 + rb3, ra4 + rb4, ra5 + rb5
+            wa0, wa1, wa2, wa3, wa4, wa5 = wa0 + wb0, wa1 + wb1, wa2 + wb2, wa3 + wb3, wa4 + wb4, wa5 + wb5
+            j = -1
+        s0, s1, s2 = links[i, S], links[i, S + 1], links[i, S + 2]
+        s3, s4, s5 = links[i, S + 3], links[i, S + 4], links[i, S + 5]
+        r = ((s0 * ra0 + s1 * ra1) + (s2 * ra2 + s3 * ra3)) + (s4 * ra4 + s5 * ra5)
+        w = ((s0 * wa0 + s1 * wa1) + (s2 * wa2 + s3 * wa3)) + (s4 * wa4 + s5 * wa5)
+        if jointed and i == first:
+            r, w = r + state[k, ROW], w + state[k, DIRECTION]
+        elif jointed and i == last:
+            r, w = r + state[k, ROW + 1], w + state[k, DIRECTION + 1]
+        column[i, 1 + 2 * k] = r
+        column[i, 2 + 2 * k] = w
+        d = links[i, INVERSE_D]
+        scaled = d * r
+        own += scaled * w
+        total -= scaled * column[i, 0]
+        for m in range(k):
+            small[0, k, m] += scaled * column[i, 2 + 2 * m]
+            small[0, m, k] += d * w * column[i, 1 + 2 * m]
+        s0, s1, s2 = links[i, U_OVER_D], links[i, U_OVER_D + 1], links[i, U_OVER_D + 2]
+        s3, s4, s5 = links[i, U_OVER_D + 3], links[i, U_OVER_D + 4], links[i, U_OVER_D + 5]
+        ra0, ra1, ra2 = ra0 - s0 * r, ra1 - s1 * r, ra2 - s2 * r
+        ra3, ra4, ra5 = ra3 - s3 * r, ra4 - s4 * r, ra5 - s5 * r
+        wa0, wa1, wa2 = wa0 - s0 * w, wa1 - s1 * w, wa2 - s2 * w
+        wa3, wa4, wa5 = wa3 - s3 * w, wa4 - s4 * w, wa5 - s5 * w
+        i = tree[i, PARENT]
+    small[0, k, k] = own
+    state[k, RHS] = total
+
+
 @inlined_kernel
-def add_contact_forces(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
-    """Add the solved contact forces to the eliminated applied forces in ``ws.column[:, 0]``."""
-    tree, column, state = model.tree, ws.column, ws.contacts
-    p = state.shape[0]
-    for k in range(p):
+def add_row_forces(model: ModelArrays, ws: Workspace):
+    """Add the solved forces of all rows to the eliminated applied forces in ``ws.column[:, 0]``."""
+    tree, column, state = model.tree, ws.column, ws.rows
+    for k in range(ws.counts[ROWS]):
         f = state[k, FORCE]
-        i = contacts.link[k, LINK]
+        i = ws.active[k, BODY_A]
+        j = ws.active[k, BODY_B]
+        if j >= 0:
+            for m in range(max(i, j) + 1):
+                column[m, 0] += f * column[m, 2 + 2 * k]
+            continue
         while i >= 0:
             column[i, 0] += f * column[i, 2 + 2 * k]
             i = tree[i, PARENT]

@@ -47,7 +47,7 @@ from dynsim.kernels.arrays import (
     V,
     Workspace,
 )
-from dynsim.kernels.jit import inlined_kernel, internal_kernel, kernel
+from dynsim.kernels.jit import apart_kernel, inlined_kernel, internal_kernel, kernel
 
 
 @inlined_kernel
@@ -97,7 +97,7 @@ def row_motion(model: ModelArrays, ws: Workspace, i, b0, b1, b2, b3, b4, b5, b6,
     return b0, b1, b2, b3, b4, b5, b6, b7, b8, px, py, pz, sx, sy, sz, lx, ly, lz
 
 
-@internal_kernel
+@apart_kernel
 def sweep_row(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
     """R, p, S, V and A of row i into ``ws.links``: what ``forward_sweep`` does for a link (dynsim.kernels.tree.sweep).
 

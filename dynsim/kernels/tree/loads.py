@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.kernels.arrays import APPLIED, PARENT, ModelArrays, P, R, S, V, Workspace
-from dynsim.kernels.jit import inlined_kernel, internal_kernel
+from dynsim.kernels.jit import apart_kernel, inlined_kernel
 
 # LoadArrays.table, int
 LINK, IN_BODY, HOLDS, DATA, SEGMENTS = 0, 1, 2, 3, 4
@@ -51,7 +51,7 @@ def segment_start(loads: LoadArrays, k, t):
     return first + low * SEGMENT_SIZE, t
 
 
-@internal_kernel
+@apart_kernel
 def add_loads(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, power, start):
     """Add S·W of every external wrench W to the applied forces of the joints that carry it, after ``forward_sweep``.
 

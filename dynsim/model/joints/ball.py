@@ -27,27 +27,6 @@ def motion(link: Link, q: Array) -> tuple[Array, Array]:
     return R, np.zeros((3, q.shape[1]))
 
 
-def quaternion(R: Array) -> Array:
-    """Quaternion w, x, y, z of a rotation, (4,), w ≥ 0: from the largest of its entries, so accurate at every angle."""
-    w, x, y, z = (
-        1.0 + R[0, 0] + R[1, 1] + R[2, 2],
-        1.0 + R[0, 0] - R[1, 1] - R[2, 2],
-        1.0 - R[0, 0] + R[1, 1] - R[2, 2],
-        1.0 - R[0, 0] - R[1, 1] + R[2, 2],
-    )
-    # Rows: four times the products of w, x, y, z with each of them.
-    products = np.array(
-        [
-            [w, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
-            [R[2, 1] - R[1, 2], x, R[1, 0] + R[0, 1], R[0, 2] + R[2, 0]],
-            [R[0, 2] - R[2, 0], R[1, 0] + R[0, 1], y, R[2, 1] + R[1, 2]],
-            [R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[2, 1] + R[1, 2], z],
-        ]
-    )
-    row = products[int(np.argmax([w, x, y, z]))]
-    return np.asarray(row / np.linalg.norm(row) * (-1.0 if row[0] < 0.0 else 1.0))
-
-
 ROWS = {
     "ball_x": Row(
         BALL_X, ("1", *ANGLE[1:]), (1.0, 0.0, 0.0, 0.0), ("qw", "qx", "qy", "qz"), drawn="ball", motion=motion

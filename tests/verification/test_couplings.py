@@ -1,0 +1,161 @@
+"""Joints that follow others: a gripper whose second finger mimics the first, and descriptions that cannot be."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from random_robots import bench, random_robot
+
+from dynsim.engine import simulate
+from dynsim.errors import ModelError
+from dynsim.kernels.state import CONSTRAINT
+from dynsim.model.description import Coupling
+from dynsim.model.model import Model
+from dynsim.model.urdf import read_urdf
+from dynsim.scenario import build_model, load_scenario
+
+BODY = '<inertial><mass value="{}"/><origin xyz="0 0 0.1"/>' + (
+    '<inertia ixx="0.002" iyy="0.002" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial>'
+)
+GRIPPER = f"""<robot name="gripper">
+<link name="base"/><link name="wrist">{BODY.format(1.0)}</link>
+<link name="left">{BODY.format(0.2)}</link><link name="right">{BODY.format(0.3)}</link>
+<joint name="turn" type="continuous"><parent link="base"/><child link="wrist"/><axis xyz="0 1 0"/>
+<dynamics damping="0.01"/></joint>
+<joint name="left_finger" type="prismatic"><parent link="wrist"/><child link="left"/><axis xyz="1 0 0"/>
+<limit lower="-0.5" upper="0.5" effort="10" velocity="10"/><dynamics damping="0.1"/></joint>
+<joint name="right_finger" type="prismatic"><parent link="wrist"/><child link="right"/><axis xyz="-1 0 0"/>
+<limit lower="-1" upper="1" effort="10" velocity="10"/>
+<mimic joint="left_finger" multiplier="1.5" offset="0.01"/></joint>
+</robot>
+"""
+
+
+@pytest.fixture
+def gripper(tmp_path: Path) -> Path:
+    (tmp_path / "gripper.urdf").write_text(GRIPPER)
+    motor = {
+        "type": "dc",
+        "torque_constant_N_m_per_A": 0.5,
+        "resistance_ohm": 1.0,
+        "inductance_H": 0.001,
+        "rotor_inertia_kg_m2": 1e-4,
+        "gear_ratio": 5,
+        "gear_damping_N_m_s_per_rad": 1e-4,
+    }
+    scenario: dict[str, Any] = {
+        "duration_s": 1.0,
+        "plant": {"type": "urdf_arm", "file": "gripper.urdf", "motor": motor, "initial_deg": {"turn": 70}},
+        "controller": {"type": "joint_pd", "k_p_V_per_rad": 20, "k_d_V_s_per_rad": 1},
+    }
+    path = tmp_path / "gripper.yaml"
+    path.write_text(json.dumps(scenario))
+    return path
+
+
+@pytest.mark.parametrize("integrator", [{}, {"method": "rodas4"}, {"solver": "m_star"}])
+def test_a_finger_that_mimics_the_other(gripper: Path, integrator: dict[str, str]):
+    """It starts and stays where it is led, carries no motor, and takes no energy."""
+    overrides = {f"integrator.{key}": value for key, value in integrator.items()}
+    record = simulate(load_scenario(gripper, overrides=overrides))
+    left, right = record["q"][:, 1], record["q"][:, 2]
+    assert record["current"].shape[1] == 2
+    assert right[0] == 0.01
+    assert np.ptp(left) > 1e-4
+    assert np.abs(right - 1.5 * left - 0.01).max() <= 1e-10
+    assert np.abs(record["v"][:, 2] - 1.5 * record["v"][:, 1]).max() <= 1e-7
+    np.testing.assert_allclose(record["vdot"][:, 2], 1.5 * record["vdot"][:, 1], rtol=0, atol=1e-9)
+    assert abs(record.summary["energy_residual_relative"]) < 1e-6
+    assert np.abs(record["work_constraint"]).max() < 1e-9
+
+
+def test_a_coupling_may_close_over_an_undriven_joint(gripper: Path):
+    """No motors at all: the two fingers fall as one mass, m_1 + r² m_2 along the slope of 30°."""
+    record = simulate(load_scenario(gripper, overrides={"plant.lock_deg": {"turn": 30}, "plant.motor": None,
+        "plant.initial_deg": {}, "controller": None, "duration_s": 0.05, "plant.damping_N_s_per_m": 0.0}))  # fmt: skip
+    mass = 0.2 + 1.5**2 * 0.3
+    # x of the turned wrist points down by sin 30°; the right finger's axis the other way.
+    acceleration = 9.81 * 0.5 * (0.2 - 1.5 * 0.3) / mass
+    np.testing.assert_allclose(record["vdot"][:, 0], acceleration, rtol=1e-9)
+
+
+def test_a_locked_leader_locks_its_follower(gripper: Path):
+    robot = read_urdf(gripper.parent / "gripper.urdf", {"left_finger": 0.1})
+    assert robot.joint_names == ("turn",)
+    assert not robot.couplings
+    model = Model(robot)
+    assert model.point_position("right", [0, 0, 0], [0.0])[0] == pytest.approx(-0.16, abs=1e-15)
+
+
+def test_a_motor_that_is_named_is_there(gripper: Path):
+    model = build_model(load_scenario(gripper))
+    assert [motor.joint for motor in model.robot.motors] == ["turn", "left_finger"]
+    motor = {**json.loads(gripper.read_text())["plant"]["motor"], "gear_ratio": 2}
+    model = build_model(load_scenario(gripper, overrides={"plant.motors": {"right_finger": motor}}))
+    assert [motor.joint for motor in model.robot.motors] == ["turn", "left_finger", "right_finger"]
+
+
+def test_written_and_read_again_it_is_the_same(gripper: Path):
+    robot = read_urdf(gripper.parent / "gripper.urdf")
+    (gripper.parent / "again.urdf").write_text(Model(robot).to_urdf())
+    assert read_urdf(gripper.parent / "again.urdf").couplings == robot.couplings
+
+
+def test_an_initial_position_that_breaks_the_coupling_is_refused(gripper: Path):
+    with pytest.raises(ModelError, match=r"coupling of right_finger: it starts at 0\.2, but left_finger at 0\.1 leads"):
+        build_model(load_scenario(gripper, overrides={"plant.initial_m": {"left_finger": 0.1, "right_finger": 0.2}}))
+    exact = {"plant.initial_m": {"left_finger": 0.1, "right_finger": 0.16}}
+    np.testing.assert_allclose(build_model(load_scenario(gripper, overrides=exact)).robot.initial[1:], [0.1, 0.16])
+
+
+@pytest.mark.parametrize(
+    ("couplings", "message"),
+    [
+        ([Coupling("joint_9", "joint_0")], "coupling of joint_9: no joint 'joint_9'"),
+        ([Coupling("joint_1", "elbow")], "coupling of joint_1: no joint 'elbow'"),
+        ([Coupling("joint_1", "joint_0"), Coupling("joint_1", "joint_2")], "the joint follows 'joint_0' already"),
+        ([Coupling("joint_1", "joint_1")], "in a circle: joint_1 → joint_1"),
+        ([Coupling("joint_1", "joint_2"), Coupling("joint_2", "joint_1")], "in a circle: joint_1 → joint_2 → joint_1"),
+        ([Coupling("joint_1", "joint_0", np.nan)], "ratio nan must be a finite number"),
+    ],
+)
+def test_couplings_that_cannot_be_are_refused(couplings: list[Coupling], message: str):
+    robot = random_robot(np.random.default_rng(0), 3)
+    with pytest.raises(ModelError, match=message):
+        Model(replace(robot, couplings=tuple(couplings)))
+
+
+@pytest.mark.parametrize(
+    ("mimic", "message"),
+    [
+        ('joint="thumb"', r"gripper.urdf:\d+: joint 'right_finger' mimics joint 'thumb', which is not in the file"),
+        ('joint="right_finger"', r"gripper.urdf:\d+: joint 'right_finger' mimics itself"),
+    ],
+)
+def test_mimic_joints_without_a_leader_are_refused(gripper: Path, mimic: str, message: str):
+    path = gripper.parent / "gripper.urdf"
+    path.write_text(GRIPPER.replace('joint="left_finger"', mimic))
+    with pytest.raises(ModelError, match=message):
+        read_urdf(path)
+
+
+def test_a_chain_of_couplings_holds_in_a_run():
+    """joint_3 follows joint_1, which follows joint_0; joints on one path to the world and on others."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        robot = replace(
+            random_robot(rng, 6, motors=False),
+            couplings=(Coupling("joint_3", "joint_1", -0.7, 0.2), Coupling("joint_1", "joint_0", 1.3, -0.1)),
+        )
+        b = bench(robot)
+        run = b.simulate(b.state(robot.initial, np.zeros(6)), np.linspace(0.0, 0.5, 6), rtol=1e-8)
+        q = run.states("q")
+        assert np.ptp(q[:, 0]) > 1e-3
+        assert np.abs(q[:, 1] - 1.3 * q[:, 0] + 0.1).max() <= 1e-9
+        assert np.abs(q[:, 3] + 0.7 * q[:, 1] - 0.2).max() <= 1e-9
+        assert np.abs(run.states("ledger")[:, CONSTRAINT]).max() < 1e-8
