@@ -10,7 +10,20 @@ import numpy as np
 from dynsim.model.description import Array, Contact, Link, Quadric, Robot
 from dynsim.model.snake import SnakeDescription
 from dynsim.record.quaternion import of_turn
-from dynsim.record.scene import HERE, WORLD, Body, Joint, Point, Quaternion, Scene, Shape, Surface, quaternion, vector3
+from dynsim.record.scene import (
+    HERE,
+    WORLD,
+    Body,
+    Joint,
+    JointKind,
+    Point,
+    Quaternion,
+    Scene,
+    Shape,
+    Surface,
+    quaternion,
+    vector3,
+)
 
 # Of a wheel, in parts of its radius; a snake's description has no width.
 WHEEL_WIDTH = 0.48
@@ -20,30 +33,33 @@ _ALONG_X: Quaternion = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
 _ALONG_Y: Quaternion = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)
 
 
-def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str, Quadric]) -> Scene:
-    """The scene of a tree of bodies whose joint positions are the signal ``q``."""
+def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str, Quadric]) -> Scene | None:
+    """The scene of a tree of bodies whose joint positions are the signal ``q``; None where one has no kind for it."""
     index = {link.name: k for k, link in enumerate(robot.links)}
-    bodies = tuple(
-        Body(link.name, WORLD if link.parent is None else index[link.parent], _joint(link), link.shapes or _rod(link))
-        for link in robot.links
-    )
+    bodies = []
+    for link in robot.links:
+        kind = link.row.drawn
+        if kind is None:
+            return None
+        parent = WORLD if link.parent is None else index[link.parent]
+        bodies.append(Body(link.name, parent, _joint(link, kind), link.shapes or _rod(link)))
     hand_body, hand_point = robot.hand
     points = [Point("hand", "hand", index[hand_body], vector3(hand_point))]
     for contact in contacts:
         body, point = robot.attach(contact.body, contact.point)
         points.append(Point(contact.name, "contact", body, vector3(point), contact.surface_name))
     return Scene(
-        bodies,
+        tuple(bodies),
         tuple(Surface.of_quadric(name, one.Q, one.b, one.c) for name, one in surfaces.items()),
         tuple(points),
         robot.fixed_shapes,
     )
 
 
-def _joint(link: Link) -> Joint:
+def _joint(link: Link, kind: JointKind) -> Joint:
     return Joint(
         name=link.joint,
-        kind=link.row.drawn,
+        kind=kind,
         axis=vector3(link.axis),
         position=vector3(link.p_PJ),
         orientation=quaternion(link.R_PJ),

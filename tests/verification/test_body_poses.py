@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from random_robots import random_robot, random_rotation, random_unit
@@ -10,6 +12,7 @@ import dynsim.engine
 from dynsim.errors import ScenarioError
 from dynsim.kernels.state import output_layout, state_layout
 from dynsim.model.description import Inertia, Link, Robot
+from dynsim.model.joints import ANGLE, Row, rows
 from dynsim.model.joints.ball import ball, floating
 from dynsim.model.joints.planar import planar, rolling
 from dynsim.model.model import Model
@@ -87,6 +90,15 @@ def test_only_the_body_of_a_joint_with_several_rows_has_its_shapes():
     for joint in (ball, floating, planar, rolling):
         links = joint(seen)
         assert [link.name for link in links if link.shapes] == ["base"]
+
+
+def test_a_joint_that_scenes_have_no_kind_for_leaves_the_record_without_a_scene(monkeypatch: pytest.MonkeyPatch):
+    """Rather than a pose by another motion."""
+    monkeypatch.setitem(rows(), "screw", Row(10, ANGLE))
+    nut = Link("nut", "screw", None, "screw", np.eye(3)[2], Inertia(1.0))
+    robot = Robot("r", (nut,), (), ("nut", np.zeros(3)))
+    assert robot_scene(robot, [], {}) is None
+    assert robot_scene(replace(robot, links=(replace(nut, kind="revolute"),)), [], {}) is not None
 
 
 def test_signs_of_quaternions_do_not_jump():
