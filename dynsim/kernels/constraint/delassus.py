@@ -44,6 +44,12 @@ def solve_small(small, state, active, p):
             x, y = state[0, RHS] / determinant, state[1, RHS] / determinant
             state[0, FORCE], state[1, FORCE] = d * x - b * y, a * y - c * x
             return 0
+    return eliminate(small, state, active, p)
+
+
+@apart_kernel
+def eliminate(small, state, active, p):
+    """:func:`solve_small` for any number of rows, without the closed forms."""
     largest, least = 0.0, math.inf
     for i in range(p):
         state[i, FORCE] = state[i, RHS]
@@ -79,7 +85,7 @@ def solve_small(small, state, active, p):
     return 0
 
 
-@apart_kernel
+@internal_kernel
 def least_norm(small, state, active, p, start):
     """Least-squares solution of least norm, from an elimination of which ``start`` columns are done.
 

@@ -62,7 +62,7 @@ from dynsim.kernels.arrays import (
     V,
     Workspace,
 )
-from dynsim.kernels.jit import internal_kernel, kernel
+from dynsim.kernels.jit import apart_kernel, internal_kernel, kernel
 
 
 @kernel
@@ -142,7 +142,7 @@ def drop_anchor(ws: Workspace, k):
     state[k, SECOND_TANGENT + 2] = x * ty - y * tx
 
 
-@internal_kernel
+@apart_kernel
 def sticking_rows(model: ModelArrays, ws: Workspace, k, i):
     """Rows of candidate k, on link i, that sticks; the first one is there already.
 

@@ -31,7 +31,7 @@ from dynsim.kernels.arrays import (
     S,
     Workspace,
 )
-from dynsim.kernels.jit import inlined_kernel, internal_kernel, kernel
+from dynsim.kernels.jit import apart_kernel, inlined_kernel, kernel
 from dynsim.kernels.tree.sweep import body_inertia, forward_sweep, inertial_wrench
 
 
@@ -164,7 +164,7 @@ def row_system(model: ModelArrays, ws: Workspace):
         state[k, RHS] = total
 
 
-@internal_kernel
+@apart_kernel
 def two_ended_row(model: ModelArrays, ws: Workspace, k):
     """Column, own entry and right-hand side of a row with two ends, as :func:`row_system` does them for one end.
 

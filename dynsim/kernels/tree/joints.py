@@ -159,7 +159,7 @@ def read_positions(model: ModelArrays, y, start, ws: Workspace):
             joints[i, EXTRA] = y[k + 1]
 
 
-@internal_kernel
+@apart_kernel
 def position_rates(model: ModelArrays, ws: Workspace, dy, start):
     """q̇ = N(q) v into dy[start:]. Ball: ½ q ∘ (0, ω) with ω in the body; rolling: V (cos ψ, sin ψ), ω."""
     tree, joints = model.tree, ws.joints
