@@ -17,6 +17,8 @@ RESIDUAL_LIMIT = 1e-6
 def energy_turnover(record: Record) -> float:
     """Energy that changed hands: the largest over time of half the sum of all terms' sizes [J]."""
     total = np.abs(record["energy_electrical"]) + np.abs(record["work_constraint"])
+    if "work_loads" in record:
+        total = total + np.abs(record["work_loads"]).sum(axis=1)
     for name in SINKS:
         total = total + np.abs(record[name])
     for name in STORES:

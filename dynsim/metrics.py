@@ -81,8 +81,10 @@ class Counts:
 
 
 def energy_residual(record: Record) -> NDArray[np.float64]:
-    """Electrical energy and constraint work minus losses minus the change of stored energy, (T,) [J]."""
+    """Electrical energy, work of constraints and loads minus losses minus the change of stored energy, (T,) [J]."""
     residual = record["energy_electrical"] + record["work_constraint"]
+    if "work_loads" in record:
+        residual = residual + record["work_loads"].sum(axis=1)
     for name in SINKS:
         residual = residual - record[name]
     for name in STORES:
@@ -140,6 +142,7 @@ def summarise(
         "gear_loss_J": final("loss_gear"),
         "joint_loss_J": final("loss_joint"),
         "friction_heat_J": final("heat_friction"),
+        **_loads(record),
         "energy_turnover_J": turnover,
         "energy_residual_relative": residual / denominator if denominator > 0.0 else 0.0,
         "constraint_drift_max_m": float(counts.extremes[:, DRIFT_MAX].max(initial=0.0)),
@@ -151,6 +154,14 @@ def summarise(
     }
     summary["warnings"] = _warnings(record, scenario, contacts, robot, counts, summary) + _sunk(record, sunk)
     return summary
+
+
+def _loads(record: Record) -> dict[str, Any]:
+    """Work of each external wrench [J], where there are some."""
+    if "work_loads" not in record:
+        return {}
+    work = record["work_loads"][-1] if len(record) else np.zeros(len(record.labels["work_loads"]))
+    return {"loads_work_J": dict(zip(record.labels["work_loads"], work.tolist(), strict=True))}
 
 
 def _contact(record: Record, k: int, contact: Contact, counts: Counts, duration: float) -> dict[str, Any]:

@@ -76,6 +76,9 @@ class Config(StrictConfig):
     hand: HandReference | None = Field(default=None, description="a path for the hand")
     joints: dict[str, JointPath] = Field(default={}, description="waypoints by joint name")
     torques: dict[str, TorquePath] = Field(default={}, description="torques of motors of type torque by joint name")
+    sample_time_s: Positive | None = Field(
+        default=None, description="commands are taken at this period and held in between; default: continuous"
+    )
     knot_spacing_s: Positive = Field(default=0.02, description="distance of the knots of the reference splines")
 
     @model_validator(mode="after")
@@ -139,6 +142,7 @@ def build(config: Config, context: BuildContext) -> JointControl:
         times=times,
         positions=dict(zip(named, columns, strict=True)),
         path=path,
+        sample_time=config.sample_time_s,
     )
 
 

@@ -41,6 +41,7 @@ class Prepared:
     system: System
     run: ki.Run
     workspace: ka.Workspace
+    loads: list[Load]
 
 
 def prepare(
@@ -88,7 +89,9 @@ def prepare(
     system = System(
         layout=layout,
         model=model.arrays,
-        drives=compile_drives(robot, k_p=list(control.k_p), k_d=list(control.k_d)),
+        drives=compile_drives(
+            robot, k_p=list(control.k_p), k_d=list(control.k_d), sampled=control.sample_time is not None
+        ),
         reference=control.reference,
         contacts=compile_contacts(robot, contacts),
         loads=compile_loads(robot, loads),
@@ -113,8 +116,18 @@ def prepare(
         step_max=options.step_max_s or np.inf,
         rtol=options.rtol,
         atol=options.atol,
+        ticks=_ticks(control),
     )
-    return Prepared(model, contacts, control, system, run, new_workspace(system))
+    return Prepared(model, contacts, control, system, run, new_workspace(system), loads)
+
+
+def _ticks(control: JointControl) -> tuple[np.ndarray, np.ndarray] | None:
+    """The tick at which commands are taken, for a sampled controller."""
+    if control.sample_time is None:
+        return None
+    tick = np.zeros((1, ki.TICK_SIZE))
+    tick[0, ki.TICK_PERIOD] = control.sample_time
+    return tick, np.array([[ki.TAKE_COMMANDS, 0]])
 
 
 def _push(body: str) -> Load:

@@ -18,8 +18,11 @@ from dynsim.record.poses import add_body_poses
 from dynsim.scenario import Scenario, build
 
 
-def make_record(scenario: Scenario, prepared: Prepared, wall: float, *, pushed: bool = False) -> Record:
-    """Name the columns that the kernels wrote; ``pushed``: wrenches besides those of the scenario did work too."""
+def make_record(scenario: Scenario, prepared: Prepared, wall: float, *, pushed: Sequence[int] | None = None) -> Record:
+    """Name the columns that the kernels wrote.
+
+    ``pushed`` : which of the bodies' own wrenches, the last of the loads, have been set; None: there are none
+    """
     model, run, contacts = prepared.model, prepared.run, prepared.contacts
     robot = model.robot
     rows = int(run.count[ki.SAMPLE])
@@ -43,6 +46,11 @@ def make_record(scenario: Scenario, prepared: Prepared, wall: float, *, pushed: 
         record.add("target_position", target, "m", labels=("x", "y", "z"))
     for integral, (name, text) in zip(run.states("ledger").T, metrics.INTEGRALS.items(), strict=True):
         record.add(name, integral, "J", description=text)
+    others = 0 if pushed is None else len(robot.links)
+    shown = [*range(len(prepared.loads) - others), *(pushed or ())]
+    if shown:
+        labels = tuple(prepared.loads[k].name for k in shown)
+        record.add("work_loads", run.states("load")[:, shown], "J", labels=labels, description="∫ W·V dt of each load")
     for store, name in zip(run.outputs("energy").T, metrics.STORES, strict=True):
         record.add(name, store, "J", description=f"{name.removeprefix('energy_')} energy")
     record.add("energy_residual", metrics.energy_residual(record), "J", description="what the ledger does not explain")

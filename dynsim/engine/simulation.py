@@ -3,16 +3,17 @@
 Steps are those of :func:`dynsim.simulate`, bit for bit, as long as nothing is rewritten: ``advance`` does not cut them.
 The step that would pass the time asked for is kept back, and the state there is taken from its dense output. Only when
 something is rewritten it is dropped, and a shorter one ends at that very time.
+
+Long because: it is one class, the public stepper, and half of it is its documentation.
 """
 
 from __future__ import annotations
 
 import math
 import time as clock
-from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,10 +21,12 @@ from numpy.typing import ArrayLike, NDArray
 from dynsim.engine.outcome import raise_stopped
 from dynsim.engine.prepare import prepare, sample_times
 from dynsim.engine.recording import make_record
+from dynsim.engine.stepped import GUARDS, Happening, Snapshot, State
 from dynsim.engine.stopping import stopped
+from dynsim.engine.trace import Trace
 from dynsim.errors import ModelError, ScenarioError, shown
 from dynsim.kernels import arrays as ka
-from dynsim.kernels.integrate import driver, events
+from dynsim.kernels.integrate import driver
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.dense import state_within
 from dynsim.kernels.state import block
@@ -35,69 +38,10 @@ from dynsim.scenario.build import START_TOLERANCE
 
 Array = NDArray[np.float64]
 
-# Rows of the buffer that kernels sample into before it is emptied, and steps in one compiled piece.
-_ROWS = 256
+# Steps in one compiled piece.
 _PIECE = 100_000
 # End of a run without end [s]: far beyond any, and still a number to reckon with.
 _FAR = 1e300
-# Guards of events by name: number in the kernels, and what they are about.
-GUARDS = {
-    "joint_position": (events.JOINT_POSITION, "joint"),
-    "joint_rate": (events.JOINT_RATE, "joint"),
-    "motor_current": (events.MOTOR_CURRENT, "motor"),
-    "motor_voltage": (events.MOTOR_VOLTAGE, "motor"),
-    "contact_force": (events.CONTACT_FORCE, "contact"),
-    "contact_gap": (events.CONTACT_GAP, "contact"),
-    "hand_position": (events.HAND_X, "axis"),
-}
-
-
-@dataclass(frozen=True)
-class State:
-    """The state of a simulation.
-
-    Attributes
-    ----------
-    time : [s]
-    q : (nq,) positions [rad or m]; v : (n,) rates; current : of the motors that have a circuit [A]
-    """
-
-    time: float
-    q: Array
-    v: Array
-    current: Array
-
-    @classmethod
-    def of(cls, record: Record, sample: int = -1) -> State:
-        """The state at a sample of a record, by default the last.
-
-        Raises
-        ------
-        MissingEntry
-            The record has no positions, rates or currents.
-        """
-        names = ("q", "v", "current")
-        return cls(float(record.time[sample]), *(np.array(record[name][sample], dtype=np.float64) for name in names))
-
-
-class Happening(NamedTuple):
-    """An event that has happened: when [s], which guard, of what."""
-
-    time: float
-    kind: str
-    subject: str
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """Everything that the future of a simulation depends on; made by :meth:`Simulation.snapshot`."""
-
-    arrays: dict[str, NDArray[Any]]
-    time: float
-    rows: tuple[tuple[Array, Array, Array], ...]
-    next_sample: int
-    happened: tuple[Happening, ...]
-    frozen: bool
 
 
 class Simulation:
@@ -140,10 +84,10 @@ class Simulation:
             raise ScenarioError(f"a simulation from t = {start:g} s cannot end at {end:g} s")
         self._scenario = scenario
         self._end = min(end, _FAR)
-        self._prepared = prepare(scenario, pushable=True, times=np.full(_ROWS, np.inf), end=self._end)
-        self._start, self._time, self._trace = start, start, trace
-        self._rows: deque[tuple[Array, Array, Array]] = deque()
-        self._next_sample, self._wall = 0, 0.0
+        self._prepared = prepare(scenario, pushable=True, times=np.full(1, np.inf), end=self._end)
+        self._time, self._wall = start, 0.0
+        # Of a ring, and of a run that goes on from another, the ledger counts from the first sample on.
+        self._relative = trace is not None or state is not None
         self._happened: list[Happening] = []
         self._guards: list[tuple[str, str, Callable[[Simulation], None] | None]] = []
         self._calls: list[Callable[[Simulation], None]] = []
@@ -154,16 +98,19 @@ class Simulation:
         self._pushes = {link.name: first + i for i, link in enumerate(robot.links)}
         self._splines = self._prepared.system.reference.spline.copy()
         self._frozen = not math.isfinite(self._prepared.control.end)
-        self._pushed = False
-        self._times = None
+        self._pushed: set[int] = set()
+        times = None
         if state is None and self._end == scenario.duration_s and trace is None:
             # The very samples of simulate; its limit of size holds here too.
             run, bodies = self._prepared.run, len(self.robot.links)
-            self._times = sample_times(scenario, run.layout.size + run.columns.size + pose_columns(bodies))
+            times = sample_times(scenario, run.layout.size + run.columns.size + pose_columns(bodies))
+        self._trace = Trace(start, self._end, scenario.record.rate_hz, trace, times)
+        self._sampled = self._prepared.system.drives.table[:, ka.SAMPLED].copy()
         run = self._prepared.run
         if state is not None:
             self._take(state)
         run.clock[ki.TIME] = start
+        run.tick[:, [ki.TICK_NEXT, ki.TICK_PHASE]] = start
         self._refill()
 
     @property
@@ -302,7 +249,7 @@ class Simulation:
         value = _finite("command", [command])[0]
         self._settle_now()
         drives = self._prepared.system.drives
-        drives.table[a, ka.SAMPLED], drives.input[a, ka.HELD] = 1, value
+        drives.table[a, ka.SAMPLED], drives.input[a, ka.HELD] = ka.GIVEN, value
         self._restart()
 
     def release(self, joint: str) -> None:
@@ -310,6 +257,7 @@ class Simulation:
         a = self._motor(joint)
         self._settle_now()
         self._prepared.system.reference.spline[a] = self._splines[a]
+        self._prepared.system.drives.table[a, ka.SAMPLED] = self._sampled[a]
         self._restart()
 
     def set_wrench(
@@ -337,13 +285,14 @@ class Simulation:
         place = loads.table[k, kl.DATA]
         loads.table[k, kl.IN_BODY] = int(in_body)
         loads.data[place + kl.POINT : place + kl.POINT + 9] = values
-        self._pushed = self._pushed or bool(values[3:].any())
+        if values[3:].any():
+            self._pushed.add(k)
         self._restart()
 
     def snapshot(self) -> Snapshot:
         """What :meth:`restore` needs to go on from here."""
         arrays = {name: array.copy() for name, array in self._arrays().items()}
-        return Snapshot(arrays, self._time, tuple(self._rows), self._next_sample, tuple(self._happened), self._frozen)
+        return Snapshot(arrays, self._time, self._trace.snapshot(), tuple(self._happened), self._frozen)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot of this simulation: the same future, bit for bit.
@@ -361,27 +310,26 @@ class Simulation:
         self._swap(**buffers)
         for name, array in self._arrays().items():
             array[...] = snapshot.arrays[name]
-        self._time, self._next_sample, self._frozen = snapshot.time, snapshot.next_sample, snapshot.frozen
-        self._rows, self._happened = deque(snapshot.rows), list(snapshot.happened)
+        self._trace.restore(snapshot.trace)
+        self._time, self._frozen, self._happened = snapshot.time, snapshot.frozen, list(snapshot.happened)
 
     def record(self) -> Record:
         """Record of the trace so far; of a ring, energies and losses count from its first sample on.
 
         ``complete`` is True for a run that has come to its end.
         """
-        rows = [*self._rows, self._sampled()]
-        times, states, outputs = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-        if self._trace is not None and len(times) > self._trace:
-            times, states, outputs = (part[len(part) - self._trace :] for part in (times, states, outputs))
         run = self._prepared.run
-        if len(times) and (self._trace is not None or self._start > 0.0):
+        times, states, outputs = self._trace.rows(run)
+        if len(times) and self._relative:
             states = states.copy()
             integrals = slice(run.layout.tracked, run.layout.size)
             states[:, integrals] -= states[0, integrals]
         count = run.count.copy()
         count[ki.SAMPLE] = len(times)
         whole = run._replace(sample_time=times, sample=states, output=outputs, count=count)
-        record = make_record(self._scenario, replace(self._prepared, run=whole), self._wall, pushed=self._pushed)
+        record = make_record(
+            self._scenario, replace(self._prepared, run=whole), self._wall, pushed=sorted(self._pushed)
+        )
         for happening in self._happened:
             record.add_event(*happening)
         record.complete = self.finished
@@ -492,23 +440,10 @@ class Simulation:
                 powers = reference.grid[1] ** np.arange(6)
                 self.set_reference(joint, float(reference.coefficients[-1, reference.spline[a]] @ powers))
 
-    def _sampled(self) -> tuple[Array, Array, Array]:
-        """Times, states and outputs of the buffer so far."""
-        run = self._prepared.run
-        rows = int(run.count[ki.SAMPLE])
-        return run.sample_time[:rows].copy(), run.sample[:rows].copy(), run.output[:rows].copy()
-
     def _refill(self, until: float = -np.inf) -> None:
         """Move what was sampled to the trace, and give the buffer the times from there on, at least up to ``until``."""
         run = self._prepared.run
-        taken = self._sampled()
-        if len(taken[0]):
-            self._rows.append(taken)
-            kept = sum(len(times) for times, _, _ in self._rows)
-            while self._trace is not None and kept - len(self._rows[0][0]) >= self._trace:
-                kept -= len(self._rows.popleft()[0])
-        self._next_sample += len(taken[0])
-        times = self._sample_block(until)
+        times = self._trace.move(run, until)
         if len(times) != len(run.sample_time):
             self._swap(
                 sample_time=times,
@@ -518,23 +453,6 @@ class Simulation:
         else:
             run.sample_time[:] = times
         run.count[ki.SAMPLE] = 0
-
-    def _sample_block(self, until: float) -> Array:
-        """The next times of samples [s]; infinite ones are never reached."""
-        if self._trace == 0:
-            return np.full(1, np.inf)
-        first, count = self._next_sample, _ROWS
-        if self._times is not None:
-            more = int(np.searchsorted(self._times, until, side="right")) - first
-            found = self._times[first : first + max(count, more + 1)]
-        else:
-            rate = self._scenario.record.rate_hz
-            if math.isfinite(until):
-                count = max(count, int((until - self._start) * rate) + 2 - first)
-            found = self._start + np.arange(first, first + count) / rate
-            found = found[found <= self._end * (1.0 + 1e-12)]
-        # After the last sample the buffer must not hold steps back.
-        return np.concatenate([found, np.full(max(count - len(found), 0) + 1, np.inf)]) if len(found) < count else found
 
     def _swap(self, **arrays: Any) -> None:
         """Take other arrays for some of those of the run."""

@@ -51,8 +51,9 @@ DC_MOTOR, POSITION_SERVO, OPEN_TORQUE = 0, 1, 2
 DRIVEN = 0  # index of the link whose joint the drive moves
 DRIVE_KIND = 1
 CIRCUIT = 2  # index of its current among those of the state, -1 for none
-SAMPLED = 3  # 1: the command is HELD between ticks; 0: it follows the state continuously
+SAMPLED = 3  # whether the command follows the state continuously, or is HELD: taken at ticks, or given by the caller
 DRIVE_SIZE = 4
+CONTINUOUS, AT_TICKS, GIVEN = 0, 1, 2
 # DriveArrays.motor
 K_M = 0  # K k [N m/A = V s/rad]
 RESISTANCE = 1  # [ohm]

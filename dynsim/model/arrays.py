@@ -121,7 +121,11 @@ def compile_drives(
     given = np.zeros((len(robot.motors), ka.INPUT_SIZE))
     circuits = 0
     for a, m in enumerate(robot.motors):
-        table[a, ka.DRIVEN], table[a, ka.CIRCUIT], table[a, ka.SAMPLED] = joints[m.joint], -1, sampled
+        table[a, ka.DRIVEN], table[a, ka.CIRCUIT], table[a, ka.SAMPLED] = (
+            joints[m.joint],
+            -1,
+            ka.AT_TICKS if sampled else ka.CONTINUOUS,
+        )
         if isinstance(m, Motor):
             table[a, ka.DRIVE_KIND], table[a, ka.CIRCUIT] = ka.DC_MOTOR, circuits
             circuits += 1

@@ -42,13 +42,15 @@ class JointControl:
     """Gains of the voltage PD per motor [V/rad, V s/rad], joint references, and the path the hand is to follow.
 
     Only DC motors take the gains; ``k_p`` of a servo says whether it follows its position. References of a torque
-    source are its torques [N m].
+    source are its torques [N m]. ``sample_time`` is the period [s] at which commands are taken, to be held in between;
+    None: they follow the state continuously.
     """
 
     k_p: NDArray[np.float64]
     k_d: NDArray[np.float64]
     reference: ReferenceArrays
     path: HandPath | None
+    sample_time: float | None = None
 
     @classmethod
     def absent(cls, robot: Robot) -> JointControl:
@@ -65,6 +67,7 @@ class JointControl:
         times: ArrayLike = (),
         positions: Mapping[str, JointMotion] | None = None,
         path: HandPath | None = None,
+        sample_time: float | None = None,
     ) -> JointControl:
         """The voltage PD u = k_p (q_d − q) + k_d (v_d − v) on joint positions that are given as samples or functions.
 
@@ -77,6 +80,7 @@ class JointControl:
         times : (T,) [s], equally spaced, T ≥ 6, from 0 to the end of the run
         positions : by joint, (T,) positions [rad or m], or a function that gives them for ``times``
         path : what the hand is to follow, for tracking errors in summary and figures
+        sample_time : period of a zero-order hold of the voltages [s]; None: continuous
 
         Raises
         ------
@@ -91,7 +95,7 @@ class JointControl:
             if name not in driven:
                 raise ModelError(f"{name!r} is no joint with a motor; those are: {', '.join(driven) or 'none'}")
         if not positions:
-            return cls(*gains, _reference(held), path)
+            return cls(*gains, _reference(held), path, sample_time)
         grid = np.asarray(times, dtype=np.float64)
         if grid.ndim != 1 or len(grid) < 6 or not np.allclose(np.diff(grid), grid[1] - grid[0], rtol=1e-6, atol=0.0):
             raise ModelError("references need six or more equally spaced times [s]")
@@ -108,7 +112,7 @@ class JointControl:
             spline[driven.index(name)] = k
         coefficients = spline_coefficients(grid, np.stack(columns, axis=1))
         begin, second = float(grid[0]), float(grid[1])
-        return cls(*gains, _reference(held, spline, (begin, second - begin), coefficients), path)
+        return cls(*gains, _reference(held, spline, (begin, second - begin), coefficients), path, sample_time)
 
     @property
     def end(self) -> float:

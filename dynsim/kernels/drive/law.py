@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dynsim.kernels.arrays import (
     APPLIED,
+    AT_TICKS,
     CIRCUIT,
     CURRENT,
     DC_MOTOR,
@@ -135,7 +136,7 @@ def take_commands(drives: DriveArrays, reference: ReferenceArrays, t, ws: Worksp
     """At a tick: the commands of all sampled drives at the state in ``ws.joints``, held from now on."""
     evaluate_reference(drives, reference, t, ws)
     for a in range(ws.motors.shape[0]):
-        if drives.table[a, SAMPLED]:
+        if drives.table[a, SAMPLED] == AT_TICKS:
             drives.input[a, HELD] = command(drives, ws, a)
 
 

@@ -26,7 +26,6 @@ from dynsim.kernels.integrate.explicit import step_explicit
 from dynsim.kernels.integrate.project import off_surface, settle
 from dynsim.kernels.integrate.rosenbrock import step_rodas4
 from dynsim.kernels.integrate.run import (
-    CALLER,
     DOPRI5,
     END,
     ERROR,
@@ -148,7 +147,7 @@ def ready(system: System, ws: Workspace, run: Run):
     if count[STARTED] == 0:
         start(system, ws, run)
         arm_events(ws, run)
-    count[TICKED] = due & CALLER
+    count[TICKED] = due & ~TAKE_COMMANDS
     return count[TICKED] == 0
 
 

@@ -1,0 +1,73 @@
+"""What goes in and out of a stepped simulation: states, events, snapshots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.engine.trace import Rows
+from dynsim.kernels.integrate import events
+from dynsim.record import Record
+
+Array = NDArray[np.float64]
+
+# Guards of events by name: number in the kernels, and what they are about.
+GUARDS = {
+    "joint_position": (events.JOINT_POSITION, "joint"),
+    "joint_rate": (events.JOINT_RATE, "joint"),
+    "motor_current": (events.MOTOR_CURRENT, "motor"),
+    "motor_voltage": (events.MOTOR_VOLTAGE, "motor"),
+    "contact_force": (events.CONTACT_FORCE, "contact"),
+    "contact_gap": (events.CONTACT_GAP, "contact"),
+    "hand_position": (events.HAND_X, "axis"),
+}
+
+
+@dataclass(frozen=True)
+class State:
+    """The state of a simulation.
+
+    Attributes
+    ----------
+    time : [s]
+    q : (nq,) positions [rad or m]; v : (n,) rates; current : of the motors that have a circuit [A]
+    """
+
+    time: float
+    q: Array
+    v: Array
+    current: Array
+
+    @classmethod
+    def of(cls, record: Record, sample: int = -1) -> State:
+        """The state at a sample of a record, by default the last.
+
+        Raises
+        ------
+        MissingEntry
+            The record has no positions, rates or currents.
+        """
+        names = ("q", "v", "current")
+        return cls(float(record.time[sample]), *(np.array(record[name][sample], dtype=np.float64) for name in names))
+
+
+class Happening(NamedTuple):
+    """An event that has happened: when [s], which guard, of what."""
+
+    time: float
+    kind: str
+    subject: str
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Everything that the future of a simulation depends on; made by :meth:`Simulation.snapshot`."""
+
+    arrays: dict[str, NDArray[Any]]
+    time: float
+    trace: tuple[tuple[Rows, ...], int]
+    happened: tuple[Happening, ...]
+    frozen: bool

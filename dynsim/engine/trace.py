@@ -1,0 +1,81 @@
+"""What a stepped simulation samples: blocks of sample times for the kernels, and the rows that are kept."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.kernels.integrate import run as ki
+
+Array = NDArray[np.float64]
+Rows = tuple[Array, Array, Array]
+
+# Rows of the buffer that kernels sample into before it is emptied.
+BLOCK = 256
+
+
+class Trace:
+    """Times, states and outputs of samples.
+
+    Parameters
+    ----------
+    start, end, rate : first time, end [s] and rate [1/s] of the samples
+    keep : samples that are kept: all (None), the last so many, or none (0)
+    times : of all samples, where they are known beforehand
+    """
+
+    def __init__(self, start: float, end: float, rate: float, keep: int | None, times: Array | None = None) -> None:
+        self._start, self._end, self._rate, self._keep, self._times = start, end, rate, keep, times
+        self._rows: deque[Rows] = deque()
+        self._next = 0
+
+    def taken(self, run: ki.Run) -> Rows:
+        """What the buffer of the run holds."""
+        rows = int(run.count[ki.SAMPLE])
+        return run.sample_time[:rows].copy(), run.sample[:rows].copy(), run.output[:rows].copy()
+
+    def move(self, run: ki.Run, until: float = -np.inf) -> Array:
+        """Keep what the buffer holds; the sample times from there on, at least up to ``until`` and one more [s]."""
+        taken = self.taken(run)
+        if len(taken[0]):
+            self._rows.append(taken)
+            kept = sum(len(times) for times, _, _ in self._rows)
+            while self._keep is not None and kept - len(self._rows[0][0]) >= self._keep:
+                kept -= len(self._rows.popleft()[0])
+        self._next += len(taken[0])
+        return self._block(until)
+
+    def rows(self, run: ki.Run) -> Rows:
+        """All that is kept, with what the buffer of the run holds."""
+        parts = zip(*self._rows, self.taken(run), strict=True)
+        times, states, outputs = (np.concatenate(part) for part in parts)
+        first = 0 if self._keep is None else max(len(times) - self._keep, 0)
+        return times[first:], states[first:], outputs[first:]
+
+    def snapshot(self) -> tuple[tuple[Rows, ...], int]:
+        """What :meth:`restore` goes back to; rows are never written again, so they are shared."""
+        return tuple(self._rows), self._next
+
+    def restore(self, snapshot: tuple[tuple[Rows, ...], int]) -> None:
+        """Go back to a snapshot."""
+        rows, self._next = snapshot
+        self._rows = deque(rows)
+
+    def _block(self, until: float) -> Array:
+        """The next times of samples [s]; infinite ones are never reached."""
+        if self._keep == 0:
+            return np.full(1, np.inf)
+        first, count = self._next, BLOCK
+        if self._times is not None:
+            more = int(np.searchsorted(self._times, until, side="right")) - first
+            found = self._times[first : first + max(count, more + 1)].copy()
+        else:
+            if math.isfinite(until):
+                count = max(count, int((until - self._start) * self._rate) + 2 - first)
+            found = self._start + np.arange(first, first + count) / self._rate
+            found = found[found <= self._end * (1.0 + 1e-12)]
+        # After the last sample the buffer must not hold steps back.
+        return np.append(found, np.inf) if len(found) < count else found
