@@ -81,15 +81,13 @@ class SimulatedArm:
             for mass, point in [masses.get(servo.joint, (0.0, None))]
         ]
         start = dynsim.State(0.0, np.asarray(posture, dtype=np.float64), np.zeros(len(joints)), np.zeros(0))
-        self._simulation = dynsim.Simulation(
-            _bare(scenario), state=start, duration=math.inf, trace=0, motors=motors
-        )
+        self._simulation = dynsim.Simulation(_bare(scenario), state=start, duration=math.inf, trace=0, motors=motors)
         self._contacts = [
             (contact, robot.links[index].name, index, point)
             for contact in build.contacts(scenario)
             for index, point in [robot.attach(contact.body, contact.point)]
         ]
-        self._pushed = {body: False for _, body, _, _ in self._contacts}
+        self._pushed: set[str] = set()  # bodies with a wrench
         self._on_stand = np.ones(len(servos), dtype=bool)
         self._jammed = np.zeros(len(servos), dtype=bool)
         self._told = [("off", 0.0, 0.0)] * len(servos)
@@ -146,21 +144,27 @@ class SimulatedArm:
     def _push(self, simulation: Simulation) -> None:
         """Write the contacts' forces at the present state, for a tick."""
         state, model = simulation.state, simulation.model
-        wrenches = {body: np.zeros(6) for body in self._pushed}
+        # By body: where its first contact is, in its own frame and in the world, and the wrench there.
+        pushes: dict[str, tuple[Array, Array, Array]] = {}
+        compliance = None
         for contact, body, index, point in self._contacts:
             position, jacobian = model.point_position_and_jacobian(index, point, state.q)
             gap = float(contact.surface.gap(position))
-            if gap < 0.0:
-                inertia = model.mass_matrix(state.q) + np.diag(model.armature)
-                mobility = jacobian @ np.linalg.solve(inertia, jacobian.T)
-                force = push(contact, position, gap, jacobian @ state.v, mobility)
-                arm = position - model.point_position(index, np.zeros(3), state.q)
-                wrenches[body] += np.concatenate([force, np.cross(arm, force)])
-        for body, wrench in wrenches.items():
-            pushed = bool(wrench.any())
-            if pushed or self._pushed[body]:
-                simulation.set_wrench(body, wrench[:3], wrench[3:])
-            self._pushed[body] = pushed
+            if gap >= 0.0:
+                continue
+            if compliance is None:
+                compliance = np.linalg.inv(model.mass_matrix(state.q) + np.diag(model.armature))
+            force = push(contact, position, gap, jacobian @ state.v, jacobian @ compliance @ jacobian.T)
+            if body in pushes:
+                _, centre, wrench = pushes[body]
+                wrench += np.concatenate([force, np.cross(position - centre, force)])
+            else:
+                pushes[body] = point, position, np.concatenate([force, np.zeros(3)])
+        for body, (point, _, wrench) in pushes.items():
+            simulation.set_wrench(body, wrench[:3], wrench[3:], point=point)
+        for body in self._pushed - pushes.keys():
+            simulation.set_wrench(body)
+        self._pushed = set(pushes)
 
 
 def push(contact: Any, position: Array, gap: float, velocity: Array, mobility: Array) -> Array:
