@@ -88,7 +88,7 @@ def test_a_limp_arm_falls_and_stays_above_the_floor_with_its_elbows() -> None:
 
 
 def test_it_is_the_simulation_of_the_same_arm_with_position_servos() -> None:
-    """Without braces, under moving set points and a failing supply: to 1e-9 with the same steps, else to its tolerances."""
+    """Under moving set points and a failing supply: to 1e-9 with the same steps, else to its tolerances."""
     arm = simulated_arm(str(ARM), "no_elbow", load_servo_map(ARM_MAP), {})
     scenario = dynsim.load_scenario(ARM, variant="no_elbow")
     bare = replace(scenario, config=scenario.config.model_copy(update={"controller": None}))

@@ -7,8 +7,8 @@ of a point [1/kg], damping c and friction b take no more speed away in a tick th
 
     f_n = max(0, −k g − c/(1 + Δt c nᵀG n) ġ)        f_t = −b/(1 + Δt b |G|) v_t,   b = μ f_n/√(v_t² + v_s²)
 
-Ticks are stable while k Δt/2 is less than what is left of c, which holds for points of more than 11 g. A load at rest is carried
-by k alone.
+Ticks are stable while k Δt/2 is less than what is left of c, which holds for points of more than 11 g. A load at rest
+is carried by k alone.
 """
 
 from __future__ import annotations
