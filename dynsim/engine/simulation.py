@@ -249,7 +249,7 @@ class Simulation:
         value = _finite("command", [command])[0]
         self._settle_now()
         drives = self._prepared.system.drives
-        drives.table[a, ka.SAMPLED], drives.input[a, ka.HELD] = ka.GIVEN, value
+        drives.table[a, ka.SAMPLED], drives.input[a, ka.COMMAND] = ka.GIVEN, value
         self._restart()
 
     def release(self, joint: str) -> None:

@@ -51,7 +51,7 @@ DC_MOTOR, POSITION_SERVO, OPEN_TORQUE = 0, 1, 2
 DRIVEN = 0  # index of the link whose joint the drive moves
 DRIVE_KIND = 1
 CIRCUIT = 2  # index of its current among those of the state, -1 for none
-SAMPLED = 3  # whether the command follows the state continuously, or is HELD: taken at ticks, or given by the caller
+SAMPLED = 3  # whether the command follows the state continuously, or is the held COMMAND: taken at ticks, or given by the caller
 DRIVE_SIZE = 4
 CONTINUOUS, AT_TICKS, GIVEN = 0, 1, 2
 # DriveArrays.motor
@@ -70,11 +70,11 @@ COULOMB_SPEED = 11  # below which it fades [rad/s]
 FREE_DRAG = 12  # viscous drag of a servo's gear while it is off [N m s/rad]
 MOTOR_SIZE = 16  # whole cache lines
 # DriveArrays.input
-HELD = 0  # command of a sampled drive between ticks [V; N m for an open torque]
+COMMAND = 0  # command of a sampled drive between ticks [V; N m for an open torque]
 LINE_START = 1  # a rewritten reference: its value [rad; N m for an open torque]
 LINE_RATE = 2  # [rad/s; N m/s]
 LINE_SINCE = 3  # time at which it has that value [s]
-MODE = 4  # of a servo
+SERVO_MODE = 4
 INPUT_SIZE = 5
 # Modes of a servo
 POSITION_MODE, VELOCITY_MODE, OFF = 0, 1, 2

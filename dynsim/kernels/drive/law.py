@@ -10,19 +10,18 @@ from dynsim.kernels.arrays import (
     APPLIED,
     AT_TICKS,
     CIRCUIT,
+    COMMAND,
     CURRENT,
     DC_MOTOR,
     DIDT,
     DRAG,
     DRIVE_KIND,
     DRIVEN,
-    HELD,
     INDUCTANCE,
     K_M,
     LINE_RATE,
     LINE_SINCE,
     LINE_START,
-    MODE,
     POSITION_SERVO,
     Q_REF,
     QD,
@@ -31,6 +30,7 @@ from dynsim.kernels.arrays import (
     RATE_V,
     REWRITTEN,
     SAMPLED,
+    SERVO_MODE,
     TORQUE_I,
     TORQUE_Q,
     TORQUE_V,
@@ -86,7 +86,7 @@ def command(drives: DriveArrays, ws: Workspace, a):
     if kind == DC_MOTOR:
         return dc_command(motor, a, q_ref, v_ref, ws.joints[i, Q], ws.joints[i, QD])
     if kind == POSITION_SERVO:
-        return servo_command(motor, a, drives.input[a, MODE], q_ref, v_ref, ws.joints[i, Q], ws.joints[i, QD])
+        return servo_command(motor, a, drives.input[a, SERVO_MODE], q_ref, v_ref, ws.joints[i, Q], ws.joints[i, QD])
     return q_ref
 
 
@@ -94,7 +94,7 @@ def command(drives: DriveArrays, ws: Workspace, a):
 def drive_dc(drives: DriveArrays, asked, i, ws: Workspace, a):
     """The DC motor a at a command [V] and a current [A]."""
     motors, motor, j = ws.motors, drives.motor, drives.table[a, DRIVEN]
-    u = clipped(drives.input[a, HELD] if drives.table[a, SAMPLED] else asked, motor[a, U_MAX])
+    u = clipped(drives.input[a, COMMAND] if drives.table[a, SAMPLED] else asked, motor[a, U_MAX])
     motors[a, CURRENT], motors[a, VOLTAGE] = i, u
     motors[a, DIDT] = dc_balance(motor, a, u, ws.joints[j, QD], i) / motor[a, INDUCTANCE]
     ws.joints[j, APPLIED] += dc_torque(motor, a, i)
@@ -118,11 +118,11 @@ def drive(drives: DriveArrays, reference: ReferenceArrays, t, y, layout: StateLa
     for a in range(na):
         j, kind = table[a, DRIVEN], table[a, DRIVE_KIND]
         v = joints[j, QD]
-        asked = drives.input[a, HELD] if table[a, SAMPLED] else command(drives, ws, a)
+        asked = drives.input[a, COMMAND] if table[a, SAMPLED] else command(drives, ws, a)
         if kind == DC_MOTOR:
             drive_dc(drives, asked, y[layout.current + table[a, CIRCUIT]], ws, a)
         elif kind == POSITION_SERVO:
-            mode = drives.input[a, MODE]
+            mode = drives.input[a, SERVO_MODE]
             motors[a, VOLTAGE], motors[a, CURRENT] = servo_circuit(motor, a, mode, asked, v)
             motors[a, DRAG] = servo_drag(motor, a, mode, v)
             joints[j, APPLIED] += motor[a, K_M] * motors[a, CURRENT] - motors[a, DRAG]
@@ -137,7 +137,7 @@ def take_commands(drives: DriveArrays, reference: ReferenceArrays, t, ws: Worksp
     evaluate_reference(drives, reference, t, ws)
     for a in range(ws.motors.shape[0]):
         if drives.table[a, SAMPLED] == AT_TICKS:
-            drives.input[a, HELD] = command(drives, ws, a)
+            drives.input[a, COMMAND] = command(drives, ws, a)
 
 
 @internal_kernel
@@ -146,7 +146,7 @@ def drive_block(drives: DriveArrays, ws: Workspace, a, block):
 
     After ``derivative``: references, voltages and states are those in the workspace.
     """
-    motors, motor, kind, mode = ws.motors, drives.motor, drives.table[a, DRIVE_KIND], drives.input[a, MODE]
+    motors, motor, kind, mode = ws.motors, drives.motor, drives.table[a, DRIVE_KIND], drives.input[a, SERVO_MODE]
     sampled = drives.table[a, SAMPLED] != 0
     for s in range(block.shape[0]):
         block[s] = 0.0
@@ -156,6 +156,6 @@ def drive_block(drives: DriveArrays, ws: Workspace, a, block):
         block[TORQUE_Q], block[TORQUE_V], block[TORQUE_I] = found[0], found[1], found[2]
         block[RATE_Q], block[RATE_V], block[RATE_I] = found[3], found[4], found[5]
     elif kind == POSITION_SERVO:
-        asked = drives.input[a, HELD] if sampled else command(drives, ws, a)
+        asked = drives.input[a, COMMAND] if sampled else command(drives, ws, a)
         v = ws.joints[drives.table[a, DRIVEN], QD]
         block[TORQUE_Q], block[TORQUE_V] = servo_block(motor, a, mode, sampled, asked, v)
