@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from dynsim.hardware.bus.control_table import MX_106, ServoModel
 
 if TYPE_CHECKING:
-    from dynsim.model.description import Servo
+    from dynsim.model.drives import Servo
 
 Array = NDArray[np.float64]
 
@@ -82,7 +82,7 @@ class MotorLaw:
 
     def _servo(self, a: int, model: ServoModel) -> Servo:
         """K_m = V/ω_no_load and R = V K_m/τ_stall at 12 V, so that d = K_m²/R; a torque per volt is K_m/R."""
-        from dynsim.model.description import Servo
+        from dynsim.model.drives import Servo
 
         torque_constant = 12.0 / model.no_load_speed
         resistance = 12.0 * torque_constant / model.stall_torque
