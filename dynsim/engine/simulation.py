@@ -31,7 +31,7 @@ from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.dense import state_within
 from dynsim.kernels.state import JOINT, block
 from dynsim.kernels.tree import loads as kl
-from dynsim.model.description import Drive
+from dynsim.model.drives import Drive
 from dynsim.model.model import Model
 from dynsim.record import Record
 from dynsim.record.poses import pose_columns

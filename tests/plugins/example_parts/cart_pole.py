@@ -8,7 +8,8 @@ import numpy as np
 
 from dynsim import families
 from dynsim.config import Positive, StrictConfig
-from dynsim.model.description import Inertia, Link, Motor, Robot, vector
+from dynsim.model.description import Inertia, Link, Robot, vector
+from dynsim.model.drives import Motor
 from dynsim.model.protocols import BuildContext
 
 ENGINE = "dynamics"
