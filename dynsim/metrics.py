@@ -13,7 +13,8 @@ from dynsim._version import __version__
 from dynsim.kernels.integrate.run import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, LOCAL_SINCE, PULLING
 from dynsim.measures import RESIDUAL_LIMIT, SINKS, STORES, energy_turnover, hand_error
 from dynsim.model.clearance import Sinking, sinking
-from dynsim.model.description import Contact, Drive, Robot, Servo, TorqueSource
+from dynsim.model.description import Contact, Robot
+from dynsim.model.drives import Drive, Servo, TorqueSource
 from dynsim.record import Record
 from dynsim.scenario import Scenario, build
 

@@ -15,7 +15,8 @@ from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.state import block, output_layout, state_layout
 from dynsim.kernels.system import System, derivative, new_workspace
 from dynsim.model.arrays import compile_contacts, compile_couplings, compile_drives, compile_loads, compile_model
-from dynsim.model.description import Contact, Inertia, Link, Load, Motor, Quadric, Robot
+from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot
+from dynsim.model.drives import Motor
 from dynsim.model.joints.ball import ball, floating
 from dynsim.model.joints.planar import planar, rolling
 from dynsim.model.model import Model

@@ -14,7 +14,8 @@ from dynsim.config import NonNegative, Positive, StrictConfig
 from dynsim.control.inverse_kinematics import follow
 from dynsim.errors import ModelError
 from dynsim.model.control import HandPath, JointControl
-from dynsim.model.description import Motor, Robot, Servo, TorqueSource
+from dynsim.model.description import Robot
+from dynsim.model.drives import Motor, Servo, TorqueSource
 from dynsim.model.protocols import BuildContext
 
 ENGINE = "dynamics"

@@ -20,7 +20,8 @@ from dynsim.kernels.system import System, new_workspace
 from dynsim.model.arrays import compile_contacts, compile_couplings, compile_drives, compile_loads
 from dynsim.model.clearance import poses
 from dynsim.model.control import JointControl
-from dynsim.model.description import Array, Contact, Drive, Load, Motor, Robot
+from dynsim.model.description import Array, Contact, Load, Robot
+from dynsim.model.drives import Drive, Motor
 from dynsim.model.model import Model
 from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, build, build_model

@@ -31,7 +31,7 @@ from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.dense import state_within
 from dynsim.kernels.state import JOINT, block
 from dynsim.kernels.tree import loads as kl
-from dynsim.model.description import Drive
+from dynsim.model.drives import Drive
 from dynsim.model.model import Model
 from dynsim.record import Record
 from dynsim.record.poses import pose_columns
@@ -252,7 +252,7 @@ class Simulation:
         values = _finite("reference", [position, rate])
         self._settle_now()
         drives, reference = self._prepared.system.drives, self._prepared.system.reference
-        reference.spline[a] = ka.REWRITTEN
+        reference.spline[a], drives.table[a, ka.SAMPLED] = ka.REWRITTEN, self._sampled[a]
         drives.input[a, [ka.LINE_START, ka.LINE_RATE, ka.LINE_SINCE]] = values[0], values[1], self._time
         self._restart()
 
@@ -406,6 +406,10 @@ class Simulation:
         for name in ("q", "v", "current"):
             part = block(run.layout, name)
             values = _finite(name, np.ravel(getattr(state, name)))
+            circuits = self._prepared.system.drives.table[:, ka.CIRCUIT] >= 0
+            if name == "current" and len(values) == len(circuits):
+                # Records have a current for each motor; those without a circuit follow from the rest.
+                values = values[circuits]
             if values.shape != run.y[part].shape:
                 raise ModelError(
                     f"the state has {len(values)} values of {name}, {model.robot.name} has {part.stop - part.start}"

@@ -12,7 +12,7 @@ from dynsim.figures.style import Array
 from dynsim.measures import hand_target
 from dynsim.record import Record
 from dynsim.record.poses import ORIENTATION, POSITION, point_positions
-from dynsim.record.scene import WORLD, Point, Scene, Surface
+from dynsim.record.scene import WORLD, Joint, Point, Scene, Surface
 
 # Postures drawn faintly, evenly over the run, besides the last one.
 FAINT = 6
@@ -30,9 +30,12 @@ class Skeleton:
     scene: Scene
 
     def segments(self, row: int) -> Array:
-        """From each body's parent to the body, and from the hand's body to the hand, (m, 2, 3) [m]."""
+        """From each body's parent to the body, and from the hand's body to the hand, (m, 2, 3) [m].
+
+        Nothing leads from the world or a body to what moves freely beside it.
+        """
         points = self.record[POSITION][row].astype(np.float64)
-        bodies = list(enumerate(self.scene.bodies))
+        bodies = [(k, body) for k, body in enumerate(self.scene.bodies) if not _moves_beside(body.joint)]
         # A sliding joint at the root moves its body away from where it is mounted.
         lines = [(np.array(body.joint.position), points[k]) for k, body in bodies if body.parent == WORLD]
         lines += [(points[body.parent], points[k]) for k, body in bodies if body.parent != WORLD]
@@ -61,6 +64,11 @@ class Skeleton:
             for point in self.scene.contacts
             if (surface := self.scene.surface(point.surface)) is not None
         ]
+
+
+def _moves_beside(joint: Joint) -> bool:
+    """Whether it is a row of a floating, planar or rolling joint that takes the body away from what it hangs on."""
+    return bool(joint.part_of) and joint.kind in ("prismatic", "planar")
 
 
 def skeleton(record: Record) -> tuple[Skeleton | None, str]:

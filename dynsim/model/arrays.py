@@ -11,7 +11,8 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.tree import loads as kl
 from dynsim.kernels.tree.loads import LoadArrays
-from dynsim.model.description import Contact, Coupling, Drive, Link, Load, Motor, Robot, Servo, TorqueSource
+from dynsim.model.description import Contact, Coupling, Link, Load, Robot
+from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
 from dynsim.model.servo import servo_row
 
 # Beyond it the reduction of an angle to a quarter turn leaves too few digits (dynsim.kernels.tree.sweep.sine_cosine).

@@ -13,7 +13,8 @@ from scipy.interpolate import make_interp_spline
 from dynsim.errors import ModelError
 from dynsim.kernels.arrays import HELD_POSITION, ReferenceArrays
 from dynsim.kernels.jit import integers, reals
-from dynsim.model.description import Robot, TorqueSource
+from dynsim.model.description import Robot
+from dynsim.model.drives import TorqueSource
 
 # Samples in a segment of the reference splines, and segments that are looked at together.
 _PER_SEGMENT = 4

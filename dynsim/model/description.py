@@ -1,4 +1,4 @@
-"""Bodies, joints, motors, surfaces and contacts as plain frozen data in SI units.
+"""Bodies, joints, surfaces and contacts as plain frozen data in SI units; drives: :mod:`dynsim.model.drives`.
 
 A :class:`Robot` is a tree of :class:`Link`; each link is one joint and the body it carries. Frames: the body's frame B
 moves with the joint; at q = 0 it is the joint frame J, placed in the parent's body frame by ``R_PJ`` and ``p_PJ``.
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.errors import ModelError
+from dynsim.model.drives import Drive, Motor
 from dynsim.model.joints import Row, rows
 from dynsim.record.scene import Shape
 
@@ -201,99 +202,6 @@ class Frame:
     body: str | None
     R: Array
     p: Array
-
-
-@dataclass(frozen=True)
-class Motor:
-    """A DC motor on a joint ([WM] eqs 16–25).
-
-    Attributes
-    ----------
-    joint : str
-    torque_constant : K [N m/A = V s/rad]
-    resistance : R [Ω]; inductance : L [H]; rotor_inertia : I_m [kg m²]
-    gear_ratio : k; gear_damping : d_m on the motor side [N m s/rad]
-    voltage_limit : [V], inf for none
-    mass : [kg] of a point on the link before the joint; on the base it moves nothing
-    mass_point : (3,) or None
-        Where, in that link's frame [m]; None: at the joint.
-    """
-
-    joint: str
-    torque_constant: float
-    resistance: float
-    inductance: float
-    rotor_inertia: float
-    gear_ratio: float
-    gear_damping: float = 0.0
-    voltage_limit: float = np.inf
-    mass: float = 0.0
-    mass_point: Array | None = None
-
-    @property
-    def armature(self) -> float:
-        """J_m = I_m k² [kg m², or kg at a prismatic joint]."""
-        return self.rotor_inertia * self.gear_ratio**2
-
-    @property
-    def reflected_damping(self) -> float:
-        """D_m = d_m k² [N m s/rad, or N s/m]."""
-        return self.gear_damping * self.gear_ratio**2
-
-
-@dataclass(frozen=True)
-class Servo:
-    """A position servo on a revolute joint, everything at its output shaft; its law: dynsim.kernels.drive.servo.
-
-    Attributes
-    ----------
-    joint : str
-    torque_constant : K_m [N m/A = V s/rad]; resistance : R [Ω]
-    k_p, k_d : gains of the position loop [V/rad, V s/rad]
-    k_v : gain of the velocity loop [V s/rad]
-    velocity_mode : the loop follows the rate of the reference, not its position
-    armature : J_m [kg m²]; reflected_damping : D_m [N m s/rad]
-    coulomb_friction : τ_c [N m]; coulomb_speed : v_s [rad/s], below which it fades
-    voltage_limit, current_limit : [V], [A]; torque_limit : of the current, K_m i [N m]; inf for none
-    free_drag : viscous drag of the gear while the servo is off [N m s/rad]
-    mass, mass_point : as of a :class:`Motor`
-    """
-
-    joint: str
-    torque_constant: float
-    resistance: float
-    k_p: float
-    k_d: float = 0.0
-    k_v: float = 0.0
-    velocity_mode: bool = False
-    armature: float = 0.0
-    reflected_damping: float = 0.0
-    coulomb_friction: float = 0.0
-    coulomb_speed: float = 1e-2
-    voltage_limit: float = np.inf
-    current_limit: float = np.inf
-    torque_limit: float = np.inf
-    free_drag: float = 0.0
-    mass: float = 0.0
-    mass_point: Array | None = None
-
-    @property
-    def greatest_current(self) -> float:
-        """The lower of the limits of current and torque [A]."""
-        return min(self.current_limit, self.torque_limit / self.torque_constant)
-
-
-@dataclass(frozen=True)
-class TorqueSource:
-    """A torque on a joint that is its own reference, within ``torque_limit`` [N m, or N]; mass as of a motor."""
-
-    joint: str
-    torque_limit: float = np.inf
-    mass: float = 0.0
-    mass_point: Array | None = None
-
-
-Drive = Motor | Servo | TorqueSource
 
 
 @dataclass(frozen=True)

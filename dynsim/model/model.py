@@ -87,7 +87,7 @@ class Model:
 
     def to_urdf(self) -> str:
         """The tree of bodies as URDF text."""
-        from dynsim.model.urdf import write_urdf
+        from dynsim.model.urdf_writer import write_urdf
 
         return write_urdf(self.robot)
 

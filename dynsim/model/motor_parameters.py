@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
 from dynsim.config import NonNegative, Positive, StrictConfig, Vector3, error_at
-from dynsim.model.description import Drive, Motor
+from dynsim.model.drives import Drive, Motor
 
 
 class DriveParameters(StrictConfig):

@@ -13,7 +13,8 @@ from typing import Any, Protocol
 from dynsim.config import StrictConfig
 from dynsim.errors import ModelError
 from dynsim.model.control import HandPath, JointControl
-from dynsim.model.description import Drive, Quadric, Robot
+from dynsim.model.description import Quadric, Robot
+from dynsim.model.drives import Drive
 from dynsim.model.model import Model
 from dynsim.model.snake import SnakeDescription, TaskSpaceController
 

@@ -67,6 +67,7 @@ def _joint(link: Link, kind: JointKind) -> Joint:
         labels=link.coordinates,
         lower=_limit(link.lower),
         upper=_limit(link.upper),
+        part_of=link.joint_of_rows or "",
     )
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.drive import servo as law
-from dynsim.model.description import Servo
+from dynsim.model.drives import Servo
 
 Array = NDArray[np.float64]
 

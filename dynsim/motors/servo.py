@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from dynsim.config import NonNegative, Positive, error_at
-from dynsim.model.description import Servo
+from dynsim.model.drives import Servo
 from dynsim.model.motor_parameters import DriveParameters
 from dynsim.model.protocols import BuildContext
 

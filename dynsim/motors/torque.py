@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from dynsim.config import Positive
-from dynsim.model.description import TorqueSource
+from dynsim.model.drives import TorqueSource
 from dynsim.model.motor_parameters import DriveParameters
 from dynsim.model.protocols import BuildContext
 

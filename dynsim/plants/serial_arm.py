@@ -9,7 +9,8 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from dynsim import families
 from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig, Vector3, error_at, unit_vector
-from dynsim.model.description import Drive, Inertia, Link, Robot, vector
+from dynsim.model.description import Inertia, Link, Robot, vector
+from dynsim.model.drives import Drive
 from dynsim.model.protocols import BuildContext
 
 ENGINE = "dynamics"

@@ -12,7 +12,8 @@ from pydantic import Field, model_validator
 from dynsim import families
 from dynsim.config import BodyPoint, NonNegative, StrictConfig, Vector3, error_at
 from dynsim.errors import ModelError
-from dynsim.model.description import Array, Drive, Robot
+from dynsim.model.description import Array, Robot
+from dynsim.model.drives import Drive
 from dynsim.model.protocols import BuildContext
 
 ENGINE = "dynamics"

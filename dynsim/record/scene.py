@@ -84,6 +84,7 @@ class Joint:
         Where the record has the joint's position: columns of a signal, one [rad or m], of a planar joint three [m, m,
         rad], of a ball joint the four of a quaternion w, x, y, z of any length; none of what is fixed.
     lower, upper : limits [rad or m], None for none
+    part_of : name of the joint with several rates that this is one of, "" for a joint of its own
     """
 
     __pydantic_config__: ClassVar[Any] = _CHECKS
@@ -96,6 +97,7 @@ class Joint:
     labels: tuple[str, ...]
     lower: float | None = None
     upper: float | None = None
+    part_of: str = ""
 
     def __post_init__(self) -> None:
         if len(self.labels) != {"planar": 3, "ball": 4, "fixed": 0}.get(self.kind, 1):

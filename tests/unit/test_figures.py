@@ -357,7 +357,7 @@ def test_a_free_body_hangs_on_nothing(tmp_path: Path):
         "plant: {type: urdf_arm, file: free.urdf, hand: {body: arm, point_m: [0.2, 0, 0]},"
         " initial_pose: {root: {position_m: [1, 2, 3]}}}\n"
     )
-    body, _ = posture._body(dynsim.simulate(load_scenario(tmp_path / "free.yaml")))
-    segments = body.segments(np.array([1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0, 0.0]))
-    drawn = [segment for segment in segments if np.ptp(segment, axis=0).any()]
+    body, _ = skeleton.skeleton(dynsim.simulate(load_scenario(tmp_path / "free.yaml")))
+    assert body is not None
+    drawn = [segment for segment in body.segments(0) if np.ptp(segment, axis=0).any()]
     np.testing.assert_allclose(drawn, [[[1, 2, 3], [1.5, 2, 3]], [[1.5, 2, 3], [1.7, 2, 3]]], atol=1e-15)

@@ -19,7 +19,11 @@ SHORT = {"duration_s": 0.3, "metrics.settle_s": 0.1}
 def test_a_run_logs_what_takes_long_and_its_warnings(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "dynsim")
     record = dynsim.simulate(load_scenario("elbow_comparison", overrides=SHORT))
-    assert {entry.name for entry in caplog.records} == {"dynsim.engine", "dynsim.engine.dynamics"}
+    assert {entry.name for entry in caplog.records} == {
+        "dynsim.engine",
+        "dynsim.engine.prepare",
+        "dynsim.engine.dynamics",
+    }
     told = [entry.getMessage() for entry in caplog.records if entry.levelno == logging.INFO]
     title = "elbow_comparison (two_elbows): "
     assert told[:2] == [f"{title}planning references over 0.3 s", told[1]]

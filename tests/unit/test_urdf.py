@@ -16,7 +16,8 @@ from dynsim.model.description import Inertia, Link, Robot
 from dynsim.model.joints.ball import ball, floating
 from dynsim.model.joints.planar import planar, rolling
 from dynsim.model.model import Model
-from dynsim.model.urdf import read_urdf, write_urdf
+from dynsim.model.urdf import read_urdf
+from dynsim.model.urdf_writer import write_urdf
 
 ARM = Path(__file__).parents[2] / "scenarios" / "robots" / "six_axis_arm.urdf"
 # A text round trip through roll, pitch, yaw costs a few roundings per joint; quantities here are of order 1 to 100.

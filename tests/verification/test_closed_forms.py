@@ -10,7 +10,8 @@ from scipy.special import ellipk
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate.run import DRIFT_MAX, METHODS
 from dynsim.kernels.state import FRICTION, OUT_FORCE
-from dynsim.model.description import Contact, Inertia, Link, Motor, Quadric, Robot
+from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
+from dynsim.model.drives import Motor
 
 G = 9.81
 X, Y, Z = np.eye(3)

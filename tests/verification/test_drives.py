@@ -14,7 +14,8 @@ from dynsim.kernels.drive.limit import clipped
 from dynsim.kernels.drive.servo import servo_command, servo_torque
 from dynsim.kernels.drive.torque import open_torque
 from dynsim.kernels.state import GEAR
-from dynsim.model.description import Drive, Inertia, Link, Motor, Robot, Servo, TorqueSource, vector
+from dynsim.model.description import Inertia, Link, Robot, vector
+from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
 from tests.random_robots import Bench, bench
 
 INERTIA = 0.3  # of the wheel and of what turns with it [kg m²]

@@ -10,7 +10,8 @@ from random_robots import Bench, bench
 
 from dynsim.kernels.integrate.run import DRIFT_MAX, FINISHED, METHODS, REJECTED, STATUS, STEPS, Run
 from dynsim.kernels.state import CONSTRAINT, ELECTRICAL, FRICTION, GEAR, JOINT, JOULE, OUT_GAP
-from dynsim.model.description import Contact, Inertia, Link, Motor, Quadric, Robot
+from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
+from dynsim.model.drives import Motor
 
 Y, Z = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 ADAPTIVE = ("rk43", "dopri5", "rodas4")

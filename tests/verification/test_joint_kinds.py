@@ -22,7 +22,8 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate.run import DRIFT_MAX, PROJECTIONS, REJECTED, STEPS
 from dynsim.kernels.state import CONSTRAINT, FRICTION, JOINT
 from dynsim.kernels.tree.joints import position_error
-from dynsim.model.description import Contact, Inertia, Link, Motor, Quadric, Robot
+from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
+from dynsim.model.drives import Motor
 from dynsim.model.joints.ball import ball, floating
 from dynsim.model.joints.planar import rolling
 from dynsim.model.model import Model

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from dynsim.hardware.bus.control_table import MX_106, ServoModel
 
 if TYPE_CHECKING:
-    from dynsim.model.description import Servo
+    from dynsim.model.drives import Servo
 
 Array = NDArray[np.float64]
 
@@ -85,7 +85,7 @@ class MotorLaw:
 
         K_m = V/ω_no_load and R = V K_m/τ_stall at 12 V, so that d = K_m²/R; a torque per volt is K_m/R.
         """
-        from dynsim.model.description import Servo
+        from dynsim.model.drives import Servo
 
         torque_constants = 12.0 / (self.stall_torque / self.damping)
         resistances = 12.0 * torque_constants / self.stall_torque

@@ -14,7 +14,8 @@ import numpy as np
 
 from dynsim.errors import ModelError
 from dynsim.model.control import JointControl
-from dynsim.model.description import Array, Contact, Inertia, Link, Motor
+from dynsim.model.description import Array, Contact, Inertia, Link
+from dynsim.model.drives import Motor
 from dynsim.model.model import Model
 from dynsim.scenario import Scenario, build, build_model
 
