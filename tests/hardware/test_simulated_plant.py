@@ -17,7 +17,8 @@ from dynsim.hardware.virtual.line import VirtualLine, line_for_map
 from dynsim.hardware.virtual.servo_plant import Drive, InertialLoad, MotorLaw
 from dynsim.hardware.virtual.servos import PHYSICS_STEP
 from dynsim.hardware.virtual.simulated_plant import CONTACT_STIFFNESS, TICK, SimulatedArm, push, simulated_arm
-from dynsim.model.description import Contact, Quadric, Servo
+from dynsim.model.description import Contact, Quadric
+from dynsim.model.drives import Servo
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 ARM = SCENARIOS / "elbow_comparison.yaml"

@@ -10,7 +10,7 @@ import pytest
 import dynsim
 from dynsim.errors import ModelError
 from dynsim.metrics import energy_residual
-from dynsim.model.description import Servo
+from dynsim.model.drives import Servo
 
 K_M, R, ARMATURE = 1.9, 2.3, 0.02
 
