@@ -101,7 +101,7 @@ def test_coulomb_friction_stops_a_servo_that_is_off():
     """I v̇ = −τ_c v/√(v² + v_s²): F(v₀) − F(v) = τ_c t/I with F = √(v² + v_s²) − v_s asinh(v_s/v)."""
     friction, smoothing, v0 = 0.5, 0.05, 2.0
     b = bench(wheel(servo(coulomb_friction=friction, coulomb_speed=smoothing)))
-    b.system.drives.input[0, ka.SERVO_MODE] = ka.OFF
+    b.system.drives.table[0, ka.SERVO_MODE] = ka.OFF
 
     def left(v: float) -> float:
         return np.hypot(v, smoothing) - smoothing * np.arcsinh(smoothing / v)
@@ -146,7 +146,7 @@ REGIMES: dict[str, tuple[Drive, float, float]] = {
 
 def law(motor: Drive, drives: ka.DriveArrays, q_ref: float, sampled: bool):
     """(q, v, i) → (torque, di/dt) from the source of the kernels; complex numbers pass."""
-    table, mode, held = drives.motor, drives.input[0, ka.SERVO_MODE], drives.input[0, ka.COMMAND]
+    table, mode, held = drives.motor, drives.table[0, ka.SERVO_MODE], drives.input[0, ka.COMMAND]
 
     def dc(q, v, i):
         asked = held if sampled else dc_command(table, 0, q_ref, 0.0, q, v)
@@ -170,7 +170,7 @@ def test_linear_blocks_equal_complex_step_derivatives(name, sampled):
     b = bench(wheel(motor), held=np.array([1.0]))
     drives = b.system.drives
     if name == "servo, off":
-        drives.input[0, ka.SERVO_MODE] = ka.OFF
+        drives.table[0, ka.SERVO_MODE] = ka.OFF
     drives.table[0, ka.SAMPLED] = sampled
     drives.input[0, ka.COMMAND] = 0.8
     current = 0.6
