@@ -22,7 +22,7 @@ from dynsim.model.protocols import (
     PlantModule,
     SurfaceModule,
 )
-from dynsim.motors import dc, wang_minami
+from dynsim.motors import dc, servo, torque, wang_minami
 from dynsim.plants import serial_arm, snake, urdf_arm
 from dynsim.surfaces import cylinder, plane, sphere
 
@@ -30,7 +30,7 @@ PLANTS: Sequence[PlantModule] = (serial_arm, snake, urdf_arm)
 CONTROLLERS: Sequence[ControllerModule] = (joint_pd, task_space)
 PATHS: Sequence[PathModule] = (circle, csv, line, waypoints)
 SURFACES: Sequence[SurfaceModule] = (cylinder, plane, sphere)
-MOTORS: Sequence[MotorModule] = (dc, wang_minami)
+MOTORS: Sequence[MotorModule] = (dc, servo, torque, wang_minami)
 
 FAMILIES: dict[str, Sequence[Member]] = {
     "plant": PLANTS,
