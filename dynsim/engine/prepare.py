@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time as clock
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -21,7 +21,7 @@ from dynsim.model.arrays import compile_contacts, compile_couplings, compile_dri
 from dynsim.model.clearance import poses
 from dynsim.model.control import JointControl
 from dynsim.model.description import Array, Contact, Load, Robot
-from dynsim.model.drives import Motor
+from dynsim.model.drives import Drive, Motor
 from dynsim.model.model import Model
 from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, build, build_model
@@ -52,6 +52,7 @@ def prepare(
     pushable: bool = False,
     times: np.ndarray | None = None,
     end: float | None = None,
+    motors: Sequence[Drive] | None = None,
 ) -> Prepared:
     """Compile a scenario; references that take long report to ``progress``.
 
@@ -60,6 +61,7 @@ def prepare(
     pushable : with an external wrench on every body, zero at first, after those of the scenario
     times : of samples [s]; default: those of the whole record
     end : of the run [s]; default: the scenario's duration
+    motors : instead of those of the plant
 
     Raises
     ------
@@ -69,6 +71,8 @@ def prepare(
         The record would be larger than ``record.size_limit_GB``, or the explicit method would need too many steps.
     """
     model = build_model(scenario)
+    if motors is not None:
+        model = Model(replace(build.robot(scenario), motors=tuple(motors)))
     robot, contacts = model.robot, build.contacts(scenario)
     build.check_start(scenario, model)
     loads = build.loads(scenario, robot)

@@ -29,8 +29,10 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import driver
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.dense import state_within
-from dynsim.kernels.state import block
+from dynsim.kernels.state import JOINT, block
 from dynsim.kernels.tree import loads as kl
+from dynsim.model.drives import Drive
+from dynsim.model.model import Model
 from dynsim.record import Record
 from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, require_scenario
@@ -42,6 +44,9 @@ Array = NDArray[np.float64]
 _PIECE = 100_000
 # End of a run without end [s]: far beyond any, and still a number to reckon with.
 _FAR = 1e300
+SERVO_MODES = {"position": ka.POSITION_MODE, "velocity": ka.VELOCITY_MODE, "off": ka.OFF}
+# Inertia of a joint whose brake is closed [kg m² or kg]: what no load moves.
+BRAKED = 1e12
 
 
 class Simulation:
@@ -60,6 +65,7 @@ class Simulation:
         last sample. The ledger starts at zero.
     duration : end of the run [s], ``math.inf`` for none; default: the scenario's. References hold where they end.
     trace : samples that are kept: all (None), the last so many, or none (0)
+    motors : instead of those of the plant, see :mod:`dynsim.model.description`; records still show the scenario's
 
     Raises
     ------
@@ -74,6 +80,7 @@ class Simulation:
         state: State | None = None,
         duration: float | None = None,
         trace: int | None = None,
+        motors: Sequence[Drive] | None = None,
     ) -> None:
         require_scenario(scenario)
         if scenario.engine != "dynamics":
@@ -84,7 +91,7 @@ class Simulation:
             raise ScenarioError(f"a simulation from t = {start:g} s cannot end at {end:g} s")
         self._scenario = scenario
         self._end = min(end, _FAR)
-        self._prepared = prepare(scenario, pushable=True, times=np.full(1, np.inf), end=self._end)
+        self._prepared = prepare(scenario, pushable=True, times=np.full(1, np.inf), end=self._end, motors=motors)
         self._time, self._wall = start, 0.0
         # Of a ring, and of a run that goes on from another, the ledger counts from the first sample on.
         self._relative = trace is not None or state is not None
@@ -92,6 +99,7 @@ class Simulation:
         self._guards: list[tuple[str, str, Callable[[Simulation], None] | None]] = []
         self._calls: list[Callable[[Simulation], None]] = []
         robot = self.robot
+        self._armature = self.model.armature
         self._joints = {link.joint: i for i, link in enumerate(robot.links)}
         self._motors = {motor.joint: a for a, motor in enumerate(robot.motors)}
         first = len(self._prepared.system.loads.table) - len(robot.links)
@@ -122,6 +130,11 @@ class Simulation:
     def robot(self) -> Any:
         """The robot, with the names of its joints, motors and bodies."""
         return self._prepared.model.robot
+
+    @property
+    def model(self) -> Model:
+        """Its rigid-body model; ``armature`` is very large where a brake is closed."""
+        return self._prepared.model
 
     @property
     def time(self) -> float:
@@ -239,7 +252,7 @@ class Simulation:
         values = _finite("reference", [position, rate])
         self._settle_now()
         drives, reference = self._prepared.system.drives, self._prepared.system.reference
-        reference.spline[a] = ka.REWRITTEN
+        reference.spline[a], drives.table[a, ka.SAMPLED] = ka.REWRITTEN, self._sampled[a]
         drives.input[a, [ka.LINE_START, ka.LINE_RATE, ka.LINE_SINCE]] = values[0], values[1], self._time
         self._restart()
 
@@ -250,6 +263,55 @@ class Simulation:
         self._settle_now()
         drives = self._prepared.system.drives
         drives.table[a, ka.SAMPLED], drives.input[a, ka.COMMAND] = ka.GIVEN, value
+        self._restart()
+
+    def set_mode(self, joint: str, mode: str) -> None:
+        """Let a servo follow positions (``"position"``) or rates (``"velocity"``) of its reference, or switch it off.
+
+        ``"off"`` opens its circuit, and the drag of its gear is left. It must have the gain of the mode.
+        """
+        a = self._motor(joint)
+        number = _index(SERVO_MODES, mode, "mode")
+        drives = self._prepared.system.drives
+        if drives.table[a, ka.DRIVE_KIND] != ka.POSITION_SERVO:
+            raise ModelError(f"the motor of {joint} is no servo and has no modes")
+        gain = {ka.POSITION_MODE: ka.K_P, ka.VELOCITY_MODE: ka.K_V}.get(number)
+        if gain is not None and drives.motor[a, gain] == 0.0:
+            raise ModelError(f"the servo of {joint} has no gain in mode {mode}")
+        self._settle_now()
+        drives.input[a, ka.SERVO_MODE] = number
+        self._restart()
+
+    def set_supply(self, voltage: float) -> None:
+        """From now on the supply of all motors limits their voltages to this one [V], whatever limits they had."""
+        value = _finite("supply", [voltage])[0]
+        if value < 0.0:
+            raise ModelError(f"a supply of {voltage:g} V; it must not be negative")
+        self._settle_now()
+        self._prepared.system.drives.motor[:, ka.U_MAX] = value
+        self._restart()
+
+    def set_brake(self, joint: str, closed: bool) -> None:
+        """Close or open the brake that every joint is thought to have: it holds the joint where it is.
+
+        A joint that turns is brought to rest by an impulse, Δv = −M⁻¹ e v_j / (eᵀ M⁻¹ e) with e the joint's unit vector
+        and M with rotors, and joint losses of the ledger take the kinetic energy, ½ v_j² / (eᵀ M⁻¹ e). Constraints are
+        met again by projection, which the ledger does not see.
+        """
+        j = _index(self._joints, joint, "joint")
+        run, model = self._prepared.run, self._prepared.model
+        armature = model.arrays.body[:, ka.ARMATURE]
+        if closed == (armature[j] == BRAKED):
+            return
+        self._settle_now()
+        if closed:
+            v = run.y[block(run.layout, "v")]
+            inertia = model.mass_matrix(run.y[block(run.layout, "q")]) + np.diag(model.armature)
+            response = np.linalg.solve(inertia, np.eye(model.n)[j])
+            run.y[run.layout.ledger + JOINT] += 0.5 * v[j] ** 2 / response[j]
+            v -= response * (v[j] / response[j])
+            v[j] = 0.0
+        armature[j] = BRAKED if closed else self._armature[j]
         self._restart()
 
     def release(self, joint: str) -> None:
@@ -344,6 +406,10 @@ class Simulation:
         for name in ("q", "v", "current"):
             part = block(run.layout, name)
             values = _finite(name, np.ravel(getattr(state, name)))
+            circuits = self._prepared.system.drives.table[:, ka.CIRCUIT] >= 0
+            if name == "current" and len(values) == len(circuits):
+                # Records have a current for each motor; those without a circuit follow from the rest.
+                values = values[circuits]
             if values.shape != run.y[part].shape:
                 raise ModelError(
                     f"the state has {len(values)} values of {name}, {model.robot.name} has {part.stop - part.start}"
@@ -468,7 +534,8 @@ class Simulation:
         found |= {f"workspace.{name}": array for name, array in prepared.workspace._asdict().items()}
         for owner, part in (("drives", system.drives), ("reference", system.reference), ("loads", system.loads)):
             found |= {f"{owner}.{name}": array for name, array in part._asdict().items()}
-        return found
+        # Closed brakes are seen there.
+        return found | {"model.body": system.model.body}
 
 
 def _index(choices: dict[str, int], name: str, what: str) -> int:

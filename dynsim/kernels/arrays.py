@@ -51,7 +51,7 @@ DC_MOTOR, POSITION_SERVO, OPEN_TORQUE = 0, 1, 2
 DRIVEN = 0  # index of the link whose joint the drive moves
 DRIVE_KIND = 1
 CIRCUIT = 2  # index of its current among those of the state, -1 for none
-SAMPLED = 3  # whether the command follows the state continuously, or is the held COMMAND: taken at ticks, or given by the caller
+SAMPLED = 3  # CONTINUOUS: the command follows the state; else it is held, taken AT_TICKS or GIVEN by the caller
 DRIVE_SIZE = 4
 CONTINUOUS, AT_TICKS, GIVEN = 0, 1, 2
 # DriveArrays.motor

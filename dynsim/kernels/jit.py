@@ -84,11 +84,11 @@ class _ToLink(JITCodeLibrary):
 class _ToCall(_ToLink):
     """The same for code that must not be merged into its callers."""
 
-    def _optimize_final_module(self) -> None:
-        for function in self._final_module.functions:
-            # What is to be merged into it stays so.
-            if not function.is_declaration and not any(b"alwaysinline" in found for found in function.attributes):
+    def add_llvm_module(self, ll_module: Any) -> None:
+        for function in ll_module.functions:  # its own; what it calls is linked in later, and may be merged into it
+            if not function.is_declaration:
                 function.add_function_attribute("noinline")
+        super().add_llvm_module(ll_module)
 
 
 class _PartCompiler(Compiler):
@@ -256,9 +256,11 @@ def internal_kernel(function: F) -> F:
 def apart_kernel(function: F) -> F:
     """As :func:`internal_kernel`, for what is rarely called from the right-hand side: a call, never merged.
 
-    Merged, it would take registers from what runs every time.
+    Merged, it would take registers from what runs every time. Where nothing is said, numba takes ``forceinline`` from
+    the caller.
     """
-    return numba.extending.register_jitable(pipeline_class=_ApartCompiler, **_OPTIONS, **_NO_ENTRY)(function)
+    options = {**_OPTIONS, **_NO_ENTRY, "forceinline": False}
+    return numba.extending.register_jitable(pipeline_class=_ApartCompiler, **options)(function)
 
 
 def inlined_kernel(function: F) -> F:

@@ -1,11 +1,6 @@
 """The coupled system of bodies, motors and contacts as one right-hand side dy/dt ([WM] eqs 28–35).
 
-State y, all in one vector:
-
-    q  (n,)   joint positions [rad or m]
-    v  (n,)   joint rates
-    i  (k,)   currents of the motors that have a circuit [A]
-    ledger (LEDGER_SIZE,), then impulse and slip of each contact (2 c,): see dynsim.kernels.ledger
+Positions, rates, currents and integrals lie in the state as dynsim.kernels.state says.
 """
 
 from __future__ import annotations

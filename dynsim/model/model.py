@@ -50,6 +50,7 @@ class Model:
         self.n, self.nq = len(robot.links), robot.nq
         self._workspace = ka.workspace(self.n, 0, 0)
         self._q = np.zeros(self.nq)
+        self._position_names = robot.position_names  # computed from every link's kind
         # forward_dynamics and mass_matrix are those of the bodies alone: no rotor inertia.
         self._bodies = self.arrays._replace(body=self.arrays.body.copy())
         self._bodies.body[:, ka.ARMATURE] = 0.0
@@ -201,7 +202,7 @@ class Model:
         sweep.newton_euler(self.arrays, self._workspace, 1.0, 0.0, 1.0)
 
     def _set(self, q: ArrayLike, v: ArrayLike | None = None) -> None:
-        self._q[:] = self._vector(q, "q", self.robot.position_names)
+        self._q[:] = self._vector(q, "q", self._position_names)
         joints.read_positions(self.arrays, self._q, 0, self._workspace)
         self._workspace.joints[:, ka.QD] = 0.0 if v is None else self._vector(v, "v", self.joint_names)
 

@@ -25,7 +25,6 @@ class Injection:
         self._script = script
         self._random = random.Random(script.seed)
         self._fired: set[int] = set()
-        self._jammed_at: dict[int, float] = {}
 
     @property
     def echo(self) -> bool:
@@ -39,7 +38,7 @@ class Injection:
             if not fault.active(servos.time - servos.torque_since):
                 continue
             if fault.kind == "stuck" and fault.id in servos.registers:
-                self._jam(servos.ids.index(fault.id), first=number not in self._fired)
+                servos.plant.stop(servos.ids.index(fault.id))
             if number in self._fired:
                 continue
             self._fired.add(number)
@@ -74,13 +73,6 @@ class Injection:
                 servos.trip_watchdog(index)
             case "backlash":
                 servos.play[index] = servos.plant.position[index]
-
-    def _jam(self, index: int, *, first: bool) -> None:
-        plant = self._servos.plant
-        if first:
-            self._jammed_at[index] = float(plant.position[index])
-        plant.position[index] = self._jammed_at[index]
-        plant.stop(index)
 
     def disturb(self, id_: int, frame: bytes, arrival: float) -> list[tuple[float, bytes]]:
         """What the scripted faults leave of a status packet."""

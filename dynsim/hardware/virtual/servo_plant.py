@@ -72,7 +72,7 @@ class MotorLaw:
         # Replaying on real servos imports this module and nothing of the simulation.
         from dynsim.model.servo import ServoBank
 
-        self._bank = ServoBank([self._servo(a, model) for a, model in enumerate(models)])
+        self._bank = ServoBank(self.servos([model.name for model in models], np.ones(len(models))))
 
     def torque(self, position: Array, velocity: Array, drive: Drive) -> Array:
         """Output torque [N·m], shape (N,), at an angle [rad] and speed [rad/s]."""
@@ -80,21 +80,28 @@ class MotorLaw:
         self._bank.supply(drive.voltage)
         return self._bank.torque(position, velocity)
 
-    def _servo(self, a: int, model: ServoModel) -> Servo:
-        """K_m = V/ω_no_load and R = V K_m/τ_stall at 12 V, so that d = K_m²/R; a torque per volt is K_m/R."""
+    def servos(self, joints: list[str], gears: Array) -> list[Servo]:
+        """The same servos on joints which they turn through gears, (N,) servo turns per joint turn.
+
+        K_m = V/ω_no_load and R = V K_m/τ_stall at 12 V, so that d = K_m²/R; a torque per volt is K_m/R.
+        """
         from dynsim.model.drives import Servo
 
-        torque_constant = 12.0 / model.no_load_speed
-        resistance = 12.0 * torque_constant / model.stall_torque
-        volts = resistance / torque_constant
-        return Servo(
-            joint=model.name,
-            torque_constant=torque_constant,
-            resistance=resistance,
-            k_p=float(self.stiffness[a]) * volts,
-            k_v=float(self.inertia[a]) / VELOCITY_TIME_CONSTANT * volts,
-            free_drag=FREE_DAMPING * float(self.damping[a]),
-        )
+        torque_constants = 12.0 / (self.stall_torque / self.damping)
+        resistances = 12.0 * torque_constants / self.stall_torque
+        volts = resistances / torque_constants
+        return [
+            Servo(
+                joint=joint,
+                torque_constant=float(torque_constants[a] * gear),
+                resistance=float(resistances[a]),
+                k_p=float(self.stiffness[a] * volts[a] * gear),
+                k_v=float(self.inertia[a] / VELOCITY_TIME_CONSTANT * volts[a] * gear),
+                armature=float(self.inertia[a] * gear**2),
+                free_drag=float(FREE_DAMPING * self.damping[a] * gear**2),
+            )
+            for a, (joint, gear) in enumerate(zip(joints, gears, strict=True))
+        ]
 
 
 class ServoPlant(Protocol):
@@ -104,18 +111,23 @@ class ServoPlant(Protocol):
     ----------
     position, velocity, torque : array, shape (N,)
         Servo angle [rad] (0 at tick 0), speed [rad/s], motor torque [N·m].
+    rests : bool
+        Nothing would move as long as all servos are off, so time may pass without steps.
     """
 
     position: Array
     velocity: Array
     torque: Array
 
+    @property
+    def rests(self) -> bool: ...
+
     def step(self, dt: float, drive: Drive) -> None:
         """Advance by ``dt`` [s]."""
         ...
 
     def stop(self, index: int) -> None:
-        """Bring one shaft to rest where it is (a jammed gear)."""
+        """Bring one shaft to rest where it is, and hold it there during the next step (a jammed gear)."""
         ...
 
 
@@ -127,11 +139,18 @@ class InertialLoad:
         self.position = np.array(position, dtype=np.float64)
         self.velocity = np.zeros(len(models))
         self.torque = np.zeros(len(models))
+        self._jammed = np.zeros(len(models), dtype=bool)
+
+    @property
+    def rests(self) -> bool:
+        return bool(np.abs(self.velocity).max(initial=0.0) < 1e-4)
 
     def step(self, dt: float, drive: Drive) -> None:
         self.torque = self.law.torque(self.position, self.velocity, drive)
-        self.velocity += dt * self.torque / self.law.inertia
+        self.velocity = np.where(self._jammed, 0.0, self.velocity + dt * self.torque / self.law.inertia)
         self.position += dt * self.velocity
+        self._jammed[:] = False
 
     def stop(self, index: int) -> None:
         self.velocity[index] = 0.0
+        self._jammed[index] = True

@@ -157,7 +157,7 @@ class VirtualServos:
 
     def step(self, until: float) -> None:
         """One physics step, or when nothing moves all that fit in before ``until`` [s]."""
-        if not self._drive.enabled.any() and np.abs(self.plant.velocity).max(initial=0.0) < 1e-4:
+        if not self._drive.enabled.any() and self.plant.rests:
             # Nothing moves: one long step for the temperatures, so that waiting for pings costs nothing.
             steps = int((until - self.time) / PHYSICS_STEP)
             self.time += steps * PHYSICS_STEP

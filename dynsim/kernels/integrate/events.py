@@ -9,7 +9,7 @@ followed by such a step anyway.
 
 from __future__ import annotations
 
-from dynsim.kernels.arrays import CURRENT, FORCE, GAP, QD, VOLTAGE, Q, Workspace
+from dynsim.kernels.arrays import CURRENT, GAP, NORMAL_FORCE, QD, VOLTAGE, Q, Workspace
 from dynsim.kernels.integrate.run import (
     AT_HIGH,
     AT_LOW,
@@ -43,7 +43,7 @@ from dynsim.kernels.integrate.run import (
 from dynsim.kernels.jit import inlined_kernel, internal_kernel
 from dynsim.kernels.tree.points import point_position
 
-# Kinds of guards. A new one is a number here, a branch in ``guard`` and a name in dynsim.engine.events.
+# Kinds of guards. A new one is a number here, a branch in ``guard`` and a name in GUARDS of dynsim.engine.stepped.
 JOINT_POSITION, JOINT_RATE, MOTOR_CURRENT, MOTOR_VOLTAGE, CONTACT_FORCE, CONTACT_GAP = 0, 1, 2, 3, 4, 5
 HAND_X, HAND_Y, HAND_Z = 6, 7, 8
 
@@ -64,7 +64,7 @@ def guard(ws: Workspace, run: Run, e):
     elif kind == MOTOR_VOLTAGE:
         value = ws.motors[k, VOLTAGE]
     elif kind == CONTACT_FORCE:
-        value = ws.contacts[k, FORCE]
+        value = ws.contacts[k, NORMAL_FORCE]
     elif kind == CONTACT_GAP:
         value = ws.contacts[k, GAP]
     else:

@@ -89,7 +89,9 @@ class Run(NamedTuple):
     def outputs(self, name: str) -> np.ndarray:
         """Columns of the samples' outputs by their name; those of contacts are (T, c, OUTPUTS_PER_CONTACT)."""
         found = self.output[: self.count[SAMPLE], block(self.columns, name)]
-        return found.reshape(len(found), -1, OUTPUTS_PER_CONTACT) if name == "contact" else found
+        if name == "contact":
+            return found.reshape(len(found), found.shape[1] // OUTPUTS_PER_CONTACT, OUTPUTS_PER_CONTACT)
+        return found
 
 
 def new_run(

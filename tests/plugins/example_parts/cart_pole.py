@@ -8,7 +8,8 @@ import numpy as np
 
 from dynsim import families
 from dynsim.config import Positive, StrictConfig
-from dynsim.model.description import Inertia, Link, Motor, Robot, vector
+from dynsim.model.description import Inertia, Link, Robot, vector
+from dynsim.model.drives import Drive
 from dynsim.model.protocols import BuildContext
 
 ENGINE = "dynamics"
@@ -44,7 +45,7 @@ def build(config: Config, context: BuildContext) -> Robot:
     return Robot(
         name="cart_pole",
         links=links,
-        motors=(families.build("motor", config.motor, context.at_joint("slide"), Motor),),
+        motors=(families.build("motor", config.motor, context.at_joint("slide"), Drive),),
         hand=("pole", vector(0, 0, config.pole_m)),
         q0=np.array([0.0, np.deg2rad(config.initial_deg)]),
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from dynsim.config import NonNegative, Positive
-from dynsim.model.description import Motor
+from dynsim.model.drives import Motor
 from dynsim.model.motor_parameters import MotorParameters
 from dynsim.model.protocols import BuildContext
 

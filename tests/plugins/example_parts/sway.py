@@ -29,7 +29,7 @@ class Config(StrictConfig):
 def build(config: Config, context: BuildContext) -> JointControl:
     """q_d = q_0 + a (1 − cos ωt)/2 for every joint with an amplitude."""
     robot = context.model.robot
-    initial = dict(zip(robot.joint_names, robot.initial, strict=True))
+    initial = dict(zip(robot.joint_names, robot.initial[list(robot.position_index)], strict=True))
     fade = np.linspace(1.0, 0.1, len(robot.motors))
 
     def motion(joint: str, t: NDArray[np.float64]) -> NDArray[np.float64]:

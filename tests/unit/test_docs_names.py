@@ -1,0 +1,152 @@
+"""What docs/architecture.md and docs/extending.md name exists: files, what is said to be in them, and dotted names."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+import dynsim
+from dynsim.families import FAMILIES
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "dynsim"
+PAGES = ("architecture.md", "extending.md")
+# What the reader of an example makes.
+MADE = {"dynsim/surfaces/ellipsoid.py", "dynsim/model/joints/screw.py"}
+
+
+def page(name: str) -> str:
+    return (ROOT / "docs" / name).read_text(encoding="utf-8")
+
+
+def prose(text: str) -> str:
+    """A page without its blocks of code."""
+    return re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def file_named(path: str) -> Path | None:
+    """The file or folder of that name, from the root of the repository or in the package."""
+    return next((base / path for base in (ROOT, PACKAGE) if (base / path).exists()), None)
+
+
+def paths(text: str) -> set[str]:
+    return set(re.findall(r"`((?:\w+/)*\w+\.py|(?:\w+/)+)`", prose(text))) - MADE
+
+
+def claims(text: str) -> set[tuple[str, str]]:
+    """(file, name) where a page says that a name is in a file: `a.py` (`f`), `a.py`, `f`, and `f`, `g` in `a.py`."""
+    text, file = " ".join(prose(text).split()), r"`((?:\w+/)*\w+\.py)`"
+    found = re.findall(rf"{file} \(([^()]*)\)", text) + re.findall(rf"{file}, (`\w+`)", text)
+    backwards = re.findall(rf"((?:`\w+`(?:, | and )?)+) (?:in|of) {file}", text)
+    found += [(path, names) for names, path in backwards]
+    return {(path, name) for path, names in found for name in re.findall(r"`(\w+)`", names)}
+
+
+@cache
+def defined(path: Path) -> frozenset[str]:
+    """Functions, classes, methods, and what modules and classes assign."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            found |= {name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)}
+    return frozenset(found)
+
+
+def dotted(text: str) -> set[str]:
+    """Dotted names that begin with dynsim, one of its modules or a name that it exports; no groups of entry points."""
+    roots = {"dynsim", *dynsim.__all__, *(path.stem for path in PACKAGE.iterdir())}
+    found = re.findall(r"`([A-Za-z_]\w*(?:\.\w+)+)(?:\([^`]*\))?`", prose(text))
+    groups = {family.group for family in FAMILIES.values()}
+    return {name for name in found if name.split(".")[0] in roots and not name.endswith(".py")} - groups
+
+
+def resolves(name: str) -> bool:
+    """Whether a dotted name, with or without ``dynsim.``, is a module or an attribute of one."""
+    parts = name.removeprefix("dynsim.").split(".")
+    thing, place = dynsim, "dynsim"
+    for part in parts:
+        place = f"{place}.{part}"
+        if hasattr(thing, part):
+            thing = getattr(thing, part)
+            continue
+        try:
+            thing = importlib.import_module(place)
+        except ImportError:
+            return False
+    return True
+
+
+def missing(text: str) -> list[str]:
+    """What a page names and there is not."""
+    found = [path for path in paths(text) if file_named(path) is None]
+    for path, name in claims(text):
+        file = file_named(path)
+        if file is not None and name not in defined(file):
+            found.append(f"{path}: {name}")
+    return sorted(found + [name for name in dotted(text) if not resolves(name)])
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_what_a_page_names_exists(name: str) -> None:
+    text = page(name)
+    # The patterns find what they are for.
+    assert len(paths(text)) > 15
+    assert len(claims(text)) > 12
+    assert missing(text) == []
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        "`kernels/nowhere.py`",
+        "`nowhere/`",
+        "`kernels/system.py` (`derivative`, `nothing`)",
+        "(`kernels/system.py`, `nothing`)",
+        "`derivative` and\n`nothing` in `kernels/system.py`",
+        "`families.nothing`",
+        "`dynsim.Simulation.nothing`",
+        "`Simulation.nothing(0.1)`",
+    ],
+)
+def test_a_name_that_is_not_there_is_found(wrong: str) -> None:
+    assert len(missing(f"See {wrong}.")) == 1
+
+
+def test_examples_make_what_is_not_there() -> None:
+    assert all(f"`{path}`" in page("extending.md") for path in MADE)
+    assert [path for path in MADE if file_named(path) is not None] == []
+
+
+def house() -> dict[str, str]:
+    """The tree of the page: room or file → what is said of it."""
+    block = page("architecture.md").split("## The house")[1].split("```text\n")[1].split("```")[0]
+    lines: dict[str, str] = {}
+    for line in block.splitlines():
+        if line.startswith(" "):
+            last = next(reversed(lines))
+            lines[last] += f" {line.strip()}"
+        else:
+            room, said = line.split(maxsplit=1)
+            lines[room] = said
+    return lines
+
+
+def test_the_house_has_every_room_and_every_file_that_it_names() -> None:
+    rooms = {
+        f"{path.relative_to(PACKAGE)}/"
+        for path in PACKAGE.rglob("*")
+        if path.is_dir() and any(path.glob("*.py")) and path.name != "shipped_scenarios"
+    }
+    files = {path.name for path in PACKAGE.glob("*.py") if not path.name.startswith("_")}
+    assert set(house()) == rooms | files
+    for room, said in house().items():
+        for name in re.findall(r"\w+\.py", said):
+            assert (PACKAGE / room / name).is_file(), f"{room}: {name}"

@@ -1,0 +1,323 @@
+"""The stepper: the same numbers as a run in one go, rewritten references and wrenches, events, ticks, snapshots."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.special import ellipkinc
+
+import dynsim
+from dynsim.errors import ModelError, ScenarioError
+
+G = 9.81
+PENDULUM = """
+duration_s: 5.0
+plant:
+  type: serial_arm
+  chain: [{axis: y, mass_kg: 0.3, length_m: 1.0, radius_m: 0.001, initial_deg: 120}]
+integrator: {method: METHOD, rtol: 1.0e-12, atol: 1.0e-14}
+record: {rate_hz: 20}
+"""
+WHEEL = """
+duration_s: 0.5
+plant:
+  type: serial_arm
+  gravity_m_s2: [0, 0, 0]
+  chain: [{axis: z, mass_kg: 0.8, length_m: 0.3, motor: {type: wang_minami}}]
+controller:
+  type: joint_pd
+  k_p_V_per_rad: 20
+  k_d_V_s_per_rad: 1
+  joints: {joint_1: {times_s: [0, 0.4], angles_deg: [0, 60]}}SAMPLED
+integrator: {rtol: 1.0e-11, atol: 1.0e-13}
+record: {rate_hz: 200}
+metrics: {settle_s: 0}
+"""
+
+
+def read(folder: Path, text: str) -> dynsim.Scenario:
+    path = folder / "case.yaml"
+    path.write_text(text)
+    return dynsim.load_scenario(path)
+
+
+def arm(**overrides: object) -> dynsim.Scenario:
+    return dynsim.load_scenario("elbow_comparison", "two_elbows", {"duration_s": 2.0, **overrides})
+
+
+def same(a: dynsim.Record, b: dynsim.Record) -> bool:
+    return set(a) == set(b) and all(a[name].tobytes() == b[name].tobytes() for name in a)
+
+
+@pytest.mark.parametrize("overrides", [{}, {"controller.sample_time_s": 2e-4, "duration_s": 0.3}])
+def test_a_run_in_pieces_is_that_in_one_go_bit_for_bit(overrides):
+    scenario = arm(**overrides)
+    whole, simulation = dynsim.simulate(scenario), dynsim.Simulation(scenario)
+    rng, t = np.random.default_rng(0), 0.0
+    while not simulation.finished:
+        t += rng.uniform(0.0, 0.1)
+        state = simulation.advance(t)
+        assert state.time == min(t, scenario.duration_s)
+    record = simulation.record()
+    assert same(whole, record)
+    assert record.complete
+    wall = ("integration_wall_s", "real_time_factor")
+    assert [whole.summary[k] == record.summary[k] for k in whole.summary if k not in wall].count(False) == 0
+
+
+def test_a_state_between_the_steps_is_that_of_the_record():
+    scenario = arm()
+    whole, simulation = dynsim.simulate(scenario), dynsim.Simulation(scenario)
+    for k in (7, 100, 263):
+        state = simulation.advance(whole.time[k])
+        # The samples are projected onto the contacts as well.
+        np.testing.assert_allclose(state.q, whole["q"][k], rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(state.current, whole["current"][k], rtol=0.0, atol=1e-6)
+
+
+def test_a_snapshot_has_the_same_future():
+    simulation = dynsim.Simulation(arm())
+    simulation.advance(0.7123)
+    snapshot = simulation.snapshot()
+    simulation.set_wrench("link_10", force=[0.0, 0.0, 20.0])
+    simulation.set_reference("joint_1", 0.4)
+    other = simulation.advance(1.5)
+    simulation.restore(snapshot)
+    first = simulation.advance(2.0)
+    untouched = dynsim.simulate(arm())
+    assert np.abs(other.q - untouched["q"][300]).max() > 1e-3
+    np.testing.assert_array_equal(first.q, untouched["q"][-1])
+    assert same(simulation.record(), untouched) or set(simulation.record()) - set(untouched) == {"work_loads"}
+    with pytest.raises(ScenarioError, match="another simulation"):
+        dynsim.Simulation(dynsim.load_scenario("single_pendulum")).restore(snapshot)
+
+
+def test_going_on_from_a_record_is_going_on():
+    scenario = arm()
+    whole = dynsim.simulate(scenario)
+    state = dynsim.State.of(whole, 200)
+    assert state.time == 1.0
+    simulation = dynsim.Simulation(scenario, state=state)
+    state = simulation.advance(2.0)
+    # Another sequence of steps, at the default tolerance.
+    np.testing.assert_allclose(state.q, whole["q"][-1], rtol=0.0, atol=1e-6)
+    record = simulation.record()
+    assert record.time[0] == 1.0
+    assert record.summary["energy_residual_relative"] < 1e-6
+    spent = whole["energy_electrical"][-1] - whole["energy_electrical"][200]
+    assert record["energy_electrical"][-1] == pytest.approx(spent, rel=1e-5)
+
+
+def test_a_run_without_end_keeps_the_last_samples_and_holds_its_references():
+    scenario = arm(duration_s=1.0)
+    simulation = dynsim.Simulation(scenario, duration=math.inf, trace=100)
+    at_end = simulation.advance(1.0).q
+    simulation.advance(4.0)
+    record = simulation.record()
+    assert len(record) == 100
+    assert record.time[-1] >= 3.99
+    assert not record.complete
+    assert record.summary["energy_residual_relative"] < 1e-6
+    # The hand has followed its path, and now stands.
+    assert np.abs(record["v"][-1]).max() < 1e-2
+    assert np.abs(record["q"][-1] - at_end).max() < 0.2
+    none = dynsim.Simulation(scenario, trace=0)
+    none.advance(1.0)
+    assert len(none.record()) == 0
+
+
+def test_a_wrench_that_is_set_is_the_load_of_a_scenario(tmp_path):
+    push = "{type: constant, body: link_1, point_m: [0, 0, 0.2], force_N: [0.5, 0.1, -0.2], torque_N_m: [0, 0.1, 0]}"
+    load = f"\nloads: {{push: {push}}}\n"
+    text = PENDULUM.replace("METHOD", "dopri5")
+    record = dynsim.simulate(read(tmp_path, text + load))
+    simulation = dynsim.Simulation(read(tmp_path, text))
+    simulation.set_wrench("link_1", force=[0.5, 0.1, -0.2], torque=[0.0, 0.1, 0.0], point=[0.0, 0.0, 0.2])
+    simulation.advance(5.0)
+    stepped = simulation.record()
+    np.testing.assert_allclose(stepped["q"], record["q"], rtol=0.0, atol=1e-10)
+    assert record.summary["loads_work_J"]["push"] == pytest.approx(stepped.summary["loads_work_J"]["link_1"], abs=1e-10)
+    stored = sum(record[name][-1] - record[name][0] for name in ("energy_kinetic", "energy_potential"))
+    assert record["work_loads"][-1, 0] == pytest.approx(stored, abs=1e-9)
+    assert abs(record["work_loads"][-1, 0]) > 0.01
+    free = dynsim.simulate(read(tmp_path, text))
+    assert np.abs(free["q"] - record["q"]).max() > 0.1
+
+
+def test_a_rewritten_reference_takes_hold_at_once_and_can_be_given_back(tmp_path):
+    scenario = read(tmp_path, WHEEL.replace("SAMPLED", ""))
+    simulation, whole = dynsim.Simulation(scenario), dynsim.simulate(scenario)
+    before = simulation.advance(0.2).q[0]
+    simulation.set_reference("joint_1", 2.0, rate=-1.0)
+    assert simulation.state.q[0] == pytest.approx(before, abs=1e-9)
+    away = simulation.advance(0.3).q[0]
+    assert away > whole["q"][60, 0] + 0.2
+    simulation.release("joint_1")
+    simulation.advance(0.5)
+    record = simulation.record()
+    assert record["q"][:40].tobytes() == whole["q"][:40].tobytes()
+    u = np.interp(0.25, record.time, record["voltage"][:, 0])
+    k = 50
+    assert u == pytest.approx(20.0 * (2.0 - 0.05 - record["q"][k, 0]) + 1.0 * (-1.0 - record["v"][k, 0]), abs=1e-6)
+    simulation = dynsim.Simulation(scenario)
+    simulation.set_command("joint_1", 3.0)
+    simulation.advance(0.5)
+    np.testing.assert_array_equal(simulation.record()["voltage"], 3.0)
+
+
+def test_a_sampled_controller_is_its_closed_form(tmp_path):
+    """x_{k+1} = e^{AT} x_k + ∫ e^{As} ds B u_k for x = (q, v, i), u_k = k_p (q_d − q_k) + k_d (v_d − v_k), 200 Hz."""
+    scenario = read(tmp_path, WHEEL.replace("SAMPLED", "\n  sample_time_s: 0.005"))
+    record = dynsim.simulate(scenario)
+    model = dynsim.build_model(scenario)
+    motor = model.robot.motors[0]
+    k = motor.gear_ratio
+    K, R, L = motor.torque_constant * k, motor.resistance, motor.inductance
+    inertia = model.mass_matrix(model.robot.initial)[0, 0] + motor.rotor_inertia * k**2
+    loss = model.damping[0]
+    A = np.array([[0.0, 1.0, 0.0], [0.0, -loss / inertia, K / inertia], [0.0, -K / L, -R / L]])
+    block = np.zeros((4, 4))
+    block[:3, :3], block[2, 3] = A, 1.0 / L
+    step = expm(0.005 * block)
+    control = dynsim.scenario.build.controller(scenario, model)
+    coefficients, spacing = control.reference.coefficients[:, 0], control.reference.grid[1]
+    x, found = np.array([model.robot.initial[0], 0.0, 0.0]), []
+    for sample in range(101):
+        found.append(x)
+        t = 0.005 * sample
+        segment = min(int(t / spacing), len(coefficients) - 1)
+        c = np.polynomial.Polynomial(coefficients[segment])
+        u = 20.0 * (c(t - segment * spacing) - x[0]) + 1.0 * (c.deriv()(t - segment * spacing) - x[1])
+        x = step[:3, :3] @ x + step[:3, 3] * u
+    found = np.array(found)
+    signals = np.stack([record["q"][:, 0], record["v"][:, 0], record["current"][:, 0]], axis=1)
+    # A hundred tolerances of the integration, per size of the state.
+    assert np.abs(signals - found).max() < 1e-9 * np.abs(found).max()
+    continuous = dynsim.simulate(read(tmp_path, WHEEL.replace("SAMPLED", "")))
+    assert np.abs(continuous["q"][:, 0] - found[:, 0]).max() > 1e-4
+
+    # The same law in Python, at the ticks of the caller.
+    def law(simulation: dynsim.Simulation) -> None:
+        t, state = simulation.time, simulation.state
+        segment = min(int(t / spacing), len(coefficients) - 1)
+        c = np.polynomial.Polynomial(coefficients[segment])
+        error, rate = c(t - segment * spacing) - state.q[0], c.deriv()(t - segment * spacing) - state.v[0]
+        simulation.set_command("joint_1", 20.0 * error + 1.0 * rate)
+
+    simulation = dynsim.Simulation(read(tmp_path, WHEEL.replace("SAMPLED", "")))
+    simulation.every(0.005, law)
+    simulation.advance(0.5)
+    np.testing.assert_allclose(simulation.record()["q"][:, 0], found[:, 0], rtol=0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("method", ["rk43", "dopri5"])
+def test_the_time_of_an_event_is_that_of_the_closed_form(tmp_path, method):
+    """A rod let go at θ0 = 120° from hanging down is at θ after √(I/(m g l)) F(…): incomplete elliptic integrals."""
+    scenario = read(tmp_path, PENDULUM.replace("METHOD", method))
+    model = dynsim.build_model(scenario)
+    inertia, lever = model.mass_matrix([0.0])[0, 0], 0.3 * 0.5
+    omega = np.sqrt(G * lever / inertia)
+    # The chain stands upright at q = 0 and hangs at q = π.
+    modulus = math.sin(0.5 * (math.pi - math.radians(120.0)))
+
+    def time_of(angle: float) -> float:
+        """Down from rest to an angle on the way to the bottom, both from hanging [rad]."""
+        phi = math.asin(min(math.sin(0.5 * angle) / modulus, 1.0))
+        quarter, part = ellipkinc(0.5 * math.pi, modulus**2), ellipkinc(phi, modulus**2)
+        return float((quarter - part) / omega)
+
+    simulation = dynsim.Simulation(scenario)
+    for level in (2.5, math.pi):
+        simulation.watch("joint_position", "joint_1", level)
+    simulation.watch("joint_rate", "joint_1", 0.0, direction=-1)
+    simulation.advance(1.2)
+    found = {(one.kind, k): one.time for k, one in enumerate(simulation.happened)}
+    times = [one.time for one in simulation.happened]
+    assert times == sorted(times)
+    assert times[0] == pytest.approx(time_of(math.pi - 2.5), abs=1e-10)
+    assert times[1] == pytest.approx(time_of(0.0), abs=1e-10)
+    # At rest on the other side after half a period, where the rate falls through zero; then down again.
+    turned = next(time for (kind, _), time in found.items() if kind == "joint_rate")
+    assert turned == pytest.approx(2.0 * time_of(0.0), abs=1e-9)
+    record = simulation.record()
+    assert [event.time for event in record.events] == times
+
+
+def test_events_have_a_direction_call_back_and_stop(tmp_path):
+    scenario = read(tmp_path, PENDULUM.replace("METHOD", "rk43"))
+    simulation, seen = dynsim.Simulation(scenario), []
+    simulation.watch("joint_position", "joint_1", math.pi, direction=-1, call=lambda s: seen.append(s.state))
+    simulation.advance(5.0)
+    assert len(seen) >= 2
+    assert all(abs(state.q[0] - math.pi) < 1e-10 and state.v[0] < 0.0 for state in seen)
+    simulation = dynsim.Simulation(scenario)
+    simulation.watch("joint_position", "joint_1", math.pi, stop=True)
+    state = simulation.advance(5.0)
+    assert simulation.finished
+    assert state.time < 1.0
+    assert state.q[0] == pytest.approx(math.pi, abs=1e-10)
+    assert simulation.record().time[-1] <= state.time
+    assert simulation.advance(5.0).time == state.time
+
+
+def test_an_event_of_a_contact_is_where_its_force_passes_zero():
+    scenario = arm(duration_s=1.0)
+    simulation, forces = dynsim.Simulation(scenario), []
+    simulation.watch("contact_force", "elbow_4", 0.0, direction=-1)
+    simulation.advance(1.0)
+    (event, *_) = simulation.happened
+    record = dynsim.simulate(arm(duration_s=1.0, **{"record.rate_hz": 20000}))
+    force = record["contact_normal_force"][:, 0]
+    k = int(np.flatnonzero((force[1:] < 0.0) & (force[:-1] >= 0.0))[0])
+    assert record.time[k] <= event.time <= record.time[k + 1]
+    forces.append(event)
+
+
+def test_ticks_are_where_they_should_be_and_do_not_add_up_roundings():
+    simulation, times = dynsim.Simulation(dynsim.load_scenario("single_pendulum")), []
+    simulation.every(0.1, lambda s: times.append(s.time))
+    simulation.every(0.3, lambda s: times.append(-s.time), first=0.2)
+    simulation.advance(10.0)
+    ours = [t for t in times if t >= 0.0]
+    # Ticks at one time are one tick, so the last digit may be that of the other.
+    np.testing.assert_allclose(ours, 0.1 * np.arange(len(ours)), rtol=4e-16)
+    assert len(ours) == 101
+    others = [-t for t in times if t < 0.0]
+    np.testing.assert_allclose(others, 0.2 + 0.3 * np.arange(len(others)), rtol=4e-16)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda s: s.advance(-1.0), ScenarioError, "cannot advance"),
+        (lambda s: s.advance(math.nan), ScenarioError, "cannot advance"),
+        (lambda s: s.set_reference("joint_x", 0.0), ModelError, "no motor 'joint_x'; those are: joint_1"),
+        (lambda s: s.set_reference("joint_1", math.inf), ModelError, "must be finite"),
+        (lambda s: s.set_wrench("hand"), ModelError, "no body 'hand'"),
+        (lambda s: s.set_wrench("link_1", force=[1.0]), ModelError, "three components"),
+        (lambda s: s.watch("angle", "joint_1"), ModelError, "no event 'angle'; events: joint_position"),
+        (lambda s: s.watch("contact_gap", "toe"), ModelError, "no contact 'toe'; those are: elbow_4, elbow_7"),
+        (lambda s: s.every(0.0, print), ScenarioError, "period > 0"),
+    ],
+)
+def test_wrong_calls_say_what_is_wrong(call, error, words):
+    simulation = dynsim.Simulation(arm(duration_s=0.1))
+    with pytest.raises(error, match=words):
+        call(simulation)
+
+
+def test_states_of_other_robots_and_off_the_floor_are_refused():
+    record = dynsim.simulate(dynsim.load_scenario("single_pendulum", overrides={"duration_s": 0.1}))
+    with pytest.raises(ModelError, match="1 values of q"):
+        dynsim.Simulation(arm(), state=dynsim.State.of(record))
+    simulation = dynsim.Simulation(arm())
+    state = simulation.state
+    lifted = dynsim.State(0.0, state.q + 0.1, state.v, state.current)
+    with pytest.raises(ModelError, match="from surface 'floor'"):
+        dynsim.Simulation(arm(), state=lifted)
+    with pytest.raises(ModelError, match="kinematic"):
+        dynsim.Simulation(dynsim.load_scenario("snake_circle"))
