@@ -20,7 +20,8 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels import system
 from dynsim.kernels.constraint.rows import set_modes
 from dynsim.kernels.jit import integers, reals
-from dynsim.model.description import Contact, Coupling, Inertia, Link, Load, Motor, Quadric, Robot, Servo, TorqueSource
+from dynsim.model.description import Contact, Coupling, Inertia, Link, Load, Quadric, Robot
+from dynsim.model.drives import Motor, Servo, TorqueSource
 
 N = 4
 
