@@ -37,8 +37,8 @@ def servo(**keys: float | bool) -> Servo:
 def turned(b: Bench, times: np.ndarray, q: float = 0.0, v: float = 0.0, method: str = "dopri5"):
     """Angle and rate at times, (T,) each."""
     y = b.state(np.array([q]), np.array([v]))
-    sample = b.simulate(y, times, method, rtol=1e-11, atol=1e-12).sample
-    return sample[:, b.system.layout.q], sample[:, b.system.layout.v]
+    run = b.simulate(y, times, method, rtol=1e-11, atol=1e-12)
+    return run.states("q")[:, 0], run.states("v")[:, 0]
 
 
 @pytest.mark.parametrize("method", ["dopri5", "rk43", "rodas4"])
@@ -108,13 +108,13 @@ def test_coulomb_friction_stops_a_servo_that_is_off():
 
     times = np.array([0.0, 0.5, 1.0, 1.2, 1.25, 4.0])
     run = b.simulate(b.state(np.zeros(1), np.array([v0])), times, rtol=1e-11, atol=1e-12)
-    v = run.sample[:, b.system.layout.v]
+    v = run.states("v")[:, 0]
     for t, rate in zip(times[:-1], v[:-1], strict=True):
         exact = brentq(lambda x, t=t: left(v0) - left(x) - friction * t / INERTIA, 1e-9, v0 + 1.0, xtol=1e-14)
         assert rate == pytest.approx(exact, abs=1e-8)
     assert abs(v[-1]) < 1e-8
     # What the wheel has lost, the gear has taken.
-    gear = run.sample[:, b.system.layout.ledger + GEAR]
+    gear = run.states("ledger")[:, GEAR]
     np.testing.assert_allclose(gear, 0.5 * INERTIA * (v0**2 - v**2), rtol=0, atol=1e-8)
 
 
