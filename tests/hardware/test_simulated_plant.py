@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import dynsim
+from dynsim.hardware.bus.control_table import MX_28, MX_106, RAD_PER_TICK
 from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.servo_map import load_servo_map
 from dynsim.hardware.virtual.line import VirtualLine, line_for_map
-from dynsim.hardware.virtual.servo_plant import MotorLaw
-from dynsim.hardware.virtual.simulated_plant import CONTACT_STIFFNESS, SimulatedArm, simulated_arm
+from dynsim.hardware.virtual.servo_plant import Drive, InertialLoad, MotorLaw
+from dynsim.hardware.virtual.servos import PHYSICS_STEP
+from dynsim.hardware.virtual.simulated_plant import CONTACT_STIFFNESS, TICK, SimulatedArm, push, simulated_arm
+from dynsim.model.description import Contact, Quadric, Servo
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
+ARM = SCENARIOS / "elbow_comparison.yaml"
+ARM_MAP = SCENARIOS / "hardware" / "arm.yaml"
+
+
+def asked(count: int, *, enabled: bool, at: np.ndarray, voltage: float = 12.0) -> Drive:
+    """All servos in position mode, off or at their set points."""
+    return Drive(np.full(count, enabled), np.ones(count, dtype=bool), np.array(at), np.zeros(count), voltage)
 
 
 def armed(variant: str, posture: dict[str, float] | None = None) -> tuple[VirtualLine, SimulatedArm, dynsim.Model]:
@@ -62,6 +74,9 @@ def test_braced_elbows_rest_on_the_floor_and_unload_the_servos() -> None:
 
 def test_a_limp_arm_falls_and_stays_above_the_floor_with_its_elbows() -> None:
     line, plant, model = armed("two_elbows")
+    # It is quite still when the torque goes: nothing but gravity sets it in motion.
+    line.advance(line.time + 3.0)
+    assert np.abs(plant.velocity).max() < 1e-4
     before = model.point_position(*model.robot.hand, plant.joint_positions)[2]
     for id_ in line.servos.ids:
         line.servos.write(id_, 64, b"\0")
@@ -70,6 +85,178 @@ def test_a_limp_arm_falls_and_stays_above_the_floor_with_its_elbows() -> None:
     elbows = [model.point_position(body, np.zeros(3), plant.joint_positions)[2] for body in ("link_4", "link_7")]
     assert min(elbows) > -3 * 10 * 0.1 * 9.81 / CONTACT_STIFFNESS - 1e-3
     assert model.point_position(*model.robot.hand, plant.joint_positions)[2] < before - 0.1
+
+
+def test_it_is_the_simulation_of_the_same_arm_with_position_servos() -> None:
+    """Under moving set points and a failing supply: to 1e-9 with the same steps, else to its tolerances."""
+    arm = simulated_arm(str(ARM), "no_elbow", load_servo_map(ARM_MAP), {})
+    scenario = dynsim.load_scenario(ARM, variant="no_elbow")
+    bare = replace(scenario, config=scenario.config.model_copy(update={"controller": None}))
+    # Data sheet at 12 V; all zeros are in the middle of the turn.
+    damping = MX_106.stall_torque / MX_106.no_load_speed
+    per_volt, stiffness = MX_106.stall_torque / 12.0, 41.0
+    motors = [
+        Servo(
+            joint=f"joint_{k}",
+            torque_constant=12.0 / MX_106.no_load_speed,
+            resistance=12.0 * (12.0 / MX_106.no_load_speed) / MX_106.stall_torque,
+            k_p=stiffness / per_volt,
+            armature=damping**2 / (4.0 * stiffness),
+        )
+        for k in range(1, 11)
+    ]
+    tight = bare.config.integrator.model_copy(update={"method": "dopri5", "rtol": 1e-12, "atol": 1e-12})
+    exact = replace(bare, config=bare.config.model_copy(update={"integrator": tight}))
+    same, best = (dynsim.Simulation(one, duration=10.0, trace=0, motors=motors) for one in (bare, exact))
+    same.every(TICK, lambda simulation: None)
+    shafts = arm.position.copy()
+    drive = asked(10, enabled=True, at=shafts)
+    for k in range(1, 301):
+        swing = 0.4 * (np.sin(0.02 * k + np.arange(10)) - np.sin(np.arange(10)))
+        drive.set_position, drive.voltage = shafts + swing, 12.0 - 0.02 * k
+        arm.step(PHYSICS_STEP, drive)
+        for simulation in (same, best):
+            simulation.set_supply(drive.voltage)
+            for j in range(10):
+                target = drive.set_position[j] - 2048 * RAD_PER_TICK
+                simulation.set_reference(f"joint_{j + 1}", target)
+            simulation.advance(PHYSICS_STEP * k)
+        np.testing.assert_allclose(arm.joint_positions, same.state.q, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(arm.joint_positions, best.state.q, rtol=0, atol=5e-6)
+        np.testing.assert_allclose(arm.velocity, same.state.v, rtol=0, atol=1e-7)
+    assert np.abs(arm.joint_positions - shafts + 2048 * RAD_PER_TICK).max() > 0.3
+    # What the servos report is their torque at this very state.
+    torque = MotorLaw([MX_106] * 10).torque(arm.position, arm.velocity, drive)
+    np.testing.assert_allclose(arm.torque, torque, rtol=0, atol=1e-12)
+    assert np.abs(torque).max() > 1.0
+
+
+@pytest.mark.parametrize("mode", ["position", "velocity", "off"])
+def test_a_gear_and_a_reversed_servo_move_the_joint_as_its_equation_says(mode, tmp_path) -> None:
+    """(I + J n²) q̈ = ± n τ(± n q + θ_0, ± n q̇) − g(q), by another integrator."""
+    file = tmp_path / "map.yaml"
+    text = ARM_MAP.read_text().split("kinds:")[0].replace("robot: arm", "robot: pendulum")
+    file.write_text(
+        text
+        + f"""
+kinds:
+  swing:
+    model: MX-28
+    mode: {"velocity" if mode == "velocity" else "position"}
+    gear: 2.0
+    follows: {{position: q, velocity: v}}
+    limits: {{position_deg: [-40, 40], velocity: 4.0, torque: 6.0}}
+    following_error: 0.25
+servos:
+  joint_1: {{kind: swing, id: 1, sign: -1, zero_tick: 2048}}
+"""
+    )
+    scale, zero, volts, start = -2.0, 2048 * RAD_PER_TICK, 9.0, np.deg2rad(20.0)
+    plant = simulated_arm(str(SCENARIOS / "single_pendulum.yaml"), None, load_servo_map(file), {"joint_1": start})
+    assert plant.position == pytest.approx([zero + scale * start])
+    law = MotorLaw([MX_28])
+    model = dynsim.build_model(dynsim.load_scenario(SCENARIOS / "single_pendulum.yaml"))
+    drive = Drive(np.array([mode != "off"]), np.array([mode != "velocity"]), np.array([zero]), np.array([1.5]), volts)
+
+    def rates(_: float, y: np.ndarray) -> list[float]:
+        q, v = y[:1], y[1:]
+        torque = scale * law.torque(zero + scale * q, scale * v, drive) - model.bias_forces(q, v)
+        return [y[1], (torque / (model.mass_matrix(q)[0] + law.inertia * scale**2))[0]]
+
+    # Off from the first step on it would stay on its stand.
+    plant.step(PHYSICS_STEP, asked(1, enabled=True, at=plant.position))
+    first = [plant.joint_positions[0], plant.velocity[0] / scale]
+    for _ in range(150):
+        plant.step(PHYSICS_STEP, drive)
+    found = solve_ivp(rates, (0.0, 150 * PHYSICS_STEP), first, rtol=1e-10, atol=1e-12).y[:, -1]
+    assert plant.joint_positions[0] == pytest.approx(found[0], abs=1e-6)
+    assert plant.velocity[0] == pytest.approx(scale * found[1], abs=1e-5)
+    assert abs(found[0] - first[0]) > 0.05
+
+
+def test_joints_stay_on_their_stand_until_they_are_switched_on() -> None:
+    arm = simulated_arm(str(ARM), "no_elbow", load_servo_map(ARM_MAP), {})
+    start, drive = arm.position.copy(), asked(10, enabled=False, at=arm.position)
+    drive.enabled[6] = True
+    drive.set_position[6] += 0.3
+    for _ in range(500):
+        arm.step(PHYSICS_STEP, drive)
+    assert arm.position[6] - start[6] == pytest.approx(0.3, abs=0.1)
+    others = np.arange(10) != 6
+    np.testing.assert_allclose(arm.position[others], start[others], rtol=0, atol=1e-9)
+    # Once on, a joint that goes limp falls.
+    drive.enabled[1] = True
+    arm.step(PHYSICS_STEP, drive)
+    drive.enabled[1] = False
+    for _ in range(100):
+        arm.step(PHYSICS_STEP, drive)
+    assert arm.position[1] - start[1] > 0.05
+
+
+@pytest.mark.parametrize("kind", ["arm", "own inertia"])
+def test_a_jam_holds_one_shaft_for_a_step_and_then_lets_go(kind: str) -> None:
+    arm = simulated_arm(str(ARM), "no_elbow", load_servo_map(ARM_MAP), {})
+    plant = arm if kind == "arm" else InertialLoad([MX_106] * 10, arm.position)
+    drive = asked(10, enabled=True, at=plant.position + 0.2)
+    for _ in range(20):
+        plant.step(PHYSICS_STEP, drive)
+    at = plant.position.copy()
+    assert abs(plant.velocity[4]) > 0.1
+    for _ in range(20):
+        plant.stop(4)
+        assert abs(plant.velocity[4]) < 1e-12
+        plant.step(PHYSICS_STEP, drive)
+        assert plant.position[4] == pytest.approx(at[4], abs=1e-12)
+    assert np.abs(plant.position - at)[5:].min() > 1e-3
+    for _ in range(10):
+        plant.step(PHYSICS_STEP, drive)
+    assert abs(plant.position[4] - at[4]) > 1e-3
+
+
+def test_a_dropped_arm_bounces_off_the_floor_without_gaining_energy() -> None:
+    """Kinetic, potential and the springs' energy only fall, up to what forces held for a tick may give back."""
+    arm = simulated_arm(str(ARM), "two_elbows", load_servo_map(ARM_MAP), {"joint_2": 0.3})
+    model = dynsim.build_model(dynsim.load_scenario(ARM, variant="two_elbows"))
+    rotors = MotorLaw([MX_106] * 10).inertia
+    arm.step(PHYSICS_STEP, asked(10, enabled=True, at=arm.position))
+    limp, energies, lowest = asked(10, enabled=False, at=arm.position), [], 0.0
+    for _ in range(1000):
+        arm.step(PHYSICS_STEP, limp)
+        q, v = arm.joint_positions, arm.velocity  # no gears, no reversed servos
+        heights = np.array([model.point_position(body, np.zeros(3), q)[2] for body in ("link_4", "link_7")])
+        lowest = min(lowest, heights.min())
+        springs = 0.5 * CONTACT_STIFFNESS * (np.minimum(heights, 0.0) ** 2).sum()
+        energies.append(model.kinetic_energy(q, v) + 0.5 * rotors @ v**2 + model.potential_energy(q) + springs)
+    assert energies[0] - energies[-1] > 1.0
+    assert np.diff(energies).max() < 1e-3 * (energies[0] - energies[-1])
+    assert -0.02 < lowest < 0.0
+
+
+def test_a_surface_pushes_and_takes_no_more_speed_than_there_is() -> None:
+    """Along the normal and across it, for points of 10 g to 100 kg, fast and slow, deep and at the surface."""
+    rng = np.random.default_rng(3)
+    floor = Quadric(np.zeros((3, 3)), np.array([0.0, 0.0, 2.0]), 0.0)
+    contact = Contact("tip", "link", np.zeros(3), floor, friction=0.8, slip_smoothing=1e-3)
+    for _ in range(500):
+        gap, velocity = -(10 ** rng.uniform(-9, -2)), rng.normal(size=3) * 10 ** rng.uniform(-4, 1)
+        root = rng.normal(size=(3, 3))
+        mobility = root @ root.T * 10 ** rng.uniform(-2, 1.0)
+        force = push(contact, np.array([0.3, 0.2, gap]), gap, velocity, mobility)
+        across = np.hypot(*force[:2])
+        assert force[2] >= 0.0
+        assert across <= contact.friction * force[2] * (1.0 + 1e-12)
+        assert force[:2] @ velocity[:2] <= 0.0
+        # What friction alone, acting on the mobility across, would change in a tick.
+        largest = np.linalg.eigvalsh(mobility[:2, :2]).max()
+        assert TICK * largest * across <= np.hypot(*velocity[:2]) * (1.0 + 1e-12)
+        if velocity[2] < 0.0:
+            damped = force[2] + CONTACT_STIFFNESS * gap
+            assert 0.0 < TICK * mobility[2, 2] * damped < -velocity[2] * (1.0 + 1e-6)
+        # At rest the spring alone carries.
+        rest = push(contact, np.array([0.3, 0.2, gap]), gap, np.zeros(3), mobility)
+        np.testing.assert_allclose(rest, [0.0, 0.0, -CONTACT_STIFFNESS * gap], rtol=1e-12, atol=1e-15)
+    away = push(contact, np.zeros(3), -1e-6, np.array([0.0, 0.0, 5.0]), np.eye(3))
+    np.testing.assert_array_equal(away, np.zeros(3))
 
 
 def test_a_map_of_other_joints_is_refused(rig) -> None:

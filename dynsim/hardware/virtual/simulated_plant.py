@@ -2,12 +2,13 @@
 
 A :class:`dynsim.Simulation` moves it: the scenario's robot, with servos of the map's models for motors. Unlike the
 scenario's bilateral law a floor does not pull here. Contact points are pushed by a stiff spring and damper with
-regularised Coulomb friction, as wrenches on their bodies that are held for a tick. With G = J M⁻¹ Jᵀ, the mobility of
-a point [1/kg], a tick Δt is stable while its damping c takes no more speed away than there is,
+regularised Coulomb friction, as wrenches on their bodies that are held for a tick Δt. With G = J M⁻¹ Jᵀ, the mobility
+of a point [1/kg], damping c and friction b take no more speed away in a tick than there is,
 
     f_n = max(0, −k g − c/(1 + Δt c nᵀG n) ġ)        f_t = −b/(1 + Δt b |G|) v_t,   b = μ f_n/√(v_t² + v_s²)
 
-and while k Δt² nᵀG n < 2, which takes a point lighter than 10 g to break. A load at rest is carried by k alone.
+Ticks are stable while k Δt/2 is less than what is left of c, which holds for points of more than 11 g. A load at rest
+is carried by k alone.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 TICK = 1e-3
-"""For so long a contact's force is held [s]; a whole part of the servos' physics step."""
+"""For so long a contact's force is held [s]; the servos' physics step is a multiple of it."""
 CONTACT_STIFFNESS = 2e4
 """[N/m]: the 50 N of a braced elbow sink it by 2.5 mm."""
 CONTACT_DAMPING = 200.0  # N·s/m
