@@ -279,7 +279,7 @@ class Simulation:
         if gain is not None and drives.motor[a, gain] == 0.0:
             raise ModelError(f"the servo of {joint} has no gain in mode {mode}")
         self._settle_now()
-        drives.input[a, ka.SERVO_MODE] = number
+        drives.table[a, ka.SERVO_MODE] = number
         self._restart()
 
     def set_supply(self, voltage: float) -> None:

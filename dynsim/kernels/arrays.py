@@ -52,7 +52,8 @@ DRIVEN = 0  # index of the link whose joint the drive moves
 DRIVE_KIND = 1
 CIRCUIT = 2  # index of its current among those of the state, -1 for none
 SAMPLED = 3  # CONTINUOUS: the command follows the state; else it is held, taken AT_TICKS or GIVEN by the caller
-DRIVE_SIZE = 4
+SERVO_MODE = 4  # POSITION_MODE, VELOCITY_MODE or OFF; may be written between steps
+DRIVE_SIZE = 5
 CONTINUOUS, AT_TICKS, GIVEN = 0, 1, 2
 # DriveArrays.motor
 K_M = 0  # K k [N m/A = V s/rad]
@@ -74,8 +75,7 @@ COMMAND = 0  # command of a sampled drive between ticks [V; N m for an open torq
 LINE_START = 1  # a rewritten reference: its value [rad; N m for an open torque]
 LINE_RATE = 2  # [rad/s; N m/s]
 LINE_SINCE = 3  # time at which it has that value [s]
-SERVO_MODE = 4
-INPUT_SIZE = 5
+INPUT_SIZE = 4
 # Modes of a servo
 POSITION_MODE, VELOCITY_MODE, OFF = 0, 1, 2
 # ReferenceArrays.spline, instead of a row of coefficients: held, and the line of DriveArrays.input

@@ -133,7 +133,7 @@ def compile_drives(
             motor[a] = _dc_motor(m, k_p[a], k_d[a])
         elif isinstance(m, Servo):
             table[a, ka.DRIVE_KIND] = ka.POSITION_SERVO
-            given[a, ka.SERVO_MODE] = ka.VELOCITY_MODE if m.velocity_mode else ka.POSITION_MODE
+            table[a, ka.SERVO_MODE] = ka.VELOCITY_MODE if m.velocity_mode else ka.POSITION_MODE
             motor[a] = servo_row(m)
         else:
             table[a, ka.DRIVE_KIND] = ka.OPEN_TORQUE

@@ -151,7 +151,7 @@ def test_written_and_read_again_it_is_the_same(known: Known, tmp_path: Path) -> 
 
 # What is refused of the package, and why.
 REFUSED = {
-    "alex_psyonic_hands.urdf": "principal moments of inertia",
+    "alex_psyonic_hands.urdf": "joint 'Left_index_q2' mimics joint 'index_q1', which is not in the file",
     "quadrotor_base.urdf": "no moving joint",
     "iris_simple.urdf": "no moving joint",
     "ur3.urdf": "has no <link>",

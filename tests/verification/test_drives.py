@@ -37,8 +37,8 @@ def servo(**keys: float | bool) -> Servo:
 def turned(b: Bench, times: np.ndarray, q: float = 0.0, v: float = 0.0, method: str = "dopri5"):
     """Angle and rate at times, (T,) each."""
     y = b.state(np.array([q]), np.array([v]))
-    sample = b.simulate(y, times, method, rtol=1e-11, atol=1e-12).sample
-    return sample[:, b.system.layout.q], sample[:, b.system.layout.v]
+    run = b.simulate(y, times, method, rtol=1e-11, atol=1e-12)
+    return run.states("q")[:, 0], run.states("v")[:, 0]
 
 
 @pytest.mark.parametrize("method", ["dopri5", "rk43", "rodas4"])
@@ -101,20 +101,20 @@ def test_coulomb_friction_stops_a_servo_that_is_off():
     """I v̇ = −τ_c v/√(v² + v_s²): F(v₀) − F(v) = τ_c t/I with F = √(v² + v_s²) − v_s asinh(v_s/v)."""
     friction, smoothing, v0 = 0.5, 0.05, 2.0
     b = bench(wheel(servo(coulomb_friction=friction, coulomb_speed=smoothing)))
-    b.system.drives.input[0, ka.SERVO_MODE] = ka.OFF
+    b.system.drives.table[0, ka.SERVO_MODE] = ka.OFF
 
     def left(v: float) -> float:
         return np.hypot(v, smoothing) - smoothing * np.arcsinh(smoothing / v)
 
     times = np.array([0.0, 0.5, 1.0, 1.2, 1.25, 4.0])
     run = b.simulate(b.state(np.zeros(1), np.array([v0])), times, rtol=1e-11, atol=1e-12)
-    v = run.sample[:, b.system.layout.v]
+    v = run.states("v")[:, 0]
     for t, rate in zip(times[:-1], v[:-1], strict=True):
         exact = brentq(lambda x, t=t: left(v0) - left(x) - friction * t / INERTIA, 1e-9, v0 + 1.0, xtol=1e-14)
         assert rate == pytest.approx(exact, abs=1e-8)
     assert abs(v[-1]) < 1e-8
     # What the wheel has lost, the gear has taken.
-    gear = run.sample[:, b.system.layout.ledger + GEAR]
+    gear = run.states("ledger")[:, GEAR]
     np.testing.assert_allclose(gear, 0.5 * INERTIA * (v0**2 - v**2), rtol=0, atol=1e-8)
 
 
@@ -146,7 +146,7 @@ REGIMES: dict[str, tuple[Drive, float, float]] = {
 
 def law(motor: Drive, drives: ka.DriveArrays, q_ref: float, sampled: bool):
     """(q, v, i) → (torque, di/dt) from the source of the kernels; complex numbers pass."""
-    table, mode, held = drives.motor, drives.input[0, ka.SERVO_MODE], drives.input[0, ka.COMMAND]
+    table, mode, held = drives.motor, drives.table[0, ka.SERVO_MODE], drives.input[0, ka.COMMAND]
 
     def dc(q, v, i):
         asked = held if sampled else dc_command(table, 0, q_ref, 0.0, q, v)
@@ -170,7 +170,7 @@ def test_linear_blocks_equal_complex_step_derivatives(name, sampled):
     b = bench(wheel(motor), held=np.array([1.0]))
     drives = b.system.drives
     if name == "servo, off":
-        drives.input[0, ka.SERVO_MODE] = ka.OFF
+        drives.table[0, ka.SERVO_MODE] = ka.OFF
     drives.table[0, ka.SAMPLED] = sampled
     drives.input[0, ka.COMMAND] = 0.8
     current = 0.6

@@ -20,11 +20,12 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels import system
 from dynsim.kernels.constraint.rows import set_modes
 from dynsim.kernels.jit import integers, reals
-from dynsim.model.description import Contact, Coupling, Inertia, Link, Load, Motor, Quadric, Robot, Servo, TorqueSource
+from dynsim.model.description import Contact, Coupling, Inertia, Link, Load, Quadric, Robot
+from dynsim.model.drives import Motor, Servo, TorqueSource
 
 N = 4
 
-LIMIT, MODE_OF_SERVO = "limit of voltage, current or torque", "mode of a servo, written between steps"
+LIMIT = "limit of voltage, current or torque"
 PIVOT, DEPENDENT = "choice of a pivot", "dependent rows"
 CLOSED_FORM = "guard of a closed form; elimination else"
 SEGMENT = "segment of a reference or load"
@@ -68,12 +69,6 @@ TIME = {
     Place("drive/law.py", "evaluate_reference", "segment = min(max(int(x / spacing), 0), c.shape[0] - 1)"): SEGMENT,
     Place("tree/loads.py", "segment_start", "if t < loads.data[first] or t > end:"): SEGMENT,
     Place("tree/loads.py", "segment_start", "if loads.data[first + middle * SEGMENT_SIZE] <= t:"): SEGMENT,
-}
-# Reals of the model that are compared with integers: kinds that lie in a table of reals, the same for all lanes.
-KINDS = {
-    Place("drive/servo.py", "servo_circuit", "if mode == OFF:"): MODE_OF_SERVO,
-    Place("drive/servo.py", "servo_command", "if mode == VELOCITY_MODE:"): MODE_OF_SERVO,
-    Place("drive/servo.py", "servo_drag", "if mode == OFF:"): MODE_OF_SERVO,
 }
 # Lines that no state comes to, as far as is known; they do not branch.
 AGAIN = "M* begins with the signs that the articulated solve has found: only rounding could turn one"
@@ -252,7 +247,7 @@ def servos() -> Case:
         Servo("joint_5", k_p=40.0, voltage_limit=0.5, **common),
     )
     b = bench(replace(robot, motors=motors), held=rng.normal(size=6))
-    b.system.drives.input[2, ka.SERVO_MODE] = ka.OFF
+    b.system.drives.table[2, ka.SERVO_MODE] = ka.OFF
     b.system.drives.table[5, ka.SAMPLED] = 1
     b.system.drives.input[5, ka.COMMAND] = 0.7
     return of(rng, b, 1.0)
@@ -380,8 +375,8 @@ def test_lanes_that_disagree_are_seen(name, places):
 
 
 def test_integers_are_apart_from_reals(notes):
-    """Tables of integers hold nothing else, tables of reals no integers; but for KINDS nothing takes a real for one."""
-    assert union(note.kinds for note in notes.values()) == {*KINDS}
+    """Tables of integers hold nothing else, tables of reals no integers, and nothing takes a real for one."""
+    assert union(note.kinds for note in notes.values()) == set()
     found = set()
     for make in CASES.values():
         case = make()

@@ -86,7 +86,7 @@ def command(drives: DriveArrays, ws: Workspace, a):
     if kind == DC_MOTOR:
         return dc_command(motor, a, q_ref, v_ref, ws.joints[i, Q], ws.joints[i, QD])
     if kind == POSITION_SERVO:
-        return servo_command(motor, a, drives.input[a, SERVO_MODE], q_ref, v_ref, ws.joints[i, Q], ws.joints[i, QD])
+        return servo_command(motor, a, drives.table[a, SERVO_MODE], q_ref, v_ref, ws.joints[i, Q], ws.joints[i, QD])
     return q_ref
 
 
@@ -122,7 +122,7 @@ def drive(drives: DriveArrays, reference: ReferenceArrays, t, y, layout: StateLa
         if kind == DC_MOTOR:
             drive_dc(drives, asked, y[layout.current + table[a, CIRCUIT]], ws, a)
         elif kind == POSITION_SERVO:
-            mode = drives.input[a, SERVO_MODE]
+            mode = drives.table[a, SERVO_MODE]
             motors[a, VOLTAGE], motors[a, CURRENT] = servo_circuit(motor, a, mode, asked, v)
             motors[a, DRAG] = servo_drag(motor, a, mode, v)
             joints[j, APPLIED] += motor[a, K_M] * motors[a, CURRENT] - motors[a, DRAG]
@@ -146,7 +146,7 @@ def drive_block(drives: DriveArrays, ws: Workspace, a, block):
 
     After ``derivative``: references, voltages and states are those in the workspace.
     """
-    motors, motor, kind, mode = ws.motors, drives.motor, drives.table[a, DRIVE_KIND], drives.input[a, SERVO_MODE]
+    motors, motor, kind, mode = ws.motors, drives.motor, drives.table[a, DRIVE_KIND], drives.table[a, SERVO_MODE]
     sampled = drives.table[a, SAMPLED] != 0
     for s in range(block.shape[0]):
         block[s] = 0.0
