@@ -212,6 +212,9 @@ def _warnings(
     for a, motor in enumerate(robot.motors):
         for what, signal, limit, unit in _limits_of(motor):
             saturated = np.abs(record[signal][:, a]) >= limit
+            if isinstance(motor, Servo):
+                # Without a current its voltage is the back-EMF.
+                saturated &= record["current"][:, a] != 0.0
             if saturated.any():
                 found.append(
                     f"{motor.joint}: {what} at its limit of {limit:g} {unit} for "

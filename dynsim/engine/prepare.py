@@ -77,7 +77,7 @@ def prepare(
     build.check_start(scenario, model)
     loads = build.loads(scenario, robot)
     if pushable:
-        loads = [*loads, *(_push(link.name) for link in robot.links)]
+        loads = [*loads, *(_push(body) for body in robot.bodies)]
     n, na, c = model.n, len(robot.motors), len(contacts)
     layout, columns = state_layout(model.nq, n, robot.circuits, c, len(loads)), output_layout(n, na, c)
     if times is None:

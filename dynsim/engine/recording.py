@@ -46,7 +46,7 @@ def make_record(scenario: Scenario, prepared: Prepared, wall: float, *, pushed: 
         record.add("target_position", target, "m", labels=("x", "y", "z"))
     for integral, (name, text) in zip(run.states("ledger").T, metrics.INTEGRALS.items(), strict=True):
         record.add(name, integral, "J", description=text)
-    others = 0 if pushed is None else len(robot.links)
+    others = 0 if pushed is None else len(robot.bodies)
     shown = [*range(len(prepared.loads) - others), *(pushed or ())]
     if shown:
         labels = tuple(prepared.loads[k].name for k in shown)

@@ -102,8 +102,8 @@ class Simulation:
         self._armature = self.model.armature
         self._joints = {link.joint: i for i, link in enumerate(robot.links)}
         self._motors = {motor.joint: a for a, motor in enumerate(robot.motors)}
-        first = len(self._prepared.system.loads.table) - len(robot.links)
-        self._pushes = {link.name: first + i for i, link in enumerate(robot.links)}
+        first = len(self._prepared.loads) - len(robot.bodies)
+        self._pushes = {body: first + k for k, body in enumerate(robot.bodies)}
         self._splines = self._prepared.system.reference.spline.copy()
         self._frozen = not math.isfinite(self._prepared.control.end)
         self._pushed: set[int] = set()
@@ -173,7 +173,7 @@ class Simulation:
         SimulationStopped
             Divergence or no solution; ``error.record`` holds the trace until then.
         """
-        if not until >= self._time:
+        if not isinstance(until, (int, float, np.number)) or not until >= self._time:
             raise ScenarioError(f"cannot advance to t = {shown(until)} s: the simulation is at {self._time:g} s")
         until = min(float(until), self._end)
         last = self._prepared.control.end
@@ -380,8 +380,15 @@ class Simulation:
 
         ``complete`` is True for a run that has come to its end.
         """
+        if self._prepared.run.count[ki.PENDING] == 1 and not self.finished:
+            # Samples up to the present time lie in the step that is kept back: end it here, and take that back.
+            before = self.snapshot()
+            self._settle_now()
+            times, states, outputs = self._trace.rows(self._prepared.run)
+            self.restore(before)
+        else:
+            times, states, outputs = self._trace.rows(self._prepared.run)
         run = self._prepared.run
-        times, states, outputs = self._trace.rows(run)
         if len(times) and self._relative:
             states = states.copy()
             integrals = slice(run.layout.tracked, run.layout.size)
@@ -433,6 +440,9 @@ class Simulation:
             run = self._prepared.run
             if run.count[ki.STARTED] == 1 and run.clock[ki.TIME] >= until:
                 break
+        if not self.finished and run.clock[ki.TIME] >= self._end:
+            # A tick at the end came before the end itself.
+            driver.advance(self._prepared.system, self._prepared.workspace, run, 0)
         self._time = min(until, self._end) if not self.finished else float(run.clock[ki.TIME])
 
     def _piece(self, until: float) -> None:
@@ -545,7 +555,10 @@ def _index(choices: dict[str, int], name: str, what: str) -> int:
 
 
 def _finite(what: str, values: Sequence[Any] | Array) -> Array:
-    array = np.asarray(values, dtype=np.float64)
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ModelError(f"{what} {shown(values)} must be numbers") from None
     if not np.isfinite(array).all():
         raise ModelError(f"{what} {array.tolist()} must be finite")
     return array

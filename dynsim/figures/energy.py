@@ -95,22 +95,25 @@ def ledger(record: Record) -> Figure | None:
         return None
     terms = {name: record[name] - record[name][:1] for name in TERMS}
     supplied = record["energy_electrical"] + record["work_constraint"]
+    source = "electrical energy"
+    if "work_loads" in record:
+        supplied, source = supplied + record["work_loads"].sum(axis=1), "electrical energy and work of loads"
     turnover = energy_turnover(record)
     dominant = bool(np.abs(terms["heat_joule"]).max() > DOMINANT * turnover > 0.0)
     figure = style.new_figure(6.6 if dominant else 5.0, style.title(record, "energy ledger"))
     panels = figure.subplots(2 + dominant, 1, sharex=True, height_ratios=[*[2.0] * (1 + dominant), 1.0])
-    _stack(panels[0], record.time, terms, supplied)
+    _stack(panels[0], record.time, terms, supplied, source)
     panels[0].set_ylabel("energy since start [J]")
     if dominant:
         rest = {name: values for name, values in terms.items() if name != "heat_joule"}
-        _stack(panels[1], record.time, rest, supplied - terms["heat_joule"])
+        _stack(panels[1], record.time, rest, supplied - terms["heat_joule"], source)
         panels[1].set_ylabel("the same without\nJoule heat [J]")
     _residual(panels[-1], record, turnover)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 
 
-def _stack(axes: Axes, time: Array, terms: Mapping[str, Array], supplied: Array) -> None:
+def _stack(axes: Axes, time: Array, terms: Mapping[str, Array], supplied: Array, source: str) -> None:
     """Positive terms upward and negative ones downward from zero: both together make up what was supplied."""
     kept = np.unique(np.linspace(0, len(time) - 1, min(len(time), style.LINE_POINTS // 4)).astype(int))
     largest = max(float(np.abs(values[-1])) for values in (*terms.values(), supplied))
@@ -127,7 +130,7 @@ def _stack(axes: Axes, time: Array, terms: Mapping[str, Array], supplied: Array)
                 time[kept], base, base + part, color=colour, linewidth=0.3, label=None if label in known else label
             )
             base = base + part
-    label = f"sum = electrical energy: {_joules(supplied, largest)}" if np.any(supplied) else "electrical energy: none"
+    label = f"sum = {source}: {_joules(supplied, largest)}" if np.any(supplied) else f"{source}: none"
     axes.plot(time[kept], supplied[kept], color=style.BLACK, linewidth=1.1, label=label)
 
 

@@ -331,6 +331,12 @@ class Robot:
     couplings: tuple[Coupling, ...] = ()
 
     @property
+    def bodies(self) -> tuple[str, ...]:
+        """Names of the links that carry a body, in their order."""
+        carriers = self.carriers
+        return tuple(link.name for link in self.links if link.name not in carriers)
+
+    @property
     def carriers(self) -> frozenset[str]:
         """Names of the links that carry no body: of a joint with several rows all but the last."""
         joint = {link.name: link.joint_of_rows or link.joint for link in self.links}

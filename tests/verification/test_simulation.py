@@ -112,6 +112,54 @@ def test_going_on_from_a_record_is_going_on():
     assert record["energy_electrical"][-1] == pytest.approx(spent, rel=1e-5)
 
 
+def test_a_record_reaches_up_to_the_present_time_and_leaves_the_future_alone():
+    scenario = arm()
+    whole, simulation = dynsim.simulate(scenario), dynsim.Simulation(scenario)
+    simulation.advance(1.0)
+    record = simulation.record()
+    np.testing.assert_array_equal(record.time, whole.time[:201])
+    np.testing.assert_allclose(record["q"], whole["q"][:201], rtol=0.0, atol=1e-8)
+    assert not record.complete
+    simulation.advance(2.0)
+    assert same(simulation.record(), whole)
+
+
+FREE = """<robot name="brick"><link name="the_world"/><link name="brick"><inertial><mass value="2"/>
+<inertia ixx="0.02" iyy="0.03" izz="0.04" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="root" type="KIND"><parent link="the_world"/><child link="brick"/><axis xyz="0 0 1"/></joint></robot>"""
+
+
+@pytest.mark.parametrize("kind", ["floating", "planar"])
+def test_bodies_without_a_fixed_base_can_be_pushed(tmp_path, kind):
+    """A push through the centre of mass: x = F t²/2 m, and the work is F x."""
+    (tmp_path / "brick.urdf").write_text(FREE.replace("KIND", kind))
+    text = "duration_s: 1\nplant: {type: urdf_arm, file: brick.urdf, gravity_m_s2: [0, 0, 0]}\n"
+    simulation = dynsim.Simulation(read(tmp_path, text))
+    simulation.every(0.1, lambda s: None)
+    simulation.set_wrench("brick", force=[3.0, 0.0, 0.0])
+    state = simulation.advance(1.0)
+    assert simulation.finished
+    assert state.q[0] == pytest.approx(0.75, abs=1e-9)
+    record = simulation.record()
+    assert record.complete
+    assert record.summary["loads_work_J"] == {"brick": pytest.approx(2.25, abs=1e-9)}
+    with pytest.raises(ModelError, match="no body 'brick.x'; those are: brick"):
+        simulation.set_wrench("brick.x", force=[1.0, 0.0, 0.0])
+
+
+def test_going_on_from_a_record_with_motors_that_have_no_circuit(tmp_path):
+    servo = "{type: servo, voltage_V: 12, stall_torque_N_m: 8, no_load_speed_rad_per_s: 5, k_p_V_per_rad: 40}"
+    scenario = read(
+        tmp_path,
+        WHEEL.replace("SAMPLED", "")
+        .replace("{type: wang_minami}", servo)
+        .replace("  k_p_V_per_rad: 20\n  k_d_V_s_per_rad: 1\n", ""),
+    )
+    whole = dynsim.simulate(scenario)
+    simulation = dynsim.Simulation(scenario, state=dynsim.State.of(whole, 40))
+    np.testing.assert_allclose(simulation.advance(0.5).q, whole["q"][-1], rtol=0.0, atol=1e-8)
+
+
 def test_a_run_without_end_keeps_the_last_samples_and_holds_its_references():
     scenario = arm(duration_s=1.0)
     simulation = dynsim.Simulation(scenario, duration=math.inf, trace=100)
@@ -293,6 +341,8 @@ def test_ticks_are_where_they_should_be_and_do_not_add_up_roundings():
 @pytest.mark.parametrize(
     ("call", "error", "words"),
     [
+        (lambda s: s.advance("x"), ScenarioError, "cannot advance to t = 'x'"),
+        (lambda s: s.set_command("joint_1", "a"), ModelError, "must be numbers"),
         (lambda s: s.advance(-1.0), ScenarioError, "cannot advance"),
         (lambda s: s.advance(math.nan), ScenarioError, "cannot advance"),
         (lambda s: s.set_reference("joint_x", 0.0), ModelError, "no motor 'joint_x'; those are: joint_1"),
