@@ -442,7 +442,7 @@ class Simulation:
                 break
         if not self.finished and run.clock[ki.TIME] >= self._end:
             # A tick at the end came before the end itself.
-            driver.advance(self._prepared.system, self._prepared.workspace, run, 0)
+            driver.advance(self._prepared.system, self._prepared.workspace, run, 1)
         self._time = min(until, self._end) if not self.finished else float(run.clock[ki.TIME])
 
     def _piece(self, until: float) -> None:

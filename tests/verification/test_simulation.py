@@ -143,7 +143,7 @@ def test_bodies_without_a_fixed_base_can_be_pushed(tmp_path, kind):
     record = simulation.record()
     assert record.complete
     assert record.summary["loads_work_J"] == {"brick": pytest.approx(2.25, abs=1e-9)}
-    with pytest.raises(ModelError, match="no body 'brick.x'; those are: brick"):
+    with pytest.raises(ModelError, match=r"no body 'brick\.x'; those are: brick"):
         simulation.set_wrench("brick.x", force=[1.0, 0.0, 0.0])
 
 
