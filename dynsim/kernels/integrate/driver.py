@@ -58,7 +58,7 @@ from dynsim.kernels.system import System
 from dynsim.kernels.tree.joints import normalise
 
 
-@merged_kernel
+@internal_kernel
 def start(system: System, ws: Workspace, run: Run):
     """First derivative, on the contacts, and a first step size where none is given. Sets STATUS when there is none."""
     if not settle(system, run.clock[TIME], run.y, ws, run.stage[0], run):
@@ -135,7 +135,7 @@ def go_on(run: Run, order, beta):
             clock[STEP] = max(clock[STEP], clock[PROPOSED])
 
 
-@merged_kernel
+@internal_kernel
 def ready(system: System, ws: Workspace, run: Run):
     """Start or restart where that is due, and do what is due at this time; False when the caller is to look."""
     count = run.count

@@ -28,7 +28,7 @@ from dynsim.kernels.arrays import (
 from dynsim.kernels.constraint.delassus import solve_small
 from dynsim.kernels.constraint.rows import row_errors
 from dynsim.kernels.integrate.run import EVALUATIONS, PROJECTIONS, Run
-from dynsim.kernels.jit import internal_kernel, merged_kernel
+from dynsim.kernels.jit import internal_kernel
 from dynsim.kernels.system import System, derivative
 from dynsim.kernels.tree.articulated import accelerate
 from dynsim.kernels.tree.joints import displace
@@ -88,7 +88,7 @@ def project(system: System, ws: Workspace, y):
                 y[start + i] += ws.joints[i, QDD]
 
 
-@merged_kernel
+@internal_kernel
 def settle(system: System, t, y, ws: Workspace, dy, run: Run):
     """Derivative at y, projecting y first where needed. Returns False when the rows cannot be met."""
     derivative(system, t, y, ws, dy)
