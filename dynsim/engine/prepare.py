@@ -122,6 +122,7 @@ def prepare(
         rtol=options.rtol,
         atol=options.atol,
         ticks=_ticks(control),
+        breaks=_breaks(loads),
     )
     return Prepared(model, contacts, control, system, run, new_workspace(system), loads)
 
@@ -133,6 +134,12 @@ def _ticks(control: JointControl) -> tuple[np.ndarray, np.ndarray] | None:
     tick = np.zeros((1, ki.TICK_SIZE))
     tick[0, ki.TICK_PERIOD] = control.sample_time
     return tick, np.array([[ki.TAKE_COMMANDS, 0]])
+
+
+def _breaks(loads: Sequence[Load]) -> np.ndarray:
+    """Times at which loads jump or bend [s]: a step that passed over them would not see a short push at all."""
+    knots = [load.knots for load in loads if len(load.coefficients) and (not load.hold or len(load.coefficients) > 1)]
+    return np.unique(np.concatenate(knots)) if knots else np.zeros(0)
 
 
 def _push(body: str) -> Load:

@@ -42,6 +42,10 @@ Array = NDArray[np.float64]
 
 # Steps in one compiled piece.
 _PIECE = 100_000
+# Of the ticks of callers: kinds are bits of a number, and shorter periods would take for ever.
+MOST_TICKS, SHORTEST_PERIOD = 60, 1e-9
+# Ticks this close to the time asked for belong to it, per second of it.
+TICK_SLACK = 1e-12
 # End of a run without end [s]: far beyond any, and still a number to reckon with.
 _FAR = 1e300
 SERVO_MODES = {"position": ka.POSITION_MODE, "velocity": ka.VELOCITY_MODE, "off": ka.OFF}
@@ -85,7 +89,13 @@ class Simulation:
         require_scenario(scenario)
         if scenario.engine != "dynamics":
             raise ModelError(f"plant {scenario.plant.type!r} is kinematic: only plants with dynamics can be stepped")
+        if state is not None and not isinstance(state, State):
+            raise ModelError(f"a simulation starts from a State, such as State.of(record), not from {shown(state)}")
+        if trace is not None and (not isinstance(trace, int) or trace < 0):
+            raise ScenarioError(f"trace is a number of samples, or None for all, not {shown(trace)}")
         start = 0.0 if state is None else float(state.time)
+        if not math.isfinite(start):
+            raise ModelError(f"the state to start from has time {start}")
         end = scenario.duration_s if duration is None else float(duration)
         if not end > start:
             raise ScenarioError(f"a simulation from t = {start:g} s cannot end at {end:g} s")
@@ -96,6 +106,7 @@ class Simulation:
         # Of a ring, and of a run that goes on from another, the ledger counts from the first sample on.
         self._relative = trace is not None or state is not None
         self._happened: list[Happening] = []
+        self._calling, self._token = False, object()
         self._guards: list[tuple[str, str, Callable[[Simulation], None] | None]] = []
         self._calls: list[Callable[[Simulation], None]] = []
         robot = self.robot
@@ -173,6 +184,8 @@ class Simulation:
         SimulationStopped
             Divergence or no solution; ``error.record`` holds the trace until then.
         """
+        if self._calling:
+            raise ScenarioError("a callback cannot advance the simulation that calls it")
         if not isinstance(until, (int, float, np.number)) or not until >= self._time:
             raise ScenarioError(f"cannot advance to t = {shown(until)} s: the simulation is at {self._time:g} s")
         until = min(float(until), self._end)
@@ -190,8 +203,13 @@ class Simulation:
         Steps end there, and what ``call`` rewrites holds until it is rewritten again.
         """
         first = self._time if first is None else float(first)
-        if not (period > 0.0 and math.isfinite(period) and first >= self._time):
-            raise ScenarioError(f"a tick needs a period > 0 and a first time from now on, not {period!r} and {first!r}")
+        if not (period >= SHORTEST_PERIOD and math.isfinite(period) and first >= self._time):
+            raise ScenarioError(
+                f"a tick needs a period of at least {SHORTEST_PERIOD:g} s and a first time from now on, "
+                f"not {period!r} and {first!r}"
+            )
+        if len(self._calls) == MOST_TICKS:
+            raise ScenarioError(f"a simulation has at most {MOST_TICKS} ticks; call several functions at one")
         run = self._prepared.run
         tick = np.zeros((1, ki.TICK_SIZE))
         tick[0, [ki.TICK_PERIOD, ki.TICK_NEXT, ki.TICK_PHASE]] = period, first, first
@@ -235,7 +253,7 @@ class Simulation:
         action = ki.STOP if stop else ki.LOG if call is None else ki.RETURN
         run = self._prepared.run
         event = np.zeros((1, ki.EVENT_SIZE))
-        event[0, ki.EVENT_LEVEL] = level
+        event[0, ki.EVENT_LEVEL] = _finite("level", [level])[0]
         axis = family == "axis"
         table = np.array([[number + (index if axis else 0), 0 if axis else index, int(np.sign(direction)), action]])
         self._settle_now()
@@ -299,6 +317,8 @@ class Simulation:
         met again by projection, which the ledger does not see.
         """
         j = _index(self._joints, joint, "joint")
+        if any(joint in (coupling.joint, coupling.leader) for coupling in self.robot.couplings):
+            raise ModelError(f"{joint}: a joint that is coupled to another has no brake of its own")
         run, model = self._prepared.run, self._prepared.model
         armature = model.arrays.body[:, ka.ARMATURE]
         if closed == (armature[j] == BRAKED):
@@ -320,6 +340,8 @@ class Simulation:
         self._settle_now()
         self._prepared.system.reference.spline[a] = self._splines[a]
         self._prepared.system.drives.table[a, ka.SAMPLED] = self._sampled[a]
+        if self._frozen and self._splines[a] >= 0:
+            self._hold_at_end(joint)
         self._restart()
 
     def set_wrench(
@@ -354,7 +376,7 @@ class Simulation:
     def snapshot(self) -> Snapshot:
         """What :meth:`restore` needs to go on from here."""
         arrays = {name: array.copy() for name, array in self._arrays().items()}
-        return Snapshot(arrays, self._time, self._trace.snapshot(), tuple(self._happened), self._frozen)
+        return Snapshot(self._token, arrays, self._time, self._trace.snapshot(), tuple(self._happened), self._frozen)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot of this simulation: the same future, bit for bit.
@@ -364,9 +386,13 @@ class Simulation:
         ScenarioError
             Events or ticks were added since, or the snapshot is of another simulation.
         """
+        if not isinstance(snapshot, Snapshot):
+            raise ScenarioError(f"a simulation is restored from its snapshot, not from {shown(snapshot)}")
         own = self._arrays()
         sizes = {name: array.shape for name, array in snapshot.arrays.items() if not name.startswith("trace.")}
-        if sizes != {name: array.shape for name, array in own.items() if not name.startswith("trace.")}:
+        if sizes != {name: array.shape for name, array in own.items() if not name.startswith("trace.")} or (
+            snapshot.owner is not self._token
+        ):
             raise ScenarioError("the snapshot is of another simulation, or ticks or events were added since")
         buffers = {name: snapshot.arrays[f"trace.{name}"].copy() for name in ("sample_time", "sample", "output")}
         self._swap(**buffers)
@@ -422,6 +448,14 @@ class Simulation:
                     f"the state has {len(values)} values of {name}, {model.robot.name} has {part.stop - part.start}"
                 )
             run.y[part] = values
+        q = dict(zip(self._joints, run.y[block(run.layout, "q")][list(model.robot.position_index)], strict=True))
+        for one in model.robot.couplings:
+            off = q[one.joint] - one.ratio * q[one.leader] - one.offset
+            if not abs(off) <= START_TOLERANCE:
+                raise ModelError(
+                    f"the state has {one.joint} {off:+.4g} off where its leader {one.leader} takes it "
+                    f"(limit {START_TOLERANCE:g})"
+                )
         for contact in self._prepared.contacts:
             gap = contact.surface.gap(model.point_position(contact.body, contact.point, run.y[block(run.layout, "q")]))
             if not abs(gap) <= START_TOLERANCE:
@@ -433,6 +467,10 @@ class Simulation:
     def _reach(self, until: float) -> None:
         """Integrate until the step that would pass a time is pending, or ends there."""
         run = self._prepared.run
+        # A tick that differs from the time asked for by roundings is not left for later.
+        near = run.tick[:, ki.TICK_NEXT] if len(self._calls) else np.zeros(0)
+        near = near[np.abs(near - until) <= TICK_SLACK * max(1.0, abs(until))]
+        until = min(max(until, float(near.max(initial=until))), self._end)
         while not self.finished and self._time < until:
             if run.count[ki.PENDING] == 1 and run.clock[ki.TIME] + run.clock[ki.STEP] > until:
                 break
@@ -461,11 +499,20 @@ class Simulation:
             self._time = float(run.clock[ki.TIME])
             raise_stopped(stopped(self._scenario, self._prepared), self.record())
         due = int(run.count[ki.TICKED])
+        # Before the calls, whose snapshots must not call again.
+        run.count[ki.TICKED] = 0
         if due:
             self._time = float(run.clock[ki.TIME])
             for k, call in enumerate(self._calls):
                 if due & (ki.CALLER << k):
-                    call(self)
+                    self._call(call)
+
+    def _call(self, call: Callable[[Simulation], None]) -> None:
+        self._calling = True
+        try:
+            call(self)
+        finally:
+            self._calling = False
 
     def _take_events(self) -> None:
         """Empty the log of the kernels."""
@@ -477,7 +524,7 @@ class Simulation:
             self._happened.append(Happening(time, kind, subject))
             if call is not None:
                 self._time = time
-                call(self)
+                self._call(call)
 
     def _settle_now(self) -> None:
         """End a step at the present time, when it lies within one."""
@@ -496,6 +543,9 @@ class Simulation:
                 run.clock[ki.HOLD] = run.sample_time[-1]
                 driver.advance(self._prepared.system, self._prepared.workspace, run, _PIECE)
             clock_[ki.END] = self._end
+            self._take_events()
+            if count[ki.STATUS] == ki.STOPPED:
+                return
             if count[ki.STATUS] != ki.FINISHED:
                 raise_stopped(stopped(self._scenario, self._prepared), self.record())
             count[ki.STATUS] = ki.RUNNING
@@ -509,12 +559,15 @@ class Simulation:
     def _freeze(self) -> None:
         """Let moving references hold where they end."""
         self._frozen = True
+        for joint, a in self._motors.items():
+            if self._prepared.system.reference.spline[a] >= 0:
+                self._hold_at_end(joint)
+
+    def _hold_at_end(self, joint: str) -> None:
+        """Let the reference of a joint hold where its spline ends."""
         reference = self._prepared.system.reference
-        ends = {motor.joint: a for motor, a in zip(self.robot.motors, range(len(self._motors)), strict=True)}
-        for joint, a in ends.items():
-            if reference.spline[a] >= 0:
-                powers = reference.grid[1] ** np.arange(6)
-                self.set_reference(joint, float(reference.coefficients[-1, reference.spline[a]] @ powers))
+        powers = reference.grid[1] ** np.arange(6)
+        self.set_reference(joint, float(reference.coefficients[-1, self._splines[self._motors[joint]]] @ powers))
 
     def _refill(self, until: float = -np.inf) -> None:
         """Move what was sampled to the trace, and give the buffer the times from there on, at least up to ``until``."""

@@ -66,6 +66,7 @@ class Happening(NamedTuple):
 class Snapshot:
     """Everything that the future of a simulation depends on; made by :meth:`Simulation.snapshot`."""
 
+    owner: object
     arrays: dict[str, NDArray[Any]]
     time: float
     trace: tuple[tuple[Rows, ...], int]

@@ -80,6 +80,12 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
     _warn(locked, places, links)
     frames = [Frame(name, place.body, place.R, place.p) for name, place in places.items() if place.body != name]
     rows = tuple(row for link in links for row in (ROWS[link.kind](link) if link.kind in ROWS else (link,)))
+    for joint in locked.joints.values():
+        for name in (joint.name, joint.mimics or joint.name):
+            if joint.mimics is not None and locked.joints[name].kind in SEVERAL:
+                raise tree.error(
+                    joint.line, f"joint {joint.name!r} mimics {joint.mimics!r}, and {name!r} has several positions"
+                )
     couplings = tuple(
         Coupling(joint.name, joint.mimics, joint.multiplier, joint.offset)
         for joint in locked.joints.values()

@@ -67,7 +67,7 @@ FALLBACK = {
 # Branches on time, which is one number for all lanes. Lanes at times of their own must lie in one segment.
 TIME = {
     Place("drive/law.py", "evaluate_reference", "segment = min(max(int(x / spacing), 0), c.shape[0] - 1)"): SEGMENT,
-    Place("tree/loads.py", "segment_start", "if t < loads.data[first] or t > end:"): SEGMENT,
+    Place("tree/loads.py", "segment_start", "if t < loads.data[first] or t >= end:"): SEGMENT,
     Place("tree/loads.py", "segment_start", "if loads.data[first + middle * SEGMENT_SIZE] <= t:"): SEGMENT,
 }
 # Lines that no state comes to, as far as is known; they do not branch.

@@ -196,6 +196,57 @@ def test_a_wrench_that_is_set_is_the_load_of_a_scenario(tmp_path):
     assert np.abs(free["q"] - record["q"]).max() > 0.1
 
 
+@pytest.mark.parametrize("method", ["rk43", "dopri5", "rk4", "rodas4"])
+@pytest.mark.parametrize("length", [1e-3, 0.3])
+def test_a_short_push_is_not_stepped_over(tmp_path, method, length):
+    """An impulse of 1 N m s on a rod that nothing else turns, in a run whose steps are otherwise seconds long."""
+    spinning = "{type: serial_arm, chain: [{axis: z, length_m: 1.0, mass_kg: 1, radius_m: 0.1}]}"
+    torque = 1.0 / length
+    push = (
+        f"{{type: samples, body: link_1, times_s: [2, {2 + length}], torque_N_m: [[0, 0, {torque}], [0, 0, {torque}]]}}"
+    )
+    text = f"duration_s: 4\nplant: {spinning}\nloads: {{kick: {push}}}\nintegrator: {{method: {method}}}\n"
+    scenario = read(tmp_path, text)
+    inertia = dynsim.build_model(scenario).mass_matrix([0.0])[0, 0]
+    record = dynsim.simulate(scenario)
+    assert record["v"][-1, 0] == pytest.approx(1.0 / inertia, rel=1e-9)
+    assert record.summary["loads_work_J"]["kick"] == pytest.approx(0.5 / inertia, rel=1e-6)
+    assert record["v"][-1, 0] * (2.0 - 0.5 * length) == pytest.approx(record["q"][-1, 0], rel=1e-9)
+
+
+def test_ticks_are_not_lost_when_something_is_rewritten_beside_them():
+    simulation, times = dynsim.Simulation(dynsim.load_scenario("single_pendulum")), []
+    simulation.every(0.1, lambda s: times.append(s.time))
+    for k in range(1, 100):
+        simulation.advance(round(0.1 * k, 1))
+        simulation.set_wrench("link_1", force=[0.0, 0.0, 0.1])
+    np.testing.assert_allclose(times, 0.1 * np.arange(100), atol=1e-14)
+
+
+def test_a_snapshot_taken_in_a_callback_does_not_call_again():
+    simulation, times, kept = dynsim.Simulation(dynsim.load_scenario("single_pendulum")), [], []
+
+    def call(s: dynsim.Simulation) -> None:
+        times.append(s.time)
+        if s.time == 0.2:
+            kept.append(s.snapshot())
+
+    simulation.every(0.1, call)
+    simulation.advance(0.45)
+    simulation.restore(kept[0])
+    simulation.advance(0.35)
+    np.testing.assert_allclose(times, [0.0, 0.1, 0.2, 0.3, 0.4, 0.3], atol=1e-15)
+
+
+def test_a_motor_given_back_after_the_end_of_its_reference_holds_there():
+    scenario = arm(duration_s=1.0)
+    held, given_back = (dynsim.Simulation(scenario, duration=3.0, trace=0) for _ in range(2))
+    for simulation in (held, given_back):
+        simulation.advance(1.2)
+    given_back.release("joint_1")
+    np.testing.assert_allclose(given_back.advance(3.0).q, held.advance(3.0).q, rtol=0.0, atol=1e-6)
+
+
 def test_a_rewritten_reference_takes_hold_at_once_and_can_be_given_back(tmp_path):
     scenario = read(tmp_path, WHEEL.replace("SAMPLED", ""))
     simulation, whole = dynsim.Simulation(scenario), dynsim.simulate(scenario)
@@ -351,7 +402,15 @@ def test_ticks_are_where_they_should_be_and_do_not_add_up_roundings():
         (lambda s: s.set_wrench("link_1", force=[1.0]), ModelError, "three components"),
         (lambda s: s.watch("angle", "joint_1"), ModelError, "no event 'angle'; events: joint_position"),
         (lambda s: s.watch("contact_gap", "toe"), ModelError, "no contact 'toe'; those are: elbow_4, elbow_7"),
-        (lambda s: s.every(0.0, print), ScenarioError, "period > 0"),
+        (lambda s: s.every(0.0, print), ScenarioError, "a period of at least"),
+        (lambda s: s.every(1e-14, print), ScenarioError, "a period of at least"),
+        (lambda s: [s.every(1.0, print, first=9.0) for _ in range(61)], ScenarioError, "at most 60 ticks"),
+        (lambda s: (s.every(1.0, lambda t: t.advance(0.1)), s.advance(0.1)), ScenarioError, "callback cannot advance"),
+        (lambda s: s.watch("joint_rate", "joint_1", math.nan), ModelError, "must be finite"),
+        (lambda s: s.restore(None), ScenarioError, "from its snapshot"),
+        (lambda s: s.restore(dynsim.Simulation(s.scenario).snapshot()), ScenarioError, "another simulation"),
+        (lambda s: dynsim.Simulation(s.scenario, trace=-1), ScenarioError, "number of samples"),
+        (lambda s: dynsim.Simulation(s.scenario, state=7), ModelError, "starts from a State"),
     ],
 )
 def test_wrong_calls_say_what_is_wrong(call, error, words):

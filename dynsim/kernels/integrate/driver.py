@@ -156,7 +156,7 @@ def advance_explicit(system: System, ws: Workspace, run: Run, limit):
     """:func:`advance` of the explicit methods."""
     order = 5.0 if run.method == DOPRI5 else 4.0
     count, taken = run.count, 0
-    while (count[STARTED] == 1 and run.tick.shape[0] == 0) or ready(system, ws, run):
+    while (count[STARTED] == 1 and run.tick.shape[0] + run.breaks.shape[0] == 0) or ready(system, ws, run):
         if taken >= limit or finished(run):
             return
         taken += 1
@@ -181,7 +181,7 @@ def advance_explicit(system: System, ws: Workspace, run: Run, limit):
 def advance_rodas4(system: System, ws: Workspace, run: Run, limit):
     """:func:`advance` of RODAS4."""
     count, taken = run.count, 0
-    while (count[STARTED] == 1 and run.tick.shape[0] == 0) or ready(system, ws, run):
+    while (count[STARTED] == 1 and run.tick.shape[0] + run.breaks.shape[0] == 0) or ready(system, ws, run):
         if taken >= limit or finished(run):
             return
         taken += 1

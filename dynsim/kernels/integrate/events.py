@@ -21,11 +21,13 @@ from dynsim.kernels.integrate.run import (
     HIGH,
     LOGGED,
     LOW,
+    NEXT_BREAK,
     ON_EVENT,
     RETURN,
     SEARCHING,
     SIDE,
     START_VALUE,
+    STARTED,
     STATUS,
     STEP,
     STOP,
@@ -174,16 +176,30 @@ def fire_events(run: Run):
 
 @internal_kernel
 def next_tick(run: Run, until):
-    """The earliest tick, or ``until`` when that comes first [s]."""
+    """The earliest tick or break, or ``until`` when that comes first [s].
+
+    A step to a break ends some roundings before it, so that its last stage lies on the near side of a jump.
+    """
     for k in range(run.tick.shape[0]):
         until = min(until, run.tick[k, TICK_NEXT])
+    k = run.count[NEXT_BREAK]
+    if k < run.breaks.shape[0]:
+        until = min(until, run.breaks[k] - 1e-14 * max(1.0, abs(run.breaks[k])))
     return until
 
 
 @internal_kernel
 def take_ticks(run: Run):
-    """Kinds of the ticks that are due, as a sum of their bits; moves them on and TIME exactly to where they are."""
-    due, clock, tick = 0, run.clock, run.tick
+    """Kinds of the ticks that are due, as a sum of their bits; moves them on and TIME exactly to where they are.
+
+    At a break the next step starts anew.
+    """
+    due, clock, tick, k = 0, run.clock, run.tick, run.count[NEXT_BREAK]
+    while k < run.breaks.shape[0] and run.breaks[k] - clock[TIME] <= 1e-12 * max(1.0, abs(clock[TIME])):
+        clock[TIME] = max(clock[TIME], run.breaks[k])
+        run.count[STARTED] = 0
+        k += 1
+    run.count[NEXT_BREAK] = k
     for k in range(tick.shape[0]):
         if tick[k, TICK_NEXT] - clock[TIME] <= 1e-12 * max(1.0, abs(clock[TIME])):
             clock[TIME] = tick[k, TICK_NEXT]

@@ -29,7 +29,8 @@ STEPS, REJECTED, EVALUATIONS, PROJECTIONS, SAMPLE, STATUS, STARTED = 0, 1, 2, 3,
 # A step waits to be accepted; trials of a root; which end of the bracket moved last; the step ends at an event; it ends
 # at a tick; events in the log; bits of the ticks that the caller is to look at.
 PENDING, SEARCHING, TURNED_BACK, FIRED, TRIMMED, LOGGED, TICKED = 7, 8, 9, 10, 11, 12, 13
-COUNT_SIZE = 14
+NEXT_BREAK = 14  # index of the first of Run.breaks that is not past
+COUNT_SIZE = 15
 # Run.event, and Run.event_table, int
 EVENT_LEVEL, SIDE, START_VALUE, VALUE, AT_LOW, AT_HIGH = 0, 1, 2, 3, 4, 5
 EVENT_SIZE = 6
@@ -76,6 +77,7 @@ class Run(NamedTuple):
     event_table: np.ndarray  # (e, EVENT_TABLE_SIZE) int
     tick: np.ndarray  # (k, TICK_SIZE)
     tick_table: np.ndarray  # (k, TICK_TABLE_SIZE) int
+    breaks: np.ndarray  # (b,) increasing times at which derivatives jump or bend: steps end there [s]
     log_time: np.ndarray  # (LOG_LENGTH,) of events [s]
     log_event: np.ndarray  # (LOG_LENGTH,) int: which
     hand: np.ndarray  # (3,) room
@@ -113,6 +115,7 @@ def new_run(
     atol: float,
     events: tuple[np.ndarray, np.ndarray] | None = None,
     ticks: tuple[np.ndarray, np.ndarray] | None = None,
+    breaks: np.ndarray | None = None,
 ) -> Run:
     """Allocate a :class:`Run` from t = 0 at state y, (layout.size,)."""
     m, p, rodas = len(y), row_limit(c, couplings), method == RODAS4
@@ -146,6 +149,7 @@ def new_run(
         event_table=integers(event_table),
         tick=reals(tick),
         tick_table=integers(tick_table),
+        breaks=reals(np.zeros(0) if breaks is None else breaks),
         log_time=np.zeros(LOG_LENGTH),
         log_event=np.zeros(LOG_LENGTH, dtype=np.int64),
         hand=np.zeros(3),

@@ -37,7 +37,8 @@ def segment_start(loads: LoadArrays, k, t):
     if count == 0:
         return -1, t
     end = loads.data[first + count * SEGMENT_SIZE]
-    if t < loads.data[first] or t > end:
+    # From the right at both ends: the steps end there (Run.breaks).
+    if t < loads.data[first] or t >= end:
         if loads.table[k, HOLDS] == 0:
             return -1, t
         t = min(max(t, loads.data[first]), end)
