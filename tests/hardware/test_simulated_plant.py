@@ -169,7 +169,7 @@ servos:
     first = [plant.joint_positions[0], plant.velocity[0] / scale]
     for _ in range(150):
         plant.step(PHYSICS_STEP, drive)
-    found = solve_ivp(rates, (0.0, 150 * PHYSICS_STEP), first, rtol=1e-10, atol=1e-12).y[:, -1]
+    found = solve_ivp(rates, (0.0, 150 * PHYSICS_STEP), first, rtol=1e-10, atol=1e-12)["y"][:, -1]
     assert plant.joint_positions[0] == pytest.approx(found[0], abs=1e-6)
     assert plant.velocity[0] == pytest.approx(scale * found[1], abs=1e-5)
     assert abs(found[0] - first[0]) > 0.05
