@@ -15,7 +15,7 @@ from dynsim.engine.outcome import check_size
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.state import block, output_layout, state_layout
+from dynsim.kernels.state import OutputLayout, StateLayout, block, output_layout, state_layout
 from dynsim.kernels.system import System, new_workspace
 from dynsim.model.arrays import compile_contacts, compile_couplings, compile_drives, compile_loads
 from dynsim.model.clearance import poses
@@ -24,7 +24,7 @@ from dynsim.model.description import Array, Contact, Load, Robot
 from dynsim.model.drives import Drive, Motor
 from dynsim.model.model import Model
 from dynsim.record.poses import pose_columns
-from dynsim.scenario import Scenario, build, build_model
+from dynsim.scenario import Scenario, build
 
 log = logging.getLogger(__name__)
 
@@ -70,9 +70,8 @@ def prepare(
     ScenarioError
         The record would be larger than ``record.size_limit_GB``, or the explicit method would need too many steps.
     """
-    model = build_model(scenario)
-    if motors is not None:
-        model = Model(replace(build.robot(scenario), motors=tuple(motors)))
+    described = build.robot(scenario)
+    model = Model(described if motors is None else replace(described, motors=tuple(motors)))
     robot, contacts = model.robot, build.contacts(scenario)
     build.check_start(scenario, model)
     loads = build.loads(scenario, robot)
@@ -81,7 +80,7 @@ def prepare(
     n, na, c = model.n, len(robot.motors), len(contacts)
     layout, columns = state_layout(model.nq, n, robot.circuits, c, len(loads)), output_layout(n, na, c)
     if times is None:
-        times = sample_times(scenario, columns=layout.size + columns.size + pose_columns(n))
+        times = sample_times(scenario, layout, columns, n)
     _check_coordinates(scenario, robot)
     _check_stiffness(scenario, robot)
     couplings = len(robot.couplings)
@@ -147,11 +146,11 @@ def _push(body: str) -> Load:
     return Load(body, body, np.zeros(3), False, np.zeros(1), np.zeros((0, 6, 4)), False)
 
 
-def sample_times(scenario: Scenario, columns: int) -> np.ndarray:
-    """Times of a whole record of so many columns, (T,) [s]; ScenarioError when it would be too large."""
+def sample_times(scenario: Scenario, layout: StateLayout, columns: OutputLayout, links: int) -> np.ndarray:
+    """Times of a whole record of a robot with so many links, (T,) [s]; ScenarioError when it would be too large."""
     rate = scenario.record.rate_hz
     count = int(np.floor(scenario.duration_s * rate * (1.0 + 1e-12))) + 1
-    check_size(scenario, count, columns)
+    check_size(scenario, count, layout.size + columns.size + pose_columns(links))
     times = np.arange(count) / rate
     if scenario.duration_s - times[-1] > 1e-9 * scenario.duration_s:
         times = np.append(times, scenario.duration_s)

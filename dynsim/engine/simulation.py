@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from dynsim.engine.outcome import raise_stopped
 from dynsim.engine.prepare import prepare, sample_times
 from dynsim.engine.recording import make_record
-from dynsim.engine.stepped import GUARDS, Happening, Snapshot, State
+from dynsim.engine.stepped import GUARDS, Snapshot, State
 from dynsim.engine.stopping import stopped
 from dynsim.engine.trace import Trace
 from dynsim.errors import ModelError, ScenarioError, shown
@@ -31,12 +31,12 @@ from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.dense import state_within
 from dynsim.kernels.state import JOINT, block
 from dynsim.kernels.tree import loads as kl
+from dynsim.model.arrays import check_couplings
 from dynsim.model.drives import Drive
 from dynsim.model.model import Model
-from dynsim.record import Record
-from dynsim.record.poses import pose_columns
+from dynsim.record import Event, Record
 from dynsim.scenario import Scenario, require_scenario
-from dynsim.scenario.build import START_TOLERANCE
+from dynsim.scenario.build import check_start
 
 Array = NDArray[np.float64]
 
@@ -105,7 +105,7 @@ class Simulation:
         self._time, self._wall = start, 0.0
         # Of a ring, and of a run that goes on from another, the ledger counts from the first sample on.
         self._relative = trace is not None or state is not None
-        self._happened: list[Happening] = []
+        self._happened: list[Event] = []
         self._calling, self._token = False, object()
         self._guards: list[tuple[str, str, Callable[[Simulation], None] | None]] = []
         self._calls: list[Callable[[Simulation], None]] = []
@@ -121,8 +121,7 @@ class Simulation:
         times = None
         if state is None and self._end == scenario.duration_s and trace is None:
             # The very samples of simulate; its limit of size holds here too.
-            run, bodies = self._prepared.run, len(self.robot.links)
-            times = sample_times(scenario, run.layout.size + run.columns.size + pose_columns(bodies))
+            times = sample_times(scenario, self._prepared.run.layout, self._prepared.run.columns, len(robot.links))
         self._trace = Trace(start, self._end, scenario.record.rate_hz, trace, times)
         self._sampled = self._prepared.system.drives.table[:, ka.SAMPLED].copy()
         run = self._prepared.run
@@ -158,7 +157,7 @@ class Simulation:
         return bool(self._prepared.run.count[ki.STATUS] != ki.RUNNING)
 
     @property
-    def happened(self) -> tuple[Happening, ...]:
+    def happened(self) -> tuple[Event, ...]:
         """Events so far."""
         return tuple(self._happened)
 
@@ -426,7 +425,7 @@ class Simulation:
             self._scenario, replace(self._prepared, run=whole), self._wall, pushed=sorted(self._pushed)
         )
         for happening in self._happened:
-            record.add_event(*happening)
+            record.add_event(happening.time, happening.kind, happening.name)
         record.complete = self.finished
         return record
 
@@ -448,21 +447,9 @@ class Simulation:
                     f"the state has {len(values)} values of {name}, {model.robot.name} has {part.stop - part.start}"
                 )
             run.y[part] = values
-        q = dict(zip(self._joints, run.y[block(run.layout, "q")][list(model.robot.position_index)], strict=True))
-        for one in model.robot.couplings:
-            off = q[one.joint] - one.ratio * q[one.leader] - one.offset
-            if not abs(off) <= START_TOLERANCE:
-                raise ModelError(
-                    f"the state has {one.joint} {off:+.4g} off where its leader {one.leader} takes it "
-                    f"(limit {START_TOLERANCE:g})"
-                )
-        for contact in self._prepared.contacts:
-            gap = contact.surface.gap(model.point_position(contact.body, contact.point, run.y[block(run.layout, "q")]))
-            if not abs(gap) <= START_TOLERANCE:
-                raise ModelError(
-                    f"contact {contact.name}: in the state to start from its point is {gap:+.4g} m from surface "
-                    f"{contact.surface_name!r} (limit {START_TOLERANCE:g} m)"
-                )
+        q = run.y[block(run.layout, "q")]
+        check_couplings(model.robot, q)
+        check_start(self._scenario, model, q)
 
     def _reach(self, until: float) -> None:
         """Integrate until the step that would pass a time is pending, or ends there."""
@@ -521,7 +508,7 @@ class Simulation:
         run.count[ki.LOGGED] = 0
         for time, e in zip(run.log_time[:logged].tolist(), run.log_event[:logged].tolist(), strict=True):
             kind, subject, call = self._guards[e]
-            self._happened.append(Happening(time, kind, subject))
+            self._happened.append(Event(time, kind, subject))
             if call is not None:
                 self._time = time
                 self._call(call)

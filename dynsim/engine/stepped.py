@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.engine.trace import Rows
 from dynsim.kernels.integrate import events
-from dynsim.record import Record
+from dynsim.record import Event, Record
 
 Array = NDArray[np.float64]
 
@@ -54,14 +54,6 @@ class State:
         return cls(float(record.time[sample]), *(np.array(record[name][sample], dtype=np.float64) for name in names))
 
 
-class Happening(NamedTuple):
-    """An event that has happened: when [s], which guard, of what."""
-
-    time: float
-    kind: str
-    subject: str
-
-
 @dataclass(frozen=True)
 class Snapshot:
     """Everything that the future of a simulation depends on; made by :meth:`Simulation.snapshot`."""
@@ -70,5 +62,5 @@ class Snapshot:
     arrays: dict[str, NDArray[Any]]
     time: float
     trace: tuple[tuple[Rows, ...], int]
-    happened: tuple[Happening, ...]
+    happened: tuple[Event, ...]
     frozen: bool

@@ -31,19 +31,9 @@ COMPARISONS: dict[str, Callable[[Mapping[str, Record]], Figure | None]] = {
 
 def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
     """See :func:`dynsim.figures.draw`."""
-    with style.look():
-        return [
-            style.save(figure, folder / f"{name}.{kind}")
-            for name, draw_one in FIGURES.items()
-            if (figure := draw_one(record)) is not None
-        ]
+    return style.save_all(FIGURES, record, folder, kind)
 
 
 def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
     """See :func:`dynsim.figures.draw_comparison`."""
-    with style.look():
-        return [
-            style.save(figure, folder / f"{name}.{kind}")
-            for name, draw_all in COMPARISONS.items()
-            if (figure := draw_all(records)) is not None
-        ]
+    return style.save_all(COMPARISONS, records, folder, kind)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import matplotlib
 import numpy as np
@@ -21,6 +21,7 @@ from dynsim.files import replacing
 from dynsim.record import Record
 from dynsim.terminal import plain
 
+T = TypeVar("T")
 Array = NDArray[np.float64]
 # A quantity over time, (T,) and (T,) or (T, k).
 Series = tuple[Array, Array]
@@ -92,6 +93,14 @@ def save(figure: Figure, path: Path) -> Path:
     for text in figure.findobj(Text):
         text.set_text(plain(text.get_text()))
     return write(figure, path, dpi=DPI)
+
+
+def save_all(makers: Mapping[str, Callable[[T], Figure | None]], of: T, folder: Path, kind: str) -> list[Path]:
+    """Every figure, by its name, that the record or records have data for, in dynsim's look; returns the files."""
+    with look():
+        return [
+            save(figure, folder / f"{name}.{kind}") for name, make in makers.items() if (figure := make(of)) is not None
+        ]
 
 
 def write(figure: Figure, path: Path, **options: Any) -> Path:

@@ -38,13 +38,14 @@ class StateLayout(NamedTuple):
     size: int
     tracked: int  # how many entries, from the first on, error control looks at: all that derivatives depend on
     extra: int  # nq − n
+    circuits: int  # currents among the states
 
 
 def state_layout(nq: int, n: int, circuits: int, contacts: int, loads: int = 0) -> StateLayout:
     """The layout for nq positions, n rates, and so many circuits, contact points and external wrenches."""
     starts = np.cumsum([0, nq, n, circuits, LEDGER_SIZE, CONTACT_SIZE * contacts, loads])
     q, v, current, ledger, contact, load, size = (int(start) for start in starts)
-    return StateLayout(q, v, current, ledger, contact, load, size, tracked=ledger, extra=nq - n)
+    return StateLayout(q, v, current, ledger, contact, load, size, tracked=ledger, extra=nq - n, circuits=circuits)
 
 
 class OutputLayout(NamedTuple):

@@ -102,7 +102,7 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
             body[i, ka.ARMATURE] += motor.armature
             body[i, ka.GEAR_DAMPING] += motor.reflected_damping
     _check_movable(robot, tree, body)
-    _check_start(robot, {joint: i for i, joint in enumerate(robot.joint_names)})
+    check_couplings(robot, robot.initial)
     return ka.ModelArrays(tree=integers(tree), body=reals(body), gravity=reals(robot.gravity))
 
 
@@ -249,11 +249,11 @@ def _check_couplings(robot: Robot) -> None:
             )
 
 
-def _check_start(robot: Robot, joints: dict[str, int]) -> None:
-    """Refuse an initial configuration that breaks a coupling."""
-    initial, position = robot.initial, robot.position_index
+def check_couplings(robot: Robot, initial: np.ndarray) -> None:
+    """Raise :class:`ModelError` for coordinates at the start, (nq,), that break a coupling."""
+    position = dict(zip(robot.joint_names, robot.position_index, strict=True))
     for coupling in robot.couplings:
-        q, leader = (initial[position[joints[joint]]] for joint in (coupling.joint, coupling.leader))
+        q, leader = (initial[position[joint]] for joint in (coupling.joint, coupling.leader))
         wanted = coupling.ratio * leader + coupling.offset
         if not abs(q - wanted) <= COUPLING_TOLERANCE:
             raise ModelError(

@@ -202,8 +202,13 @@ class Model:
         sweep.newton_euler(self.arrays, self._workspace, 1.0, 0.0, 1.0)
 
     def _set(self, q: ArrayLike, v: ArrayLike | None = None) -> None:
-        self._q[:] = self._vector(q, "q", self._position_names)
-        joints.read_positions(self.arrays, self._q, 0, self._workspace)
+        positions = self._vector(q, "q", self._position_names)
+        if self.nq == self.n:
+            # A coordinate for each rate: most robots need not load the kernel that tells kinds of joints apart.
+            self._workspace.joints[:, ka.Q] = positions
+        else:
+            self._q[:] = positions
+            joints.read_positions(self.arrays, self._q, 0, self._workspace)
         self._workspace.joints[:, ka.QD] = 0.0 if v is None else self._vector(v, "v", self.joint_names)
 
     def _vector(self, values: ArrayLike, name: str, labels: tuple[str, ...]) -> Array:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import overload
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynsim import families
 from dynsim.config import BodyPoint
@@ -190,12 +191,15 @@ def _payload(name: str, config: Payload, point: Array, axes: Array) -> Inertia:
     return payload
 
 
-def check_start(scenario: Scenario, model: Model) -> None:
-    """Raise :class:`ModelError` unless every contact point is on a body of the robot and starts on its surface."""
+def check_start(scenario: Scenario, model: Model, q: NDArray[np.float64] | None = None) -> None:
+    """Raise :class:`ModelError` unless every contact point is on a body of the robot and starts on its surface.
+
+    ``q`` : coordinates at the start, (nq,) [rad or m]; default: the robot's initial ones
+    """
     for contact in contacts(scenario):
         keys = ("contacts", "points", contact.name)
         try:
-            position = model.point_position(contact.body, contact.point, model.robot.initial)
+            position = model.point_position(contact.body, contact.point, model.robot.initial if q is None else q)
         except ModelError as error:
             raise ModelError(f"{dotted((*keys, 'body'))}: {error}", keys=(*keys, "body")) from error
         gap = contact.surface.gap(position)

@@ -109,7 +109,7 @@ def drive(drives: DriveArrays, reference: ReferenceArrays, t, y, layout: StateLa
     table, motor, motors, joints = drives.table, drives.motor, ws.motors, ws.joints
     na = motors.shape[0]
     evaluate_reference(drives, reference, t, ws)
-    if layout.ledger - layout.current == na:  # every drive has a circuit, its own: the loop that most robots take
+    if layout.circuits == na:  # every drive has a circuit, its own: the loop that most robots take
         for a in range(na):
             j = table[a, DRIVEN]
             asked = dc_command(motor, a, motors[a, Q_REF], motors[a, V_REF], joints[j, Q], joints[j, QD])

@@ -151,54 +151,58 @@ def ready(system: System, ws: Workspace, run: Run):
     return count[TICKED] == 0
 
 
+@merged_kernel
+def waiting(system: System, ws: Workspace, run: Run):
+    """True when a step can be taken; False when the caller is to look first."""
+    # Most runs have nothing to do between two steps.
+    idle = run.count[STARTED] == 1 and run.tick.shape[0] + run.breaks.shape[0] == 0
+    return idle or ready(system, ws, run)
+
+
+@merged_kernel
+def conclude(system: System, ws: Workspace, run: Run, error, order):
+    """Accept or refuse the step just taken, or that was kept back; True when the caller is to look."""
+    count = run.count
+    if count[PENDING] == 0:
+        if rejected(ws, run, error, order):
+            count[SEARCHING] = 0
+            return False
+        if not take_step(ws, run, error):
+            return count[PENDING] == 1
+    count[PENDING] = 0
+    accept(system, ws, run)
+    go_on(run, order, 0.04)
+    return run.event.shape[0] > 0 and fire_events(run)
+
+
 @kernel
 def advance_explicit(system: System, ws: Workspace, run: Run, limit):
     """:func:`advance` of the explicit methods."""
     order = 5.0 if run.method == DOPRI5 else 4.0
-    count, taken = run.count, 0
-    while (count[STARTED] == 1 and run.tick.shape[0] + run.breaks.shape[0] == 0) or ready(system, ws, run):
+    taken, error = 0, 0.0
+    while waiting(system, ws, run):
         if taken >= limit or finished(run):
             return
         taken += 1
-        if count[PENDING] == 0:
+        if run.count[PENDING] == 0:
             propose(run)
             error = step_explicit(system, ws, run)
-            if rejected(ws, run, error, order):
-                count[SEARCHING] = 0
-                continue
-            if not take_step(ws, run, error):
-                if count[PENDING] == 1:
-                    return
-                continue
-        count[PENDING] = 0
-        accept(system, ws, run)
-        go_on(run, order, 0.04)
-        if run.event.shape[0] > 0 and fire_events(run):
+        if conclude(system, ws, run, error, order):
             return
 
 
 @kernel
 def advance_rodas4(system: System, ws: Workspace, run: Run, limit):
     """:func:`advance` of RODAS4."""
-    count, taken = run.count, 0
-    while (count[STARTED] == 1 and run.tick.shape[0] + run.breaks.shape[0] == 0) or ready(system, ws, run):
+    taken, error = 0, 0.0
+    while waiting(system, ws, run):
         if taken >= limit or finished(run):
             return
         taken += 1
-        if count[PENDING] == 0:
+        if run.count[PENDING] == 0:
             propose(run)
             error = step_rodas4(system, ws, run)
-            if rejected(ws, run, error, 4.0):
-                count[SEARCHING] = 0
-                continue
-            if not take_step(ws, run, error):
-                if count[PENDING] == 1:
-                    return
-                continue
-        count[PENDING] = 0
-        accept(system, ws, run)
-        go_on(run, 4.0, 0.04)
-        if run.event.shape[0] > 0 and fire_events(run):
+        if conclude(system, ws, run, error, 4.0):
             return
 
 

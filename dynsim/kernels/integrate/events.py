@@ -89,10 +89,10 @@ def arm_events(ws: Workspace, run: Run):
 
 
 @inlined_kernel
-def happened(run: Run, e):
-    """True when the guard of event e has passed zero in its direction within the last step."""
+def happened(run: Run, e, value):
+    """True when the guard of event e has passed zero in its direction once it has this value."""
     side, direction = run.event[e, SIDE], run.event_table[e, DIRECTION]
-    return side != 0.0 and run.event[e, VALUE] * side <= 0.0 and (direction == 0 or direction * side < 0.0)
+    return side != 0.0 and value * side <= 0.0 and (direction == 0 or direction * side < 0.0)
 
 
 @inlined_kernel
@@ -111,7 +111,7 @@ def cut_step(ws: Workspace, run: Run):
     h, hit = clock[STEP], False
     for e in range(event.shape[0]):
         event[e, VALUE] = guard(ws, run, e)
-        hit = happened(run, e) or hit
+        hit = happened(run, e, event[e, VALUE]) or hit
     if count[SEARCHING] == 0:
         if not hit:
             return False
@@ -143,8 +143,8 @@ def cut_step(ws: Workspace, run: Run):
         return True
     trial = high
     for e in range(event.shape[0]):
-        a, b, side, direction = event[e, AT_LOW], event[e, AT_HIGH], event[e, SIDE], run.event_table[e, DIRECTION]
-        if side != 0.0 and b * side <= 0.0 and a * side > 0.0 and (direction == 0 or direction * side < 0.0):
+        a, b = event[e, AT_LOW], event[e, AT_HIGH]
+        if happened(run, e, b) and not happened(run, e, a):
             trial = min(trial, low + (high - low) * a / (a - b))
     if not low < trial < high:
         trial = 0.5 * (low + high)
@@ -157,7 +157,7 @@ def fire_events(run: Run):
     """Log the events that the accepted step ends at, and do as they say; True when the caller is to look."""
     count, event, look = run.count, run.event, False
     for e in range(event.shape[0]):
-        if count[FIRED] == 1 and happened(run, e):
+        if count[FIRED] == 1 and happened(run, e, event[e, VALUE]):
             action = run.event_table[e, ON_EVENT]
             if count[LOGGED] < run.log_time.shape[0]:
                 run.log_time[count[LOGGED]] = run.clock[TIME]
