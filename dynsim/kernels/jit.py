@@ -1,10 +1,8 @@
 """The one place that compiles: ``@kernel`` on plain module-level functions.
 
-Two habits of numba are mended here, because results must not depend on what a process has done before:
-
-- it keeps every callee twice, as a library of its own and as a copy in its caller, see :class:`_OwnCallees`;
-- its cache checks only the file that holds the function (an edit in a callee elsewhere silently runs old machine code)
-  and believes whatever bytes it finds, see :class:`_KernelCache`.
+How is in dynsim.kernels.compiler. Here is the cache, because results must not depend on what a process has done before:
+numba's checks only the file that holds the function (an edit in a callee elsewhere silently runs old machine code) and
+believes whatever bytes it finds, see :class:`_KernelCache`.
 """
 
 from __future__ import annotations
@@ -22,96 +20,23 @@ from typing import Any, TypeVar
 
 import llvmlite
 import numba
-import numba.extending
 import numpy as np
-from llvmlite.binding import Linkage
-from numba import _dynfunc
 from numba.core import config, serialize
 from numba.core.caching import _Cache
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler, CompileResult
+from numba.core.compiler import CompileResult
+
+from dynsim.kernels.compiler import ApartCompiler, KernelCompiler, PartCompiler, as_part, register_part
 
 # Packs the scalar formulas of 3-vectors and wrenches into vector instructions (numba leaves it off): a right-hand side
 # takes 8 % less time. Global, and read when numba compiles its first function in the process.
 config.SLP_VECTORIZE = 1
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}, "_nrt": False}
-_NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 # The packages whose functions are compiled into each other: an edit in one makes all compiled code stale.
 _PACKAGES = tuple(Path(__file__).parents[1] / name for name in ("kernels", "snake"))
 
 F = TypeVar("F", bound=Callable[..., Any])
-
-
-class _OwnCallees(JITCodeLibrary):
-    """Machine code that calls only what it brings along.
-
-    numba links a copy of every callee into its caller, optimised again there, and leaves all copies under one name:
-    which of them runs is then a matter of what the process has loaded before, and so are the last bits of a result.
-    Made internal, the copies of a library are its own, in the process that compiles and in all that load it.
-    """
-
-    def _optimize_final_module(self) -> None:
-        for function in self._final_module.functions:
-            if function.linkage == Linkage.linkonce_odr and not function.is_declaration:
-                function.linkage = Linkage.internal
-        # numba runs a cheaper set of passes before, for the sake of reference counting, which kernels do without.
-        passes, builder = self._codegen._module_pass_manager()
-        passes.run(self._final_module, builder)
-
-
-class _Compiler(Compiler):
-    """numba's compiler, into :class:`_OwnCallees`."""
-
-    def compile_extra(self, func: Callable[..., Any]) -> Any:
-        self.state.library = _OwnCallees(self.state.targetctx.codegen(), func.__qualname__)
-        self.state.library.enable_object_caching()
-        return super().compile_extra(func)
-
-
-class _ToLink(JITCodeLibrary):
-    """Code that is only linked into other libraries and optimised there; it never becomes machine code of its own."""
-
-    def _optimize_final_module(self) -> None:
-        pass
-
-    def _finalize_final_module(self) -> None:
-        self._finalize_dynamic_globals()
-        self._finalized = True
-
-
-class _ToCall(_ToLink):
-    """The same for code that must not be merged into its callers."""
-
-    def add_llvm_module(self, ll_module: Any) -> None:
-        for function in ll_module.functions:  # its own; what it calls is linked in later, and may be merged into it
-            if not function.is_declaration:
-                function.add_function_attribute("noinline")
-        super().add_llvm_module(ll_module)
-
-
-class _PartCompiler(Compiler):
-    """numba's compiler, into :class:`_ToLink`."""
-
-    library = _ToLink
-
-    def compile_extra(self, func: Callable[..., Any]) -> Any:
-        self.state.library = self.library(self.state.targetctx.codegen(), func.__qualname__)
-        self.state.flags.no_compile = True
-        result = super().compile_extra(func)
-        # Nothing to call: numba only asks for an object of the kind.
-        entry = _dynfunc.make_function(
-            result.fndesc.lookup_module(), func.__name__, "", 0, result.environment, (result.library,)
-        )
-        self.state.targetctx.insert_user_function(entry, result.fndesc, [result.library])
-        return result._replace(entry_point=entry)
-
-
-class _ApartCompiler(_PartCompiler):
-    """numba's compiler, into :class:`_ToCall`."""
-
-    library = _ToCall
 
 
 class _KernelCache(_Cache):
@@ -250,17 +175,15 @@ def internal_kernel(function: F) -> F:
 
     Unpacking the tables of a model from Python objects would take longer to compile than most of these functions.
     """
-    return numba.extending.register_jitable(pipeline_class=_PartCompiler, **_OPTIONS, **_NO_ENTRY)(function)
+    return register_part(function, PartCompiler, _OPTIONS)
 
 
 def apart_kernel(function: F) -> F:
     """As :func:`internal_kernel`, for what is rarely called from the right-hand side: a call, never merged.
 
-    Merged, it would take registers from what runs every time. Where nothing is said, numba takes ``forceinline`` from
-    the caller.
+    Merged, it would take registers from what runs every time.
     """
-    options = {**_OPTIONS, **_NO_ENTRY, "forceinline": False}
-    return numba.extending.register_jitable(pipeline_class=_ApartCompiler, **options)(function)
+    return register_part(function, ApartCompiler, _OPTIONS)
 
 
 def inlined_kernel(function: F) -> F:
@@ -268,9 +191,7 @@ def inlined_kernel(function: F) -> F:
 
     Passing the tables of a model costs about as much as a whole sweep over ten links.
     """
-    return numba.extending.register_jitable(pipeline_class=_PartCompiler, **_OPTIONS, **_NO_ENTRY, forceinline=True)(
-        function
-    )
+    return register_part(function, PartCompiler, {**_OPTIONS, "forceinline": True})
 
 
 def exact_kernel(function: F) -> F:
@@ -278,14 +199,16 @@ def exact_kernel(function: F) -> F:
 
     Which products of a sum are contracted depends on the place, and so would the last bits of what it computes.
     """
-    options = {**_OPTIONS, **_NO_ENTRY, "fastmath": False, "forceinline": True}
-    return numba.extending.register_jitable(pipeline_class=_PartCompiler, **options)(function)
+    return register_part(function, PartCompiler, {**_OPTIONS, "fastmath": False, "forceinline": True})
 
 
 def _compile(function: F, **options: Any) -> F:
-    compiled = numba.njit(pipeline_class=_Compiler, **_OPTIONS, **options)(function)
+    compiled = numba.njit(pipeline_class=KernelCompiler, no_cfunc_wrapper=True, **_OPTIONS, **options)(function)
     if not config.DISABLE_JIT:
         compiled._cache = _KernelCache(function)
+        if not options:  # other kernels bring it along: they need no entry of its own
+            part = as_part(function, _OPTIONS)
+            compiled.get_call_template, compiled.get_overload = part.get_call_template, part.get_overload
     return compiled
 
 

@@ -312,12 +312,37 @@ class Load:
 
 
 @dataclass(frozen=True)
+class MobileBase:
+    """A base on two driven wheels and a caster ([WM] II.E); its frame: below the axle's midpoint on the ground, x ahead.
+
+    Attributes
+    ----------
+    body : name of the link that carries it
+    wheels : joints of the left and of the right wheel; a positive rate rolls ahead
+    wheel_radius : r [m]; track : T, between the wheels' contact points [m]
+    caster : (3,) where the caster touches the ground, in the base's frame [m]
+    spin_inertia : of one wheel about its axle [kg m²]
+    wheel_friction : μ between wheels and ground, for the traction demand
+    stop_on_overturn : whether a run ends when it tips; else it goes on as if held down
+    """
+
+    body: str
+    wheels: tuple[str, str]
+    wheel_radius: float
+    track: float
+    caster: Array
+    spin_inertia: float
+    wheel_friction: float = 0.8
+    stop_on_overturn: bool = False
+
+
+@dataclass(frozen=True)
 class Robot:
     """A tree of links with its motors.
 
     ``hand`` is the controlled point (body name, point in its frame [m]); ``q0`` the initial configuration [rad or m],
     zero unless given; ``frames`` further names to attach points to; ``fixed_shapes`` what stands still in the world;
-    ``couplings`` of joints to joints.
+    ``couplings`` of joints to joints; ``base`` what it drives on, None: it stands fixed or floats.
     """
 
     name: str
@@ -329,6 +354,7 @@ class Robot:
     frames: tuple[Frame, ...] = ()
     fixed_shapes: tuple[Shape, ...] = ()
     couplings: tuple[Coupling, ...] = ()
+    base: MobileBase | None = None
 
     @property
     def bodies(self) -> tuple[str, ...]:

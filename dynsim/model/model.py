@@ -199,7 +199,7 @@ class Model:
 
     def _sweep(self, q: ArrayLike, v: ArrayLike | None = None) -> None:
         self._set(q, v)
-        sweep.newton_euler(self.arrays, self._workspace, 1.0, 0.0, 1.0)
+        sweep.kinematics(self.arrays, self._workspace)
 
     def _set(self, q: ArrayLike, v: ArrayLike | None = None) -> None:
         positions = self._vector(q, "q", self._position_names)

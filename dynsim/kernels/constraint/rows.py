@@ -62,10 +62,10 @@ from dynsim.kernels.arrays import (
     V,
     Workspace,
 )
-from dynsim.kernels.jit import apart_kernel, internal_kernel, kernel
+from dynsim.kernels.jit import apart_kernel, internal_kernel
 
 
-@kernel
+@internal_kernel
 def set_modes(contacts: ContactArrays, couplings: CouplingArrays, ws: Workspace, modes):
     """Give every candidate its mode, (c,) of OPEN, SLIDING or STICKING, and rebuild the table of rows.
 

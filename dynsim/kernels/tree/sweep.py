@@ -260,6 +260,12 @@ def inertial_wrench(ws: Workspace, i, m, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, iz
 
 
 @kernel
+def kinematics(model: ModelArrays, ws: Workspace):
+    """Poses, axes and velocities of all links from q and v in ``ws.joints``: :func:`forward_sweep` at vdot = 0."""
+    forward_sweep(model, ws, 1.0, 0.0, 1.0)
+
+
+@kernel
 def newton_euler(model: ModelArrays, ws: Workspace, velocity, acceleration, gravity):
     """Generalised forces tau = M vdot + h + g, into the BIAS column of ``ws.joints`` [N m or N] ([WM] eqs 42–44, 52).
 

@@ -1,0 +1,196 @@
+"""How kernels are compiled: numba's compiler with some of its habits mended, so that code is compiled once.
+
+- It keeps every callee twice, as a library of its own and as a copy in its caller, see :class:`_OwnCallees`.
+- It compiles a function again for each set of options that it is called from, see :func:`register_part`.
+- It compares sets of options, and tries the rules of array arithmetic on two numbers, some hundred thousand times a
+  kernel, see the end of this file.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import Any, TypeVar
+
+import numba
+from llvmlite.binding import Linkage
+from numba import _dynfunc
+from numba.core import typed_passes, types, untyped_passes
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
+from numba.core.compiler_machinery import PassManager
+from numba.core.targetconfig import TargetConfig
+from numba.core.typing.npydecl import NumpyRulesArrayOperator
+from numba.core.typing.templates import infer, infer_global, make_overload_template
+
+_NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+class _OwnCallees(JITCodeLibrary):
+    """Machine code that calls only what it brings along.
+
+    numba links a copy of every callee into its caller, optimised again there, and leaves all copies under one name:
+    which of them runs is then a matter of what the process has loaded before, and so are the last bits of a result.
+    Made internal, the copies of a library are its own, in the process that compiles and in all that load it.
+    """
+
+    def _optimize_functions(self, ll_module: Any) -> None:
+        """Nothing yet: all of it is optimised in the end."""
+        ll_module.data_layout = self._codegen._data_layout
+
+    def _optimize_final_module(self) -> None:
+        for function in self._final_module.functions:
+            if function.linkage == Linkage.linkonce_odr and not function.is_declaration:
+                function.linkage = Linkage.internal
+        # numba runs a cheaper set of passes before, for the sake of reference counting, which kernels do without.
+        passes, builder = self._codegen._module_pass_manager()
+        passes.run(self._final_module, builder)
+
+
+class _LeanCompiler(Compiler):
+    """numba's compiler without the passes for what kernels do not have: closures, array expressions, ``with``, loops
+    over types."""
+
+    def define_pipelines(self) -> list[PassManager]:
+        passes = PassManager("kernel")
+        for one in _PASSES:
+            passes.add_pass(one, one.__name__)
+        passes.finalize()
+        return [passes]
+
+
+_PASSES = (
+    untyped_passes.TranslateByteCode,
+    untyped_passes.FixupArgs,
+    untyped_passes.IRProcessing,
+    untyped_passes.GenericRewrites,
+    untyped_passes.InlineInlinables,
+    untyped_passes.DeadBranchPrune,
+    untyped_passes.ReconstructSSA,
+    typed_passes.NopythonTypeInference,
+    typed_passes.PreLowerStripPhis,
+    typed_passes.IRLegalization,
+    typed_passes.NativeLowering,
+    typed_passes.NoPythonBackend,
+)
+
+
+class KernelCompiler(_LeanCompiler):
+    """numba's compiler, into :class:`_OwnCallees`."""
+
+    def compile_extra(self, func: Callable[..., Any]) -> Any:
+        self.state.library = _OwnCallees(self.state.targetctx.codegen(), func.__qualname__)
+        self.state.library.enable_object_caching()
+        # What is compiled is still in use: collecting garbage meanwhile finds none, and takes an eighth of the time.
+        collecting = gc.isenabled()
+        gc.disable()
+        try:
+            return super().compile_extra(func)
+        finally:
+            if collecting:
+                gc.enable()
+
+
+class _ToLink(JITCodeLibrary):
+    """Code that is only linked into other libraries and optimised there; it never becomes machine code of its own."""
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+
+class _ToCall(_ToLink):
+    """The same for code that must not be merged into its callers."""
+
+    def add_llvm_module(self, ll_module: Any) -> None:
+        for function in ll_module.functions:  # its own; what it calls is linked in later, and may be merged into it
+            if not function.is_declaration:
+                function.add_function_attribute("noinline")
+        super().add_llvm_module(ll_module)
+
+
+class PartCompiler(_LeanCompiler):
+    """numba's compiler, into :class:`_ToLink`."""
+
+    library = _ToLink
+
+    def compile_extra(self, func: Callable[..., Any]) -> Any:
+        self.state.library = self.library(self.state.targetctx.codegen(), func.__qualname__)
+        self.state.flags.no_compile = True
+        result = super().compile_extra(func)
+        # Nothing to call: numba only asks for an object of the kind.
+        entry = _dynfunc.make_function(
+            result.fndesc.lookup_module(), func.__name__, "", 0, result.environment, (result.library,)
+        )
+        self.state.targetctx.insert_user_function(entry, result.fndesc, [result.library])
+        return result._replace(entry_point=entry)
+
+
+class ApartCompiler(PartCompiler):
+    """numba's compiler, into :class:`_ToCall`."""
+
+    library = _ToCall
+
+
+def as_part(function: Callable[..., Any], options: Mapping[str, Any]) -> Any:
+    """numba's dispatcher of what is linked into its callers; LLVM decides whether it is merged into them."""
+    return numba.njit(pipeline_class=PartCompiler, **{"forceinline": False, **options, **_NO_ENTRY})(function)
+
+
+def register_part(function: F, compiler: type[Compiler], options: Mapping[str, Any]) -> F:
+    """The function itself; kernels that call it link it in, compiled once for the types of its arguments.
+
+    numba's own ``register_jitable`` compiles it once more for each set of options of its callers, and takes from them
+    what is not said here (``forceinline``).
+    """
+
+    def implementation(*_: Any, **__: Any) -> F:
+        return function
+
+    every = {"nopython": True, "pipeline_class": compiler, "forceinline": False, **options, **_NO_ENTRY}
+    template = make_overload_template(function, implementation, every, strict=False, inline="never")
+    template._get_impl = _implementation
+    infer(template)
+    infer_global(function, types.Function(template))
+    return function
+
+
+def _implementation(template: Any, args: Any, kws: Any) -> Any:
+    """``_get_impl`` of a template, whatever the options of the caller."""
+    key = template.context, tuple(args), tuple(kws.items())
+    if key not in template._impl_cache:
+        template._build_impl(key, args, kws)
+    return template._impl_cache[key]
+
+
+def _options(self: TargetConfig) -> dict[str, Any]:
+    return _defaults(type(self)) | self._values
+
+
+@cache
+def _defaults(kind: type[TargetConfig]) -> dict[str, Any]:
+    return {name: option.default for name, option in kind.options.items()}
+
+
+def _hash_of_options(self: TargetConfig) -> int:
+    return hash(type(self))
+
+
+_array_rules = NumpyRulesArrayOperator.generic
+
+
+def _only_arrays(self: NumpyRulesArrayOperator, args: Any, kws: Any) -> Any:
+    if any(isinstance(argument, types.ArrayCompatible) for argument in args):
+        return _array_rules(self, args, kws)
+    return None
+
+
+TargetConfig.__hash__ = _hash_of_options
+TargetConfig.values = _options
+NumpyRulesArrayOperator.generic = _only_arrays
