@@ -132,7 +132,7 @@ def build(config: Config, context: BuildContext) -> Robot:
         axis=vector(1.0, 0.0, 0.0),
         inertia=Inertia.merged(parts),
         R_PJ=_turn(np.deg2rad(base.heading_deg)),
-        p_PJ=vector(*base.position_m, 0.0),
+        p_PJ=np.array([*base.position_m, 0.0]),
         damping=wheel.damping_N_m_s_per_rad,
         shapes=(*_shapes(base), *(shape.placed(mount[1], _quaternion(base)) for shape in arm.fixed_shapes)),
         armature=axle,
