@@ -116,7 +116,7 @@ def build(config: Config, context: BuildContext) -> JointControl:
         if name not in sources:
             raise ModelError(f"controller: torques.{name}: only motors of type torque take torques")
     for name in config.joints:
-        if robot.links[model.joint_names.index(name)].kind != "revolute":
+        if robot.links[model.joint_names.index(name)].units[0] != "rad":
             raise ModelError(f"controller: {name!r} is prismatic; waypoints in angles_deg are for revolute joints")
     path, times, columns = None, np.zeros(0), []
     if config.hand is not None:
