@@ -12,6 +12,7 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.state import CONTACT_SIZE, IMPULSE, OUT_FORCE, OUT_GAP, OUT_SLIP, OUT_VECTOR, SLIP
 from dynsim.model.description import Link
+from dynsim.model.mobile_base import base_pose
 from dynsim.model.scene import robot_scene
 from dynsim.record import Record
 from dynsim.record.poses import add_body_poses
@@ -35,6 +36,9 @@ def make_record(scenario: Scenario, prepared: Prepared, wall: float, *, pushed: 
     record.add("q", run.states("q"), angle, labels=robot.position_names, description="joint positions")
     record.add("v", run.states("v"), rate, labels=joints, description="joint rates")
     record.add("vdot", run.outputs("vdot"), acceleration, labels=joints, description="joint accelerations")
+    if robot.base is not None:
+        pose = base_pose(robot, run.states("q"))
+        record.add("base_pose", pose, "m, m, rad", labels=("x", "y", "heading"), description="base in the world")
     current, voltage = run.outputs("current"), run.outputs("voltage")
     record.add("current", current, "A", labels=driven, description="motor currents")
     record.add("voltage", voltage, "V", labels=driven, description="motor terminal voltages")

@@ -17,7 +17,7 @@ import numpy as np
 # Joint kinds. The three axis-aligned revolute joints are special cases of REVOLUTE, for speed.
 REVOLUTE_X, REVOLUTE_Y, REVOLUTE_Z, REVOLUTE, PRISMATIC = 0, 1, 2, 3, 4
 # Rows of joints with several velocities, or with a motion of their own: dynsim.kernels.tree.joints.
-BALL_X, BALL_Y, BALL_Z, ROLL, TURN = 5, 6, 7, 8, 9
+BALL_X, BALL_Y, BALL_Z, ROLL, TURN, LEFT_WHEEL, RIGHT_WHEEL = 5, 6, 7, 8, 9, 10, 11
 # Friction of a contact under a negative (pulling) normal force, see dynsim.kernels.constraint.surface.
 FRICTION_SIGNED, FRICTION_DISSIPATIVE = 0, 1
 # What a candidate is at present: off its surface (no row), sliding (one row, friction in its direction), or held at its

@@ -85,6 +85,7 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         body[i, ka.INERTIA : ka.INERTIA + 6] = tensor[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
         body[i, ka.DAMPING] = link.damping
         body[i, ka.PARAMETER] = link.parameter
+        body[i, ka.ARMATURE] = link.armature
     names = set(index)
     for frame in robot.frames:
         if frame.name in names:
@@ -96,7 +97,7 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
     for motor in robot.motors:
         _check_motor(motor, by_joint)
         i = joints[motor.joint]
-        if len(links[i].row.neutral) != 1:
+        if len(links[i].row.neutral) != 1 and not links[i].row.own_position:
             raise ModelError(f"motor: {motor.joint} is one of several rates of a joint and has no position to control")
         if not isinstance(motor, TorqueSource):
             body[i, ka.ARMATURE] += motor.armature

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from dynsim.errors import ModelError
 from dynsim.model.drives import Drive, Motor
 from dynsim.model.joints import Row, rows
+from dynsim.model.mobile_base import MobileBase
 from dynsim.record.scene import Shape
 
 Array = NDArray[np.float64]
@@ -115,6 +116,7 @@ class Link:
     lower, upper, velocity_limit, effort_limit : float
         Limits of the joint [rad or m; rad/s or m/s; N m or N]. Nothing enforces them: a run that passes one warns.
     parameter : what else its kind of joint needs
+    armature : inertia that only turns with the joint, beside that of its motor [kg m² or kg]
     joint_of_rows : name of the joint with several rows that this is one of, None for a joint of its own
     radius : of a cylinder about the body's axis [m], zero when unknown: deeper than that below a surface, a run warns
     tip : (3,) or None
@@ -140,6 +142,7 @@ class Link:
     shapes: tuple[Shape, ...] = ()
     parameter: float = 0.0
     joint_of_rows: str | None = None
+    armature: float = 0.0
 
     @property
     def row(self) -> Row:
@@ -312,37 +315,13 @@ class Load:
 
 
 @dataclass(frozen=True)
-class MobileBase:
-    """A base on two driven wheels and a caster ([WM] II.E); its frame: below the axle's midpoint on the ground, x ahead.
-
-    Attributes
-    ----------
-    body : name of the link that carries it
-    wheels : joints of the left and of the right wheel; a positive rate rolls ahead
-    wheel_radius : r [m]; track : T, between the wheels' contact points [m]
-    caster : (3,) where the caster touches the ground, in the base's frame [m]
-    spin_inertia : of one wheel about its axle [kg m²]
-    wheel_friction : μ between wheels and ground, for the traction demand
-    stop_on_overturn : whether a run ends when it tips; else it goes on as if held down
-    """
-
-    body: str
-    wheels: tuple[str, str]
-    wheel_radius: float
-    track: float
-    caster: Array
-    spin_inertia: float
-    wheel_friction: float = 0.8
-    stop_on_overturn: bool = False
-
-
-@dataclass(frozen=True)
 class Robot:
     """A tree of links with its motors.
 
     ``hand`` is the controlled point (body name, point in its frame [m]); ``q0`` the initial configuration [rad or m],
     zero unless given; ``frames`` further names to attach points to; ``fixed_shapes`` what stands still in the world;
-    ``couplings`` of joints to joints; ``base`` what it drives on, None: it stands fixed or floats.
+    ``couplings`` of joints to joints; ``base`` what it drives on, None: it stands fixed or floats;
+    ``fixed_inertia`` of what is fixed to the world, which a mobile base would have to carry.
     """
 
     name: str
@@ -355,6 +334,7 @@ class Robot:
     fixed_shapes: tuple[Shape, ...] = ()
     couplings: tuple[Coupling, ...] = ()
     base: MobileBase | None = None
+    fixed_inertia: Inertia = field(default_factory=lambda: Inertia(0.0))
 
     @property
     def bodies(self) -> tuple[str, ...]:

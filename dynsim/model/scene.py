@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from dynsim.model.description import Array, Contact, Link, Quadric, Robot
+from dynsim.model.mobile_base import MobileBase
 from dynsim.model.snake import SnakeDescription
 from dynsim.record.quaternion import of_turn
 from dynsim.record.scene import (
@@ -27,6 +28,7 @@ from dynsim.record.scene import (
 
 # Of a wheel, in parts of its radius; a snake's description has no width.
 WHEEL_WIDTH = 0.48
+BASE_WHEEL_WIDTH = 0.5
 # Thickness of the snake's body, likewise.
 BODY_RADIUS = 0.5
 _ALONG_X: Quaternion = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
@@ -45,6 +47,8 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
         bodies.append(Body(link.name, parent, _joint(link, kind), link.shapes or _rod(link)))
     hand_body, hand_point = robot.hand
     points = [Point("hand", "hand", index[hand_body], vector3(hand_point))]
+    if robot.base is not None:
+        bodies.extend(_wheels(robot.base, index[robot.base.body]))
     for contact in contacts:
         body, point = robot.attach(contact.body, contact.point)
         points.append(Point(contact.name, "contact", body, vector3(point), contact.surface_name))
@@ -56,7 +60,21 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
     )
 
 
+def _wheels(base: MobileBase, body: int) -> list[Body]:
+    """Wheels as bodies of their own, which turn on the base."""
+    r, wheels = base.wheel_radius, []
+    for name, side in zip(base.wheels, (0.5, -0.5), strict=True):
+        place = (0.0, side * base.track, r)
+        joint = Joint(f"{name}.axle", "revolute", (0.0, 1.0, 0.0), place, HERE, "q", (name,))
+        wheels.append(
+            Body(f"{name}.wheel", body, joint, (Shape("cylinder", (r, BASE_WHEEL_WIDTH * r), orientation=_ALONG_Y),))
+        )
+    return wheels
+
+
 def _joint(link: Link, kind: JointKind) -> Joint:
+    if link.kind == "left_wheel":  # its angles are not where it is
+        return Joint(link.joint, kind, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), HERE, "base_pose", ("x", "y", "heading"))
     return Joint(
         name=link.joint,
         kind=kind,

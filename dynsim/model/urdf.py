@@ -99,7 +99,18 @@ def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
         frames=tuple(frames),
         couplings=couplings,
         fixed_shapes=_shapes(locked, places).get(None, ()),
+        fixed_inertia=_fixed(locked, places),
     )
+
+
+def _fixed(tree: UrdfTree, places: Mapping[str, _Place]) -> Inertia:
+    """Mass properties of all that is fixed to the root, in its frame."""
+    parts = [
+        inertia.placed(place.R, place.p)
+        for name, place in places.items()
+        if place.body is None and (inertia := tree.links[name].inertia) is not None
+    ]
+    return Inertia.merged(parts) if parts else Inertia(0.0)
 
 
 def _locked_followers(tree: UrdfTree, lock: Mapping[str, float]) -> dict[str, float]:

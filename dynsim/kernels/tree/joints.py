@@ -14,7 +14,11 @@ joint                  coordinates                      rows
 =====================  ===============================  ==================================================
 ball                   quaternion w, x, y, z            angular velocity about the body's x, y, z
 rolling base           x, y, heading in the ground      unit speed along the heading; unit rate of turning
+wheeled base           angles of its left and right     rates of the wheels: each moves the axle's middle by r/2 ahead
+                       wheel; x, y in the ground        and turns it by r/T, the left one to the right
 =====================  ===============================  ==================================================
+
+The heading of a wheeled base is (r/T)(right − left): r/T is the parameter of its first row, r/2 that of its second.
 
 A free body is three prismatic rows and a ball; a planar joint two prismatic rows and a revolute one.
 """
@@ -30,12 +34,15 @@ from dynsim.kernels.arrays import (
     BASE,
     EXTRA,
     KIND,
+    LEFT_WHEEL,
     P_PJ,
+    PARAMETER,
     PARENT,
     POSITION_INDEX,
     QD,
     QDD,
     R_PJ,
+    RIGHT_WHEEL,
     ROLL,
     TURN,
     A,
@@ -92,6 +99,18 @@ def row_motion(model: ModelArrays, ws: Workspace, i, b0, b1, b2, b3, b4, b5, b6,
         lx, ly, lz = b0, b3, b6
     elif kind == TURN:
         sx, sy, sz = b2, b5, b8
+    elif kind == LEFT_WHEEL:
+        turn, ahead = model.body[i, PARAMETER], model.body[i + 1, PARAMETER]
+        x, y, heading = joints[i, EXTRA], joints[i + 1, EXTRA], turn * (joints[i + 1, Q] - joints[i, Q])
+        s, c = math.sin(heading), math.cos(heading)
+        px, py, pz = px + b0 * x + b1 * y, py + b3 * x + b4 * y, pz + b6 * x + b7 * y
+        b0, b1 = c * b0 + s * b1, c * b1 - s * b0
+        b3, b4 = c * b3 + s * b4, c * b4 - s * b3
+        b6, b7 = c * b6 + s * b7, c * b7 - s * b6
+        sx, sy, sz, lx, ly, lz = -turn * b2, -turn * b5, -turn * b8, ahead * b0, ahead * b3, ahead * b6
+    elif kind == RIGHT_WHEEL:
+        turn, ahead = model.body[i - 1, PARAMETER], model.body[i, PARAMETER]
+        sx, sy, sz, lx, ly, lz = turn * b2, turn * b5, turn * b8, ahead * b0, ahead * b3, ahead * b6
     # As a motion at the world origin.
     lx, ly, lz = lx + py * sz - pz * sy, ly + pz * sx - px * sz, lz + px * sy - py * sx
     return b0, b1, b2, b3, b4, b5, b6, b7, b8, px, py, pz, sx, sy, sz, lx, ly, lz
@@ -157,11 +176,16 @@ def read_positions(model: ModelArrays, y, start, ws: Workspace):
         joints[i, Q] = y[k]
         if tree[i, KIND] == BALL_X or tree[i, KIND] == ROLL:
             joints[i, EXTRA] = y[k + 1]
+        elif tree[i, KIND] == LEFT_WHEEL or tree[i, KIND] == RIGHT_WHEEL:
+            joints[i, EXTRA] = y[k + 2]
 
 
 @apart_kernel
 def position_rates(model: ModelArrays, ws: Workspace, dy, start):
-    """q̇ = N(q) v into dy[start:]. Ball: ½ q ∘ (0, ω) with ω in the body; rolling: V (cos ψ, sin ψ), ω."""
+    """q̇ = N(q) v into dy[start:]. Ball: ½ q ∘ (0, ω) with ω in the body; rolling: V (cos ψ, sin ψ), ω.
+
+    Wheels: their own rates, and V = (r/2)(left + right) along the heading as of a rolling base.
+    """
     tree, joints = model.tree, ws.joints
     for i in range(tree.shape[0]):
         k, kind = start + tree[i, POSITION_INDEX], tree[i, KIND]
@@ -175,7 +199,12 @@ def position_rates(model: ModelArrays, ws: Workspace, dy, start):
         elif kind == ROLL:
             dy[k] = joints[i, QD] * ws.trig[1, i + 1]
             dy[k + 1] = joints[i, QD] * ws.trig[0, i + 1]
-        elif kind != BALL_Y and kind != BALL_Z:
+        elif kind == LEFT_WHEEL:
+            heading = model.body[i, PARAMETER] * (joints[i + 1, Q] - joints[i, Q])
+            speed = model.body[i + 1, PARAMETER] * (joints[i, QD] + joints[i + 1, QD])
+            dy[k], dy[k + 1] = joints[i, QD], joints[i + 1, QD]
+            dy[k + 2], dy[k + 3] = speed * math.cos(heading), speed * math.sin(heading)
+        elif kind != BALL_Y and kind != BALL_Z and kind != RIGHT_WHEEL:
             dy[k] = joints[i, QD]
 
 
@@ -195,7 +224,16 @@ def displace(model: ModelArrays, ws: Workspace, y, start):
         elif kind == ROLL:
             y[k] += joints[i, QDD] * ws.trig[1, i + 1]
             y[k + 1] += joints[i, QDD] * ws.trig[0, i + 1]
-        elif kind != BALL_Y and kind != BALL_Z:
+        elif kind == LEFT_WHEEL:
+            left, right = joints[i, QDD], joints[i + 1, QDD]
+            # Along the heading halfway: what is left of the displacement's square is then no first-order error.
+            heading = model.body[i, PARAMETER] * (y[k + 1] - y[k] + 0.5 * (right - left))
+            shift = model.body[i + 1, PARAMETER] * (left + right)
+            y[k] += left
+            y[k + 1] += right
+            y[k + 2] += shift * math.cos(heading)
+            y[k + 3] += shift * math.sin(heading)
+        elif kind != BALL_Y and kind != BALL_Z and kind != RIGHT_WHEEL:
             y[k] += joints[i, QDD]
 
 
@@ -230,8 +268,8 @@ def position_error(model: ModelArrays, y, y_new, error, start, rtol, atol):
             ez = scale * (w * dz - z * dw - x * dy + y0 * dx)
             total += ex * ex + ey * ey + ez * ez
             count += 3
-        elif kind != BALL_Y and kind != BALL_Z:
-            for s in range(2 if kind == ROLL else 1):
+        elif kind != BALL_Y and kind != BALL_Z and kind != RIGHT_WHEEL:
+            for s in range(2 if kind == ROLL else 4 if kind == LEFT_WHEEL else 1):
                 e = error[k + s] / (atol + rtol * max(abs(y[k + s]), abs(y_new[k + s])))
                 total += e * e
                 count += 1

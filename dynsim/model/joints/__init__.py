@@ -39,6 +39,8 @@ class Row:
     neutral : coordinates of the whole joint where its frames coincide; of its later rows empty
     names : of these coordinates, where there are several
     offset : where the row's own coordinates begin among those of the joint
+    own_position : whether the first of these is the integral of its rate, so that a motor can control it, though the
+        joint has several rows
     drawn : kind of joint, in the scene of a record, that moves the row's body as this row does; None: there is none,
         and records of robots with such a joint have no scene
     motion : (link, coordinates (k, T)) → rotation (3, 3, T) and origin (3, T) of the body in the joint's frame
@@ -49,6 +51,7 @@ class Row:
     neutral: tuple[float, ...] = (0.0,)
     names: tuple[str, ...] = ()
     offset: int = 0
+    own_position: bool = field(default=False, kw_only=True)
     drawn: JointKind | None = field(default=None, kw_only=True)
     motion: Callable[[Link, Array], tuple[Array, Array]] | None = None
 

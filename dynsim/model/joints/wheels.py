@@ -1,0 +1,48 @@
+"""A base on two driven wheels of one axle, without side slip: its rates are those of the wheels ([WM] II.E)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dynsim.kernels.arrays import LEFT_WHEEL, RIGHT_WHEEL
+from dynsim.model.joints import ANGLE, Array, Row, turned
+
+if TYPE_CHECKING:
+    from dynsim.model.description import Link
+
+
+def motion(link: Link, q: Array) -> tuple[Array, Array]:
+    """See :class:`dynsim.model.joints.Row`."""
+    left, right, x, y = q
+    return turned(np.array([0.0, 0.0, 1.0]), link.parameter * (right - left)), np.stack([x, y, np.zeros_like(x)])
+
+
+ROWS = {
+    "left_wheel": Row(
+        LEFT_WHEEL,
+        ANGLE,
+        (0.0, 0.0, 0.0, 0.0),
+        ("left", "right", "x", "y"),
+        own_position=True,
+        drawn="planar",
+        motion=motion,
+    ),
+    "right_wheel": Row(RIGHT_WHEEL, ANGLE, (), offset=1, own_position=True, drawn="fixed"),
+}
+
+
+def wheeled(link: Link, radius: float, track: float) -> tuple[Link, ...]:
+    """Links of a base that rolls on the plane z = 0 of the joint's frame on wheels of that radius, a track [m] apart.
+
+    Coordinates: angles of the left and the right wheel, then x and y of the middle of the axle; both wheels turn
+    positively when the base rolls ahead, along its x. Rates: those of the wheels, V = r (φ̇_r + φ̇_l)/2 and
+    ω = r (φ̇_r − φ̇_l)/T; so rolling without slip, and the heading r (φ_r − φ_l)/T, are exact.
+    """
+    from dynsim.model.description import in_rows
+
+    x = np.eye(3)[0]
+    left, right = in_rows(link, [("left", "left_wheel", x), ("right", "right_wheel", x)])
+    return replace(left, parameter=radius / track), replace(right, parameter=0.5 * radius)
