@@ -44,6 +44,7 @@ FAMILIES = {
     "plant": Family("dynsim.plants", "dynsim.plants", ("ENGINE",)),
     "controller": Family("dynsim.control", "dynsim.controllers", ("ENGINE",)),
     "path": Family("dynsim.control.paths", "dynsim.paths"),
+    "base_path": Family("dynsim.control.base_paths", "dynsim.base_paths"),
     "surface": Family("dynsim.surfaces", "dynsim.surfaces"),
     "motor": Family("dynsim.motors", "dynsim.motors"),
 }
