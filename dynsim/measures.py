@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,6 +48,39 @@ def hand_error(record: Record, settle: float) -> dict[str, float | None]:
     square = (error**2).sum(axis=1)
     values = (_mean(square, time) ** 0.5, square.max() ** 0.5, _mean(error[:, 2] ** 2, time) ** 0.5)
     return dict(zip(names, map(float, values), strict=True))
+
+
+def base_summary(record: Record, settle: float, overturn: str) -> dict[str, Any]:
+    """How a mobile base has driven and stood, from the samples; None where there is nothing to say.
+
+    Parameters
+    ----------
+    settle : time from which ``tip_margin_min_settled`` counts [s]
+    overturn : kind of the events of tipping, which are found between samples: the margin is zero there
+    """
+    pose, load, margin = record["base_pose"], record["wheel_load"], record["tip_margin"]
+    tips = [event.time for event in record.events if event.kind == overturn]
+    # Samples on a circle: the arc over each chord.
+    chord, turn = np.hypot(*np.diff(pose[:, :2], axis=0).T), np.diff(pose[:, 2])
+    traction, labels = record["traction_demand"], record.labels["wheel_load"]
+
+    def least(values: NDArray[np.float64], since: float) -> float | None:
+        found = [*values[record.time >= since].tolist(), *(0.0 for time in tips if time >= since)]
+        return min(found, default=None)
+
+    def named(loads: NDArray[np.float64] | None) -> dict[str, float] | None:
+        return None if loads is None else dict(zip(labels, loads.tolist(), strict=True))
+
+    return {
+        "pose_final": pose[-1].tolist() if len(pose) else None,
+        "path_length_m": float((chord / np.sinc(turn / (2.0 * np.pi))).sum()),
+        "wheel_load_min_N": named(load.min(axis=0) if len(load) else None),
+        "wheel_load_final_N": named(load[-1] if len(load) else None),
+        "tip_margin_min": least(margin, -np.inf),
+        "tip_margin_min_settled": least(margin, settle),
+        "overturns_at_s": min(tips, default=None),
+        "traction_demand_max": float(np.nanmax(traction)) if np.isfinite(traction).any() else None,
+    }
 
 
 def _mean(values: NDArray[np.float64], time: NDArray[np.float64]) -> float:

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from dynsim._version import __version__
 from dynsim.kernels.integrate.run import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, LOCAL_SINCE, PULLING
-from dynsim.measures import RESIDUAL_LIMIT, SINKS, STORES, energy_turnover, hand_error
+from dynsim.measures import RESIDUAL_LIMIT, SINKS, STORES, base_summary, energy_turnover, hand_error
 from dynsim.model.clearance import Sinking, sinking
 from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Drive, Servo, TorqueSource
+from dynsim.model.mobile_base import MobileBase
 from dynsim.record import Record
 from dynsim.scenario import Scenario, build
 
@@ -31,6 +32,8 @@ INTEGRALS = {
     "energy_electrical_supply": "∫ max(Σ u i, 0) dt, one supply for all motors that takes nothing back",
 }
 
+# Kind of the event of a mobile base that tips.
+TIP_OVER = "tip_over"
 DRIFT_LIMIT_M = 1e-9
 # Limits in files are rounded: a joint that starts at 1.5707963 = 90° is not beyond it.
 LIMIT_SLACK = 1e-6
@@ -147,6 +150,7 @@ def summarise(
         "energy_turnover_J": turnover,
         "energy_residual_relative": residual / denominator if denominator > 0.0 else 0.0,
         "constraint_drift_max_m": float(counts.extremes[:, DRIFT_MAX].max(initial=0.0)),
+        **({"base": base_summary(record, scenario.metrics.settle_s, TIP_OVER)} if robot.base else {}),
         "contacts": [_contact(record, k, contact, counts, duration) for k, contact in enumerate(contacts)],
         "sinking": [
             {"body": s.body, "surface": s.surface, "depth_m": s.depth, "since_s": float(record.time[s.sample])}
@@ -221,6 +225,8 @@ def _warnings(
                     f"{100 * saturated.mean():.1f} % of the run"
                 )
     found.extend(_passed_limits(record, robot))
+    if robot.base is not None:
+        found.extend(_tipped(record, robot.base))
     if summary["energy_residual_relative"] > RESIDUAL_LIMIT:
         found.append(
             f"the energy ledger does not close: residual {summary['energy_residual_relative']:.1e} of the turnover; "
@@ -239,6 +245,40 @@ def _warnings(
             f"of {s.joint} is anything from {s.low:.4g} to {s.high:.4g} {s.unit} over the splits of the normal forces "
             f"that keep their signs (this run: {s.taken:.4g}); take away braces until the rest are independent"
         )
+    return found
+
+
+def _tipped(record: Record, base: MobileBase) -> list[str]:
+    """What a mobile base does that a real one could not do."""
+    found = []
+    load, traction = record["wheel_load"], record["traction_demand"]
+    first = min((event.time for event in record.events if event.kind == TIP_OVER), default=np.inf)
+    if np.isfinite(first) and not base.stop_on_overturn:
+        pulled = ", ".join(
+            f"{name} {low:.3g}"
+            for name, low in zip(record.labels["wheel_load"], load.min(axis=0, initial=np.inf), strict=True)
+            if low < 0.0
+        )
+        found.append(
+            f"the base tips over at t = {first:.4f} s; the run goes on as if it were held down"
+            f"{f' (least loads [N]: {pulled})' if pulled else ''}: plant.base.on_overturn: stop ends it there"
+        )
+    lifted = load.sum(axis=1) <= 0.0
+    if lifted.any():
+        found.append(
+            f"the base is lifted: no load on its wheels and caster in {100 * lifted.mean():.1f} % of the samples, "
+            f"first at t = {record.time[lifted.argmax()]:.4g} s (counts as a tip margin of -1)"
+        )
+    # Once it has tipped, the loads mean nothing.
+    standing = record.time < first
+    for name, demand in zip(record.labels["traction_demand"], traction[standing].T, strict=True):
+        slips = demand > 1.0
+        if slips.any():
+            found.append(
+                f"the {name} wheel would slip: it needs up to {np.nanmax(demand):.3g} times the traction that "
+                f"plant.base.wheel_friction = {base.wheel_friction:g} gives, first at "
+                f"t = {record.time[standing][slips.argmax()]:.4g} s; rolling is enforced all the same"
+            )
     return found
 
 

@@ -10,11 +10,13 @@ from dynsim.engine import SIMULATION, Progress, Start
 from dynsim.engine.outcome import kernels_logged, raise_stopped
 from dynsim.engine.prepare import Prepared, prepare
 from dynsim.engine.recording import make_record
+from dynsim.engine.stepped import take_log
 from dynsim.engine.stopping import last_state, stopped
 from dynsim.errors import SimulationInterrupted, SimulationStopped
 from dynsim.kernels.integrate import driver
 from dynsim.kernels.integrate import run as ki
-from dynsim.record import Record
+from dynsim.metrics import TIP_OVER
+from dynsim.record import Event, Record
 from dynsim.scenario import Scenario
 
 __all__ = ["Prepared", "prepare", "simulate", "start"]
@@ -41,6 +43,8 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
         driver.advance(prepared.system, prepared.workspace, run, 0)
     if progress is not None:
         progress(0.0, SIMULATION)
+    base = prepared.model.robot.base
+    happened: list[Event] = []
     started, limit, interrupted = clock.perf_counter(), 1, False
     try:
         log.info("%s: integrating %g s by %s", scenario.title, scenario.duration_s, scenario.integrator.method)
@@ -48,6 +52,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
             before = clock.perf_counter()
             driver.advance(prepared.system, prepared.workspace, run, limit)
             taken = clock.perf_counter() - before
+            happened += [Event(time, TIP_OVER, base.body) for time, _ in take_log(run)] if base else []
             limit = int(min(max(limit * min(CHUNK_S / max(taken, 1e-9), 10.0), 1), 1_000_000))
             if progress is not None:
                 progress(float(run.clock[ki.TIME]), SIMULATION)
@@ -59,7 +64,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
         interrupted = True
     wall = clock.perf_counter() - started
     log.info("%s: integrated %g s in %d steps, %.3f s", scenario.title, run.clock[ki.TIME], run.count[ki.STEPS], wall)
-    record = make_record(scenario, prepared, wall)
+    record = make_record(scenario, prepared, wall, happened=happened)
     reached = float(run.clock[ki.TIME])
     if interrupted or run.count[ki.STATUS] != ki.FINISHED:
         if interrupted:

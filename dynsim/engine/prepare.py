@@ -15,9 +15,17 @@ from dynsim.engine.outcome import check_size
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.integrate.events import TIP_MARGIN
 from dynsim.kernels.state import OutputLayout, StateLayout, block, output_layout, state_layout
 from dynsim.kernels.system import System, new_workspace
-from dynsim.model.arrays import compile_contacts, compile_couplings, compile_drives, compile_loads
+from dynsim.kernels.tree.support import OUTPUTS
+from dynsim.model.arrays import (
+    compile_contacts,
+    compile_couplings,
+    compile_drives,
+    compile_loads,
+    compile_support,
+)
 from dynsim.model.clearance import poses
 from dynsim.model.control import JointControl
 from dynsim.model.description import Array, Contact, Load, Robot
@@ -78,7 +86,8 @@ def prepare(
     if pushable:
         loads = [*loads, *(_push(body) for body in robot.bodies)]
     n, na, c = model.n, len(robot.motors), len(contacts)
-    layout, columns = state_layout(model.nq, n, robot.circuits, c, len(loads)), output_layout(n, na, c)
+    layout = state_layout(model.nq, n, robot.circuits, c, len(loads))
+    columns = output_layout(n, na, c, OUTPUTS if robot.base else 0)
     if times is None:
         times = sample_times(scenario, layout, columns, n)
     _check_coordinates(scenario, robot)
@@ -122,6 +131,8 @@ def prepare(
         atol=options.atol,
         ticks=_ticks(control),
         breaks=_breaks(loads),
+        events=_tipping(robot),
+        support=compile_support(robot),
     )
     return Prepared(model, contacts, control, system, run, new_workspace(system), loads)
 
@@ -133,6 +144,16 @@ def _ticks(control: JointControl) -> tuple[np.ndarray, np.ndarray] | None:
     tick = np.zeros((1, ki.TICK_SIZE))
     tick[0, ki.TICK_PERIOD] = control.sample_time
     return tick, np.array([[ki.TAKE_COMMANDS, 0]])
+
+
+def _tipping(robot: Robot) -> tuple[np.ndarray, np.ndarray] | None:
+    """The event of a mobile base that tips: its margin falls through zero."""
+    if robot.base is None:
+        return None
+    event = np.zeros((1, ki.EVENT_SIZE))
+    # It stood before the run: one that begins beyond zero tips at once.
+    event[0, ki.SIDE] = 1.0
+    return event, np.array([[TIP_MARGIN, 0, -1, ki.STOP if robot.base.stop_on_overturn else ki.LOG]])
 
 
 def _breaks(loads: Sequence[Load]) -> np.ndarray:

@@ -11,18 +11,27 @@ from dynsim.engine.uniqueness import motion_spread
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.state import CONTACT_SIZE, IMPULSE, OUT_FORCE, OUT_GAP, OUT_SLIP, OUT_VECTOR, SLIP
-from dynsim.model.description import Link
-from dynsim.model.mobile_base import base_pose
+from dynsim.kernels.tree import support as ks
+from dynsim.model.description import Link, Robot
+from dynsim.model.mobile_base import MobileBase, base_pose
 from dynsim.model.scene import robot_scene
-from dynsim.record import Record
+from dynsim.record import Event, Record
 from dynsim.record.poses import add_body_poses
 from dynsim.scenario import Scenario, build
 
 
-def make_record(scenario: Scenario, prepared: Prepared, wall: float, *, pushed: Sequence[int] | None = None) -> Record:
+def make_record(
+    scenario: Scenario,
+    prepared: Prepared,
+    wall: float,
+    *,
+    pushed: Sequence[int] | None = None,
+    happened: Sequence[Event] = (),
+) -> Record:
     """Name the columns that the kernels wrote.
 
     ``pushed`` : which of the bodies' own wrenches, the last of the loads, have been set; None: there are none
+    ``happened`` : events of the run
     """
     model, run, contacts = prepared.model, prepared.run, prepared.contacts
     robot = model.robot
@@ -37,8 +46,7 @@ def make_record(scenario: Scenario, prepared: Prepared, wall: float, *, pushed: 
     record.add("v", run.states("v"), rate, labels=joints, description="joint rates")
     record.add("vdot", run.outputs("vdot"), acceleration, labels=joints, description="joint accelerations")
     if robot.base is not None:
-        pose = base_pose(robot, run.states("q"))
-        record.add("base_pose", pose, "m, m, rad", labels=("x", "y", "heading"), description="base in the world")
+        _add_base(record, robot, robot.base, run)
     current, voltage = run.outputs("current"), run.outputs("voltage")
     record.add("current", current, "A", labels=driven, description="motor currents")
     record.add("voltage", voltage, "V", labels=driven, description="motor terminal voltages")
@@ -67,6 +75,8 @@ def make_record(scenario: Scenario, prepared: Prepared, wall: float, *, pushed: 
     integrals = run.states("contact").reshape(rows, len(contacts), CONTACT_SIZE)
     record.add("contact_impulse", integrals[:, :, IMPULSE], "N s", labels=names, description="∫ f_n dt")
     record.add("contact_slip_distance", integrals[:, :, SLIP], "m", labels=names, description="∫ |v_t| dt")
+    for event in happened:
+        record.add_event(event.time, event.kind, event.name)
     record.scene = robot_scene(robot, contacts, build.surfaces(scenario))
     add_body_poses(record)
     deficient, spread = int(prepared.workspace.counts[ka.DEPENDENT]), None
@@ -85,6 +95,20 @@ def make_record(scenario: Scenario, prepared: Prepared, wall: float, *, pushed: 
     )
     record.summary = metrics.summarise(record, scenario, contacts, robot, counts)
     return record
+
+
+def _add_base(record: Record, robot: Robot, base: MobileBase, run: ki.Run) -> None:
+    """Where the base is, and what the ground carries; see dynsim.kernels.tree.support."""
+    pose, speed = base_pose(robot, run.states("q")), run.states("v")[:, list(map(robot.joint_names.index, base.wheels))]
+    record.add("base_pose", pose, "m, m, rad", labels=("x", "y", "heading"), description="base in the world")
+    sides, support = ("left", "right"), run.outputs("support")
+    parts = (slice(ks.LOADS, ks.LOADS + 3), slice(ks.PRESSURE, ks.PRESSURE + 2), slice(ks.TRACTION, ks.TRACTION + 2))
+    load, pressure, traction = (support[:, part] for part in parts)
+    record.add("wheel_speed", speed, "rad/s", labels=sides, description="positive rolls ahead")
+    record.add("wheel_load", load, "N", labels=(*sides, "caster"), description="normal forces; negative: pulling")
+    record.add("center_of_pressure", pressure, "m", labels=("x", "y"), description="in the world; NaN for no load")
+    record.add("tip_margin", support[:, ks.MARGIN], "1", description="1 at the incentre, 0 tipping; -1 lifted")
+    record.add("traction_demand", traction, "1", labels=sides, description="|F|/(μ N); NaN without load")
 
 
 def _joint_units(links: Iterable[Link]) -> Sequence[str]:

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from dynsim.engine.outcome import raise_stopped
 from dynsim.engine.prepare import prepare, sample_times
 from dynsim.engine.recording import make_record
-from dynsim.engine.stepped import GUARDS, Snapshot, State
+from dynsim.engine.stepped import GUARDS, Snapshot, State, take_log
 from dynsim.engine.stopping import stopped
 from dynsim.engine.trace import Trace
 from dynsim.errors import ModelError, ScenarioError, shown
@@ -31,6 +31,7 @@ from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.dense import state_within
 from dynsim.kernels.state import JOINT, block
 from dynsim.kernels.tree import loads as kl
+from dynsim.metrics import TIP_OVER
 from dynsim.model.arrays import check_couplings
 from dynsim.model.drives import Drive
 from dynsim.model.model import Model
@@ -110,6 +111,8 @@ class Simulation:
         self._guards: list[tuple[str, str, Callable[[Simulation], None] | None]] = []
         self._calls: list[Callable[[Simulation], None]] = []
         robot = self.robot
+        if robot.base is not None:
+            self._guards.append((TIP_OVER, robot.base.body, None))
         self._armature = self.model.armature
         self._joints = {link.joint: i for i, link in enumerate(robot.links)}
         self._motors = {motor.joint: a for a, motor in enumerate(robot.motors)}
@@ -232,9 +235,9 @@ class Simulation:
         Parameters
         ----------
         kind : ``joint_position``, ``joint_rate``, ``motor_current``, ``motor_voltage``, ``contact_force``,
-            ``contact_gap`` or ``hand_position``
-        subject : joint, joint of the motor, contact, or x, y, z of the hand
-        level : [rad, m, rad/s, A, V, N]
+            ``contact_gap``, ``hand_position`` or ``tip_margin``
+        subject : joint, joint of the motor, contact, x, y, z of the hand, or the mobile base
+        level : [rad, m, rad/s, A, V, N, 1]
         direction : +1 rising only, −1 falling only, 0 both
         call : called at the event, may rewrite; ``stop`` ends the run there
 
@@ -247,7 +250,9 @@ class Simulation:
             raise ModelError(f"no event {shown(kind)}; events: {', '.join(GUARDS)}")
         number, family = GUARDS[kind]
         contacts = {contact.name: k for k, contact in enumerate(self._prepared.contacts)}
-        choices = {"joint": self._joints, "motor": self._motors, "contact": contacts, "axis": {"x": 0, "y": 1, "z": 2}}
+        base = {} if self.robot.base is None else {self.robot.base.body: 0}
+        choices = {"joint": self._joints, "motor": self._motors, "contact": contacts, "base": base}
+        choices["axis"] = {"x": 0, "y": 1, "z": 2}
         index = _index(choices[family], subject, family)
         action = ki.STOP if stop else ki.LOG if call is None else ki.RETURN
         run = self._prepared.run
@@ -422,10 +427,12 @@ class Simulation:
         count[ki.SAMPLE] = len(times)
         whole = run._replace(sample_time=times, sample=states, output=outputs, count=count)
         record = make_record(
-            self._scenario, replace(self._prepared, run=whole), self._wall, pushed=sorted(self._pushed)
+            self._scenario,
+            replace(self._prepared, run=whole),
+            self._wall,
+            pushed=sorted(self._pushed),
+            happened=self._happened,
         )
-        for happening in self._happened:
-            record.add_event(happening.time, happening.kind, happening.name)
         record.complete = self.finished
         return record
 
@@ -504,9 +511,7 @@ class Simulation:
     def _take_events(self) -> None:
         """Empty the log of the kernels."""
         run = self._prepared.run
-        logged = int(run.count[ki.LOGGED])
-        run.count[ki.LOGGED] = 0
-        for time, e in zip(run.log_time[:logged].tolist(), run.log_event[:logged].tolist(), strict=True):
+        for time, e in take_log(run):
             kind, subject, call = self._guards[e]
             self._happened.append(Event(time, kind, subject))
             if call is not None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from dynsim.engine.trace import Rows
 from dynsim.kernels.integrate import events
+from dynsim.kernels.integrate import run as ki
 from dynsim.record import Event, Record
 
 Array = NDArray[np.float64]
@@ -23,7 +24,15 @@ GUARDS = {
     "contact_force": (events.CONTACT_FORCE, "contact"),
     "contact_gap": (events.CONTACT_GAP, "contact"),
     "hand_position": (events.HAND_X, "axis"),
+    "tip_margin": (events.TIP_MARGIN, "base"),
 }
+
+
+def take_log(run: ki.Run) -> list[tuple[float, int]]:
+    """Empty the log of the kernels: times [s] and indices of what has happened."""
+    logged = int(run.count[ki.LOGGED])
+    run.count[ki.LOGGED] = 0
+    return list(zip(run.log_time[:logged].tolist(), run.log_event[:logged].tolist(), strict=True))
 
 
 @dataclass(frozen=True)

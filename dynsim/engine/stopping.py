@@ -56,6 +56,11 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
         return (
             f"{where}: the step size fell to {run.clock[ki.STEP]:.1e} s; try integrator.method rodas4 or a larger rtol"
         )
+    if status == ki.STOPPED:
+        return (
+            f"{where}: the base tips over (tip margin zero), and plant.base.on_overturn is stop; brace it, move its "
+            "caster or make it heavier, or take on_overturn: warn to go on as if it were held down"
+        )
     ws = prepared.workspace
     gaps = ws.rows[: ws.counts[ka.ROWS], ka.ROW_GAP]
     worst = int(np.argmax(np.abs(gaps)))

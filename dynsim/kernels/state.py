@@ -49,7 +49,10 @@ def state_layout(nq: int, n: int, circuits: int, contacts: int, loads: int = 0) 
 
 
 class OutputLayout(NamedTuple):
-    """First column of each recorded output that is no state; ``contact`` has OUTPUTS_PER_CONTACT for each point."""
+    """First column of each recorded output that is no state; ``contact`` has OUTPUTS_PER_CONTACT for each point.
+
+    ``support`` is there for robots with a mobile base, see dynsim.kernels.tree.support.
+    """
 
     vdot: int
     current: int
@@ -58,6 +61,7 @@ class OutputLayout(NamedTuple):
     hand: int
     energy: int
     contact: int
+    support: int
     size: int
 
 
@@ -74,7 +78,7 @@ OUT_FORCE, OUT_VECTOR, OUT_GAP, OUT_SLIP = 0, 1, 4, 5
 OUTPUTS_PER_CONTACT = 8
 
 
-def output_layout(n: int, motors: int, contacts: int) -> OutputLayout:
-    """The columns for n joints, so many motors and contact points."""
-    starts = np.cumsum([0, n, motors, motors, motors, 3, ENERGIES, OUTPUTS_PER_CONTACT * contacts])
+def output_layout(n: int, motors: int, contacts: int, support: int = 0) -> OutputLayout:
+    """The columns for n joints, so many motors and contact points, and so many of a mobile base's support."""
+    starts = np.cumsum([0, n, motors, motors, motors, 3, ENERGIES, OUTPUTS_PER_CONTACT * contacts, support])
     return OutputLayout(*(int(start) for start in starts))

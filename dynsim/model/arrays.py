@@ -10,6 +10,7 @@ from dynsim.errors import ModelError, shown
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.tree import loads as kl
+from dynsim.kernels.tree import support as ks
 from dynsim.kernels.tree.loads import LoadArrays
 from dynsim.model.description import Contact, Coupling, Link, Load, Robot
 from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
@@ -215,6 +216,37 @@ def compile_couplings(robot: Robot) -> ka.CouplingArrays:
         joint[k, ka.FOLLOWER], joint[k, ka.LEADER] = joints[coupling.joint], joints[coupling.leader]
         law[k, ka.RATIO], law[k, ka.OFFSET] = coupling.ratio, coupling.offset
     return ka.CouplingArrays(joint=integers(joint), law=reals(law))
+
+
+def compile_support(robot: Robot) -> ks.SupportArrays:
+    """Tables of the mobile base; empty for a robot without one.
+
+    Raises
+    ------
+    ModelError
+        Its body or wheels are none of the robot's, or it has no triangle to stand on.
+    """
+    base, sizes = robot.base, (ks.INDEX_SIZE, ks.BASE_SIZE, ks.STATE_SIZE) if robot.base else (0, 0, 0)
+    arrays = ks.SupportArrays(*(of(np.zeros(size)) for of, size in zip((integers, reals, reals), sizes, strict=True)))
+    if base is None:
+        return arrays
+    bodies, joints = [link.name for link in robot.links], robot.joint_names
+    if base.body not in bodies or not set(base.wheels) <= set(joints):
+        raise ModelError(
+            f"{robot.name}: the mobile base is {base.body!r} on {', '.join(base.wheels)}, not of the robot"
+        )
+    if not (base.wheel_radius > 0.0 and base.track > 0.0 and base.wheel_friction > 0.0):
+        raise ModelError(f"{robot.name}: wheel radius, track and friction of the wheels must be positive")
+    x, y = (float(part) for part in base.caster[:2])
+    if x == 0.0:
+        raise ModelError(f"{robot.name}: the caster is below the axle, so that the base has no triangle to stand on")
+    arrays.index[[ks.BODY, ks.LEFT, ks.RIGHT]] = bodies.index(base.body), *map(joints.index, base.wheels)
+    arrays.base[[ks.TRACK, ks.CASTER_X, ks.CASTER_Y]] = base.track, x, y
+    arrays.base[[ks.SPIN_INERTIA, ks.FRICTION]] = base.spin_inertia, base.wheel_friction
+    half = 0.5 * base.track
+    sides = np.array([np.hypot(x, y + half), np.hypot(x, y - half), base.track])
+    arrays.base[ks.SHARE : ks.SHARE + 3] = sides.sum() / sides
+    return arrays
 
 
 def _check_couplings(robot: Robot) -> None:

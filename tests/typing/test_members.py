@@ -27,10 +27,10 @@ from dynsim.model.protocols import (
     SurfaceModule,
 )
 from dynsim.motors import dc, servo, torque, wang_minami
-from dynsim.plants import serial_arm, snake, urdf_arm
+from dynsim.plants import pws_arm, serial_arm, snake, urdf_arm
 from dynsim.surfaces import cylinder, plane, sphere
 
-PLANTS: Sequence[PlantModule] = (serial_arm, snake, urdf_arm)
+PLANTS: Sequence[PlantModule] = (pws_arm, serial_arm, snake, urdf_arm)
 CONTROLLERS: Sequence[ControllerModule] = (joint_pd, task_space)
 PATHS: Sequence[PathModule] = (circle, csv, line, waypoints)
 BASE_PATHS: Sequence[BasePathModule] = (arc, base_csv, hold, straight, base_waypoints)

@@ -102,10 +102,10 @@ def finished(run: Run):
 
 
 @merged_kernel
-def take_step(ws: Workspace, run: Run, error):
+def take_step(system: System, ws: Workspace, run: Run, error):
     """What becomes of a step that has been taken: True when it is accepted by error control, events and HOLD."""
     clock, count = run.clock, run.count
-    if run.event.shape[0] > 0 and cut_step(ws, run):
+    if run.event.shape[0] > 0 and cut_step(system, ws, run):
         return False
     clock[ERROR] = error
     if clock[TIME] + clock[STEP] > clock[HOLD]:
@@ -146,7 +146,7 @@ def ready(system: System, ws: Workspace, run: Run):
         count[STARTED] = 0
     if count[STARTED] == 0:
         start(system, ws, run)
-        arm_events(ws, run)
+        arm_events(system, ws, run)
     count[TICKED] = due & ~TAKE_COMMANDS
     return count[TICKED] == 0
 
@@ -167,7 +167,7 @@ def conclude(system: System, ws: Workspace, run: Run, error, order):
         if rejected(ws, run, error, order):
             count[SEARCHING] = 0
             return False
-        if not take_step(ws, run, error):
+        if not take_step(system, ws, run, error):
             return count[PENDING] == 1
     count[PENDING] = 0
     accept(system, ws, run)

@@ -43,19 +43,22 @@ from dynsim.kernels.integrate.run import (
     Run,
 )
 from dynsim.kernels.jit import inlined_kernel, internal_kernel
+from dynsim.kernels.system import System
 from dynsim.kernels.tree.points import point_position
+from dynsim.kernels.tree.support import MARGIN, ground_reaction
 
 # Kinds of guards. A new one is a number here, a branch in ``guard`` and a name in GUARDS of dynsim.engine.stepped.
 JOINT_POSITION, JOINT_RATE, MOTOR_CURRENT, MOTOR_VOLTAGE, CONTACT_FORCE, CONTACT_GAP = 0, 1, 2, 3, 4, 5
 HAND_X, HAND_Y, HAND_Z = 6, 7, 8
+TIP_MARGIN = 9
 
 # Steps that a root may take; regula falsi with halving (Illinois) needs about eight.
 SEARCH_LIMIT = 60
 
 
 @inlined_kernel
-def guard(ws: Workspace, run: Run, e):
-    """Value of event e, zero where it happens, right after ``derivative``."""
+def guard(system: System, t, ws: Workspace, run: Run, e):
+    """Value of event e, zero where it happens, right after ``derivative`` at time t."""
     kind, k, value = run.event_table[e, EVENT_KIND], run.event_table[e, EVENT_INDEX], 0.0
     if kind == JOINT_POSITION:
         value = ws.joints[k, Q]
@@ -69,6 +72,9 @@ def guard(ws: Workspace, run: Run, e):
         value = ws.contacts[k, NORMAL_FORCE]
     elif kind == CONTACT_GAP:
         value = ws.contacts[k, GAP]
+    elif kind == TIP_MARGIN:
+        ground_reaction(system.model, system.loads, t, ws, run.support)
+        value = run.support.state[MARGIN]
     else:
         point_position(ws, run.hand_link, run.hand_point, run.hand)
         value = run.hand[kind - HAND_X]
@@ -76,13 +82,13 @@ def guard(ws: Workspace, run: Run, e):
 
 
 @internal_kernel
-def arm_events(ws: Workspace, run: Run):
+def arm_events(system: System, ws: Workspace, run: Run):
     """Values and sides of all guards at the start of a step, right after ``derivative`` there.
 
     An event that has just happened keeps the side it has gone to, whatever rounding says of its guard.
     """
     for e in range(run.event.shape[0]):
-        value = guard(ws, run, e)
+        value = guard(system, run.clock[TIME], ws, run, e)
         run.event[e, START_VALUE] = value
         if run.event[e, SIDE] == 0.0:
             run.event[e, SIDE] = 1.0 if value > 0.0 else (-1.0 if value < 0.0 else 0.0)
@@ -102,7 +108,7 @@ def event_tolerance(t):
 
 
 @internal_kernel
-def cut_step(ws: Workspace, run: Run):
+def cut_step(system: System, ws: Workspace, run: Run):
     """True when the step just taken must be repeated because an event lies within it: STEP is then the next trial.
 
     False leaves FIRED at 1 when the step ends at an event.
@@ -110,7 +116,7 @@ def cut_step(ws: Workspace, run: Run):
     clock, count, event = run.clock, run.count, run.event
     h, hit = clock[STEP], False
     for e in range(event.shape[0]):
-        event[e, VALUE] = guard(ws, run, e)
+        event[e, VALUE] = guard(system, clock[TIME] + h, ws, run, e)
         hit = happened(run, e, event[e, VALUE]) or hit
     if count[SEARCHING] == 0:
         if not hit:

@@ -25,6 +25,7 @@ from dynsim.kernels.ledger import kinetic_energy, magnetic_energy, potential_ene
 from dynsim.kernels.state import OUT_FORCE, OUT_GAP, OUT_SLIP, OUT_VECTOR, OUTPUTS_PER_CONTACT
 from dynsim.kernels.system import System
 from dynsim.kernels.tree.points import point_position
+from dynsim.kernels.tree.support import OUTPUTS, ground_reaction
 
 
 @internal_kernel
@@ -57,3 +58,7 @@ def write_output(system: System, ws: Workspace, run: Run, row):
             out[row, k + OUT_VECTOR + s] = state[c, FORCE_VECTOR + s]
             out[row, k + OUT_SLIP + s] = state[c, SLIP_VELOCITY + s]
         k += OUTPUTS_PER_CONTACT
+    if run.support.index.shape[0] > 0:
+        ground_reaction(system.model, system.loads, run.sample_time[row], ws, run.support)
+        for s in range(OUTPUTS):
+            out[row, columns.support + s] = run.support.state[s]

@@ -10,6 +10,7 @@ from dynsim.kernels.arrays import BLOCK_SIZE, row_limit
 from dynsim.kernels.constraint.uniqueness import ROOM
 from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.state import OUTPUTS_PER_CONTACT, OutputLayout, StateLayout, block
+from dynsim.kernels.tree.support import SupportArrays
 
 DOPRI5, RK4, RODAS4, RK43 = 0, 1, 2, 3
 METHODS = {"rk43": RK43, "dopri5": DOPRI5, "rk4": RK4, "rodas4": RODAS4}
@@ -81,6 +82,7 @@ class Run(NamedTuple):
     log_time: np.ndarray  # (LOG_LENGTH,) of events [s]
     log_event: np.ndarray  # (LOG_LENGTH,) int: which
     hand: np.ndarray  # (3,) room
+    support: SupportArrays
     columns: OutputLayout
     output: np.ndarray  # (T, columns.size)
 
@@ -116,6 +118,7 @@ def new_run(
     events: tuple[np.ndarray, np.ndarray] | None = None,
     ticks: tuple[np.ndarray, np.ndarray] | None = None,
     breaks: np.ndarray | None = None,
+    support: SupportArrays | None = None,
 ) -> Run:
     """Allocate a :class:`Run` from t = 0 at state y, (layout.size,)."""
     m, p, rodas = len(y), row_limit(c, couplings), method == RODAS4
@@ -153,6 +156,7 @@ def new_run(
         log_time=np.zeros(LOG_LENGTH),
         log_event=np.zeros(LOG_LENGTH, dtype=np.int64),
         hand=np.zeros(3),
+        support=support or SupportArrays(integers([]), reals([]), reals([])),
         columns=columns,
         output=np.zeros((len(sample_time), columns.size)),
     )

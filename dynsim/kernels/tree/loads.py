@@ -52,38 +52,47 @@ def segment_start(loads: LoadArrays, k, t):
     return first + low * SEGMENT_SIZE, t
 
 
+@inlined_kernel
+def load_wrench(loads: LoadArrays, k, t, ws: Workspace):
+    """Moment about the world origin and force of load k at time t in W [N m, N], after ``forward_sweep``."""
+    links, table, data = ws.links, loads.table, loads.data
+    i, place = table[k, LINK], table[k, DATA]
+    fx, fy, fz = data[place + WRENCH], data[place + WRENCH + 1], data[place + WRENCH + 2]
+    mx, my, mz = data[place + WRENCH + 3], data[place + WRENCH + 4], data[place + WRENCH + 5]
+    segment, at = segment_start(loads, k, t)
+    if segment >= 0:
+        x = at - data[segment]
+        c = segment + 1
+        fx += data[c] + x * (data[c + 1] + x * (data[c + 2] + x * data[c + 3]))
+        fy += data[c + 4] + x * (data[c + 5] + x * (data[c + 6] + x * data[c + 7]))
+        fz += data[c + 8] + x * (data[c + 9] + x * (data[c + 10] + x * data[c + 11]))
+        mx += data[c + 12] + x * (data[c + 13] + x * (data[c + 14] + x * data[c + 15]))
+        my += data[c + 16] + x * (data[c + 17] + x * (data[c + 18] + x * data[c + 19]))
+        mz += data[c + 20] + x * (data[c + 21] + x * (data[c + 22] + x * data[c + 23]))
+    b0, b1, b2 = links[i, R], links[i, R + 1], links[i, R + 2]
+    b3, b4, b5 = links[i, R + 3], links[i, R + 4], links[i, R + 5]
+    b6, b7, b8 = links[i, R + 6], links[i, R + 7], links[i, R + 8]
+    if table[k, IN_BODY] != 0:
+        fx, fy, fz = b0 * fx + b1 * fy + b2 * fz, b3 * fx + b4 * fy + b5 * fz, b6 * fx + b7 * fy + b8 * fz
+        mx, my, mz = b0 * mx + b1 * my + b2 * mz, b3 * mx + b4 * my + b5 * mz, b6 * mx + b7 * my + b8 * mz
+    x, y, z = data[place + POINT], data[place + POINT + 1], data[place + POINT + 2]
+    rx = links[i, P] + b0 * x + b1 * y + b2 * z
+    ry = links[i, P + 1] + b3 * x + b4 * y + b5 * z
+    rz = links[i, P + 2] + b6 * x + b7 * y + b8 * z
+    mx, my, mz = mx + ry * fz - rz * fy, my + rz * fx - rx * fz, mz + rx * fy - ry * fx
+    return mx, my, mz, fx, fy, fz
+
+
 @apart_kernel
 def add_loads(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, power, start):
     """Add S·W of every external wrench W to the applied forces of the joints that carry it, after ``forward_sweep``.
 
     Its power W·V goes to power[start:] [W].
     """
-    links, joints, table, data = ws.links, ws.joints, loads.table, loads.data
+    links, joints, table = ws.links, ws.joints, loads.table
     for k in range(table.shape[0]):
-        i, place = table[k, LINK], table[k, DATA]
-        fx, fy, fz = data[place + WRENCH], data[place + WRENCH + 1], data[place + WRENCH + 2]
-        mx, my, mz = data[place + WRENCH + 3], data[place + WRENCH + 4], data[place + WRENCH + 5]
-        segment, at = segment_start(loads, k, t)
-        if segment >= 0:
-            x = at - data[segment]
-            c = segment + 1
-            fx += data[c] + x * (data[c + 1] + x * (data[c + 2] + x * data[c + 3]))
-            fy += data[c + 4] + x * (data[c + 5] + x * (data[c + 6] + x * data[c + 7]))
-            fz += data[c + 8] + x * (data[c + 9] + x * (data[c + 10] + x * data[c + 11]))
-            mx += data[c + 12] + x * (data[c + 13] + x * (data[c + 14] + x * data[c + 15]))
-            my += data[c + 16] + x * (data[c + 17] + x * (data[c + 18] + x * data[c + 19]))
-            mz += data[c + 20] + x * (data[c + 21] + x * (data[c + 22] + x * data[c + 23]))
-        b0, b1, b2 = links[i, R], links[i, R + 1], links[i, R + 2]
-        b3, b4, b5 = links[i, R + 3], links[i, R + 4], links[i, R + 5]
-        b6, b7, b8 = links[i, R + 6], links[i, R + 7], links[i, R + 8]
-        if table[k, IN_BODY] != 0:
-            fx, fy, fz = b0 * fx + b1 * fy + b2 * fz, b3 * fx + b4 * fy + b5 * fz, b6 * fx + b7 * fy + b8 * fz
-            mx, my, mz = b0 * mx + b1 * my + b2 * mz, b3 * mx + b4 * my + b5 * mz, b6 * mx + b7 * my + b8 * mz
-        x, y, z = data[place + POINT], data[place + POINT + 1], data[place + POINT + 2]
-        rx = links[i, P] + b0 * x + b1 * y + b2 * z
-        ry = links[i, P + 1] + b3 * x + b4 * y + b5 * z
-        rz = links[i, P + 2] + b6 * x + b7 * y + b8 * z
-        mx, my, mz = mx + ry * fz - rz * fy, my + rz * fx - rx * fz, mz + rx * fy - ry * fx
+        i = table[k, LINK]
+        mx, my, mz, fx, fy, fz = load_wrench(loads, k, t, ws)
         power[start + k] = (
             mx * links[i, V] + my * links[i, V + 1] + mz * links[i, V + 2]
             + fx * links[i, V + 3] + fy * links[i, V + 4] + fz * links[i, V + 5]

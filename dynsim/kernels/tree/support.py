@@ -1,0 +1,156 @@
+"""What the ground carries of a mobile base: loads of wheels and caster, centre of pressure, how far it is from tipping.
+
+The base stands on the contact points of its left wheel L = (0, T/2), its right wheel R = (0, −T/2) and its caster
+C = (c_x, c_y), in the plane z = 0 of its frame, whose z is the normal of the ground. Three normal forces N balance the
+force along z and the moments about x and y, so they are determined; side slip and rolling take their forces along y and
+x there. The loads are those of a base that is held down: N < 0 pulls.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from dynsim.kernels.arrays import (
+    BASE,
+    BODY_B,
+    DIRECTION,
+    FORCE,
+    JOINT_ROW,
+    PARENT,
+    QD,
+    QDD,
+    ROW_KIND,
+    ROWS,
+    A,
+    ModelArrays,
+    P,
+    R,
+    S,
+    V,
+    Workspace,
+)
+from dynsim.kernels.jit import apart_kernel
+from dynsim.kernels.tree.loads import LoadArrays, load_wrench
+from dynsim.kernels.tree.sweep import body_inertia, inertial_wrench
+
+# SupportArrays.index, int: the body, and the rows of the wheels' rates
+BODY, LEFT, RIGHT = 0, 1, 2
+INDEX_SIZE = 3
+# SupportArrays.base
+TRACK, CASTER_X, CASTER_Y, SPIN_INERTIA, FRICTION = 0, 1, 2, 3, 4
+# Perimeter of the support triangle by the length of the side opposite to L, R and C: the largest margins there.
+SHARE = 5
+BASE_SIZE = 8
+# SupportArrays.state: what is recorded of it
+LOADS = 0  # 3: of left wheel, right wheel, caster [N]
+PRESSURE = 3  # 2: centre of pressure in W [m], NaN for no load
+MARGIN = 5
+TRACTION = 6  # 2: |F| / (μ N) of left and right wheel, NaN for N <= 0
+OUTPUTS = 8
+# and what it follows from: the forces of the wheels along x, the sum of those along y [N]
+LONGITUDINAL, LATERAL = 8, 10
+STATE_SIZE = 11
+
+
+class SupportArrays(NamedTuple):
+    """The mobile base of a robot; all of its arrays are empty for robots that have none."""
+
+    index: np.ndarray  # (INDEX_SIZE,) int
+    base: np.ndarray  # (BASE_SIZE,)
+    state: np.ndarray  # (STATE_SIZE,) written by ground_reaction
+
+
+@apart_kernel
+def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, support: SupportArrays):
+    """Loads, centre of pressure, tip margin and traction demand at time t into ``support.state``.
+
+    To be called right after ``derivative``; overwrites V with what it is and A with the accelerations minus gravity.
+
+    Balance of momentum of all bodies about the world origin: W = Σ (İV − weight) + İ_a − Σ W_contact − Σ W_load. The
+    inertia I_a of the wheels about their axle y is not in the tensors of the bodies but on the rows of the wheels; its
+    momentum I_a (φ̇_L + φ̇_R) y changes by I_a ((φ̈_L + φ̈_R) y + (φ̇_L + φ̇_R) ω × y). Momentum of rotors and gears is left
+    out, as it is of all joints. Moved to the base's frame, M_x = (N_L − N_R) T/2 + N_C c_y, M_y = −N_C c_x,
+    F_z = ΣN; M_z = (F_R − F_L) T/2 and F_x = F_L + F_R give the forces along x that roll the wheels.
+
+    The margin is min_i d_i/ρ, d_i the distance of the centre of pressure Σ N_i p_i / ΣN from side i (negative beyond
+    it), ρ the inradius. N_i/ΣN are its barycentric coordinates, so d_i/ρ = (N_i/ΣN) (perimeter / side i): 1 at the
+    incentre. ΣN <= 0 counts as −1. Loaded wheels share the lateral force, by load.
+    """
+    tree, links, joints = model.tree, ws.links, ws.joints
+    index, base, state = support.index, support.base, support.state
+    mx, my, mz, fx, fy, fz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(tree.shape[0]):
+        j, m, v, vdot = tree[i, PARENT], tree[i, BASE], joints[i, QD], joints[i, QDD]
+        s0, s1, s2 = links[i, S], links[i, S + 1], links[i, S + 2]
+        s3, s4, s5 = links[i, S + 3], links[i, S + 4], links[i, S + 5]
+        wx, wy, wz, ox, oy, oz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        if m >= 0:
+            wx, wy, wz = links[m, V], links[m, V + 1], links[m, V + 2]
+            ox, oy, oz = links[m, V + 3], links[m, V + 4], links[m, V + 5]
+        # V_m × S v: see dynsim.kernels.tree.joints.
+        bias = (
+            wy * s2 - wz * s1,
+            wz * s0 - wx * s2,
+            wx * s1 - wy * s0,
+            wy * s5 - wz * s4 + oy * s2 - oz * s1,
+            wz * s3 - wx * s5 + oz * s0 - ox * s2,
+            wx * s4 - wy * s3 + ox * s1 - oy * s0,
+        )
+        root = (0.0, 0.0, 0.0, -model.gravity[0], -model.gravity[1], -model.gravity[2])
+        for s in range(6):
+            links[i, V + s] = links[i, S + s] * v + (links[j, V + s] if j >= 0 else 0.0)
+            links[i, A + s] = links[i, S + s] * vdot + bias[s] * v + (links[j, A + s] if j >= 0 else root[s])
+        mass, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz = body_inertia(model, ws, i)
+        n0, n1, n2, n3, n4, n5 = inertial_wrench(ws, i, mass, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz)
+        mx, my, mz, fx, fy, fz = mx + n0, my + n1, mz + n2, fx + n3, fy + n4, fz + n5
+    for k in range(ws.counts[ROWS]):
+        # What joins two bodies or two joints is no force from outside.
+        if ws.active[k, ROW_KIND] != JOINT_ROW and ws.active[k, BODY_B] < 0:
+            f = ws.rows[k, FORCE]
+            mx, fx = mx - f * ws.rows[k, DIRECTION], fx - f * ws.rows[k, DIRECTION + 3]
+            my, fy = my - f * ws.rows[k, DIRECTION + 1], fy - f * ws.rows[k, DIRECTION + 4]
+            mz, fz = mz - f * ws.rows[k, DIRECTION + 2], fz - f * ws.rows[k, DIRECTION + 5]
+    for k in range(loads.table.shape[0]):
+        n0, n1, n2, n3, n4, n5 = load_wrench(loads, k, t, ws)
+        mx, my, mz, fx, fy, fz = mx - n0, my - n1, mz - n2, fx - n3, fy - n4, fz - n5
+    b, left, right = index[BODY], index[LEFT], index[RIGHT]
+    r0, r1, r2 = links[b, R], links[b, R + 1], links[b, R + 2]
+    r3, r4, r5 = links[b, R + 3], links[b, R + 4], links[b, R + 5]
+    r6, r7, r8 = links[b, R + 6], links[b, R + 7], links[b, R + 8]
+    spin = base[SPIN_INERTIA] * (joints[left, QD] + joints[right, QD])
+    rate = base[SPIN_INERTIA] * (joints[left, QDD] + joints[right, QDD])
+    mx += rate * r1 + spin * (links[b, V + 1] * r7 - links[b, V + 2] * r4)
+    my += rate * r4 + spin * (links[b, V + 2] * r1 - links[b, V] * r7)
+    mz += rate * r7 + spin * (links[b, V] * r4 - links[b, V + 1] * r1)
+    px, py, pz = links[b, P], links[b, P + 1], links[b, P + 2]
+    mx, my, mz = mx - (py * fz - pz * fy), my - (pz * fx - px * fz), mz - (px * fy - py * fx)
+    mx, my, mz = r0 * mx + r3 * my + r6 * mz, r1 * mx + r4 * my + r7 * mz, r2 * mx + r5 * my + r8 * mz
+    fx, fy, fz = r0 * fx + r3 * fy + r6 * fz, r1 * fx + r4 * fy + r7 * fz, r2 * fx + r5 * fy + r8 * fz
+
+    caster = -my / base[CASTER_X]
+    difference = 2.0 * (mx - caster * base[CASTER_Y]) / base[TRACK]
+    state[LOADS] = 0.5 * (fz - caster + difference)
+    state[LOADS + 1] = 0.5 * (fz - caster - difference)
+    state[LOADS + 2] = caster
+    state[LONGITUDINAL] = 0.5 * fx - mz / base[TRACK]
+    state[LONGITUDINAL + 1] = 0.5 * fx + mz / base[TRACK]
+    state[LATERAL] = fy
+    state[MARGIN] = -1.0
+    state[PRESSURE], state[PRESSURE + 1] = math.nan, math.nan
+    if fz > 0.0:
+        x, y = -my / fz, mx / fz
+        state[PRESSURE], state[PRESSURE + 1] = px + r0 * x + r1 * y, py + r3 * x + r4 * y
+        state[MARGIN] = math.inf
+        for k in range(3):
+            state[MARGIN] = min(state[MARGIN], state[LOADS + k] / fz * base[SHARE + k])
+    carried = max(state[LOADS], 0.0) + max(state[LOADS + 1], 0.0)
+    for k in range(2):
+        load = state[LOADS + k]
+        state[TRACTION + k] = math.nan
+        if load > 0.0:
+            lateral = fy * load / carried
+            force = math.sqrt(state[LONGITUDINAL + k] ** 2 + lateral * lateral)
+            state[TRACTION + k] = force / (base[FRICTION] * load)
