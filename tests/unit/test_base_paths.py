@@ -252,7 +252,7 @@ def test_a_cusp_between_points_is_a_corner(model: Model) -> None:
 BAD = {
     "sideways": (
         {"type": "waypoints", "times_s": [0, 5], "points_m": [[0, 0], [0, 1]], "frame": "start"},
-        r"controller.base.path: point 1 \(0, 1\) m, t = 5 s lies 90° off the heading at the start .* cannot move sideways",
+        r"controller.base.path: point 1 \(0, 1\) m, t = 5 s lies 90° off the heading at the start .* move sideways",
     ),
     "elsewhere": (
         {"type": "waypoints", "times_s": [0, 5], "points_m": [[0, 0], [1, 1]]},
@@ -316,7 +316,7 @@ def test_bad_files_are_one_line_of_a_scenario(content: str, message: str, tmp_pa
 def test_a_plant_without_a_mobile_base_has_no_path_for_one() -> None:
     overrides = {"controller.base": {"path": {"type": "hold"}}}
     scenario = load_scenario("elbow_comparison", overrides=overrides)
-    with pytest.raises(ModelError, match="^controller.base: the plant has no mobile base; pws_arm has one$"):
+    with pytest.raises(ModelError, match=r"^controller\.base: the plant has no mobile base; pws_arm has one$"):
         build.controller(scenario, build.build_model(scenario))
 
 
@@ -390,9 +390,26 @@ def test_contacts_of_the_references_move_with_the_base() -> None:
     scenario = load_scenario("mobile_elbow_comparison_driving")
     model = build.build_model(scenario)
     control = build.controller(scenario, model)
-    times, q = (np.concatenate(pieces) for pieces in zip(*control.positions(model.robot), strict=True))
+    _, q = (np.concatenate(pieces) for pieces in zip(*control.positions(model.robot), strict=True))
     elbow = np.array([model.point_position("link_4", np.zeros(3), one) for one in q[::50]])
     ahead = (elbow - elbow[0]) @ np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0])
     # Joint 1 turns the arm to the hand's circle; the elbow goes on with the base.
     assert ahead[-1] == pytest.approx(0.2, abs=0.02)
     assert np.abs(elbow[:, 2]).max() < 1e-9
+
+
+def test_references_that_drive_an_elbow_off_its_surface_are_refused_with_time_and_place() -> None:
+    """On a cylinder across the way, the elbow leaves its top as the base drives on; joint 1 holds."""
+    name, variant = "mobile_elbow_comparison_driving", "elbow_4"
+    model = build.build_model(load_scenario(name, variant))
+    elbow = model.point_position("link_4", np.zeros(3), model.robot.initial)
+    across = {"type": "cylinder", "axis": [1, -1, 0], "radius_m": 1.0, "point_m": [*elbow[:2].tolist(), -1.0]}
+    scenario = load_scenario(name, variant, overrides={"surfaces.floor": across, "controller.hand": None})
+    far = np.sqrt((1.0 + scenario.config.contacts.reference_tolerance_m) ** 2 - 1.0)
+    fine = np.linspace(0.0, DURATION, 100_001)
+    off = fine[np.argmax(0.2 * jerk_law(fine, 0.0, DURATION) > far)]
+    with pytest.raises(ModelError, match=r"contact elbow_4: the references of the joints take its point") as refused:
+        prepare(scenario)
+    found = re.search(r"from t = ([\d.]+) s on", str(refused.value))
+    assert found is not None
+    assert float(found[1]) == pytest.approx(off, abs=0.006)
