@@ -250,9 +250,17 @@ def test_a_cusp_between_points_is_a_corner(model: Model) -> None:
 
 
 BAD = {
+    "too sharp": (
+        {"type": "arc", "radius_m": 0.1, "angle_deg": 90, "duration_s": 0.1, "start_s": 1},
+        r"controller.base.path: at t = 1.0\d0 s the heading turns by 0\.\d+ rad from one knot .* round it off",
+    ),
     "sideways": (
         {"type": "waypoints", "times_s": [0, 5], "points_m": [[0, 0], [0, 1]], "frame": "start"},
         r"controller.base.path: point 1 \(0, 1\) m, t = 5 s lies 90° off the heading at the start .* move sideways",
+    ),
+    "too near": (
+        {"type": "waypoints", "times_s": [0, 1, 2], "points_m": [[0, 0], [9e9, 0], [9e9, 1e-9]], "frame": "start"},
+        r"controller.base.path: point 2 .* is too near the point before it",
     ),
     "elsewhere": (
         {"type": "waypoints", "times_s": [0, 5], "points_m": [[0, 0], [1, 1]]},

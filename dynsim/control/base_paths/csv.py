@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, Self
 
@@ -92,7 +93,7 @@ def build(config: Config, context: BuildContext) -> BasePath:
         raise ModelError(f"{config.file}: no row is {SPACING:g} m from the first; for a base that stands take hold")
     names = [f"row {k + 1} ({rows[k, 0]:g}, {rows[k, 1]:g}) m, t = {times[k]:g} s" for k in kept]
     try:
-        curve = PlaneCurve(points[kept], names, start_limit=TURN_LIMIT, turn_limit=TURN_LIMIT)
+        curve = PlaneCurve(points[kept], names, start_limit=TURN_LIMIT, turn_limit=TURN_LIMIT, samples=8)
     except ModelError as error:
         raise ModelError(f"{config.file}: {error}") from error
     return Places(curve, PchipInterpolator(times, way))
@@ -101,8 +102,10 @@ def build(config: Config, context: BuildContext) -> BasePath:
 def _along(points: NDArray[np.float64]) -> tuple[list[int], NDArray[np.float64]]:
     """Rows that the curve goes through, and the way along their chords at every row [m]; it never goes back."""
     kept = [0]
-    for k, point in enumerate(points[1:], 1):
-        if np.hypot(*(point - points[kept[-1]])) >= SPACING:
+    begin, *others = points.tolist()
+    for k, point in enumerate(others, 1):
+        if math.dist(begin, point) >= SPACING:
+            begin = point
             kept.append(k)
     # It ends at the last row, however near.
     kept[1:] = [*kept[1:-1], len(points) - 1] if len(kept) > 1 else []
