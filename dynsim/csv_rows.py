@@ -17,7 +17,12 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORE
 
 
 def read_rows(file: str, *headers: Sequence[str], what: str) -> list[list[float]]:
-    """Two or more rows of a file whose first line is one of ``headers``, the first column increasing.
+    """The rows that :func:`read_table` reads, where their number of columns tells which header it was."""
+    return read_table(file, *headers, what=what)[1]
+
+
+def read_table(file: str, *headers: Sequence[str], what: str) -> tuple[tuple[str, ...], list[list[float]]]:
+    """Two or more rows of a file whose first line is one of ``headers``, which comes first; first column increasing.
 
     Parameters
     ----------
@@ -50,7 +55,7 @@ def read_rows(file: str, *headers: Sequence[str], what: str) -> list[list[float]
             )
     if len(rows) < 2:
         raise ValueError(f"{file}: {len(rows)} rows below the header; {what} needs two or more")
-    return rows
+    return columns, rows
 
 
 def _row(line: str, columns: Sequence[str], place: str) -> list[float]:

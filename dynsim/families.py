@@ -44,6 +44,7 @@ FAMILIES = {
     "plant": Family("dynsim.plants", "dynsim.plants", ("ENGINE",)),
     "controller": Family("dynsim.control", "dynsim.controllers", ("ENGINE",)),
     "path": Family("dynsim.control.paths", "dynsim.paths"),
+    "base_path": Family("dynsim.control.base_paths", "dynsim.base_paths"),
     "surface": Family("dynsim.surfaces", "dynsim.surfaces"),
     "motor": Family("dynsim.motors", "dynsim.motors"),
 }
@@ -200,24 +201,32 @@ def _lack(module: Any, family: Family, name: str) -> str:
     return ""
 
 
-def union(family: str) -> Any:
-    """A pydantic field type: the ``Config`` of whichever member of the family the key ``type`` names."""
-    return Annotated[Any, Choice(family)]
+def union(family: str, only: tuple[str, ...] = ()) -> Any:
+    """A pydantic field type: the ``Config`` of whichever member of the family the key ``type`` names.
+
+    ``only`` : these of the package's members and no others; default: all, and plug-ins
+    """
+    return Annotated[Any, Choice(family, only)]
 
 
 class Choice:
     """Pydantic's side of :func:`union`: a union of the package's members by ``type``; plug-ins where it has none."""
 
-    def __init__(self, family: str) -> None:
-        self.family = family
+    def __init__(self, family: str, only: tuple[str, ...] = ()) -> None:
+        self.family, self.only = family, only
 
     def models(self) -> list[type[BaseModel]]:
         """Configurations of the package's members and of the plug-ins in use."""
+        if self.only:
+            return [member(self.family, name).Config for name in self.only]
         plugins = [plugin.module.Config for (family, _), plugin in _imported.items() if family == self.family]
         return [member(self.family, name).Config for name in shipped(self.family)] + plugins
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
-        choices = {name: handler.generate_schema(member(self.family, name).Config) for name in shipped(self.family)}
+        choices = {
+            name: handler.generate_schema(member(self.family, name).Config)
+            for name in self.only or shipped(self.family)
+        }
         return core_schema.no_info_wrap_validator_function(
             self._validate,
             core_schema.tagged_union_schema(choices, discriminator="type", from_attributes=True),
@@ -226,11 +235,11 @@ class Choice:
         )
 
     def __get_pydantic_json_schema__(self, schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler) -> Any:
-        return handler(_tagged({name: member(self.family, name).Config for name in members(self.family)}))
+        return handler(_tagged({name: member(self.family, name).Config for name in self.only or members(self.family)}))
 
     def _validate(self, value: Any, validate: core_schema.ValidatorFunctionWrapHandler) -> Any:
         name = value.get("type") if isinstance(value, Mapping) else getattr(value, "type", None)
-        if not isinstance(name, str) or name in shipped(self.family):
+        if not isinstance(name, str) or self.only or name in shipped(self.family):
             return validate(value)
         if name not in _entry_points(self.family):
             known = ", ".join(map(repr, names(self.family)))

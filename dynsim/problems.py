@@ -205,3 +205,8 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
 
 def _literals(model: type[BaseModel]) -> tuple[Any, ...]:
     return typing.get_args(model.model_fields["type"].annotation) if "type" in model.model_fields else ()
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names for a line of text: all of a few, the first and the last of many."""
+    return ", ".join(names) if len(names) <= 4 else f"{names[0]} … {names[-1]} ({len(names)})"

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.errors import UnreachableReference
+from dynsim.model.mobile_base import base_row
 from dynsim.model.model import Model
 
 Array = NDArray[np.float64]
@@ -28,8 +29,11 @@ def follow(
     q: Array,
     tolerance: float,
     progress: Callable[[float], None] | None = None,
+    base: Array | None = None,
 ) -> Array:
     """Positions of ``joints`` that put the hand on ``targets`` at ``times``; the others stay as in ``q``.
+
+    The targets are in the world: what a mobile base moves by meanwhile, the joints make up for.
 
     Damped Gauss–Newton from the previous solution: dq = Jᵀ (J Jᵀ + λ 1)⁻¹ e, with λ falling with the error, so that
     near a solution it is Newton's method and far from one it does not jump. More than three joints move as little as
@@ -42,6 +46,7 @@ def follow(
     q : (nq,) configuration to start from; it selects the branch
     tolerance : distance that counts as reached [m]
     progress : called now and then with the time on the path [s], when it takes longer than a second
+    base : (T, 4) coordinates of the mobile base at ``times``: its wheels [rad], x and y [m]; None: it stays
 
     Returns
     -------
@@ -56,12 +61,15 @@ def follow(
     places = [model.robot.position_index[column] for column in columns]
     body, point = model.body_index(model.robot.hand[0]), model.robot.hand[1]
     q, identity = q.copy(), np.eye(3)
+    carried = 0 if base is None else base_row(model.robot)[0]
     result = np.zeros((len(times), len(columns)))
     due = clock.perf_counter() + QUIET_S
     for k, (t, target) in enumerate(zip(times, targets, strict=True)):
         if progress is not None and clock.perf_counter() >= due:
             progress(float(t))
             due = clock.perf_counter() + REPORT_S
+        if base is not None:
+            q[carried : carried + 4] = base[k]
         if k >= 3 and len(columns) <= 3:
             # The parabola through the last three solutions leaves one iteration to do. Not for redundant joints: what
             # the hand does not determine would run away along it.

@@ -13,14 +13,18 @@ from dynsim import families
 from dynsim.config import NonNegative, Positive, StrictConfig
 from dynsim.control.inverse_kinematics import follow
 from dynsim.errors import ModelError
-from dynsim.model.control import HandPath, JointControl
+from dynsim.model.control import BasePath, HandPath, JointControl, spline_coefficients
 from dynsim.model.description import Robot
 from dynsim.model.drives import Motor, Servo, TorqueSource
+from dynsim.model.mobile_base import base_row
+from dynsim.model.model import Model
 from dynsim.model.protocols import BuildContext
+from dynsim.model.rolling import rolled, wheel_angles
 
 ENGINE = "dynamics"
 
 PathChoice: Any = families.union("path")
+BasePathChoice: Any = families.union("base_path")
 
 # Of the reference splines: half a gigabyte for each joint.
 SEGMENTS_MAX = 10_000_000
@@ -32,6 +36,12 @@ class HandReference(StrictConfig):
     path: PathChoice
     joints: list[str] = Field(min_length=1, description="joints that follow the path; the others hold")
     tolerance_m: Positive = Field(default=1e-6, description="a target further off than this is unreachable")
+
+
+class BaseReference(StrictConfig):
+    """A path of the mobile base, turned into references of its wheels."""
+
+    path: BasePathChoice
 
 
 def _check_waypoints(times: list[float], values: list[float], key: str) -> None:
@@ -75,6 +85,7 @@ class Config(StrictConfig):
     k_p_V_per_rad: NonNegative | list[NonNegative] = Field(default=500.0, description="V/m at a prismatic joint")
     k_d_V_s_per_rad: NonNegative | list[NonNegative] = Field(default=20.0, description="V s/m at a prismatic joint")
     hand: HandReference | None = Field(default=None, description="a path for the hand")
+    base: BaseReference | None = Field(default=None, description="a path for the mobile base; none: it holds")
     joints: dict[str, JointPath] = Field(default={}, description="waypoints by joint name")
     torques: dict[str, TorquePath] = Field(default={}, description="torques of motors of type torque by joint name")
     sample_time_s: Positive | None = Field(
@@ -100,12 +111,46 @@ def build(config: Config, context: BuildContext) -> JointControl:
     UnreachableReference
         The hand cannot follow its path.
     """
-    model, duration = context.model, context.duration
+    model = context.model
+    robot = model.robot
+    _check_names(config, model)
+    path = None
+    if config.hand is not None:
+        path = families.build("path", config.hand.path, context, HandPath)
+    base_path = None if config.base is None else _base_path(config.base, context)
+    times, positions = np.zeros(0), dict[str, NDArray[np.float64]]()
+    if config.joints or config.torques or path is not None or base_path is not None:
+        times = _knots(config.knot_spacing_s, context.duration)
+        for name, joint in config.joints.items():
+            positions[name] = _waypoints(joint.times_s, np.deg2rad(joint.angles_deg), times)
+        for name, torque in config.torques.items():
+            positions[name] = _waypoints(torque.times_s, np.array(torque.torques_N_m), times)
+        if base_path is not None:
+            positions |= _wheel_angles(robot, base_path, times)
+        if config.hand is not None and path is not None:
+            hand, targets = config.hand, path.position(times)
+            base = _base_coordinates(robot, positions, times)
+            followed = follow(
+                model, times, targets, hand.joints, robot.initial, hand.tolerance_m, context.progress, base
+            )
+            positions |= dict(zip(hand.joints, followed.T, strict=True))
+    return JointControl.following(
+        robot,
+        k_p=_gains(config, robot, "k_p"),
+        k_d=_gains(config, robot, "k_d"),
+        times=times,
+        positions=positions,
+        path=path,
+        sample_time=config.sample_time_s,
+    )
+
+
+def _check_names(config: Config, model: Model) -> None:
+    """Refuse references of what is no joint, has no motor, or one of another kind."""
     robot = model.robot
     driven = [motor.joint for motor in robot.motors]
     in_hand = config.hand.joints if config.hand else []
-    named = [*config.joints, *config.torques, *in_hand]
-    for name in named:
+    for name in [*config.joints, *config.torques, *in_hand]:
         if name not in driven:
             raise ModelError(f"controller: {name!r} is no joint with a motor; those are: {', '.join(driven) or 'none'}")
     sources = {motor.joint for motor in robot.motors if isinstance(motor, TorqueSource)}
@@ -116,35 +161,69 @@ def build(config: Config, context: BuildContext) -> JointControl:
         if name not in sources:
             raise ModelError(f"controller: torques.{name}: only motors of type torque take torques")
     for name in config.joints:
-        if robot.links[model.joint_names.index(name)].kind != "revolute":
+        if robot.links[model.joint_names.index(name)].units[0] != "rad":
             raise ModelError(f"controller: {name!r} is prismatic; waypoints in angles_deg are for revolute joints")
-    path, times, columns = None, np.zeros(0), []
-    if config.hand is not None:
-        path = families.build("path", config.hand.path, context, HandPath)
-    if named:
-        segments = duration / config.knot_spacing_s
-        if segments > SEGMENTS_MAX:
-            raise ModelError(
-                f"controller.knot_spacing_s = {config.knot_spacing_s:g}: {segments:.3g} knots in {duration:g} s, "
-                f"at most {SEGMENTS_MAX:g} are made; {duration / SEGMENTS_MAX:.3g} would fit"
-            )
-        # A quintic spline needs six knots.
-        times = np.linspace(0.0, duration, max(int(np.ceil(segments)), 6) + 1)
-        columns = [_waypoints(joint.times_s, np.deg2rad(joint.angles_deg), times) for joint in config.joints.values()]
-        columns += [_waypoints(one.times_s, np.array(one.torques_N_m), times) for one in config.torques.values()]
-        if config.hand is not None and path is not None:
-            hand, targets = config.hand, path.position(times)
-            followed = follow(model, times, targets, hand.joints, robot.initial, hand.tolerance_m, context.progress)
-            columns.extend(followed.T)
-    return JointControl.following(
-        robot,
-        k_p=_gains(config, robot, "k_p"),
-        k_d=_gains(config, robot, "k_d"),
-        times=times,
-        positions=dict(zip(named, columns, strict=True)),
-        path=path,
-        sample_time=config.sample_time_s,
-    )
+    wheels = () if robot.base is None else robot.base.wheels
+    for wheel in wheels:
+        if wheel in in_hand:
+            raise ModelError(f"controller: {wheel!r} is a wheel; the hand's path is for joints of the arm")
+    if config.base is None:
+        return
+    keys = ("controller", "base")
+    if not wheels:
+        raise ModelError("controller.base: the plant has no mobile base; pws_arm has one", keys=keys)
+    for wheel in wheels:
+        if wheel not in driven:
+            raise ModelError(f"controller.base: {wheel!r} has no motor; set plant.base.wheel.motor", keys=keys)
+        if wheel in sources:
+            raise ModelError(f"controller.base: {wheel!r} has a motor of type torque, which follows no path", keys=keys)
+        if wheel in config.joints:
+            raise ModelError(f"controller: {wheel!r} cannot follow both the base's path and waypoints of its own")
+
+
+def _knots(spacing: float, duration: float) -> NDArray[np.float64]:
+    """Times of the samples of the reference splines [s]."""
+    segments = duration / spacing
+    if segments > SEGMENTS_MAX:
+        raise ModelError(
+            f"controller.knot_spacing_s = {spacing:g}: {segments:.3g} knots in {duration:g} s, "
+            f"at most {SEGMENTS_MAX:g} are made; {duration / SEGMENTS_MAX:.3g} would fit"
+        )
+    # A quintic spline needs six knots.
+    return np.linspace(0.0, duration, max(int(np.ceil(segments)), 6) + 1)
+
+
+def _base_path(base: BaseReference, context: BuildContext) -> BasePath:
+    try:
+        return families.build("base_path", base.path, context, BasePath)
+    except ModelError as error:
+        raise ModelError(f"controller.base.path: {error}", keys=("controller", "base", "path")) from error
+
+
+def _wheel_angles(robot: Robot, path: BasePath, times: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """References of the two wheels [rad]; none where the base does not move, so that they hold."""
+    assert robot.base is not None
+    motion = path.motion(times)
+    if not motion.any():
+        return {}
+    first, _ = base_row(robot)
+    angles = robot.initial[first : first + 2] + wheel_angles(robot.base, motion)
+    return dict(zip(robot.base.wheels, angles.T, strict=True))
+
+
+def _base_coordinates(
+    robot: Robot, positions: dict[str, NDArray[np.float64]], times: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """Wheel angles [rad], x and y [m] of the base at the times of its references, (T, 4); None where it holds."""
+    if robot.base is None or not any(wheel in positions for wheel in robot.base.wheels):
+        return None
+    first, _ = base_row(robot)
+    start = robot.initial[first : first + 4]
+    angles = np.tile(start[:2], (len(times), 1))
+    for k, wheel in enumerate(robot.base.wheels):
+        angles[:, k] = positions.get(wheel, angles[:, k])
+    ways = rolled(robot.base, start[2:], spline_coefficients(times, angles), float(times[1] - times[0]))
+    return np.hstack([angles, np.vstack([start[2:], ways[:, -1]])])
 
 
 def _waypoints(at: list[float], values: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:

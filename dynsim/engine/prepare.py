@@ -262,11 +262,9 @@ def _check_references(scenario: Scenario, robot: Robot, contacts: Sequence[Conta
     if not held:
         return
     tolerance = scenario.config.contacts.reference_tolerance_m
-    joints = dict(zip(robot.joint_names, robot.position_index, strict=True))
-    driven = np.array([joints[motor.joint] for motor in robot.motors])
     worst: dict[str, tuple[float, float, np.ndarray]] = {}
     first: dict[str, float] = {}
-    for times, q in control.positions(robot.initial, driven):
+    for times, q in control.positions(robot):
         for link, R, p in poses(robot, q, held):
             for contact, point in held.get(link.name, ()):
                 position = (p + point @ R).T

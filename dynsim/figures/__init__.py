@@ -18,7 +18,7 @@ MEASURED, SIMULATED = "dynsim.figures.measured", "dynsim.figures.arm"
 # Module with ``draw`` and ``draw_comparison`` → sets of signals, any of which tells its records; the first module that
 # finds one draws.
 MODULES: dict[str, tuple[set[str], ...]] = {
-    "dynsim.figures.snake": ({"posture"}, {"base_pose"}, {"w", "w_target"}),
+    "dynsim.figures.snake": ({"posture"}, {"base_pose", "mode"}, {"w", "w_target"}),
     MEASURED: ({"q_goal"}, {"record_time"}, {"torque_estimate"}),
     SIMULATED: ({"hand_position"}, {"current"}, {"energy_residual"}),
 }

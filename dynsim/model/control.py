@@ -15,6 +15,8 @@ from dynsim.kernels.arrays import HELD_POSITION, ReferenceArrays
 from dynsim.kernels.jit import integers, reals
 from dynsim.model.description import Robot
 from dynsim.model.drives import TorqueSource
+from dynsim.model.mobile_base import base_row
+from dynsim.model.rolling import rolled
 
 # Samples in a segment of the reference splines, and segments that are looked at together.
 _PER_SEGMENT = 4
@@ -30,6 +32,14 @@ class HandPath(Protocol):
 
     def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
         """Positions at times t [s], shape (T,) → (T, 3) [m]."""
+
+
+@runtime_checkable
+class BasePath(Protocol):
+    """A motion of a mobile base without side slip; the way to its place follows."""
+
+    def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distance ahead [m] and turn to the left [rad] since the start at times t [s], shape (T,) → (T, 2)."""
 
 
 def held_values(robot: Robot) -> NDArray[np.float64]:
@@ -122,20 +132,21 @@ class JointControl:
         moving = bool((self.reference.spline >= 0).any())
         return float(begin + spacing * len(self.reference.coefficients)) if moving else np.inf
 
-    def positions(self, q: NDArray[np.float64], places: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.float64], ...]]:
-        """Times, (T,) [s], and the joint positions, (T, nq), of the references, in pieces of some thousand samples.
+    def positions(self, robot: Robot) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+        """Times, (T,) [s], and the coordinates, (T, nq), of the references, in pieces of some thousand samples.
 
-        Taken at the knots and at three times between two of them.
+        Taken at the knots and at three times between two of them. Joints without a moving reference stay where they
+        start; a base is where its wheels roll it.
 
         Parameters
         ----------
-        q : (nq,) positions of all joints at the start; those without a moving reference stay there
-        places : (na,) where in q the joint of each motor is
+        robot : whose motors follow the references
         """
-        reference = self.reference
+        reference, q, start = self.reference, robot.initial, None
         begin, spacing = reference.grid
+        places = dict(zip(robot.joint_names, robot.position_index, strict=True))
+        moved = np.array([places[motor.joint] for motor in robot.motors])[reference.spline >= 0]
         segments, columns = len(reference.coefficients), reference.spline[reference.spline >= 0]
-        moved = places[reference.spline >= 0]
         x = spacing * np.arange(_PER_SEGMENT + 1) / _PER_SEGMENT
         powers = x[:, None] ** np.arange(6)
         for first in range(0, segments, _PIECE):
@@ -143,6 +154,15 @@ class JointControl:
             times = begin + spacing * np.arange(first, first + len(piece))[:, None] + x
             positions = np.tile(q, (times.size, 1))
             positions[:, moved] = np.einsum("scp,xp->sxc", piece, powers).reshape(times.size, len(columns))
+            if robot.base is not None:
+                k, _ = base_row(robot)
+                angles = np.zeros((len(piece), 2, 6))
+                angles[:, :, 0] = q[k : k + 2]
+                for wheel in (0, 1):
+                    if k + wheel in moved:
+                        angles[:, wheel] = piece[:, list(moved).index(k + wheel)]
+                way = rolled(robot.base, q[k + 2 : k + 4] if start is None else start, angles, spacing, _PER_SEGMENT)
+                positions[:, k + 2 : k + 4], start = way.reshape(-1, 2), way[-1, -1]
             yield times.ravel(), positions
 
     def target(self, t: NDArray[np.float64]) -> NDArray[np.float64] | None:

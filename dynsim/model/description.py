@@ -28,11 +28,6 @@ def vector(x: float, y: float, z: float) -> Array:
     return np.array([x, y, z], dtype=np.float64)
 
 
-def listed(names: Sequence[str]) -> str:
-    """Names for a line of text: all of a few, the first and the last of many."""
-    return ", ".join(names) if len(names) <= 4 else f"{names[0]} … {names[-1]} ({len(names)})"
-
-
 @dataclass(frozen=True)
 class Inertia:
     """Mass properties of a rigid body.
@@ -318,10 +313,9 @@ class Load:
 class Robot:
     """A tree of links with its motors.
 
-    ``hand`` is the controlled point (body name, point in its frame [m]); ``q0`` the initial configuration [rad or m],
-    zero unless given; ``frames`` further names to attach points to; ``fixed_shapes`` what stands still in the world;
-    ``couplings`` of joints to joints; ``base`` what it drives on, None: it stands fixed or floats;
-    ``fixed_inertia`` of what is fixed to the world, which a mobile base would have to carry.
+    ``hand``: the controlled point (body name, point in its frame [m]); ``q0``: initial configuration [rad or m], zero
+    unless given; ``frames``: further names to attach points to; ``fixed_shapes``, ``fixed_inertia``: what stands still
+    in the world; ``couplings`` of joints to joints; ``base``: what it drives on, None: it stands fixed or floats.
     """
 
     name: str

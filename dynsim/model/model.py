@@ -15,7 +15,8 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels import ledger
 from dynsim.kernels.tree import articulated, joints, points, sweep
 from dynsim.model.arrays import compile_model
-from dynsim.model.description import Array, Robot, listed
+from dynsim.model.description import Array, Robot
+from dynsim.problems import listed
 
 _FLOAT64 = np.dtype(np.float64)
 

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from dynsim.config import StrictConfig
 from dynsim.errors import ModelError
-from dynsim.model.control import HandPath, JointControl
+from dynsim.model.control import BasePath, HandPath, JointControl
 from dynsim.model.description import Quadric, Robot
 from dynsim.model.drives import Drive
 from dynsim.model.model import Model
@@ -26,7 +26,7 @@ class BuildContext:
     Attributes
     ----------
     duration : simulated time [s]
-    machine : what a controller is built for; None for the other families
+    machine : what a controller, or the path of a base, is built for; None for the other families
     joint : the joint of a motor, "" for the other families
     progress : to be called with the time [s] that references have come to, when they take long; None: nobody listens
     """
@@ -94,6 +94,12 @@ class PathModule(Member, Protocol):
     """A path of the hand."""
 
     def build(self, config: Any, context: BuildContext) -> HandPath: ...
+
+
+class BasePathModule(Member, Protocol):
+    """A path of a mobile base; built for ``context.model``, which has one."""
+
+    def build(self, config: Any, context: BuildContext) -> BasePath: ...
 
 
 class SurfaceModule(Member, Protocol):

@@ -24,8 +24,7 @@ ENGINE = "dynamics"
 BASE = "base"
 
 MotorChoice: Any = families.union("motor")
-ArmChoice: Any = families.union("plant")
-ARMS = ("serial_arm", "urdf_arm")
+ArmChoice: Any = families.union("plant", only=("serial_arm", "urdf_arm"))
 
 # Of a wheel, in parts of its radius: for drawing.
 WHEEL_WIDTH = 0.5
@@ -97,9 +96,7 @@ class Config(StrictConfig):
 
     @model_validator(mode="after")
     def _check_arm(self) -> Self:
-        if self.arm.type not in ARMS:
-            raise error_at("arm.type", f"{self.arm.type!r} cannot stand on a base; {' or '.join(ARMS)} can")
-        if "base" in getattr(self.arm, "model_fields_set", ()):
+        if "base" in self.arm.model_fields_set:
             raise error_at("arm.base", "on a mobile base the arm stands at plant.base.mount; remove arm.base")
         return self
 
@@ -132,7 +129,7 @@ def build(config: Config, context: BuildContext) -> Robot:
         axis=vector(1.0, 0.0, 0.0),
         inertia=Inertia.merged(parts),
         R_PJ=_turn(np.deg2rad(base.heading_deg)),
-        p_PJ=vector(*base.position_m, 0.0),
+        p_PJ=np.array([*base.position_m, 0.0]),
         damping=wheel.damping_N_m_s_per_rad,
         shapes=(*_shapes(base), *(shape.placed(mount[1], _quaternion(base)) for shape in arm.fixed_shapes)),
         armature=axle,

@@ -11,8 +11,7 @@ from pydantic import Field, field_validator
 
 from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig
 from dynsim.families import member, union
-from dynsim.model.description import listed
-from dynsim.problems import Origin
+from dynsim.problems import Origin, listed
 from dynsim.scenario.loads import LoadConfig
 
 # Bytes of the name of a folder on common file systems.

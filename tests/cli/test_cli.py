@@ -378,8 +378,8 @@ def test_a_terminal_that_knows_ascii_only(tmp_path: Path):
 
 
 def test_a_damaged_kernel_cache_is_a_warning_in_one_line(tmp_path: Path):
-    build_model(load_scenario("single_pendulum")).bias_forces([0.0], [0.0])
-    files = sorted(cache_folder().glob("dynsim.kernels.tree.sweep.newton_euler-*"))
+    build_model(load_scenario("single_pendulum")).joint_positions([0.0])
+    files = sorted(cache_folder().glob("dynsim.kernels.tree.sweep.kinematics-*"))
     cache = tmp_path / "dynsim" / cache_folder().name
     cache.mkdir(parents=True, mode=0o700)
     assert files

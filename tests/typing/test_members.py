@@ -11,9 +11,13 @@ import pytest
 from dynsim import families
 from dynsim.config import StrictConfig
 from dynsim.control import joint_pd, task_space
+from dynsim.control.base_paths import arc, hold, straight
+from dynsim.control.base_paths import csv as base_csv
+from dynsim.control.base_paths import waypoints as base_waypoints
 from dynsim.control.paths import circle, csv, line, waypoints
 from dynsim.errors import ModelError
 from dynsim.model.protocols import (
+    BasePathModule,
     BuildContext,
     ControllerModule,
     Member,
@@ -23,12 +27,13 @@ from dynsim.model.protocols import (
     SurfaceModule,
 )
 from dynsim.motors import dc, servo, torque, wang_minami
-from dynsim.plants import serial_arm, snake, urdf_arm
+from dynsim.plants import pws_arm, serial_arm, snake, urdf_arm
 from dynsim.surfaces import cylinder, plane, sphere
 
-PLANTS: Sequence[PlantModule] = (serial_arm, snake, urdf_arm)
+PLANTS: Sequence[PlantModule] = (pws_arm, serial_arm, snake, urdf_arm)
 CONTROLLERS: Sequence[ControllerModule] = (joint_pd, task_space)
 PATHS: Sequence[PathModule] = (circle, csv, line, waypoints)
+BASE_PATHS: Sequence[BasePathModule] = (arc, base_csv, hold, straight, base_waypoints)
 SURFACES: Sequence[SurfaceModule] = (cylinder, plane, sphere)
 MOTORS: Sequence[MotorModule] = (dc, servo, torque, wang_minami)
 
@@ -36,6 +41,7 @@ FAMILIES: dict[str, Sequence[Member]] = {
     "plant": PLANTS,
     "controller": CONTROLLERS,
     "path": PATHS,
+    "base_path": BASE_PATHS,
     "surface": SURFACES,
     "motor": MOTORS,
 }
@@ -49,7 +55,7 @@ def test_these_are_all_members_and_each_has_what_its_family_asks_for(family: str
         assert families._lack(module, families.FAMILIES[family], name) == ""
 
 
-@pytest.mark.parametrize("family", ["surface", "motor", "path"])
+@pytest.mark.parametrize("family", ["surface", "motor", "path", "base_path"])
 def test_a_member_that_gives_something_else_is_named(family: str, monkeypatch: pytest.MonkeyPatch) -> None:
     module = FAMILIES[family][0]
     name = families.shipped(family)[0]

@@ -27,8 +27,7 @@ def test_samples_and_functions_are_the_same_references_and_the_other_joints_hold
     second = JointControl.following(robot, 500.0, 20.0, TIMES, {"joint_3": motion})
     for one, other in zip(first.reference, second.reference, strict=True):
         assert np.array_equal(one, other)
-    driven = np.arange(len(robot.motors))
-    times, q = (np.concatenate(pieces) for pieces in zip(*first.positions(robot.initial, driven), strict=True))
+    times, q = (np.concatenate(pieces) for pieces in zip(*first.positions(robot), strict=True))
     # A quintic spline errs by some h⁶ max|f⁽⁶⁾| = 0.02⁶ · 0.1 · 3⁶, more towards its ends.
     assert np.allclose(q[:, 2], motion(times), rtol=0.0, atol=1e-7)
     others = [j for j in range(len(robot.links)) if j != 2]

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.config import NonNegative, Positive, StrictConfig, Vector3
+from dynsim.control.minimum_jerk import minimum_jerk
 from dynsim.model.control import HandPath
 from dynsim.model.protocols import BuildContext
 
@@ -23,10 +24,8 @@ class Config(StrictConfig):
 
     def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
         """a + (b − a) s(x) with s = 10x³ − 15x⁴ + 6x⁵ at times t [s], shape (T, 3) [m]."""
-        x = np.clip((np.asarray(t) - self.start_s) / self.duration_s, 0.0, 1.0)
-        s = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
         a, b = np.array(self.from_m), np.array(self.to_m)
-        return a + np.outer(s, b - a)
+        return a + np.outer(minimum_jerk(t, self.start_s, self.duration_s), b - a)
 
 
 def build(config: Config, context: BuildContext) -> HandPath:

@@ -1,0 +1,112 @@
+"""A base motion from a CSV file: places t_s, x_m, y_m, or rates t_s, V_m_s, omega_rad_s."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, PrivateAttr, model_validator
+from scipy.interpolate import PchipInterpolator
+
+from dynsim.config import StrictConfig, error_at
+from dynsim.control.plane_curve import PlaneCurve, seen_from_start
+from dynsim.csv_rows import read_table
+from dynsim.errors import ModelError
+from dynsim.model.control import BasePath
+from dynsim.model.protocols import BuildContext
+
+PLACES = ("t_s", "x_m", "y_m")
+RATES = ("t_s", "V_m_s", "omega_rad_s")
+# Rows nearer than this to the last one of the curve say how fast it is gone along, not where it leads [m].
+SPACING = 1e-3
+# A corner between two rows that far apart; rows of a smooth path turn less [rad].
+TURN_LIMIT = np.deg2rad(15.0)
+
+
+class Config(StrictConfig):
+    """Along the places, or with the rates, of ``file``; at rest beyond its ends."""
+
+    type: Literal["csv"]
+    file: str = Field(
+        description="CSV file, relative to the scenario file, with a header t_s,x_m,y_m or t_s,V_m_s,omega_rad_s"
+    )
+    frame: Literal["world", "start"] | None = Field(
+        default=None, description="of x_m and y_m (default: world); start: that of the base at its start, x ahead"
+    )
+    # Read once: an edit of the file does not change a scenario that is already loaded, only the next one.
+    _rows: NDArray[np.float64] = PrivateAttr()
+    _are_rates: bool = PrivateAttr()
+
+    @model_validator(mode="after")
+    def _read(self) -> Self:
+        columns, rows = read_table(self.file, PLACES, RATES, what="a path")
+        self._rows, self._are_rates = np.array(rows), columns == RATES
+        if self._rows[0, 0] < 0.0:
+            raise ValueError(f"{self.file}: begins at {self._rows[0, 0]:g} s, before the run")
+        if not np.abs(self._rows).max() < 1e9 or np.diff(self._rows[:, 0]).min() < 1e-9:
+            raise ValueError(f"{self.file}: numbers too large, or rows too close in time, for a curve through them")
+        if self._are_rates and self.frame is not None:
+            raise error_at("frame", "has no effect on rates")
+        return self
+
+
+@dataclass(frozen=True)
+class Rates:
+    """V and ω, shape-preserving cubics of time."""
+
+    rates: PchipInterpolator
+
+    def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Their integrals, distance [m] and turn [rad], at times t [s], (T, 2)."""
+        return np.asarray(self.rates.antiderivative()(np.clip(t, *self.rates.x[[0, -1]])))
+
+
+@dataclass(frozen=True)
+class Places:
+    """A curve r(u), and u as a shape-preserving cubic of time."""
+
+    curve: PlaneCurve
+    way: PchipInterpolator
+
+    def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distance [m] and turn [rad] at times t [s], (T, 2)."""
+        return self.curve.motion(self.way(np.clip(t, *self.way.x[[0, -1]])))
+
+
+def build(config: Config, context: BuildContext) -> BasePath:
+    """The motion that the rows describe.
+
+    Raises
+    ------
+    ModelError
+        The places start elsewhere or sideways, or have a corner: with the row.
+    """
+    times, rows = config._rows[:, 0], config._rows[:, 1:]
+    if config._are_rates:
+        return Rates(PchipInterpolator(times, rows))
+    points = seen_from_start(context.model.robot, rows, config.frame or "world")
+    kept, way = _along(points)
+    if len(kept) < 2:
+        raise ModelError(f"{config.file}: no row is {SPACING:g} m from the first; for a base that stands take hold")
+    names = [f"row {k + 1} ({rows[k, 0]:g}, {rows[k, 1]:g}) m, t = {times[k]:g} s" for k in kept]
+    try:
+        curve = PlaneCurve(points[kept], names, start_limit=TURN_LIMIT, turn_limit=TURN_LIMIT)
+    except ModelError as error:
+        raise ModelError(f"{config.file}: {error}") from error
+    return Places(curve, PchipInterpolator(times, np.minimum(way, curve.nodes[-1])))
+
+
+def _along(points: NDArray[np.float64]) -> tuple[list[int], NDArray[np.float64]]:
+    """Rows that the curve goes through, and the way along their chords at every row [m]; it never goes back."""
+    kept, begun, way = [0], 0.0, [0.0]
+    for k, point in enumerate(points[1:], 1):
+        distance = float(np.hypot(*(point - points[kept[-1]])))
+        if distance >= SPACING:
+            begun += distance
+            kept.append(k)
+            way.append(begun)
+        else:
+            way.append(max(way[-1], begun + distance))
+    return kept, np.array(way)
