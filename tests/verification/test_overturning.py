@@ -277,3 +277,155 @@ def test_loads_along_a_run_with_contacts_and_changing_loads(tmp_path, arm):
         assert np.abs(record["contact_normal_force"]).max() > 1.0
     for k in range(0, len(record), 9):
         assert_same_support(scenario, record, k)
+
+
+def test_a_robot_at_rest_stands_by_its_levers(tmp_path):
+    """The centre of pressure of what has come to rest lies below the centre of mass."""
+    record = dynsim.simulate(read(tmp_path, SWINGING, duration_s=8.0))
+    robot = build.robot(read(tmp_path, SWINGING))
+    total, first = 0.0, np.zeros(2)
+    for link, R, p in poses(robot, record["q"][-1:]):
+        m = link.inertia.mass
+        total, first = total + m, first + m * (p[:2, 0] + R[:2, :, 0] @ link.inertia.com)
+    assert np.abs(record["v"][-1]).max() < 1e-9
+    np.testing.assert_allclose(record["center_of_pressure"][-1], first / total, rtol=0.0, atol=1e-8)
+    x, y, heading = record["base_pose"][-1]
+    c, s = np.cos(heading), np.sin(heading)
+    a, b = np.array([[c, s], [-s, c]]) @ (first / total - [x, y])
+    caster = total * 9.81 * a / CASTER[0]
+    rest = total * 9.81 - caster
+    left = 0.5 * rest + (total * 9.81 * b - caster * CASTER[1]) / TRACK
+    np.testing.assert_allclose(record["wheel_load"][-1], [left, rest - left, caster], rtol=1e-7)
+    base = record.summary["base"]
+    assert list(base["wheel_load_final_N"].values()) == record["wheel_load"][-1].tolist()
+    assert base["tip_margin_min"] == record["tip_margin"].min()
+    assert base["overturns_at_s"] is None
+    assert base["pose_final"] == record["base_pose"][-1].tolist()
+
+
+def pressed(scenario: dynsim.Scenario, point: np.ndarray, extra: float) -> dynsim.Record:
+    """One sample at the start, with a weight put on the base so that the pressure's centre is there (base's frame)."""
+
+    def sample(force: float, place: np.ndarray) -> dynsim.Record:
+        simulation = dynsim.Simulation(scenario)
+        simulation.set_wrench("base", [0.0, 0.0, -force], point=np.r_[place, 0.0])
+        simulation.advance(1e-7)
+        return simulation.record()
+
+    # A weight on the base moves nothing, so loads are linear in it.
+    loads = sample(0.0, point)["wheel_load"][0]
+    return sample(extra, point + (point - (loads @ FEET)[:2] / loads.sum()) * loads.sum() / extra)
+
+
+def test_the_margin_is_one_at_the_incentre_zero_on_the_sides_and_minus_one_aloft(tmp_path):
+    scenario = read(tmp_path, SWINGING)
+    assert pressed(scenario, incentre(), 50.0)["tip_margin"][0] == pytest.approx(1.0, abs=1e-10)
+    for k in range(3):
+        middle = 0.5 * (FEET[k - 1] + FEET[k - 2])[:2]
+        assert pressed(scenario, middle, 50.0)["tip_margin"][0] == pytest.approx(0.0, abs=1e-10)
+        out = middle + 2.0 * (middle - incentre())
+        assert pressed(scenario, out, 50.0)["tip_margin"][0] == pytest.approx(margin(out), abs=1e-9)
+    aloft = pressed(scenario, incentre(), -500.0)
+    assert aloft["tip_margin"][0] == -1.0
+    assert any("the base is lifted" in warning for warning in aloft.summary["warnings"])
+
+
+# A push on the base that grows until the base tips, and beyond.
+TIPPING = """
+loads:
+  push: {type: samples, body: base, point_m: [0.0, 0.0, 0.15], times_s: [0, 0.15, 0.3, 0.4],
+         force_N: [[0, 0, 0], [2, 20, 0], [-3, 48, 0], [2, 30, 0]]}
+"""
+
+
+def crossing(times: np.ndarray, values: np.ndarray) -> float:
+    """First zero of samples, by the polynomial through the six around it."""
+    k = int(np.flatnonzero((values[:-1] > 0.0) & (values[1:] <= 0.0))[0])
+    near = slice(k - 2, k + 4)
+    fit = np.polynomial.Polynomial.fit(times[near], values[near], 5)
+    roots = [root.real for root in fit.roots() if abs(root.imag) < 1e-12 and times[k] <= root.real <= times[k + 1]]
+    assert len(roots) == 1
+    return float(roots[0])
+
+
+def test_it_tips_when_an_independent_margin_is_zero_and_goes_on_as_if_held(tmp_path):
+    scenario = read(tmp_path, SWINGING, TIPPING)
+    record = dynsim.simulate(scenario)
+    tips = [event for event in record.events if event.kind == "tip_over"]
+    base = record.summary["base"]
+    assert base["overturns_at_s"] == tips[0].time
+    expected = np.array([expected_at(scenario, record, k)["margin"] for k in range(len(record))])
+    assert tips[0].time == pytest.approx(crossing(record.time, expected), abs=1e-6)
+    assert record.complete
+    assert base["tip_margin_min"] == record["tip_margin"].min() < 0.0
+    assert base["wheel_load_min_N"]["right"] == record["wheel_load"][:, 1].min()
+    assert any("held down" in warning for warning in record.summary["warnings"])
+    assert base["traction_demand_max"] == np.nanmax(record["traction_demand"])
+
+
+def test_a_run_that_is_to_stop_where_it_tips_ends_there_with_all_that_it_has(tmp_path):
+    scenario = read(tmp_path, SWINGING, TIPPING, overturn="stop")
+    goes_on = dynsim.simulate(read(tmp_path, SWINGING, TIPPING))
+    with pytest.raises(SimulationStopped, match="the base tips over") as stop:
+        dynsim.simulate(scenario)
+    assert stop.value.exit_code == 3
+    record = stop.value.record
+    assert stop.value.time == goes_on.summary["base"]["overturns_at_s"] == record.summary["base"]["overturns_at_s"]
+    assert record.summary["base"]["tip_margin_min"] == 0.0
+    assert [event.kind for event in record.events] == ["tip_over"]
+    count = len(record)
+    assert record.time[-1] <= stop.value.time < goes_on.time[count]
+    for name in ("q", "wheel_load", "tip_margin"):
+        assert record[name].tobytes() == goes_on[name][:count].tobytes()
+    simulation = dynsim.Simulation(scenario)
+    simulation.advance(0.1)
+    with pytest.raises(SimulationStopped, match="the base tips over") as stepped:
+        simulation.advance(0.4)
+    assert stepped.value.time == stop.value.time
+    assert stepped.value.record["q"].tobytes() == record["q"].tobytes()
+
+
+def test_a_stepper_records_the_same_and_watches_margins(tmp_path):
+    scenario = read(tmp_path, SWINGING, TIPPING)
+    whole, simulation = dynsim.simulate(scenario), dynsim.Simulation(scenario)
+    for t in (0.031, 0.2, 0.4):
+        simulation.advance(t)
+    record = simulation.record()
+    assert record.events == whole.events
+    for name in whole:
+        assert record[name].tobytes() == whole[name].tobytes()
+    assert record.summary["base"] == whole.summary["base"]
+    other = dynsim.Simulation(scenario)
+    other.watch("tip_margin", "base", 0.2, direction=-1, stop=True)
+    other.advance(0.4)
+    early = crossing(whole.time, whole["tip_margin"] - 0.2)
+    assert other.time == pytest.approx(early, abs=1e-6)
+    with pytest.raises(ModelError, match="base"):
+        other.watch("tip_margin", "link_1")
+
+
+def test_a_base_that_begins_beyond_its_triangle_tips_at_once(tmp_path):
+    text = BASE.replace(f"com_m: {COM.tolist()}", "com_m: [-0.1, 0.0, 0.08]")
+    path = tmp_path / "case.yaml"
+    path.write_text((text + SWINGING + END).replace("GRAVITY", DOWN).replace("OVERTURN", "stop"))
+    with pytest.raises(SimulationStopped, match="tips over") as stop:
+        dynsim.simulate(dynsim.load_scenario(path))
+    assert stop.value.time < 1e-12
+    assert stop.value.record.summary["base"]["tip_margin_min"] < 0.0
+
+
+def test_a_record_of_a_lifted_wheel_comes_back_from_its_file(tmp_path):
+    record = dynsim.simulate(read(tmp_path, SWINGING, TIPPING))
+    assert np.isnan(record["traction_demand"]).any()
+    again = dynsim.Record.load(record.save(tmp_path / "record.h5"))
+    for name in ("wheel_load", "center_of_pressure", "tip_margin", "traction_demand", "wheel_speed"):
+        np.testing.assert_array_equal(again[name], record[name])
+    assert again.events == record.events
+
+
+def test_path_length_of_wheels_that_turn_is_that_of_their_angles(tmp_path):
+    record = dynsim.simulate(read(tmp_path, SWINGING, TIPPING, **{"record.rate_hz": 2000}))
+    rate = 0.5 * RADIUS * np.abs(record["wheel_speed"].sum(axis=1))
+    length = record.summary["base"]["path_length_m"]
+    assert length > 1e-4
+    assert length == pytest.approx(np.trapezoid(rate, record.time), rel=1e-3)
