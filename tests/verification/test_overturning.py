@@ -61,7 +61,7 @@ SWINGING = """
 # Of the issue: joints 4 and 7 stand on the floor.
 _A = 0.4 * np.pi
 _B = np.arccos(-(0.12 + 0.3 * np.cos(_A)) / 0.3)
-_ANGLES = np.rad2deg([0.0, _A, _B - _A, 0.25 * np.pi - _B]).tolist() + [45, 45, -90, 45, -45, 45]
+_ANGLES = [*np.rad2deg([0.0, _A, _B - _A, 0.25 * np.pi - _B]).tolist(), 45, 45, -90, 45, -45, 45]
 BRACED = f"""
     chain: [{{axis: z, length_m: 0.0}}, {{axis: y, count: 9}}]
     initial_deg: {[float(angle) for angle in _ANGLES]}
@@ -157,7 +157,7 @@ def reaction(
     disc = np.diag([ACROSS, AXLE, ACROSS])
     for k, foot in enumerate(FEET[:2]):
         R = np.einsum("ijt,jkt->ikt", base_R, about_y(path[:, k]))
-        centre = base_p + np.einsum("ijt,j->it", base_R, foot + [0.0, 0.0, RADIUS])
+        centre = base_p + np.einsum("ijt,j->it", base_R, foot + np.array([0.0, 0.0, RADIUS]))
         parts.append((WHEEL_MASS, np.zeros(3), disc, R, centre))
     for link in robot.links[2:]:
         parts.append((link.inertia.mass, link.inertia.com, link.inertia.tensor, *placed[link.name]))
