@@ -104,7 +104,9 @@ class Config(StrictConfig):
 
     @model_validator(mode="after")
     def _check_arm(self) -> Self:
-        if "base" in self.arm.model_fields_set:
+        # Resolved scenarios have it all; the place of an arm that was given none is no other than that of its mount.
+        own = getattr(self.arm, "base", None)
+        if own is not None and own != type(own)():
             raise error_at("arm.base", "on a mobile base the arm stands at plant.base.mount; remove arm.base")
         return self
 
