@@ -35,7 +35,13 @@ class Skeleton:
         Nothing leads from the world or a body to what moves freely beside it.
         """
         points = self.record[POSITION][row].astype(np.float64)
-        bodies = [(k, body) for k, body in enumerate(self.scene.bodies) if not _moves_beside(body.joint)]
+        # A mobile base is drawn as what it is, see dynsim.figures.solids.
+        solid = self.scene.base
+        bodies = [
+            (k, body)
+            for k, body in enumerate(self.scene.bodies)
+            if k not in solid and not _moves_beside(body.joint)
+        ]
         # A sliding joint at the root moves its body away from where it is mounted.
         lines = [(np.array(body.joint.position), points[k]) for k, body in bodies if body.parent == WORLD]
         lines += [(points[body.parent], points[k]) for k, body in bodies if body.parent != WORLD]
