@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -27,11 +28,11 @@ def overturning(record: Record) -> Figure | None:
     """Loads of wheels and caster, tip margin and traction demand over time; None without a mobile base."""
     if not {LOADS, MARGIN, TRACTION} <= set(record):
         return None
-    figure = style.new_figure(6.2, style.title(record, f"does the base stand? {_verdict(record)}"))
+    figure = style.new_figure(6.2, style.title(record, "what the base stands on"))
     loads, margin, traction = record[LOADS], record[MARGIN], record[TRACTION]
     demanded = np.minimum(traction, TRACTION_TOP)
     series = [loads, np.maximum(margin, MARGIN_LOW), demanded]
-    rows = style.time_rows(figure, [[(record.time, one)] for one in series], style.settle_time(record), compress=True)
+    rows = style.time_rows(figure, [[(record.time, one)] for one in series], style.settle_time(record))
     for axes in rows[0]:
         _lines(axes, record, LOADS, "least {} N", np.nanmin)
         _mark_negative(axes, "pulls: held down")
@@ -48,8 +49,21 @@ def overturning(record: Record) -> Figure | None:
     for panels, label in zip(rows, ("load [N]", "tip margin", "traction demand\n|F| / (μ N)"), strict=True):
         panels[0].set_ylabel(label)
         style.legend_above(panels[-1], columns=4)
-    if np.nanmax(traction, initial=0.0) > TRACTION_TOP:
-        _note(rows[2][-1], f"peaks above {TRACTION_TOP:g} cut off: hardly any load")
+    note = [f"higher peaks, of wheels with hardly any load, are cut off at {TRACTION_TOP:g}"]
+    if not np.nanmax(traction, initial=0.0) > TRACTION_TOP:
+        note = []
+    if missing := float(np.isnan(traction).any(axis=1).mean()):
+        note.append(f"no demand where a wheel carries no load: {100.0 * missing:.2g} % of the samples")
+    rows[2][-1].text(
+        0.99,
+        0.96,
+        "\n".join(note),
+        transform=rows[2][-1].transAxes,
+        ha="right",
+        va="top",
+        color=style.GREY,
+        fontsize=6.5,
+    )
     return figure
 
 
@@ -59,8 +73,10 @@ def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
     if not shown:
         return None
     some = list(shown.values())
-    more = (-(-len(shown) // 2) - 1) * style.LEGEND_ROW / 72.0
-    figure = style.new_figure(3.6 + more, style.comparison_title(some, "tip margin (1: safest place, 0: tips over)"))
+    figure = style.new_figure(
+        3.4 + len(shown) * style.LEGEND_ROW / 72.0,
+        style.comparison_title(some, "tip margin (1: safest place, 0: tips over)"),
+    )
     series = [(record.time, np.maximum(record[MARGIN], MARGIN_LOW)) for record in some]
     (panels,) = style.time_rows(figure, [series], max(map(style.settle_time, some)))
     styles = style.variant_styles(list(records))
@@ -70,7 +86,8 @@ def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
         _frame_margin(axes)
         _mark_tipping(axes, some, [str(styles[name]["color"]) for name in shown])
     panels[0].set_ylabel("tip margin")
-    style.legend_above(panels[-1], columns=2)
+    handles, labels = panels[-1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=1)
     return figure
 
 
@@ -90,11 +107,12 @@ def tracking(record: Record) -> Figure | None:
                 middle = float(np.nanmean(values))
                 axes.set_ylim(middle - least, middle + least)
             axes.ticklabel_format(axis="y", useOffset=False)
-    for k, name in enumerate("xy"):
+    # Dashes: x and y may be the same.
+    for k, (name, dashes) in enumerate((("x", "-"), ("y", (0, (5, 4))))):
         for axes in rows[0]:
-            _pair(axes, record.time, target[:, k], pose[:, k], name, style.AXIS_COLOURS[name])
+            _pair(axes, record.time, target[:, k], pose[:, k], name, style.AXIS_COLOURS[name], dashes)
     for axes in rows[1]:
-        _pair(axes, record.time, heading[:, 0], heading[:, 1], "heading", style.BLACK)
+        _pair(axes, record.time, heading[:, 0], heading[:, 1], "heading", style.BLACK, "-")
     for k, (name, colour) in enumerate((("ahead", style.BLUE), ("to the left", style.GREEN))):
         label = f"{name}: rms {style.number(_rms(parts[2][:, k]), 3)} mm"
         for axes in rows[2]:
@@ -130,8 +148,8 @@ def _verdict(record: Record) -> str:
     times = tipping_times(record)
     if not times:
         return "it never tips over"
-    more = f", {len(times)} times" if len(times) > 1 else ""
-    return f"tips over at {style.number(times[0])} s{more}"
+    more = f"{len(times)} times, first " if len(times) > 1 else ""
+    return f"tips over {more}at {style.number(times[0], 3)} s"
 
 
 def _margin_label(name: str, record: Record) -> str:
@@ -142,7 +160,7 @@ def _margin_label(name: str, record: Record) -> str:
     return f"{name}:{least} {_verdict(record)}"
 
 
-def _lines(axes: Axes, record: Record, signal: str, note: str, extreme: np.ufunc) -> None:
+def _lines(axes: Axes, record: Record, signal: str, note: str, extreme: Callable[[Array], Any]) -> None:
     """A line for each column, its extreme in the legend."""
     for values, name, colour in zip(record[signal].T, record.labels[signal], SIDE_COLOURS, strict=False):
         known = np.isfinite(values).any()
@@ -150,10 +168,10 @@ def _lines(axes: Axes, record: Record, signal: str, note: str, extreme: np.ufunc
         style.line(axes, record.time, values, color=colour, label=label)
 
 
-def _pair(axes: Axes, time: Array, target: Array, actual: Array, name: str, colour: str) -> None:
+def _pair(axes: Axes, time: Array, target: Array, actual: Array, name: str, colour: str, dashes: Any) -> None:
     """Actual over its reference, which is wide and pale so that both are seen where they agree."""
     style.line(axes, time, target, color=colour, linewidth=4.0, alpha=0.3, label=f"{name}, reference")
-    style.line(axes, time, actual, color=colour, label=f"{name}, actual")
+    style.line(axes, time, actual, color=colour, linestyle=dashes, label=f"{name}, actual")
 
 
 def _frame_margin(axes: Axes) -> None:
@@ -175,10 +193,9 @@ def _mark_tipping(axes: Axes, records: Sequence[Record], colours: Sequence[str])
     for record, colour in zip(records, colours, strict=True):
         for time in tipping_times(record):
             axes.axvline(time, color=colour, linestyle=(0, (4, 2)), linewidth=0.9)
-
-
-def _note(axes: Axes, text: str) -> None:
-    axes.text(0.99, 0.96, text, transform=axes.transAxes, ha="right", va="top", color=style.GREY, fontsize=6.5)
+            # Above the axes, where a line at their edge is seen too.
+            top = axes.get_xaxis_transform()
+            axes.plot(time, 1.0, "v", color=colour, markersize=4, transform=top, clip_on=False, zorder=5)
 
 
 def _rms(values: Array) -> float:

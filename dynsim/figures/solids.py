@@ -35,7 +35,7 @@ def surface(shape: Shape) -> Array:
     elif shape.kind == "cylinder":
         radius, length = shape.size
         rim = radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(CORNERS)], axis=1)
-        points = np.concatenate([rim + [0.0, 0.0, end * length] for end in (-0.5, 0.5)])
+        points = np.concatenate([rim + np.array([0.0, 0.0, end * length]) for end in (-0.5, 0.5)])
     elif shape.kind in ("sphere", "capsule"):
         latitude = np.linspace(-0.5 * np.pi, 0.5 * np.pi, CORNERS // 2 + 1)[:, None]
         ball = np.stack(
@@ -43,7 +43,7 @@ def surface(shape: Shape) -> Array:
             axis=-1,
         ).reshape(-1, 3)
         half = 0.5 * shape.size[1] if shape.kind == "capsule" else 0.0
-        points = np.concatenate([shape.size[0] * ball + [0.0, 0.0, end * half] for end in (-1.0, 1.0)])
+        points = np.concatenate([shape.size[0] * ball + np.array([0.0, 0.0, end * half]) for end in (-1.0, 1.0)])
     else:
         return np.zeros((0, 3))
     return np.array(shape.position) + rotated(np.array(shape.orientation), points.T).T

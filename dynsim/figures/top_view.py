@@ -1,4 +1,4 @@
-"""A mobile base from above: where it drove and stood, its arm's elbows and hand, and where it is pressed to the ground."""
+"""A mobile base from above: where it drove and stood, elbows and hand of its arm, where it presses on the ground."""
 
 from __future__ import annotations
 
@@ -8,21 +8,25 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
+from numpy.typing import NDArray
 
 from dynsim.figures import style
 from dynsim.figures.hand import edge_on, target_name
 from dynsim.figures.posture import ARM_COLOUR
 from dynsim.figures.skeleton import Skeleton, skeleton
-from dynsim.figures.solids import outline, solids
+from dynsim.figures.solids import outline
 from dynsim.figures.style import Array
 from dynsim.measures import hand_target
 from dynsim.record import Record
 from dynsim.record.poses import point_positions
+from dynsim.record.scene import Point
 
-# Support triangles are drawn so often, evenly over the way; more of them than this share of the base apart.
-TRIANGLES, APART = 5, 0.5
-ELBOW_COLOURS = (style.ORANGE, style.GREEN, style.PURPLE, style.SKY)
-INSIDE, OUTSIDE = style.BLUE, style.PULLING
+Rows = NDArray[np.intp]
+
+# So many support triangles at most, evenly over the way, at least this share of their size apart.
+TRIANGLES, APART = 6, 0.25
+ELBOW_COLOURS = (style.ORANGE, style.GREEN, "#8C6D31")
+TRIANGLE, INSIDE, OUTSIDE = style.SKY, style.PURPLE, style.PULLING
 
 
 def top_view(record: Record) -> Figure | None:
@@ -45,7 +49,7 @@ def top_view(record: Record) -> Figure | None:
     world.set_ylim(low[1], high[1])
     _draw_own(own, body, rows)
     for axes in (world, own):
-        axes.set_aspect("equal", adjustable="box")
+        axes.set_aspect("equal", adjustable="box", anchor="N")
     handles, labels = world.get_legend_handles_labels()
     more = [pair for pair in zip(*own.get_legend_handles_labels(), strict=True) if pair[1] not in labels]
     handles, labels = [*handles, *(one for one, _ in more)], [*labels, *(text for _, text in more)]
@@ -65,14 +69,14 @@ def pressure_in_base(record: Record) -> Array:
     return np.stack([c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]], axis=1)
 
 
-def _extent(body: Skeleton, rows: Array) -> tuple[Array, Array]:
+def _extent(body: Skeleton, rows: Rows) -> tuple[Array, Array]:
     """Corners of what is drawn of the world [m]; a centre of pressure far away is not in it."""
     record = body.record
     points = [record["hand_position"][:, :2]] if "hand_position" in record else []
     if (target := hand_target(record)) is not None:
         points.append(target[:, :2])
-    points += [point_positions(record, one, rows)[:, :2] for one in (*body.scene.contacts, *body.scene.supports)]
-    points += [solid[:, :2] for row in rows[[0, -1]] for solid in solids(record, body.scene.base, row)]
+    points += [_track(body, one, rows) for one in (*body.scene.contacts, *body.scene.supports)]
+    points += [solid[:, :2] for row in rows[[0, -1]] for solid in body.solids(row)]
     points.append(body.segments(int(rows[-1])).reshape(-1, 3)[:, :2])
     everything = np.concatenate(points)
     everything = everything[np.isfinite(everything).all(axis=1)]
@@ -81,7 +85,12 @@ def _extent(body: Skeleton, rows: Array) -> tuple[Array, Array]:
     return low - room, high + room
 
 
-def _draw_world(axes: Axes, body: Skeleton, rows: Array) -> None:
+def _track(body: Skeleton, point: Point, rows: Rows) -> Array:
+    """Way of a point over the ground, (rows, 2) [m]."""
+    return point_positions(body.record, point)[rows, :2]
+
+
+def _draw_world(axes: Axes, body: Skeleton, rows: Rows) -> None:
     record, scene = body.record, body.scene
     first, last = int(rows[0]), int(rows[-1])
     _draw_outline(axes, body, first, facecolor="none", linestyle=(0, (3, 2)), label="base at the start")
@@ -90,18 +99,18 @@ def _draw_world(axes: Axes, body: Skeleton, rows: Array) -> None:
     for segment in arm:
         axes.plot(*segment.T, color=ARM_COLOUR, lw=1.6, alpha=0.35, zorder=3)
     axes.plot([], [], color=ARM_COLOUR, lw=1.6, alpha=0.35, label="arm at the end")
-    for row in _spread(record["base_pose"], rows, 0.5 * float(np.ptp(support_corners(body, first), axis=0).max())):
-        axes.add_patch(Polygon(support_corners(body, row), facecolor="none", edgecolor=style.GREEN, lw=0.7, zorder=4))
-    axes.plot([], [], color=style.GREEN, lw=0.7, label="support triangle")
+    for row in _spread(record["base_pose"], rows, APART * float(np.ptp(support_corners(body, first), axis=0).max())):
+        axes.add_patch(Polygon(support_corners(body, row), facecolor="none", edgecolor=TRIANGLE, lw=0.7, zorder=4))
+    axes.plot([], [], color=TRIANGLE, lw=0.7, label="support triangle")
     looks: tuple[dict[str, Any], ...] = (
         {"color": style.BLACK, "lw": 0.9, "label": "wheel tracks"},
         {"color": style.BLACK, "lw": 0.9},
         {"color": style.BLACK, "lw": 0.9, "linestyle": (0, (1, 1)), "label": "caster track"},
     )
     for point, look in zip(scene.supports, looks, strict=True):
-        axes.plot(*style.sparse(point_positions(record, point, rows)[:, :2]).T, zorder=5, **look)
+        axes.plot(*style.sparse(_track(body, point, rows)).T, zorder=5, **look)
     for k, contact in enumerate(scene.contacts):
-        path = style.sparse(point_positions(record, contact, rows)[:, :2])
+        path = style.sparse(_track(body, contact, rows))
         colour = ELBOW_COLOURS[k % len(ELBOW_COLOURS)]
         axes.plot(*path.T, color=colour, lw=1.4, zorder=6, label=contact.name)
         axes.plot(*path[-1], "o", color=colour, markersize=4, zorder=6)
@@ -117,19 +126,25 @@ def _draw_world(axes: Axes, body: Skeleton, rows: Array) -> None:
     axes.set_ylabel("y [m]")
 
 
-def _draw_own(axes: Axes, body: Skeleton, rows: Array) -> None:
+def _draw_own(axes: Axes, body: Skeleton, rows: Rows) -> None:
     """The base from above, in its own frame: ahead is to the right."""
     record = body.record
     x, y, heading = record["base_pose"][rows[-1]]
     turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
-    parts = [(solid[:, :2] - [x, y]) @ turn for solid in solids(record, body.scene.base, int(rows[-1]))]
+    parts = [(solid[:, :2] - [x, y]) @ turn for solid in body.solids(int(rows[-1]))]
     for part in parts:
         axes.add_patch(Polygon(outline(part), facecolor="#EEEEEE", edgecolor=style.GREY, lw=0.7, zorder=1))
     corners = (support_corners(body, int(rows[-1])) - [x, y]) @ turn
-    axes.add_patch(Polygon(corners, facecolor=style.GREEN, alpha=0.12, lw=0, zorder=2))
-    axes.add_patch(Polygon(corners, facecolor="none", edgecolor=style.GREEN, lw=1.0, zorder=3))
+    axes.add_patch(Polygon(corners, facecolor=TRIANGLE, alpha=0.2, lw=0, zorder=2))
+    axes.add_patch(Polygon(corners, facecolor="none", edgecolor=TRIANGLE, lw=1.0, zorder=3))
+    middle = corners.mean(axis=0)
     for point, corner in zip(body.scene.supports, corners, strict=True):
-        axes.annotate(point.name, corner, xytext=(3, 3), textcoords="offset points", fontsize=7, zorder=6)
+        axes.plot(*corner, "o", color=ARM_COLOUR, markersize=3, zorder=6)
+        # Towards the middle, where there is room.
+        away = 16.0 * (middle - corner) / np.linalg.norm(middle - corner)
+        axes.annotate(
+            point.name, corner, xytext=away, textcoords="offset points", fontsize=7, zorder=6, ha="center", va="center"
+        )
     path = pressure_in_base(record)
     _draw_pressure(axes, path, record)
     # The path may go far; what it does within a base's length of the base is in the picture.
@@ -150,7 +165,7 @@ def _draw_own(axes: Axes, body: Skeleton, rows: Array) -> None:
 
 
 def _draw_outline(axes: Axes, body: Skeleton, row: int, *, label: str, **look: Any) -> None:
-    for k, solid in enumerate(solids(body.record, body.scene.base, row)):
+    for k, solid in enumerate(body.solids(row)):
         patch = Polygon(outline(solid[:, :2]), edgecolor=ARM_COLOUR, lw=0.8, zorder=2, **look)
         patch.set_label(label if k == 0 else "_")
         axes.add_patch(patch)
@@ -159,7 +174,7 @@ def _draw_outline(axes: Axes, body: Skeleton, row: int, *, label: str, **look: A
 def _draw_pressure(axes: Axes, path: Array, record: Record) -> None:
     """The centre of pressure: where the base stands, and where it tips."""
     outside = record["tip_margin"] < 0.0
-    for mask, colour, label in ((~outside, INSIDE, "centre of pressure"), (outside, OUTSIDE, "outside: tips over")):
+    for mask, colour, label in ((~outside, INSIDE, "centre of pressure"), (outside, OUTSIDE, "outside the triangle")):
         if mask.any():
             # A piece of a line needs its first point of the other kind too.
             joined = mask | np.append(False, mask[:-1]) if colour == OUTSIDE else mask
@@ -172,8 +187,10 @@ def _draw_pressure(axes: Axes, path: Array, record: Record) -> None:
             axes.plot(*path[k], "o", markersize=4, color=colour, markerfacecolor=face or colour, zorder=10)
 
 
-def _spread(pose: Array, rows: Array, apart: float) -> list[int]:
+def _spread(pose: Array, rows: Rows, apart: float) -> list[int]:
     """Rows at which the base has gone on by at least ``apart`` [m], the first and the last among them."""
     way = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[rows, :2], axis=0).T)))
     count = int(np.clip(way[-1] / max(apart, 1e-9), 1, TRIANGLES - 1)) + 1
-    return [int(rows[np.searchsorted(way, share).clip(max=len(rows) - 1)]) for share in np.linspace(0.0, way[-1], count)]
+    return [
+        int(rows[np.searchsorted(way, share).clip(max=len(rows) - 1)]) for share in np.linspace(0.0, way[-1], count)
+    ]

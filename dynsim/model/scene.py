@@ -85,9 +85,7 @@ def _supports(base: MobileBase, body: int) -> tuple[Point, ...]:
 def _joint(link: Link, kind: JointKind) -> Joint:
     if link.kind == "left_wheel":  # its angles are not where it is
         pose, part_of = ("x", "y", "heading"), link.joint_of_rows or ""
-        return Joint(
-            link.joint, kind, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), HERE, "base_pose", pose, None, None, part_of
-        )
+        return Joint(link.joint, kind, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), HERE, "base_pose", pose, None, None, part_of)
     return Joint(
         name=link.joint,
         kind=kind,
