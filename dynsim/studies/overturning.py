@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.patheffects import withTickedStroke as TickedStroke
+from matplotlib.patheffects import withTickedStroke
 from numpy.typing import NDArray
 
 from dynsim._version import __version__
@@ -57,14 +57,16 @@ COLUMNS = (
     "dynsim_version",
 )  # fmt: skip
 
+SHADE = "#E4EEF6"
+# On the side of a zero line where values are below it.
+_TICKS = withTickedStroke(spacing=7, length=0.7, angle=-135)
+
 
 def below_zero(time: Array, margin: Array) -> list[tuple[float, float | None]]:
     """From when to when the margin is below zero in the samples [s]; None: to the end."""
     edges = np.diff(np.concatenate([[0], margin < 0.0, [0]]).astype(int))
     first, last = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
-    return [
-        (float(time[a]), float(time[b]) if b < len(time) else None) for a, b in zip(first, last, strict=True)
-    ]
+    return [(float(time[a]), float(time[b]) if b < len(time) else None) for a, b in zip(first, last, strict=True)]
 
 
 def configuration(scenario: str, variant: str) -> Row:
@@ -98,7 +100,8 @@ def configuration(scenario: str, variant: str) -> Row:
 
 def shipped_base() -> dict[str, Any]:
     """``plant.base`` of the scenario that is varied."""
-    return load_scenario(SCENARIO).resolved["plant"]["base"]
+    base: dict[str, Any] = load_scenario(SCENARIO).resolved["plant"]["base"]
+    return base
 
 
 def overrides(base: Mapping[str, Any], mass: float, track: float, caster: float) -> dict[str, Any]:
@@ -113,10 +116,12 @@ def overrides(base: Mapping[str, Any], mass: float, track: float, caster: float)
 
 def point(mass: float, track: float, caster: float, variant: str) -> Row:
     """One run of the sweep: it stands if its margin stays above zero from the settled time on."""
-    row: Row = {"mass_kg": mass, "track_m": track, "caster_m": caster, "variant": variant}
+    row: Row = {"mass_kg": mass, "track_m": track, "caster_m": caster, "variant": variant, "stands": None}
     row["dynsim_version"] = __version__
     try:
-        summary = simulate(load_scenario(SCENARIO, variant, SWEEP | overrides(shipped_base(), mass, track, caster))).summary
+        summary = simulate(
+            load_scenario(SCENARIO, variant, SWEEP | overrides(shipped_base(), mass, track, caster))
+        ).summary
     except DynsimError as error:
         return row | {"reason": " ".join(str(error).split())}
     found = {key: summary["base"][key] for key in ("tip_margin_min_settled", "tip_margin_min", "overturns_at_s")}
@@ -127,7 +132,7 @@ def points() -> list[tuple[float, float, float]]:
     """Mass, track and caster: every pair of them against each other, the third as shipped."""
     base = shipped_base()
     shipped = (base["mass_kg"], base["track_m"], base["caster_m"][0])
-    grid = product(*(values for _, values in AXES.values()))
+    grid = product(MASSES_KG, TRACKS_M, CASTERS_M)
     return [place for place in grid if any(at == value for at, value in zip(place, shipped, strict=True))]
 
 
@@ -153,11 +158,16 @@ def picture(rows: Sequence[Row]) -> Figure:
         _panel(axes, [row for row in rows if row[third] == shipped[third]], x, y, styles)
         axes.plot(shipped[x], shipped[y], "k*", markersize=9, zorder=6)
         axes.set(xlabel=AXES[x][0], ylabel=AXES[y][0], title=f"{third.rsplit('_', 1)[0]} as shipped")
+    falling = [name for name in styles if any(row["variant"] == name and row["stands"] is False for row in rows)]
     handles: list[Any] = [
-        Line2D([], [], color=style["color"], path_effects=[_TICKS], label=f"{name} falls on the side of the ticks")
-        for name, style in styles.items()
-        if any(row["variant"] == name and row["stands"] is False for row in rows)
+        Line2D(
+            [], [], color=styles[name]["color"], path_effects=[_TICKS], label=f"{name} falls on the side of the ticks"
+        )
+        for name in falling
     ]
+    standing = [name for name in styles if name not in falling]
+    if standing:
+        handles.append(Line2D([], [], linestyle="", label=f"{', '.join(standing)}: never below zero"))
     handles += [
         Patch(color=SHADE, label="bracing decides: stands with two elbows, falls with none"),
         Line2D([], [], color="k", marker="*", linestyle="", markersize=8, label="as shipped"),
@@ -165,10 +175,6 @@ def picture(rows: Sequence[Row]) -> Figure:
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     return figure
-
-
-SHADE = "#E4EEF6"
-_TICKS = TickedStroke(spacing=7, length=0.7, angle=-135)
 
 
 def _panel(axes: Axes, rows: Sequence[Row], x: str, y: str, styles: Mapping[str, Mapping[str, Any]]) -> None:
@@ -187,18 +193,20 @@ def _panel(axes: Axes, rows: Sequence[Row], x: str, y: str, styles: Mapping[str,
                 path_effects=[_TICKS]
             )
     axes.plot(*(grid.ravel() for grid in np.meshgrid(xs, ys)), "k.", markersize=2.0, clip_on=False)
-    failed = [(row[x], row[y]) for row in rows if row["reason"]]
-    if failed:
-        axes.plot(*zip(*failed, strict=True), "kx", markersize=5.0)
+    axes.plot(*np.array([(row[x], row[y]) for row in rows if row["reason"]]).reshape(-1, 2).T, "kx", markersize=5.0)
 
 
 def table(configurations: Mapping[str, Row]) -> str:
     """The configurations of one scenario, for the terminal."""
-    lines = [f"{'':12}{'margin min':>11}{'settled':>9}{'overturns at':>14}  settled loads: left, right, caster [N]; below zero"]
+    lines = [
+        f"{'':12}{'margin min':>11}{'settled':>9}{'overturns at':>14} settled loads left, right, caster [N]; under zero"
+    ]
     for name, row in configurations.items():
         tips = row["overturns_at_s"]
         loads = ", ".join(f"{load:.1f}" for load in row["wheel_load_min_settled_N"].values())
-        spells = ", ".join(f"{a:.4f} s to {'the end' if b is None else f'{b:.4f} s'}" for a, b in row["margin_below_zero_s"])
+        spells = ", ".join(
+            f"{a:.4f} s to {'the end' if b is None else f'{b:.4f} s'}" for a, b in row["margin_below_zero_s"]
+        )
         lines.append(
             f"{name:12}{row['tip_margin_min']:11.3f}{row['tip_margin_min_settled']:9.3f}"
             f"{'never' if tips is None else f'{tips:.4f} s':>14}  {loads}; {spells or 'never'}"
