@@ -39,8 +39,9 @@ def about_z(angle: float) -> Array:
 
 
 def random_motor(rng: np.random.Generator) -> dict[str, Any]:
-    """Keys of a DC motor."""
+    """Keys of a DC motor; half of them have a mass."""
     return {
+        "mass_kg": float(rng.uniform(0.1, 0.8)) if rng.random() < 0.5 else 0.0,
         "type": "dc",
         "torque_constant_N_m_per_A": float(rng.uniform(0.05, 0.3)),
         "resistance_ohm": float(rng.uniform(0.5, 2.0)),
@@ -68,7 +69,7 @@ def random_base(rng: np.random.Generator) -> dict[str, Any]:
             "inertia_axle_kg_m2": mass * radius**2 * float(rng.uniform(0.3, 0.9)),
             "inertia_across_kg_m2": mass * radius**2 * float(rng.uniform(0.5, 0.6)),
             "damping_N_m_s_per_rad": float(rng.uniform(0.0, 0.1)),
-            "motor": random_motor(rng),
+            "motor": random_motor(rng) | {"mass_kg": 0.3, "mass_point_m": rng.normal(scale=0.1, size=3).tolist()},
         },
         "track_m": float(rng.uniform(0.15, 0.6)),
         "caster_m": [0.15, 0.0, 0.0],
@@ -155,6 +156,13 @@ class RealWheels:
         names = (self._serial if arm["type"] == "serial_arm" else self._urdf)(arm, mount)
         self.model.gravity = pin.Motion(np.array(arm.get("gravity_m_s2", [0.0, 0.0, -9.81])), np.zeros(3))
         self.joints = (*WHEELS, *names)
+        for name in self.joints:
+            if (motor := self.motor[name]) is not None and motor.get("mass_kg", 0.0) > 0.0:
+                # A point on what comes before its joint.
+                here = self.model.getJointId(name)
+                point = np.array(motor.get("mass_point_m", self.model.jointPlacements[here].translation))
+                body = pin.Inertia(motor["mass_kg"], point, np.zeros((3, 3)))
+                self.model.appendBodyToJoint(self.model.parents[here], body, pin.SE3.Identity())
         self.data = self.model.createData()
         self.index = np.array([self.model.joints[self.model.getJointId(name)].idx_v for name in self.joints])
         turning = ["X", "Y", "heading", *self.joints]

@@ -74,7 +74,10 @@ def _wheels(base: MobileBase, body: int) -> list[Body]:
 
 def _joint(link: Link, kind: JointKind) -> Joint:
     if link.kind == "left_wheel":  # its angles are not where it is
-        return Joint(link.joint, kind, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), HERE, "base_pose", ("x", "y", "heading"))
+        place, columns = (0.0, 0.0, 0.0), ("x", "y", "heading")
+        return Joint(
+            link.joint, kind, (0.0, 0.0, 1.0), place, HERE, "base_pose", columns, part_of=link.joint_of_rows or ""
+        )
     return Joint(
         name=link.joint,
         kind=kind,

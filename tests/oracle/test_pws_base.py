@@ -32,7 +32,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def case(seed: int, arm: str, folder: Path) -> tuple[Robot, RealWheels, np.ndarray, np.ndarray, np.ndarray]:
-    """A random mobile arm from a scenario, its oracle, and coordinates, rates and currents."""
+    """A random mobile arm from a scenario, with its motors mounted, its oracle, coordinates, rates and currents."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 8))
     plant: dict[str, Any] = {"type": "pws_arm", "base": random_base(rng)}
@@ -40,7 +40,7 @@ def case(seed: int, arm: str, folder: Path) -> tuple[Robot, RealWheels, np.ndarr
     file = folder / "case.yaml"
     # JSON is YAML.
     file.write_text(json.dumps({"duration_s": 1.0, "plant": plant}))
-    robot, oracle = build_robot(load_scenario(file)), RealWheels(plant)
+    robot, oracle = build_robot(load_scenario(file)).with_motors_mounted(), RealWheels(plant)
     assert robot.joint_names == oracle.joints
     q, v = rng.normal(size=robot.nq), rng.normal(size=len(robot.links))
     return robot, oracle, q, v, rng.normal(scale=3.0, size=robot.circuits)
@@ -211,35 +211,33 @@ class Driven:
         self.index = self.oracle.index[[self.oracle.joints.index(name) for name in self.joints]]
         start = self.oracle.configuration(q)
         self.start = np.concatenate([start, np.zeros(nv + len(self.joints))])
-        angles = self.controller["joints"]
-        self.wanted = [
-            self.spline(angles[name]["times_s"], np.deg2rad(angles[name]["angles_deg"])) if name in angles else start[i]
+        grid = np.linspace(0.0, self.duration, max(int(np.ceil(self.duration / SPACING)), 6) + 1)
+
+        def through(times: list[float], values: Any) -> np.ndarray:
+            return CubicSpline(times, values, bc_type="clamped")(np.clip(grid, times[0], times[-1]))
+
+        angles, torques = self.controller["joints"], self.controller.get("torques", {})
+        columns = [
+            through(angles[name]["times_s"], np.deg2rad(angles[name]["angles_deg"]))
+            if name in angles
+            else np.full(len(grid), start[i])
             for name, i in zip(self.joints, self.index, strict=True)
         ]
-        self.pushes = [
-            (self.oracle.index[WHEELS.index(name)], self.spline(one["times_s"], one["torques_N_m"]))
-            for name, one in self.controller.get("torques", {}).items()
-        ]
+        columns += [through(one["times_s"], one["torques_N_m"]) for one in torques.values()]
+        self.pushed = self.oracle.index[[WHEELS.index(name) for name in torques]]
+        self.wanted = make_interp_spline(grid, np.stack(columns, axis=1), k=5)
+        self.slope = self.wanted.derivative()
         of = [self.oracle.motor[name] for name in self.joints]
         self.R, self.L = (np.array([one[key] for one in of]) for key in ("resistance_ohm", "inductance_H"))
         self.K = np.array([one["torque_constant_N_m_per_A"] * one["gear_ratio"] for one in of])
 
-    def spline(self, times: list[float], values: Any) -> Any:
-        grid = np.linspace(0.0, self.duration, max(int(np.ceil(self.duration / SPACING)), 6) + 1)
-        cubic = CubicSpline(times, values, bc_type="clamped")
-        quintic = make_interp_spline(grid, cubic(np.clip(grid, times[0], times[-1])), k=5)
-        return quintic, quintic.derivative()
-
     def __call__(self, t: float, y: np.ndarray) -> np.ndarray:
         nv = self.oracle.model.nv
         q, v, i = y[:nv], y[nv : 2 * nv], y[2 * nv :]
-        tau, u = np.zeros(nv), np.zeros(len(i))
-        tau[self.index] = self.K * i
-        for k, push in self.pushes:
-            tau[k] = push[0](t)
-        for a, (k, wanted) in enumerate(zip(self.index, self.wanted, strict=True)):
-            angle, rate = (wanted[0](t), wanted[1](t)) if isinstance(wanted, tuple) else (wanted, 0.0)
-            u[a] = K_P * (angle - q[k]) + K_D * (rate - v[k])
+        count, wanted = len(i), self.wanted(t)
+        u = K_P * (wanted[:count] - q[self.index]) + K_D * (self.slope(t)[:count] - v[self.index])
+        tau = np.zeros(nv)
+        tau[self.index], tau[self.pushed] = self.K * i, wanted[count:]
         vdot, _, _ = self.oracle.accelerations(q, v, tau)
         return np.concatenate([v, vdot, (u - self.R * i - self.K * v[self.index]) / self.L])
 
