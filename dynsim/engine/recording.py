@@ -12,8 +12,8 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.state import CONTACT_SIZE, IMPULSE, OUT_FORCE, OUT_GAP, OUT_SLIP, OUT_VECTOR, SLIP
 from dynsim.kernels.tree import support as ks
-from dynsim.model.description import Link, Robot
-from dynsim.model.mobile_base import MobileBase, base_pose
+from dynsim.model.description import Link
+from dynsim.model.mobile_base import SUPPORTS, MobileBase, base_pose
 from dynsim.model.scene import robot_scene
 from dynsim.record import Event, Record
 from dynsim.record.poses import add_body_poses
@@ -46,7 +46,7 @@ def make_record(
     record.add("v", run.states("v"), rate, labels=joints, description="joint rates")
     record.add("vdot", run.outputs("vdot"), acceleration, labels=joints, description="joint accelerations")
     if robot.base is not None:
-        _add_base(record, robot, robot.base, run)
+        _add_base(record, prepared, robot.base)
     current, voltage = run.outputs("current"), run.outputs("voltage")
     record.add("current", current, "A", labels=driven, description="motor currents")
     record.add("voltage", voltage, "V", labels=driven, description="motor terminal voltages")
@@ -97,15 +97,19 @@ def make_record(
     return record
 
 
-def _add_base(record: Record, robot: Robot, base: MobileBase, run: ki.Run) -> None:
-    """Where the base is, and what the ground carries; see dynsim.kernels.tree.support."""
+def _add_base(record: Record, prepared: Prepared, base: MobileBase) -> None:
+    """Where the base is and should be, and what the ground carries; see dynsim.kernels.tree.support."""
+    robot, run = prepared.model.robot, prepared.run
     pose, speed = base_pose(robot, run.states("q")), run.states("v")[:, list(map(robot.joint_names.index, base.wheels))]
     record.add("base_pose", pose, "m, m, rad", labels=("x", "y", "heading"), description="base in the world")
-    sides, support = ("left", "right"), run.outputs("support")
+    target = prepared.control.base_target(robot, record.time)
+    if target is not None:
+        record.add("base_target", target, "m, m, rad", labels=("x", "y", "heading"), description="by the references")
+    sides, support = SUPPORTS[:2], run.outputs("support")
     parts = (slice(ks.LOADS, ks.LOADS + 3), slice(ks.PRESSURE, ks.PRESSURE + 2), slice(ks.TRACTION, ks.TRACTION + 2))
     load, pressure, traction = (support[:, part] for part in parts)
     record.add("wheel_speed", speed, "rad/s", labels=sides, description="positive rolls ahead")
-    record.add("wheel_load", load, "N", labels=(*sides, "caster"), description="normal forces; negative: pulling")
+    record.add("wheel_load", load, "N", labels=SUPPORTS, description="normal forces; negative: pulling")
     record.add("center_of_pressure", pressure, "m", labels=("x", "y"), description="in the world; NaN for no load")
     record.add("tip_margin", support[:, ks.MARGIN], "1", description="1 at the incentre, 0 tipping; -1 lifted")
     record.add("traction_demand", traction, "1", labels=sides, description="|F|/(μ N); NaN without load")

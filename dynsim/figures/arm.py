@@ -7,7 +7,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from dynsim.figures import contacts, energy, hand, motors, posture, style
+from dynsim.figures import base, contacts, energy, hand, motors, posture, style, top_view
 from dynsim.record import Record
 
 # File name → figure, None where the record has no data for it.
@@ -19,6 +19,9 @@ FIGURES: dict[str, Callable[[Record], Figure | None]] = {
     "contact_forces": contacts.forces,
     "motors": motors.motors,
     "posture": posture.posture,
+    "base": top_view.top_view,
+    "overturning": base.overturning,
+    "base_tracking": base.tracking,
 }
 COMPARISONS: dict[str, Callable[[Mapping[str, Record]], Figure | None]] = {
     "compare_hand_path": hand.path_comparison,
@@ -26,6 +29,7 @@ COMPARISONS: dict[str, Callable[[Mapping[str, Record]], Figure | None]] = {
     "compare_energy": energy.energy_comparison,
     "compare_contact_forces": contacts.forces_comparison,
     "compare_posture": posture.posture_comparison,
+    "compare_tip_margin": base.margin_comparison,
 }
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection  # type: ignore[import-untyped]
@@ -26,6 +27,7 @@ from dynsim.figures.skeleton import (
     skeleton,
     with_labels,
 )
+from dynsim.figures.solids import faces, outline
 from dynsim.figures.style import Array
 from dynsim.measures import hand_target
 from dynsim.record import Record
@@ -36,6 +38,7 @@ SHORT_AXIS = 0.45
 # Joints are dots up to this many.
 DOTS = 40
 ARM_COLOUR = "#444444"
+BASE_COLOUR = "#D5D5D5"
 # Width of a side view in a figure of one column, and of two [point].
 FULL, HALF = 440.0, 205.0
 
@@ -50,9 +53,10 @@ def posture(record: Record) -> Figure | None:
     body, note = skeleton(record)
     drawn = [] if body is None else body.postures()
     plane = side_plane(record, drawn)
-    low, high = bounds([record], drawn)
+    everything = drawn if body is None else [*drawn, *(solid for base in body.bases() for solid in base)]
+    low, high = bounds([record], everything)
     wide = np.hypot(high[0] - low[0], high[1] - low[1]) > 2.2 * (high[2] - low[2])
-    extent = extent_of(plane, drawn, [record])
+    extent = extent_of(plane, everything, [record])
     size = extent[1] - extent[0]
     # What the side view needs at the width that it has, and the labels of its axis, title and legend.
     height = 5.6 if wide else 1.15 + float(np.clip(HALF / 72.0 * size[1] / size[0], 1.5, 3.4))
@@ -82,6 +86,7 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     drawn = {name: body.postures() for name, body in shown.items()}
     everything = [segments for one in drawn.values() for segments in one]
     plane = side_plane(some[0], everything)
+    everything += [solid for body in shown.values() for base in body.bases() for solid in base]
     columns = 2 if len(shown) > 1 else 1
     lines = -(-len(shown) // columns)
     low, high = extent_of(plane, everything, some)
@@ -142,6 +147,14 @@ def _side_view(
     colour: str,
     path: str = style.BLUE,
 ) -> None:
+    for k, base in enumerate([] if body is None else body.bases()):
+        last = k == len(drawn) - 1
+        for solid in base:
+            corners = outline(plane.project(solid))
+            face = BASE_COLOUR if last else "none"
+            axes.add_patch(
+                Polygon(corners, facecolor=face, edgecolor=colour, lw=0.8, alpha=1.0 if last else 0.22, zorder=2.5)
+            )
     for k, segments in enumerate(drawn):
         last = k == len(drawn) - 1
         flat = plane.project(segments)
@@ -191,6 +204,12 @@ def _space_view(
     axes.computed_zorder = False
     for surface in () if body is None else body.scene.surfaces:
         _draw_surface(axes, surface, low, high)
+    base = [] if body is None or not drawn else body.solids(body.shown()[-1])
+    if base:
+        # One collection: it sorts its faces by depth.
+        shown = np.concatenate([faces(solid) for solid in base])
+        solid = Poly3DCollection(shown, facecolors=BASE_COLOUR, linewidths=0, shade=True, antialiased=False, zorder=2.5)
+        axes.add_collection3d(solid, autolim=False)
     for k, segments in enumerate(drawn):
         last = k == len(drawn) - 1
         lines = Line3DCollection(

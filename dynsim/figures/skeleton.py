@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dynsim.figures import style
+from dynsim.figures.solids import solids
 from dynsim.figures.style import Array
 from dynsim.measures import hand_target
 from dynsim.record import Record
@@ -35,21 +36,37 @@ class Skeleton:
         Nothing leads from the world or a body to what moves freely beside it.
         """
         points = self.record[POSITION][row].astype(np.float64)
-        bodies = [(k, body) for k, body in enumerate(self.scene.bodies) if not _moves_beside(body.joint)]
+        # A mobile base is drawn as what it is, see dynsim.figures.solids.
+        solid = self.scene.base
+        bodies = [
+            (k, body) for k, body in enumerate(self.scene.bodies) if k not in solid and not _moves_beside(body.joint)
+        ]
         # A sliding joint at the root moves its body away from where it is mounted.
         lines = [(np.array(body.joint.position), points[k]) for k, body in bodies if body.parent == WORLD]
-        lines += [(points[body.parent], points[k]) for k, body in bodies if body.parent != WORLD]
+        lines += [(points[body.parent], points[k]) for k, body in bodies if body.parent not in (WORLD, *solid)]
         hand = self.scene.hand
         if hand is not None and hand.body != WORLD:
             lines.append((points[hand.body], point_positions(self.record, hand, row)))
         return np.array(lines)
 
+    def solids(self, row: int) -> list[Array]:
+        """Points on the shapes of a mobile base and its wheels at a sample, (n, 3) [m] each."""
+        return solids(self.record, self.scene.base, row)
+
+    def bases(self) -> list[list[Array]]:
+        """Solids of a mobile base for each of the postures."""
+        return [self.solids(k) for k in self.shown()]
+
     def postures(self) -> list[Array]:
         """Segments at some samples, those of the last one last; a run that diverged may end in some without poses."""
+        return [self.segments(k) for k in self.shown()]
+
+    def shown(self) -> list[int]:
+        """Samples at which the robot is drawn, the last one last; none where it never had a pose."""
         rows = np.flatnonzero(np.isfinite(self.record[POSITION]).all(axis=(1, 2)))
         if not len(rows):
             return []
-        return [self.segments(k) for k in dict.fromkeys(rows[np.linspace(0, len(rows) - 1, FAINT + 1).astype(int)])]
+        return list(dict.fromkeys(rows[np.linspace(0, len(rows) - 1, FAINT + 1).astype(int)].tolist()))
 
     def contacts(self) -> list[tuple[Point, Surface, Array, float]]:
         """Contact, its surface, position and normal force at the end; NaN for a force that is not known."""
@@ -85,10 +102,11 @@ def skeleton(record: Record) -> tuple[Skeleton | None, str]:
 
 @dataclass(frozen=True)
 class SidePlane:
-    """A vertical plane through ``origin`` along the horizontal unit vector ``direction``."""
+    """A vertical plane through ``origin``, where ``where`` is, along the horizontal unit vector ``direction``."""
 
     origin: Array
     direction: Array
+    where: str = "the base"
 
     def project(self, points: Array) -> Array:
         """(…, 3) world → (…, 2): along the plane and z [m]."""
@@ -104,24 +122,25 @@ class SidePlane:
     def label(self) -> str:
         """Label of the plane's horizontal axis."""
         azimuth = np.degrees(np.arctan2(self.direction[1], self.direction[0]))
-        return f"distance from the base, azimuth {azimuth:.0f}° [m]"
+        return f"distance from {self.where}, azimuth {azimuth:.0f}° [m]"
 
 
 def side_plane(record: Record, drawn: Sequence[Array]) -> SidePlane:
     """The vertical plane that the arm spans: from the base in the horizontal direction of its greatest extent."""
     points = drawn[0].reshape(-1, 3) if drawn else record["hand_position"]
     origin = points[0]
+    where = "the arm's first place" if record.scene is not None and record.scene.base else "the base"
     spread = (points - origin)[:, :2]
     spread = spread[np.isfinite(spread).all(axis=1)]
     if not len(spread) or np.abs(spread).max() < NOTHING:
         # It stands upright at first; where does it go from there?
         spread = np.concatenate([segments.reshape(-1, 3) for segments in drawn] or [points])[:, :2] - origin[:2]
     if np.abs(spread).max(initial=0.0) < NOTHING:
-        return SidePlane(origin, np.array([1.0, 0.0, 0.0]))
+        return SidePlane(origin, np.array([1.0, 0.0, 0.0]), where)
     first = np.linalg.svd(spread, full_matrices=False)[2][0]
     if (spread @ first).sum() < 0.0:
         first = -first
-    return SidePlane(origin, np.array([*first, 0.0]))
+    return SidePlane(origin, np.array([*first, 0.0]), where)
 
 
 @dataclass(frozen=True)

@@ -79,21 +79,28 @@ def joint_motion(
     angles, rates = [], []
     for name, rate in RATES.items():
         if name in record and rate in record:
-            rows = {len(record), len(record[name]), len(record[rate])}
-            if record[name].ndim != 2 or record[rate].shape != record[name].shape or len(rows) > 1:
-                raise RecordError(
-                    f"signals {name!r} {record[name].shape} and {rate!r} {record[rate].shape} of the record must both "
-                    "have a row per sample and a column per joint"
-                )
-            joints += record.labels[name]
-            angles.append(record[name])
-            rates.append(record[rate])
+            shared = _in_both(record, name, rate)
+            joints += shared
+            angles.append(record[name][:, [record.labels[name].index(joint) for joint in shared]])
+            rates.append(record[rate][:, [record.labels[rate].index(joint) for joint in shared]])
     if not joints:
         pairs = ", ".join(f"{name} with {rate}" for name, rate in RATES.items())
         raise RecordError(f"the record holds no joint motion ({pairs}); it has {', '.join(record)}")
     if len(record) < 2:
         raise RecordError(f"the record has {len(record)} samples; a motion needs two")
     return joints, record.time - record.time[0], np.hstack(angles), np.hstack(rates)
+
+
+def _in_both(record: Record, name: str, rate: str) -> list[str]:
+    """Joints with a column in both signals: the coordinates of a mobile base in the plane, or of a ball joint, have no
+    rate of their own."""
+    for signal in (name, rate):
+        if record[signal].ndim != 2 or len(record[signal]) != len(record):
+            raise RecordError(
+                f"signals {name!r} {record[name].shape} and {rate!r} {record[rate].shape} of the record must both "
+                "have a row per sample and a column per joint"
+            )
+    return [label for label in record.labels[name] if label in record.labels[rate]]
 
 
 def _within(path: JointPath, time: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -114,7 +121,7 @@ def _write_csv(
     v: NDArray[np.float64],
 ) -> None:
     pairs = [(name, rate) for name, rate in RATES.items() if name in record and rate in record]
-    units = [[record.units[pair[k]] for pair in pairs for _ in record.labels[pair[0]]] for k in (0, 1)]
+    units = [[record.units[pair[k]] for pair in pairs for _ in _in_both(record, *pair)] for k in (0, 1)]
     headings = [f"{joint} [{unit}]" for column in units for joint, unit in zip(joints, column, strict=True)]
     rows = csv.writer(file)
     rows.writerow(["time [s]", *headings])

@@ -15,8 +15,8 @@ from dynsim.kernels.arrays import HELD_POSITION, ReferenceArrays
 from dynsim.kernels.jit import integers, reals
 from dynsim.model.description import Robot
 from dynsim.model.drives import TorqueSource
-from dynsim.model.mobile_base import base_row
-from dynsim.model.rolling import rolled
+from dynsim.model.mobile_base import base_pose, base_row
+from dynsim.model.rolling import coordinates, rolled
 
 # Samples in a segment of the reference splines, and segments that are looked at together.
 _PER_SEGMENT = 4
@@ -156,14 +156,39 @@ class JointControl:
             positions[:, moved] = np.einsum("scp,xp->sxc", piece, powers).reshape(times.size, len(columns))
             if robot.base is not None:
                 k, _ = base_row(robot)
-                angles = np.zeros((len(piece), 2, 6))
-                angles[:, :, 0] = q[k : k + 2]
-                for wheel in (0, 1):
-                    if k + wheel in moved:
-                        angles[:, wheel] = piece[:, list(moved).index(k + wheel)]
+                angles = self._wheels(robot, slice(first, first + _PIECE))
                 way = rolled(robot.base, q[k + 2 : k + 4] if start is None else start, angles, spacing, _PER_SEGMENT)
                 positions[:, k + 2 : k + 4], start = way.reshape(-1, 2), way[-1, -1]
             yield times.ravel(), positions
+
+    def _wheels(self, robot: Robot, segments: slice) -> NDArray[np.float64]:
+        """References of the wheels of a mobile base as splines, (segments, 2, 6); of one that holds, its angle."""
+        assert robot.base is not None
+        k, _ = base_row(robot)
+        driven = [motor.joint for motor in robot.motors]
+        pieces = self.reference.coefficients[segments]
+        angles = np.zeros((len(pieces), 2, 6))
+        angles[:, :, 0] = robot.initial[k : k + 2]
+        for wheel, joint in enumerate(robot.base.wheels):
+            column = self.reference.spline[driven.index(joint)] if joint in driven else HELD_POSITION
+            if column >= 0:
+                angles[:, wheel] = pieces[:, column]
+        return angles
+
+    def base_target(self, robot: Robot, t: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Where the references of its wheels take a mobile base: x, y [m], heading [rad] at times t [s], (T, 3).
+
+        None without a base, or where a wheel follows nothing.
+        """
+        follows = {motor.joint for motor, k_p in zip(robot.motors, self.k_p, strict=True) if k_p > 0.0}
+        if robot.base is None or not follows.issuperset(robot.base.wheels):
+            return None
+        k, _ = base_row(robot)
+        q = np.tile(robot.initial, (len(t), 1))
+        wheels = self._wheels(robot, slice(None))
+        begin, spacing = self.reference.grid
+        q[:, k : k + 4] = coordinates(robot.base, robot.initial[k + 2 : k + 4], wheels, spacing, t - begin)
+        return base_pose(robot, q)
 
     def target(self, t: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Target of the hand at times t, (T, 3) [m]; None without a path."""

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+# What the base stands on, in the order of the recorded loads.
+SUPPORTS = ("left", "right", "caster")
+
 
 @dataclass(frozen=True)
 class MobileBase:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from dynsim.model.description import Array, Contact, Link, Quadric, Robot
-from dynsim.model.mobile_base import MobileBase
+from dynsim.model.mobile_base import SUPPORTS, MobileBase
 from dynsim.model.snake import SnakeDescription
 from dynsim.record.quaternion import of_turn
 from dynsim.record.scene import (
@@ -47,8 +47,10 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
         bodies.append(Body(link.name, parent, _joint(link, kind), link.shapes or _rod(link)))
     hand_body, hand_point = robot.hand
     points = [Point("hand", "hand", index[hand_body], vector3(hand_point))]
+    supports: tuple[Point, ...] = ()
     if robot.base is not None:
         bodies.extend(_wheels(robot.base, index[robot.base.body]))
+        supports = _supports(robot.base, index[robot.base.body])
     for contact in contacts:
         body, point = robot.attach(contact.body, contact.point)
         points.append(Point(contact.name, "contact", body, vector3(point), contact.surface_name))
@@ -57,6 +59,7 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
         tuple(Surface.of_quadric(name, one.Q, one.b, one.c) for name, one in surfaces.items()),
         tuple(points),
         robot.fixed_shapes,
+        supports,
     )
 
 
@@ -70,6 +73,13 @@ def _wheels(base: MobileBase, body: int) -> list[Body]:
             Body(f"{name}.wheel", body, joint, (Shape("cylinder", (r, BASE_WHEEL_WIDTH * r), orientation=_ALONG_Y),))
         )
     return wheels
+
+
+def _supports(base: MobileBase, body: int) -> tuple[Point, ...]:
+    """Where wheels and caster touch the ground, with the names of their loads."""
+    left, right = (vector3((0.0, side * base.track, 0.0)) for side in (0.5, -0.5))
+    places = zip(SUPPORTS, (left, right, vector3(base.caster)), strict=True)
+    return tuple(Point(name, "support", body, place) for name, place in places)
 
 
 def _joint(link: Link, kind: JointKind) -> Joint:

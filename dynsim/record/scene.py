@@ -172,7 +172,7 @@ class Point:
 
     Attributes
     ----------
-    role : "hand" or "contact"
+    role : "hand", "contact" or "support", where a mobile base stands on the ground
     body : index, ``WORLD`` for a point in the world
     position : in the body's frame [m]
     surface : name of the surface that holds a contact point
@@ -180,7 +180,7 @@ class Point:
 
     __pydantic_config__: ClassVar[Any] = _CHECKS
     name: str
-    role: Literal["hand", "contact"]
+    role: Literal["hand", "contact", "support"]
     body: int
     position: Vector3
     surface: str = ""
@@ -189,6 +189,12 @@ class Point:
 @dataclass(frozen=True)
 class Scene:
     """Bodies, each after the one that carries it, surfaces, named points, and what stands still in the world.
+
+    Attributes
+    ----------
+    points : the hand and the contact points
+    supports : where a mobile base touches the ground: left wheel, right wheel, caster. Not among the points, so that
+        earlier versions, which do not know their role, pass them over
 
     Raises
     ------
@@ -201,12 +207,13 @@ class Scene:
     surfaces: tuple[Surface, ...] = ()
     points: tuple[Point, ...] = ()
     fixed: tuple[Shape, ...] = ()
+    supports: tuple[Point, ...] = ()
 
     def __post_init__(self) -> None:
         for k, body in enumerate(self.bodies):
             if not WORLD <= body.parent < k:
                 raise RecordError(f"body {body.name!r} ({k}) does not come after its parent ({body.parent})")
-        for point in self.points:
+        for point in (*self.points, *self.supports):
             if not WORLD <= point.body < len(self.bodies):
                 raise RecordError(f"point {point.name!r} is on body {point.body}, there are {len(self.bodies)}")
 
@@ -219,6 +226,18 @@ class Scene:
     def contacts(self) -> tuple[Point, ...]:
         """The contact points."""
         return tuple(point for point in self.points if point.role == "contact")
+
+    @property
+    def base(self) -> tuple[int, ...]:
+        """Indices of the bodies of a mobile base: the one that stands on the supports, then its wheels."""
+        if not self.supports or self.supports[0].body == WORLD:
+            return ()
+        base = self.supports[0].body
+        # The joint of the base has the angles of its wheels among its coordinates.
+        joint = self.bodies[base].joint.part_of
+        own = {body.joint.name for body in self.bodies if joint and body.joint.part_of == joint}
+        wheels = [k for k, body in enumerate(self.bodies) if body.parent == base and own & set(body.joint.labels)]
+        return base, *wheels
 
     def surface(self, name: str) -> Surface | None:
         """The surface of a name."""

@@ -1,0 +1,202 @@
+"""A mobile base over time: loads of wheels and caster, tip margin, traction demand, reference against actual."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dynsim.figures import style
+from dynsim.figures.style import Array
+from dynsim.record import Record
+
+# Kind of the events of tipping.
+TIP_OVER = "tip_over"
+LOADS, MARGIN, TRACTION = "wheel_load", "tip_margin", "traction_demand"
+# Without load the demand has no bound, and the margin none where the ground carries almost nothing: axes end here.
+TRACTION_TOP, MARGIN_LOW = 2.5, -2.0
+SIDE_COLOURS = (style.BLUE, style.GREEN, style.ORANGE)
+# Tracking: axes of positions and headings show at least this [m, °], so that rest is not drawn as motion.
+LEAST_POSITION, LEAST_HEADING = 1e-3, 0.1
+MILLI = 1e3
+
+
+def overturning(record: Record) -> Figure | None:
+    """Loads of wheels and caster, tip margin and traction demand over time; None without a mobile base."""
+    if not {LOADS, MARGIN, TRACTION} <= set(record):
+        return None
+    figure = style.new_figure(6.2, style.title(record, "what the base stands on"))
+    loads, margin, traction = record[LOADS], record[MARGIN], record[TRACTION]
+    demanded = np.minimum(traction, TRACTION_TOP)
+    series = [loads, np.maximum(margin, MARGIN_LOW), demanded]
+    rows = style.time_rows(figure, [[(record.time, one)] for one in series], style.settle_time(record))
+    for axes in rows[0]:
+        _lines(axes, record, LOADS, "least {} N", np.nanmin)
+        _mark_negative(axes, "pulls: held down")
+        _mark_tipping(axes, [record], [style.PULLING])
+    for axes in rows[1]:
+        style.line(axes, record.time, margin, color=style.BLACK, label=_margin_label("margin", record))
+        _frame_margin(axes)
+        _mark_tipping(axes, [record], [style.PULLING])
+    for axes in rows[2]:
+        _lines(axes, record, TRACTION, "at most {}", np.nanmax)
+        axes.axhline(1.0, color=style.PULLING, linewidth=0.8, label="slips above 1")
+        axes.set_ylim(0.0, min(max(axes.get_ylim()[1], 1.15), TRACTION_TOP))
+        _mark_tipping(axes, [record], [style.PULLING])
+    for panels, label in zip(rows, ("load [N]", "tip margin", "traction demand\n|F| / (μ N)"), strict=True):
+        panels[0].set_ylabel(label)
+        style.legend_above(panels[-1], columns=4)
+    note = [f"higher peaks, of wheels with hardly any load, are cut off at {TRACTION_TOP:g}"]
+    if not np.nanmax(traction, initial=0.0) > TRACTION_TOP:
+        note = []
+    if missing := float(np.isnan(traction).any(axis=1).mean()):
+        note.append(f"no demand where a wheel carries no load: {100.0 * missing:.2g} % of the samples")
+    rows[2][-1].text(
+        0.99,
+        0.96,
+        "\n".join(note),
+        transform=rows[2][-1].transAxes,
+        ha="right",
+        va="top",
+        color=style.GREY,
+        fontsize=6.5,
+    )
+    return figure
+
+
+def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
+    """Tip margins of all variants over each other; None without mobile bases."""
+    shown = {name: record for name, record in records.items() if MARGIN in record}
+    if not shown:
+        return None
+    some = list(shown.values())
+    figure = style.new_figure(
+        3.4 + len(shown) * style.LEGEND_ROW / 72.0,
+        style.comparison_title(some, "tip margin (1: safest place, 0: tips over)"),
+    )
+    series = [(record.time, np.maximum(record[MARGIN], MARGIN_LOW)) for record in some]
+    (panels,) = style.time_rows(figure, [series], max(map(style.settle_time, some)))
+    styles = style.variant_styles(list(records))
+    for axes in panels:
+        for name, record in shown.items():
+            style.line(axes, record.time, record[MARGIN], label=_margin_label(name, record), **styles[name])
+        _frame_margin(axes)
+        _mark_tipping(axes, some, [str(styles[name]["color"]) for name in shown])
+    panels[0].set_ylabel("tip margin")
+    handles, labels = panels[-1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=1)
+    return figure
+
+
+def tracking(record: Record) -> Figure | None:
+    """Reference and place of a mobile base over time, and what lies between; None without a reference."""
+    if not {"base_pose", "base_target"} <= set(record):
+        return None
+    pose, target = record["base_pose"], record["base_target"]
+    error = base_error(record)
+    figure = style.new_figure(6.6, style.title(record, "base, reference and actual"))
+    heading = np.degrees(np.stack([target[:, 2], pose[:, 2]], axis=1))
+    parts = [np.hstack([target[:, :2], pose[:, :2]]), heading, MILLI * error[:, :2], np.degrees(error[:, 2:])]
+    rows = style.time_rows(figure, [[(record.time, one)] for one in parts], style.settle_time(record))
+    for panels, values, least in zip(rows, parts, (LEAST_POSITION, LEAST_HEADING, 0.0, 0.0), strict=True):
+        for axes in panels:
+            if np.ptp(values[np.isfinite(values)]) < least and least:
+                middle = float(np.nanmean(values))
+                axes.set_ylim(middle - least, middle + least)
+            axes.ticklabel_format(axis="y", useOffset=False)
+    # Dashes: x and y may be the same.
+    for k, (name, dashes) in enumerate((("x", "-"), ("y", (0, (5, 4))))):
+        for axes in rows[0]:
+            _pair(axes, record.time, target[:, k], pose[:, k], name, style.AXIS_COLOURS[name], dashes)
+    for axes in rows[1]:
+        _pair(axes, record.time, heading[:, 0], heading[:, 1], "heading", style.BLACK, "-")
+    for k, (name, colour) in enumerate((("ahead", style.BLUE), ("to the left", style.GREEN))):
+        label = f"{name}: rms {style.number(_rms(parts[2][:, k]), 3)} mm"
+        for axes in rows[2]:
+            style.line(axes, record.time, parts[2][:, k], color=colour, label=label)
+    for axes in rows[3]:
+        label = f"rms {style.number(_rms(parts[3]), 3)}°"
+        style.line(axes, record.time, parts[3][:, 0], color=style.BLACK, label=label)
+    for panels in rows[2:]:
+        for axes in panels:
+            axes.axhline(0.0, color=style.GREY, linewidth=0.6)
+    labels = ("position [m]", "heading [°]", "error [mm]", "heading error [°]")
+    for panels, label in zip(rows, labels, strict=True):
+        panels[0].set_ylabel(label)
+        style.legend_above(panels[-1], columns=4)
+    figure.align_ylabels([panels[0] for panels in rows])
+    return figure
+
+
+def base_error(record: Record) -> Array:
+    """Actual minus reference of a mobile base: ahead and to the left of the reference [m], heading [rad], (T, 3)."""
+    target = record["base_target"]
+    error = record["base_pose"] - target
+    c, s = np.cos(target[:, 2]), np.sin(target[:, 2])
+    return np.stack([c * error[:, 0] + s * error[:, 1], c * error[:, 1] - s * error[:, 0], error[:, 2]], axis=1)
+
+
+def tipping_times(record: Record) -> list[float]:
+    """When the base tips over [s], in the order of time."""
+    return [event.time for event in record.events if event.kind == TIP_OVER]
+
+
+def _verdict(record: Record) -> str:
+    times = tipping_times(record)
+    if not times:
+        return "it never tips over"
+    more = f"{len(times)} times, first " if len(times) > 1 else ""
+    return f"tips over {more}at {style.number(times[0], 3)} s"
+
+
+def _margin_label(name: str, record: Record) -> str:
+    """With the least margin after the start, and whether it tips."""
+    settle = style.settle_time(record)
+    late = record[MARGIN][record.time >= settle]
+    least = f" least {style.number(float(np.nanmin(late)), 3)} from {settle:g} s on;" if np.isfinite(late).any() else ""
+    return f"{name}:{least} {_verdict(record)}"
+
+
+def _lines(axes: Axes, record: Record, signal: str, note: str, extreme: Callable[[Array], Any]) -> None:
+    """A line for each column, its extreme in the legend."""
+    for values, name, colour in zip(record[signal].T, record.labels[signal], SIDE_COLOURS, strict=False):
+        known = np.isfinite(values).any()
+        label = f"{name}: {note.format(style.number(float(extreme(values)), 3))}" if known else name
+        style.line(axes, record.time, values, color=colour, label=label)
+
+
+def _pair(axes: Axes, time: Array, target: Array, actual: Array, name: str, colour: str, dashes: Any) -> None:
+    """Actual over its reference, which is wide and pale so that both are seen where they agree."""
+    style.line(axes, time, target, color=colour, linewidth=4.0, alpha=0.3, label=f"{name}, reference")
+    style.line(axes, time, actual, color=colour, linestyle=dashes, label=f"{name}, actual")
+
+
+def _frame_margin(axes: Axes) -> None:
+    low, high = axes.get_ylim()
+    axes.set_ylim(max(min(low, -0.05), MARGIN_LOW), max(high, 0.1))
+    _mark_negative(axes, "beyond the triangle")
+
+
+def _mark_negative(axes: Axes, label: str) -> None:
+    """The zero line, and what lies below it shaded, if any of the axis does."""
+    axes.axhline(0.0, color=style.PULLING, linewidth=0.8)
+    low, high = axes.get_ylim()
+    if low < 0.0:
+        axes.axhspan(low, 0.0, color=style.PULLING, alpha=0.1, linewidth=0, label=label)
+        axes.set_ylim(low, high)
+
+
+def _mark_tipping(axes: Axes, records: Sequence[Record], colours: Sequence[str]) -> None:
+    for record, colour in zip(records, colours, strict=True):
+        for time in tipping_times(record):
+            axes.axvline(time, color=colour, linestyle=(0, (4, 2)), linewidth=0.9)
+            # Above the axes, where a line at their edge is seen too.
+            top = axes.get_xaxis_transform()
+            axes.plot(time, 1.0, "v", color=colour, markersize=4, transform=top, clip_on=False, zorder=5)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.nanmean(values**2)))

@@ -1,0 +1,196 @@
+"""A mobile base from above: where it drove and stood, elbows and hand of its arm, where it presses on the ground."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+from numpy.typing import NDArray
+
+from dynsim.figures import style
+from dynsim.figures.hand import edge_on, target_name
+from dynsim.figures.posture import ARM_COLOUR
+from dynsim.figures.skeleton import Skeleton, skeleton
+from dynsim.figures.solids import outline
+from dynsim.figures.style import Array
+from dynsim.measures import hand_target
+from dynsim.record import Record
+from dynsim.record.poses import point_positions
+from dynsim.record.scene import Point
+
+Rows = NDArray[np.intp]
+
+# So many support triangles at most, evenly over the way, at least this share of their size apart.
+TRIANGLES, APART = 6, 0.25
+ELBOW_COLOURS = (style.ORANGE, style.GREEN, "#8C6D31")
+TRIANGLE, INSIDE, OUTSIDE = style.SKY, style.PURPLE, style.PULLING
+
+
+def top_view(record: Record) -> Figure | None:
+    """The run from above in the world, and the pressure centre in the base's frame; None without a mobile base."""
+    body, _ = skeleton(record)
+    if body is None or len(body.scene.supports) != 3 or not {"base_pose", "center_of_pressure"} <= set(record):
+        return None
+    rows = np.flatnonzero(np.isfinite(record["base_pose"]).all(axis=1))
+    if not len(rows):
+        return None
+    low, high = _extent(body, rows)
+    size = high - low
+    wide = size[0] > 1.8 * size[1]
+    height = 6.3 if wide else 0.9 + float(np.clip(3.9 * size[1] / size[0], 3.3, 6.0))
+    figure = style.new_figure(height, style.title(record, "base from above"))
+    ratios: dict[str, Any] = {"height_ratios": [1.2, 1.0]} if wide else {"width_ratios": [1.25, 1.0]}
+    world, own = figure.subplots(*((2, 1) if wide else (1, 2)), **ratios)
+    _draw_world(world, body, rows)
+    world.set_xlim(low[0], high[0])
+    world.set_ylim(low[1], high[1])
+    _draw_own(own, body, rows)
+    for axes in (world, own):
+        axes.set_aspect("equal", adjustable="box", anchor="N")
+    handles, labels = world.get_legend_handles_labels()
+    more = [pair for pair in zip(*own.get_legend_handles_labels(), strict=True) if pair[1] not in labels]
+    handles, labels = [*handles, *(one for one, _ in more)], [*labels, *(text for _, text in more)]
+    figure.legend(handles, labels, loc="outside lower center", ncols=4)
+    return figure
+
+
+def support_corners(body: Skeleton, row: int) -> Array:
+    """Where the base stands on the ground: left wheel, right wheel, caster, (3, 2) [m]."""
+    return np.array([point_positions(body.record, point, row)[:2] for point in body.scene.supports])
+
+
+def pressure_in_base(record: Record) -> Array:
+    """Centre of pressure in the base's frame, (T, 2) [m]."""
+    away = record["center_of_pressure"] - record["base_pose"][:, :2]
+    c, s = np.cos(record["base_pose"][:, 2]), np.sin(record["base_pose"][:, 2])
+    return np.stack([c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]], axis=1)
+
+
+def _extent(body: Skeleton, rows: Rows) -> tuple[Array, Array]:
+    """Corners of what is drawn of the world [m]; a centre of pressure far away is not in it."""
+    record = body.record
+    points = [record["hand_position"][:, :2]] if "hand_position" in record else []
+    if (target := hand_target(record)) is not None:
+        points.append(target[:, :2])
+    points += [_track(body, one, rows) for one in (*body.scene.contacts, *body.scene.supports)]
+    points += [solid[:, :2] for row in rows[[0, -1]] for solid in body.solids(row)]
+    points.append(body.segments(int(rows[-1])).reshape(-1, 3)[:, :2])
+    everything = np.concatenate(points)
+    everything = everything[np.isfinite(everything).all(axis=1)]
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    room = 0.05 * float((high - low).max())
+    return low - room, high + room
+
+
+def _track(body: Skeleton, point: Point, rows: Rows) -> Array:
+    """Way of a point over the ground, (rows, 2) [m]."""
+    return point_positions(body.record, point)[rows, :2]
+
+
+def _draw_world(axes: Axes, body: Skeleton, rows: Rows) -> None:
+    record, scene = body.record, body.scene
+    first, last = int(rows[0]), int(rows[-1])
+    _draw_outline(axes, body, first, facecolor="none", linestyle=(0, (3, 2)), label="base at the start")
+    _draw_outline(axes, body, last, facecolor="#DDDDDD", linestyle="-", label="base at the end")
+    arm = body.segments(last)[:, :, :2]
+    for segment in arm:
+        axes.plot(*segment.T, color=ARM_COLOUR, lw=1.6, alpha=0.35, zorder=3)
+    axes.plot([], [], color=ARM_COLOUR, lw=1.6, alpha=0.35, label="arm at the end")
+    for row in _spread(record["base_pose"], rows, APART * float(np.ptp(support_corners(body, first), axis=0).max())):
+        axes.add_patch(Polygon(support_corners(body, row), facecolor="none", edgecolor=TRIANGLE, lw=0.7, zorder=4))
+    axes.plot([], [], color=TRIANGLE, lw=0.7, label="support triangle")
+    looks: tuple[dict[str, Any], ...] = (
+        {"color": style.BLACK, "lw": 0.9, "label": "wheel tracks"},
+        {"color": style.BLACK, "lw": 0.9},
+        {"color": style.BLACK, "lw": 0.9, "linestyle": (0, (1, 1)), "label": "caster track"},
+    )
+    for point, look in zip(scene.supports, looks, strict=True):
+        axes.plot(*style.sparse(_track(body, point, rows)).T, zorder=5, **look)
+    for k, contact in enumerate(scene.contacts):
+        path = style.sparse(_track(body, contact, rows))
+        colour = ELBOW_COLOURS[k % len(ELBOW_COLOURS)]
+        axes.plot(*path.T, color=colour, lw=1.4, zorder=6, label=contact.name)
+        axes.plot(*path[-1], "o", color=colour, markersize=4, zorder=6)
+    if (wanted := hand_target(record)) is not None:
+        flat = edge_on(wanted[:, :2])
+        axes.plot(*flat.T, color=style.BLACK, linestyle=(0, (3, 2)), lw=0.9, zorder=8, label=target_name(record))
+    if "hand_position" in record:
+        hand = style.sparse(record["hand_position"][:, :2])
+        axes.plot(*hand.T, color=style.BLUE, lw=1.0, zorder=7, label="hand path")
+    _draw_pressure(axes, record["center_of_pressure"], record)
+    axes.set_title("in the world")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+
+
+def _draw_own(axes: Axes, body: Skeleton, rows: Rows) -> None:
+    """The base from above, in its own frame: ahead is to the right."""
+    record = body.record
+    x, y, heading = record["base_pose"][rows[-1]]
+    turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
+    parts = [(solid[:, :2] - [x, y]) @ turn for solid in body.solids(int(rows[-1]))]
+    for part in parts:
+        axes.add_patch(Polygon(outline(part), facecolor="#EEEEEE", edgecolor=style.GREY, lw=0.7, zorder=1))
+    corners = (support_corners(body, int(rows[-1])) - [x, y]) @ turn
+    axes.add_patch(Polygon(corners, facecolor=TRIANGLE, alpha=0.2, lw=0, zorder=2))
+    axes.add_patch(Polygon(corners, facecolor="none", edgecolor=TRIANGLE, lw=1.0, zorder=3))
+    middle = corners.mean(axis=0)
+    for point, corner in zip(body.scene.supports, corners, strict=True):
+        axes.plot(*corner, "o", color=ARM_COLOUR, markersize=3, zorder=6)
+        # Towards the middle, where there is room.
+        away = 16.0 * (middle - corner) / np.linalg.norm(middle - corner)
+        axes.annotate(
+            point.name, corner, xytext=away, textcoords="offset points", fontsize=7, zorder=6, ha="center", va="center"
+        )
+    path = pressure_in_base(record)
+    _draw_pressure(axes, path, record)
+    # The path may go far; what it does within a base's length of the base is in the picture.
+    drawn = np.concatenate([corners, *parts])
+    low, high = drawn.min(axis=0), drawn.max(axis=0)
+    reach = 0.75 * float((high - low).max())
+    known = path[np.isfinite(path).all(axis=1)]
+    near = known[((known >= low - reach) & (known <= high + reach)).all(axis=1)]
+    everything = np.concatenate([drawn, near])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    room = 0.06 * float((high - low).max())
+    axes.set_xlim(low[0] - room, high[0] + room)
+    axes.set_ylim(low[1] - room, high[1] + room)
+    lost = 1.0 - len(near) / max(len(path), 1)
+    axes.set_title("in the base's frame" + (f"; {100 * lost:.2g} % of the path is farther off" if lost > 0.0 else ""))
+    axes.set_xlabel("ahead [m]")
+    axes.set_ylabel("to the left [m]")
+
+
+def _draw_outline(axes: Axes, body: Skeleton, row: int, *, label: str, **look: Any) -> None:
+    for k, solid in enumerate(body.solids(row)):
+        patch = Polygon(outline(solid[:, :2]), edgecolor=ARM_COLOUR, lw=0.8, zorder=2, **look)
+        patch.set_label(label if k == 0 else "_")
+        axes.add_patch(patch)
+
+
+def _draw_pressure(axes: Axes, path: Array, record: Record) -> None:
+    """The centre of pressure: where the base stands, and where it tips."""
+    outside = record["tip_margin"] < 0.0
+    for mask, colour, label in ((~outside, INSIDE, "centre of pressure"), (outside, OUTSIDE, "outside the triangle")):
+        if mask.any():
+            # A piece of a line needs its first point of the other kind too.
+            joined = mask | np.append(False, mask[:-1]) if colour == OUTSIDE else mask
+            points = np.where(joined[:, None], path, np.nan)
+            axes.plot(*style.sparse(points).T, color=colour, lw=1.1, zorder=9, label=label)
+    known = np.flatnonzero(np.isfinite(path).all(axis=1))
+    for row, face in ((known[:1], "white"), (known[-1:], None)):
+        for k in row:
+            colour = OUTSIDE if outside[k] else INSIDE
+            axes.plot(*path[k], "o", markersize=4, color=colour, markerfacecolor=face or colour, zorder=10)
+
+
+def _spread(pose: Array, rows: Rows, apart: float) -> list[int]:
+    """Rows at which the base has gone on by at least ``apart`` [m], the first and the last among them."""
+    way = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[rows, :2], axis=0).T)))
+    count = int(np.clip(way[-1] / max(apart, 1e-9), 1, TRIANGLES - 1)) + 1
+    return [
+        int(rows[np.searchsorted(way, share).clip(max=len(rows) - 1)]) for share in np.linspace(0.0, way[-1], count)
+    ]
