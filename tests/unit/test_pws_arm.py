@@ -11,6 +11,7 @@ import pytest
 
 import dynsim
 from dynsim.cli import main
+from dynsim.hardware.export import joint_motion
 from dynsim.scenario import build_model, scenario_from_resolved
 
 GOOD = """duration_s: 0.2
@@ -110,6 +111,16 @@ def test_a_resolved_scenario_gives_the_same_run(case):
     again = dynsim.simulate(scenario_from_resolved(scenario.resolved))
     for name in record:
         np.testing.assert_array_equal(again[name], record[name])
+
+
+def test_wheels_and_joints_are_exported_with_their_rates(case):
+    """Each by its name: the base has four coordinates and two rates, so that columns of q and v are not the same."""
+    record = dynsim.simulate(dynsim.load_scenario(case, overrides={"record.rate_hz": 1000}))
+    joints, time, position, velocity = joint_motion(record)
+    assert joints == ["base.left", "base.right", "joint_1", "joint_2"]
+    assert np.ptp(velocity, axis=0).min() > 1e-3
+    middle = (position[2:] - position[:-2]) / (time[2:] - time[:-2])[:, None]
+    np.testing.assert_allclose(middle[20:], velocity[1:-1][20:], rtol=0, atol=1e-2)
 
 
 def test_run_and_compare_write_records_and_figures(case, monkeypatch):
