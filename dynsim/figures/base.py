@@ -49,21 +49,13 @@ def overturning(record: Record) -> Figure | None:
     for panels, label in zip(rows, ("load [N]", "tip margin", "traction demand\n|F| / (μ N)"), strict=True):
         panels[0].set_ylabel(label)
         style.legend_above(panels[-1], columns=4)
-    note = [f"higher peaks, of wheels with hardly any load, are cut off at {TRACTION_TOP:g}"]
-    if not np.nanmax(traction, initial=0.0) > TRACTION_TOP:
-        note = []
+    note = []
+    if np.nanmax(traction, initial=0.0) > TRACTION_TOP:
+        note.append(f"demand cut off at {TRACTION_TOP:g}: hardly any load")
     if missing := float(np.isnan(traction).any(axis=1).mean()):
-        note.append(f"no demand where a wheel carries no load: {100.0 * missing:.2g} % of the samples")
-    rows[2][-1].text(
-        0.99,
-        0.96,
-        "\n".join(note),
-        transform=rows[2][-1].transAxes,
-        ha="right",
-        va="top",
-        color=style.GREY,
-        fontsize=6.5,
-    )
+        note.append(f"none where a wheel carries no load: {100.0 * missing:.2g} % of the samples")
+    last = rows[2][-1]
+    last.set_xlabel("\n".join([last.get_xlabel(), *note]))
     return figure
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
@@ -120,7 +121,7 @@ def _draw_world(axes: Axes, body: Skeleton, rows: Rows) -> None:
     if "hand_position" in record:
         hand = style.sparse(record["hand_position"][:, :2])
         axes.plot(*hand.T, color=style.BLUE, lw=1.0, zorder=7, label="hand path")
-    _draw_pressure(axes, record["center_of_pressure"], record)
+    _draw_pressure(axes, body, record["center_of_pressure"])
     axes.set_title("in the world")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
@@ -146,7 +147,7 @@ def _draw_own(axes: Axes, body: Skeleton, rows: Rows) -> None:
             point.name, corner, xytext=away, textcoords="offset points", fontsize=7, zorder=6, ha="center", va="center"
         )
     path = pressure_in_base(record)
-    _draw_pressure(axes, path, record)
+    _draw_pressure(axes, body, path)
     # The path may go far; what it does within a base's length of the base is in the picture.
     drawn = np.concatenate([corners, *parts])
     low, high = drawn.min(axis=0), drawn.max(axis=0)
@@ -171,20 +172,42 @@ def _draw_outline(axes: Axes, body: Skeleton, row: int, *, label: str, **look: A
         axes.add_patch(patch)
 
 
-def _draw_pressure(axes: Axes, path: Array, record: Record) -> None:
-    """The centre of pressure: where the base stands, and where it tips."""
-    outside = record["tip_margin"] < 0.0
-    for mask, colour, label in ((~outside, INSIDE, "centre of pressure"), (outside, OUTSIDE, "outside the triangle")):
-        if mask.any():
-            # A piece of a line needs its first point of the other kind too.
-            joined = mask | np.append(False, mask[:-1]) if colour == OUTSIDE else mask
-            points = np.where(joined[:, None], path, np.nan)
-            axes.plot(*style.sparse(points).T, color=colour, lw=1.1, zorder=9, label=label)
+def _draw_pressure(axes: Axes, body: Skeleton, path: Array) -> None:
+    """The centre of pressure, (T, 2) in the axes drawn: inside the support triangle, and outside."""
+    corners = np.array([point.position[:2] for point in body.scene.supports])
+    at, outside = pressure_pieces(pressure_in_base(body.record), corners)
+    points = np.stack([np.interp(at, np.arange(len(path)), column) for column in path.T], axis=1)
+    pieces = np.stack([points[:-1], points[1:]], axis=1)
+    for those, colour, label in ((~outside, INSIDE, "centre of pressure"), (outside, OUTSIDE, "outside the triangle")):
+        if those.any():
+            axes.add_collection(LineCollection(list(pieces[those]), colors=colour, linewidths=1.1, zorder=9))
+            axes.plot([], [], color=colour, lw=1.1, label=label)
     known = np.flatnonzero(np.isfinite(path).all(axis=1))
-    for row, face in ((known[:1], "white"), (known[-1:], None)):
-        for k in row:
-            colour = OUTSIDE if outside[k] else INSIDE
-            axes.plot(*path[k], "o", markersize=4, color=colour, markerfacecolor=face or colour, zorder=10)
+    for place, face in ((known[:1], "white"), (known[-1:], style.BLACK)):
+        axes.plot(*path[place].T, "o", markersize=4, color=style.BLACK, markerfacecolor=face, zorder=10)
+
+
+def pressure_pieces(path: Array, corners: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Cut a path, (T, 2), where it crosses a side of a triangle, (3, 2).
+
+    Returns
+    -------
+    at : (m,) samples, and fractions of samples at which it is cut
+    outside : (m - 1,) whether the piece that follows lies outside the triangle
+    """
+    kept = np.linspace(0, len(path) - 1, min(len(path), style.LINE_POINTS)).astype(int)
+    path, side = path[kept], np.roll(corners, -1, axis=0) - corners
+    normal = np.stack([-side[:, 1], side[:, 0]], axis=1)
+    normal *= np.sign((normal * (corners.mean(axis=0) - corners)).sum(axis=1))[:, None]
+    # Distances from the sides, positive inside, by the sides' lengths: linear along each piece.
+    distance = ((path[:, None] - corners) * normal).sum(axis=2)
+    a, b = distance[:-1], distance[1:]
+    row, crossed = np.nonzero(a * b < 0.0)
+    share = a[row, crossed] / (a[row, crossed] - b[row, crossed])
+    at = np.union1d(np.arange(len(path)), row + share)
+    middle = 0.5 * (at[:-1] + at[1:])
+    between = np.stack([np.interp(middle, np.arange(len(path)), column) for column in distance.T], axis=1)
+    return np.interp(at, np.arange(len(kept)), kept), between.min(axis=1) < 0.0
 
 
 def _spread(pose: Array, rows: Rows, apart: float) -> list[int]:
