@@ -260,7 +260,8 @@ def _tipped(record: Record, base: MobileBase) -> list[str]:
             if low < 0.0
         )
         found.append(
-            f"the base tips over at t = {first:.4f} s; the run goes on as if it were held down"
+            f"the base tips over at t = {first:.4f} s, with a tip margin below zero in "
+            f"{100 * (record['tip_margin'] < 0.0).mean():.1f} % of the samples; the run goes on as if it were held down"
             f"{f' (least loads [N]: {pulled})' if pulled else ''}: plant.base.on_overturn: stop ends it there"
         )
     lifted = load.sum(axis=1) <= 0.0

@@ -28,6 +28,8 @@ BasePathChoice: Any = families.union("base_path")
 
 # Of the reference splines: half a gigabyte for each joint.
 SEGMENTS_MAX = 10_000_000
+# Of a base between two knots [rad]: more is no longer the motion that the path describes.
+TURN_MAX = 0.2
 
 
 class HandReference(StrictConfig):
@@ -203,9 +205,20 @@ def _base_path(base: BaseReference, context: BuildContext) -> BasePath:
 def _wheel_angles(robot: Robot, path: BasePath, times: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
     """References of the two wheels [rad]; none where the base does not move, so that they hold."""
     assert robot.base is not None
-    motion = path.motion(times)
+    keys = ("controller", "base", "path")
+    motion = np.asarray(path.motion(times), dtype=np.float64)
+    if motion.shape != (len(times), 2) or not np.isfinite(motion).all():
+        raise ModelError(f"controller.base.path: needs {len(times)} finite distances and turns", keys=keys)
     if not motion.any():
         return {}
+    turns = np.abs(np.diff(motion[:, 1]))
+    if turns.max() > TURN_MAX:
+        raise ModelError(
+            f"controller.base.path: at t = {times[turns.argmax()]:.3f} s the heading turns by {turns.max():.3g} rad "
+            f"from one knot of the references to the next, {times[1]:.3g} s later (limit {TURN_MAX:g} rad); go slower, "
+            "round it off, or lower controller.knot_spacing_s",
+            keys=keys,
+        )
     first, _ = base_row(robot)
     angles = robot.initial[first : first + 2] + wheel_angles(robot.base, motion)
     return dict(zip(robot.base.wheels, angles.T, strict=True))

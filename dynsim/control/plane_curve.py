@@ -12,8 +12,8 @@ from dynsim.model.mobile_base import base_row
 
 Array = NDArray[np.float64]
 
-# Samples of the tangent between two points, and the turn between two of them that no base follows [rad].
-SAMPLES, JUMP = 128, 0.2
+# The turn between two samples of the tangent that no base follows [rad].
+JUMP = 0.2
 # A first point this far off the base's start is refused [m].
 START_TOLERANCE = 1e-6
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
@@ -40,14 +40,15 @@ class PlaneCurve:
     points : (N, 2) no two neighbours equal, the first at the origin [m]
     names : of the points, with place and time, for messages
     start_limit, turn_limit : largest angle between +x and the first chord, and between neighbouring chords [rad]
+    samples : of the tangent between two points, to find where it jumps
 
     Raises
     ------
     ModelError
-        It would have to jump sideways, or has a corner: with the point where.
+        It does not begin at the origin, leaves it sideways, or has a corner: with the point where.
     """
 
-    def __init__(self, points: Array, names: list[str], start_limit: float, turn_limit: float) -> None:
+    def __init__(self, points: Array, names: list[str], start_limit: float, turn_limit: float, samples: int) -> None:
         if not np.hypot(*points[0]) <= START_TOLERANCE:
             raise ModelError(f"{names[0]} is {np.hypot(*points[0]):.4g} m from where the base starts; begin there")
         chords = np.diff(points, axis=0)
@@ -64,10 +65,13 @@ class PlaneCurve:
         if (turns >= turn_limit).any():
             _refuse_corner(names[1 + int(turns.argmax())], float(turns.max()))
         self.nodes = np.concatenate([[0.0], np.cumsum(lengths)])
+        if not (np.diff(self.nodes) > 0.0).all():
+            short = names[1 + int(np.argmin(np.diff(self.nodes)))]
+            raise ModelError(f"{short} is too near the point before it, beside the length of the path")
         spline = CubicSpline(self.nodes, points, bc_type=((1, np.array([1.0, 0.0])), (2, np.zeros(2))))
         self._tangent = spline.derivative()
         # Tangent's angle and the length so far, at samples from which both are continued.
-        parts = np.arange(SAMPLES) / SAMPLES
+        parts = np.arange(samples) / samples
         self._u = np.append((self.nodes[:-1, None] + lengths[:, None] * parts).ravel(), self.nodes[-1])
         steps = np.diff(self._angle(self._u))
         steps = (steps + np.pi) % (2.0 * np.pi) - np.pi

@@ -489,7 +489,7 @@ class Simulation:
         driver.advance(prepared.system, prepared.workspace, run, _PIECE)
         self._wall += clock.perf_counter() - begun
         self._take_events()
-        if run.count[ki.STATUS] not in (ki.RUNNING, ki.FINISHED, ki.STOPPED):
+        if run.count[ki.STATUS] not in (ki.RUNNING, ki.FINISHED, ki.STOPPED) or self._overturned():
             self._time = float(run.clock[ki.TIME])
             raise_stopped(stopped(self._scenario, self._prepared), self.record())
         due = int(run.count[ki.TICKED])
@@ -518,6 +518,13 @@ class Simulation:
                 self._time = time
                 self._call(call)
 
+    def _overturned(self) -> bool:
+        """True when the base has tipped and its scenario says that runs stop there."""
+        base = self.robot.base
+        if base is None or not base.stop_on_overturn or self._prepared.run.count[ki.STATUS] != ki.STOPPED:
+            return False
+        return self._happened[-1].kind == TIP_OVER
+
     def _settle_now(self) -> None:
         """End a step at the present time, when it lies within one."""
         run = self._prepared.run
@@ -536,7 +543,7 @@ class Simulation:
                 driver.advance(self._prepared.system, self._prepared.workspace, run, _PIECE)
             clock_[ki.END] = self._end
             self._take_events()
-            if count[ki.STATUS] == ki.STOPPED:
+            if count[ki.STATUS] == ki.STOPPED and not self._overturned():
                 return
             if count[ki.STATUS] != ki.FINISHED:
                 raise_stopped(stopped(self._scenario, self._prepared), self.record())

@@ -84,8 +84,10 @@ def _supports(base: MobileBase, body: int) -> tuple[Point, ...]:
 
 def _joint(link: Link, kind: JointKind) -> Joint:
     if link.kind == "left_wheel":  # its angles are not where it is
-        pose, part_of = ("x", "y", "heading"), link.joint_of_rows or ""
-        return Joint(link.joint, kind, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), HERE, "base_pose", pose, None, None, part_of)
+        place, columns = (0.0, 0.0, 0.0), ("x", "y", "heading")
+        return Joint(
+            link.joint, kind, (0.0, 0.0, 1.0), place, HERE, "base_pose", columns, part_of=link.joint_of_rows or ""
+        )
     return Joint(
         name=link.joint,
         kind=kind,

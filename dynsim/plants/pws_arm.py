@@ -40,6 +40,14 @@ class Wheel(StrictConfig):
     damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="viscous loss of each wheel's joint")
     motor: MotorChoice | None = Field(default=None, description="of each wheel; none: it rolls free")
 
+    @model_validator(mode="after")
+    def _check_moments(self) -> Self:
+        axle, across = self.moments
+        if axle > 2.0 * across * (1.0 + 1e-9):
+            key = "inertia_axle_kg_m2" if self.inertia_axle_kg_m2 is not None else "inertia_across_kg_m2"
+            raise error_at(key, f"{axle:g} about the axle is more than twice {across:g} across it, as of no real wheel")
+        return self
+
     @property
     def moments(self) -> tuple[float, float]:
         """Moments of inertia about the axle and across it [kg m²]."""
@@ -96,7 +104,9 @@ class Config(StrictConfig):
 
     @model_validator(mode="after")
     def _check_arm(self) -> Self:
-        if "base" in self.arm.model_fields_set:
+        # Resolved scenarios have it all; the place of an arm that was given none is no other than that of its mount.
+        own = getattr(self.arm, "base", None)
+        if own is not None and own != type(own)():
             raise error_at("arm.base", "on a mobile base the arm stands at plant.base.mount; remove arm.base")
         return self
 
@@ -105,22 +115,27 @@ def build(config: Config, context: BuildContext) -> Robot:
     """The base as a joint with the rates of its wheels, and the arm's bodies on it.
 
     The wheels' masses, and their moments across the axle, are part of the base; their spin is inertia of their joints:
-    on flat ground that is the energy of real wheels, T = ½ I_a φ̇² + ½ I_t ω² + ½ m v².
+    on flat ground that is the energy of real wheels, T = ½ I_a φ̇² + ½ I_t ω² + ½ m v². Their motors sit on the base.
 
     Raises
     ------
     ModelError
-        The arm says so, or one of its bodies has the name of the base or of a part of it.
+        The arm says so, one of its bodies has the name of the base or of a part of it, or no real body or wheel can
+        have such an inertia.
     """
     arm = families.build("plant", config.arm, context, Robot)
     base, wheel = config.base, config.base.wheel
     axle, across = wheel.moments
     mount = _turn(np.deg2rad(base.mount.yaw_deg)), np.array(base.mount.position_m)
-    parts = [_body(base), arm.fixed_inertia.placed(*mount)]
-    for side in (0.5, -0.5):
-        parts.append(
-            Inertia(wheel.mass_kg, vector(0.0, side * base.track_m, wheel.radius_m), np.diag([across, axle, across]))
-        )
+    parts, wheels, motors = [_body(base), arm.fixed_inertia.placed(*mount)], (f"{BASE}.left", f"{BASE}.right"), []
+    for joint, side in zip(wheels, (0.5, -0.5), strict=True):
+        hub = vector(0.0, side * base.track_m, wheel.radius_m)
+        parts.append(Inertia(wheel.mass_kg, hub, np.diag([across, axle, across])))
+        if wheel.motor is not None:
+            motor: Drive = families.build("motor", wheel.motor, context.at_joint(joint), Drive)
+            # The rows of the base carry no body: what the motor weighs cannot be left to its joint.
+            parts.append(Inertia(motor.mass, hub if motor.mass_point is None else motor.mass_point))
+            motors.append(replace(motor, mass=0.0, mass_point=None))
     body = Link(
         name=BASE,
         joint=BASE,
@@ -138,11 +153,9 @@ def build(config: Config, context: BuildContext) -> Robot:
     taken = {name for row in rows for name in (row.name, row.joint)}
     for name in (name for link in arm.links for name in (link.name, link.joint)):
         if name in taken:
-            raise ModelError(f"plant.arm: {name!r} is a name of the mobile base too; rename it in the arm")
-    wheels = rows[0].joint, rows[1].joint
-    motors: list[Drive] = []
-    if wheel.motor is not None:
-        motors = [families.build("motor", wheel.motor, context.at_joint(joint), Drive) for joint in wheels]
+            raise ModelError(
+                f"plant.arm: {name!r} is a name of the mobile base too; rename it in the arm", keys=("plant", "arm")
+            )
     return replace(
         arm,
         name="pws_arm",
@@ -168,7 +181,10 @@ def build(config: Config, context: BuildContext) -> Robot:
 def _body(base: Base) -> Inertia:
     xx, xy, xz, yy, yz, zz = base.inertia_kg_m2
     body = Inertia(base.mass_kg, np.array(base.com_m), np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-    body.check("plant.base")
+    try:
+        body.check("plant.base")
+    except ModelError as error:
+        raise ModelError(str(error), keys=("plant", "base", "inertia_kg_m2")) from None
     return body
 
 

@@ -59,7 +59,7 @@ def part(
 
 
 BLOCKS = ("q", "v", "current", "ledger", "contact", "load")
-COLUMNS = ("vdot", "current", "voltage", "torque", "hand", "energy", "contact")
+COLUMNS = ("vdot", "current", "voltage", "torque", "hand", "energy", "contact", "support")
 
 
 class Pair:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal, Self
 
@@ -72,7 +73,7 @@ class Places:
 
     def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
         """Distance [m] and turn [rad] at times t [s], (T, 2)."""
-        return self.curve.motion(self.way(np.clip(t, *self.way.x[[0, -1]])))
+        return self.curve.motion(np.clip(self.way(np.clip(t, *self.way.x[[0, -1]])), 0.0, self.curve.nodes[-1]))
 
 
 def build(config: Config, context: BuildContext) -> BasePath:
@@ -92,21 +93,23 @@ def build(config: Config, context: BuildContext) -> BasePath:
         raise ModelError(f"{config.file}: no row is {SPACING:g} m from the first; for a base that stands take hold")
     names = [f"row {k + 1} ({rows[k, 0]:g}, {rows[k, 1]:g}) m, t = {times[k]:g} s" for k in kept]
     try:
-        curve = PlaneCurve(points[kept], names, start_limit=TURN_LIMIT, turn_limit=TURN_LIMIT)
+        curve = PlaneCurve(points[kept], names, start_limit=TURN_LIMIT, turn_limit=TURN_LIMIT, samples=8)
     except ModelError as error:
         raise ModelError(f"{config.file}: {error}") from error
-    return Places(curve, PchipInterpolator(times, np.minimum(way, curve.nodes[-1])))
+    return Places(curve, PchipInterpolator(times, way))
 
 
 def _along(points: NDArray[np.float64]) -> tuple[list[int], NDArray[np.float64]]:
     """Rows that the curve goes through, and the way along their chords at every row [m]; it never goes back."""
-    kept, begun, way = [0], 0.0, [0.0]
-    for k, point in enumerate(points[1:], 1):
-        distance = float(np.hypot(*(point - points[kept[-1]])))
-        if distance >= SPACING:
-            begun += distance
+    kept = [0]
+    begin, *others = points.tolist()
+    for k, point in enumerate(others, 1):
+        if math.dist(begin, point) >= SPACING:
+            begin = point
             kept.append(k)
-            way.append(begun)
-        else:
-            way.append(max(way[-1], begun + distance))
-    return kept, np.array(way)
+    # It ends at the last row, however near.
+    kept[1:] = [*kept[1:-1], len(points) - 1] if len(kept) > 1 else []
+    chords = np.append(np.hypot(*np.diff(points[kept], axis=0).T), 0.0)
+    last = np.searchsorted(kept, np.arange(len(points)), side="right") - 1
+    beyond = np.minimum(np.hypot(*(points - points[kept][last]).T), chords[last])
+    return kept, np.maximum.accumulate(np.cumsum(chords)[last] - chords[last] + beyond)
