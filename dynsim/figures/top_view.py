@@ -27,6 +27,7 @@ Rows = NDArray[np.intp]
 # So many support triangles at most, evenly over the way, at least this share of their size apart.
 TRIANGLES, APART = 6, 0.25
 ELBOW_COLOURS = (style.ORANGE, style.GREEN, "#8C6D31")
+ARM_ABOVE = "#A8A8A8"
 TRIANGLE, INSIDE, OUTSIDE = style.SKY, style.PURPLE, style.PULLING
 
 
@@ -43,8 +44,11 @@ def top_view(record: Record) -> Figure | None:
     wide = size[0] > 1.8 * size[1]
     height = 6.3 if wide else 0.9 + float(np.clip(3.9 * size[1] / size[0], 3.3, 6.0))
     figure = style.new_figure(height, style.title(record, "base from above"))
-    ratios: dict[str, Any] = {"height_ratios": [1.2, 1.0]} if wide else {"width_ratios": [1.25, 1.0]}
-    world, own = figure.subplots(*((2, 1) if wide else (1, 2)), **ratios)
+    if wide:
+        grid = figure.add_gridspec(2, 2, height_ratios=[1.2, 1.0], width_ratios=[1.0, 1.25])
+        world, own = figure.add_subplot(grid[0, :]), figure.add_subplot(grid[1, 0])
+    else:
+        world, own = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
     _draw_world(world, body, rows)
     world.set_xlim(low[0], high[0])
     world.set_ylim(low[1], high[1])
@@ -54,7 +58,12 @@ def top_view(record: Record) -> Figure | None:
     handles, labels = world.get_legend_handles_labels()
     more = [pair for pair in zip(*own.get_legend_handles_labels(), strict=True) if pair[1] not in labels]
     handles, labels = [*handles, *(one for one, _ in more)], [*labels, *(text for _, text in more)]
-    figure.legend(handles, labels, loc="outside lower center", ncols=4)
+    if wide:
+        beside = figure.add_subplot(grid[1, 1])
+        beside.set_axis_off()
+        beside.legend(handles, labels, loc="center", ncols=2)
+    else:
+        figure.legend(handles, labels, loc="outside lower center", ncols=4)
     return figure
 
 
@@ -98,8 +107,8 @@ def _draw_world(axes: Axes, body: Skeleton, rows: Rows) -> None:
     _draw_outline(axes, body, last, facecolor="#DDDDDD", linestyle="-", label="base at the end")
     arm = body.segments(last)[:, :, :2]
     for segment in arm:
-        axes.plot(*segment.T, color=ARM_COLOUR, lw=1.6, alpha=0.35, zorder=3)
-    axes.plot([], [], color=ARM_COLOUR, lw=1.6, alpha=0.35, label="arm at the end")
+        axes.plot(*segment.T, color=ARM_ABOVE, lw=1.6, zorder=3)
+    axes.plot([], [], color=ARM_ABOVE, lw=1.6, label="arm at the end")
     for row in _spread(record["base_pose"], rows, APART * float(np.ptp(support_corners(body, first), axis=0).max())):
         axes.add_patch(Polygon(support_corners(body, row), facecolor="none", edgecolor=TRIANGLE, lw=0.7, zorder=4))
     axes.plot([], [], color=TRIANGLE, lw=0.7, label="support triangle")
@@ -144,7 +153,15 @@ def _draw_own(axes: Axes, body: Skeleton, rows: Rows) -> None:
         # Towards the middle, where there is room.
         away = 16.0 * (middle - corner) / np.linalg.norm(middle - corner)
         axes.annotate(
-            point.name, corner, xytext=away, textcoords="offset points", fontsize=7, zorder=6, ha="center", va="center"
+            point.name,
+            corner,
+            xytext=away,
+            textcoords="offset points",
+            fontsize=7,
+            ha="center",
+            va="center",
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.5},
+            zorder=11,
         )
     path = pressure_in_base(record)
     _draw_pressure(axes, body, path)
