@@ -245,7 +245,8 @@ class RealWheels:
         out = np.zeros(self.model.nq)
         for joint in self.model.joints[1:]:
             angle = q[joint.idx_v]
-            out[joint.idx_q : joint.idx_q + joint.nq] = angle if joint.nq == 1 else (np.cos(angle), np.sin(angle))
+            first, count = joint.idx_q, joint.nq
+            out[np.arange(count) + first] = angle if count == 1 else (np.cos(angle), np.sin(angle))
         return out
 
     # ---- mechanics
