@@ -18,7 +18,8 @@ TIP_OVER = "tip_over"
 LOADS, MARGIN, TRACTION = "wheel_load", "tip_margin", "traction_demand"
 # Without load the demand has no bound, and the margin none where the ground carries almost nothing: axes end here.
 TRACTION_TOP, MARGIN_LOW = 2.5, -2.0
-SIDE_COLOURS = (style.BLUE, style.GREEN, style.ORANGE)
+# Of left wheel, right wheel and caster; the left is wider, to be seen below the right where they carry the same.
+LOOKS = ((style.BLUE, 2.4), (style.GREEN, 1.0), (style.ORANGE, 1.2))
 # Tracking: axes of positions and headings show at least this [m, °], so that rest is not drawn as motion.
 LEAST_POSITION, LEAST_HEADING = 1e-3, 0.1
 MILLI = 1e3
@@ -49,21 +50,13 @@ def overturning(record: Record) -> Figure | None:
     for panels, label in zip(rows, ("load [N]", "tip margin", "traction demand\n|F| / (μ N)"), strict=True):
         panels[0].set_ylabel(label)
         style.legend_above(panels[-1], columns=4)
-    note = [f"higher peaks, of wheels with hardly any load, are cut off at {TRACTION_TOP:g}"]
-    if not np.nanmax(traction, initial=0.0) > TRACTION_TOP:
-        note = []
+    note = []
+    if np.nanmax(traction, initial=0.0) > TRACTION_TOP:
+        note.append(f"demand cut off at {TRACTION_TOP:g}: hardly any load")
     if missing := float(np.isnan(traction).any(axis=1).mean()):
-        note.append(f"no demand where a wheel carries no load: {100.0 * missing:.2g} % of the samples")
-    rows[2][-1].text(
-        0.99,
-        0.96,
-        "\n".join(note),
-        transform=rows[2][-1].transAxes,
-        ha="right",
-        va="top",
-        color=style.GREY,
-        fontsize=6.5,
-    )
+        note.append(f"none where a wheel carries no load: {100.0 * missing:.2g} % of the samples")
+    last = rows[2][-1]
+    last.set_xlabel("\n".join([last.get_xlabel(), *note]))
     return figure
 
 
@@ -99,7 +92,9 @@ def tracking(record: Record) -> Figure | None:
     error = base_error(record)
     figure = style.new_figure(6.6, style.title(record, "base, reference and actual"))
     heading = np.degrees(np.stack([target[:, 2], pose[:, 2]], axis=1))
-    parts = [np.hstack([target[:, :2], pose[:, :2]]), heading, MILLI * error[:, :2], np.degrees(error[:, 2:])]
+    # To a nanometre: beyond it a base that stands shows its rounding.
+    away, turned = np.round(MILLI * error[:, :2], 6), np.round(np.degrees(error[:, 2:]), 6)
+    parts = [np.hstack([target[:, :2], pose[:, :2]]), heading, away, turned]
     rows = style.time_rows(figure, [[(record.time, one)] for one in parts], style.settle_time(record))
     for panels, values, least in zip(rows, parts, (LEAST_POSITION, LEAST_HEADING, 0.0, 0.0), strict=True):
         for axes in panels:
@@ -114,12 +109,12 @@ def tracking(record: Record) -> Figure | None:
     for axes in rows[1]:
         _pair(axes, record.time, heading[:, 0], heading[:, 1], "heading", style.BLACK, "-")
     for k, (name, colour) in enumerate((("ahead", style.BLUE), ("to the left", style.GREEN))):
-        label = f"{name}: rms {style.number(_rms(parts[2][:, k]), 3)} mm"
+        label = f"{name}: rms {style.number(_rms(away[:, k]), 3)} mm"
         for axes in rows[2]:
-            style.line(axes, record.time, parts[2][:, k], color=colour, label=label)
+            style.line(axes, record.time, away[:, k], color=colour, label=label)
     for axes in rows[3]:
-        label = f"rms {style.number(_rms(parts[3]), 3)}°"
-        style.line(axes, record.time, parts[3][:, 0], color=style.BLACK, label=label)
+        label = f"rms {style.number(_rms(turned), 3)}°"
+        style.line(axes, record.time, turned[:, 0], color=style.BLACK, label=label)
     for panels in rows[2:]:
         for axes in panels:
             axes.axhline(0.0, color=style.GREY, linewidth=0.6)
@@ -162,10 +157,10 @@ def _margin_label(name: str, record: Record) -> str:
 
 def _lines(axes: Axes, record: Record, signal: str, note: str, extreme: Callable[[Array], Any]) -> None:
     """A line for each column, its extreme in the legend."""
-    for values, name, colour in zip(record[signal].T, record.labels[signal], SIDE_COLOURS, strict=False):
+    for values, name, (colour, width) in zip(record[signal].T, record.labels[signal], LOOKS, strict=False):
         known = np.isfinite(values).any()
         label = f"{name}: {note.format(style.number(float(extreme(values)), 3))}" if known else name
-        style.line(axes, record.time, values, color=colour, label=label)
+        style.line(axes, record.time, values, color=colour, linewidth=width, label=label)
 
 
 def _pair(axes: Axes, time: Array, target: Array, actual: Array, name: str, colour: str, dashes: Any) -> None:

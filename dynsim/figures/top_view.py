@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ Rows = NDArray[np.intp]
 # So many support triangles at most, evenly over the way, at least this share of their size apart.
 TRIANGLES, APART = 6, 0.25
 ELBOW_COLOURS = (style.ORANGE, style.GREEN, "#8C6D31")
+ARM_ABOVE = "#A8A8A8"
 TRIANGLE, INSIDE, OUTSIDE = style.SKY, style.PURPLE, style.PULLING
 
 
@@ -42,8 +44,11 @@ def top_view(record: Record) -> Figure | None:
     wide = size[0] > 1.8 * size[1]
     height = 6.3 if wide else 0.9 + float(np.clip(3.9 * size[1] / size[0], 3.3, 6.0))
     figure = style.new_figure(height, style.title(record, "base from above"))
-    ratios: dict[str, Any] = {"height_ratios": [1.2, 1.0]} if wide else {"width_ratios": [1.25, 1.0]}
-    world, own = figure.subplots(*((2, 1) if wide else (1, 2)), **ratios)
+    if wide:
+        grid = figure.add_gridspec(2, 2, height_ratios=[1.2, 1.0], width_ratios=[1.0, 1.25])
+        world, own = figure.add_subplot(grid[0, :]), figure.add_subplot(grid[1, 0])
+    else:
+        world, own = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
     _draw_world(world, body, rows)
     world.set_xlim(low[0], high[0])
     world.set_ylim(low[1], high[1])
@@ -53,7 +58,12 @@ def top_view(record: Record) -> Figure | None:
     handles, labels = world.get_legend_handles_labels()
     more = [pair for pair in zip(*own.get_legend_handles_labels(), strict=True) if pair[1] not in labels]
     handles, labels = [*handles, *(one for one, _ in more)], [*labels, *(text for _, text in more)]
-    figure.legend(handles, labels, loc="outside lower center", ncols=4)
+    if wide:
+        beside = figure.add_subplot(grid[1, 1])
+        beside.set_axis_off()
+        beside.legend(handles, labels, loc="center", ncols=2)
+    else:
+        figure.legend(handles, labels, loc="outside lower center", ncols=4)
     return figure
 
 
@@ -97,8 +107,8 @@ def _draw_world(axes: Axes, body: Skeleton, rows: Rows) -> None:
     _draw_outline(axes, body, last, facecolor="#DDDDDD", linestyle="-", label="base at the end")
     arm = body.segments(last)[:, :, :2]
     for segment in arm:
-        axes.plot(*segment.T, color=ARM_COLOUR, lw=1.6, alpha=0.35, zorder=3)
-    axes.plot([], [], color=ARM_COLOUR, lw=1.6, alpha=0.35, label="arm at the end")
+        axes.plot(*segment.T, color=ARM_ABOVE, lw=1.6, zorder=3)
+    axes.plot([], [], color=ARM_ABOVE, lw=1.6, label="arm at the end")
     for row in _spread(record["base_pose"], rows, APART * float(np.ptp(support_corners(body, first), axis=0).max())):
         axes.add_patch(Polygon(support_corners(body, row), facecolor="none", edgecolor=TRIANGLE, lw=0.7, zorder=4))
     axes.plot([], [], color=TRIANGLE, lw=0.7, label="support triangle")
@@ -120,7 +130,7 @@ def _draw_world(axes: Axes, body: Skeleton, rows: Rows) -> None:
     if "hand_position" in record:
         hand = style.sparse(record["hand_position"][:, :2])
         axes.plot(*hand.T, color=style.BLUE, lw=1.0, zorder=7, label="hand path")
-    _draw_pressure(axes, record["center_of_pressure"], record)
+    _draw_pressure(axes, body, record["center_of_pressure"])
     axes.set_title("in the world")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
@@ -143,10 +153,18 @@ def _draw_own(axes: Axes, body: Skeleton, rows: Rows) -> None:
         # Towards the middle, where there is room.
         away = 16.0 * (middle - corner) / np.linalg.norm(middle - corner)
         axes.annotate(
-            point.name, corner, xytext=away, textcoords="offset points", fontsize=7, zorder=6, ha="center", va="center"
+            point.name,
+            corner,
+            xytext=away,
+            textcoords="offset points",
+            fontsize=7,
+            ha="center",
+            va="center",
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.5},
+            zorder=11,
         )
     path = pressure_in_base(record)
-    _draw_pressure(axes, path, record)
+    _draw_pressure(axes, body, path)
     # The path may go far; what it does within a base's length of the base is in the picture.
     drawn = np.concatenate([corners, *parts])
     low, high = drawn.min(axis=0), drawn.max(axis=0)
@@ -171,20 +189,42 @@ def _draw_outline(axes: Axes, body: Skeleton, row: int, *, label: str, **look: A
         axes.add_patch(patch)
 
 
-def _draw_pressure(axes: Axes, path: Array, record: Record) -> None:
-    """The centre of pressure: where the base stands, and where it tips."""
-    outside = record["tip_margin"] < 0.0
-    for mask, colour, label in ((~outside, INSIDE, "centre of pressure"), (outside, OUTSIDE, "outside the triangle")):
-        if mask.any():
-            # A piece of a line needs its first point of the other kind too.
-            joined = mask | np.append(False, mask[:-1]) if colour == OUTSIDE else mask
-            points = np.where(joined[:, None], path, np.nan)
-            axes.plot(*style.sparse(points).T, color=colour, lw=1.1, zorder=9, label=label)
+def _draw_pressure(axes: Axes, body: Skeleton, path: Array) -> None:
+    """The centre of pressure, (T, 2) in the axes drawn: inside the support triangle, and outside."""
+    corners = np.array([point.position[:2] for point in body.scene.supports])
+    at, outside = pressure_pieces(pressure_in_base(body.record), corners)
+    points = np.stack([np.interp(at, np.arange(len(path)), column) for column in path.T], axis=1)
+    pieces = np.stack([points[:-1], points[1:]], axis=1)
+    for those, colour, label in ((~outside, INSIDE, "centre of pressure"), (outside, OUTSIDE, "outside the triangle")):
+        if those.any():
+            axes.add_collection(LineCollection(list(pieces[those]), colors=colour, linewidths=1.1, zorder=9))
+            axes.plot([], [], color=colour, lw=1.1, label=label)
     known = np.flatnonzero(np.isfinite(path).all(axis=1))
-    for row, face in ((known[:1], "white"), (known[-1:], None)):
-        for k in row:
-            colour = OUTSIDE if outside[k] else INSIDE
-            axes.plot(*path[k], "o", markersize=4, color=colour, markerfacecolor=face or colour, zorder=10)
+    for place, face in ((known[:1], "white"), (known[-1:], style.BLACK)):
+        axes.plot(*path[place].T, "o", markersize=4, color=style.BLACK, markerfacecolor=face, zorder=10)
+
+
+def pressure_pieces(path: Array, corners: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Cut a path, (T, 2), where it crosses a side of a triangle, (3, 2).
+
+    Returns
+    -------
+    at : (m,) samples, and fractions of samples at which it is cut
+    outside : (m - 1,) whether the piece that follows lies outside the triangle
+    """
+    kept = np.linspace(0, len(path) - 1, min(len(path), style.LINE_POINTS)).astype(int)
+    path, side = path[kept], np.roll(corners, -1, axis=0) - corners
+    normal = np.stack([-side[:, 1], side[:, 0]], axis=1)
+    normal *= np.sign((normal * (corners.mean(axis=0) - corners)).sum(axis=1))[:, None]
+    # Distances from the sides, positive inside, by the sides' lengths: linear along each piece.
+    distance = ((path[:, None] - corners) * normal).sum(axis=2)
+    a, b = distance[:-1], distance[1:]
+    row, crossed = np.nonzero(a * b < 0.0)
+    share = a[row, crossed] / (a[row, crossed] - b[row, crossed])
+    at = np.union1d(np.arange(len(path)), row + share)
+    middle = 0.5 * (at[:-1] + at[1:])
+    between = np.stack([np.interp(middle, np.arange(len(path)), column) for column in distance.T], axis=1)
+    return np.interp(at, np.arange(len(kept)), kept), between.min(axis=1) < 0.0
 
 
 def _spread(pose: Array, rows: Rows, apart: float) -> list[int]:

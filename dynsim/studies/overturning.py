@@ -151,7 +151,7 @@ def picture(rows: Sequence[Row]) -> Figure:
     base = shipped_base()
     shipped = {"mass_kg": base["mass_kg"], "track_m": base["track_m"], "caster_m": base["caster_m"][0]}
     styles = variant_styles(variant_names(SCENARIO))
-    figure = new_figure(3.4, f"{SCENARIO}: which base stands (least tip margin after settling above zero)")
+    figure = new_figure(3.4, f"{SCENARIO}, dynsim {__version__}: which base stands, once settled")
     panels = figure.subplots(1, 3)
     for axes, (x, y) in zip(panels, combinations(AXES, 2), strict=True):
         third = next(key for key in AXES if key not in (x, y))
@@ -167,7 +167,7 @@ def picture(rows: Sequence[Row]) -> Figure:
     ]
     standing = [name for name in styles if name not in falling]
     if standing:
-        handles.append(Line2D([], [], linestyle="", label=f"{', '.join(standing)}: never below zero"))
+        handles.append(Line2D([], [], linestyle="", label=f"{', '.join(standing)}: stand in every run"))
     handles += [
         Patch(color=SHADE, label="bracing decides: stands with two elbows, falls with none"),
         Line2D([], [], color="k", marker="*", linestyle="", markersize=8, label="as shipped"),

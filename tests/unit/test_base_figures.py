@@ -1,0 +1,285 @@
+"""Figures of a mobile base: from its record alone, and saying what the record says."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from scipy.spatial import ConvexHull
+
+import dynsim
+from dynsim import figures
+from dynsim.figures import arm, base, posture, skeleton, solids, style, top_view
+from dynsim.hardware.export import export_record, joint_motion
+from dynsim.record import Record
+from dynsim.record.scene import Scene, Shape
+from dynsim.scenario import load_scenario
+
+TRACK, CASTER = 0.3, 0.15
+ARC = {
+    "duration_s": 0.5,
+    "record.rate_hz": 130,
+    "controller.hand": None,
+    "controller.base.path": {"type": "arc", "radius_m": 0.4, "angle_deg": 50, "duration_s": 0.4, "start_s": 0.05},
+}
+
+
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(style, "DPI", 50)
+
+
+def run(variant: str, scenario: str = "mobile_elbow_comparison_driving", **overrides: object) -> Record:
+    return dynsim.simulate(load_scenario(scenario, variant, {"duration_s": 0.5, "metrics.settle_s": 0.2, **overrides}))
+
+
+@pytest.fixture(scope="module")
+def braced() -> Record:
+    return run("two_elbows")
+
+
+@pytest.fixture(scope="module")
+def tipped() -> Record:
+    """Without elbows on the floor the base tips over."""
+    return run("no_elbow")
+
+
+@pytest.fixture(scope="module")
+def turning() -> Record:
+    """A base that drives along an arc, its arm held."""
+    return run("no_elbow", **ARC)
+
+
+def drawn(figure: Figure | None) -> Figure:
+    assert figure is not None
+    return figure
+
+
+def texts(figure: Figure) -> str:
+    legends = [axes.get_legend() for axes in figure.axes] + list(figure.legends)
+    return "\n".join(text.get_text() for legend in legends if legend is not None for text in legend.get_texts())
+
+
+def in_world(record: Record, x: float, y: float) -> np.ndarray:
+    """A point of the base over the ground, (T, 2), from its pose alone."""
+    px, py, heading = record["base_pose"].T
+    return np.stack([px + x * np.cos(heading) - y * np.sin(heading), py + x * np.sin(heading) + y * np.cos(heading)], 1)
+
+
+def test_every_figure_of_a_mobile_base(braced: Record, tipped: Record, tmp_path: Path) -> None:
+    assert {path.stem for path in figures.draw(braced, tmp_path)} == set(arm.FIGURES)
+    assert {path.stem for path in figures.draw(tipped, tmp_path)} == set(arm.FIGURES) - {"contact_forces"}
+    paths = figures.draw_comparison({"a": braced, "b": tipped}, tmp_path)
+    assert {path.stem for path in paths} == set(arm.COMPARISONS)
+
+
+@pytest.mark.parametrize("samples", [2, 1, 0])
+def test_a_run_that_ended_early_is_drawn(tipped: Record, samples: int, tmp_path: Path) -> None:
+    record = Record(tipped.time[:samples], provenance=tipped.provenance)
+    for name, signal in tipped.signals.items():
+        record.add(name, signal.data[:samples].copy(), signal.unit, labels=signal.labels)
+    record.scene, record.complete = tipped.scene, False
+    for signal in list(record.signals.values())[: 4 if samples == 2 else 0]:
+        signal.data[-1:] = np.nan
+    assert bool(figures.draw(record, tmp_path)) == bool(samples)
+
+
+def test_supports_of_the_record_are_where_the_pose_has_them(turning: Record) -> None:
+    body, _ = skeleton.skeleton(turning)
+    assert body is not None
+    assert [point.name for point in body.scene.supports] == list(turning.labels["wheel_load"])
+    for row in (0, len(turning) - 1):
+        expected = [in_world(turning, *at)[row] for at in ((0, TRACK / 2), (0, -TRACK / 2), (CASTER, 0))]
+        np.testing.assert_allclose(top_view.support_corners(body, row), expected, atol=1e-7)
+    assert [turning.scene.bodies[k].name for k in turning.scene.base] == ["base", "base.left.wheel", "base.right.wheel"]
+
+
+def test_the_top_view_has_equal_axes_tracks_and_triangles(turning: Record) -> None:
+    figure = drawn(top_view.top_view(turning))
+    world = figure.axes[0]
+    assert all(axes.get_aspect() == 1.0 for axes in figure.axes[:2])
+    lines = {str(line.get_label()): line for line in world.get_lines()}
+    left = np.column_stack(lines["wheel tracks"].get_data())
+    np.testing.assert_allclose(left, in_world(turning, 0, TRACK / 2), atol=1e-7)
+    np.testing.assert_allclose(
+        np.column_stack(lines["caster track"].get_data()), in_world(turning, CASTER, 0), atol=1e-7
+    )
+    triangles = [patch.get_xy()[:3] for patch in world.patches if len(patch.get_xy()) == 4]
+    assert len(triangles) > 2
+    for corners in triangles:
+        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1)
+        np.testing.assert_allclose(np.sort(sides), np.sort([TRACK, *[math.hypot(TRACK / 2, CASTER)] * 2]), rtol=1e-6)
+
+
+def test_the_pressure_path_is_cut_at_the_sides_of_the_triangle() -> None:
+    corners = np.array([[0.0, 1.0], [0.0, -1.0], [1.0, 0.0]])
+    at, outside = top_view.pressure_pieces(np.array([[-1.0, 0.0], [0.5, 0.0], [0.5, 1.0], [0.2, 0.1]]), corners)
+    # It comes in at x = 0, goes out at (0.5, 0.5), beyond which it crosses no side, and comes in where y = 1 - x.
+    inside = 2.0 + 0.5 / 1.2
+    np.testing.assert_allclose(at[~np.isin(at, [0, 1, 2, 3])][[0, 1, -1]], [1.0 / 1.5, 1.5, inside], rtol=1e-12)
+    assert outside[at[:-1] < 0.6].all()
+    assert not outside[(at[:-1] > 0.6) & (at[:-1] < 1.4)].any()
+    assert outside[(at[:-1] > 1.4) & (at[:-1] < inside - 1e-9)].all()
+    assert not outside[at[:-1] > inside - 1e-9].any()
+
+
+def test_outside_of_the_triangle_is_where_the_margin_is_negative(tipped: Record) -> None:
+    corners = np.array([[0.0, TRACK / 2], [0.0, -TRACK / 2], [CASTER, 0.0]])
+    at, outside = top_view.pressure_pieces(top_view.pressure_in_base(tipped), corners)
+    # A piece between two samples on the same side of the margin, and cut by none, is on that side too.
+    whole = np.flatnonzero((at[:-1] % 1 == 0) & (np.diff(at) == 1))
+    rows = at[whole].astype(int)
+    negative = tipped["tip_margin"] < 0.0
+    same = negative[rows] == negative[rows + 1]
+    np.testing.assert_array_equal(outside[whole][same], negative[rows][same])
+    assert outside.any()
+    assert not outside.all()
+    assert "outside the triangle" in texts(drawn(top_view.top_view(tipped)))
+
+
+def test_tipping_is_marked_in_every_panel(tipped: Record, turning: Record) -> None:
+    figure = drawn(base.overturning(tipped))
+    times = {event.time for event in tipped.events if event.kind == base.TIP_OVER}
+    assert times
+    for axes in figure.axes:
+        marked = {line.get_xdata()[0] for line in axes.get_lines() if line.get_marker() == "v"}
+        assert marked == times
+    assert f"at {min(times):.3g} s" in texts(figure)
+    assert f"at {min(times):.3g} s" in texts(drawn(base.margin_comparison({"a": tipped, "b": turning})))
+
+
+def test_a_peak_of_the_demand_does_not_hide_the_rest(braced: Record) -> None:
+    assert np.nanmax(braced["traction_demand"]) > base.TRACTION_TOP
+    figure = drawn(base.overturning(braced))
+    columns = len(figure.axes) // 3
+    assert all(axes.get_ylim()[1] <= base.TRACTION_TOP for axes in figure.axes[2 * columns :])
+    assert f"cut off at {base.TRACTION_TOP:g}" in figure.axes[-1].get_xlabel()
+
+
+def test_reference_of_an_arc_is_the_arc(turning: Record) -> None:
+    """In closed form: x = R sin ψ, y = R (1 − cos ψ) along the start, ψ = α (10u³ − 15u⁴ + 6u⁵)."""
+    u = np.clip((turning.time - 0.05) / 0.4, 0.0, 1.0)
+    turn = math.radians(50.0) * u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
+    x, y, start = 0.4 * np.sin(turn), 0.4 * (1.0 - np.cos(turn)), math.radians(45.0)
+    place = [x * np.cos(start) - y * np.sin(start), x * np.sin(start) + y * np.cos(start), start + turn]
+    # The reference is a spline with knots at 20 ms, of which the jerk jumps twice.
+    np.testing.assert_allclose(turning["base_target"], np.stack(place, axis=1), atol=3e-4)
+    knot = np.isclose(turning.time % 0.02, 0.0, atol=1e-9) | np.isclose(turning.time % 0.02, 0.02, atol=1e-9)
+    assert knot.sum() > 3
+    np.testing.assert_allclose(turning["base_target"][knot, 2], place[2][knot], atol=1e-12)
+
+
+def test_reference_between_the_knots_is_where_the_wheels_would_roll(turning: Record) -> None:
+    """Equal to the integral of V cos ψ, V sin ψ on 20 times as many samples, for the references' own wheel angles."""
+    from dynsim.engine.prepare import prepare
+
+    scenario = load_scenario("mobile_elbow_comparison_driving", "no_elbow", {"duration_s": 0.5, **ARC})
+    prepared = prepare(scenario)
+    robot = prepared.model.robot
+    t = np.linspace(0.0, 0.5, 20_001)
+    target = prepared.control.base_target(robot, t)
+    assert target is not None
+    coefficients = prepared.control.reference.coefficients
+    spacing = prepared.control.reference.grid[1]
+    k = np.minimum((t / spacing).astype(int), len(coefficients) - 1)
+    rates = np.einsum(
+        "scp,sp->sc", coefficients[k][:, :2, 1:] * np.arange(1, 6), (t - k * spacing)[:, None] ** np.arange(5)
+    )
+    speed = 0.05 * rates.mean(axis=1)
+    for column, wave in ((0, np.cos), (1, np.sin)):
+        value = speed * wave(target[:, 2])
+        # Simpson's rule over pairs of intervals.
+        h = t[1] - t[0]
+        way = np.cumsum(h / 3.0 * (value[:-2:2] + 4.0 * value[1:-1:2] + value[2::2]))
+        np.testing.assert_allclose(target[2::2, column], way, atol=1e-9)
+
+
+def test_no_reference_without_motors_that_follow() -> None:
+    record = run("no_elbow", **{**ARC, "controller": None})
+    assert "base_target" not in record
+    assert base.tracking(record) is None
+
+
+def test_a_base_that_holds_has_its_start_as_reference() -> None:
+    record = run("two_elbows", "mobile_elbow_comparison")
+    np.testing.assert_allclose(record["base_target"], np.tile([0.0, 0.0, math.pi / 4], (len(record), 1)), atol=1e-15)
+
+
+def test_base_error_is_seen_from_the_reference() -> None:
+    record = Record([0.0, 1.0])
+    record.add("base_target", [[1.0, 2.0, math.pi / 2], [0.0, 0.0, math.pi]], "m, m, rad", labels=("x", "y", "heading"))
+    record.add("base_pose", [[1.0, 2.5, math.pi / 2], [0.0, 0.25, 3.0]], "m, m, rad", labels=("x", "y", "heading"))
+    np.testing.assert_allclose(base.base_error(record), [[0.5, 0, 0], [0, -0.25, 3.0 - math.pi]], atol=1e-15)
+
+
+def test_tracking_shows_the_errors_of_the_record(turning: Record) -> None:
+    figure = drawn(base.tracking(turning))
+    rms = 1e3 * math.sqrt(float(np.mean(base.base_error(turning)[:, 0] ** 2)))
+    assert f"ahead: rms {style.number(rms, 3)} mm" in texts(figure)
+
+
+def test_postures_show_the_base_and_its_wheels(turning: Record) -> None:
+    body, _ = skeleton.skeleton(turning)
+    assert body is not None
+    at_start, at_end = body.solids(0), body.solids(len(turning) - 1)
+    assert len(at_start) == 4  # plate, ball of the caster, two wheels
+    for solid in at_end:
+        assert solid[:, 2].min() > -1e-7
+    wheels = [solid for solid in at_end if np.ptp(solid[:, 2]) == pytest.approx(0.1, rel=1e-2)]
+    middles = np.array([solid.mean(axis=0)[:2] for solid in wheels])
+    np.testing.assert_allclose(middles, [in_world(turning, 0, side * TRACK / 2)[-1] for side in (1, -1)], atol=1e-6)
+    figure = drawn(posture.posture(turning))
+    shown = len(body.shown())
+    assert len(figure.axes[1].patches) == 4 * shown
+    extent = figure.axes[1].viewLim
+    assert all(extent.contains(*corner) for patch in figure.axes[1].patches for corner in patch.get_xy())
+    compared = drawn(posture.posture_comparison({"a": turning, "b": turning}))
+    assert [len(axes.patches) for axes in compared.axes] == [4 * shown] * 2
+
+
+def test_shapes_are_hulls_of_their_surfaces() -> None:
+    turned = (math.cos(0.3), 0.0, math.sin(0.3), 0.0)
+
+    def volume(kind: str, *size: float) -> float:
+        points = solids.surface(Shape(kind, size, (1.0, 2.0, 3.0), turned))
+        triangles = solids.faces(points)
+        # Of a closed surface whose faces turn to the left seen from outside: Σ a·(b × c)/6.
+        enclosed = float((triangles[:, 0] * np.cross(triangles[:, 1], triangles[:, 2])).sum() / 6.0)
+        assert enclosed == pytest.approx(ConvexHull(points).volume, rel=1e-12)
+        return enclosed
+
+    n = solids.CORNERS
+    prism = 0.5 * n * math.sin(2.0 * math.pi / n)
+    assert volume("box", 0.2, 0.3, 0.4) == pytest.approx(0.024, rel=1e-12)
+    assert volume("cylinder", 0.1, 0.5) == pytest.approx(prism * 0.01 * 0.5, rel=1e-12)
+    ball = 4.0 / 3.0 * math.pi * 0.1**3
+    assert 0.95 * ball < volume("sphere", 0.1) < ball
+    assert volume("capsule", 0.1, 0.5) == pytest.approx(volume("sphere", 0.1) + prism * 0.01 * 0.5, rel=1e-12)
+    assert not len(solids.surface(Shape("mesh", (1.0, 1.0, 1.0), file="a.stl")))
+    assert not len(solids.faces(np.zeros((5, 3))))
+
+
+def test_supports_are_apart_from_the_points_that_older_versions_know(braced: Record, tmp_path: Path) -> None:
+    text = braced.scene.to_json()
+    assert Scene.from_json(text) == braced.scene
+    content = json.loads(text)
+    assert {point["role"] for point in content["points"]} == {"hand", "contact"}
+    del content["supports"]
+    older = Scene.from_json(json.dumps(content))
+    assert older.supports == ()
+    assert older.base == ()
+
+
+def test_export_has_the_joints_that_have_rates(braced: Record, tmp_path: Path) -> None:
+    joints, _, position, velocity = joint_motion(braced)
+    assert tuple(joints) == braced.labels["v"]
+    np.testing.assert_array_equal(velocity, braced["v"])
+    for joint, column in zip(joints, position.T, strict=True):
+        np.testing.assert_array_equal(column, braced["q"][:, braced.labels["q"].index(joint)])
+    rows = export_record(braced, tmp_path / "a.csv", "csv").read_text().splitlines()
+    assert rows[0].split(",")[:2] == ["time [s]", "base.left [rad]"]
+    assert all(len(row.split(",")) == 1 + 2 * len(joints) for row in rows)
