@@ -93,7 +93,7 @@ def tracking(record: Record) -> Figure | None:
     figure = style.new_figure(6.6, style.title(record, "base, reference and actual"))
     heading = np.degrees(np.stack([target[:, 2], pose[:, 2]], axis=1))
     # To a nanometre: beyond it a base that stands shows its rounding.
-    away, turned = np.round(MILLI * error[:, :2], 6), np.round(np.degrees(error[:, 2:]), 6)
+    away, turned = np.round(MILLI * error[:, :2], 6), np.round(180.0 / np.pi * error[:, 2:], 6)
     parts = [np.hstack([target[:, :2], pose[:, :2]]), heading, away, turned]
     rows = style.time_rows(figure, [[(record.time, one)] for one in parts], style.settle_time(record))
     for panels, values, least in zip(rows, parts, (LEAST_POSITION, LEAST_HEADING, 0.0, 0.0), strict=True):
