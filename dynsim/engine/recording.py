@@ -42,7 +42,9 @@ def make_record(
     angle, rate, acceleration, _ = _joint_units(robot.links)
     with_motor = set(driven)
     *_, force = _joint_units([link for link in robot.links if link.joint in with_motor] or robot.links)
-    record.add("q", run.states("q"), angle, labels=robot.position_names, description="joint positions")
+    # One unit for all: that of the columns that servos replay and figures draw.
+    positions = "joint positions" if robot.base is None else "joint positions; base.x and base.y [m]"
+    record.add("q", run.states("q"), angle, labels=robot.position_names, description=positions)
     record.add("v", run.states("v"), rate, labels=joints, description="joint rates")
     record.add("vdot", run.outputs("vdot"), acceleration, labels=joints, description="joint accelerations")
     if robot.base is not None:

@@ -26,6 +26,7 @@ class Model:
 
     ``M(q) v̇ + h(q, v) + g(q) = tau``: ``mass_matrix`` is M, ``bias_forces`` h + g. Rotor inertia, gear and joint losses
     and contacts are not part of these (they belong to motors and scenario); ``armature`` and ``damping`` give them.
+    The wheels of a mobile base are part but for their spin, which is in ``armature`` as that of a rotor is.
     The masses of motors are: they sit on the links (:meth:`Robot.with_motors_mounted`).
 
     Parameters
@@ -99,7 +100,7 @@ class Model:
 
     @property
     def armature(self) -> Array:
-        """Reflected rotor inertia of each joint, J_m [kg m²], (n,)."""
+        """What only turns with each joint: reflected rotor inertia J_m, spin of a wheel [kg m²], (n,)."""
         return self.arrays.body[:, ka.ARMATURE].copy()
 
     @property
