@@ -19,7 +19,7 @@ LOADS, MARGIN, TRACTION = "wheel_load", "tip_margin", "traction_demand"
 # Without load the demand has no bound, and the margin none where the ground carries almost nothing: axes end here.
 TRACTION_TOP, MARGIN_LOW = 2.5, -2.0
 # Of left wheel, right wheel and caster; the left is wider, to be seen below the right where they carry the same.
-LOOKS = ((style.BLUE, 2.4), (style.GREEN, 1.0), (style.ORANGE, 1.2))
+LOOKS = ((style.BLUE, 2.0), (style.GREEN, 1.0), (style.ORANGE, 1.2))
 # Tracking: axes of positions and headings show at least this [m, °], so that rest is not drawn as motion.
 LEAST_POSITION, LEAST_HEADING = 1e-3, 0.1
 MILLI = 1e3
@@ -52,7 +52,7 @@ def overturning(record: Record) -> Figure | None:
         style.legend_above(panels[-1], columns=4)
     note = []
     if np.nanmax(traction, initial=0.0) > TRACTION_TOP:
-        note.append(f"demand cut off at {TRACTION_TOP:g}: hardly any load")
+        note.append(f"traction demand cut off at {TRACTION_TOP:g}: hardly any load")
     if missing := float(np.isnan(traction).any(axis=1).mean()):
         note.append(f"none where a wheel carries no load: {100.0 * missing:.2g} % of the samples")
     last = rows[2][-1]
@@ -93,7 +93,7 @@ def tracking(record: Record) -> Figure | None:
     figure = style.new_figure(6.6, style.title(record, "base, reference and actual"))
     heading = np.degrees(np.stack([target[:, 2], pose[:, 2]], axis=1))
     # To a nanometre: beyond it a base that stands shows its rounding.
-    away, turned = np.round(MILLI * error[:, :2], 6), np.round(error[:, 2:] * (180.0 / np.pi), 6)
+    away, turned = np.round(MILLI * error[:, :2], 6), np.round(180.0 / np.pi * error[:, 2:], 6)
     parts = [np.hstack([target[:, :2], pose[:, :2]]), heading, away, turned]
     rows = style.time_rows(figure, [[(record.time, one)] for one in parts], style.settle_time(record))
     for panels, values, least in zip(rows, parts, (LEAST_POSITION, LEAST_HEADING, 0.0, 0.0), strict=True):

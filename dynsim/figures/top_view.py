@@ -197,7 +197,9 @@ def _draw_pressure(axes: Axes, body: Skeleton, path: Array) -> None:
     pieces = np.stack([points[:-1], points[1:]], axis=1)
     for those, colour, label in ((~outside, INSIDE, "centre of pressure"), (outside, OUTSIDE, "outside the triangle")):
         if those.any():
-            axes.add_collection(LineCollection(list(pieces[those]), colors=colour, linewidths=1.1, zorder=9))
+            axes.add_collection(
+                LineCollection(list(pieces[those]), colors=colour, linewidths=1.1, capstyle="round", zorder=9)
+            )
             axes.plot([], [], color=colour, lw=1.1, label=label)
     known = np.flatnonzero(np.isfinite(path).all(axis=1))
     for place, face in ((known[:1], "white"), (known[-1:], style.BLACK)):

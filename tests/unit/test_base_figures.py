@@ -167,7 +167,7 @@ def test_reference_of_an_arc_is_the_arc(turning: Record) -> None:
     x, y, start = 0.4 * np.sin(turn), 0.4 * (1.0 - np.cos(turn)), math.radians(45.0)
     place = [x * np.cos(start) - y * np.sin(start), x * np.sin(start) + y * np.cos(start), start + turn]
     # The reference is a spline with knots at 20 ms, of which the jerk jumps twice.
-    np.testing.assert_allclose(turning["base_target"], np.stack(place, axis=1), atol=3e-4)
+    np.testing.assert_allclose(turning["base_target"], np.stack(place, axis=1), atol=1e-4)
     knot = np.isclose(turning.time % 0.02, 0.0, atol=1e-9) | np.isclose(turning.time % 0.02, 0.02, atol=1e-9)
     assert knot.sum() > 3
     np.testing.assert_allclose(turning["base_target"][knot, 2], place[2][knot], atol=1e-12)
