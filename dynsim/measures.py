@@ -50,13 +50,20 @@ def hand_error(record: Record, settle: float) -> dict[str, float | None]:
     return dict(zip(names, map(float, values), strict=True))
 
 
-def base_summary(record: Record, settle: float, overturn: str) -> dict[str, Any]:
-    """How a mobile base has driven and stood, from the samples; None where there is nothing to say.
+def least_loads(record: Record, steps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Least loads of wheels and caster, (3,) [N], over the samples and over all steps (``steps``, empty: unknown)."""
+    found = record["wheel_load"].min(axis=0, initial=np.inf)
+    return np.minimum(found, steps[:3]) if len(steps) else found
+
+
+def base_summary(record: Record, settle: float, overturn: str, steps: NDArray[np.float64]) -> dict[str, Any]:
+    """How a mobile base has driven and stood; None where there is nothing to say.
 
     Parameters
     ----------
     settle : time from which ``tip_margin_min_settled`` counts [s]
     overturn : kind of the events of tipping, which are found between samples: the margin is zero there
+    steps : (4,) least loads and least margin over all steps, which are closer together than the samples; or empty
     """
     pose, load, margin = record["base_pose"], record["wheel_load"], record["tip_margin"]
     tips = [event.time for event in record.events if event.kind == overturn]
@@ -66,6 +73,8 @@ def base_summary(record: Record, settle: float, overturn: str) -> dict[str, Any]
 
     def least(values: NDArray[np.float64], since: float) -> float | None:
         found = [*values[record.time >= since].tolist(), *(0.0 for time in tips if time >= since)]
+        if np.isfinite(steps).all() and len(steps) and since == -np.inf:
+            found.append(float(steps[-1]))
         return min(found, default=None)
 
     def named(loads: NDArray[np.float64] | None) -> dict[str, float] | None:
@@ -74,7 +83,7 @@ def base_summary(record: Record, settle: float, overturn: str) -> dict[str, Any]
     return {
         "pose_final": pose[-1].tolist() if len(pose) else None,
         "path_length_m": float((chord / np.sinc(turn / (2.0 * np.pi))).sum()),
-        "wheel_load_min_N": named(load.min(axis=0) if len(load) else None),
+        "wheel_load_min_N": named(least_loads(record, steps) if len(load) else None),
         "wheel_load_final_N": named(load[-1] if len(load) else None),
         "tip_margin_min": least(margin, -np.inf),
         "tip_margin_min_settled": least(margin, settle),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dynsim._version import __version__
 from dynsim.kernels.integrate.run import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, LOCAL_SINCE, PULLING
-from dynsim.measures import RESIDUAL_LIMIT, SINKS, STORES, base_summary, energy_turnover, hand_error
+from dynsim.measures import RESIDUAL_LIMIT, SINKS, STORES, base_summary, energy_turnover, hand_error, least_loads
 from dynsim.model.clearance import Sinking, sinking
 from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Drive, Servo, TorqueSource
@@ -72,6 +72,7 @@ class Counts:
     extremes : (c, 6) over all steps, see dynsim.kernels.integrate: FORCE_MIN, FORCE_MAX, DRIFT_MAX, PULLING,
         LAST_FORCE, LOCAL_SINCE
     spread : motion that dependent rows leave open; None: none
+    support : (4,) least loads of wheels and caster and least tip margin of a mobile base over all steps, else empty
     """
 
     wall: float
@@ -82,6 +83,7 @@ class Counts:
     deficient: int
     extremes: NDArray[np.float64]
     spread: MotionSpread | None = None
+    support: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
 
 def energy_residual(record: Record) -> NDArray[np.float64]:
@@ -150,7 +152,7 @@ def summarise(
         "energy_turnover_J": turnover,
         "energy_residual_relative": residual / denominator if denominator > 0.0 else 0.0,
         "constraint_drift_max_m": float(counts.extremes[:, DRIFT_MAX].max(initial=0.0)),
-        **({"base": base_summary(record, scenario.metrics.settle_s, TIP_OVER)} if robot.base else {}),
+        **({"base": base_summary(record, scenario.metrics.settle_s, TIP_OVER, counts.support)} if robot.base else {}),
         "contacts": [_contact(record, k, contact, counts, duration) for k, contact in enumerate(contacts)],
         "sinking": [
             {"body": s.body, "surface": s.surface, "depth_m": s.depth, "since_s": float(record.time[s.sample])}
@@ -226,7 +228,7 @@ def _warnings(
                 )
     found.extend(_passed_limits(record, robot))
     if robot.base is not None:
-        found.extend(_tipped(record, robot.base))
+        found.extend(_tipped(record, robot.base, counts.support))
     if summary["energy_residual_relative"] > RESIDUAL_LIMIT:
         found.append(
             f"the energy ledger does not close: residual {summary['energy_residual_relative']:.1e} of the turnover; "
@@ -248,16 +250,15 @@ def _warnings(
     return found
 
 
-def _tipped(record: Record, base: MobileBase) -> list[str]:
+def _tipped(record: Record, base: MobileBase, support: NDArray[np.float64]) -> list[str]:
     """What a mobile base does that a real one could not do."""
     found = []
     load, traction = record["wheel_load"], record["traction_demand"]
+    lowest = least_loads(record, support)
     first = min((event.time for event in record.events if event.kind == TIP_OVER), default=np.inf)
     if np.isfinite(first) and not base.stop_on_overturn:
         pulled = ", ".join(
-            f"{name} {low:.3g}"
-            for name, low in zip(record.labels["wheel_load"], load.min(axis=0, initial=np.inf), strict=True)
-            if low < 0.0
+            f"{name} {low:.3g}" for name, low in zip(record.labels["wheel_load"], lowest, strict=True) if low < 0.0
         )
         found.append(
             f"the base tips over at t = {first:.4f} s, with a tip margin below zero in "

@@ -94,6 +94,7 @@ def make_record(
         deficient=deficient,
         extremes=run.extremes,
         spread=spread,
+        support=run.support.least,
     )
     record.summary = metrics.summarise(record, scenario, contacts, robot, counts)
     return record

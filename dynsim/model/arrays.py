@@ -226,8 +226,9 @@ def compile_support(robot: Robot) -> ks.SupportArrays:
     ModelError
         Its body or wheels are none of the robot's, or it has no triangle to stand on.
     """
-    base, sizes = robot.base, (ks.INDEX_SIZE, ks.BASE_SIZE, ks.STATE_SIZE) if robot.base else (0, 0, 0)
-    arrays = ks.SupportArrays(*(of(np.zeros(size)) for of, size in zip((integers, reals, reals), sizes, strict=True)))
+    base = robot.base
+    index, *sizes = (ks.INDEX_SIZE, ks.BASE_SIZE, ks.STATE_SIZE, ks.LEAST_SIZE) if base else (0, 0, 0, 0)
+    arrays = ks.SupportArrays(integers(np.zeros(index)), *(reals(np.full(size, np.inf)) for size in sizes))
     if base is None:
         return arrays
     bodies, joints = [link.name for link in robot.links], robot.joint_names

@@ -56,6 +56,7 @@ from dynsim.kernels.integrate.watch import forces_unique, watch
 from dynsim.kernels.jit import internal_kernel, kernel, merged_kernel
 from dynsim.kernels.system import System
 from dynsim.kernels.tree.joints import normalise
+from dynsim.kernels.tree.support import watch_support
 
 
 @internal_kernel
@@ -82,6 +83,9 @@ def accept(system: System, ws: Workspace, run: Run):
     if not (clearly_unique(ws) or forces_unique(system, ws, run, t + h)):
         return
     watch(ws, run, h)
+    # The event of tipping has asked for the ground's reaction at the end of this step.
+    if run.support.index.shape[0] > 0 and run.event.shape[0] > 0:
+        watch_support(run.support)
     if system.layout.extra > 0:
         normalise(system.model, run.y_new, system.layout.q)
     sample_step(system, ws, run)

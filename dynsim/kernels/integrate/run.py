@@ -156,7 +156,7 @@ def new_run(
         log_time=np.zeros(LOG_LENGTH),
         log_event=np.zeros(LOG_LENGTH, dtype=np.int64),
         hand=np.zeros(3),
-        support=support or SupportArrays(integers([]), reals([]), reals([])),
+        support=support or SupportArrays(integers([]), reals([]), reals([]), reals([])),
         columns=columns,
         output=np.zeros((len(sample_time), columns.size)),
     )

@@ -32,7 +32,7 @@ from dynsim.kernels.arrays import (
     V,
     Workspace,
 )
-from dynsim.kernels.jit import apart_kernel
+from dynsim.kernels.jit import apart_kernel, internal_kernel
 from dynsim.kernels.tree.loads import LoadArrays, load_wrench
 from dynsim.kernels.tree.sweep import body_inertia, inertial_wrench
 
@@ -53,6 +53,9 @@ OUTPUTS = 8
 # and what it follows from: the forces of the wheels along x, the sum of those along y [N]
 LONGITUDINAL, LATERAL = 8, 10
 STATE_SIZE = 11
+# SupportArrays.least: loads as in state, then the margin
+LEAST_MARGIN = 3
+LEAST_SIZE = 4
 
 
 class SupportArrays(NamedTuple):
@@ -61,6 +64,7 @@ class SupportArrays(NamedTuple):
     index: np.ndarray  # (INDEX_SIZE,) int
     base: np.ndarray  # (BASE_SIZE,)
     state: np.ndarray  # (STATE_SIZE,) written by ground_reaction
+    least: np.ndarray  # (LEAST_SIZE,) of the loads and of the margin at accepted steps, see watch_support
 
 
 @apart_kernel
@@ -154,3 +158,12 @@ def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, sup
             lateral = fy * load / carried
             force = math.sqrt(state[LONGITUDINAL + k] ** 2 + lateral * lateral)
             state[TRACTION + k] = force / (base[FRICTION] * load)
+
+
+@internal_kernel
+def watch_support(support: SupportArrays):
+    """Least loads and margin so far, after :func:`ground_reaction` at the end of an accepted step."""
+    state, least = support.state, support.least
+    for k in range(3):
+        least[k] = min(least[k], state[LOADS + k])
+    least[LEAST_MARGIN] = min(least[LEAST_MARGIN], state[MARGIN])
