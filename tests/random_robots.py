@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,10 +20,17 @@ from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robo
 from dynsim.model.drives import Motor
 from dynsim.model.joints.ball import ball, floating
 from dynsim.model.joints.planar import planar, rolling
+from dynsim.model.joints.wheels import wheeled
 from dynsim.model.model import Model
 
 SURFACES = ("plane", "sphere", "cylinder")
-SEVERAL_ROWS = {"ball": ball, "floating": floating, "planar": planar, "rolling": rolling}
+SEVERAL_ROWS = {
+    "ball": ball,
+    "floating": floating,
+    "planar": planar,
+    "rolling": rolling,
+    "wheeled": partial(wheeled, radius=0.07, track=0.4),
+}
 
 
 def random_unit(rng: np.random.Generator) -> np.ndarray:

@@ -245,7 +245,8 @@ class RealWheels:
         out = np.zeros(self.model.nq)
         for joint in self.model.joints[1:]:
             angle = q[joint.idx_v]
-            out[joint.idx_q : joint.idx_q + joint.nq] = angle if joint.nq == 1 else (np.cos(angle), np.sin(angle))
+            first, count = joint.idx_q, joint.nq
+            out[np.arange(count) + first] = angle if count == 1 else (np.cos(angle), np.sin(angle))
         return out
 
     # ---- mechanics
@@ -271,12 +272,32 @@ class RealWheels:
         """What v̇ = 0 needs, losses included."""
         return np.asarray(pin.nonLinearEffects(self.model, self.data, self._coordinates(q), v)) + self.loss * v
 
-    def accelerations(self, q: Array, v: Array, tau: Array) -> tuple[Array, Array, Array]:
-        """v̇, (nv,), the three multipliers, and the matrix of the system."""
+    def accelerations(
+        self, q: Array, v: Array, tau: Array, J: Array | None = None, target: Array | None = None
+    ) -> tuple[Array, Array, Array]:
+        """v̇, (nv,), the three multipliers, then those of rows J v̇ = target, and the matrix of the system."""
         A, drift = self.rows(q, v)
-        K = np.block([[self.mass_matrix(q), -A.T], [A, np.zeros((3, 3))]])
+        if J is not None and target is not None:
+            A, drift = np.vstack([A, J]), np.concatenate([drift, target])
+        K = np.block([[self.mass_matrix(q), -A.T], [A, np.zeros((len(A), len(A)))]])
         x = np.linalg.solve(K, np.concatenate([tau - self.bias_forces(q, v), drift]))
-        return x[:-3], x[-3:], K
+        return x[: self.model.nv], x[self.model.nv :], K
+
+    def point(self, body: str, point: Array, q: Array, v: Array) -> tuple[Array, Array, Array]:
+        """Jacobian (3, nv), velocity and drift acceleration of a point on the base or on the link of a joint."""
+        joint, coordinates = self.model.getJointId(body), self._coordinates(q)
+        pin.forwardKinematics(self.model, self.data, coordinates, v, np.zeros(self.model.nv))
+        pin.computeJointJacobians(self.model, self.data, coordinates)
+        arm = self.data.oMi[joint].rotation @ point
+        J = pin.getJointJacobian(self.model, self.data, joint, pin.LOCAL_WORLD_ALIGNED)
+        rate = pin.getVelocity(self.model, self.data, joint, pin.LOCAL_WORLD_ALIGNED)
+        drift = pin.getClassicalAcceleration(self.model, self.data, joint, pin.LOCAL_WORLD_ALIGNED)
+        w = rate.angular
+        return (
+            J[:3] - pin.skew(arm) @ J[3:],
+            rate.linear + np.cross(w, arm),
+            drift.linear + np.cross(drift.angular, arm) + np.cross(w, np.cross(w, arm)),
+        )
 
     def forces(self, q: Array, v: Array, vdot: Array) -> Array:
         """Forces of the motors at :attr:`joints` that these accelerations of them need, losses paid, multipliers free.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from random_robots import Bench, bench
+from random_robots import Bench, bench, random_contacts
 from real_wheels import WHEELS, RealWheels, random_base, random_serial, random_urdf
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline, make_interp_spline
@@ -75,6 +76,36 @@ def test_accelerations(arm, folder, seed):
     np.testing.assert_allclose(found[0], found[1], rtol=0, atol=1e-10 * (1.0 + np.abs(expected).max()))
 
 
+@pytest.mark.parametrize("m_star", [False, True], ids=["articulated", "m_star"])
+@arms
+@given(seed=seeds)
+def test_braced_on_surfaces(arm, m_star, folder, seed):
+    """One or two points of base or arm held to curved surfaces, so that what braces the arm reacts on the wheels."""
+    robot, oracle, q, v, current = case(seed, arm, folder)
+    rng = np.random.default_rng(seed + 2)
+    contacts = [replace(one, friction=0.0) for one in random_contacts(rng, robot, q, int(rng.integers(1, 3)))]
+    full, rates = oracle.configuration(q), oracle.rates(q, v)
+    T = np.column_stack([oracle.rates(q, one) for one in np.eye(len(v))])
+    J, target = np.zeros((len(contacts), oracle.model.nv)), np.zeros(len(contacts))
+    model, joints = Model(robot), {link.name: link.joint for link in robot.links} | {"base": "heading"}
+    for k, one in enumerate(contacts):
+        place = model.point_position(one.body, one.point, q)
+        Jp, velocity, drift = oracle.point(joints[one.body], one.point, full, rates)
+        gradient = one.surface.Q @ place + one.surface.b
+        slope = np.linalg.norm(gradient)
+        J[k] = gradient / slope @ Jp
+        target[k] = -(gradient @ drift + velocity @ one.surface.Q @ velocity) / slope
+    # Rows that depend on each other, or feel no joint, have no single solution.
+    if np.linalg.svd(J @ T)[1].min() < 1e-3:
+        return
+    expected, multipliers, K = oracle.accelerations(full, rates, torques(robot, oracle, current), J, target)
+    b = bench(robot, contacts, m_star=m_star)
+    found = b.part(b.derivative(b.state(q, v, current)), "v")
+    scale = 1e-14 * np.linalg.cond(K) * (1.0 + max(np.abs(expected).max(), np.abs(multipliers).max()))
+    np.testing.assert_allclose(found, expected[oracle.index], rtol=0, atol=scale)
+    np.testing.assert_allclose(b.ws.contacts[:, ka.FORCE], multipliers[3:], rtol=0, atol=scale)
+
+
 @arms
 @given(seed=seeds)
 def test_torques_of_the_motors(arm, folder, seed):
@@ -108,24 +139,20 @@ def test_mass_matrix_and_energy(arm, folder, seed):
 @given(seed=seeds)
 def test_points_and_their_rates(arm, folder, seed):
     """Places of points on every body, their Jacobians against those of the oracle and against differences of places."""
-    import pinocchio as pin
-
     robot, oracle, q, v, _ = case(seed, arm, folder)
     model, full = Model(robot), oracle.configuration(q)
     point, h = np.random.default_rng(seed).normal(size=3), 1e-5
     T = np.column_stack([oracle.rates(q, one) for one in np.eye(model.n)])
     b = bench(robot)
     qdot = b.part(b.derivative(b.state(q, v)), "q")
-    joints = {"base": oracle.body}
-    joints |= {link.name: oracle.model.getJointId(link.joint) for link in robot.links[2:]}
+    joints = {"base": "heading"} | {link.name: link.joint for link in robot.links[2:]}
     for name, joint in joints.items():
-        pin.computeJointJacobians(oracle.model, oracle.data, oracle._coordinates(full))
-        place = oracle.data.oMi[joint]
-        J6 = pin.getJointJacobian(oracle.model, oracle.data, joint, pin.LOCAL_WORLD_ALIGNED)
-        J = (J6[:3] - pin.skew(place.rotation @ point) @ J6[3:]) @ T
+        J, velocity, _ = oracle.point(joint, point, full, oracle.rates(q, v))
+        place = oracle.data.oMi[oracle.model.getJointId(joint)]
         position, ours = model.point_position_and_jacobian(name, point, q)
         np.testing.assert_allclose(position, place.act(point), rtol=0, atol=1e-12)
-        np.testing.assert_allclose(ours, J, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(ours, J @ T, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(ours @ v, velocity, rtol=0, atol=1e-11)
         ends = [model.point_position(name, point, q + sign * h * qdot) for sign in (1.0, -1.0)]
         np.testing.assert_allclose((ends[0] - ends[1]) / (2.0 * h), ours @ v, rtol=0, atol=1e-6)
 

@@ -10,7 +10,7 @@ from random_robots import bench, random_inertia, random_robot, random_unit
 
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.jit import kernel
-from dynsim.kernels.tree.sweep import sine_cosine
+from dynsim.kernels.tree.angles import sine_cosine
 from dynsim.model.description import Inertia, Link, Robot
 from dynsim.model.drives import Motor
 from dynsim.model.model import Model

@@ -157,7 +157,11 @@ def free(seed: int = 0) -> Case:
 
 def every_joint() -> Case:
     rng = np.random.default_rng(1)
-    return of(rng, bench(random_robot_of(rng, ["ball", "rolling", "planar", "floating", "prismatic", "revolute"])), 1.0)
+    return of(
+        rng,
+        bench(random_robot_of(rng, ["ball", "rolling", "planar", "floating", "wheeled", "prismatic", "revolute"])),
+        1.0,
+    )
 
 
 def held(modes: list[int]) -> Case:

@@ -55,6 +55,7 @@ from dynsim.kernels.arrays import (
     Workspace,
 )
 from dynsim.kernels.jit import apart_kernel, inlined_kernel, internal_kernel, kernel
+from dynsim.kernels.tree.angles import sine_cosine_of
 
 
 @inlined_kernel
@@ -102,7 +103,7 @@ def row_motion(model: ModelArrays, ws: Workspace, i, b0, b1, b2, b3, b4, b5, b6,
     elif kind == LEFT_WHEEL:
         turn, ahead = model.body[i, PARAMETER], model.body[i + 1, PARAMETER]
         x, y, heading = joints[i, EXTRA], joints[i + 1, EXTRA], turn * (joints[i + 1, Q] - joints[i, Q])
-        s, c = math.sin(heading), math.cos(heading)
+        s, c = sine_cosine_of(heading)
         px, py, pz = px + b0 * x + b1 * y, py + b3 * x + b4 * y, pz + b6 * x + b7 * y
         b0, b1 = c * b0 + s * b1, c * b1 - s * b0
         b3, b4 = c * b3 + s * b4, c * b4 - s * b3
@@ -203,7 +204,8 @@ def position_rates(model: ModelArrays, ws: Workspace, dy, start):
             heading = model.body[i, PARAMETER] * (joints[i + 1, Q] - joints[i, Q])
             speed = model.body[i + 1, PARAMETER] * (joints[i, QD] + joints[i + 1, QD])
             dy[k], dy[k + 1] = joints[i, QD], joints[i + 1, QD]
-            dy[k + 2], dy[k + 3] = speed * math.cos(heading), speed * math.sin(heading)
+            s, c = sine_cosine_of(heading)
+            dy[k + 2], dy[k + 3] = speed * c, speed * s
         elif kind != BALL_Y and kind != BALL_Z and kind != RIGHT_WHEEL:
             dy[k] = joints[i, QD]
 
@@ -231,8 +233,9 @@ def displace(model: ModelArrays, ws: Workspace, y, start):
             shift = model.body[i + 1, PARAMETER] * (left + right)
             y[k] += left
             y[k + 1] += right
-            y[k + 2] += shift * math.cos(heading)
-            y[k + 3] += shift * math.sin(heading)
+            s, c = sine_cosine_of(heading)
+            y[k + 2] += shift * c
+            y[k + 3] += shift * s
         elif kind != BALL_Y and kind != BALL_Z and kind != RIGHT_WHEEL:
             y[k] += joints[i, QDD]
 
