@@ -24,6 +24,9 @@ from dynsim.record.scene import Point
 
 Rows = NDArray[np.intp]
 
+# Height of the row with the base in its own frame, where it stands below the world [inch].
+BELOW = 2.9
+
 # So many support triangles at most, evenly over the way, at least this share of their size apart.
 TRIANGLES, APART = 6, 0.25
 ELBOW_COLOURS = (style.ORANGE, style.GREEN, "#8C6D31")
@@ -42,10 +45,12 @@ def top_view(record: Record) -> Figure | None:
     low, high = _extent(body, rows)
     size = high - low
     wide = size[0] > 1.8 * size[1]
-    height = 6.3 if wide else 0.9 + float(np.clip(3.9 * size[1] / size[0], 3.3, 6.0))
+    # In a row of its own the world is as high as its width makes it, with 0.6 inch for its labels.
+    above = 0.6 + 6.3 * float(size[1] / size[0])
+    height = 0.3 + above + BELOW if wide else 0.9 + float(np.clip(3.9 * size[1] / size[0], 3.3, 6.0))
     figure = style.new_figure(height, style.title(record, "base from above"))
     if wide:
-        grid = figure.add_gridspec(2, 2, height_ratios=[1.2, 1.0], width_ratios=[1.0, 1.25])
+        grid = figure.add_gridspec(2, 2, height_ratios=[above, BELOW], width_ratios=[1.0, 1.25])
         world, own = figure.add_subplot(grid[0, :]), figure.add_subplot(grid[1, 0])
     else:
         world, own = figure.subplots(1, 2, width_ratios=[1.25, 1.0])

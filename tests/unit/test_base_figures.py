@@ -83,9 +83,17 @@ def test_a_run_that_ended_early_is_drawn(tipped: Record, samples: int, tmp_path:
     for name, signal in tipped.signals.items():
         record.add(name, signal.data[:samples].copy(), signal.unit, labels=signal.labels)
     record.scene, record.complete = tipped.scene, False
-    for signal in list(record.signals.values())[: 4 if samples == 2 else 0]:
-        signal.data[-1:] = np.nan
     assert bool(figures.draw(record, tmp_path)) == bool(samples)
+
+
+def test_values_that_are_not_finite_are_drawn_around(tipped: Record, tmp_path: Path) -> None:
+    record = Record(tipped.time, provenance=tipped.provenance)
+    for name, signal in tipped.signals.items():
+        data = signal.data.copy()
+        data[-3:] = np.nan
+        record.add(name, data, signal.unit, labels=signal.labels)
+    record.scene = tipped.scene
+    assert {"base", "overturning", "base_tracking", "posture"} <= {path.stem for path in figures.draw(record, tmp_path)}
 
 
 def test_supports_of_the_record_are_where_the_pose_has_them(turning: Record) -> None:
