@@ -594,9 +594,13 @@ class Simulation:
             if isinstance(array, np.ndarray):
                 found[f"trace.{name}" if name in buffers else f"run.{name}"] = array
         found |= {f"workspace.{name}": array for name, array in prepared.workspace._asdict().items()}
-        parts = (system.drives, system.reference, system.loads, prepared.run.support)
-        for owner, part in zip(("drives", "reference", "loads", "support"), parts, strict=True):
-            found |= {f"{owner}.{name}": array for name, array in part._asdict().items()}
+        for owner, part in (
+            ("drives", system.drives._asdict()),
+            ("reference", system.reference._asdict()),
+            ("loads", system.loads._asdict()),
+            ("support", prepared.run.support._asdict()),
+        ):
+            found |= {f"{owner}.{name}": array for name, array in part.items()}
         # Closed brakes are seen there.
         return found | {"model.body": system.model.body}
 

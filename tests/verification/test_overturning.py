@@ -298,7 +298,8 @@ def test_a_robot_at_rest_stands_by_its_levers(tmp_path):
     np.testing.assert_allclose(record["wheel_load"][-1], [left, rest - left, caster], rtol=1e-7)
     base = record.summary["base"]
     assert list(base["wheel_load_final_N"].values()) == record["wheel_load"][-1].tolist()
-    assert base["tip_margin_min"] == record["tip_margin"].min()
+    # Of all steps, which do not end at samples.
+    assert 0.0 <= record["tip_margin"].min() - base["tip_margin_min"] < 2e-3
     assert base["overturns_at_s"] is None
     assert base["pose_final"] == record["base_pose"][-1].tolist()
 
@@ -357,8 +358,9 @@ def test_it_tips_when_an_independent_margin_is_zero_and_goes_on_as_if_held(tmp_p
     expected = np.array([expected_at(scenario, record, k)["margin"] for k in range(len(record))])
     assert tips[0].time == pytest.approx(crossing(record.time, expected), abs=1e-6)
     assert record.complete
-    assert base["tip_margin_min"] == record["tip_margin"].min() < 0.0
-    assert base["wheel_load_min_N"]["right"] == record["wheel_load"][:, 1].min()
+    assert record["tip_margin"].min() < 0.0
+    assert 0.0 <= record["tip_margin"].min() - base["tip_margin_min"] < 1e-3
+    assert 0.0 <= record["wheel_load"][:, 1].min() - base["wheel_load_min_N"]["right"] < 0.01
     assert any("held down" in warning for warning in record.summary["warnings"])
     assert base["traction_demand_max"] == np.nanmax(record["traction_demand"])
 
@@ -371,7 +373,7 @@ def test_a_run_that_is_to_stop_where_it_tips_ends_there_with_all_that_it_has(tmp
     assert stop.value.exit_code == 3
     record = stop.value.record
     assert stop.value.time == goes_on.summary["base"]["overturns_at_s"] == record.summary["base"]["overturns_at_s"]
-    assert record.summary["base"]["tip_margin_min"] == 0.0
+    assert record.summary["base"]["tip_margin_min"] == pytest.approx(0.0, abs=1e-12)
     assert [event.kind for event in record.events] == ["tip_over"]
     count = len(record)
     assert record.time[-1] <= stop.value.time < goes_on.time[count]
