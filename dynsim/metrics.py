@@ -228,7 +228,7 @@ def _warnings(
                 )
     found.extend(_passed_limits(record, robot))
     if robot.base is not None:
-        found.extend(_tipped(record, robot.base, counts.support))
+        found.extend(_tipped(record, robot.base, counts.support, scenario.metrics.settle_s))
     if summary["energy_residual_relative"] > RESIDUAL_LIMIT:
         found.append(
             f"the energy ledger does not close: residual {summary['energy_residual_relative']:.1e} of the turnover; "
@@ -250,11 +250,13 @@ def _warnings(
     return found
 
 
-def _tipped(record: Record, base: MobileBase, support: NDArray[np.float64]) -> list[str]:
+def _tipped(record: Record, base: MobileBase, support: NDArray[np.float64], settle: float) -> list[str]:
     """What a mobile base does that a real one could not do."""
     found = []
     load, traction = record["wheel_load"], record["traction_demand"]
     lowest = least_loads(record, support)
+    late = record["tip_margin"][record.time >= settle]
+    since = f", none from {settle:g} s on (margin at least {late.min():.3g})" if late.size and late.min() > 0.0 else ""
     first = min((event.time for event in record.events if event.kind == TIP_OVER), default=np.inf)
     if np.isfinite(first) and not base.stop_on_overturn:
         pulled = ", ".join(
@@ -262,7 +264,8 @@ def _tipped(record: Record, base: MobileBase, support: NDArray[np.float64]) -> l
         )
         found.append(
             f"the base tips over at t = {first:.4f} s, with a tip margin below zero in "
-            f"{100 * (record['tip_margin'] < 0.0).mean():.1f} % of the samples; the run goes on as if it were held down"
+            f"{100 * (record['tip_margin'] < 0.0).mean():.1f} % of the samples{since}; the run goes on as if it were "
+            "held down"
             f"{f' (least loads [N]: {pulled})' if pulled else ''}: plant.base.on_overturn: stop ends it there"
         )
     lifted = load.sum(axis=1) <= 0.0

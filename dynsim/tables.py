@@ -31,6 +31,20 @@ def _deepest(summary: Summary) -> str | None:
     return None if sunk is None else f"[bold red]{_number(sunk['depth_m'], 1e3, 3)}[/]"
 
 
+def _base(key: str) -> Callable[[Summary], Any]:
+    """A number of the mobile base; None where there is none."""
+    return lambda summary: summary.get("base", {}).get(key)
+
+
+def _margin(value: float) -> str:
+    return f"[bold red]{value:.3g}[/]" if value < 0.0 else f"{value:.3g}"
+
+
+def _least_load(summary: Summary) -> float | None:
+    loads = _base("wheel_load_min_N")(summary)
+    return None if loads is None else min(loads.values())
+
+
 # Heading, and how to take it from a summary. A row is left out when no run has it.
 _ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = (
     ("electrical energy [J]", lambda s: s.get("electrical_energy_J"), _number),
@@ -55,6 +69,10 @@ _ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = 
     ("cost, final", lambda s: s.get("cost_final"), _number),
     ("mode switches", lambda s: s.get("mode_switches"), lambda v: str(v)),
     ("deepest below a surface [mm]", _deepest, str),
+    ("tip margin, settled", _base("tip_margin_min_settled"), _margin),
+    ("  whole run", _base("tip_margin_min"), _margin),
+    ("  tips over at [s]", _base("overturns_at_s"), lambda v: _number(v, digits=3)),
+    ("least load, wheels, caster [N]", _least_load, lambda v: _number(v, digits=3)),
     ("ledger residual, relative", lambda s: s.get("energy_residual_relative"), lambda v: f"{v:.1e}"),
     ("constraint drift [m]", lambda s: s.get("constraint_drift_max_m"), lambda v: f"{v:.1e}"),
     ("integration [s]", lambda s: s.get("integration_wall_s"), lambda v: f"{v:.3f}"),

@@ -53,9 +53,10 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
             "lower contacts.friction, or take contacts.pulling_friction: signed"
         )
     if status == ki.STEP_TOO_SMALL:
-        return (
-            f"{where}: the step size fell to {run.clock[ki.STEP]:.1e} s; try integrator.method rodas4 or a larger rtol"
-        )
+        stiff = "try integrator.method rodas4 or a larger rtol" if run.layout.extra == 0 else "try a larger rtol"
+        if prepared.control.sample_time is not None:
+            stiff += "; or a shorter controller.sample_time_s, or smaller gains: commands that are held for long sway"
+        return f"{where}: the step size fell to {run.clock[ki.STEP]:.1e} s; {stiff}"
     if status == ki.STOPPED:
         return (
             f"{where}: the base tips over (tip margin zero), and plant.base.on_overturn is stop; brace it, move its "

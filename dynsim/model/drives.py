@@ -21,7 +21,7 @@ class Motor:
     resistance : R [Ω]; inductance : L [H]; rotor_inertia : I_m [kg m²]
     gear_ratio : k; gear_damping : d_m on the motor side [N m s/rad]
     voltage_limit : [V], inf for none
-    mass : [kg] of a point on the link before the joint; on the base it moves nothing
+    mass : [kg] of a point on the link before the joint; on what stands fixed it moves nothing
     mass_point : (3,) or None
         Where, in that link's frame [m]; None: at the joint.
     """

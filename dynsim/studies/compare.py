@@ -268,10 +268,20 @@ def _simulate(scenario: Scenario) -> Record | None:
     return None if _interrupt.is_set() else simulate(scenario, look)
 
 
+def _flat(summary: dict[str, Any]) -> dict[str, Any]:
+    """A summary whose numbers of a mobile base stand beside the others, under ``base.…``."""
+    base = dict(summary.get("base", {}))
+    for key in [key for key, value in base.items() if isinstance(value, dict)]:
+        base.update({f"{key}.{name}": value for name, value in base.pop(key).items()})
+    return summary | {f"base.{key}": value for key, value in base.items()}
+
+
 def save_comparison(records: Mapping[str, Record], folder: Path) -> None:
     """Write ``comparison.json`` and ``comparison.csv``."""
     summaries = {name: record.summary for name, record in records.items()}
-    columns = ["variant"] + [key for key, value in next(iter(summaries.values())).items() if _is_scalar(value)]
+    flat = {name: _flat(summary) for name, summary in summaries.items()}
+    # A number that one variant lacks, another may have.
+    columns = ["variant"] + [key for one in flat.values() for key, value in one.items() if _is_scalar(value)]
     columns = list(dict.fromkeys(columns))
     contacts = list(dict.fromkeys(c["name"] for s in summaries.values() for c in s.get("contacts", ())))
     contact_keys = (
@@ -283,7 +293,7 @@ def save_comparison(records: Mapping[str, Record], folder: Path) -> None:
     writer.writerow([*columns, *(f"{name}.{key}" for name in contacts for key in contact_keys)])
     for name, summary in summaries.items():
         by_name = {c["name"]: c for c in summary.get("contacts", ())}
-        row = [name if key == "variant" else summary.get(key, "") for key in columns]
+        row = [name if key == "variant" else flat[name].get(key, "") for key in columns]
         row += [by_name.get(contact, {}).get(key, "") for contact in contacts for key in contact_keys]
         writer.writerow(row)
     table = json_text({"variants": summaries})
