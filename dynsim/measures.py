@@ -56,19 +56,20 @@ def least_loads(record: Record, steps: NDArray[np.float64]) -> NDArray[np.float6
     return np.minimum(found, steps[:3]) if len(steps) else found
 
 
-def base_summary(record: Record, settle: float, overturn: str, steps: NDArray[np.float64]) -> dict[str, Any]:
+def base_summary(
+    record: Record, settle: float, overturn: str, steps: NDArray[np.float64], travel: NDArray[np.float64]
+) -> dict[str, Any]:
     """How a mobile base has driven and stood; None where there is nothing to say.
 
     Parameters
     ----------
     settle : time from which ``tip_margin_min_settled`` counts [s]
     overturn : kind of the events of tipping, which are found between samples: the margin is zero there
+    travel : way of the axle's middle along the heading, backwards negative, (T,) [m]
     steps : (4,) least loads and least margin over all steps, which are closer together than the samples; or empty
     """
     pose, load, margin = record["base_pose"], record["wheel_load"], record["tip_margin"]
     tips = [event.time for event in record.events if event.kind == overturn]
-    # Samples on a circle: the arc over each chord.
-    chord, turn = np.hypot(*np.diff(pose[:, :2], axis=0).T), np.diff(pose[:, 2])
     traction, labels = record["traction_demand"], record.labels["wheel_load"]
 
     def least(values: NDArray[np.float64], since: float) -> float | None:
@@ -82,7 +83,7 @@ def base_summary(record: Record, settle: float, overturn: str, steps: NDArray[np
 
     return {
         "pose_final": pose[-1].tolist() if len(pose) else None,
-        "path_length_m": float((chord / np.sinc(turn / (2.0 * np.pi))).sum()),
+        "path_length_m": float(np.abs(np.diff(travel)).sum()),
         "wheel_load_min_N": named(least_loads(record, steps) if len(load) else None),
         "wheel_load_final_N": named(load[-1] if len(load) else None),
         "tip_margin_min": least(margin, -np.inf),

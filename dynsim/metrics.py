@@ -152,7 +152,7 @@ def summarise(
         "energy_turnover_J": turnover,
         "energy_residual_relative": residual / denominator if denominator > 0.0 else 0.0,
         "constraint_drift_max_m": float(counts.extremes[:, DRIFT_MAX].max(initial=0.0)),
-        **({"base": base_summary(record, scenario.metrics.settle_s, TIP_OVER, counts.support)} if robot.base else {}),
+        **_base(record, scenario, robot, counts),
         "contacts": [_contact(record, k, contact, counts, duration) for k, contact in enumerate(contacts)],
         "sinking": [
             {"body": s.body, "surface": s.surface, "depth_m": s.depth, "since_s": float(record.time[s.sample])}
@@ -161,6 +161,16 @@ def summarise(
     }
     summary["warnings"] = _warnings(record, scenario, contacts, robot, counts, summary) + _sunk(record, sunk)
     return summary
+
+
+def _base(record: Record, scenario: Scenario, robot: Robot, counts: Counts) -> dict[str, Any]:
+    """What there is to say of a mobile base, where there is one."""
+    if robot.base is None:
+        return {}
+    columns = [record.labels["q"].index(joint) for joint in robot.base.wheels]
+    # Rolling: s = r (φ_l + φ_r)/2, however far apart the samples are.
+    travel = robot.base.wheel_radius * record["q"][:, columns].mean(axis=1)
+    return {"base": base_summary(record, scenario.metrics.settle_s, TIP_OVER, counts.support, travel)}
 
 
 def _loads(record: Record) -> dict[str, Any]:

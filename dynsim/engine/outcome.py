@@ -41,10 +41,16 @@ def check_size(scenario: Scenario, rows: int, columns: int) -> None:
         )
 
 
-def raise_stopped(stop: SimulationStopped, record: Record) -> NoReturn:
-    """Mark the record as incomplete, say why in its summary and provenance, and raise ``stop`` with it."""
+def mark_stopped(stop: SimulationStopped, record: Record) -> None:
+    """Mark the record as incomplete, and say why in its summary and provenance."""
     record.complete = False
     record.summary["warnings"].append(f"incomplete: {stop}")
     record.provenance["stopped"] = {"time_s": stop.time, "reason": str(stop), "state": stop.state}
+
+
+def raise_stopped(stop: SimulationStopped, record: Record) -> NoReturn:
+    """Mark the record as incomplete, unless it is, and raise ``stop`` with it."""
+    if "stopped" not in record.provenance:
+        mark_stopped(stop, record)
     stop.record = record
     raise stop

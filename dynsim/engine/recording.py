@@ -27,6 +27,7 @@ def make_record(
     *,
     pushed: Sequence[int] | None = None,
     happened: Sequence[Event] = (),
+    base_as_planned: bool = True,
 ) -> Record:
     """Name the columns that the kernels wrote.
 
@@ -48,7 +49,7 @@ def make_record(
     record.add("v", run.states("v"), rate, labels=joints, description="joint rates")
     record.add("vdot", run.outputs("vdot"), acceleration, labels=joints, description="joint accelerations")
     if robot.base is not None:
-        _add_base(record, prepared, robot.base)
+        _add_base(record, prepared, robot.base, base_as_planned)
     current, voltage = run.outputs("current"), run.outputs("voltage")
     record.add("current", current, "A", labels=driven, description="motor currents")
     record.add("voltage", voltage, "V", labels=driven, description="motor terminal voltages")
@@ -100,12 +101,12 @@ def make_record(
     return record
 
 
-def _add_base(record: Record, prepared: Prepared, base: MobileBase) -> None:
+def _add_base(record: Record, prepared: Prepared, base: MobileBase, as_planned: bool) -> None:
     """Where the base is and should be, and what the ground carries; see dynsim.kernels.tree.support."""
     robot, run = prepared.model.robot, prepared.run
     pose, speed = base_pose(robot, run.states("q")), run.states("v")[:, list(map(robot.joint_names.index, base.wheels))]
     record.add("base_pose", pose, "m, m, rad", labels=("x", "y", "heading"), description="base in the world")
-    target = prepared.control.base_target(robot, record.time)
+    target = prepared.control.base_target(robot, record.time) if as_planned else None
     if target is not None:
         record.add("base_target", target, "m, m, rad", labels=("x", "y", "heading"), description="by the references")
     sides, support = SUPPORTS[:2], run.outputs("support")

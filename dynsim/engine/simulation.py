@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dynsim.engine.outcome import raise_stopped
+from dynsim.engine.outcome import mark_stopped, raise_stopped
 from dynsim.engine.prepare import prepare, sample_times
 from dynsim.engine.recording import make_record
 from dynsim.engine.stepped import GUARDS, Snapshot, State, take_log
@@ -127,6 +127,10 @@ class Simulation:
             times = sample_times(scenario, self._prepared.run.layout, self._prepared.run.columns, len(robot.links))
         self._trace = Trace(start, self._end, scenario.record.rate_hz, trace, times)
         self._sampled = self._prepared.system.drives.table[:, ka.SAMPLED].copy()
+        reference = self._prepared.control.reference
+        # As planned: where the base should be is drawn from it, until a wheel is told otherwise.
+        self._planned = replace(self._prepared.control, reference=reference._replace(spline=reference.spline.copy()))
+        self._base_as_planned = state is None
         run = self._prepared.run
         if state is not None:
             self._take(state)
@@ -270,8 +274,12 @@ class Simulation:
 
         Of an open torque ``position`` is the torque [N m].
         """
-        a = self._motor(joint)
         values = _finite("reference", [position, rate])
+        self._follow_line(joint, values)
+        self._leave_plan(joint)
+
+    def _follow_line(self, joint: str, values: Array) -> None:
+        a = self._motor(joint)
         self._settle_now()
         drives, reference = self._prepared.system.drives, self._prepared.system.reference
         reference.spline[a], drives.table[a, ka.SAMPLED] = ka.REWRITTEN, self._sampled[a]
@@ -286,6 +294,12 @@ class Simulation:
         drives = self._prepared.system.drives
         drives.table[a, ka.SAMPLED], drives.input[a, ka.COMMAND] = ka.GIVEN, value
         self._restart()
+        self._leave_plan(joint)
+
+    def _leave_plan(self, joint: str) -> None:
+        """Remember that a wheel of the base does not do any more what the scenario says."""
+        if self.robot.base is not None and joint in self.robot.base.wheels:
+            self._base_as_planned = False
 
     def set_mode(self, joint: str, mode: str) -> None:
         """Let a servo follow positions (``"position"``) or rates (``"velocity"``) of its reference, or switch it off.
@@ -428,12 +442,15 @@ class Simulation:
         whole = run._replace(sample_time=times, sample=states, output=outputs, count=count)
         record = make_record(
             self._scenario,
-            replace(self._prepared, run=whole),
+            replace(self._prepared, run=whole, control=self._planned),
             self._wall,
             pushed=sorted(self._pushed),
             happened=self._happened,
+            base_as_planned=self._base_as_planned,
         )
         record.complete = self.finished
+        if self._overturned():
+            mark_stopped(stopped(self._scenario, self._prepared), record)
         return record
 
     def _motor(self, joint: str) -> int:
@@ -566,7 +583,8 @@ class Simulation:
         """Let the reference of a joint hold where its spline ends."""
         reference = self._prepared.system.reference
         powers = reference.grid[1] ** np.arange(6)
-        self.set_reference(joint, float(reference.coefficients[-1, self._splines[self._motors[joint]]] @ powers))
+        end = float(reference.coefficients[-1, self._splines[self._motors[joint]]] @ powers)
+        self._follow_line(joint, np.array([end, 0.0]))
 
     def _refill(self, until: float = -np.inf) -> None:
         """Move what was sampled to the trace, and give the buffer the times from there on, at least up to ``until``."""

@@ -41,7 +41,7 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
     where = f"stopped at t = {t:.6g} s"
     if status == ki.NOT_FINITE:
         advice = (
-            f"take a smaller integrator.step_s than {run.clock[ki.STEP]:g}, or an adaptive method (rk43, rodas4)"
+            f"take a smaller integrator.step_s than {run.clock[ki.STEP]:g}, or an adaptive method (rk43)"
             if method == "rk4"
             else "look at the last state for a joint that runs away"
         )

@@ -366,7 +366,7 @@ def _check_motor(motor: Drive, joints: dict[str, Link]) -> None:
         raise ModelError(f"motor of {motor.joint}: voltage limit {motor.voltage_limit} V must be positive")
     if not isinstance(motor, Motor) and not motor.torque_limit > 0.0:
         raise ModelError(f"motor of {motor.joint}: torque limit {motor.torque_limit} N m must be positive")
-    if isinstance(motor, Servo) and joints[motor.joint].kind != "revolute":
+    if isinstance(motor, Servo) and joints[motor.joint].units[0] != "rad":
         raise ModelError(f"motor of {motor.joint}: a servo turns, the joint is {joints[motor.joint].kind}")
 
 
