@@ -54,7 +54,7 @@ def overturning(record: Record) -> Figure | None:
     if np.nanmax(traction, initial=0.0) > TRACTION_TOP:
         note.append(f"traction demand cut off at {TRACTION_TOP:g}: hardly any load")
     if missing := float(np.isnan(traction).any(axis=1).mean()):
-        note.append(f"none where a wheel carries no load: {100.0 * missing:.2g} % of the samples")
+        note.append(f"none without load on a wheel: {100.0 * missing:.2g} % of the samples")
     last = rows[2][-1]
     last.set_xlabel("\n".join([last.get_xlabel(), *note]))
     return figure
@@ -185,8 +185,12 @@ def _mark_negative(axes: Axes, label: str) -> None:
 
 
 def _mark_tipping(axes: Axes, records: Sequence[Record], colours: Sequence[str]) -> None:
+    """Lines and triangles at the times that the axes show; others would stand, and take room, beside the axes."""
+    low, high = axes.get_xlim()
     for record, colour in zip(records, colours, strict=True):
         for time in tipping_times(record):
+            if not low <= time <= high:
+                continue
             axes.axvline(time, color=colour, linestyle=(0, (4, 2)), linewidth=0.9)
             # Above the axes, where a line at their edge is seen too.
             top = axes.get_xaxis_transform()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,8 @@ from dynsim.record import Record
 
 PLANES = ((0, 1), (0, 2), (1, 2))
 MILLI = 1e3
+# A target that stays within this is held, not followed [m].
+HELD = 1e-6
 # Legends: where the path has the hand, and where the goals of the joints have it.
 TARGET, GOALS = "target", "goals"
 # Where a hand starts: the same mark for all variants, so that the legend shows what is drawn.
@@ -70,13 +72,12 @@ def error(record: Record) -> Figure | None:
     for k, name in enumerate("xyz"):
         style.line(top, record.time, deviation[:, k], label=f"$e_{name}$", color=style.AXIS_COLOURS[name])
     top.set_ylabel(f"hand − {target_name(record)} [mm]")
-    style.legend_above(top)
     style.line(bottom, record.time, norm, label=_error_label("|e|", record), color=style.BLACK)
     bottom.set_ylabel(f"distance from {target_name(record)} [mm]")
     bottom.set_ylim(bottom=0.0)
     bottom.set_xlabel("time [s]")
-    for axes in (top, bottom):
-        _mark_settle(axes, record)
+    _mark_settle((top, bottom), record)
+    style.legend_above(top, columns=4)
     style.legend_above(bottom)
     return figure
 
@@ -99,8 +100,7 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
     top.set_ylabel("distance from target [mm]")
     bottom.set_ylabel("vertical error $e_z$ [mm]")
     bottom.set_xlabel("time [s]")
-    for axes in (top, bottom):
-        _mark_settle(axes, next(iter(shown.values())))
+    _mark_settle((top, bottom), next(iter(shown.values())))
     figure.legend(loc="outside lower center", ncols=2)
     return figure
 
@@ -137,8 +137,17 @@ def _draw_target(axes: Axes, record: Record, plane: tuple[int, int]) -> None:
     if wanted is None:
         return
     target = wanted[:, plane]
+    if _is_held(wanted):
+        # Larger than the start of the hand, which may lie on it.
+        axes.plot(*target[0], "x", label=target_name(record), color=style.BLACK, markersize=8, zorder=3)
+        return
     axes.plot(*edge_on(target).T, label=target_name(record), color=style.BLACK, linestyle=(0, (4, 2)), zorder=3, lw=0.9)
     axes.plot(*target[0], "x", color=style.BLACK, markersize=5, zorder=4)
+
+
+def _is_held(target: Array) -> bool:
+    known = target[np.isfinite(target).all(axis=1)]
+    return len(known) > 0 and float(np.ptp(known, axis=0).max()) <= HELD
 
 
 def target_name(record: Record) -> str:
@@ -164,10 +173,12 @@ def edge_on(points: Array) -> Array:
 
 def _legend_below(figure: Figure, axes: Axes) -> None:
     handles, labels = axes.get_legend_handles_labels()
+    followed = {line.get_label() for line in axes.get_lines() if line.get_linestyle() != "None"}
     start = axes.plot([], [], **START)
     handles, labels = [*handles, *start], [*labels, "start of the hand"]
     for target in (TARGET, GOALS):
-        if target in labels:
+        # One that is held is a mark itself.
+        if target in followed:
             handles += axes.plot([], [], "x", color=style.BLACK, markersize=5)
             labels.append(f"start of the {target}")
     figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 4))
@@ -179,16 +190,10 @@ def _error_label(name: str, record: Record) -> str:
     return name if rms is None or not np.isfinite(rms) else f"{name}: rms {MILLI * rms:.3g} mm from {settle:g} s on"
 
 
-def _mark_settle(axes: Axes, record: Record) -> None:
+def _mark_settle(panels: Sequence[Axes], record: Record) -> None:
+    """A line in every panel; the legend of the first names it, as a label beside it would lie on the curves."""
     settle = style.settle_time(record)
     if max(0.0, record.time[0]) < settle < record.time[-1]:
-        axes.axvline(settle, color=style.GREY, linestyle=":", linewidth=1.0)
-        axes.annotate(
-            "settled",
-            (settle, 1.0),
-            xycoords=("data", "axes fraction"),
-            xytext=(3, -8),
-            textcoords="offset points",
-            color=style.GREY,
-            fontsize=7,
-        )
+        for axes in panels:
+            label = f"settled from {settle:g} s on" if axes is panels[0] else None
+            axes.axvline(settle, color=style.GREY, linestyle=":", linewidth=1.0, label=label)

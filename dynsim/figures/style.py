@@ -64,6 +64,8 @@ _LOOK: Any = {
 }
 # Lines of more points than this are thinned: a figure is some 1200 pixels wide.
 LINE_POINTS = 4000
+# A panel of the transient shows this times its length, and there is none where that is most of the run.
+TRANSIENT_ROOM, TRANSIENT_MOST = 1.2, 0.8
 # Height of a row of a legend [point].
 LEGEND_ROW = 12.5
 
@@ -214,7 +216,8 @@ def time_rows(
     """Axes for quantities over time, one row each, with a column for the initial transient where it needs one.
 
     A transient that would squeeze the settled rest of some row to less than two thirds of the height gets an enlarged
-    panel on the left; the axes on the right are then cut to the settled range.
+    panel on the left; the axes on the right are then cut to the settled range. A transient that lasts for most of the
+    run gets none, as that panel would show the run a second time.
 
     Parameters
     ----------
@@ -227,9 +230,11 @@ def time_rows(
     list of tuples of Axes
         For each row (transient, whole run) or (whole run,); draw everything in all of them.
     """
-    found = [_transient(row, settle) for row in rows]
-    ends = [time[-1] for row in rows for time, _ in row]
-    end = max(ends)
+    end = max(time[-1] for row in rows for time, _ in row)
+    longest = TRANSIENT_MOST * end / TRANSIENT_ROOM
+    found = [
+        one if one is not None and one.end < longest else None for one in (_transient(row, settle) for row in rows)
+    ]
     window = max((one.end for one in found if one is not None), default=0.0)
     split = window > 0.0
     grid = figure.subplots(
@@ -239,7 +244,7 @@ def time_rows(
         if end > 0.0:
             axes[-1].set_xlim(0.0, end)
         if split:
-            axes[0].set_xlim(0.0, min(1.2 * window, end))
+            axes[0].set_xlim(0.0, TRANSIENT_ROOM * window)
         if one is not None:
             axes[-1].set_ylim(one.low, one.high)
             if compress:

@@ -15,7 +15,7 @@ import dynsim
 from dynsim import figures
 from dynsim.figures import arm, base, posture, skeleton, solids, style, top_view
 from dynsim.hardware.export import export_record, joint_motion
-from dynsim.record import Record
+from dynsim.record import Event, Record
 from dynsim.record.scene import Scene, Shape
 from dynsim.scenario import load_scenario
 
@@ -149,15 +149,29 @@ def test_outside_of_the_triangle_is_where_the_margin_is_negative(tipped: Record)
     assert "outside the triangle" in texts(drawn(top_view.top_view(tipped)))
 
 
-def test_tipping_is_marked_in_every_panel(tipped: Record, turning: Record) -> None:
+def test_tipping_is_marked_in_every_panel_that_shows_its_time(tipped: Record, turning: Record) -> None:
     figure = drawn(base.overturning(tipped))
     times = {event.time for event in tipped.events if event.kind == base.TIP_OVER}
     assert times
     for axes in figure.axes:
         marked = {line.get_xdata()[0] for line in axes.get_lines() if line.get_marker() == "v"}
-        assert marked == times
+        low, high = axes.get_xlim()
+        assert marked == {time for time in times if low <= time <= high}
     assert f"at {min(times):.3g} s" in texts(figure)
     assert f"at {min(times):.3g} s" in texts(drawn(base.margin_comparison({"a": tipped, "b": turning})))
+
+
+def test_marks_of_later_times_take_no_room_beside_the_transient() -> None:
+    time = np.linspace(0.0, 5.0, 501)
+    figure = style.new_figure(3.0, "")
+    (panels,) = style.time_rows(figure, [[(time, 1.0 + 50.0 * np.exp(-time / 0.05))]], settle=2.0)
+    record = Record(time)
+    record.events.extend(Event(at, base.TIP_OVER, "") for at in (0.05, 4.5))
+    for axes in panels:
+        base._mark_tipping(axes, [record], [style.PULLING])
+    figure.draw_without_rendering()
+    left, right = (axes.get_position() for axes in panels)
+    assert right.x0 - left.x1 < 0.1
 
 
 def test_a_peak_of_the_demand_does_not_hide_the_rest(braced: Record) -> None:

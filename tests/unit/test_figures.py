@@ -242,6 +242,16 @@ def test_hand_path_panels_have_one_scale_and_all_points(braced: Record) -> None:
             assert all(inside(*point) for point in braced[name][:, (i, j)])
 
 
+def test_target_that_is_held_is_a_mark(braced: Record) -> None:
+    held = without(braced, "target_position")
+    held.add("target_position", np.tile(braced["target_position"][0], (len(braced), 1)), "m", labels=("x", "y", "z"))
+    for record, named in ((held, {"target"}), (braced, {"target", "start of the target"})):
+        for figure in (drawn(hand.path(record)), drawn(hand.path_comparison({"a": record}))):
+            assert {name for name in texts(figure).splitlines() if "target" in name} == named
+            target = next(line for line in figure.axes[0].get_lines() if line.get_label() == "target")
+            assert target.get_marker() == ("x" if record is held else "None")
+
+
 def test_tracking_error_states_the_rms_of_the_summary(braced: Record) -> None:
     assert f"rms {1e3 * braced.summary['hand_error_rms_m']:.3g} mm" in texts(drawn(hand.error(braced)))
 
@@ -274,6 +284,15 @@ def test_transient_has_a_panel_and_the_rest_its_own_range() -> None:
     assert panels[1].get_ylim()[1] < 1.5
     (whole,) = style.time_rows(style.new_figure(3.0, ""), [[(time, np.sin(time))]], settle=2.0)
     assert len(whole) == 1
+
+
+@pytest.mark.parametrize("settle", [9.0, 9.9, 20.0])
+def test_transient_of_the_whole_run_has_no_panel(settle: float) -> None:
+    time = np.linspace(0.0, 10.0, 1001)
+    (panels,) = style.time_rows(style.new_figure(3.0, ""), [[(time, 50.0 * np.exp(-time / 3.0))]], settle=settle)
+    assert len(panels) == 1
+    panels[0].plot(time, 50.0 * np.exp(-time / 3.0))
+    assert panels[0].get_ylim()[1] > 50.0
 
 
 def test_thinning_keeps_peaks() -> None:
