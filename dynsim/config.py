@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -52,6 +53,14 @@ class BodyPoint(StrictConfig):
 def error_at(key: str, message: str) -> PydanticCustomError:
     """An error for a validator of a whole mapping to raise about one dotted ``key`` within it."""
     return PydanticCustomError("value_error", "{message}", {"message": message, "key": key})
+
+
+def check_waypoints(times: Sequence[float], values: Sequence[Any], key: str) -> None:
+    """ValueError unless the times of waypoints increase and there are as many as values, which ``key`` names."""
+    if len(times) != len(values):
+        raise ValueError(f"{len(times)} times_s and {len(values)} {key}: there must be as many")
+    if np.any(np.diff(times) <= 0.0):
+        raise ValueError("times_s must increase")
 
 
 def unit_vector(values: list[float], name: str) -> NDArray[np.float64]:

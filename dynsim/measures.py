@@ -15,6 +15,9 @@ STORES = ("energy_kinetic", "energy_potential", "energy_magnetic")
 
 RESIDUAL_LIMIT = 1e-6
 
+# Kind of the event of a mobile base that tips; found between samples, where the margin is zero.
+TIP_OVER = "tip_over"
+
 
 def energy_turnover(record: Record) -> float:
     """Energy that changed hands: the largest over time of half the sum of all terms' sizes [J]."""
@@ -57,19 +60,18 @@ def least_loads(record: Record, steps: NDArray[np.float64]) -> NDArray[np.float6
 
 
 def base_summary(
-    record: Record, settle: float, overturn: str, steps: NDArray[np.float64], travel: NDArray[np.float64]
+    record: Record, settle: float, steps: NDArray[np.float64], travel: NDArray[np.float64]
 ) -> dict[str, Any]:
     """How a mobile base has driven and stood; None where there is nothing to say.
 
     Parameters
     ----------
     settle : time from which ``tip_margin_min_settled`` counts [s]
-    overturn : kind of the events of tipping, which are found between samples: the margin is zero there
     travel : way of the axle's middle along the heading, backwards negative, (T,) [m]
     steps : (4,) least loads and least margin over all steps, which are closer together than the samples; or empty
     """
     pose, load, margin = record["base_pose"], record["wheel_load"], record["tip_margin"]
-    tips = [event.time for event in record.events if event.kind == overturn]
+    tips = [event.time for event in record.events if event.kind == TIP_OVER]
     traction, labels = record["traction_demand"], record.labels["wheel_load"]
 
     def least(values: NDArray[np.float64], since: float) -> float | None:

@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 
 from dynsim._version import __version__
 from dynsim.kernels.integrate.run import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, LOCAL_SINCE, PULLING
-from dynsim.measures import RESIDUAL_LIMIT, SINKS, STORES, base_summary, energy_turnover, hand_error, least_loads
+from dynsim.measures import (
+    RESIDUAL_LIMIT,
+    SINKS,
+    STORES,
+    TIP_OVER,
+    base_summary,
+    energy_turnover,
+    hand_error,
+    least_loads,
+)
 from dynsim.model.clearance import Sinking, sinking
 from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Drive, Servo, TorqueSource
@@ -32,8 +41,6 @@ INTEGRALS = {
     "energy_electrical_supply": "∫ max(Σ u i, 0) dt, one supply for all motors that takes nothing back",
 }
 
-# Kind of the event of a mobile base that tips.
-TIP_OVER = "tip_over"
 DRIFT_LIMIT_M = 1e-9
 # Limits in files are rounded: a joint that starts at 1.5707963 = 90° is not beyond it.
 LIMIT_SLACK = 1e-6
@@ -170,7 +177,7 @@ def _base(record: Record, scenario: Scenario, robot: Robot, counts: Counts) -> d
     columns = [record.labels["q"].index(joint) for joint in robot.base.wheels]
     # Rolling: s = r (φ_l + φ_r)/2, however far apart the samples are.
     travel = robot.base.wheel_radius * record["q"][:, columns].mean(axis=1)
-    return {"base": base_summary(record, scenario.metrics.settle_s, TIP_OVER, counts.support, travel)}
+    return {"base": base_summary(record, scenario.metrics.settle_s, counts.support, travel)}
 
 
 def _loads(record: Record) -> dict[str, Any]:

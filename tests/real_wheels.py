@@ -19,6 +19,15 @@ from dynsim.model.urdf_writer import write_urdf
 
 Array = np.ndarray
 WHEELS = ("base.left", "base.right")
+MOTOR = {
+    "type": "dc",
+    "torque_constant_N_m_per_A": 0.203,
+    "resistance_ohm": 1.1,
+    "inductance_H": 0.0017,
+    "rotor_inertia_kg_m2": 1.64e-4,
+    "gear_ratio": 3.0,
+    "gear_damping_N_m_s_per_rad": 0.01,
+}
 
 
 def six(tensor: Array) -> list[float]:

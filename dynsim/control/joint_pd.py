@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from scipy.interpolate import CubicSpline
 
 from dynsim import families
-from dynsim.config import NonNegative, Positive, StrictConfig
+from dynsim.config import NonNegative, Positive, StrictConfig, check_waypoints
 from dynsim.control.inverse_kinematics import follow
 from dynsim.errors import ModelError
 from dynsim.model.control import BasePath, HandPath, JointControl, spline_coefficients
@@ -46,13 +46,6 @@ class BaseReference(StrictConfig):
     path: BasePathChoice
 
 
-def _check_waypoints(times: list[float], values: list[float], key: str) -> None:
-    if len(times) != len(values):
-        raise ValueError(f"{len(times)} times_s and {len(values)} {key}: there must be as many")
-    if np.any(np.diff(times) <= 0.0):
-        raise ValueError("times_s must increase")
-
-
 class JointPath(StrictConfig):
     """Waypoints of one joint: a cubic spline, at rest at both ends and held beyond them."""
 
@@ -61,7 +54,7 @@ class JointPath(StrictConfig):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        _check_waypoints(self.times_s, self.angles_deg, "angles_deg")
+        check_waypoints(self.times_s, self.angles_deg, "angles_deg")
         return self
 
 
@@ -73,7 +66,7 @@ class TorquePath(StrictConfig):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        _check_waypoints(self.times_s, self.torques_N_m, "torques_N_m")
+        check_waypoints(self.times_s, self.torques_N_m, "torques_N_m")
         return self
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import BPoly, CubicSpline, PchipInterpolator
 
 from dynsim.errors import ModelError
 from dynsim.model.description import Robot
@@ -97,6 +99,18 @@ class PlaneCurve:
         half = 0.5 * (b - a)
         slopes = self._tangent(a[:, None] + half[:, None] * (1.0 + _NODES))
         return np.asarray(half * (np.hypot(slopes[..., 0], slopes[..., 1]) @ _WEIGHTS))
+
+
+@dataclass(frozen=True)
+class AlongCurve:
+    """A base path along a curve r(u), with u as piecewise polynomials of time."""
+
+    curve: PlaneCurve
+    way: BPoly | PchipInterpolator
+
+    def motion(self, t: Array) -> Array:
+        """Distance [m] and turn [rad] at times t [s], (T, 2)."""
+        return self.curve.motion(np.clip(self.way(np.clip(t, *self.way.x[[0, -1]])), 0.0, self.curve.nodes[-1]))
 
 
 def _refuse_corner(name: str, turn: float) -> None:

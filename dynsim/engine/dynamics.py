@@ -15,7 +15,7 @@ from dynsim.engine.stopping import last_state, stopped
 from dynsim.errors import SimulationInterrupted, SimulationStopped
 from dynsim.kernels.integrate import driver
 from dynsim.kernels.integrate import run as ki
-from dynsim.metrics import TIP_OVER
+from dynsim.measures import TIP_OVER
 from dynsim.record import Event, Record
 from dynsim.scenario import Scenario
 

@@ -33,6 +33,7 @@ def make_record(
 
     ``pushed`` : which of the bodies' own wrenches, the last of the loads, have been set; None: there are none
     ``happened`` : events of the run
+    ``base_as_planned`` : whether the wheels of a base follow what ``prepared.control`` says, and from its start
     """
     model, run, contacts = prepared.model, prepared.run, prepared.contacts
     robot = model.robot

@@ -31,7 +31,7 @@ from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.dense import state_within
 from dynsim.kernels.state import JOINT, block
 from dynsim.kernels.tree import loads as kl
-from dynsim.metrics import TIP_OVER
+from dynsim.measures import TIP_OVER
 from dynsim.model.arrays import check_couplings
 from dynsim.model.drives import Drive
 from dynsim.model.model import Model

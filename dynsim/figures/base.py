@@ -11,10 +11,9 @@ from matplotlib.figure import Figure
 
 from dynsim.figures import style
 from dynsim.figures.style import Array
+from dynsim.measures import TIP_OVER
 from dynsim.record import Record
 
-# Kind of the events of tipping.
-TIP_OVER = "tip_over"
 LOADS, MARGIN, TRACTION = "wheel_load", "tip_margin", "traction_demand"
 # Without load the demand has no bound, and the margin none where the ground carries almost nothing: axes end here.
 TRACTION_TOP, MARGIN_LOW = 2.5, -2.0

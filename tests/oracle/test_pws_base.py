@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from random_robots import Bench, bench, random_contacts
-from real_wheels import WHEELS, RealWheels, random_base, random_serial, random_urdf
+from real_wheels import MOTOR, WHEELS, RealWheels, random_base, random_serial, random_urdf
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline, make_interp_spline
 
@@ -159,15 +159,6 @@ def test_points_and_their_rates(arm, folder, seed):
 
 # ---- runs
 
-MOTOR = {
-    "type": "dc",
-    "torque_constant_N_m_per_A": 0.203,
-    "resistance_ohm": 1.1,
-    "inductance_H": 0.0017,
-    "rotor_inertia_kg_m2": 1.64e-4,
-    "gear_ratio": 3.0,
-    "gear_damping_N_m_s_per_rad": 0.01,
-}
 # A base of 4 kg whose mass is off the axle and off its middle, with an arm on it that reaches over its side.
 PLANT: dict[str, Any] = {
     "type": "pws_arm",

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from random_robots import Bench, bench
+from real_wheels import MOTOR
 from scipy.linalg import expm
 
 import dynsim
@@ -14,15 +15,6 @@ from dynsim.model.description import Robot
 from dynsim.scenario import scenario_from_resolved
 from dynsim.scenario.build import robot as build_robot
 
-MOTOR = {
-    "type": "dc",
-    "torque_constant_N_m_per_A": 0.203,
-    "resistance_ohm": 1.1,
-    "inductance_H": 0.0017,
-    "rotor_inertia_kg_m2": 1.64e-4,
-    "gear_ratio": 3.0,
-    "gear_damping_N_m_s_per_rad": 0.01,
-}
 R, TRACK = 0.06, 0.32
 MASS, WHEEL_MASS = 3.5, 0.4
 # The body about its centre of mass, a wheel about its axle and across it.

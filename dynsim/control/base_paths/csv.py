@@ -12,7 +12,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from scipy.interpolate import PchipInterpolator
 
 from dynsim.config import StrictConfig, error_at
-from dynsim.control.plane_curve import PlaneCurve, seen_from_start
+from dynsim.control.plane_curve import AlongCurve, PlaneCurve, seen_from_start
 from dynsim.csv_rows import read_table
 from dynsim.errors import ModelError
 from dynsim.model.control import BasePath
@@ -64,18 +64,6 @@ class Rates:
         return np.asarray(self.rates.antiderivative()(np.clip(t, *self.rates.x[[0, -1]])))
 
 
-@dataclass(frozen=True)
-class Places:
-    """A curve r(u), and u as a shape-preserving cubic of time."""
-
-    curve: PlaneCurve
-    way: PchipInterpolator
-
-    def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance [m] and turn [rad] at times t [s], (T, 2)."""
-        return self.curve.motion(np.clip(self.way(np.clip(t, *self.way.x[[0, -1]])), 0.0, self.curve.nodes[-1]))
-
-
 def build(config: Config, context: BuildContext) -> BasePath:
     """The motion that the rows describe.
 
@@ -96,7 +84,7 @@ def build(config: Config, context: BuildContext) -> BasePath:
         curve = PlaneCurve(points[kept], names, start_limit=TURN_LIMIT, turn_limit=TURN_LIMIT, samples=8)
     except ModelError as error:
         raise ModelError(f"{config.file}: {error}") from error
-    return Places(curve, PchipInterpolator(times, way))
+    return AlongCurve(curve, PchipInterpolator(times, way))
 
 
 def _along(points: NDArray[np.float64]) -> tuple[list[int], NDArray[np.float64]]:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy.interpolate import BPoly
 
-from dynsim.config import NonNegative, StrictConfig
-from dynsim.control.plane_curve import PlaneCurve, seen_from_start
+from dynsim.config import NonNegative, StrictConfig, check_waypoints
+from dynsim.control.plane_curve import AlongCurve, PlaneCurve, seen_from_start
 from dynsim.model.control import BasePath
 from dynsim.model.protocols import BuildContext
 
@@ -30,25 +28,10 @@ class Config(StrictConfig):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if len(self.times_s) != len(self.points_m):
-            raise ValueError(f"{len(self.times_s)} times_s and {len(self.points_m)} points_m: there must be as many")
-        if np.any(np.diff(self.times_s) <= 0.0):
-            raise ValueError("times_s must increase")
+        check_waypoints(self.times_s, self.points_m, "points_m")
         if not np.hypot(*np.diff(self.points_m, axis=0).T).min() > 0.0:
             raise ValueError("two neighbouring points_m are the same; a base that waits takes csv with V_m_s")
         return self
-
-
-@dataclass(frozen=True)
-class Path:
-    """A curve r(u), and u as a polynomial of time between two points."""
-
-    curve: PlaneCurve
-    way: BPoly
-
-    def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance [m] and turn [rad] at times t [s], (T, 2)."""
-        return self.curve.motion(np.clip(self.way(np.clip(t, *self.way.x[[0, -1]])), 0.0, self.curve.nodes[-1]))
 
 
 def build(config: Config, context: BuildContext) -> BasePath:
@@ -70,4 +53,4 @@ def build(config: Config, context: BuildContext) -> BasePath:
     middle = 2.0 / (1.0 / speeds[:-1] + 1.0 / speeds[1:])
     rates = np.concatenate([[0.0], middle, [0.0]])
     way = BPoly.from_derivatives(config.times_s, np.stack([curve.nodes, rates, np.zeros_like(rates)], axis=1))
-    return Path(curve, way)
+    return AlongCurve(curve, way)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy.interpolate import CubicSpline
 
-from dynsim.config import StrictConfig, Vector3
+from dynsim.config import StrictConfig, Vector3, check_waypoints
 from dynsim.model.control import HandPath
 from dynsim.model.protocols import BuildContext
 
@@ -23,10 +23,7 @@ class Config(StrictConfig):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        if len(self.times_s) != len(self.points_m):
-            raise ValueError(f"{len(self.times_s)} times_s and {len(self.points_m)} points_m: there must be as many")
-        if np.any(np.diff(self.times_s) <= 0.0):
-            raise ValueError("times_s must increase")
+        check_waypoints(self.times_s, self.points_m, "points_m")
         return self
 
     def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:

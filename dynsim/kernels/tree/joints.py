@@ -117,13 +117,41 @@ def row_motion(model: ModelArrays, ws: Workspace, i, b0, b1, b2, b3, b4, b5, b6,
     return b0, b1, b2, b3, b4, b5, b6, b7, b8, px, py, pz, sx, sy, sz, lx, ly, lz
 
 
+@inlined_kernel
+def row_rates(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
+    """V and A of link i from its axis S, for every kind of joint: V = V_p + S v, A = A_p + V_b × S v + S vdot.
+
+    p is the parent, b what the joint is mounted on. ``forward_sweep`` writes this out for joints of one row.
+    """
+    links, j, m = ws.links, model.tree[i, PARENT], model.tree[i, BASE]
+    sx, sy, sz = links[i, S], links[i, S + 1], links[i, S + 2]
+    lx, ly, lz = links[i, S + 3], links[i, S + 4], links[i, S + 5]
+    wx, wy, wz, ox, oy, oz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    if m >= 0:
+        wx, wy, wz = links[m, V], links[m, V + 1], links[m, V + 2]
+        ox, oy, oz = links[m, V + 3], links[m, V + 4], links[m, V + 5]
+    bias = (
+        wy * sz - wz * sy,
+        wz * sx - wx * sz,
+        wx * sy - wy * sx,
+        wy * lz - wz * ly + oy * sz - oz * sy,
+        wz * lx - wx * lz + oz * sx - ox * sz,
+        wx * ly - wy * lx + ox * sy - oy * sx,
+    )
+    # The world's acceleration is −g.
+    root = (0.0, 0.0, 0.0, -gx, -gy, -gz)
+    for s in range(6):
+        links[i, V + s] = links[i, S + s] * v + (links[j, V + s] if j >= 0 else 0.0)
+        links[i, A + s] = links[i, S + s] * vdot + bias[s] * v + (links[j, A + s] if j >= 0 else root[s])
+
+
 @apart_kernel
 def sweep_row(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
     """R, p, S, V and A of row i into ``ws.links``: what ``forward_sweep`` does for a link (dynsim.kernels.tree.sweep).
 
     v, vdot : rate and acceleration of the row with the sweep's factors; g : gravity likewise
     """
-    body, links, j, m = model.body, ws.links, model.tree[i, PARENT], model.tree[i, BASE]
+    body, links, j = model.body, ws.links, model.tree[i, PARENT]
     b0, b1, b2 = body[i, R_PJ], body[i, R_PJ + 1], body[i, R_PJ + 2]
     b3, b4, b5 = body[i, R_PJ + 3], body[i, R_PJ + 4], body[i, R_PJ + 5]
     b6, b7, b8 = body[i, R_PJ + 6], body[i, R_PJ + 7], body[i, R_PJ + 8]
@@ -149,23 +177,7 @@ def sweep_row(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
     links[i, P], links[i, P + 1], links[i, P + 2] = px, py, pz
     links[i, S], links[i, S + 1], links[i, S + 2] = sx, sy, sz
     links[i, S + 3], links[i, S + 4], links[i, S + 5] = lx, ly, lz
-    wx, wy, wz, ox, oy, oz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    if m >= 0:
-        wx, wy, wz = links[m, V], links[m, V + 1], links[m, V + 2]
-        ox, oy, oz = links[m, V + 3], links[m, V + 4], links[m, V + 5]
-    bias = (
-        wy * sz - wz * sy,
-        wz * sx - wx * sz,
-        wx * sy - wy * sx,
-        wy * lz - wz * ly + oy * sz - oz * sy,
-        wz * lx - wx * lz + oz * sx - ox * sz,
-        wx * ly - wy * lx + ox * sy - oy * sx,
-    )
-    # The world's acceleration is −g.
-    root = (0.0, 0.0, 0.0, -gx, -gy, -gz)
-    for s in range(6):
-        links[i, V + s] = links[i, S + s] * v + (links[j, V + s] if j >= 0 else 0.0)
-        links[i, A + s] = links[i, S + s] * vdot + bias[s] * v + (links[j, A + s] if j >= 0 else root[s])
+    row_rates(model, ws, i, v, vdot, gx, gy, gz)
 
 
 @kernel

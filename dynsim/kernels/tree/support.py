@@ -14,25 +14,22 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.kernels.arrays import (
-    BASE,
     BODY_B,
     DIRECTION,
     FORCE,
     JOINT_ROW,
-    PARENT,
     QD,
     QDD,
     ROW_KIND,
     ROWS,
-    A,
     ModelArrays,
     P,
     R,
-    S,
     V,
     Workspace,
 )
 from dynsim.kernels.jit import apart_kernel, internal_kernel
+from dynsim.kernels.tree.joints import row_rates
 from dynsim.kernels.tree.loads import LoadArrays, load_wrench
 from dynsim.kernels.tree.sweep import body_inertia, inertial_wrench
 
@@ -83,30 +80,11 @@ def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, sup
     it), ρ the inradius. N_i/ΣN are its barycentric coordinates, so d_i/ρ = (N_i/ΣN) (perimeter / side i): 1 at the
     incentre. ΣN <= 0 counts as −1. Loaded wheels share the lateral force, by load.
     """
-    tree, links, joints = model.tree, ws.links, ws.joints
+    links, joints, gravity = ws.links, ws.joints, model.gravity
     index, base, state = support.index, support.base, support.state
     mx, my, mz, fx, fy, fz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for i in range(tree.shape[0]):
-        j, m, v, vdot = tree[i, PARENT], tree[i, BASE], joints[i, QD], joints[i, QDD]
-        s0, s1, s2 = links[i, S], links[i, S + 1], links[i, S + 2]
-        s3, s4, s5 = links[i, S + 3], links[i, S + 4], links[i, S + 5]
-        wx, wy, wz, ox, oy, oz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        if m >= 0:
-            wx, wy, wz = links[m, V], links[m, V + 1], links[m, V + 2]
-            ox, oy, oz = links[m, V + 3], links[m, V + 4], links[m, V + 5]
-        # V_m × S v: see dynsim.kernels.tree.joints.
-        bias = (
-            wy * s2 - wz * s1,
-            wz * s0 - wx * s2,
-            wx * s1 - wy * s0,
-            wy * s5 - wz * s4 + oy * s2 - oz * s1,
-            wz * s3 - wx * s5 + oz * s0 - ox * s2,
-            wx * s4 - wy * s3 + ox * s1 - oy * s0,
-        )
-        root = (0.0, 0.0, 0.0, -model.gravity[0], -model.gravity[1], -model.gravity[2])
-        for s in range(6):
-            links[i, V + s] = links[i, S + s] * v + (links[j, V + s] if j >= 0 else 0.0)
-            links[i, A + s] = links[i, S + s] * vdot + bias[s] * v + (links[j, A + s] if j >= 0 else root[s])
+    for i in range(joints.shape[0]):
+        row_rates(model, ws, i, joints[i, QD], joints[i, QDD], gravity[0], gravity[1], gravity[2])
         mass, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz = body_inertia(model, ws, i)
         n0, n1, n2, n3, n4, n5 = inertial_wrench(ws, i, mass, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz)
         mx, my, mz, fx, fy, fz = mx + n0, my + n1, mz + n2, fx + n3, fy + n4, fz + n5
