@@ -134,7 +134,11 @@ def stop_rows(unilateral: UnilateralArrays, ws: Workspace, p):
             joint = table[k, STOP_JOINT]
             new_row(ws, p, JOINT_ROW, couplings + k, joint)
             ws.active[p, BODY_B] = joint
-            ws.rows[p, ROW], ws.rows[p, DIRECTION], ws.rows[p, ROW_OFFSET] = stop[k, SIDE], stop[k, SIDE], stop[k, LIMIT]
+            ws.rows[p, ROW], ws.rows[p, DIRECTION], ws.rows[p, ROW_OFFSET] = (
+                stop[k, SIDE],
+                stop[k, SIDE],
+                stop[k, LIMIT],
+            )
             table[k, STOP_ROW] = p
             p += 1
     return p
