@@ -75,7 +75,7 @@ def test_a_block_on_a_slope_rests_or_slides(method, mu):
     a = max(0.0, G * (np.sin(alpha) - mu * np.cos(alpha)))
     downhill = np.array([np.cos(alpha), 0.0, -np.sin(alpha)])
     way = 0.5 * a * run.sample_time[:, None] ** 2 * downhill
-    np.testing.assert_allclose(run.states("q"), way, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(run.states("q"), way, rtol=0, atol=1e-9)
     touch = run.outputs("contact")[:, 0]
     np.testing.assert_allclose(touch[:, OUT_FORCE], 3.0 * G * np.cos(alpha), rtol=1e-9)
     assert (touch[:, OUT_MODE] == (ka.SLIDING if mu < 0.4 else ka.STICKING)).all()
