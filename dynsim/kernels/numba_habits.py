@@ -7,11 +7,12 @@ numba is pinned to one minor version, see pyproject.toml; a test compiles with a
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
-from numba.core import ir, ssa, types
+from numba.core import base, ir, ssa, transforms, types
 from numba.core.base import BaseContext
+from numba.core.postproc import PostProcessor, VariableLifetime
 from numba.core.targetconfig import TargetConfig
 from numba.core.types.functions import BaseFunction
 from numba.core.typing.npydecl import NumpyRulesArrayOperator
@@ -106,3 +107,24 @@ def _only_arrays(self: NumpyRulesArrayOperator, args: Any, kws: Any) -> Any:
     if any(isinstance(argument, types.ArrayCompatible) for argument in args):
         return _array_rules(self, args, kws)
     return None
+
+
+_post_process = PostProcessor.run
+
+
+@mend(PostProcessor, "run")
+def _only_what_is_read(self: PostProcessor, emit_dels: bool = False, extend_lifetimes: bool = False) -> None:
+    """numba's, without the variables that live at the entry of each block: only generators are compiled from them."""
+    code = self.func_ir
+    if code.is_generator:
+        _post_process(self, emit_dels, extend_lifetimes)
+        return
+    code.blocks = transforms.canonicalize_cfg(code.blocks)
+    code.variable_lifetime = VariableLifetime(code.blocks)
+    code.generator_info = None
+    if emit_dels:
+        self._insert_var_dels(extend_lifetimes=extend_lifetimes)
+
+
+base._has_loc = lru_cache(maxsize=4096)(base._has_loc)
+BaseContext.get_abi_sizeof = lru_cache(maxsize=4096)(BaseContext.get_abi_sizeof)
