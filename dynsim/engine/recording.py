@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+import numpy as np
+
 from dynsim import metrics
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.provenance import provenance
@@ -96,7 +98,7 @@ def make_record(
         deficient=deficient,
         extremes=run.extremes,
         spread=spread,
-        support=run.support.least,
+        support=np.zeros(0) if run.support is None else run.support.least,
     )
     record.summary = metrics.summarise(record, scenario, contacts, robot, counts)
     return record

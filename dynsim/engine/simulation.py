@@ -616,7 +616,7 @@ class Simulation:
             ("drives", system.drives._asdict()),
             ("reference", system.reference._asdict()),
             ("loads", system.loads._asdict()),
-            ("support", prepared.run.support._asdict()),
+            ("support", prepared.run.support._asdict() if prepared.run.support else {}),
         ):
             found |= {f"{owner}.{name}": array for name, array in part.items()}
         # Closed brakes are seen there.

@@ -45,7 +45,7 @@ from dynsim.kernels.integrate.run import (
 from dynsim.kernels.jit import inlined_kernel, internal_kernel
 from dynsim.kernels.system import System
 from dynsim.kernels.tree.points import point_position
-from dynsim.kernels.tree.support import MARGIN, ground_reaction
+from dynsim.kernels.tree.support import tip_margin
 
 # Kinds of guards. A new one is a number here, a branch in ``guard`` and a name in GUARDS of dynsim.engine.stepped.
 JOINT_POSITION, JOINT_RATE, MOTOR_CURRENT, MOTOR_VOLTAGE, CONTACT_FORCE, CONTACT_GAP = 0, 1, 2, 3, 4, 5
@@ -73,8 +73,7 @@ def guard(system: System, t, ws: Workspace, run: Run, e):
     elif kind == CONTACT_GAP:
         value = ws.contacts[k, GAP]
     elif kind == TIP_MARGIN:
-        ground_reaction(system.model, system.loads, t, ws, run.support)
-        value = run.support.state[MARGIN]
+        value = tip_margin(system.model, system.loads, t, ws, run.support)
     else:
         point_position(ws, run.hand_link, run.hand_point, run.hand)
         value = run.hand[kind - HAND_X]

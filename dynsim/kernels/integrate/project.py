@@ -82,7 +82,7 @@ def project(system: System, ws: Workspace, y):
                 column[i, 0] -= state[k, FORCE] * column[i, 1 + 2 * k]
         accelerate(system.model, ws)
         if level == 0 and not plain:
-            displace(system.model, ws, y, start)
+            displace(system.model.compound, system.model, ws, y, start)
         else:
             for i in range(n):
                 y[start + i] += ws.joints[i, QDD]

@@ -82,7 +82,7 @@ class Run(NamedTuple):
     log_time: np.ndarray  # (LOG_LENGTH,) of events [s]
     log_event: np.ndarray  # (LOG_LENGTH,) int: which
     hand: np.ndarray  # (3,) room
-    support: SupportArrays
+    support: SupportArrays | None
     columns: OutputLayout
     output: np.ndarray  # (T, columns.size)
 
@@ -156,7 +156,7 @@ def new_run(
         log_time=np.zeros(LOG_LENGTH),
         log_event=np.zeros(LOG_LENGTH, dtype=np.int64),
         hand=np.zeros(3),
-        support=support or SupportArrays(integers([]), reals([]), reals([]), reals([])),
+        support=support,
         columns=columns,
         output=np.zeros((len(sample_time), columns.size)),
     )
