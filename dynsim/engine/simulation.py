@@ -618,7 +618,7 @@ class Simulation:
             ("drives", system.drives._asdict()),
             ("reference", system.reference._asdict()),
             ("loads", system.loads._asdict()),
-            ("support", prepared.run.support._asdict()),
+            ("support", prepared.run.support._asdict() if prepared.run.support else {}),
             ("unilateral", {} if system.unilateral is None else system.unilateral._asdict()),
         ):
             found |= {f"{owner}.{name}": array for name, array in part.items() if isinstance(array, np.ndarray)}

@@ -111,10 +111,10 @@ def accept(system: System, ws: Workspace, run: Run):
     watch(ws, run, h)
     watch_modes(system.unilateral, ws, h)
     # The event of tipping has asked for the ground's reaction at the end of this step.
-    if run.support.index.shape[0] > 0 and run.event.shape[0] > 0:
+    if run.event.shape[0] > 0:
         watch_support(run.support)
     if system.layout.extra > 0:
-        normalise(system.model, run.y_new, system.layout.q)
+        normalise(system.model.compound, system.model, run.y_new, system.layout.q)
     sample_step(system, ws, run)
     take_directions(system.unilateral, ws, run)
     for j in range(run.y.shape[0]):

@@ -89,7 +89,7 @@ class Run(NamedTuple):
     log_event: np.ndarray  # (LOG_LENGTH,) int: which
     hand: np.ndarray  # (3,) room
     gaps: np.ndarray  # (c, 2) gaps and their rates at the start of the step
-    support: SupportArrays
+    support: SupportArrays | None
     columns: OutputLayout
     output: np.ndarray  # (T, columns.size)
 
@@ -166,7 +166,7 @@ def new_run(
         log_event=np.zeros(LOG_LENGTH, dtype=np.int64),
         hand=np.zeros(3),
         gaps=np.zeros((c, 2)),
-        support=support or SupportArrays(integers([]), reals([]), reals([]), reals([])),
+        support=support,
         columns=columns,
         output=np.zeros((len(sample_time), columns.size)),
     )
