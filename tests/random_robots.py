@@ -22,6 +22,7 @@ from dynsim.model.joints.ball import ball, floating
 from dynsim.model.joints.planar import planar, rolling
 from dynsim.model.joints.wheels import wheeled
 from dynsim.model.model import Model
+from dynsim.model.shapes import compile_shapes
 
 SURFACES = ("plane", "sphere", "cylinder")
 SEVERAL_ROWS = {
@@ -283,5 +284,6 @@ def bench(
         loads=compile_loads(robot, loads or ()),
         dense=np.zeros((size, size + 1)) if m_star else None,
         couplings=compile_couplings(robot),
+        shapes=compile_shapes(robot, contacts or []),
     )
     return Bench(robot, system, new_workspace(system))

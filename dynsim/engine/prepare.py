@@ -31,6 +31,7 @@ from dynsim.model.control import JointControl
 from dynsim.model.description import Array, Contact, Load, Robot
 from dynsim.model.drives import Drive, Motor
 from dynsim.model.model import Model
+from dynsim.model.shapes import compile_shapes
 from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, build
 
@@ -110,6 +111,7 @@ def prepare(
         loads=compile_loads(robot, loads),
         dense=np.zeros((size, size + 1)) if options.solver == "m_star" else None,
         couplings=compile_couplings(robot),
+        shapes=compile_shapes(robot, contacts),
     )
     y = np.zeros(layout.size)
     y[block(layout, "q")] = robot.initial
