@@ -212,8 +212,12 @@ class Contact:
     ----------
     point : (3,) in the body's frame [m]: the point, the centre of the sphere, or one end of the capsule's axis
     friction : kinetic coefficient μ
-    slip_smoothing : v_s [m/s] of the direction v_t/√(v_t² + v_s²)
-    pulling_friction : "signed" (f_t = μ f_n as [WM] prints it) or "dissipative" (f_t = μ |f_n|)
+    slip_smoothing : v_s [m/s] of the direction v_t/√(v_t² + v_s²); bilateral law
+    pulling_friction : "signed" (f_t = μ f_n as [WM] prints it) or "dissipative" (f_t = μ |f_n|); bilateral law
+    static_friction : coefficient μ_s that holds at rest; None: μ. This and what follows: unilateral law
+    stribeck : speed [m/s] of μ + (μ_s − μ) exp(−(v/v_s)²); 0: μ from the first slip on
+    viscous_friction : what each m/s adds to the coefficient [s/m]
+    restitution : share of the normal speed that is left after an impact, with its sign turned
     radius : of sphere or capsule [m]
     tip : (3,) or None
         The other end of a capsule's axis, in the same frame [m]. Where the surface bends away from the free side the
@@ -228,6 +232,10 @@ class Contact:
     friction: float = 0.0
     slip_smoothing: float = 1e-3
     pulling_friction: str = "dissipative"
+    static_friction: float | None = None
+    stribeck: float = 0.0
+    viscous_friction: float = 0.0
+    restitution: float = 0.0
     radius: float = 0.0
     tip: Array | None = None
 
@@ -243,6 +251,15 @@ class Coupling:
     leader: str
     ratio: float = 1.0
     offset: float = 0.0
+
+
+@dataclass(frozen=True)
+class JointStop:
+    """What a joint comes up against: side 1 keeps q ≥ position, side −1 q ≤ position [rad or m]."""
+
+    joint: str
+    side: float
+    position: float
 
 
 @dataclass(frozen=True)

@@ -71,6 +71,8 @@ def _read_npy(file: str) -> list[list[float]]:
     except (OSError, EOFError, ValueError) as error:
         raise ValueError(f"{file}: is no array of numbers ({error})") from error
     if not isinstance(heights, np.ndarray) or heights.ndim != 2 or heights.dtype.kind not in "fiu":
-        raise ValueError(f"{file}: its array is of shape {getattr(heights, 'shape', ())}; it must have a row for each y")
+        raise ValueError(
+            f"{file}: its array is of shape {getattr(heights, 'shape', ())}; it must have a row for each y"
+        )
     rows: list[list[float]] = heights.astype(np.float64).tolist()
     return rows

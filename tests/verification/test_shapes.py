@@ -184,7 +184,7 @@ def test_tangential_rows_of_what_sticks_roll(kind, shape):
         b, contact, q, v, a = random_case(kind, shape, seed)
         y, eps = b.state(q, v), 1e-5
         b.derivative(y)
-        set_modes(b.system.contacts, b.system.couplings, b.ws, integers([ka.STICKING]))
+        set_modes(b.system.contacts, b.system.couplings, None, b.ws, integers([ka.STICKING]))
         b.derivative(y)
         state, rows = b.ws.contacts[0].copy(), b.ws.rows.copy()
         tangents = state[ka.FIRST_TANGENT : ka.SECOND_TANGENT + 3].reshape(2, 3)
@@ -263,15 +263,13 @@ def test_a_ball_and_a_cylinder_roll_down_a_slope(shape, share):
     b = bench(robot, contacts)
     y = b.state(pose(robot, r * NORMAL), np.zeros(6))
     b.derivative(y)
-    set_modes(b.system.contacts, b.system.couplings, b.ws, integers([ka.STICKING] * len(contacts)))
+    set_modes(b.system.contacts, b.system.couplings, None, b.ws, integers([ka.STICKING] * len(contacts)))
     run = b.simulate(y, times, rtol=1e-10)
     q = run.states("q")
     travelled = (q[:, :3] - q[0, :3]) @ DOWN
     np.testing.assert_allclose(travelled, 0.5 * share * G * np.sin(SLOPE) * times**2, rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose((q[:, :3] - q[0, :3]) @ NORMAL, 0.0, atol=1e-9)
-    np.testing.assert_allclose(
-        run.outputs("contact")[:, :, OUT_FORCE].sum(axis=1), mass * G * np.cos(SLOPE), rtol=1e-8
-    )
+    np.testing.assert_allclose(run.outputs("contact")[:, :, OUT_FORCE].sum(axis=1), mass * G * np.cos(SLOPE), rtol=1e-8)
 
 
 def test_a_ball_rolls_over_a_sphere():
@@ -281,7 +279,7 @@ def test_a_ball_rolls_over_a_sphere():
     b = bench(robot, [Contact("ball", "body", np.zeros(3), round_surface(np.zeros(3), R), radius=r)])
     y = b.state(pose(robot, (R + r) * np.array([np.sin(start), 0.0, np.cos(start)])), np.zeros(6))
     b.derivative(y)
-    set_modes(b.system.contacts, b.system.couplings, b.ws, integers([ka.STICKING]))
+    set_modes(b.system.contacts, b.system.couplings, None, b.ws, integers([ka.STICKING]))
     run = b.simulate(y, np.linspace(0.0, 0.8, 9), rtol=1e-10)
     place, v = run.states("q")[:, :3], run.states("v")
     theta = np.arctan2(place[:, 0], place[:, 2])

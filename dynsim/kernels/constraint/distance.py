@@ -306,6 +306,4 @@ def surface_distances(shapes: ShapeArrays, points, gaps, normals):
 def nearest_points(shapes: ShapeArrays, starts, along, u):
     """:func:`nearest` of candidate 0 for axes from ``starts`` along ``along``, (T, 3), into ``u``, (T,)."""
     for t in range(starts.shape[0]):
-        u[t] = nearest(
-            shapes, 0, starts[t, 0], starts[t, 1], starts[t, 2], along[t, 0], along[t, 1], along[t, 2]
-        )
+        u[t] = nearest(shapes, 0, starts[t, 0], starts[t, 1], starts[t, 2], along[t, 0], along[t, 1], along[t, 2])

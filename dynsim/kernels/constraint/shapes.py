@@ -26,6 +26,7 @@ from dynsim.kernels.arrays import (
     POSITION,
     ROW,
     ROW_GAP,
+    ROW_MU,
     SLIP_VELOCITY,
     STICKING,
     TANGENT,
@@ -42,6 +43,7 @@ from dynsim.kernels.arrays import (
 from dynsim.kernels.constraint.distance import MOVES, RADIUS, SURFACE, AS_POINT, D, ShapeArrays, distance, nearest
 from dynsim.kernels.constraint.rows import sticking_rows, tangents
 from dynsim.kernels.constraint.surface import signed_friction, unit_force
+from dynsim.kernels.constraint.unilateral import UnilateralArrays, slide_direction
 from dynsim.kernels.jit import internal_kernel
 
 # sin² of the angle between an axis and the direction along which the distance does not change, below which the nearest
@@ -50,7 +52,9 @@ ALONG = 1e-8
 
 
 @internal_kernel
-def shaped_rows(shapes, model: ModelArrays, contacts: ContactArrays, ws: Workspace):
+def shaped_rows(
+    shapes, unilateral: UnilateralArrays | None, model: ModelArrays, contacts: ContactArrays, ws: Workspace
+):
     """Overwrite what ``contact_rows`` has made of the candidates that are no points on quadrics; None: there are none.
 
     Position (the point of contact c), gap, slip, row, target and direction as there, and the rows of those that stick.
@@ -59,11 +63,18 @@ def shaped_rows(shapes, model: ModelArrays, contacts: ContactArrays, ws: Workspa
         return
     for k in range(contacts.link.shape[0]):
         if shapes.kind[k, SURFACE] != AS_POINT:
-            shaped_row(shapes, model, contacts, ws, k)
+            shaped_row(shapes, unilateral, model, contacts, ws, k)
 
 
 @internal_kernel
-def shaped_row(shapes: ShapeArrays, model: ModelArrays, contacts: ContactArrays, ws: Workspace, k):
+def shaped_row(
+    shapes: ShapeArrays,
+    unilateral: UnilateralArrays | None,
+    model: ModelArrays,
+    contacts: ContactArrays,
+    ws: Workspace,
+    k,
+):
     """Geometry and rows of one candidate.
 
     Friction acts at c, along the velocity of the body's point there. Where it sticks it rolls: its tangential rows are
@@ -115,16 +126,19 @@ def shaped_row(shapes: ShapeArrays, model: ModelArrays, contacts: ContactArrays,
     rate = nx * vx + ny * vy + nz * vz
     vx, vy, vz = vx - radius * (wy * nz - wz * ny), vy - radius * (wz * nx - wx * nz), vz - radius * (wx * ny - wy * nx)
     tx, ty, tz = vx - rate * nx, vy - rate * ny, vz - rate * nz
-    scale = 1.0 / math.sqrt(tx * tx + ty * ty + tz * tz + point[k, V_S] * point[k, V_S])
+    if unilateral is None:
+        scale = 1.0 / math.sqrt(tx * tx + ty * ty + tz * tz + point[k, V_S] * point[k, V_S])
+        gx, gy, gz = tx * scale, ty * scale, tz * scale
+    else:
+        gx, gy, gz, rows[m, ROW_MU] = slide_direction(unilateral, contacts, k, tx, ty, tz)
     state[k, GAP], state[k, GAP_RATE], rows[m, TARGET] = far - radius, rate, -second
     state[k, POSITION], state[k, POSITION + 1], state[k, POSITION + 2] = cx, cy, cz
     state[k, NORMAL], state[k, NORMAL + 1], state[k, NORMAL + 2] = nx, ny, nz
     state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2] = tx, ty, tz
-    tx, ty, tz = tx * scale, ty * scale, tz * scale
-    state[k, TANGENT], state[k, TANGENT + 1], state[k, TANGENT + 2] = tx, ty, tz
+    state[k, TANGENT], state[k, TANGENT + 1], state[k, TANGENT + 2] = gx, gy, gz
     rows[m, ROW], rows[m, ROW + 1], rows[m, ROW + 2] = cy * nz - cz * ny, cz * nx - cx * nz, cx * ny - cy * nx
     rows[m, ROW + 3], rows[m, ROW + 4], rows[m, ROW + 5] = nx, ny, nz
-    unit_force(rows, m, signed_friction(ws, m), cx, cy, cz, nx, ny, nz, tx, ty, tz)
+    unit_force(rows, m, signed_friction(ws, m), cx, cy, cz, nx, ny, nz, gx, gy, gz)
     if ws.active[k, MODE] != STICKING:
         return
     rolls = radius > 0.0 or shapes.kind[k, MOVES] != 0
