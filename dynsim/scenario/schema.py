@@ -46,8 +46,7 @@ class Contacts(StrictConfig):
         default=None, description="coefficient that holds at rest, at least friction (the default); unilateral law"
     )
     stribeck_m_s: Positive | None = Field(
-        default=None,
-        description="v_s of μ + (μ_s − μ) exp(−(v/v_s)²); default: μ from the first slip on; unilateral law",
+        default=None, description="v_s of μ + (μ_s − μ) exp(−(v/v_s)²); default: μ from the first slip on; unilateral law"
     )
     viscous_friction_s_per_m: NonNegative = Field(
         default=0.0, description="what each m/s of slip adds to the coefficient; unilateral law"
