@@ -85,8 +85,8 @@ def prepare(
     """
     described = build.robot(scenario)
     model = Model(described if motors is None else replace(described, motors=tuple(motors)))
-    robot, contacts = model.robot, build.contacts(scenario)
-    build.check_start(scenario, model)
+    robot, contacts = model.robot, build.contacts(scenario, model.robot)
+    build.check_start(scenario, model, contacts)
     loads = build.loads(scenario, robot)
     if pushable:
         loads = [*loads, *(_push(body) for body in robot.bodies)]

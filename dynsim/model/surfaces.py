@@ -153,6 +153,10 @@ class HeightField(_Shaped):
         return _spline(_spline(self.heights).T).T
 
 
+SURFACES = Quadric | Box | HeightField
+"""What a member of the family ``surface`` may build."""
+
+
 def _spline(values: Array) -> Array:
     """Coefficients of cubic B-splines along the first axis, (n, m) → (n + 2, m)."""
     from scipy.linalg import solve_banded

@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from dynsim.config import Positive, StrictConfig, Vector3, error_at
 from dynsim.model.protocols import BuildContext
 from dynsim.model.surfaces import Box
+from dynsim.model.urdf_reader import rotation
 
 
 class Config(StrictConfig):
@@ -34,15 +35,5 @@ class Config(StrictConfig):
 
 def build(config: Config, context: BuildContext) -> Box:
     """The box with the edges of its core and its rounding."""
-    roll, pitch, yaw = np.deg2rad(config.rpy_deg)
-    R = _turn(2, yaw) @ _turn(1, pitch) @ _turn(0, roll)
-    return Box(np.array(config.center_m), R.T, np.array(config.edges_m), config.edge_radius_m)
-
-
-def _turn(axis: int, angle: float) -> np.ndarray:
-    """Rotation about x, y or z."""
-    R = np.eye(3)
-    a, b = (axis + 1) % 3, (axis + 2) % 3
-    R[a, a] = R[b, b] = np.cos(angle)
-    R[a, b], R[b, a] = -np.sin(angle), np.sin(angle)
-    return R
+    axes = rotation(*np.deg2rad(config.rpy_deg).tolist()).T
+    return Box(np.array(config.center_m), axes, np.array(config.edges_m), config.edge_radius_m)
