@@ -18,10 +18,10 @@ from dynsim.kernels.arrays import (
     DEPENDENT,
     DIDT,
     GEAR_DAMPING,
+    OPEN,
     QD,
     QDD,
     ROWS,
-    OPEN,
     SLIDING,
     ContactArrays,
     CouplingArrays,
@@ -33,8 +33,8 @@ from dynsim.kernels.arrays import (
     workspace,
 )
 from dynsim.kernels.constraint.delassus import solve_small
-from dynsim.kernels.constraint.m_star import solve_m_star
 from dynsim.kernels.constraint.distance import ShapeArrays
+from dynsim.kernels.constraint.m_star import solve_m_star
 from dynsim.kernels.constraint.rows import set_modes
 from dynsim.kernels.constraint.shapes import shaped_rows
 from dynsim.kernels.constraint.splits import admissible_forces

@@ -58,7 +58,10 @@ def bends_outward(surface: Surface) -> bool:
 
 
 def shape_arrays(entries: Sequence[tuple[Surface | None, float, Array, bool]]) -> kd.ShapeArrays:
-    """Tables of candidates: surface (None: a point on a quadric), radius [m], axis in its body [m], whether it moves."""
+    """Tables of candidates: surface, radius [m], axis in its body [m], and whether its nearest point touches.
+
+    The surface is None for a point on a quadric.
+    """
     kind = np.zeros((len(entries), kd.SHAPE_KIND_SIZE), dtype=np.int64)
     data = np.zeros((len(entries), kd.SHAPE_SIZE))
     fields: list[Array] = [np.zeros(0)]

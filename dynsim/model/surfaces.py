@@ -70,9 +70,10 @@ class Quadric:
         )
 
     def normal(self, position: Array) -> Array:
-        """∇C/|∇C| at a point, (3,)."""
+        """∇C/|∇C| at a point, (3,); zero where there is none, as in the middle of a sphere."""
         gradient = self.Q @ position + self.b
-        return np.asarray(gradient / np.linalg.norm(gradient))
+        slope = float(np.linalg.norm(gradient))
+        return np.asarray(gradient / slope) if slope > 0.0 else np.zeros(3)
 
     @cached_property
     def drawn(self) -> Drawn:
@@ -88,7 +89,7 @@ class _Shaped:
         """Table of a point candidate on this surface."""
         from dynsim.model.shapes import shape_arrays
 
-        return shape_arrays([(self, 0.0, np.zeros(3), False)])  # type: ignore[list-item]
+        return shape_arrays([(self, 0.0, np.zeros(3), False)])
 
     def gap(self, position: Array) -> float:
         """Signed distance of a point, (3,), along the normal [m]."""

@@ -236,7 +236,8 @@ def check_start(
             continue
         if not abs(gap) <= START_TOLERANCE:
             raise ModelError(
-                f"{dotted(keys)}: {'its point' if declared else contact.name} starts {gap:+.4g} m from surface {contact.surface_name!r} "
+                f"{dotted(keys)}: {'its point' if declared else contact.name} starts {gap:+.4g} m "
+                f"from surface {contact.surface_name!r} "
                 f"(limit {START_TOLERANCE:g} m), at {position.tolist()}; "
                 "change the initial configuration or the surface, or disable the contact",
                 keys=keys,

@@ -48,8 +48,7 @@ def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declare
             for contact in taken
             if contact.surface_name == surface_name
         ]
-        for contact in _joints(robot) if kind == "joints" else _links(robot, surface):
-            contact = replace(contact, surface=surface, surface_name=surface_name)
+        for contact in (_joints if kind == "joints" else _links)(robot, surface, surface_name):
             places = _places(model, contact, configurations)
             if contact.tip is None:
                 if any(_same(places, other) and contact.radius == one.radius for one, other in known):
@@ -71,48 +70,34 @@ def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declare
     return found
 
 
-def _joints(robot: Robot) -> list[Contact]:
+def _joints(robot: Robot, surface: Surface, name: str) -> list[Contact]:
     """Origins of all joints, and the hand."""
-    carriers, nowhere = robot.carriers, _Nowhere()
+    carriers = robot.carriers
     found = [
-        Contact(link.joint_of_rows or link.joint, link.name, np.zeros(3), nowhere)
+        Contact(link.joint_of_rows or link.joint, link.name, np.zeros(3), surface, name)
         for link in robot.links
         if link.name not in carriers
     ]
-    return [*found, Contact("hand", *robot.hand, nowhere)]
+    return [*found, Contact("hand", *robot.hand, surface, name)]
 
 
-def _links(robot: Robot, surface: Surface) -> list[Contact]:
+def _links(robot: Robot, surface: Surface, on: str) -> list[Contact]:
     """Axes of all links against a surface: spheres at their beginnings, then at their ends, and capsules between."""
-    carriers, nowhere = robot.carriers, _Nowhere()
     starts, ends, capsules = [], [], []
-    tips = axis_ends(robot)
+    tips, carriers = axis_ends(robot), robot.carriers
     for link in robot.links:
         axes = [tip for tip in tips[link.name] if np.linalg.norm(tip) > SAME]
         if link.name in carriers:
             continue
         joint = link.joint_of_rows or link.joint
-        starts.append(Contact(joint, link.name, np.zeros(3), nowhere, radius=link.radius))
+        starts.append(Contact(joint, link.name, np.zeros(3), surface, on, radius=link.radius))
         for k, tip in enumerate(axes):
             name = link.name if len(axes) == 1 else f"{link.name}_{k + 1}"
-            ends.append(Contact(f"{name}_end", link.name, tip, nowhere, radius=link.radius))
-            capsules.append(Contact(name, link.name, np.zeros(3), nowhere, radius=link.radius, tip=tip))
+            ends.append(Contact(f"{name}_end", link.name, tip, surface, on, radius=link.radius))
+            capsules.append(Contact(name, link.name, np.zeros(3), surface, on, radius=link.radius, tip=tip))
     if not bends_outward(surface):
         return starts + ends
     return [*starts, *ends, *capsules] if isinstance(surface, Box) else capsules
-
-
-class _Nowhere:
-    """The surface of a candidate that has none yet."""
-
-    def gap(self, position: Array) -> float:
-        raise NotImplementedError
-
-    def gaps(self, positions: Array) -> Array:
-        raise NotImplementedError
-
-    def normal(self, position: Array) -> Array:
-        raise NotImplementedError
 
 
 def _configurations(robot: Robot) -> list[Array]:

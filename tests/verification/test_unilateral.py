@@ -9,7 +9,7 @@ from random_robots import Bench, bench
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import contact_events as ce
 from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.state import FRICTION, OUT_FORCE, OUT_GAP, OUT_MODE, OUT_VECTOR
+from dynsim.kernels.state import FRICTION, OUT_FORCE, OUT_GAP, OUT_MODE
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot, vector
 
 G = 9.81

@@ -87,8 +87,8 @@ def distance(shapes: ShapeArrays, k, x, y, z):
 def box_distance(shapes: ShapeArrays, k, x, y, z):
     """As :func:`distance` for a box whose centre is the origin.
 
-    With p in its axes, b its half edges without the rounding r, and o = max(|p| − b, 0): φ = |o| − r outside the core b,
-    n and H those of a plane, a cylinder or a sphere by how many components o has. Within the core: the nearest face.
+    With p in its axes, b its half edges without the rounding r, and o = max(|p| − b, 0): φ = |o| − r outside the core
+    b, n and H those of a plane, a cylinder or a sphere by how many components o has. Within the core: the nearest face.
     """
     data = shapes.data
     px = data[k, AXES] * x + data[k, AXES + 1] * y + data[k, AXES + 2] * z
@@ -240,7 +240,7 @@ def spline_weights(x, per, count):
 
 @internal_kernel
 def nearest(shapes: ShapeArrays, k, x, y, z, dx, dy, dz):
-    """u in [0, 1] at which x + u d is nearest to the surface of candidate k: a sphere, a cylinder or a box from outside.
+    """u in [0, 1] at which x + u d is nearest to the surface of candidate k: sphere, cylinder or box from outside.
 
     In closed form for the first two. Of a box φ is convex, so n·d grows with u: Newton's method kept within brackets.
     In the middle of where the distance does not change.

@@ -40,7 +40,7 @@ from dynsim.kernels.arrays import (
     V,
     Workspace,
 )
-from dynsim.kernels.constraint.distance import MOVES, RADIUS, SURFACE, AS_POINT, D, ShapeArrays, distance, nearest
+from dynsim.kernels.constraint.distance import AS_POINT, MOVES, RADIUS, SURFACE, D, ShapeArrays, distance, nearest
 from dynsim.kernels.constraint.rows import sticking_rows, tangents
 from dynsim.kernels.constraint.surface import signed_friction, unit_force
 from dynsim.kernels.constraint.unilateral import UnilateralArrays, slide_direction

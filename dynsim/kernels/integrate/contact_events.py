@@ -20,7 +20,6 @@ from dynsim.kernels.arrays import (
     MODE,
     NORMAL_FORCE,
     OPEN,
-    QD,
     SLIDING,
     SLIP_VELOCITY,
     STICKING,
@@ -71,13 +70,15 @@ from dynsim.kernels.integrate.run import (
     EVENT_INDEX,
     EVENT_KIND,
     LOGGED,
-    SIDE as GUARD_SIDE,
     STARTED,
     STATUS,
     STOP_LOG,
     TIME,
     VALUE,
     Run,
+)
+from dynsim.kernels.integrate.run import (
+    SIDE as GUARD_SIDE,
 )
 from dynsim.kernels.jit import apart_kernel, internal_kernel
 from dynsim.kernels.system import System

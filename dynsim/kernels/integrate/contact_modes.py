@@ -65,7 +65,6 @@ from dynsim.kernels.constraint.unilateral import (
     STRUCK,
     TABLE_ROW,
     TOUCHING,
-    VISCOUS,
     WANTED,
     UnilateralArrays,
     slide_direction,
