@@ -282,7 +282,7 @@ def bench(
     k_p: float = 30.0,
     k_d: float = 1.0,
     real: bool = False,
-    slow: float = 1e-6,
+    slow: float = 1e-5,
 ) -> Bench:
     """Compile a robot and its contacts, with a voltage PD that holds ``held`` (zero by default).
 

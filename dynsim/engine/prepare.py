@@ -179,7 +179,7 @@ def guards(
 
 def slow_slip(atol: float) -> float:
     """Speed below which the direction of slip is noise of the integration, so that the last one stands [m/s]."""
-    return max(100.0 * atol, 1e-9)
+    return max(1000.0 * atol, 1e-9)
 
 
 def _breaks(loads: Sequence[Load]) -> np.ndarray:

@@ -103,9 +103,10 @@ FORCE_SLACK = 1e-9
 
 
 @internal_kernel
-def contact_guard(system: System, ws: Workspace, kind, k):
+def contact_guard(unilateral: UnilateralArrays | None, ws: Workspace, kind, k):
     """Value of a guard of the unilateral law, right after ``derivative``."""
-    unilateral = system.unilateral
+    if unilateral is None:  # known to the compiler
+        return 1.0
     if kind == STOP_GUARD:
         stop, j = unilateral.stop, unilateral.stop_table[k, STOP_JOINT]
         if unilateral.stop_table[k, STOP_CLOSED] == 1:
@@ -124,13 +125,21 @@ def contact_guard(system: System, ws: Workspace, kind, k):
 
 
 @internal_kernel
-def passes_below(system: System, ws: Workspace, run: Run, h, gaps):
-    """Fraction of the step at which an open candidate dips below its surface and is out again at the end, else 1.
+def too_long(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
+    """The fraction of a step to take instead, where it has passed over something; else 1.
 
-    The minimum of the cubic through gaps and their rates at both ends; ``gaps``: (c, 2) those at the start.
+    An open candidate may dip below its surface and be out again at the end: the minimum of the cubic through gaps and
+    their rates at both ends, ``gaps``, (c, 2), at the start. And a frozen direction of slip may have stood for too long.
     """
     found = 1.0
+    if unilateral is None:  # known to the compiler
+        return found
     for k in range(gaps.shape[0]):
+        slow = unilateral.number[SLOW]
+        if ws.active[k, MODE] == SLIDING and unilateral.slide[k, FROZEN] == 1.0 and unilateral.law[k, STATIC] > 0.0:
+            speed = slip_speed(ws, k)
+            if speed > 2.0 * slow:
+                found = min(found, max(1.5 * slow / speed, 0.01))
         if ws.active[k, MODE] != OPEN or gaps[k, 1] >= 0.0 or ws.contacts[k, GAP_RATE] <= 0.0:
             continue
         g0, g1, d0, d1 = gaps[k, 0], ws.contacts[k, GAP], h * gaps[k, 1], h * ws.contacts[k, GAP_RATE]
@@ -153,8 +162,10 @@ def note_gaps(ws: Workspace, gaps):
 
 
 @internal_kernel
-def watch_modes(unilateral: UnilateralArrays, ws: Workspace, h):
+def watch_modes(unilateral: UnilateralArrays | None, ws: Workspace, h):
     """At an accepted step, before its samples: times in each mode, depths, and the directions of slip at its end."""
+    if unilateral is None:
+        return
     state, tally, slide = ws.contacts, unilateral.tally, unilateral.slide
     for k in range(state.shape[0]):
         tally[k, TIME_OPEN + ws.active[k, MODE]] += h
@@ -169,8 +180,10 @@ def watch_modes(unilateral: UnilateralArrays, ws: Workspace, h):
 
 
 @internal_kernel
-def take_directions(unilateral: UnilateralArrays, ws: Workspace, run: Run):
+def take_directions(unilateral: UnilateralArrays | None, ws: Workspace, run: Run):
     """After the samples of a step: freeze directions of what has become slow, free those of what is fast again."""
+    if unilateral is None:
+        return
     slide, slow = unilateral.slide, unilateral.number[SLOW]
     for k in range(slide.shape[0]):
         if ws.active[k, MODE] != SLIDING:
@@ -200,7 +213,7 @@ def consistent(system: System, ws: Workspace):
         mode = ws.active[k, MODE]
         if mode != OPEN and ws.contacts[k, NORMAL_FORCE] < -slack:
             return False
-        if mode == STICKING and contact_guard(system, ws, SLIP_GUARD, k) < -slack:
+        if mode == STICKING and contact_guard(unilateral, ws, SLIP_GUARD, k) < -slack:
             return False
     return True
 
@@ -293,9 +306,10 @@ def log_changes(system: System, ws: Workspace, run: Run):
 
 
 @apart_kernel
-def switch_contacts(system: System, ws: Workspace, run: Run):
+def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Workspace, run: Run):
     """Do what the contact events at the end of the accepted step ask for; the next step starts anew."""
-    unilateral = system.unilateral
+    if unilateral is None:
+        return
     mode, table = unilateral.mode, unilateral.stop_table
     happened, by_hand = 0, True
     for e in range(run.event.shape[0]):

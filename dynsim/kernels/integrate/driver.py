@@ -18,6 +18,7 @@ After each accepted step q and v are projected onto the active rows when they ha
 from __future__ import annotations
 
 from dynsim.kernels.arrays import CONTRADICTORY, Workspace
+from dynsim.kernels.constraint.unilateral import UnilateralArrays
 from dynsim.kernels.constraint.uniqueness import clearly_unique
 from dynsim.kernels.drive.law import take_commands
 from dynsim.kernels.integrate.contact_events import (
@@ -70,7 +71,7 @@ from dynsim.kernels.tree.support import watch_support
 @internal_kernel
 def start(system: System, ws: Workspace, run: Run):
     """First derivative, on the contacts, and a first step size where none is given. Sets STATUS when there is none."""
-    if not start_contacts(system, ws, run):
+    if not start_contacts(system.unilateral, system, ws, run):
         run.count[STATUS] = NOT_PROJECTED if run.count[STATUS] == RUNNING else run.count[STATUS]
     elif not finite(run.stage[0]):
         run.count[STATUS] = NO_FORCES if ws.counts[CONTRADICTORY] > 0 else NOT_FINITE
@@ -82,21 +83,20 @@ def start(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
-def start_contacts(system: System, ws: Workspace, run: Run):
+def start_contacts(unilateral: UnilateralArrays | None, system: System, ws: Workspace, run: Run):
     """Derivative at the start of a step, on the constraints; under the unilateral law with modes that agree with it."""
-    if system.unilateral is not None:
-        first = run.count[MODES_DUE] == 1
-        if first:
-            run.count[MODES_DUE] = 0
-            solve_modes(system, ws, run, True)
-        if run.count[STATUS] != RUNNING or not settle(system, run.clock[TIME], run.y, ws, run.stage[0], run):
-            return False
-        if consistent(system, ws):
-            return True
-        solve_modes(system, ws, run, first)
-        if run.count[STATUS] != RUNNING:
-            return False
-    return settle(system, run.clock[TIME], run.y, ws, run.stage[0], run)
+    if unilateral is None:  # known to the compiler, as it is below: system.unilateral would not be
+        return settle(system, run.clock[TIME], run.y, ws, run.stage[0], run)
+    first = run.count[MODES_DUE] == 1
+    if first:
+        run.count[MODES_DUE] = 0
+        solve_modes(system, ws, run, True)
+    if run.count[STATUS] != RUNNING or not settle(system, run.clock[TIME], run.y, ws, run.stage[0], run):
+        return False
+    if consistent(system, ws):
+        return True
+    solve_modes(system, ws, run, first)
+    return run.count[STATUS] == RUNNING and settle(system, run.clock[TIME], run.y, ws, run.stage[0], run)
 
 
 @merged_kernel
@@ -109,16 +109,14 @@ def accept(system: System, ws: Workspace, run: Run):
     if not (clearly_unique(ws) or forces_unique(system, ws, run, t + h)):
         return
     watch(ws, run, h)
-    if system.unilateral is not None:
-        watch_modes(system.unilateral, ws, h)
+    watch_modes(system.unilateral, ws, h)
     # The event of tipping has asked for the ground's reaction at the end of this step.
     if run.support.index.shape[0] > 0 and run.event.shape[0] > 0:
         watch_support(run.support)
     if system.layout.extra > 0:
         normalise(system.model, run.y_new, system.layout.q)
     sample_step(system, ws, run)
-    if system.unilateral is not None:
-        take_directions(system.unilateral, ws, run)
+    take_directions(system.unilateral, ws, run)
     for j in range(run.y.shape[0]):
         run.y[j] = run.y_new[j]
         run.stage[0, j] = run.stage[6, j]
@@ -206,8 +204,8 @@ def conclude(system: System, ws: Workspace, run: Run, error, order):
     count[PENDING] = 0
     accept(system, ws, run)
     go_on(run, order, 0.04)
-    if system.unilateral is not None and count[FIRED] == 1 and count[STATUS] == RUNNING:
-        switch_contacts(system, ws, run)
+    if count[FIRED] == 1 and count[STATUS] == RUNNING:
+        switch_contacts(system.unilateral, system, ws, run)
     return run.event.shape[0] > 0 and fire_events(run)
 
 

@@ -10,7 +10,7 @@ followed by such a step anyway.
 from __future__ import annotations
 
 from dynsim.kernels.arrays import CURRENT, GAP, NORMAL_FORCE, QD, VOLTAGE, Q, Workspace
-from dynsim.kernels.integrate.contact_events import NORMAL_GUARD, contact_guard, note_gaps, passes_below
+from dynsim.kernels.integrate.contact_events import NORMAL_GUARD, contact_guard, note_gaps, too_long
 from dynsim.kernels.integrate.run import (
     AT_HIGH,
     AT_LOW,
@@ -79,8 +79,7 @@ def guard(system: System, t, ws: Workspace, run: Run, e):
         ground_reaction(system.model, system.loads, t, ws, run.support)
         value = run.support.state[MARGIN]
     elif kind >= NORMAL_GUARD:
-        if system.unilateral is not None:
-            value = contact_guard(system, ws, kind, k)
+        value = contact_guard(system.unilateral, ws, kind, k)
     else:
         point_position(ws, run.hand_link, run.hand_point, run.hand)
         value = run.hand[kind - HAND_X]
@@ -98,8 +97,7 @@ def arm_events(system: System, ws: Workspace, run: Run):
         run.event[e, START_VALUE] = value
         if run.event[e, SIDE] == 0.0:
             run.event[e, SIDE] = 1.0 if value > 0.0 else (-1.0 if value < 0.0 else 0.0)
-    if system.unilateral is not None:
-        note_gaps(ws, run.gaps)
+    note_gaps(ws, run.gaps)
 
 
 @inlined_kernel
@@ -128,7 +126,7 @@ def cut_step(system: System, ws: Workspace, run: Run):
         hit = happened(run, e, event[e, VALUE]) or hit
     if count[SEARCHING] == 0:
         if not hit:
-            return grazes(system, ws, run)
+            return passes_over(system, ws, run)
         clock[LOW], clock[HIGH], count[TURNED_BACK] = 0.0, h, 0
         for e in range(event.shape[0]):
             event[e, AT_LOW], event[e, AT_HIGH] = event[e, START_VALUE], event[e, VALUE]
@@ -167,17 +165,16 @@ def cut_step(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
-def grazes(system: System, ws: Workspace, run: Run):
-    """True when a candidate seems to touch within the step and to be off again at its end: STEP ends where it touches."""
-    if system.unilateral is not None:
-        part = passes_below(system, ws, run, run.clock[STEP], run.gaps)
-        # A touch that is none, after all, does not shorten steps for ever.
-        if part < 1.0 and run.count[GRAZING] < SEARCH_LIMIT:
-            run.count[GRAZING] += 1
-            run.clock[STEP] *= part
-            return True
-        run.count[GRAZING] = 0
-        note_gaps(ws, run.gaps)
+def passes_over(system: System, ws: Workspace, run: Run):
+    """True when a contact has been passed over within the step: STEP is then the one to take instead."""
+    part = too_long(system.unilateral, ws, run.clock[STEP], run.gaps)
+    # What is none, after all, does not shorten steps for ever.
+    if part < 1.0 and run.count[GRAZING] < SEARCH_LIMIT:
+        run.count[GRAZING] += 1
+        run.clock[STEP] *= part
+        return True
+    run.count[GRAZING] = 0
+    note_gaps(ws, run.gaps)
     return False
 
 

@@ -20,7 +20,7 @@ from dynsim.kernels.arrays import (
     Workspace,
 )
 from dynsim.kernels.constraint.rows import force_vectors
-from dynsim.kernels.constraint.unilateral import STOP_FORCE
+from dynsim.kernels.constraint.unilateral import STOP_FORCE, UnilateralArrays
 from dynsim.kernels.integrate.run import Run
 from dynsim.kernels.jit import internal_kernel
 from dynsim.kernels.ledger import kinetic_energy, magnetic_energy, potential_energy
@@ -65,6 +65,13 @@ def write_output(system: System, ws: Workspace, run: Run, row):
         ground_reaction(system.model, system.loads, run.sample_time[row], ws, run.support)
         for s in range(OUTPUTS):
             out[row, columns.support + s] = run.support.state[s]
-    if system.unilateral is not None:
-        for k in range(system.unilateral.stop.shape[0]):
-            out[row, columns.stop + k] = system.unilateral.stop[k, STOP_FORCE]
+    stop_forces(system.unilateral, out[row, columns.stop :])
+
+
+@internal_kernel
+def stop_forces(unilateral: UnilateralArrays | None, out):
+    """Forces of the joint stops, (s,) or more."""
+    if unilateral is None:  # known to the compiler
+        return
+    for k in range(unilateral.stop.shape[0]):
+        out[k] = unilateral.stop[k, STOP_FORCE]

@@ -34,7 +34,7 @@ STEPS, REJECTED, EVALUATIONS, PROJECTIONS, SAMPLE, STATUS, STARTED = 0, 1, 2, 3,
 PENDING, SEARCHING, TURNED_BACK, FIRED, TRIMMED, LOGGED, TICKED = 7, 8, 9, 10, 11, 12, 13
 NEXT_BREAK = 14  # index of the first of Run.breaks that is not past
 MODES_DUE = 15  # 1: contact modes are to be chosen at the next start
-GRAZING = 16  # the step is shortened to look at a minimum of a gap
+GRAZING = 16  # how often the step was shortened because it passed over a contact
 COUNT_SIZE = 17
 # Run.event, and Run.event_table, int
 EVENT_LEVEL, SIDE, START_VALUE, VALUE, AT_LOW, AT_HIGH = 0, 1, 2, 3, 4, 5
