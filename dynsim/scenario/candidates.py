@@ -66,7 +66,7 @@ def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declare
             else:
                 still.append(name)
     if still:
-        log.info("contacts.candidates: %s cannot move along the normal and are left out", ", ".join(still))
+        log.info("contacts.candidates: left out, because nothing moves them along the normal: %s", ", ".join(still))
     return found
 
 

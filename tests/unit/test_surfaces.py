@@ -125,7 +125,7 @@ def test_joints_touch_each_surface_but_those_that_cannot_move_along_its_normal(t
     """The first two joints are one point on the base: of the plane's normal nothing moves it, so it is named."""
     with caplog.at_level(logging.INFO, logger="dynsim"):
         assert names(tmp_path, "joints") == ["joint_3", "joint_4", "hand"]
-    assert "contacts.candidates: joint_1 cannot move along the normal and are left out" in caplog.text
+    assert "contacts.candidates: left out, because nothing moves them along the normal: joint_1" in caplog.text
     two = "{floor: {type: plane, point_m: [0, 0, -2]}, ball: {type: sphere, center_m: [3, 0, 0], radius_m: 1}}"
     assert names(tmp_path, "joints", surfaces=two) == [
         f"{one}_{surface}" for surface in ("floor", "ball") for one in ("joint_3", "joint_4", "hand")

@@ -307,6 +307,24 @@ def test_a_field_of_cubics_is_kept_exactly_and_goes_on_straight():
     assert np.abs(field.gaps(beyond)).max() <= 1e-12
 
 
+def test_a_field_meets_smooth_hills_to_the_fourth_power_of_its_spacing():
+    rng = np.random.default_rng(4)
+    places = rng.uniform(0.0, 2.0, size=(200, 2))
+
+    def hill(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return 0.1 * np.sin(3.0 * x) * np.cos(2.0 * y)
+
+    errors = []
+    for cells in (20, 40, 80):
+        lines = np.linspace(0.0, 2.0, cells + 1)
+        field = HeightField(np.zeros(2), np.full(2, 2.0 / cells), hill(lines, lines[:, None]))
+        on = np.column_stack([places, hill(*places.T)])
+        errors.append(np.abs(field.gaps(on)).max())
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert (orders > 3.6).all()
+    assert errors[-1] < 1e-6
+
+
 def test_points_on_quadrics_have_no_table():
     rng = np.random.default_rng(2)
     robot = random_robot(rng, 3)
