@@ -12,7 +12,7 @@ from dynsim.model.clearance import axis_ends
 from dynsim.model.description import Contact, Robot
 from dynsim.model.model import Model
 from dynsim.model.shapes import bends_outward
-from dynsim.model.surfaces import Array, Box, Surface
+from dynsim.model.surfaces import Array, Surface
 
 log = logging.getLogger(__name__)
 
@@ -20,6 +20,9 @@ log = logging.getLogger(__name__)
 CONFIGURATIONS = 6
 # Points that are always as close as this are one [m]; rows smaller than this always are none.
 SAME = 1e-9
+# What is between the ends of a capsule is so much thinner [m]: where an end is nearest, or the axis lies along a face, the
+# ends touch alone, and the rows do not depend on each other.
+THINNER = 1e-6
 # Of a capsule that moves along its axis, where its row is looked at.
 SHARES = (0.0, 0.3, 0.7, 1.0)
 
@@ -29,8 +32,8 @@ def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declare
 
     ``joints``: the origins of all joints, and the hand, as points. ``links``: the axes of all links, with their radii.
     A capsule is nearest to a flat or hollow surface, and to a height field, with one of the spheres at its ends; those
-    that neighbours share count once, on the link whose joint it is, with the larger radius. Spheres and cylinders are
-    touched from outside by the nearest point of the axis, boxes by that and by the ends: an axis may lie on a face.
+    that neighbours share count once, on the link whose joint it is, with the larger radius. Spheres, cylinders and
+    boxes are touched from outside by these, and by the nearest point of the axis; that is :data:`THINNER`.
 
     Left out are points that are declared or the same as others, and what cannot move along the normal (a log line
     names it): it would have a row of zeros.
@@ -94,10 +97,9 @@ def _links(robot: Robot, surface: Surface, on: str) -> list[Contact]:
         for k, tip in enumerate(axes):
             name = link.name if len(axes) == 1 else f"{link.name}_{k + 1}"
             ends.append(Contact(f"{name}_end", link.name, tip, surface, on, radius=link.radius))
-            capsules.append(Contact(name, link.name, np.zeros(3), surface, on, radius=link.radius, tip=tip))
-    if not bends_outward(surface):
-        return starts + ends
-    return [*starts, *ends, *capsules] if isinstance(surface, Box) else capsules
+            thinner = max(link.radius - THINNER, 0.0)
+            capsules.append(Contact(name, link.name, np.zeros(3), surface, on, radius=thinner, tip=tip))
+    return [*starts, *ends, *capsules] if bends_outward(surface) else starts + ends
 
 
 def _configurations(robot: Robot) -> list[Array]:

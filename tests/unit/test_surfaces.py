@@ -146,20 +146,21 @@ def test_declared_points_are_not_candidates_once_more(tmp_path):
     ]
 
 
+FLAT = ["joint_3", "joint_4", "link_4_end"]
+BENT = [*FLAT, "link_2", "link_3", "link_4"]
+
+
 @pytest.mark.parametrize(
     ("surface", "expected"),
     [
-        ("{type: plane, point_m: [0, 0, -2]}", ["joint_3", "joint_4", "link_4_end"]),
-        ("{type: sphere, center_m: [0, 0, -2], radius_m: 1}", ["link_2", "link_3", "link_4"]),
-        ("{type: sphere, center_m: [0, 0, 0.1], radius_m: 3, inside: true}", ["joint_3", "joint_4", "link_4_end"]),
-        ("{type: cylinder, point_m: [0, 0, -2], axis: [1, 0, 0], radius_m: 1}", ["link_2", "link_3", "link_4"]),
-        (
-            "{type: box, center_m: [0, 0, -2], edges_m: [1, 1, 1]}",
-            ["joint_3", "joint_4", "link_4_end", "link_2", "link_3", "link_4"],
-        ),
+        ("{type: plane, point_m: [0, 0, -2]}", FLAT),
+        ("{type: sphere, center_m: [0, 0, -2], radius_m: 1}", BENT),
+        ("{type: sphere, center_m: [0, 0, 0.1], radius_m: 3, inside: true}", FLAT),
+        ("{type: cylinder, point_m: [0, 0, -2], axis: [1, 0, 0], radius_m: 1}", BENT),
+        ("{type: box, center_m: [0, 0, -2], edges_m: [1, 1, 1]}", BENT),
     ],
 )
-def test_links_are_spheres_on_flat_surfaces_and_capsules_on_round_ones(tmp_path, surface, expected):
+def test_links_are_spheres_on_flat_surfaces_and_capsules_too_on_round_ones(tmp_path, surface, expected):
     assert names(tmp_path, "links", surfaces=f"{{floor: {surface}}}") == expected
 
 
