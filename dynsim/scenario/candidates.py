@@ -20,8 +20,8 @@ log = logging.getLogger(__name__)
 CONFIGURATIONS = 6
 # Points that are always as close as this are one [m]; rows smaller than this always are none.
 SAME = 1e-9
-# What is between the ends of a capsule is so much thinner [m]: where an end is nearest, or the axis lies along a face, the
-# ends touch alone, and the rows do not depend on each other.
+# What is between the ends of a capsule is so much thinner [m]: where an end is nearest, or the axis lies along a face,
+# the ends touch alone, and the rows do not depend on each other.
 THINNER = 1e-6
 # Of a capsule that moves along its axis, where its row is looked at.
 SHARES = (0.0, 0.3, 0.7, 1.0)
