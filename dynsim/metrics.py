@@ -25,9 +25,10 @@ from dynsim.measures import (
     sinks,
 )
 from dynsim.model.clearance import Sinking, sinking
-from dynsim.model.description import Contact, JointStop, Robot
+from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Drive, Servo, TorqueSource
 from dynsim.model.mobile_base import MobileBase
+from dynsim.model.unilateral import JointStop
 from dynsim.record import Record
 from dynsim.scenario import Scenario, build
 
@@ -332,8 +333,8 @@ def _chattered(contacts: Sequence[Contact], unilateral: UnilateralArrays) -> lis
     for contact, tally in zip(contacts, unilateral.tally, strict=True):
         if tally[ku.CHATTERED]:
             found.append(
-                f"{contact.name}: chatter, more than {MOST_EVENTS} contact events within {WINDOW:g} s; points that leave "
-                f"more slowly than {tally[ku.SETTLE]:.0e} m/s were kept on the surface"
+                f"{contact.name}: chatter, more than {MOST_EVENTS} contact events within {WINDOW:g} s; what left more "
+                f"slowly than {tally[ku.SETTLE]:.0e} m/s was kept on the surface"
             )
     return found
 

@@ -22,16 +22,15 @@ from dynsim.model.arrays import (
     compile_drives,
     compile_loads,
     compile_model,
-    compile_unilateral,
-    joint_stops,
 )
-from dynsim.model.description import Contact, Inertia, JointStop, Link, Load, Quadric, Robot
+from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot
 from dynsim.model.drives import Motor
 from dynsim.model.joints.ball import ball, floating
 from dynsim.model.joints.planar import planar, rolling
 from dynsim.model.joints.wheels import wheeled
 from dynsim.model.model import Model
 from dynsim.model.shapes import compile_shapes
+from dynsim.model.unilateral import JointStop, compile_unilateral, joint_stops
 
 SURFACES = ("plane", "sphere", "cylinder")
 SEVERAL_ROWS = {

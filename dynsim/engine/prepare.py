@@ -26,15 +26,14 @@ from dynsim.model.arrays import (
     compile_drives,
     compile_loads,
     compile_support,
-    compile_unilateral,
-    joint_stops,
 )
 from dynsim.model.clearance import poses
 from dynsim.model.control import JointControl
-from dynsim.model.description import Array, Contact, JointStop, Load, Robot
+from dynsim.model.description import Array, Contact, Load, Robot
 from dynsim.model.drives import Drive, Motor
 from dynsim.model.model import Model
 from dynsim.model.shapes import compile_shapes
+from dynsim.model.unilateral import JointStop, compile_unilateral, joint_stops
 from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, build
 
@@ -159,7 +158,7 @@ def _ticks(control: JointControl) -> tuple[np.ndarray, np.ndarray] | None:
 def guards(
     robot: Robot, contacts: Sequence[Contact], stops: Sequence[JointStop]
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """The events that a run watches for by itself, and what they do: a base that tips, then those of the unilateral law.
+    """The events that a run watches for by itself, and what they do: those of a base, then of the unilateral law.
 
     Of a mobile base the margin falls through zero; of contacts and stops see dynsim.kernels.integrate.contact_events.
     """

@@ -92,7 +92,12 @@ def make_record(
     add_body_poses(record)
     deficient, spread = int(prepared.workspace.counts[ka.DEPENDENT]), None
     # Under the unilateral law rows of what sticks depend on each other, which leaves no motion open.
-    if prepared.system.unilateral is None and deficient and rows and any(contact.friction > 0.0 for contact in contacts):
+    if (
+        prepared.system.unilateral is None
+        and deficient
+        and rows
+        and any(contact.friction > 0.0 for contact in contacts)
+    ):
         joint_units = [(link.joint, link.units[2]) for link in robot.links]
         spread = motion_spread(prepared.system, run.sample_time[:rows], run.sample[:rows], joint_units)
     counts = metrics.Counts(

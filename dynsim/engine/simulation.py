@@ -110,6 +110,7 @@ class Simulation:
         self._calling, self._token = False, object()
         self._guards: list[tuple[str, str, Callable[[Simulation], None] | None]] = []
         self._calls: list[Callable[[Simulation], None]] = []
+        robot = self.robot
         self._guards.extend((kind, subject, None) for kind, subject in own_guards(self._prepared))
         self._armature = self.model.armature
         self._joints = {link.joint: i for i, link in enumerate(robot.links)}

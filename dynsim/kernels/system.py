@@ -68,7 +68,7 @@ class System(NamedTuple):
 
 
 def new_workspace(system: System) -> Workspace:
-    """The workspace of a system: every coupling holds, every candidate slides; under the unilateral law all are open."""
+    """The workspace of a system: couplings hold, candidates slide, under the unilateral law they are open."""
     contacts, couplings, unilateral = system.contacts, system.couplings, system.unilateral
     c, joint_rows = contacts.link.shape[0], couplings.joint.shape[0]
     if unilateral is not None:

@@ -254,15 +254,6 @@ class Coupling:
 
 
 @dataclass(frozen=True)
-class JointStop:
-    """What a joint comes up against: side 1 keeps q ≥ position, side −1 q ≤ position [rad or m]."""
-
-    joint: str
-    side: float
-    position: float
-
-
-@dataclass(frozen=True)
 class Load:
     """A force and a torque from outside on a point of a body, as cubic polynomials of time.
 

@@ -46,7 +46,8 @@ class Contacts(StrictConfig):
         default=None, description="coefficient that holds at rest, at least friction (the default); unilateral law"
     )
     stribeck_m_s: Positive | None = Field(
-        default=None, description="v_s of μ + (μ_s − μ) exp(−(v/v_s)²); default: μ from the first slip on; unilateral law"
+        default=None,
+        description="v_s of μ + (μ_s − μ) exp(−(v/v_s)²); default: μ from the first slip on; unilateral law",
     )
     viscous_friction_s_per_m: NonNegative = Field(
         default=0.0, description="what each m/s of slip adds to the coefficient; unilateral law"
@@ -67,11 +68,15 @@ class Contacts(StrictConfig):
     )
     points: dict[str, ContactPoint] = {}
 
+    @property
+    def other_keys(self) -> tuple[str, ...]:
+        """Keys that only the other law reads."""
+        return BILATERAL_KEYS if self.law == "unilateral" else UNILATERAL_KEYS
+
     @model_validator(mode="after")
     def _check_law(self) -> Self:
         """Keys of the other law would be read by nobody."""
-        other = BILATERAL_KEYS if self.law == "unilateral" else UNILATERAL_KEYS
-        set_here = [key for key in other if key in self.model_fields_set]
+        set_here = [key for key in self.other_keys if key in self.model_fields_set]
         if set_here:
             raise ValueError(f"{listed(set_here)} {'is' if len(set_here) == 1 else 'are'} not of law {self.law}")
         if self.law == "bilateral" and self.candidates != "points":
@@ -225,6 +230,10 @@ class Scenario:
         resolved = self.config.model_dump(mode="json", exclude_none=True)
         if not self.config.loads:
             del resolved["loads"]
+        contacts = self.config.contacts
+        for part in (resolved["contacts"], *resolved["contacts"]["points"].values()):
+            for key in contacts.other_keys:
+                part.pop(key, None)
         return resolved
 
     def place(self, keys: Sequence[int | str] = (), variant: str = "") -> str:

@@ -82,8 +82,8 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: Unilat
     C(r) = r·Q r/2 + b·r + c, n = ∇C/|∇C| ([WM] eqs 3, 6, 8); a gap > 0 is off the surface. Row:
     n·r̈ = −ṙᵀ(∂²C/∂r²)ṙ / |∇C| ([WM] eqs 15, 30). Force per unit f_n: n − σ μ t with the smoothed slip direction
     t = v_t / √(|v_t|² + v_s²) ([WM] eqs 9, 14 and f_t = μ f_n); v_s is dynsim's assumption, the paper says nothing
-    of zero slip. σ is 1 in the paper's law; for the dissipative law it is the sign of f_n, kept between calls. Under the
-    unilateral law t and μ are those of :func:`~dynsim.kernels.constraint.unilateral.slide_direction`.
+    of zero slip. σ is 1 in the paper's law; for the dissipative law it is the sign of f_n, kept between calls. Under
+    the unilateral law t and μ are those of :func:`~dynsim.kernels.constraint.unilateral.slide_direction`.
     """
     links, state, rows, point, gravity = ws.links, ws.contacts, ws.rows, contacts.point, model.gravity
     for k in range(contacts.link.shape[0]):

@@ -1,4 +1,4 @@
-"""The unilateral law: tables of candidates that only push and of joint stops, and the direction in which a point slides.
+"""The unilateral law: tables of candidates and joint stops that only push, and the direction in which a point slides.
 
 0 ≤ f_n ⟂ gap ≥ 0; a point that slides is driven by n − μ(s) t along t = v_t/|v_t|, one that is at rest is held while
 |f_t| ≤ μ_s f_n. Which candidates are open, slide or stick is constant within a step
@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.kernels.arrays import MU, ContactArrays
+from dynsim.kernels.constraint.cone_program import ConeProgram
 from dynsim.kernels.jit import inlined_kernel
 
 # UnilateralArrays.law; the kinetic coefficient is ContactArrays.point[:, MU].
@@ -81,7 +82,7 @@ class UnilateralArrays(NamedTuple):
     place: np.ndarray  # (PLACES, p) int
     vector: np.ndarray  # (VECTORS, p)
     split: np.ndarray  # (2, p, p)
-    split_room: np.ndarray  # scratch of best_split
+    split_room: ConeProgram  # scratch of best_split
     matrix: np.ndarray  # (p, p)
     room: np.ndarray  # scratch of solve_cones
     number: np.ndarray  # (NUMBERS,)

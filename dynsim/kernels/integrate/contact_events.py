@@ -4,8 +4,8 @@ Each candidate has two guards, each stop one. Off its surface the guard is the g
 point that sticks the second guard is its margin μ_s f_n − |f_t|, of one that slides its speed along the direction that
 it began the step with. All of them fall through zero.
 
-Lift-off and the begin of slip leave forces as they are, so that the one candidate is switched by hand: its complementarity
-problem is degenerate there. Everything else, and whatever this leaves inconsistent, is solved anew.
+Lift-off and the begin of slip leave forces as they are, so that the one candidate is switched by hand: its
+complementarity problem is degenerate there. Everything else, and whatever this leaves inconsistent, is solved anew.
 """
 
 from __future__ import annotations
@@ -89,11 +89,11 @@ NORMAL_GUARD, SLIP_GUARD, STOP_GUARD = 10, 11, 12
 LANDING, LIFT_OFF, SLIP_START, SLIP_STOP, BOUNCE, CHATTERS, STOP_HIT, STOP_LEFT = 0, 1, 2, 3, 4, 5, 6, 7
 LOG_KINDS = 8
 
-# Below its surface by this much a point has landed [m]: projection leaves closed ones within half of it, on either side.
+# Below its surface by this much a point has landed [m]; projection leaves closed ones within half of it.
 DEPTH = 2e-10
 # A candidate that starts, or comes to rest, this close to its surface touches it [m].
 TOUCH = 1e-9
-# More events of a candidate than this in WINDOW seconds are chatter; SETTLE grows tenfold then, up to MOST_SETTLE.
+# More events of a candidate than MOST_EVENTS in WINDOW [s] are chatter; SETTLE grows tenfold then, up to MOST_SETTLE.
 WINDOW, MOST_EVENTS, MOST_SETTLE = 1.0, 200, 1e-2
 # So many changes at one instant, or chatter so often at one candidate, end the run.
 MOST_CHANGES, MOST_CHATTER = 60, 100
@@ -129,7 +129,7 @@ def too_long(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
     """The fraction of a step to take instead, where it has passed over something; else 1.
 
     An open candidate may dip below its surface and be out again at the end: the minimum of the cubic through gaps and
-    their rates at both ends, ``gaps``, (c, 2), at the start. And a frozen direction of slip may have stood for too long.
+    their rates at both ends, ``gaps``, (c, 2), at the start. Or a frozen direction of slip has stood for too long.
     """
     found = 1.0
     if unilateral is None:  # known to the compiler

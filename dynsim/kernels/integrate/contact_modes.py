@@ -5,8 +5,8 @@ approaches is stopped by impulses (Moreau's law with Newton's restitution and Co
 
     0 ≤ f_n ⟂ n·r̈ ≥ 0,   |f_t| ≤ μ_s f_n, and f_t = −μ_s f_n a_t/|a_t| where a_t ≠ 0
 
-is solved for what is at rest along its surface, with one unknown, f_n (n − μ t), for each point that slides already. The
-solution says which points leave, which stick, and where slip begins, in which direction.
+is solved for what is at rest along its surface, with one unknown, f_n (n − μ t), for each point that slides already.
+The solution says which points leave, which stick, and where slip begins, in which direction.
 """
 
 from __future__ import annotations
@@ -254,7 +254,7 @@ def impact(system: System, ws: Workspace, run: Run):
 def choose(system: System, ws: Workspace, run: Run):
     """Modes by the accelerations of all that touches; the rates of what is closed are brought to zero."""
     unilateral = system.unilateral
-    mode, vector, table = unilateral.mode, unilateral.vector, unilateral.stop_table
+    mode, vector = unilateral.mode, unilateral.vector
     p = gather(system, ws, run)
     largest = 0.0
     for r in range(p):
@@ -288,7 +288,6 @@ def choose(system: System, ws: Workspace, run: Run):
         run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
         return
     take_solution(system, ws, size, largest)
-    before = ws.counts[DEPENDENT]
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
     unilateral.number[REDUNDANT] = 0.0
     evaluate(system, ws, run)
@@ -412,11 +411,11 @@ def give_way(system: System, ws: Workspace, size, largest):
             continue
         while place[TABLE_ROW, i] != ws.active[k, FIRST_ROW]:
             i += 1
-        if mode[k, WANTED] == STICKING and law[k, STRIBECK] == 0.0 and law[k, STATIC] > system.contacts.point[k, MU]:
-            if f[i] > 0.0 and slips(system, i, size, largest, law[k, STATIC]):
-                begin_slip(system, ws, k, f[i + 1], f[i + 2])
-                mode[k, WANTED] = SLIDING
-                changed = True
+        drops = law[k, STRIBECK] == 0.0 and law[k, STATIC] > system.contacts.point[k, MU] and f[i] > 0.0
+        if mode[k, WANTED] == STICKING and drops and slips(system, i, size, largest, law[k, STATIC]):
+            begin_slip(system, ws, k, f[i + 1], f[i + 2])
+            mode[k, WANTED] = SLIDING
+            changed = True
     return changed
 
 

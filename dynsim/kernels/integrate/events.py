@@ -49,8 +49,8 @@ from dynsim.kernels.system import System
 from dynsim.kernels.tree.points import point_position
 from dynsim.kernels.tree.support import MARGIN, ground_reaction
 
-# Kinds of guards. A new one is a number here, a branch in ``guard`` and a name in GUARDS of dynsim.engine.stepped. Those of
-# the unilateral law, from NORMAL_GUARD on, are in dynsim.kernels.integrate.contact_events.
+# Kinds of guards. A new one is a number here, a branch in ``guard`` and a name in GUARDS of dynsim.engine.stepped.
+# Those of the unilateral law, from NORMAL_GUARD on, are in dynsim.kernels.integrate.contact_events.
 JOINT_POSITION, JOINT_RATE, MOTOR_CURRENT, MOTOR_VOLTAGE, CONTACT_FORCE, CONTACT_GAP = 0, 1, 2, 3, 4, 5
 HAND_X, HAND_Y, HAND_Z = 6, 7, 8
 TIP_MARGIN = 9
