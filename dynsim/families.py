@@ -155,7 +155,7 @@ def build(family: str, config: Any, context: BuildContext, expected: type[T] | U
     """
     result = member(family, config.type).build(config, context)
     if not isinstance(result, expected):
-        wanted = getattr(expected, "__name__", expected)
+        wanted = " or ".join(one.__name__ for one in typing.get_args(expected) or (expected,))
         raise ModelError(f"{family} {config.type!r}: its build must return a {wanted}, not {shown(result)}")
     return cast(T, result)
 

@@ -29,6 +29,7 @@ from dynsim.model.joints.ball import ball, floating
 from dynsim.model.joints.planar import planar, rolling
 from dynsim.model.joints.wheels import wheeled
 from dynsim.model.model import Model
+from dynsim.model.shapes import compile_shapes
 from dynsim.model.unilateral import JointStop, compile_unilateral, joint_stops
 
 SURFACES = ("plane", "sphere", "cylinder")
@@ -300,6 +301,7 @@ def bench(
         loads=compile_loads(robot, loads or ()),
         dense=np.zeros((size, size + 1)) if m_star else None,
         couplings=compile_couplings(robot),
+        shapes=compile_shapes(robot, contacts or []),
         unilateral=compile_unilateral(robot, contacts or [], stops, slow) if real else None,
     )
     return Bench(robot, system, new_workspace(system), tuple(contacts or ()) if real else (), tuple(stops))

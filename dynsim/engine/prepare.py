@@ -32,6 +32,7 @@ from dynsim.model.control import JointControl
 from dynsim.model.description import Array, Contact, Load, Robot
 from dynsim.model.drives import Drive, Motor
 from dynsim.model.model import Model
+from dynsim.model.shapes import compile_shapes
 from dynsim.model.unilateral import JointStop, compile_unilateral, joint_stops
 from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, build
@@ -83,8 +84,8 @@ def prepare(
     """
     described = build.robot(scenario)
     model = Model(described if motors is None else replace(described, motors=tuple(motors)))
-    robot, contacts = model.robot, build.contacts(scenario)
-    build.check_start(scenario, model)
+    robot, contacts = model.robot, build.contacts(scenario, model.robot)
+    build.check_start(scenario, model, contacts)
     loads = build.loads(scenario, robot)
     if pushable:
         loads = [*loads, *(_push(body) for body in robot.bodies)]
@@ -116,6 +117,7 @@ def prepare(
         loads=compile_loads(robot, loads),
         dense=np.zeros((size, size + 1)) if options.solver == "m_star" else None,
         couplings=compile_couplings(robot),
+        shapes=compile_shapes(robot, contacts),
         unilateral=compile_unilateral(robot, contacts, stops, slow_slip(options.atol)) if real else None,
     )
     y = np.zeros(layout.size)

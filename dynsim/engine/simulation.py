@@ -472,7 +472,7 @@ class Simulation:
             run.y[part] = values
         q = run.y[block(run.layout, "q")]
         check_couplings(model.robot, q)
-        check_start(self._scenario, model, q)
+        check_start(self._scenario, model, self._prepared.contacts, q)
 
     def _reach(self, until: float) -> None:
         """Integrate until the step that would pass a time is pending, or ends there."""

@@ -12,7 +12,7 @@ from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.tree import loads as kl
 from dynsim.kernels.tree import support as ks
 from dynsim.kernels.tree.loads import LoadArrays
-from dynsim.model.description import Contact, Coupling, Link, Load, Robot
+from dynsim.model.description import Contact, Coupling, Link, Load, Quadric, Robot
 from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
 from dynsim.model.servo import servo_row
 
@@ -179,14 +179,18 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArr
         if not contact.slip_smoothing > 0.0:
             raise ModelError(f"contact {contact.name}: slip smoothing {contact.slip_smoothing} m/s must be positive")
         surface = contact.surface
+        link[k, ka.LINK], link[k, ka.FRICTION_LAW] = body, _FRICTION[contact.pulling_friction]
+        point[k, ka.POINT : ka.POINT + 3] = on_body
+        point[k, ka.MU], point[k, ka.V_S] = contact.friction, contact.slip_smoothing
+        if not isinstance(surface, Quadric):  # any plane will do: its rows are overwritten
+            point[k, ka.QUADRIC + 8] = 1.0
+            continue
         curved = bool(surface.Q.any())
         scale = 1.0 if curved else 1.0 / float(np.linalg.norm(surface.b))
-        link[k] = body, _FRICTION[contact.pulling_friction], curved
-        point[k, ka.POINT : ka.POINT + 3] = on_body
+        link[k, ka.CURVED] = curved
         point[k, ka.QUADRIC : ka.QUADRIC + 6] = surface.Q[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
         point[k, ka.QUADRIC + 6 : ka.QUADRIC + 9] = scale * surface.b
         point[k, ka.QUADRIC + 9] = scale * surface.c
-        point[k, ka.MU], point[k, ka.V_S] = contact.friction, contact.slip_smoothing
     return ka.ContactArrays(link=integers(link), point=reals(point))
 
 

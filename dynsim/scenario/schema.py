@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig
+from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig, error_at
 from dynsim.families import member, union
 from dynsim.problems import Origin, listed
 from dynsim.scenario.loads import LoadConfig
@@ -62,6 +62,10 @@ class Contacts(StrictConfig):
     reference_tolerance_m: Positive = Field(
         default=2e-3, description="references that take a contact point further off its surface than this are refused"
     )
+    candidates: Literal["points", "joints", "links"] = Field(
+        default="points",
+        description="what can touch beside the points: nothing, all joints and the hand, or the links as capsules",
+    )
     points: dict[str, ContactPoint] = {}
 
     @property
@@ -75,6 +79,10 @@ class Contacts(StrictConfig):
         set_here = [key for key in self.other_keys if key in self.model_fields_set]
         if set_here:
             raise ValueError(f"{listed(set_here)} {'is' if len(set_here) == 1 else 'are'} not of law {self.law}")
+        if self.law == "bilateral" and self.candidates != "points":
+            raise error_at(
+                "candidates", f"{self.candidates!r} would glue all of them to their surfaces; it needs law: unilateral"
+            )
         static = self.friction if self.static_friction is None else self.static_friction
         if static < self.friction:
             raise ValueError(f"static_friction {static:g} is less than friction {self.friction:g}")
