@@ -157,7 +157,7 @@ ROW_OFFSET = 19  # of a joint row: what its two joints, times its coefficients, 
 ROW_STATE_SIZE = 20
 # Workspace.active, int: of each row
 ROW_KIND = 0
-OWNER = 1  # candidate or coupling
+OWNER = 1  # candidate, coupling or, counted on behind the couplings, joint stop
 BODY_A = 2  # link, or the following joint of a joint row
 BODY_B = 3  # link at the other end, -1 for the world; the leading joint of a joint row
 LAW = 4  # FRICTION_SIGNED unless the sign of the force decides about DIRECTION

@@ -244,14 +244,18 @@ class Quadric:
 
 @dataclass(frozen=True)
 class Contact:
-    """A body-fixed point held to a surface.
+    """A body-fixed point held to a surface, or pushed by it alone.
 
     Attributes
     ----------
     point : (3,) in the body's frame [m]
     friction : kinetic coefficient μ
-    slip_smoothing : v_s [m/s] of the direction v_t/√(v_t² + v_s²)
-    pulling_friction : "signed" (f_t = μ f_n as [WM] prints it) or "dissipative" (f_t = μ |f_n|)
+    slip_smoothing : v_s [m/s] of the direction v_t/√(v_t² + v_s²); bilateral law
+    pulling_friction : "signed" (f_t = μ f_n as [WM] prints it) or "dissipative" (f_t = μ |f_n|); bilateral law
+    static_friction : coefficient μ_s that holds at rest; None: μ. This and what follows: unilateral law
+    stribeck : speed [m/s] of μ + (μ_s − μ) exp(−(v/v_s)²); 0: μ from the first slip on
+    viscous_friction : what each m/s adds to the coefficient [s/m]
+    restitution : share of the normal speed that is left after an impact, with its sign turned
     """
 
     name: str
@@ -262,6 +266,10 @@ class Contact:
     friction: float = 0.0
     slip_smoothing: float = 1e-3
     pulling_friction: str = "dissipative"
+    static_friction: float | None = None
+    stribeck: float = 0.0
+    viscous_friction: float = 0.0
+    restitution: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from dynsim.model.protocols import BuildContext
 from dynsim.model.snake import SnakeDescription, TaskSpaceController
 from dynsim.problems import dotted, suggest
 from dynsim.scenario.loads import Payload
-from dynsim.scenario.schema import Scenario
+from dynsim.scenario.schema import ContactPoint, Contacts, Scenario
 
 # A contact point must start this close to its surface [m].
 START_TOLERANCE = 1e-6
@@ -139,11 +139,26 @@ def contacts(scenario: Scenario) -> list[Contact]:
                 surface=known[point.surface],
                 surface_name=point.surface,
                 friction=options.friction if point.friction is None else point.friction,
-                slip_smoothing=options.slip_smoothing_m_s,
-                pulling_friction=options.pulling_friction,
+                **(_bilateral(options) if options.law == "bilateral" else _unilateral(options, point)),
             )
         )
     return result
+
+
+def _bilateral(options: Contacts) -> dict[str, Any]:
+    """What the bilateral law says of a contact."""
+    return {"slip_smoothing": options.slip_smoothing_m_s, "pulling_friction": options.pulling_friction}
+
+
+def _unilateral(options: Contacts, point: ContactPoint) -> dict[str, Any]:
+    """What the unilateral law says of a contact."""
+    return {
+        "pulling_friction": "signed",
+        "static_friction": options.static_friction if point.static_friction is None else point.static_friction,
+        "stribeck": options.stribeck_m_s or 0.0,
+        "viscous_friction": options.viscous_friction_s_per_m,
+        "restitution": options.restitution if point.restitution is None else point.restitution,
+    }
 
 
 def loads(scenario: Scenario, robot: Robot) -> list[Load]:
@@ -203,6 +218,8 @@ def check_start(scenario: Scenario, model: Model, q: NDArray[np.float64] | None 
         except ModelError as error:
             raise ModelError(f"{dotted((*keys, 'body'))}: {error}", keys=(*keys, "body")) from error
         gap = contact.surface.gap(position)
+        if scenario.config.contacts.law == "unilateral" and gap > 0.0:
+            continue
         if not abs(gap) <= START_TOLERANCE:
             raise ModelError(
                 f"{dotted(keys)}: its point starts {gap:+.4g} m from surface {contact.surface_name!r} "

@@ -169,7 +169,7 @@ def held(modes: list[int]) -> Case:
     case = on_planes(7, len(modes), seed=2, spread=1e-3)
     b = case.bench
     _, b.ws = run(case, [case.y], 0.0)  # which says where the points that stick are
-    lanes.plain(set_modes)(b.system.contacts, b.system.couplings, b.ws, integers(modes))
+    lanes.plain(set_modes)(b.system.contacts, b.system.couplings, None, b.ws, integers(modes))
     return case
 
 

@@ -11,6 +11,7 @@ from dynsim.kernels.arrays import (
     GAP,
     J_M,
     K_M,
+    MODE,
     NORMAL_FORCE,
     QD,
     QDD,
@@ -19,10 +20,11 @@ from dynsim.kernels.arrays import (
     Workspace,
 )
 from dynsim.kernels.constraint.rows import force_vectors
+from dynsim.kernels.constraint.unilateral import STOP_FORCE, UnilateralArrays
 from dynsim.kernels.integrate.run import Run
 from dynsim.kernels.jit import internal_kernel
 from dynsim.kernels.ledger import kinetic_energy, magnetic_energy, potential_energy
-from dynsim.kernels.state import OUT_FORCE, OUT_GAP, OUT_SLIP, OUT_VECTOR, OUTPUTS_PER_CONTACT
+from dynsim.kernels.state import OUT_FORCE, OUT_GAP, OUT_MODE, OUT_SLIP, OUT_VECTOR, OUTPUTS_PER_CONTACT
 from dynsim.kernels.system import System
 from dynsim.kernels.tree.points import point_position
 from dynsim.kernels.tree.support import OUTPUTS, ground_reaction
@@ -54,6 +56,7 @@ def write_output(system: System, ws: Workspace, run: Run, row):
     for c in range(state.shape[0]):
         out[row, k + OUT_FORCE] = state[c, NORMAL_FORCE]
         out[row, k + OUT_GAP] = state[c, GAP]
+        out[row, k + OUT_MODE] = ws.active[c, MODE]
         for s in range(3):
             out[row, k + OUT_VECTOR + s] = state[c, FORCE_VECTOR + s]
             out[row, k + OUT_SLIP + s] = state[c, SLIP_VELOCITY + s]
@@ -62,3 +65,13 @@ def write_output(system: System, ws: Workspace, run: Run, row):
         ground_reaction(system.model, system.loads, run.sample_time[row], ws, run.support)
         for s in range(OUTPUTS):
             out[row, columns.support + s] = run.support.state[s]
+    stop_forces(system.unilateral, out[row, columns.stop :])
+
+
+@internal_kernel
+def stop_forces(unilateral: UnilateralArrays | None, out):
+    """Forces of the joint stops, (s,) or more."""
+    if unilateral is None:  # known to the compiler
+        return
+    for k in range(unilateral.stop.shape[0]):
+        out[k] = unilateral.stop[k, STOP_FORCE]

@@ -1,0 +1,84 @@
+"""The contact problem: closed forms, and random problems whose conditions are checked by independent code."""
+
+import numpy as np
+
+from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, CONE_ROOM, ONE_WAY, TANGENT, solve_cones
+
+BLOCK = [CONE, TANGENT, TANGENT]
+
+
+def solve(W, b, kind, mu=0.0, start=None, tolerance=1e-12):
+    """Residual and forces; mu: one number, or one for each row."""
+    W, b = np.array(W, dtype=float), np.array(b, dtype=float)
+    p = len(b)
+    f = np.zeros(p) if start is None else np.array(start, dtype=float)
+    kind = np.array(kind, dtype=np.int64)
+    room = np.zeros((CONE_ROOM, p, p))
+    residual = solve_cones(W, b, kind, np.zeros(p) + mu, p, f, room, tolerance)
+    return residual, f
+
+
+def violation(W, b, kind, mu, f):
+    """The worst violation of the conditions as they are written, in the units of u, without any natural map."""
+    u, worst, k = W @ f + b, 0.0, 0
+    while k < len(b):
+        w = np.trace(W[k : k + 3, k : k + 3]) / 3 if kind[k] == CONE else W[k, k]
+        if kind[k] == BOTH_WAYS:
+            worst = max(worst, abs(u[k]))
+            k += 1
+            continue
+        # One of the two vanishes, and neither is negative.
+        worst = max(worst, min(abs(u[k]), abs(w * f[k])), -u[k], -w * f[k])
+        if kind[k] == CONE:
+            f_t, u_t = f[k + 1 : k + 3], u[k + 1 : k + 3]
+            size, margin = np.linalg.norm(u_t), mu[k] * f[k] - np.linalg.norm(f_t)
+            worst = max(worst, -w * margin)
+            # It sticks; or it is on the cone, and the force opposes the slip.
+            opposed = np.linalg.norm(f_t * size + u_t * np.linalg.norm(f_t)) / max(size, np.linalg.norm(f_t), 1e-300)
+            if mu[k] * f[k] > 0:
+                worst = max(worst, min(size, max(abs(w * margin), min(opposed * w, opposed))))
+            k += 2
+        k += 1
+    return worst
+
+
+def test_a_block_on_a_slope_sticks_below_its_friction_angle_and_slides_beyond():
+    mass, g = 2.0, 9.81
+    for slope in (0.1, 0.29, 0.31, 0.9):
+        b = [-g * np.cos(slope), 0.6 * g * np.sin(slope), 0.8 * g * np.sin(slope)]
+        residual, f = solve(np.eye(3) / mass, b, BLOCK, mu=0.3)
+        normal = mass * g * np.cos(slope)
+        tangential = min(mass * g * np.sin(slope), 0.3 * normal)
+        assert residual <= 1e-12
+        np.testing.assert_allclose(f, [normal, -0.6 * tangential, -0.8 * tangential], rtol=1e-12)
+
+
+def test_what_leaves_the_surface_has_no_force():
+    residual, f = solve(np.eye(3), [1.0, -3.0, 2.0], BLOCK, mu=1.0, start=[5.0, 1.0, 1.0])
+    assert residual == 0.0
+    assert (f == 0.0).all()
+
+
+def test_normal_and_tangent_that_are_coupled():
+    # u_n = 2 f_n + f_x − 1, u_x = f_n + f_x + 1 with sliding towards +x: f_x = −μ f_n, f_n = 1 / (2 − μ).
+    mu, W = 0.5, [[2.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    residual, f = solve(W, [-1.0, 1.0, 0.0], BLOCK, mu=mu)
+    assert residual <= 1e-12
+    np.testing.assert_allclose(f, [1 / (2 - mu), -mu / (2 - mu), 0.0], rtol=1e-12, atol=1e-15)
+
+
+def test_directed_friction_makes_a_problem_of_one_way_rows_that_every_start_solves():
+    random = np.random.default_rng(4)
+    for _ in range(300):
+        p = random.integers(1, 9)
+        # Strictly diagonally dominant with positive diagonal: a P-matrix, so that the solution is unique.
+        W = random.normal(size=(p, p))
+        np.fill_diagonal(W, np.abs(W).sum(axis=1) * random.uniform(1.0, 1.5))
+        b = random.normal(size=p)
+        solutions = []
+        for start in (np.zeros(p), 10.0 * random.normal(size=p)):
+            residual, f = solve(W, b, [ONE_WAY] * p, start=start)
+            assert residual <= 1e-12
+            assert violation(W, b, [ONE_WAY] * p, np.zeros(p), f) <= 1e-11
+            solutions.append(f)
+        np.testing.assert_allclose(*solutions, atol=1e-11)
