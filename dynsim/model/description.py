@@ -220,6 +220,11 @@ class Quadric:
         value = float(0.5 * position @ self.Q @ position + self.b @ position + self.c)
         return float(surface_distance(value, slope, float(normal @ self.Q @ normal)))
 
+    def normal(self, position: Array) -> Array:
+        """Unit normal ∇C/|∇C| at a point, (3,)."""
+        gradient = self.Q @ position + self.b
+        return np.asarray(gradient / np.linalg.norm(gradient))
+
     def gaps(self, positions: Array) -> Array:
         """:meth:`gap` of many points, (T, 3) → (T,) [m]; where ∇C vanishes, as in the middle of a sphere, too."""
         if not self.Q.any():
