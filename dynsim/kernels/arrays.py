@@ -205,6 +205,7 @@ class ReferenceArrays(NamedTuple):
     held: np.ndarray  # (na,) constant angle of a held joint
     grid: np.ndarray  # (2,) time of the first knot, knot distance [s]
     coefficients: np.ndarray  # (segments, splines, 6) ascending powers of t - t_knot
+    voltage: np.ndarray | None = None  # (segments, na, 6) added to the commands of DC motors [V]; None for none
 
 
 class ContactArrays(NamedTuple):

@@ -15,6 +15,7 @@ from dynsim.errors import ModelError, ScenarioError, shown
 from dynsim.model.control import JointControl
 from dynsim.model.description import Array, Contact, Inertia, Load, Robot
 from dynsim.model.model import Model
+from dynsim.model.posture import on_surfaces
 from dynsim.model.protocols import BuildContext
 from dynsim.model.shapes import contact_gap
 from dynsim.model.snake import SnakeDescription, TaskSpaceController
@@ -54,7 +55,15 @@ def robot(scenario: Scenario) -> Robot:
     links = list(bare.links)
     for body, parts in inertias.items():
         links[body] = replace(links[body], inertia=Inertia.merged(parts))
-    return replace(bare, links=tuple(links)) if inertias else bare
+    built = replace(bare, links=tuple(links)) if inertias else bare
+    initial = scenario.config.initial
+    if initial is None:
+        return built
+    points = {contact.name: contact for contact in contacts(scenario)}
+    try:
+        return replace(built, q0=on_surfaces(Model(built), points, initial.on_surface, initial.keep))
+    except ModelError as error:
+        raise ModelError(str(error), keys=("initial",)) from error
 
 
 def build_model(scenario: Scenario) -> Model:
@@ -94,7 +103,8 @@ def controller(
         raise ModelError("the scenario has no controller; its motors are short-circuited")
     if scenario.engine != families.member("controller", config.type).ENGINE:
         raise ModelError(f"controller {config.type!r} cannot drive a {scenario.plant.type!r}")
-    context = BuildContext(scenario.duration_s, machine, progress=progress)
+    points = {} if isinstance(machine, SnakeDescription) else {c.name: c for c in contacts(scenario)}
+    context = BuildContext(scenario.duration_s, machine, progress=progress, contacts=points)
     if isinstance(machine, Model):
         control = families.build("controller", config, context, JointControl)
         # The kernels would follow the last polynomial on.

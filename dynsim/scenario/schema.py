@@ -97,6 +97,13 @@ class Contacts(StrictConfig):
         return self
 
 
+class Initial(StrictConfig):
+    """What the initial posture is changed by, as little as possible."""
+
+    on_surface: list[str] = Field(min_length=1, description="contact points that start exactly on their surfaces")
+    keep: list[str] = Field(default=[], description="joints that do not move for it, and `hand` for the hand's place")
+
+
 class Integrator(StrictConfig):
     """Time integration."""
 
@@ -136,6 +143,7 @@ class ScenarioConfig(StrictConfig):
     controller: union("controller") | None = None  # type: ignore[valid-type]
     surfaces: dict[str, union("surface")] = {}  # type: ignore[valid-type]
     contacts: Contacts = Contacts()
+    initial: Initial | None = Field(default=None, description="posture solved from the plant's initial one")
     loads: dict[str, LoadConfig] = Field(default={}, description="forces, torques and payloads by name")
     integrator: Integrator = Integrator()
     record: RecordOptions = RecordOptions()
