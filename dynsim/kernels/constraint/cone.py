@@ -57,7 +57,7 @@ ROUNDS, SWEEPS, SWEPT_ROUNDS = 200, 10, 40
 # Of paths: how many, steps of one, starts at each.
 PATHS, PATH_STEPS, PATH_ROUNDS = 40, 150, 8
 # A proof holds for all forces up to this times |b| / mobility; its problem is regularised by the second number.
-PROVED_FORCE, PROOF_SHIFT = 1e6, 1e-10
+PROVED_FORCE, PROOF_SHIFT, PROOF_STEPS = 1e6, 1e-6, 4
 
 
 @kernel
@@ -242,22 +242,26 @@ def impossible(W, b, kind, mu, p, room):
     is allowed makes (Wᵀd)·f positive: bodies that close in on each other from all sides. Such a d is what is left of
     motion, −ε w f, when the problem without friction is solved with ε w added to W.
     """
-    proof, none, mobility = room[PROOF, 0], room[NO_FRICTION, 0], room[MOBILITY, 0]
-    scale = 0.0
+    proof, none, scale = room[PROOF, 0], room[NO_FRICTION, 0], 0.0
+    right, mobility = room[SHIFTED_RIGHT, 0], room[MOBILITY, 0]
     for k in range(p):
-        proof[k], none[k], room[ANCHOR, 0, k] = 0.0, 0.0, 0.0
-        scale = max(scale, abs(b[k]))
+        proof[k], none[k], room[ANCHOR, 0, k], scale = 0.0, 0.0, 0.0, max(scale, abs(b[k]))
     mobilities(W, kind, p, room)
     shift(W, b, p, room, PROOF_SHIFT)
-    approach(room[SHIFTED], room[SHIFTED_RIGHT, 0], kind, none, p, proof, room, 1e-9 * scale, PATH_ROUNDS)
-    mobilities(W, kind, p, room)
+    # What is left of what is left: each time a millionth of what forces can move.
+    for _ in range(PROOF_STEPS):
+        approach(room[SHIFTED], right, kind, none, p, proof, room, 1e-9 * scale, PATH_ROUNDS)
+        mobilities(W, kind, p, room)
+        for k in range(p):
+            proof[k] = 0.0 if kind[k] == TANGENT else PROOF_SHIFT * mobility[k] * proof[k]
+            if kind[k] != BOTH_WAYS:
+                proof[k] = max(proof[k], 0.0)
+            right[k] = -proof[k]
+            room[LAST, 0, k] = proof[k]
+            proof[k] /= PROOF_SHIFT * mobility[k]
     total = 0.0
     for k in range(p):
-        proof[k] *= mobility[k]
-        if kind[k] == TANGENT:
-            proof[k] = 0.0
-        elif kind[k] != BOTH_WAYS:
-            proof[k] = max(proof[k], 0.0)
+        proof[k] = room[LAST, 0, k]
         total += proof[k] * b[k]
     k = 0
     while k < p:
