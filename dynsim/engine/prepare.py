@@ -16,6 +16,7 @@ from dynsim.errors import ModelError, ScenarioError
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.events import TIP_MARGIN
+from dynsim.kernels.integrate.time_stepping import stepping_arrays
 from dynsim.kernels.state import OutputLayout, StateLayout, block, output_layout, state_layout
 from dynsim.kernels.system import System, new_workspace
 from dynsim.kernels.tree.support import OUTPUTS
@@ -91,6 +92,8 @@ def prepare(
     if times is None:
         times = sample_times(scenario, layout, columns, n)
     _check_coordinates(scenario, robot)
+    if robot.base is not None and scenario.integrator.method == "time_stepping":
+        raise ScenarioError("integrator.method: time_stepping does not locate events, such as a mobile base that tips")
     _check_stiffness(scenario, robot)
     couplings = len(robot.couplings)
     _check_work(scenario, n, c + couplings)
@@ -98,7 +101,7 @@ def prepare(
     _check_references(scenario, robot, contacts, control)
     options, size = scenario.integrator, n + ka.row_limit(c, couplings) + robot.circuits
     method = ki.METHODS[options.method]
-    step = options.step_s or (1e-3 if method == ki.RK4 else 0.0)
+    step = options.step_s or (1e-3 if method in ki.FIXED_STEP else 0.0)
     system = System(
         layout=layout,
         model=model.arrays,
@@ -111,6 +114,9 @@ def prepare(
         dense=np.zeros((size, size + 1)) if options.solver == "m_star" else None,
         couplings=compile_couplings(robot),
     )
+    stepping = None
+    if method == ki.TIME_STEPPING:
+        stepping = stepping_arrays(model.arrays, system.contacts, na, couplings, options.theta)
     y = np.zeros(layout.size)
     y[block(layout, "q")] = robot.initial
     run = ki.new_run(
@@ -133,6 +139,7 @@ def prepare(
         breaks=_breaks(loads),
         events=_tipping(robot),
         support=compile_support(robot),
+        stepping=stepping,
     )
     return Prepared(model, contacts, control, system, run, new_workspace(system), loads)
 
@@ -216,7 +223,9 @@ def _check_work(scenario: Scenario, n: int, p: int) -> None:
     # A Jacobian by differences, and its factors.
     per_step = (2 * n + 6) * seconds + 3e-10 * n**3 if options.method == "rodas4" else 4.0 * seconds
     # Motors and friction hold the step at about a millisecond.
-    steps = scenario.duration_s / (options.step_s if options.step_s and options.method == "rk4" else 1e-3)
+    steps = scenario.duration_s / (
+        options.step_s if options.step_s and ki.METHODS[options.method] in ki.FIXED_STEP else 1e-3
+    )
     hours = steps * per_step / 3600.0
     if hours > options.time_limit_h:
         raise ScenarioError(
