@@ -48,8 +48,8 @@ class Integrator(StrictConfig):
 
     method: Literal["rk43", "dopri5", "rk4", "rodas4", "time_stepping"] = Field(
         default="rk43",
-        description="adaptive 4(3) or 5(4), fixed step, adaptive linearly implicit for stiff motors, or fixed step with "
-        "contacts that open and close",
+        description="adaptive 4(3) or 5(4), fixed step, adaptive linearly implicit for stiff motors, or fixed step "
+        "with contacts that open and close",
     )
     solver: Literal["articulated", "m_star"] = Field(default="articulated", description="O(n) sweeps or the dense M*")
     rtol: float = Field(default=1e-6, ge=1e-13, le=1e-1)
