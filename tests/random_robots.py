@@ -233,6 +233,7 @@ class Bench:
         fixed: bool = False,
         rtol: float = 1e-6,
         atol: float | None = None,
+        stepping: Any = None,
     ) -> Run:
         """A run from y to the last of ``times``, recorded there, that has not begun.
 
@@ -253,6 +254,7 @@ class Bench:
             hand=(n - 1, self.robot.hand[1]),
             end=float(times[-1]),
             step=step,
+            stepping=stepping,
             step_max=step if fixed else np.inf,
             rtol=rtol,
             # With an absolute tolerance out of reach every step is accepted and the next one is as long as allowed.

@@ -107,14 +107,20 @@ class Initial(StrictConfig):
 class Integrator(StrictConfig):
     """Time integration."""
 
-    method: Literal["rk43", "dopri5", "rk4", "rodas4"] = Field(
+    method: Literal["rk43", "dopri5", "rk4", "rodas4", "time_stepping"] = Field(
         default="rk43",
-        description="adaptive 4(3) or 5(4), fixed step, or adaptive linearly implicit for stiff motors",
+        description="adaptive 4(3) or 5(4), fixed step, adaptive linearly implicit for stiff motors, or fixed step "
+        "with contacts that open and close",
     )
     solver: Literal["articulated", "m_star"] = Field(default="articulated", description="O(n) sweeps or the dense M*")
     rtol: float = Field(default=1e-6, ge=1e-13, le=1e-1)
     atol: float = Field(default=1e-8, ge=1e-16, le=1e-1)
-    step_s: Positive | None = Field(default=None, description="fixed step of rk4 (default 0.001), else the first step")
+    step_s: Positive | None = Field(
+        default=None, description="fixed step of rk4 and time_stepping (default 0.001), else the first step"
+    )
+    theta: float = Field(
+        default=0.5, ge=0.5, le=1.0, description="time_stepping: 0.5 is second order between events, 1 damps"
+    )
     step_max_s: Positive | None = None
     time_limit_h: Positive = Field(default=24.0, description="runs estimated to integrate for longer are refused [h]")
 

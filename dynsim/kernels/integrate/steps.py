@@ -9,6 +9,7 @@ from dynsim.kernels.integrate.events import next_tick
 from dynsim.kernels.integrate.run import (
     ATOL,
     END,
+    FIXED_STEP,
     LAST_ERROR,
     NO_FORCES,
     NOT_FINITE,
@@ -85,7 +86,7 @@ def choose_step(run: Run):
     until = next_tick(run, clock[END])
     remaining = until - clock[TIME]
     run.count[TRIMMED] = 1 if until < clock[END] and remaining < 2.0 * clock[STEP] else 0
-    if run.method == RK4:
+    if run.method in FIXED_STEP:
         if remaining < clock[STEP] * (1.0 + 1e-9):
             clock[STEP] = remaining
     elif remaining <= clock[STEP] * 1.0000001:
