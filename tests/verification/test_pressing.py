@@ -150,6 +150,6 @@ def test_least_heat_keeps_both_elbows_on_the_real_floor(tmp_path):
     ],
 )
 def test_refused(overrides, said):
+    model = dynsim.build_model(scenario())
     with pytest.raises(DynsimError, match=said):
-        case = scenario(**overrides)
-        build.controller(case, dynsim.build_model(case))
+        build.controller(scenario(**overrides), model)
