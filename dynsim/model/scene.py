@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dynsim.model.description import Array, Contact, Link, Quadric, Robot
 from dynsim.model.mobile_base import SUPPORTS, MobileBase
-from dynsim.model.snake import SnakeDescription
 from dynsim.record.quaternion import of_turn
 from dynsim.record.scene import (
     HERE,
@@ -25,6 +25,9 @@ from dynsim.record.scene import (
     quaternion,
     vector3,
 )
+
+if TYPE_CHECKING:
+    from dynsim.model.snake import SnakeDescription
 
 # Of a wheel, in parts of its radius; a snake's description has no width.
 WHEEL_WIDTH = 0.48

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import overload
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +16,12 @@ from dynsim.model.control import JointControl
 from dynsim.model.description import Array, Contact, Inertia, Load, Quadric, Robot
 from dynsim.model.model import Model
 from dynsim.model.protocols import BuildContext
-from dynsim.model.snake import SnakeDescription, TaskSpaceController
 from dynsim.problems import dotted, suggest
 from dynsim.scenario.loads import Payload
 from dynsim.scenario.schema import Scenario
+
+if TYPE_CHECKING:
+    from dynsim.model.snake import SnakeDescription, TaskSpaceController
 
 # A contact point must start this close to its surface [m].
 START_TOLERANCE = 1e-6
@@ -28,6 +30,9 @@ START_TOLERANCE = 1e-6
 def machine(scenario: Scenario) -> Robot | SnakeDescription:
     """What the plant of the scenario is, a tree of bodies or a snake."""
     if scenario.engine == "kinematic":
+        # Imported here and below: an arm needs nothing of a snake.
+        from dynsim.model.snake import SnakeDescription
+
         return families.build("plant", scenario.plant, BuildContext(scenario.duration_s), SnakeDescription)
     return robot(scenario)
 
@@ -99,6 +104,8 @@ def controller(
             ends = f"end at {control.end:g} s, the run at {scenario.duration_s:g} s"
             raise ModelError(f"controller {config.type!r}: its references {ends}")
         return control
+    from dynsim.model.snake import TaskSpaceController
+
     return families.build("controller", config, context, TaskSpaceController)
 
 
