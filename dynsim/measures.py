@@ -11,6 +11,8 @@ from dynsim.record import Record
 
 # Where the electrical energy goes, in the order in which it is drawn and printed.
 SINKS = ("heat_joule", "loss_gear", "loss_joint", "heat_friction")
+# Sinks that only runs under the unilateral law have.
+IMPACT_SINKS = ("loss_impact", "loss_stop")
 STORES = ("energy_kinetic", "energy_potential", "energy_magnetic")
 
 RESIDUAL_LIMIT = 1e-6
@@ -19,12 +21,17 @@ RESIDUAL_LIMIT = 1e-6
 TIP_OVER = "tip_over"
 
 
+def sinks(record: Record) -> tuple[str, ...]:
+    """The sinks of energy that a record has."""
+    return SINKS + tuple(name for name in IMPACT_SINKS if name in record)
+
+
 def energy_turnover(record: Record) -> float:
     """Energy that changed hands: the largest over time of half the sum of all terms' sizes [J]."""
     total = np.abs(record["energy_electrical"]) + np.abs(record["work_constraint"])
     if "work_loads" in record:
         total = total + np.abs(record["work_loads"]).sum(axis=1)
-    for name in SINKS:
+    for name in sinks(record):
         total = total + np.abs(record[name])
     for name in STORES:
         total = total + np.abs(record[name] - record[name][:1])

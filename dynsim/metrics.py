@@ -10,21 +10,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim._version import __version__
+from dynsim.kernels.constraint import unilateral as ku
+from dynsim.kernels.constraint.unilateral import UnilateralArrays
+from dynsim.kernels.integrate.contact_events import MOST_EVENTS, WINDOW
 from dynsim.kernels.integrate.run import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, LOCAL_SINCE, PULLING
 from dynsim.measures import (
     RESIDUAL_LIMIT,
-    SINKS,
     STORES,
     TIP_OVER,
     base_summary,
     energy_turnover,
     hand_error,
     least_loads,
+    sinks,
 )
 from dynsim.model.clearance import Sinking, sinking
 from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Drive, Servo, TorqueSource
 from dynsim.model.mobile_base import MobileBase
+from dynsim.model.unilateral import JointStop
 from dynsim.record import Record
 from dynsim.scenario import Scenario, build
 
@@ -41,9 +45,15 @@ INTEGRALS = {
     "energy_electrical_supply": "∫ max(Σ u i, 0) dt, one supply for all motors that takes nothing back",
 }
 
+# Those that runs under the unilateral law have beside them.
+LOSSES = {"loss_impact": "energy that impacts of contacts take", "loss_stop": "energy that impacts at joint stops take"}
+
 DRIFT_LIMIT_M = 1e-9
 # Limits in files are rounded: a joint that starts at 1.5707963 = 90° is not beyond it.
 LIMIT_SLACK = 1e-6
+
+
+_LOSS_KEYS = {"impact_loss": "loss_impact", "stop_loss": "loss_stop"}
 
 
 @dataclass(frozen=True)
@@ -80,6 +90,8 @@ class Counts:
         LAST_FORCE, LOCAL_SINCE
     spread : motion that dependent rows leave open; None: none
     support : (4,) least loads of wheels and caster and least tip margin of a mobile base over all steps, else empty
+    unilateral : tables of the unilateral law with what they have counted; None under the other one
+    stops : joint stops, in their order there
     """
 
     wall: float
@@ -91,6 +103,8 @@ class Counts:
     extremes: NDArray[np.float64]
     spread: MotionSpread | None = None
     support: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    unilateral: UnilateralArrays | None = None
+    stops: tuple[JointStop, ...] = ()
 
 
 def energy_residual(record: Record) -> NDArray[np.float64]:
@@ -98,7 +112,7 @@ def energy_residual(record: Record) -> NDArray[np.float64]:
     residual = record["energy_electrical"] + record["work_constraint"]
     if "work_loads" in record:
         residual = residual + record["work_loads"].sum(axis=1)
-    for name in SINKS:
+    for name in sinks(record):
         residual = residual - record[name]
     for name in STORES:
         residual = residual - (record[name] - record[name][:1])
@@ -155,6 +169,7 @@ def summarise(
         "gear_loss_J": final("loss_gear"),
         "joint_loss_J": final("loss_joint"),
         "friction_heat_J": final("heat_friction"),
+        **({} if counts.unilateral is None else {f"{key}_J": final(name) for key, name in _LOSS_KEYS.items()}),
         **_loads(record),
         "energy_turnover_J": turnover,
         "energy_residual_relative": residual / denominator if denominator > 0.0 else 0.0,
@@ -166,6 +181,8 @@ def summarise(
             for s in sunk
         ],
     }
+    if counts.unilateral is not None:
+        summary["joint_stops"] = _stops(counts, duration)
     summary["warnings"] = _warnings(record, scenario, contacts, robot, counts, summary) + _sunk(record, sunk)
     return summary
 
@@ -190,18 +207,59 @@ def _loads(record: Record) -> dict[str, Any]:
 
 def _contact(record: Record, k: int, contact: Contact, counts: Counts, duration: float) -> dict[str, Any]:
     force = record["contact_normal_force"][:, k]
+    real = {} if counts.unilateral is None else _modes(counts.unilateral, k, duration)
+    # Under the unilateral law a force ends at zero; what lies below is the tolerance of that event.
+    least = -np.inf if counts.unilateral is None else 0.0
     extremes = counts.extremes[k] if counts.steps else np.zeros(EXTREMES_SIZE)
     # Extremes are those of every accepted step, which are closer together than the samples, and of the samples.
     return {
         "name": contact.name,
         "surface": contact.surface_name,
-        "normal_force_min_N": float(min(extremes[FORCE_MIN], force.min(initial=np.inf))),
+        "normal_force_min_N": max(float(min(extremes[FORCE_MIN], force.min(initial=np.inf))), least),
         "normal_force_mean_N": float(record["contact_impulse"][-1, k] / duration) if duration > 0 else 0.0,
         "normal_force_max_N": float(max(extremes[FORCE_MAX], force.max(initial=-np.inf))),
         "closed_fraction": 1.0,
         "pulling_fraction": min(float(extremes[PULLING]) / duration, 1.0) if duration > 0.0 else 0.0,
         "slip_distance_m": float(record["contact_slip_distance"][-1, k]) if len(record) else 0.0,
+        **real,
     }
+
+
+def _modes(unilateral: UnilateralArrays, k: int, duration: float) -> dict[str, Any]:
+    """What a candidate has done under the unilateral law."""
+    tally = unilateral.tally[k]
+    fractions = tally[[ku.TIME_STICKING, ku.TIME_SLIDING]] / duration if duration > 0.0 else np.zeros(2)
+    sticking, sliding = np.minimum(fractions, 1.0).tolist()
+    return {
+        "closed_fraction": min(sticking + sliding, 1.0),
+        "pulling_fraction": 0.0,
+        "sticking_fraction": sticking,
+        "sliding_fraction": sliding,
+        "lift_offs": int(tally[ku.LIFT_OFFS]),
+        "landings": int(tally[ku.LANDINGS]),
+        "slip_starts": int(tally[ku.SLIP_STARTS]),
+        "bounces": int(tally[ku.BOUNCES]),
+        "impact_loss_J": float(tally[ku.LOSS]),
+        "penetration_max_m": float(tally[ku.DEEPEST]),
+    }
+
+
+def _stops(counts: Counts, duration: float) -> list[dict[str, Any]]:
+    """The joint stops that were touched."""
+    assert counts.unilateral is not None
+    found = []
+    for stop, row in zip(counts.stops, counts.unilateral.stop, strict=True):
+        if row[ku.HITS] > 0 or row[ku.CLOSED_TIME] > 0.0:
+            found.append(
+                {
+                    "joint": stop.joint,
+                    "limit": stop.position,
+                    "hits": int(row[ku.HITS]),
+                    "closed_fraction": min(float(row[ku.CLOSED_TIME]) / duration, 1.0) if duration > 0.0 else 0.0,
+                    "impact_loss_J": float(row[ku.STOP_LOSS]),
+                }
+            )
+    return found
 
 
 def _warnings(
@@ -213,6 +271,8 @@ def _warnings(
     summary: dict[str, Any],
 ) -> list[str]:
     found = []
+    if counts.unilateral is not None:
+        found.extend(_chattered(contacts, counts.unilateral))
     for contact in summary["contacts"]:
         if contact["normal_force_min_N"] < 0.0:
             found.append(
@@ -264,6 +324,18 @@ def _warnings(
             f"of {s.joint} is anything from {s.low:.4g} to {s.high:.4g} {s.unit} over the splits of the normal forces "
             f"that keep their signs (this run: {s.taken:.4g}); take away braces until the rest are independent"
         )
+    return found
+
+
+def _chattered(contacts: Sequence[Contact], unilateral: UnilateralArrays) -> list[str]:
+    """Contacts whose events came too fast to be followed one by one."""
+    found = []
+    for contact, tally in zip(contacts, unilateral.tally, strict=True):
+        if tally[ku.CHATTERED]:
+            found.append(
+                f"{contact.name}: chatter, more than {MOST_EVENTS} contact events within {WINDOW:g} s; what left more "
+                f"slowly than {tally[ku.SETTLE]:.0e} m/s was kept on the surface"
+            )
     return found
 
 
@@ -354,6 +426,6 @@ def _passed_limits(record: Record, robot: Robot) -> list[str]:
                 amount, first = beyond[over].max(), record.time[over[0]]
                 found.append(
                     f"{link.joint}: passes its {what} limit of {limit:.4g} {unit} by up to {amount:.3g} {unit}, "
-                    f"first at t = {first:.4g} s; limits of joints are not enforced"
+                    f"first at t = {first:.4g} s; limits of joints are enforced under contacts.law: unilateral"
                 )
     return found

@@ -9,19 +9,28 @@ from typing import Any
 
 import numpy as np
 
+from dynsim.engine.prepare import guards
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate.driver import advance
 from dynsim.kernels.integrate.run import FINISHED, METHODS, STATUS, Run, new_run
 from dynsim.kernels.jit import integers, reals
-from dynsim.kernels.state import block, output_layout, state_layout
+from dynsim.kernels.state import LOSSES, block, output_layout, state_layout
 from dynsim.kernels.system import System, derivative, new_workspace
-from dynsim.model.arrays import compile_contacts, compile_couplings, compile_drives, compile_loads, compile_model
+from dynsim.model.arrays import (
+    compile_contacts,
+    compile_couplings,
+    compile_drives,
+    compile_loads,
+    compile_model,
+)
 from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot
 from dynsim.model.drives import Motor
 from dynsim.model.joints.ball import ball, floating
 from dynsim.model.joints.planar import planar, rolling
 from dynsim.model.joints.wheels import wheeled
 from dynsim.model.model import Model
+from dynsim.model.shapes import compile_shapes
+from dynsim.model.unilateral import JointStop, compile_unilateral, joint_stops
 
 SURFACES = ("plane", "sphere", "cylinder")
 SEVERAL_ROWS = {
@@ -188,6 +197,8 @@ class Bench:
     robot: Robot
     system: System
     ws: ka.Workspace
+    contacts: tuple[Contact, ...] = ()  # under the unilateral law
+    stops: tuple[JointStop, ...] = ()
 
     @property
     def sizes(self) -> tuple[int, int, int]:
@@ -233,11 +244,12 @@ class Bench:
             METHODS[method],
             y,
             self.system.layout,
-            output_layout(n, na, c),
+            output_layout(n, na, c, 0, len(self.stops)),
             n=n,
             na=na,
             c=c,
-            couplings=len(self.robot.couplings),
+            couplings=len(self.robot.couplings) + len(self.stops),
+            events=guards(self.robot, self.contacts, self.stops),
             sample_time=times,
             hand=(n - 1, self.robot.hand[1]),
             end=float(times[-1]),
@@ -270,14 +282,20 @@ def bench(
     held: np.ndarray | None = None,
     k_p: float = 30.0,
     k_d: float = 1.0,
+    real: bool = False,
+    slow: float = 1e-5,
 ) -> Bench:
-    """Compile a robot and its contacts, with a voltage PD that holds ``held`` (zero by default)."""
+    """Compile a robot and its contacts, with a voltage PD that holds ``held`` (zero by default).
+
+    ``real``: under the unilateral law, with the robot's joint stops; slip below ``slow`` [m/s] keeps its direction.
+    """
     na = len(robot.motors)
     contact_arrays = compile_contacts(robot, contacts or [])
     n, c, circuits = len(robot.links), len(contacts or []), robot.circuits
-    size = n + ka.row_limit(c, len(robot.couplings)) + circuits
+    stops = joint_stops(robot) if real else []
+    size = n + ka.row_limit(c, len(robot.couplings) + len(stops)) + circuits
     system = System(
-        layout=state_layout(robot.nq, n, circuits, c, len(loads or ())),
+        layout=state_layout(robot.nq, n, circuits, c, len(loads or ()), LOSSES if real else 0),
         model=compile_model(robot),
         drives=compile_drives(robot, k_p=[k_p] * na, k_d=[k_d] * na),
         reference=held_reference(np.zeros(na) if held is None else held),
@@ -285,5 +303,7 @@ def bench(
         loads=compile_loads(robot, loads or ()),
         dense=np.zeros((size, size + 1)) if m_star else None,
         couplings=compile_couplings(robot),
+        shapes=compile_shapes(robot, contacts or []),
+        unilateral=compile_unilateral(robot, contacts or [], stops, slow) if real else None,
     )
-    return Bench(robot, system, new_workspace(system))
+    return Bench(robot, system, new_workspace(system), tuple(contacts or ()) if real else (), tuple(stops))

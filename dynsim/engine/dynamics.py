@@ -10,12 +10,11 @@ from dynsim.engine import SIMULATION, Progress, Start
 from dynsim.engine.outcome import kernels_logged, raise_stopped
 from dynsim.engine.prepare import Prepared, prepare
 from dynsim.engine.recording import make_record
-from dynsim.engine.stepped import take_log
+from dynsim.engine.stepped import event_name, own_guards, take_log
 from dynsim.engine.stopping import last_state, stopped
 from dynsim.errors import SimulationInterrupted, SimulationStopped
 from dynsim.kernels.integrate import driver
 from dynsim.kernels.integrate import run as ki
-from dynsim.measures import TIP_OVER
 from dynsim.record import Event, Record
 from dynsim.scenario import Scenario
 
@@ -43,7 +42,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
         driver.advance(prepared.system, prepared.workspace, run, 0)
     if progress is not None:
         progress(0.0, SIMULATION)
-    base = prepared.model.robot.base
+    own = own_guards(prepared)
     happened: list[Event] = []
     started, limit, interrupted = clock.perf_counter(), 1, False
     try:
@@ -52,7 +51,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
             before = clock.perf_counter()
             driver.advance(prepared.system, prepared.workspace, run, limit)
             taken = clock.perf_counter() - before
-            happened += [Event(time, TIP_OVER, base.body) for time, _ in take_log(run)] if base else []
+            happened += [Event(time, *(event_name(prepared, e) or own[e])) for time, e in take_log(run)]
             limit = int(min(max(limit * min(CHUNK_S / max(taken, 1e-9), 10.0), 1), 1_000_000))
             if progress is not None:
                 progress(float(run.clock[ki.TIME]), SIMULATION)

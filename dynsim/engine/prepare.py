@@ -15,9 +15,10 @@ from dynsim.engine.outcome import check_size
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.integrate.contact_events import NORMAL_GUARD, SLIP_GUARD, STOP_GUARD
 from dynsim.kernels.integrate.events import TIP_MARGIN
 from dynsim.kernels.integrate.time_stepping import stepping_arrays
-from dynsim.kernels.state import OutputLayout, StateLayout, block, output_layout, state_layout
+from dynsim.kernels.state import LOSSES, OutputLayout, StateLayout, block, output_layout, state_layout
 from dynsim.kernels.system import System, new_workspace
 from dynsim.kernels.tree.support import OUTPUTS
 from dynsim.model.arrays import (
@@ -32,6 +33,8 @@ from dynsim.model.control import JointControl
 from dynsim.model.description import Array, Contact, Load, Robot
 from dynsim.model.drives import Drive, Motor
 from dynsim.model.model import Model
+from dynsim.model.shapes import compile_shapes
+from dynsim.model.unilateral import JointStop, compile_unilateral, joint_stops
 from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, build
 
@@ -52,6 +55,7 @@ class Prepared:
     run: ki.Run
     workspace: ka.Workspace
     loads: list[Load]
+    stops: list[JointStop]
 
 
 def prepare(
@@ -81,25 +85,31 @@ def prepare(
     """
     described = build.robot(scenario)
     model = Model(described if motors is None else replace(described, motors=tuple(motors)))
-    robot, contacts = model.robot, build.contacts(scenario)
-    build.check_start(scenario, model)
+    robot, contacts = model.robot, build.contacts(scenario, model.robot)
+    build.check_start(scenario, model, contacts)
     loads = build.loads(scenario, robot)
     if pushable:
         loads = [*loads, *(_push(body) for body in robot.bodies)]
     n, na, c = model.n, len(robot.motors), len(contacts)
-    layout = state_layout(model.nq, n, robot.circuits, c, len(loads))
-    columns = output_layout(n, na, c, OUTPUTS if robot.base else 0)
+    real = scenario.config.contacts.law == "unilateral"
+    stops = joint_stops(robot) if real else []
+    layout = state_layout(model.nq, n, robot.circuits, c, len(loads), LOSSES if real else 0)
+    columns = output_layout(n, na, c, OUTPUTS if robot.base else 0, len(stops))
     if times is None:
         times = sample_times(scenario, layout, columns, n)
     _check_coordinates(scenario, robot)
-    if robot.base is not None and scenario.integrator.method == "time_stepping":
-        raise ScenarioError("integrator.method: time_stepping does not locate events, such as a mobile base that tips")
+    if scenario.integrator.method == "time_stepping":
+        if robot.base is not None:
+            raise ScenarioError("integrator.method: time_stepping locates no events, such as a mobile base that tips")
+        if contacts and not real:
+            raise ScenarioError("integrator.method: time_stepping needs `contacts: {law: unilateral}`")
     _check_stiffness(scenario, robot)
-    couplings = len(robot.couplings)
-    _check_work(scenario, n, c + couplings)
+    joint_rows = len(robot.couplings) + len(stops)
+    _check_work(scenario, n, c + joint_rows)
     control = _control(scenario, model, progress)
-    _check_references(scenario, robot, contacts, control)
-    options, size = scenario.integrator, n + ka.row_limit(c, couplings) + robot.circuits
+    if not real:
+        _check_references(scenario, robot, contacts, control)
+    options, size = scenario.integrator, n + ka.row_limit(c, joint_rows) + robot.circuits
     method = ki.METHODS[options.method]
     step = options.step_s or (1e-3 if method in ki.FIXED_STEP else 0.0)
     system = System(
@@ -113,10 +123,12 @@ def prepare(
         loads=compile_loads(robot, loads),
         dense=np.zeros((size, size + 1)) if options.solver == "m_star" else None,
         couplings=compile_couplings(robot),
+        shapes=compile_shapes(robot, contacts),
+        unilateral=compile_unilateral(robot, contacts, stops, slow_slip(options.atol)) if real else None,
     )
     stepping = None
     if method == ki.TIME_STEPPING:
-        stepping = stepping_arrays(model.arrays, system.contacts, na, couplings, options.theta)
+        stepping = stepping_arrays(model.arrays, system.contacts, na, joint_rows, options.theta, system.unilateral)
     y = np.zeros(layout.size)
     y[block(layout, "q")] = robot.initial
     run = ki.new_run(
@@ -127,7 +139,7 @@ def prepare(
         n=n,
         na=na,
         c=c,
-        couplings=couplings,
+        couplings=joint_rows,
         sample_time=times,
         hand=(model.body_index(robot.hand[0]), robot.hand[1]),
         end=scenario.duration_s if end is None else end,
@@ -137,11 +149,11 @@ def prepare(
         atol=options.atol,
         ticks=_ticks(control),
         breaks=_breaks(loads),
-        events=_tipping(robot),
+        events=guards(robot, contacts if real else (), stops),
         support=compile_support(robot),
         stepping=stepping,
     )
-    return Prepared(model, contacts, control, system, run, new_workspace(system), loads)
+    return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops)
 
 
 def _ticks(control: JointControl) -> tuple[np.ndarray, np.ndarray] | None:
@@ -153,14 +165,30 @@ def _ticks(control: JointControl) -> tuple[np.ndarray, np.ndarray] | None:
     return tick, np.array([[ki.TAKE_COMMANDS, 0]])
 
 
-def _tipping(robot: Robot) -> tuple[np.ndarray, np.ndarray] | None:
-    """The event of a mobile base that tips: its margin falls through zero."""
-    if robot.base is None:
+def guards(
+    robot: Robot, contacts: Sequence[Contact], stops: Sequence[JointStop]
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The events that a run watches for by itself, and what they do: those of a base, then of the unilateral law.
+
+    Of a mobile base the margin falls through zero; of contacts and stops see dynsim.kernels.integrate.contact_events.
+    """
+    rows = []
+    if robot.base is not None:
+        rows.append((TIP_MARGIN, 0, -1, ki.STOP if robot.base.stop_on_overturn else ki.LOG))
+    for k in range(len(contacts)):
+        rows += [(NORMAL_GUARD, k, -1, ki.LOG), (SLIP_GUARD, k, -1, ki.LOG)]
+    rows += [(STOP_GUARD, k, -1, ki.LOG) for k in range(len(stops))]
+    if not rows:
         return None
-    event = np.zeros((1, ki.EVENT_SIZE))
-    # It stood before the run: one that begins beyond zero tips at once.
-    event[0, ki.SIDE] = 1.0
-    return event, np.array([[TIP_MARGIN, 0, -1, ki.STOP if robot.base.stop_on_overturn else ki.LOG]])
+    event = np.zeros((len(rows), ki.EVENT_SIZE))
+    # It stood before the run: what begins beyond zero happens at once.
+    event[:, ki.SIDE] = 1.0
+    return event, np.array(rows)
+
+
+def slow_slip(atol: float) -> float:
+    """Speed below which the direction of slip is noise of the integration, so that the last one stands [m/s]."""
+    return max(1000.0 * atol, 1e-9)
 
 
 def _breaks(loads: Sequence[Load]) -> np.ndarray:

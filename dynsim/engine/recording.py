@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+import numpy as np
+
 from dynsim import metrics
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.provenance import provenance
 from dynsim.engine.uniqueness import motion_spread
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.state import CONTACT_SIZE, IMPULSE, OUT_FORCE, OUT_GAP, OUT_SLIP, OUT_VECTOR, SLIP
+from dynsim.kernels.state import CONTACT_SIZE, IMPULSE, OUT_FORCE, OUT_GAP, OUT_MODE, OUT_SLIP, OUT_VECTOR, SLIP
 from dynsim.kernels.tree import support as ks
 from dynsim.model.description import Link
 from dynsim.model.mobile_base import SUPPORTS, MobileBase, base_pose
@@ -62,6 +64,9 @@ def make_record(
         record.add("target_position", target, "m", labels=("x", "y", "z"))
     for integral, (name, text) in zip(run.states("ledger").T, metrics.INTEGRALS.items(), strict=True):
         record.add(name, integral, "J", description=text)
+    if prepared.system.unilateral is not None:
+        for integral, (name, text) in zip(run.states("loss").T, metrics.LOSSES.items(), strict=True):
+            record.add(name, integral, "J", description=text)
     others = 0 if pushed is None else len(robot.bodies)
     shown = [*range(len(prepared.loads) - others), *(pushed or ())]
     if shown:
@@ -79,12 +84,20 @@ def make_record(
     integrals = run.states("contact").reshape(rows, len(contacts), CONTACT_SIZE)
     record.add("contact_impulse", integrals[:, :, IMPULSE], "N s", labels=names, description="∫ f_n dt")
     record.add("contact_slip_distance", integrals[:, :, SLIP], "m", labels=names, description="∫ |v_t| dt")
+    if prepared.system.unilateral is not None:
+        _add_unilateral(record, prepared)
     for event in happened:
         record.add_event(event.time, event.kind, event.name)
     record.scene = robot_scene(robot, contacts, build.surfaces(scenario))
     add_body_poses(record)
     deficient, spread = int(prepared.workspace.counts[ka.DEPENDENT]), None
-    if deficient and rows and any(contact.friction > 0.0 for contact in contacts):
+    # Under the unilateral law rows of what sticks depend on each other, which leaves no motion open.
+    if (
+        prepared.system.unilateral is None
+        and deficient
+        and rows
+        and any(contact.friction > 0.0 for contact in contacts)
+    ):
         joint_units = [(link.joint, link.units[2]) for link in robot.links]
         spread = motion_spread(prepared.system, run.sample_time[:rows], run.sample[:rows], joint_units)
     counts = metrics.Counts(
@@ -96,10 +109,28 @@ def make_record(
         deficient=deficient,
         extremes=run.extremes,
         spread=spread,
-        support=run.support.least,
+        support=np.zeros(0) if run.support is None else run.support.least,
+        unilateral=prepared.system.unilateral,
+        stops=tuple(prepared.stops),
     )
     record.summary = metrics.summarise(record, scenario, contacts, robot, counts)
     return record
+
+
+def _add_unilateral(record: Record, prepared: Prepared) -> None:
+    """Modes of the contacts, forces of the joint stops."""
+    run, robot = prepared.run, prepared.model.robot
+    names = tuple(contact.name for contact in prepared.contacts)
+    modes = run.outputs("contact")[:, :, OUT_MODE]
+    record.add("contact_mode", modes, "1", labels=names, description="0 off its surface, 1 sliding, 2 sticking")
+    if prepared.stops:
+        units = {link.joint: link.units[3] for link in robot.links}
+        joints = tuple(dict.fromkeys(stop.joint for stop in prepared.stops))
+        force = np.zeros((len(record), len(joints)))
+        for stop, column in zip(prepared.stops, run.outputs("stop").T, strict=True):
+            force[:, joints.index(stop.joint)] += stop.side * column
+        unit = " or ".join(dict.fromkeys(units[joint] for joint in joints))
+        record.add("stop_force", force, unit, labels=joints, description="of joint stops; positive at a lower limit")
 
 
 def _add_base(record: Record, prepared: Prepared, base: MobileBase, as_planned: bool) -> None:

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from dynsim.engine.outcome import mark_stopped, raise_stopped
 from dynsim.engine.prepare import prepare, sample_times
 from dynsim.engine.recording import make_record
-from dynsim.engine.stepped import GUARDS, Snapshot, State, take_log
+from dynsim.engine.stepped import GUARDS, Snapshot, State, event_name, own_guards, take_log
 from dynsim.engine.stopping import stopped
 from dynsim.engine.trace import Trace
 from dynsim.errors import ModelError, ScenarioError, shown
@@ -111,8 +111,7 @@ class Simulation:
         self._guards: list[tuple[str, str, Callable[[Simulation], None] | None]] = []
         self._calls: list[Callable[[Simulation], None]] = []
         robot = self.robot
-        if robot.base is not None:
-            self._guards.append((TIP_OVER, robot.base.body, None))
+        self._guards.extend((kind, subject, None) for kind, subject in own_guards(self._prepared))
         self._armature = self.model.armature
         self._joints = {link.joint: i for i, link in enumerate(robot.links)}
         self._motors = {motor.joint: a for a, motor in enumerate(robot.motors)}
@@ -473,7 +472,7 @@ class Simulation:
             run.y[part] = values
         q = run.y[block(run.layout, "q")]
         check_couplings(model.robot, q)
-        check_start(self._scenario, model, q)
+        check_start(self._scenario, model, self._prepared.contacts, q)
 
     def _reach(self, until: float) -> None:
         """Integrate until the step that would pass a time is pending, or ends there."""
@@ -529,6 +528,9 @@ class Simulation:
         """Empty the log of the kernels."""
         run = self._prepared.run
         for time, e in take_log(run):
+            if named := event_name(self._prepared, e):
+                self._happened.append(Event(time, *named))
+                continue
             kind, subject, call = self._guards[e]
             self._happened.append(Event(time, kind, subject))
             if call is not None:
@@ -616,9 +618,10 @@ class Simulation:
             ("drives", system.drives._asdict()),
             ("reference", system.reference._asdict()),
             ("loads", system.loads._asdict()),
-            ("support", prepared.run.support._asdict()),
+            ("support", prepared.run.support._asdict() if prepared.run.support else {}),
+            ("unilateral", {} if system.unilateral is None else system.unilateral._asdict()),
         ):
-            found |= {f"{owner}.{name}": array for name, array in part.items()}
+            found |= {f"{owner}.{name}": array for name, array in part.items() if isinstance(array, np.ndarray)}
         # Closed brakes are seen there.
         return found | {"model.body": system.model.body}
 

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dynsim.engine.prepare import Prepared
 from dynsim.engine.trace import Rows
-from dynsim.kernels.integrate import events
+from dynsim.kernels.integrate import contact_events, events
 from dynsim.kernels.integrate import run as ki
+from dynsim.measures import TIP_OVER
 from dynsim.record import Event, Record
 
 Array = NDArray[np.float64]
@@ -28,11 +30,44 @@ GUARDS = {
 }
 
 
+# What contacts and joint stops do, by its number in the kernels.
+CONTACT_EVENTS = {
+    contact_events.LANDING: "landing",
+    contact_events.LIFT_OFF: "lift_off",
+    contact_events.SLIP_START: "slip_start",
+    contact_events.SLIP_STOP: "slip_stop",
+    contact_events.BOUNCE: "bounce",
+    contact_events.CHATTERS: "chatter",
+    contact_events.STOP_HIT: "stop_hit",
+    contact_events.STOP_LEFT: "stop_left",
+}
+
+
 def take_log(run: ki.Run) -> list[tuple[float, int]]:
-    """Empty the log of the kernels: times [s] and indices of what has happened."""
+    """Empty the log of the kernels: times [s] and numbers of what has happened."""
     logged = int(run.count[ki.LOGGED])
     run.count[ki.LOGGED] = 0
     return list(zip(run.log_time[:logged].tolist(), run.log_event[:logged].tolist(), strict=True))
+
+
+def own_guards(prepared: Prepared) -> list[tuple[str, str]]:
+    """Kind and subject of the events that a run watches for by itself, in the order of its guards.
+
+    Those of contacts and stops are logged under numbers of their own: :func:`event_name`.
+    """
+    base = prepared.model.robot.base
+    tipping = [] if base is None else [(TIP_OVER, base.body)]
+    return tipping + [("", "")] * (len(prepared.run.event) - len(tipping))
+
+
+def event_name(prepared: Prepared, number: int) -> tuple[str, str] | None:
+    """Kind and subject of a logged event of a contact or a joint stop; None for the number of a guard."""
+    if number < ki.CONTACT_LOG:
+        return None
+    first = ki.STOP_LOG if number >= ki.STOP_LOG else ki.CONTACT_LOG
+    k, kind = divmod(number - first, contact_events.LOG_KINDS)
+    subject = prepared.stops[k].joint if first == ki.STOP_LOG else prepared.contacts[k].name
+    return CONTACT_EVENTS[kind], subject
 
 
 @dataclass(frozen=True)

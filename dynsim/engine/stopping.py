@@ -62,12 +62,27 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
             f"{where}: the base tips over (tip margin zero), and plant.base.on_overturn is stop; brace it, move its "
             "caster or make it heavier, or take on_overturn: warn to go on as if it were held down"
         )
+    if status == ki.NO_CONTACT_FORCES:
+        names = ", ".join(contact.name for contact in prepared.contacts)
+        return (
+            f"{where}: no forces at {names} agree with Coulomb's law (Painlevé's paradox, or rows that contradict each "
+            "other); lower contacts.friction, or take another posture"
+        )
+    if status == ki.CHATTER:
+        return (
+            f"{where}: contacts open and close without end; take integrator.method: time_stepping, or a larger "
+            "integrator.atol"
+        )
     ws = prepared.workspace
     gaps = ws.rows[: ws.counts[ka.ROWS], ka.ROW_GAP]
     worst = int(np.argmax(np.abs(gaps)))
     owner = int(ws.active[worst, ka.OWNER])
     if ws.active[worst, ka.ROW_KIND] == ka.JOINT_ROW:
-        coupling = prepared.model.robot.couplings[owner]
+        couplings = prepared.model.robot.couplings
+        if owner >= len(couplings):
+            joint = prepared.stops[owner - len(couplings)].joint
+            return f"{where}: joint {joint} cannot be kept at its stop (off by {gaps[worst]:+.2e})"
+        coupling = couplings[owner]
         what = f"joint {coupling.joint} cannot be kept where {coupling.leader} leads it (off by {gaps[worst]:+.2e})"
     else:
         what = f"contact {prepared.contacts[owner].name} cannot be kept on its surface (gap {gaps[worst]:+.2e} m)"

@@ -8,6 +8,7 @@ State y, all in one vector, blocks in this order:
     ledger   (LEDGER_SIZE,) integrals of power [J], see dynsim.kernels.ledger
     contact  (2 c,) impulse of the normal force [N s] and slip [m] of each contact point
     load     (l,)   work of each external wrench [J]
+    loss     (2,)   what impacts of contacts and of joint stops take [J]; only under the unilateral law
 
 The first three are what error control looks at; the rest are integrals that nothing depends on.
 """
@@ -24,6 +25,9 @@ LEDGER_SIZE = 9
 # Per contact: impulse of the normal force [N s], slip distance [m].
 IMPULSE, SLIP = 0, 1
 CONTACT_SIZE = 2
+# Losses of impacts [J].
+IMPACT_LOSS, JOINT_STOP_LOSS = 0, 1
+LOSSES = 2
 
 
 class StateLayout(NamedTuple):
@@ -35,17 +39,20 @@ class StateLayout(NamedTuple):
     ledger: int
     contact: int
     load: int
+    loss: int
     size: int
     tracked: int  # how many entries, from the first on, error control looks at: all that derivatives depend on
     extra: int  # nq − n
     circuits: int  # currents among the states
 
 
-def state_layout(nq: int, n: int, circuits: int, contacts: int, loads: int = 0) -> StateLayout:
-    """The layout for nq positions, n rates, and so many circuits, contact points and external wrenches."""
-    starts = np.cumsum([0, nq, n, circuits, LEDGER_SIZE, CONTACT_SIZE * contacts, loads])
-    q, v, current, ledger, contact, load, size = (int(start) for start in starts)
-    return StateLayout(q, v, current, ledger, contact, load, size, tracked=ledger, extra=nq - n, circuits=circuits)
+def state_layout(nq: int, n: int, circuits: int, contacts: int, loads: int = 0, losses: int = 0) -> StateLayout:
+    """The layout for nq positions, n rates, and so many circuits, contact points, external wrenches and losses."""
+    starts = np.cumsum([0, nq, n, circuits, LEDGER_SIZE, CONTACT_SIZE * contacts, loads, losses])
+    q, v, current, ledger, contact, load, loss, size = (int(start) for start in starts)
+    return StateLayout(
+        q, v, current, ledger, contact, load, loss, size, tracked=ledger, extra=nq - n, circuits=circuits
+    )
 
 
 class OutputLayout(NamedTuple):
@@ -62,6 +69,7 @@ class OutputLayout(NamedTuple):
     energy: int
     contact: int
     support: int
+    stop: int
     size: int
 
 
@@ -73,12 +81,12 @@ def block(layout: StateLayout | OutputLayout, name: str) -> slice:
 
 # Kinetic, potential and magnetic energy.
 ENERGIES = 3
-# Per contact: f_n, force vector (3), gap, slip velocity (3).
-OUT_FORCE, OUT_VECTOR, OUT_GAP, OUT_SLIP = 0, 1, 4, 5
-OUTPUTS_PER_CONTACT = 8
+# Per contact: f_n, force vector (3), gap, slip velocity (3), mode.
+OUT_FORCE, OUT_VECTOR, OUT_GAP, OUT_SLIP, OUT_MODE = 0, 1, 4, 5, 8
+OUTPUTS_PER_CONTACT = 9
 
 
-def output_layout(n: int, motors: int, contacts: int, support: int = 0) -> OutputLayout:
-    """The columns for n joints, so many motors and contact points, and so many of a mobile base's support."""
-    starts = np.cumsum([0, n, motors, motors, motors, 3, ENERGIES, OUTPUTS_PER_CONTACT * contacts, support])
+def output_layout(n: int, motors: int, contacts: int, support: int = 0, stops: int = 0) -> OutputLayout:
+    """The columns for n joints, so many motors, contact points and joint stops, and so many of a base's support."""
+    starts = np.cumsum([0, n, motors, motors, motors, 3, ENERGIES, OUTPUTS_PER_CONTACT * contacts, support, stops])
     return OutputLayout(*(int(start) for start in starts))

@@ -18,6 +18,7 @@ from dynsim.kernels.arrays import (
     DEPENDENT,
     DIDT,
     GEAR_DAMPING,
+    OPEN,
     QD,
     QDD,
     ROWS,
@@ -32,9 +33,13 @@ from dynsim.kernels.arrays import (
     workspace,
 )
 from dynsim.kernels.constraint.delassus import solve_small
+from dynsim.kernels.constraint.distance import ShapeArrays
 from dynsim.kernels.constraint.m_star import solve_m_star
 from dynsim.kernels.constraint.rows import set_modes
+from dynsim.kernels.constraint.shapes import shaped_rows
+from dynsim.kernels.constraint.splits import admissible_forces
 from dynsim.kernels.constraint.surface import contact_rows, sign_changed
+from dynsim.kernels.constraint.unilateral import UnilateralArrays
 from dynsim.kernels.drive.law import drive
 from dynsim.kernels.jit import inlined_kernel, integers, internal_kernel, kernel, reals
 from dynsim.kernels.ledger import ledger_rates
@@ -58,14 +63,18 @@ class System(NamedTuple):
     couplings: CouplingArrays = CouplingArrays(
         integers(np.zeros((0, COUPLING_JOINT_SIZE))), reals(np.zeros((0, COUPLING_SIZE)))
     )
+    unilateral: UnilateralArrays | None = None  # candidates are glued to their surfaces, and joints have no stops
+    shapes: ShapeArrays | None = None  # of candidates that are not points on quadrics; None: all are
 
 
 def new_workspace(system: System) -> Workspace:
-    """The workspace of a system: every candidate slides, every coupling holds."""
-    contacts, couplings = system.contacts, system.couplings
-    c = contacts.link.shape[0]
-    ws = workspace(system.model.tree.shape[0], system.drives.table.shape[0], c, couplings.joint.shape[0])
-    set_modes(contacts, couplings, ws, integers(np.full(c, SLIDING)))
+    """The workspace of a system: couplings hold, candidates slide, under the unilateral law they are open."""
+    contacts, couplings, unilateral = system.contacts, system.couplings, system.unilateral
+    c, joint_rows = contacts.link.shape[0], couplings.joint.shape[0]
+    if unilateral is not None:
+        joint_rows += unilateral.stop.shape[0]
+    ws = workspace(system.model.tree.shape[0], system.drives.table.shape[0], c, joint_rows)
+    set_modes(contacts, couplings, unilateral, ws, integers(np.full(c, SLIDING if unilateral is None else OPEN)))
     return ws
 
 
@@ -110,7 +119,7 @@ def derivative(system: System, t, y, ws: Workspace, dy):
     # Most robots have a position for each rate; the others read and write their positions by kind of joint.
     plain = layout.extra == 0
     if not plain:
-        read_positions(model, y, layout.q, ws)
+        read_positions(model.compound, model, y, layout.q, ws)
     for i in range(n):
         if plain:
             joints[i, Q] = y[layout.q + i]
@@ -123,13 +132,15 @@ def derivative(system: System, t, y, ws: Workspace, dy):
     forward_sweep(model, ws, 1.0, 0.0, 1.0)
     if system.loads.table.shape[0] > 0:
         add_loads(model, system.loads, t, ws, dy, layout.load)
-    contact_rows(model, contacts, ws)
+    contact_rows(model, contacts, system.unilateral, ws)
+    shaped_rows(system.shapes, system.unilateral, model, contacts, ws)
     found = ws.counts[DEPENDENT]
     constrained_acceleration(model, ws)
     m_star_acceleration(system.dense, model, drives, ws, found)
+    admissible_forces(system.unilateral, ws)
 
     if not plain:
-        position_rates(model, ws, dy, layout.q)
+        position_rates(model.compound, model, ws, dy, layout.q)
     for i in range(n):
         if plain:
             dy[layout.q + i] = joints[i, QD]

@@ -13,10 +13,11 @@ from typing import Any, Protocol
 from dynsim.config import StrictConfig
 from dynsim.errors import ModelError
 from dynsim.model.control import BasePath, HandPath, JointControl
-from dynsim.model.description import Quadric, Robot
+from dynsim.model.description import Robot
 from dynsim.model.drives import Drive
 from dynsim.model.model import Model
 from dynsim.model.snake import SnakeDescription, TaskSpaceController
+from dynsim.model.surfaces import Box, HeightField, Quadric
 
 
 @dataclass(frozen=True)
@@ -103,9 +104,9 @@ class BasePathModule(Member, Protocol):
 
 
 class SurfaceModule(Member, Protocol):
-    """A surface that contact points stay on."""
+    """A surface that can be touched."""
 
-    def build(self, config: Any, context: BuildContext) -> Quadric: ...
+    def build(self, config: Any, context: BuildContext) -> Quadric | Box | HeightField: ...
 
 
 class MotorModule(Member, Protocol):

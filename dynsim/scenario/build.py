@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +13,16 @@ from dynsim import families
 from dynsim.config import BodyPoint
 from dynsim.errors import ModelError, ScenarioError, shown
 from dynsim.model.control import JointControl
-from dynsim.model.description import Array, Contact, Inertia, Load, Quadric, Robot
+from dynsim.model.description import Array, Contact, Inertia, Load, Robot
 from dynsim.model.model import Model
 from dynsim.model.protocols import BuildContext
+from dynsim.model.shapes import contact_gap
 from dynsim.model.snake import SnakeDescription, TaskSpaceController
+from dynsim.model.surfaces import SURFACES, Surface
 from dynsim.problems import dotted, suggest
+from dynsim.scenario.candidates import candidates
 from dynsim.scenario.loads import Payload
-from dynsim.scenario.schema import Scenario
+from dynsim.scenario.schema import ContactPoint, Contacts, Scenario
 
 # A contact point must start this close to its surface [m].
 START_TOLERANCE = 1e-6
@@ -102,16 +105,18 @@ def controller(
     return families.build("controller", config, context, TaskSpaceController)
 
 
-def surfaces(scenario: Scenario) -> dict[str, Quadric]:
+def surfaces(scenario: Scenario) -> dict[str, Surface]:
     """All surfaces by name, whether anything touches them or not."""
     context = BuildContext(scenario.duration_s)
     return {
-        name: families.build("surface", config, context, Quadric) for name, config in scenario.config.surfaces.items()
+        name: families.build("surface", config, context, SURFACES) for name, config in scenario.config.surfaces.items()
     }
 
 
-def contacts(scenario: Scenario) -> list[Contact]:
-    """All enabled contact points with their surfaces.
+def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact]:
+    """All enabled contact points with their surfaces, then the other candidates.
+
+    ``described`` : the robot of the scenario, when it is known already; candidates that are not points are its parts
 
     Raises
     ------
@@ -139,11 +144,30 @@ def contacts(scenario: Scenario) -> list[Contact]:
                 surface=known[point.surface],
                 surface_name=point.surface,
                 friction=options.friction if point.friction is None else point.friction,
-                slip_smoothing=options.slip_smoothing_m_s,
-                pulling_friction=options.pulling_friction,
+                **(_bilateral(options) if options.law == "bilateral" else _unilateral(options, point)),
             )
         )
+    if options.candidates != "points":
+        law = {"friction": options.friction, **_unilateral(options, ContactPoint(body=""))}
+        described = robot(scenario) if described is None else described
+        result += [replace(one, **law) for one in candidates(options.candidates, described, known, result)]
     return result
+
+
+def _bilateral(options: Contacts) -> dict[str, Any]:
+    """What the bilateral law says of a contact."""
+    return {"slip_smoothing": options.slip_smoothing_m_s, "pulling_friction": options.pulling_friction}
+
+
+def _unilateral(options: Contacts, point: ContactPoint) -> dict[str, Any]:
+    """What the unilateral law says of a contact."""
+    return {
+        "pulling_friction": "signed",
+        "static_friction": options.static_friction if point.static_friction is None else point.static_friction,
+        "stribeck": options.stribeck_m_s or 0.0,
+        "viscous_friction": options.viscous_friction_s_per_m,
+        "restitution": options.restitution if point.restitution is None else point.restitution,
+    }
 
 
 def loads(scenario: Scenario, robot: Robot) -> list[Load]:
@@ -191,21 +215,29 @@ def _payload(name: str, config: Payload, point: Array, axes: Array) -> Inertia:
     return payload
 
 
-def check_start(scenario: Scenario, model: Model, q: NDArray[np.float64] | None = None) -> None:
-    """Raise :class:`ModelError` unless every contact point is on a body of the robot and starts on its surface.
+def check_start(
+    scenario: Scenario, model: Model, touching: Sequence[Contact], q: NDArray[np.float64] | None = None
+) -> None:
+    """Raise :class:`ModelError` unless every contact is on a body of the robot and starts on its surface.
 
     ``q`` : coordinates at the start, (nq,) [rad or m]; default: the robot's initial ones
     """
-    for contact in contacts(scenario):
-        keys = ("contacts", "points", contact.name)
+    q = model.robot.initial if q is None else q
+    for contact in touching:
+        declared = contact.name in scenario.config.contacts.points
+        keys = ("contacts", "points", contact.name) if declared else ("contacts", "candidates")
         try:
-            position = model.point_position(contact.body, contact.point, model.robot.initial if q is None else q)
+            position = model.point_position(contact.body, contact.point, q)
         except ModelError as error:
             raise ModelError(f"{dotted((*keys, 'body'))}: {error}", keys=(*keys, "body")) from error
-        gap = contact.surface.gap(position)
+        end = None if contact.tip is None else model.point_position(contact.body, contact.tip, q)
+        gap = contact_gap(contact, position, end)
+        if scenario.config.contacts.law == "unilateral" and gap > 0.0:
+            continue
         if not abs(gap) <= START_TOLERANCE:
             raise ModelError(
-                f"{dotted(keys)}: its point starts {gap:+.4g} m from surface {contact.surface_name!r} "
+                f"{dotted(keys)}: {'its point' if declared else contact.name} starts {gap:+.4g} m "
+                f"from surface {contact.surface_name!r} "
                 f"(limit {START_TOLERANCE:g} m), at {position.tolist()}; "
                 "change the initial configuration or the surface, or disable the contact",
                 keys=keys,

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
-from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig
+from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig, error_at
 from dynsim.families import member, union
 from dynsim.problems import Origin, listed
 from dynsim.scenario.loads import LoadConfig
@@ -18,21 +18,43 @@ from dynsim.scenario.loads import LoadConfig
 NAME_LIMIT = 255
 
 
+# Keys that only one law reads.
+BILATERAL_KEYS = ("slip_smoothing_m_s", "pulling_friction")
+UNILATERAL_KEYS = ("static_friction", "stribeck_m_s", "viscous_friction_s_per_m", "restitution")
+Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
+
+
 class ContactPoint(BodyPoint):
     """A point fixed on a body, held to a surface."""
 
     surface: str = "floor"
     friction: NonNegative | None = Field(default=None, description="kinetic coefficient; default: that of contacts")
+    static_friction: NonNegative | None = Field(default=None, description="default: that of contacts; unilateral law")
+    restitution: Share | None = Field(default=None, description="default: that of contacts; unilateral law")
     enabled: bool = True
 
 
 class Contacts(StrictConfig):
     """Contact law and contact points."""
 
-    law: Literal["bilateral"] = Field(
-        default="bilateral", description="the point stays on the surface, f_n of any sign"
+    law: Literal["bilateral", "unilateral"] = Field(
+        default="bilateral",
+        description="points stay on their surfaces, f_n of any sign; or they are pushed only, stick, slip and lift off",
     )
-    friction: NonNegative = 0.1
+    friction: NonNegative = Field(default=0.1, description="kinetic coefficient μ")
+    static_friction: NonNegative | None = Field(
+        default=None, description="coefficient that holds at rest, at least friction (the default); unilateral law"
+    )
+    stribeck_m_s: Positive | None = Field(
+        default=None,
+        description="v_s of μ + (μ_s − μ) exp(−(v/v_s)²); default: μ from the first slip on; unilateral law",
+    )
+    viscous_friction_s_per_m: NonNegative = Field(
+        default=0.0, description="what each m/s of slip adds to the coefficient; unilateral law"
+    )
+    restitution: Share = Field(
+        default=0.0, description="share of the normal speed that an impact turns round; unilateral law"
+    )
     slip_smoothing_m_s: Positive = Field(default=1e-3, description="v_s of the slip direction v_t/√(v_t² + v_s²)")
     pulling_friction: Literal["signed", "dissipative"] = Field(
         default="dissipative", description="f_t = μ f_n as printed in the paper, or μ |f_n|"
@@ -40,7 +62,39 @@ class Contacts(StrictConfig):
     reference_tolerance_m: Positive = Field(
         default=2e-3, description="references that take a contact point further off its surface than this are refused"
     )
+    candidates: Literal["points", "joints", "links"] = Field(
+        default="points",
+        description="what can touch beside the points: nothing, all joints and the hand, or the links as capsules",
+    )
     points: dict[str, ContactPoint] = {}
+
+    @property
+    def other_keys(self) -> tuple[str, ...]:
+        """Keys that only the other law reads."""
+        return BILATERAL_KEYS if self.law == "unilateral" else UNILATERAL_KEYS
+
+    @model_validator(mode="after")
+    def _check_law(self) -> Self:
+        """Keys of the other law would be read by nobody."""
+        set_here = [key for key in self.other_keys if key in self.model_fields_set]
+        if set_here:
+            raise ValueError(f"{listed(set_here)} {'is' if len(set_here) == 1 else 'are'} not of law {self.law}")
+        if self.law == "bilateral" and self.candidates != "points":
+            raise error_at(
+                "candidates", f"{self.candidates!r} would glue all of them to their surfaces; it needs law: unilateral"
+            )
+        static = self.friction if self.static_friction is None else self.static_friction
+        if static < self.friction:
+            raise ValueError(f"static_friction {static:g} is less than friction {self.friction:g}")
+        for name, point in self.points.items():
+            if self.law == "bilateral" and point.model_fields_set & set(UNILATERAL_KEYS):
+                keys = listed(sorted(point.model_fields_set & set(UNILATERAL_KEYS)))
+                raise ValueError(f"points.{name}: {keys} not of law bilateral")
+            kinetic = self.friction if point.friction is None else point.friction
+            holds = point.static_friction if point.static_friction is not None else self.static_friction
+            if holds is not None and holds < kinetic:
+                raise ValueError(f"points.{name}: static_friction {holds:g} is less than friction {kinetic:g}")
+        return self
 
 
 class Integrator(StrictConfig):
@@ -182,6 +236,10 @@ class Scenario:
         resolved = self.config.model_dump(mode="json", exclude_none=True)
         if not self.config.loads:
             del resolved["loads"]
+        contacts = self.config.contacts
+        for part in (resolved["contacts"], *resolved["contacts"]["points"].values()):
+            for key in contacts.other_keys:
+                part.pop(key, None)
         return resolved
 
     def place(self, keys: Sequence[int | str] = (), variant: str = "") -> str:

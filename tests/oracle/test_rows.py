@@ -26,7 +26,7 @@ seeds = st.integers(0, 2**32 - 1)
 def stick(b: Bench, y: np.ndarray, *modes: int) -> None:
     """Give the candidates these modes at the state y."""
     b.derivative(y)
-    set_modes(b.system.contacts, b.system.couplings, b.ws, integers(modes))
+    set_modes(b.system.contacts, b.system.couplings, b.system.unilateral, b.ws, integers(modes))
 
 
 def free_motion(b: Bench, oracle: Oracle, q: np.ndarray, v: np.ndarray, current: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -18,7 +18,7 @@ G = 9.81
 
 def switch(b: Bench, y: np.ndarray, *modes: int) -> None:
     b.derivative(y)
-    set_modes(b.system.contacts, b.system.couplings, b.ws, integers(modes))
+    set_modes(b.system.contacts, b.system.couplings, b.system.unilateral, b.ws, integers(modes))
 
 
 def block(mass: float) -> Robot:

@@ -62,12 +62,25 @@ from dynsim.kernels.arrays import (
     V,
     Workspace,
 )
+from dynsim.kernels.constraint.unilateral import (
+    LIMIT,
+    SIDE,
+    STOP_CLOSED,
+    STOP_FORCE,
+    STOP_JOINT,
+    STOP_ROW,
+    UnilateralArrays,
+)
 from dynsim.kernels.jit import apart_kernel, internal_kernel
 
 
 @internal_kernel
-def set_modes(contacts: ContactArrays, couplings: CouplingArrays, ws: Workspace, modes):
+def set_modes(
+    contacts: ContactArrays, couplings: CouplingArrays, unilateral: UnilateralArrays | None, ws: Workspace, modes
+):
     """Give every candidate its mode, (c,) of OPEN, SLIDING or STICKING, and rebuild the table of rows.
+
+    Behind the couplings come the joint stops that are closed, then the candidates.
 
     Call it right after ``derivative`` at the state where modes change, and ``derivative`` once more afterwards: a
     candidate that begins to stick is held where the last evaluation has seen it. Its slip should have come to rest:
@@ -81,6 +94,9 @@ def set_modes(contacts: ContactArrays, couplings: CouplingArrays, ws: Workspace,
         rows[k, ROW], rows[k, ROW + 1] = 1.0, -couplings.law[k, RATIO]
         rows[k, DIRECTION], rows[k, DIRECTION + 1] = rows[k, ROW], rows[k, ROW + 1]
         rows[k, ROW_OFFSET] = couplings.law[k, OFFSET]
+    if unilateral is not None:
+        p = stop_rows(unilateral, ws, p)
+    joint_rows = p
     for k in range(contacts.link.shape[0]):
         i = contacts.link[k, LINK]
         if modes[k] == STICKING and active[k, MODE] != STICKING:
@@ -96,7 +112,7 @@ def set_modes(contacts: ContactArrays, couplings: CouplingArrays, ws: Workspace,
             for _ in range(MOST_ROWS):
                 new_row(ws, p, STICKING_ROW, k, i)
                 p += 1
-    ws.counts[ROWS], ws.counts[COUPLED], ws.counts[HELD] = p, couplings.joint.shape[0], held
+    ws.counts[ROWS], ws.counts[COUPLED], ws.counts[HELD] = p, joint_rows, held
     for k in range(contacts.link.shape[0]):
         if modes[k] == OPEN:
             active[k, FIRST_ROW] = p
@@ -106,6 +122,26 @@ def set_modes(contacts: ContactArrays, couplings: CouplingArrays, ws: Workspace,
     for i in range(ws.column.shape[0]):
         for s in range(ws.column.shape[1]):
             ws.column[i, s] = 0.0
+
+
+@internal_kernel
+def stop_rows(unilateral: UnilateralArrays, ws: Workspace, p):
+    """A joint row, of one joint, for every stop that is closed; returns the number of rows then."""
+    table, stop, couplings = unilateral.stop_table, unilateral.stop, p
+    for k in range(table.shape[0]):
+        stop[k, STOP_FORCE] = 0.0
+        if table[k, STOP_CLOSED] == 1:
+            joint = table[k, STOP_JOINT]
+            new_row(ws, p, JOINT_ROW, couplings + k, joint)
+            ws.active[p, BODY_B] = joint
+            ws.rows[p, ROW], ws.rows[p, DIRECTION], ws.rows[p, ROW_OFFSET] = (
+                stop[k, SIDE],
+                stop[k, SIDE],
+                stop[k, LIMIT],
+            )
+            table[k, STOP_ROW] = p
+            p += 1
+    return p
 
 
 @internal_kernel
@@ -123,9 +159,16 @@ def new_row(ws: Workspace, r, kind, owner, link):
 def drop_anchor(ws: Workspace, k):
     """Hold candidate k at the foot of its present position on the surface, along n and two tangents there."""
     state = ws.contacts
-    x, y, z = state[k, NORMAL], state[k, NORMAL + 1], state[k, NORMAL + 2]
     for s in range(3):
         state[k, ANCHOR + s] = state[k, POSITION + s] - state[k, GAP] * state[k, NORMAL + s]
+    tangents(ws, k)
+
+
+@internal_kernel
+def tangents(ws: Workspace, k):
+    """Two directions along the surface at the present normal of candidate k, for the rows of a point that sticks."""
+    state = ws.contacts
+    x, y, z = state[k, NORMAL], state[k, NORMAL + 1], state[k, NORMAL + 2]
     # n × the axis that is furthest from n.
     ax, ay, az = abs(x), abs(y), abs(z)
     if ax <= ay and ax <= az:

@@ -40,6 +40,7 @@ from dynsim.kernels.arrays import (
     Workspace,
 )
 from dynsim.kernels.constraint.rows import sticking_rows
+from dynsim.kernels.constraint.unilateral import UnilateralArrays, slide_direction
 from dynsim.kernels.jit import exact_kernel, inlined_kernel, kernel
 
 # Tries, beyond two per contact, to find signs of dissipative contacts that agree with their forces.
@@ -73,7 +74,7 @@ def hessian_product(point, k, x, y, z):
 
 
 @inlined_kernel
-def contact_rows(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
+def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace):
     """Position, gap, slip, constraint row and force direction of every candidate, after ``forward_sweep``.
 
     A candidate that is off its surface has a row too, behind the active ones: geometry without branches.
@@ -81,7 +82,8 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
     C(r) = r·Q r/2 + b·r + c, n = ∇C/|∇C| ([WM] eqs 3, 6, 8); a gap > 0 is off the surface. Row:
     n·r̈ = −ṙᵀ(∂²C/∂r²)ṙ / |∇C| ([WM] eqs 15, 30). Force per unit f_n: n − σ μ t with the smoothed slip direction
     t = v_t / √(|v_t|² + v_s²) ([WM] eqs 9, 14 and f_t = μ f_n); v_s is dynsim's assumption, the paper says nothing
-    of zero slip. σ is 1 in the paper's law; for the dissipative law it is the sign of f_n, kept between calls.
+    of zero slip. σ is 1 in the paper's law; for the dissipative law it is the sign of f_n, kept between calls. Under
+    the unilateral law t and μ are those of :func:`~dynsim.kernels.constraint.unilateral.slide_direction`.
     """
     links, state, rows, point, gravity = ws.links, ws.contacts, ws.rows, contacts.point, model.gravity
     for k in range(contacts.link.shape[0]):
@@ -116,7 +118,12 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
         az = links[i, A + 5] + gravity[2] + ex * ry - ey * rx + wx * vy - wy * vx
         rate = nx * vx + ny * vy + nz * vz
         tx, ty, tz = vx - rate * nx, vy - rate * ny, vz - rate * nz
-        scale = 1.0 / math.sqrt(tx * tx + ty * ty + tz * tz + point[k, V_S] * point[k, V_S])
+        if unilateral is None:
+            scale = 1.0 / math.sqrt(tx * tx + ty * ty + tz * tz + point[k, V_S] * point[k, V_S])
+            sx, sy, sz = tx * scale, ty * scale, tz * scale
+        else:
+            sx, sy, sz, mu = slide_direction(unilateral, contacts, k, tx, ty, tz)
+            rows[m, ROW_MU] = mu
         state[k, GAP] = gap
         state[k, GAP_RATE] = rate
         target = -(nx * ax + ny * ay + nz * az)
@@ -125,7 +132,6 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, ws: Workspace):
         state[k, NORMAL], state[k, NORMAL + 1], state[k, NORMAL + 2] = nx, ny, nz
         state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2] = tx, ty, tz
         # From here on nothing is read back: stores to one table keep the compiler from trusting the other.
-        sx, sy, sz = tx * scale, ty * scale, tz * scale
         state[k, TANGENT], state[k, TANGENT + 1], state[k, TANGENT + 2] = sx, sy, sz
         rows[m, ROW], rows[m, ROW + 1], rows[m, ROW + 2] = ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx
         rows[m, ROW + 3], rows[m, ROW + 4], rows[m, ROW + 5] = nx, ny, nz

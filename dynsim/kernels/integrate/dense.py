@@ -71,7 +71,7 @@ def sample_step(system: System, ws: Workspace, run: Run):
         for j in range(row.shape[0]):
             row[j] = run.y[j] + x * (d[0, j] + z * (d[1, j] + x * (d[2, j] + z * d[3, j])))
         if system.layout.extra > 0:
-            normalise(system.model, row, system.layout.q)
+            normalise(system.model.compound, system.model, row, system.layout.q)
         settle(system, run.sample_time[last], row, ws, run.stage[7], run)
         write_output(system, ws, run, last)
         last += 1

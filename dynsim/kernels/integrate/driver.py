@@ -19,8 +19,16 @@ After each accepted step q and v are projected onto the active rows when they ha
 from __future__ import annotations
 
 from dynsim.kernels.arrays import CONTRADICTORY, Workspace
+from dynsim.kernels.constraint.unilateral import UnilateralArrays
 from dynsim.kernels.constraint.uniqueness import clearly_unique
 from dynsim.kernels.drive.law import take_commands
+from dynsim.kernels.integrate.contact_events import (
+    consistent,
+    solve_modes,
+    switch_contacts,
+    take_directions,
+    watch_modes,
+)
 from dynsim.kernels.integrate.dense import sample_step
 from dynsim.kernels.integrate.events import arm_events, cut_step, fire_events, take_ticks
 from dynsim.kernels.integrate.explicit import step_explicit
@@ -34,6 +42,7 @@ from dynsim.kernels.integrate.run import (
     FINISHED,
     FIRED,
     HOLD,
+    MODES_DUE,
     NO_FORCES,
     NOT_FINITE,
     NOT_PROJECTED,
@@ -65,8 +74,8 @@ from dynsim.kernels.tree.support import watch_support
 @internal_kernel
 def start(system: System, ws: Workspace, run: Run):
     """First derivative, on the contacts, and a first step size where none is given. Sets STATUS when there is none."""
-    if not settle(system, run.clock[TIME], run.y, ws, run.stage[0], run):
-        run.count[STATUS] = NOT_PROJECTED
+    if not start_contacts(system.unilateral, system, ws, run):
+        run.count[STATUS] = NOT_PROJECTED if run.count[STATUS] == RUNNING else run.count[STATUS]
     elif not finite(run.stage[0]):
         run.count[STATUS] = NO_FORCES if ws.counts[CONTRADICTORY] > 0 else NOT_FINITE
     elif forces_unique(system, ws, run, run.clock[TIME]):
@@ -74,6 +83,23 @@ def start(system: System, ws: Workspace, run: Run):
         if run.clock[STEP] <= 0.0:
             first_step(system, ws, run)
     run.count[STARTED] = 1
+
+
+@internal_kernel
+def start_contacts(unilateral: UnilateralArrays | None, system: System, ws: Workspace, run: Run):
+    """Derivative at the start of a step, on the constraints; under the unilateral law with modes that agree with it."""
+    if unilateral is None:  # known to the compiler, as it is below: system.unilateral would not be
+        return settle(system, run.clock[TIME], run.y, ws, run.stage[0], run)
+    first = run.count[MODES_DUE] == 1
+    if first:
+        run.count[MODES_DUE] = 0
+        solve_modes(system, ws, run, True)
+    if run.count[STATUS] != RUNNING or not settle(system, run.clock[TIME], run.y, ws, run.stage[0], run):
+        return False
+    if consistent(system, ws):
+        return True
+    solve_modes(system, ws, run, first)
+    return run.count[STATUS] == RUNNING and settle(system, run.clock[TIME], run.y, ws, run.stage[0], run)
 
 
 @merged_kernel
@@ -86,12 +112,14 @@ def accept(system: System, ws: Workspace, run: Run):
     if not (clearly_unique(ws) or forces_unique(system, ws, run, t + h)):
         return
     watch(ws, run, h)
+    watch_modes(system.unilateral, ws, h)
     # The event of tipping has asked for the ground's reaction at the end of this step.
-    if run.support.index.shape[0] > 0 and run.event.shape[0] > 0:
+    if run.event.shape[0] > 0:
         watch_support(run.support)
     if system.layout.extra > 0:
-        normalise(system.model, run.y_new, system.layout.q)
+        normalise(system.model.compound, system.model, run.y_new, system.layout.q)
     sample_step(system, ws, run)
+    take_directions(system.unilateral, ws, run)
     for j in range(run.y.shape[0]):
         run.y[j] = run.y_new[j]
         run.stage[0, j] = run.stage[6, j]
@@ -179,6 +207,8 @@ def conclude(system: System, ws: Workspace, run: Run, error, order):
     count[PENDING] = 0
     accept(system, ws, run)
     go_on(run, order, 0.04)
+    if count[FIRED] == 1 and count[STATUS] == RUNNING:
+        switch_contacts(system.unilateral, system, ws, run)
     return run.event.shape[0] > 0 and fire_events(run)
 
 

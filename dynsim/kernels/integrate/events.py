@@ -10,6 +10,7 @@ followed by such a step anyway.
 from __future__ import annotations
 
 from dynsim.kernels.arrays import CURRENT, GAP, NORMAL_FORCE, QD, VOLTAGE, Q, Workspace
+from dynsim.kernels.integrate.contact_events import NORMAL_GUARD, contact_guard, note_gaps, too_long
 from dynsim.kernels.integrate.run import (
     AT_HIGH,
     AT_LOW,
@@ -18,6 +19,7 @@ from dynsim.kernels.integrate.run import (
     EVENT_KIND,
     EVENT_LEVEL,
     FIRED,
+    GRAZING,
     HIGH,
     LOGGED,
     LOW,
@@ -45,9 +47,10 @@ from dynsim.kernels.integrate.run import (
 from dynsim.kernels.jit import inlined_kernel, internal_kernel
 from dynsim.kernels.system import System
 from dynsim.kernels.tree.points import point_position
-from dynsim.kernels.tree.support import MARGIN, ground_reaction
+from dynsim.kernels.tree.support import tip_margin
 
 # Kinds of guards. A new one is a number here, a branch in ``guard`` and a name in GUARDS of dynsim.engine.stepped.
+# Those of the unilateral law, from NORMAL_GUARD on, are in dynsim.kernels.integrate.contact_events.
 JOINT_POSITION, JOINT_RATE, MOTOR_CURRENT, MOTOR_VOLTAGE, CONTACT_FORCE, CONTACT_GAP = 0, 1, 2, 3, 4, 5
 HAND_X, HAND_Y, HAND_Z = 6, 7, 8
 TIP_MARGIN = 9
@@ -73,8 +76,9 @@ def guard(system: System, t, ws: Workspace, run: Run, e):
     elif kind == CONTACT_GAP:
         value = ws.contacts[k, GAP]
     elif kind == TIP_MARGIN:
-        ground_reaction(system.model, system.loads, t, ws, run.support)
-        value = run.support.state[MARGIN]
+        value = tip_margin(system.model, system.loads, t, ws, run.support)
+    elif kind >= NORMAL_GUARD:
+        value = contact_guard(system.unilateral, ws, kind, k)
     else:
         point_position(ws, run.hand_link, run.hand_point, run.hand)
         value = run.hand[kind - HAND_X]
@@ -92,6 +96,7 @@ def arm_events(system: System, ws: Workspace, run: Run):
         run.event[e, START_VALUE] = value
         if run.event[e, SIDE] == 0.0:
             run.event[e, SIDE] = 1.0 if value > 0.0 else (-1.0 if value < 0.0 else 0.0)
+    note_gaps(ws, run.gaps)
 
 
 @inlined_kernel
@@ -120,7 +125,7 @@ def cut_step(system: System, ws: Workspace, run: Run):
         hit = happened(run, e, event[e, VALUE]) or hit
     if count[SEARCHING] == 0:
         if not hit:
-            return False
+            return passes_over(system, ws, run)
         clock[LOW], clock[HIGH], count[TURNED_BACK] = 0.0, h, 0
         for e in range(event.shape[0]):
             event[e, AT_LOW], event[e, AT_HIGH] = event[e, START_VALUE], event[e, VALUE]
@@ -156,6 +161,20 @@ def cut_step(system: System, ws: Workspace, run: Run):
         trial = 0.5 * (low + high)
     clock[STEP] = trial
     return True
+
+
+@internal_kernel
+def passes_over(system: System, ws: Workspace, run: Run):
+    """True when a contact has been passed over within the step: STEP is then the one to take instead."""
+    part = too_long(system.unilateral, ws, run.clock[STEP], run.gaps)
+    # What is none, after all, does not shorten steps for ever.
+    if part < 1.0 and run.count[GRAZING] < SEARCH_LIMIT:
+        run.count[GRAZING] += 1
+        run.clock[STEP] *= part
+        return True
+    run.count[GRAZING] = 0
+    note_gaps(ws, run.gaps)
+    return False
 
 
 @internal_kernel

@@ -63,6 +63,7 @@ from dynsim.kernels.integrate.time_stepping import (
     place_joints,
     row_rates,
     solve_contacts,
+    stop_forces,
     tangent_rows,
 )
 from dynsim.kernels.integrate.watch import watch
@@ -92,7 +93,7 @@ def step_moreau(system: System, ws: Workspace, run: Run):
     """One step from y to y_new; mean accelerations and forces stay in the workspace."""
     s, t, h, y, y_new, layout = run.stepping, run.clock[TIME], run.clock[STEP], run.y, run.y_new, system.layout
     joints, theta, n = ws.joints, s.theta, ws.joints.shape[0]
-    model = ModelArrays(system.model.tree, s.body, system.model.gravity)
+    model = ModelArrays(system.model.tree, s.body, system.model.gravity, system.model.compound)
     v0, v_bias, last = s.before[0], s.before[1], s.before[2]
     place_joints(system, ws, y)
     for i in range(n):
@@ -116,12 +117,13 @@ def step_moreau(system: System, ws: Workspace, run: Run):
         geometry(system, model, s, ws)
     if system.loads.table.shape[0] > 0:
         add_loads(model, system.loads, t + theta * h, ws, run.stage[1], layout.load)
-    tangent_rows(s, ws)
+    tangent_rows(system, s, ws)
     factor(model, ws)
     row_rates(model, ws, v0, s.rate[0])
     if ws.counts[ROWS] > 0:
         row_system(model, ws)
         solve_contacts(s, ws, h)
+        stop_forces(system.unilateral, ws)
         add_row_forces(model, ws)
     accelerate(model, ws)
     run.count[EVALUATIONS] += 1
@@ -211,7 +213,7 @@ def sample_moreau(system: System, ws: Workspace, run: Run):
         for j in range(row.shape[0]):
             row[j] = run.y[j] + x * (run.y_new[j] - run.y[j])
         if system.layout.extra > 0:
-            normalise(system.model, row, system.layout.q)
+            normalise(system.model.compound, system.model, row, system.layout.q)
         place_joints(system, ws, row)
         for i in range(ws.joints.shape[0]):
             ws.joints[i, QD], ws.joints[i, APPLIED] = row[system.layout.v + i], 0.0

@@ -11,6 +11,7 @@ from dynsim.kernels.arrays import (
     GAP,
     J_M,
     K_M,
+    MODE,
     NORMAL_FORCE,
     QD,
     QDD,
@@ -19,13 +20,14 @@ from dynsim.kernels.arrays import (
     Workspace,
 )
 from dynsim.kernels.constraint.rows import force_vectors
+from dynsim.kernels.constraint.unilateral import STOP_FORCE, UnilateralArrays
 from dynsim.kernels.integrate.run import Run
 from dynsim.kernels.jit import internal_kernel
 from dynsim.kernels.ledger import kinetic_energy, magnetic_energy, potential_energy
-from dynsim.kernels.state import OUT_FORCE, OUT_GAP, OUT_SLIP, OUT_VECTOR, OUTPUTS_PER_CONTACT
+from dynsim.kernels.state import OUT_FORCE, OUT_GAP, OUT_MODE, OUT_SLIP, OUT_VECTOR, OUTPUTS_PER_CONTACT
 from dynsim.kernels.system import System
 from dynsim.kernels.tree.points import point_position
-from dynsim.kernels.tree.support import OUTPUTS, ground_reaction
+from dynsim.kernels.tree.support import OUTPUTS, SupportArrays, ground_reaction
 
 
 @internal_kernel
@@ -54,11 +56,29 @@ def write_output(system: System, ws: Workspace, run: Run, row):
     for c in range(state.shape[0]):
         out[row, k + OUT_FORCE] = state[c, NORMAL_FORCE]
         out[row, k + OUT_GAP] = state[c, GAP]
+        out[row, k + OUT_MODE] = ws.active[c, MODE]
         for s in range(3):
             out[row, k + OUT_VECTOR + s] = state[c, FORCE_VECTOR + s]
             out[row, k + OUT_SLIP + s] = state[c, SLIP_VELOCITY + s]
         k += OUTPUTS_PER_CONTACT
-    if run.support.index.shape[0] > 0:
-        ground_reaction(system.model, system.loads, run.sample_time[row], ws, run.support)
-        for s in range(OUTPUTS):
-            out[row, columns.support + s] = run.support.state[s]
+    write_support(system, ws, run, row, run.support)
+    stop_forces(system.unilateral, out[row, columns.stop :])
+
+
+@internal_kernel
+def stop_forces(unilateral: UnilateralArrays | None, out):
+    """Forces of the joint stops, (s,) or more."""
+    if unilateral is None:  # known to the compiler
+        return
+    for k in range(unilateral.stop.shape[0]):
+        out[k] = unilateral.stop[k, STOP_FORCE]
+
+
+@internal_kernel
+def write_support(system: System, ws: Workspace, run: Run, row, support: SupportArrays | None):
+    """What the ground carries of a mobile base, into the columns ``support``."""
+    if support is None:  # known to the compiler
+        return
+    ground_reaction(system.model, system.loads, run.sample_time[row], ws, support)
+    for s in range(OUTPUTS):
+        run.output[row, run.columns.support + s] = support.state[s]

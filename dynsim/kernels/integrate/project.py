@@ -64,28 +64,37 @@ def project(system: System, ws: Workspace, y):
     dq = −M⁻¹ Jᵀ λ with J M⁻¹ Jᵀ λ = gap, and the same for v with J v: the nearest point in the kinetic metric. The
     factors of M + J_m and the eliminated rows are those that the derivative has left in the workspace.
     """
+    project_level(system, ws, y, 0)
+    project_level(system, ws, y, 1)
+
+
+@internal_kernel
+def project_level(system: System, ws: Workspace, y, level):
+    """Positions (level 0) or rates (1) of :func:`project`; returns ½ λᵀ J v, the kinetic energy that rates lose [J]."""
     state, active, column, small = ws.rows, ws.active, ws.column, ws.small
     n, p = ws.joints.shape[0], ws.counts[ROWS]
-    plain = system.layout.extra == 0
-    for level in range(2):
-        start = system.layout.q if level == 0 else system.layout.v
-        for k in range(p):
-            state[k, RHS] = state[k, ROW_GAP] if level == 0 else state[k, ROW_RATE]
-            for m in range(p):
-                small[0, k, m] = 0.0
-                for i in range(n):
-                    small[0, k, m] += column[i, 1 + 2 * k] * column[i, 1 + 2 * m] * ws.links[i, INVERSE_D]
-        solve_small(small, state, active, p)
-        for i in range(n):
-            column[i, 0] = 0.0
-            for k in range(p):
-                column[i, 0] -= state[k, FORCE] * column[i, 1 + 2 * k]
-        accelerate(system.model, ws)
-        if level == 0 and not plain:
-            displace(system.model, ws, y, start)
-        else:
+    start = system.layout.q if level == 0 else system.layout.v
+    for k in range(p):
+        state[k, RHS] = state[k, ROW_GAP] if level == 0 else state[k, ROW_RATE]
+        for m in range(p):
+            small[0, k, m] = 0.0
             for i in range(n):
-                y[start + i] += ws.joints[i, QDD]
+                small[0, k, m] += column[i, 1 + 2 * k] * column[i, 1 + 2 * m] * ws.links[i, INVERSE_D]
+    solve_small(small, state, active, p)
+    energy = 0.0
+    for k in range(p):
+        energy += 0.5 * state[k, FORCE] * state[k, RHS]
+    for i in range(n):
+        column[i, 0] = 0.0
+        for k in range(p):
+            column[i, 0] -= state[k, FORCE] * column[i, 1 + 2 * k]
+    accelerate(system.model, ws)
+    if level == 0 and system.layout.extra > 0:
+        displace(system.model.compound, system.model, ws, y, start)
+    else:
+        for i in range(n):
+            y[start + i] += ws.joints[i, QDD]
+    return energy
 
 
 @internal_kernel

@@ -20,6 +20,8 @@ FIXED_STEP = (RK4, TIME_STEPPING)
 
 RUNNING, FINISHED, NOT_FINITE, STEP_TOO_SMALL, NOT_PROJECTED, NO_FORCES = 0, 1, 2, 3, 4, 5
 FORCES_REVERSED, SEVERAL_FORCES, STOPPED = 6, 7, 8
+# Under the unilateral law: no forces agree with Coulomb's law; modes change without end.
+NO_CONTACT_FORCES, CHATTER = 9, 10
 
 # Run.clock
 TIME, STEP, LAST_ERROR, END, RTOL, ATOL, STEP_MAX = 0, 1, 2, 3, 4, 5, 6
@@ -34,7 +36,9 @@ STEPS, REJECTED, EVALUATIONS, PROJECTIONS, SAMPLE, STATUS, STARTED = 0, 1, 2, 3,
 # at a tick; events in the log; bits of the ticks that the caller is to look at.
 PENDING, SEARCHING, TURNED_BACK, FIRED, TRIMMED, LOGGED, TICKED = 7, 8, 9, 10, 11, 12, 13
 NEXT_BREAK = 14  # index of the first of Run.breaks that is not past
-COUNT_SIZE = 15
+MODES_DUE = 15  # 1: contact modes are to be chosen at the next start
+GRAZING = 16  # how often the step was shortened because it passed over a contact
+COUNT_SIZE = 17
 # Run.event, and Run.event_table, int
 EVENT_LEVEL, SIDE, START_VALUE, VALUE, AT_LOW, AT_HIGH = 0, 1, 2, 3, 4, 5
 EVENT_SIZE = 6
@@ -49,6 +53,8 @@ TICK_KIND, TICK_COUNT = 0, 1
 TICK_TABLE_SIZE = 2
 TAKE_COMMANDS, CALLER = 1, 2
 LOG_LENGTH = 1024
+# Entries of Run.log_event from these numbers on are of contacts and of joint stops, see contact_events.
+CONTACT_LOG, STOP_LOG = 1 << 20, 1 << 40
 # Run.extremes, per contact
 FORCE_MIN, FORCE_MAX, DRIFT_MAX = 0, 1, 2
 PULLING, LAST_FORCE = 3, 4  # time with a negative normal force [s]; normal force at the last accepted step [N]
@@ -85,7 +91,8 @@ class Run(NamedTuple):
     log_time: np.ndarray  # (LOG_LENGTH,) of events [s]
     log_event: np.ndarray  # (LOG_LENGTH,) int: which
     hand: np.ndarray  # (3,) room
-    support: SupportArrays
+    gaps: np.ndarray  # (c, 2) gaps and their rates at the start of the step
+    support: SupportArrays | None
     columns: OutputLayout
     output: np.ndarray  # (T, columns.size)
     stepping: SteppingArrays | None  # of time stepping alone
@@ -134,6 +141,8 @@ def new_run(
     tick, tick_table = ticks or (np.zeros((0, TICK_SIZE)), np.zeros((0, TICK_TABLE_SIZE)))
     extremes = np.zeros((c, EXTREMES_SIZE))
     extremes[:, FORCE_MIN], extremes[:, FORCE_MAX], extremes[:, LOCAL_SINCE] = np.inf, -np.inf, np.inf
+    count = np.zeros(COUNT_SIZE, dtype=np.int64)
+    count[MODES_DUE] = 1
     return Run(
         method=method,
         layout=layout,
@@ -146,7 +155,7 @@ def new_run(
         pivot=np.zeros(n if rodas else 0, dtype=np.int64),
         linear=np.zeros((na, BLOCK_SIZE)),
         clock=clock,
-        count=np.zeros(COUNT_SIZE, dtype=np.int64),
+        count=count,
         extremes=extremes,
         room=np.zeros((ROOM, p, p)),
         hand_link=hand[0],
@@ -161,7 +170,8 @@ def new_run(
         log_time=np.zeros(LOG_LENGTH),
         log_event=np.zeros(LOG_LENGTH, dtype=np.int64),
         hand=np.zeros(3),
-        support=support or SupportArrays(integers([]), reals([]), reals([]), reals([])),
+        gaps=np.zeros((c, 2)),
+        support=support,
         columns=columns,
         output=np.zeros((len(sample_time), columns.size)),
         stepping=stepping,

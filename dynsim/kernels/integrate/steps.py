@@ -36,7 +36,8 @@ def error_norm(system: System, ws: Workspace, run: Run, error):
     y, y_new, atol, rtol, layout = run.y, run.y_new, run.clock[ATOL], run.clock[RTOL], system.layout
     total = 0.0
     if layout.extra > 0:
-        total, size = position_error(system.model, y, y_new, error, layout.q, rtol, atol)
+        model = system.model
+        total, size = position_error(model.compound, model, y, y_new, error, layout.q, rtol, atol)
         beyond = layout.q + ws.joints.shape[0] + layout.extra
         for j in range(layout.tracked):
             if j < layout.q or j >= beyond:

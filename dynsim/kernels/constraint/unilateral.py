@@ -1,0 +1,113 @@
+"""The unilateral law: tables of candidates and joint stops that only push, and the direction in which a point slides.
+
+0 ≤ f_n ⟂ gap ≥ 0; a point that slides is driven by n − μ(s) t along t = v_t/|v_t|, one that is at rest is held while
+|f_t| ≤ μ_s f_n. Which candidates are open, slide or stick is constant within a step
+(:mod:`dynsim.kernels.constraint.contact_modes` chooses); this module is what a right-hand side needs of the law.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from dynsim.kernels.arrays import MU, ContactArrays
+from dynsim.kernels.constraint.cone_program import ConeProgram
+from dynsim.kernels.jit import inlined_kernel
+
+# UnilateralArrays.law; the kinetic coefficient is ContactArrays.point[:, MU].
+STATIC = 0  # static coefficient μ_s ≥ μ_k
+STRIBECK = 1  # speed v_s [m/s] of μ_k + (μ_s − μ_k) exp(−(s/v_s)²); 0: μ_k from the first slip on
+VISCOUS = 2  # [s/m]: adds c s to the coefficient
+RESTITUTION = 3
+LAW_SIZE = 4
+# UnilateralArrays.slide
+REFERENCE = 0  # 3: direction of slip at the start of the step, or since it began while FROZEN; 0 before any
+FROZEN = 3  # 1: slip is too slow to have a direction of its own, that of REFERENCE stands
+SPEED = 4  # v_t · REFERENCE [m/s]
+NEXT = 5  # 3: direction at the end of the step
+NEXT_SPEED = 8  # |v_t| there [m/s]
+SLIDE_SIZE = 9
+# UnilateralArrays.tally, of a candidate
+TIME_OPEN, TIME_SLIDING, TIME_STICKING = 0, 1, 2  # in the order of the modes [s]
+LIFT_OFFS, LANDINGS, SLIP_STARTS, BOUNCES = 3, 4, 5, 6
+LOSS = 7  # energy that impacts have taken [J]
+SETTLE = 8  # slower than that a touching point counts as at rest along the normal [m/s]
+WINDOW_START, WINDOW_COUNT = 9, 10  # of the count of events that tells chatter
+CHATTERED = 11  # how often SETTLE was raised because of it
+DEEPEST = 12  # largest depth below the surface [m]
+TALLY_SIZE = 13
+# UnilateralArrays.stop_table, int
+STOP_JOINT = 0  # link whose joint it stops
+STOP_CLOSED = 1
+STOP_ROW = 2  # its row while it is closed
+STOP_BEFORE = 3  # scratch of the choice of modes
+STOP_TABLE_SIZE = 4
+# UnilateralArrays.stop
+SIDE = 0  # 1 for a lower limit, −1 for an upper one
+LIMIT = 1  # SIDE times the limit [rad or m]: the gap is SIDE q − LIMIT
+STOP_FORCE = 2  # [N m or N], ≥ 0
+HITS = 3
+STOP_LOSS = 4  # [J]
+CLOSED_TIME = 5  # [s]
+STOP_SIZE = 6
+# UnilateralArrays.mode, int: columns
+WANTED, BEFORE, TOUCHING, STRUCK = 0, 1, 2, 3
+MODE_SIZE = 4
+# UnilateralArrays.vector: three of the splits of forces, then those of the problem that chooses modes
+OFFSET, SOLUTION, CONE_FRICTION, FIRST_PART, SECOND_PART = 3, 4, 5, 6, 7
+VECTORS = 8
+# UnilateralArrays.place, int: three of the splits of forces; kinds of the problem's rows, and which of the table's
+KINDS, TABLE_ROW = 3, 4
+PLACES = 5
+# UnilateralArrays.number
+REDUNDANT = 0  # 1: the rows of what sticks depend on each other
+BEST_MARGIN = 1  # the worst margin of the best split of their forces [N], where the least norm fits no cones
+SPLIT = 2  # 1: BEST_MARGIN counts at this evaluation
+SLOW = 3  # below this speed the direction of slip is frozen [m/s]
+LAST_CHANGE, CHANGES = 4, 5  # time of the last change of modes, and how many there were at that time
+NUMBERS = 6
+
+
+class UnilateralArrays(NamedTuple):
+    """c candidates and s joint stops under the unilateral law; p is the most rows that there can be."""
+
+    law: np.ndarray  # (c, LAW_SIZE)
+    slide: np.ndarray  # (c, SLIDE_SIZE)
+    mode: np.ndarray  # (c, MODE_SIZE) int
+    tally: np.ndarray  # (c, TALLY_SIZE)
+    stop_table: np.ndarray  # (s, STOP_TABLE_SIZE) int
+    stop: np.ndarray  # (s, STOP_SIZE)
+    place: np.ndarray  # (PLACES, p) int
+    vector: np.ndarray  # (VECTORS, p)
+    split: np.ndarray  # (2, p, p)
+    split_room: ConeProgram  # scratch of best_split
+    matrix: np.ndarray  # (p, p)
+    room: np.ndarray  # scratch of solve_cones
+    number: np.ndarray  # (NUMBERS,)
+
+
+@inlined_kernel
+def slide_direction(unilateral: UnilateralArrays, contacts: ContactArrays, k, x, y, z):
+    """Direction of slip of candidate k at tangential velocity (x, y, z), and its coefficient of friction there.
+
+    While FROZEN the direction is that of REFERENCE. Else v_t/|v_t|, with the sign of v_t · REFERENCE: through zero it
+    goes on as it was, so that a step that passes the end of slip is smooth, and the end of slip is where
+    v_t · REFERENCE is zero.
+    """
+    slide, law = unilateral.slide, unilateral.law
+    a, b, c = slide[k, REFERENCE], slide[k, REFERENCE + 1], slide[k, REFERENCE + 2]
+    along = x * a + y * b + z * c
+    size = math.sqrt(x * x + y * y + z * z)
+    slide[k, SPEED] = along
+    speed = along
+    if slide[k, FROZEN] == 0.0 and size > 0.0:
+        scale = 1.0 / size if along >= 0.0 else -1.0 / size
+        a, b, c = x * scale, y * scale, z * scale
+        speed = size if along >= 0.0 else -size
+    mu = contacts.point[k, MU]
+    if law[k, STRIBECK] > 0.0:
+        ratio = speed / law[k, STRIBECK]
+        mu += (law[k, STATIC] - mu) * math.exp(-ratio * ratio)
+    return a, b, c, mu + law[k, VISCOUS] * speed

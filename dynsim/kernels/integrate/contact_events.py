@@ -1,0 +1,358 @@
+"""Events of the unilateral law: landing, lift-off, begin and end of slip, joint stops; what each of them changes.
+
+Each candidate has two guards, each stop one. Off its surface the guard is the gap, closed it is the normal force; of a
+point that sticks the second guard is its margin μ_s f_n − |f_t|, of one that slides its speed along the direction that
+it began the step with. All of them fall through zero.
+
+Lift-off and the begin of slip leave forces as they are, so that the one candidate is switched by hand: its
+complementarity problem is degenerate there. Everything else, and whatever this leaves inconsistent, is solved anew.
+"""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.kernels.arrays import (
+    FIRST_ROW,
+    FORCE,
+    GAP,
+    GAP_RATE,
+    MODE,
+    NORMAL_FORCE,
+    OPEN,
+    SLIDING,
+    SLIP_VELOCITY,
+    STICKING,
+    Q,
+    Workspace,
+)
+from dynsim.kernels.constraint.rows import set_modes
+from dynsim.kernels.constraint.splits import margin
+from dynsim.kernels.constraint.unilateral import (
+    BEFORE,
+    BEST_MARGIN,
+    BOUNCES,
+    CHANGES,
+    CHATTERED,
+    CLOSED_TIME,
+    DEEPEST,
+    FROZEN,
+    HITS,
+    LANDINGS,
+    LAST_CHANGE,
+    LIFT_OFFS,
+    LIMIT,
+    NEXT,
+    NEXT_SPEED,
+    REFERENCE,
+    SETTLE,
+    SIDE,
+    SLIP_STARTS,
+    SLOW,
+    SPEED,
+    SPLIT,
+    STATIC,
+    STOP_BEFORE,
+    STOP_CLOSED,
+    STOP_FORCE,
+    STOP_JOINT,
+    STRUCK,
+    TIME_OPEN,
+    WANTED,
+    WINDOW_COUNT,
+    WINDOW_START,
+    UnilateralArrays,
+)
+from dynsim.kernels.integrate.contact_modes import begin_slip, evaluate, resolve, slip_speed
+from dynsim.kernels.integrate.run import (
+    CHATTER,
+    CONTACT_LOG,
+    EVENT_INDEX,
+    EVENT_KIND,
+    LOGGED,
+    STARTED,
+    STATUS,
+    STOP_LOG,
+    TIME,
+    VALUE,
+    Run,
+)
+from dynsim.kernels.integrate.run import (
+    SIDE as GUARD_SIDE,
+)
+from dynsim.kernels.jit import apart_kernel, internal_kernel
+from dynsim.kernels.system import System
+
+# Kinds of guards, behind those of dynsim.kernels.integrate.events.
+NORMAL_GUARD, SLIP_GUARD, STOP_GUARD = 10, 11, 12
+# What is logged of a candidate, and of a stop.
+LANDING, LIFT_OFF, SLIP_START, SLIP_STOP, BOUNCE, CHATTERS, STOP_HIT, STOP_LEFT = 0, 1, 2, 3, 4, 5, 6, 7
+LOG_KINDS = 8
+
+# Below its surface by this much a point has landed [m]; projection leaves closed ones within half of it.
+DEPTH = 2e-10
+# A candidate that starts, or comes to rest, this close to its surface touches it [m].
+TOUCH = 1e-9
+# More events of a candidate than MOST_EVENTS in WINDOW [s] are chatter; SETTLE grows tenfold then, up to MOST_SETTLE.
+WINDOW, MOST_EVENTS, MOST_SETTLE = 1.0, 200, 1e-2
+# So many changes at one instant, or chatter so often at one candidate, end the run.
+MOST_CHANGES, MOST_CHATTER = 60, 100
+INSTANT = 1e-11
+# Forces that contradict their modes by less than this, absolute [N] and of the largest, are rounding.
+FORCE_SLACK = 1e-9
+
+
+@internal_kernel
+def contact_guard(unilateral: UnilateralArrays | None, ws: Workspace, kind, k):
+    """Value of a guard of the unilateral law, right after ``derivative``."""
+    if unilateral is None:  # known to the compiler
+        return 1.0
+    if kind == STOP_GUARD:
+        stop, j = unilateral.stop, unilateral.stop_table[k, STOP_JOINT]
+        if unilateral.stop_table[k, STOP_CLOSED] == 1:
+            return stop[k, STOP_FORCE]
+        return stop[k, SIDE] * ws.joints[j, Q] - stop[k, LIMIT] + DEPTH
+    mode = ws.active[k, MODE]
+    if kind == NORMAL_GUARD:
+        return ws.contacts[k, GAP] + DEPTH if mode == OPEN else ws.contacts[k, NORMAL_FORCE]
+    if mode == SLIDING and unilateral.law[k, STATIC] > 0.0:
+        return unilateral.slide[k, SPEED]
+    if mode == STICKING:
+        own = margin(unilateral, ws, k)
+        # Of dependent rows the forces in the workspace may be the least that fit: they say nothing of what is left.
+        return min(own, unilateral.number[BEST_MARGIN]) if unilateral.number[SPLIT] == 1.0 else own
+    return 1.0
+
+
+@internal_kernel
+def too_long(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
+    """The fraction of a step to take instead, where it has passed over something; else 1.
+
+    An open candidate may dip below its surface and be out again at the end: the minimum of the cubic through gaps and
+    their rates at both ends, ``gaps``, (c, 2), at the start. Or a frozen direction of slip has stood for too long.
+    """
+    found = 1.0
+    if unilateral is None:  # known to the compiler
+        return found
+    for k in range(gaps.shape[0]):
+        slow = unilateral.number[SLOW]
+        if ws.active[k, MODE] == SLIDING and unilateral.slide[k, FROZEN] == 1.0 and unilateral.law[k, STATIC] > 0.0:
+            speed = slip_speed(ws, k)
+            if speed > 2.0 * slow:
+                found = min(found, max(1.5 * slow / speed, 0.01))
+        if ws.active[k, MODE] != OPEN or gaps[k, 1] >= 0.0 or ws.contacts[k, GAP_RATE] <= 0.0:
+            continue
+        g0, g1, d0, d1 = gaps[k, 0], ws.contacts[k, GAP], h * gaps[k, 1], h * ws.contacts[k, GAP_RATE]
+        # Hermite: g0 + d0 x + a x² + b x³.
+        a, b = 3.0 * (g1 - g0) - 2.0 * d0 - d1, 2.0 * (g0 - g1) + d0 + d1
+        root = a * a - 3.0 * b * d0
+        if root <= 0.0 or a + math.sqrt(root) == 0.0:
+            continue
+        x = -d0 / (a + math.sqrt(root))
+        if 0.0 < x < 1.0 and g0 + x * (d0 + x * (a + x * b)) < -DEPTH:
+            found = min(found, x)
+    return found
+
+
+@internal_kernel
+def note_gaps(ws: Workspace, gaps):
+    """Gaps and their rates at the start of a step, for :func:`passes_below`."""
+    for k in range(gaps.shape[0]):
+        gaps[k, 0], gaps[k, 1] = ws.contacts[k, GAP], ws.contacts[k, GAP_RATE]
+
+
+@internal_kernel
+def watch_modes(unilateral: UnilateralArrays | None, ws: Workspace, h):
+    """At an accepted step, before its samples: times in each mode, depths, and the directions of slip at its end."""
+    if unilateral is None:
+        return
+    state, tally, slide = ws.contacts, unilateral.tally, unilateral.slide
+    for k in range(state.shape[0]):
+        tally[k, TIME_OPEN + ws.active[k, MODE]] += h
+        tally[k, DEEPEST] = max(tally[k, DEEPEST], -state[k, GAP])
+        speed = slip_speed(ws, k)
+        slide[k, NEXT_SPEED] = speed
+        for s in range(3):
+            slide[k, NEXT + s] = state[k, SLIP_VELOCITY + s] / speed if speed > 0.0 else slide[k, REFERENCE + s]
+    for k in range(unilateral.stop.shape[0]):
+        if unilateral.stop_table[k, STOP_CLOSED] == 1:
+            unilateral.stop[k, CLOSED_TIME] += h
+
+
+@internal_kernel
+def take_directions(unilateral: UnilateralArrays | None, ws: Workspace, run: Run):
+    """After the samples of a step: freeze directions of what has become slow, free those of what is fast again."""
+    if unilateral is None:
+        return
+    slide, slow = unilateral.slide, unilateral.number[SLOW]
+    for k in range(slide.shape[0]):
+        if ws.active[k, MODE] != SLIDING:
+            continue
+        fast = slide[k, NEXT_SPEED] >= slow
+        if fast and slide[k, FROZEN] == 1.0:
+            # The direction turns a little: the next step starts anew.
+            run.count[STARTED] = 0
+        if fast or slide[k, FROZEN] == 0.0:
+            for s in range(3):
+                slide[k, REFERENCE + s] = slide[k, NEXT + s]
+        slide[k, FROZEN] = 0.0 if fast else 1.0
+
+
+@internal_kernel
+def consistent(system: System, ws: Workspace):
+    """True when all forces agree with their modes, right after ``derivative``."""
+    unilateral, table = system.unilateral, system.unilateral.stop_table
+    slack = 0.0
+    for k in range(ws.contacts.shape[0]):
+        slack = max(slack, abs(ws.contacts[k, NORMAL_FORCE]))
+    slack = FORCE_SLACK * (1.0 + slack)
+    for k in range(table.shape[0]):
+        if table[k, STOP_CLOSED] == 1 and unilateral.stop[k, STOP_FORCE] < -slack:
+            return False
+    for k in range(ws.contacts.shape[0]):
+        mode = ws.active[k, MODE]
+        if mode != OPEN and ws.contacts[k, NORMAL_FORCE] < -slack:
+            return False
+        if mode == STICKING and contact_guard(unilateral, ws, SLIP_GUARD, k) < -slack:
+            return False
+    return True
+
+
+@apart_kernel
+def solve_modes(system: System, ws: Workspace, run: Run, first):
+    """Choose all modes anew, and log what that changes; ``first``: nothing of it is an event."""
+    resolve(system, ws, run, TOUCH)
+    if not first:
+        log_changes(system, ws, run)
+    rearm(run)
+    count_changes(system, run)
+
+
+@internal_kernel
+def rearm(run: Run):
+    """All guards of the unilateral law are on their positive side."""
+    for e in range(run.event.shape[0]):
+        if run.event_table[e, EVENT_KIND] >= NORMAL_GUARD:
+            run.event[e, GUARD_SIDE], run.event[e, VALUE] = 1.0, 1.0
+
+
+@internal_kernel
+def count_changes(system: System, run: Run):
+    """End a run whose modes go on changing without time passing."""
+    number = system.unilateral.number
+    number[CHANGES] = number[CHANGES] + 1.0 if run.clock[TIME] - number[LAST_CHANGE] <= INSTANT else 1.0
+    number[LAST_CHANGE] = run.clock[TIME]
+    if number[CHANGES] > MOST_CHANGES:
+        run.count[STATUS] = CHATTER
+
+
+@internal_kernel
+def log(run: Run, code):
+    """Write an event to the log; what finds no room is lost to the log alone."""
+    count = run.count
+    if count[LOGGED] < run.log_time.shape[0]:
+        run.log_time[count[LOGGED]], run.log_event[count[LOGGED]] = run.clock[TIME], code
+        count[LOGGED] += 1
+
+
+@internal_kernel
+def tell(system: System, run: Run, k, kind):
+    """Log an event of candidate k, count it, and watch for chatter."""
+    tally = system.unilateral.tally
+    log(run, CONTACT_LOG + LOG_KINDS * k + kind)
+    if kind == LANDING:
+        tally[k, LANDINGS] += 1.0
+    elif kind == LIFT_OFF:
+        tally[k, LIFT_OFFS] += 1.0
+    elif kind == SLIP_START:
+        tally[k, SLIP_STARTS] += 1.0
+    elif kind == BOUNCE:
+        tally[k, BOUNCES] += 1.0
+    if run.clock[TIME] - tally[k, WINDOW_START] > WINDOW:
+        tally[k, WINDOW_START], tally[k, WINDOW_COUNT] = run.clock[TIME], 0.0
+    tally[k, WINDOW_COUNT] += 1.0
+    if tally[k, WINDOW_COUNT] > MOST_EVENTS:
+        if tally[k, CHATTERED] == 0.0:
+            log(run, CONTACT_LOG + LOG_KINDS * k + CHATTERS)
+        tally[k, CHATTERED] += 1.0
+        tally[k, SETTLE] = min(10.0 * tally[k, SETTLE], MOST_SETTLE)
+        tally[k, WINDOW_START], tally[k, WINDOW_COUNT] = run.clock[TIME], 0.0
+        if tally[k, CHATTERED] > MOST_CHATTER:
+            run.count[STATUS] = CHATTER
+
+
+@internal_kernel
+def log_changes(system: System, ws: Workspace, run: Run):
+    """Log what a choice of modes has changed."""
+    unilateral, table = system.unilateral, system.unilateral.stop_table
+    for k in range(ws.contacts.shape[0]):
+        before, now = unilateral.mode[k, BEFORE], ws.active[k, MODE]
+        if before == OPEN:
+            if now != OPEN:
+                tell(system, run, k, LANDING)
+            elif unilateral.mode[k, STRUCK] == 1:
+                tell(system, run, k, BOUNCE)
+        elif now == OPEN:
+            tell(system, run, k, LIFT_OFF)
+        elif before == STICKING and now == SLIDING:
+            tell(system, run, k, SLIP_START)
+        elif before == SLIDING and now == STICKING:
+            tell(system, run, k, SLIP_STOP)
+    for k in range(table.shape[0]):
+        if table[k, STOP_CLOSED] != table[k, STOP_BEFORE]:
+            hit = table[k, STOP_CLOSED] == 1
+            unilateral.stop[k, HITS] += 1.0 if hit else 0.0
+            log(run, STOP_LOG + LOG_KINDS * k + (STOP_HIT if hit else STOP_LEFT))
+
+
+@apart_kernel
+def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Workspace, run: Run):
+    """Do what the contact events at the end of the accepted step ask for; the next step starts anew."""
+    if unilateral is None:
+        return
+    mode, table = unilateral.mode, unilateral.stop_table
+    happened, by_hand = 0, True
+    for e in range(run.event.shape[0]):
+        if run.event_table[e, EVENT_KIND] >= NORMAL_GUARD and run.event[e, VALUE] <= 0.0:
+            happened += 1
+    if happened == 0:
+        return
+    # Samples may have left another state in the workspace.
+    evaluate(system, ws, run)
+    for k in range(mode.shape[0]):
+        mode[k, WANTED] = ws.active[k, MODE]
+    for e in range(run.event.shape[0]):
+        kind, k = run.event_table[e, EVENT_KIND], run.event_table[e, EVENT_INDEX]
+        if kind < NORMAL_GUARD or run.event[e, VALUE] > 0.0:
+            continue
+        if kind == STOP_GUARD:
+            if table[k, STOP_CLOSED] == 1:
+                table[k, STOP_CLOSED] = 0
+                log(run, STOP_LOG + LOG_KINDS * k + STOP_LEFT)
+            else:
+                by_hand = False
+        elif ws.active[k, MODE] == OPEN:
+            by_hand = False
+        elif kind == NORMAL_GUARD:
+            mode[k, WANTED] = OPEN
+            tell(system, run, k, LIFT_OFF)
+        elif mode[k, WANTED] == STICKING:
+            r = ws.active[k, FIRST_ROW]
+            begin_slip(system, ws, k, ws.rows[r + 1, FORCE], ws.rows[r + 2, FORCE])
+            mode[k, WANTED] = SLIDING
+            tell(system, run, k, SLIP_START)
+        elif mode[k, WANTED] == SLIDING:
+            if slip_speed(ws, k) > 10.0 * unilateral.number[SLOW]:
+                # Slip has only turned.
+                for s in range(3):
+                    unilateral.slide[k, REFERENCE + s] = ws.contacts[k, SLIP_VELOCITY + s] / slip_speed(ws, k)
+                unilateral.slide[k, FROZEN] = 0.0
+            else:
+                by_hand = False
+    if by_hand:
+        set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
+        rearm(run)
+        count_changes(system, run)
+    else:
+        solve_modes(system, ws, run, False)
+    run.count[STARTED] = 0

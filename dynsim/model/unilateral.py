@@ -1,0 +1,93 @@
+"""The unilateral law of a robot's contacts and joint stops, compiled to the arrays of the kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dynsim.errors import ModelError
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.constraint import unilateral as ku
+from dynsim.kernels.constraint.cone import CONE_ROOM
+from dynsim.kernels.constraint.socp import split_room
+from dynsim.kernels.constraint.unilateral import UnilateralArrays
+from dynsim.kernels.jit import integers, reals
+from dynsim.model.description import Contact, Robot
+
+# After an impact a point that leaves more slowly than this stays: bounces that accumulate come to an end [m/s].
+SETTLE_SPEED = 1e-5
+
+
+@dataclass(frozen=True)
+class JointStop:
+    """What a joint comes up against: side 1 keeps q ≥ position, side −1 q ≤ position [rad or m]."""
+
+    joint: str
+    side: float
+    position: float
+
+
+def compile_unilateral(
+    robot: Robot, contacts: Sequence[Contact], stops: Sequence[JointStop], slow: float
+) -> UnilateralArrays:
+    """Tables of the unilateral law.
+
+    Parameters
+    ----------
+    stops : what joints come up against
+    slow : speed below which slip has no direction of its own [m/s]
+
+    Raises
+    ------
+    ModelError
+        Static friction below the kinetic one, negative numbers, or restitution above one.
+    """
+    c, s = len(contacts), len(stops)
+    p = ka.row_limit(c, len(robot.couplings) + s)
+    law = np.zeros((c, ku.LAW_SIZE))
+    for k, contact in enumerate(contacts):
+        static = contact.friction if contact.static_friction is None else contact.static_friction
+        if not static >= contact.friction:
+            raise ModelError(
+                f"contact {contact.name}: static friction {static:g} is less than the kinetic {contact.friction:g}"
+            )
+        if not 0.0 <= contact.restitution <= 1.0:
+            raise ModelError(f"contact {contact.name}: restitution {contact.restitution:g} is not between 0 and 1")
+        if not (contact.stribeck >= 0.0 and contact.viscous_friction >= 0.0):
+            raise ModelError(f"contact {contact.name}: Stribeck speed and viscous friction must not be negative")
+        law[k, [ku.STATIC, ku.STRIBECK]] = static, contact.stribeck
+        law[k, [ku.VISCOUS, ku.RESTITUTION]] = contact.viscous_friction, contact.restitution
+    stop_table, stop = np.zeros((s, ku.STOP_TABLE_SIZE), dtype=np.int64), np.zeros((s, ku.STOP_SIZE))
+    for k, limit in enumerate(stops):
+        stop_table[k, ku.STOP_JOINT] = robot.joint_names.index(limit.joint)
+        stop[k, ku.SIDE], stop[k, ku.LIMIT] = limit.side, limit.side * limit.position
+    tally, number = np.zeros((c, ku.TALLY_SIZE)), np.zeros(ku.NUMBERS)
+    tally[:, ku.SETTLE], tally[:, ku.WINDOW_START], number[ku.LAST_CHANGE] = SETTLE_SPEED, -np.inf, -np.inf
+    number[ku.SLOW] = slow
+    return UnilateralArrays(
+        law=reals(law),
+        slide=reals(np.zeros((c, ku.SLIDE_SIZE))),
+        mode=integers(np.zeros((c, ku.MODE_SIZE))),
+        tally=reals(tally),
+        stop_table=integers(stop_table),
+        stop=reals(stop),
+        place=integers(np.zeros((ku.PLACES, p))),
+        vector=reals(np.zeros((ku.VECTORS, p))),
+        split=reals(np.zeros((2, p, p))),
+        split_room=split_room(3 * c, c),
+        matrix=reals(np.zeros((p, p))),
+        room=reals(np.zeros((CONE_ROOM, p, p))),
+        number=reals(number),
+    )
+
+
+def joint_stops(robot: Robot) -> list[JointStop]:
+    """The stops of a robot's joints: their finite limits, the lower one first."""
+    found = []
+    for link in robot.links:
+        for side, limit in ((1.0, link.lower), (-1.0, link.upper)):
+            if np.isfinite(limit):
+                found.append(JointStop(link.joint, side, float(limit)))
+    return found

@@ -1,0 +1,259 @@
+"""Real contact in closed form: blocks on slopes, bouncing balls, discs, rods, joint stops."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from random_robots import Bench, bench
+
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.integrate import contact_events as ce
+from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.state import FRICTION, OUT_FORCE, OUT_GAP, OUT_MODE
+from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot, vector
+
+G = 9.81
+ORIGIN = np.zeros(3)
+
+
+def plane(normal: np.ndarray, point: np.ndarray = ORIGIN) -> Quadric:
+    return Quadric(np.zeros((3, 3)), normal, -float(normal @ point))
+
+
+def block(mass: float) -> Robot:
+    """A body that can go anywhere and does not turn."""
+    links = []
+    for k, name in enumerate("xyz"):
+        inertia = Inertia(mass if name == "z" else 0.0)
+        links.append(Link(name, f"joint_{name}", "wxyz"[k] if k else None, "prismatic", np.eye(3)[k], inertia))
+    return Robot("block", tuple(links), (), ("z", np.zeros(3)))
+
+
+def happened(run: ki.Run) -> list[tuple[float, int, int]]:
+    """Time, contact and kind of the logged events of contacts."""
+    found = []
+    for t, code in zip(run.log_time, run.log_event[: run.count[ki.LOGGED]], strict=False):
+        k, kind = divmod(int(code) - ki.CONTACT_LOG, ce.LOG_KINDS)
+        found.append((float(t), k, kind))
+    return found
+
+
+def residual(b: Bench, run: ki.Run) -> float:
+    """What the ledger of a passive system without losses of joints does not explain [J]."""
+    stored = run.outputs("energy").sum(axis=1)
+    taken = run.states("ledger")[:, FRICTION] + run.states("loss").sum(axis=1)
+    return float(np.abs(stored - stored[0] + taken).max())
+
+
+def sloped(alpha: float, mu: float, **law: float) -> Bench:
+    normal = np.array([np.sin(alpha), 0.0, np.cos(alpha)])
+    return bench(
+        block(3.0),
+        [
+            Contact(
+                "foot",
+                "z",
+                vector(0.1, -0.2, 0.0),
+                plane(normal, vector(0.1, -0.2, 0.0)),
+                friction=mu,
+                pulling_friction="signed",
+                **law,
+            )
+        ],
+        real=True,
+    )
+
+
+@pytest.mark.parametrize("method", ["rk43", "dopri5", "rk4", "rodas4"])
+@pytest.mark.parametrize("mu", [0.3, 0.5])
+def test_a_block_on_a_slope_rests_or_slides(method, mu):
+    alpha = np.arctan(0.4)
+    b = sloped(alpha, mu)
+    run = b.simulate(
+        b.state(np.zeros(3), np.zeros(3)), np.linspace(0.0, 2.0, 5), method, step=1e-2 if method == "rk4" else 0.0
+    )
+    a = max(0.0, G * (np.sin(alpha) - mu * np.cos(alpha)))
+    downhill = np.array([np.cos(alpha), 0.0, -np.sin(alpha)])
+    way = 0.5 * a * run.sample_time[:, None] ** 2 * downhill
+    np.testing.assert_allclose(run.states("q"), way, rtol=0, atol=1e-9)
+    touch = run.outputs("contact")[:, 0]
+    np.testing.assert_allclose(touch[:, OUT_FORCE], 3.0 * G * np.cos(alpha), rtol=1e-9)
+    assert (touch[:, OUT_MODE] == (ka.SLIDING if mu < 0.4 else ka.STICKING)).all()
+    assert np.abs(touch[:, OUT_GAP]).max() <= 1e-9
+    assert residual(b, run) < 1e-8
+
+
+def test_a_bouncing_ball():
+    """Impact times of a ball with restitution e, and the time at which its bounces have come to an end."""
+    e, height = 0.6, 0.5
+    b = bench(
+        block(0.7),
+        [Contact("foot", "z", np.zeros(3), plane(vector(0, 0, 1)), restitution=e, pulling_friction="signed")],
+        real=True,
+    )
+    y = b.state(vector(0.0, 0.0, height), np.zeros(3))
+    first = np.sqrt(2.0 * height / G)
+    run = b.simulate(y, np.linspace(0.0, 3.0, 31), "rk43")
+    found = happened(run)
+    times = np.array([t for t, _, _ in found])
+    flights = 2.0 * first * e ** np.arange(1, 11)
+    np.testing.assert_allclose(times[:10], first + np.concatenate([[0.0], np.cumsum(flights)[:9]]), rtol=0, atol=1e-8)
+    # Bounces slower than 1e-5 m/s are let settle.
+    end = first * (1.0 + e) / (1.0 - e)
+    assert found[-1][2] == ce.LANDING
+    assert times[-1] == pytest.approx(end, abs=2.0 * 1e-5 / G / (1.0 - e))
+    assert all(kind == ce.BOUNCE for _, _, kind in found[:-1])
+    assert np.abs(run.states("q")[-1]).max() <= 1e-9
+    assert run.states("loss")[-1, 0] == pytest.approx(0.7 * G * height, rel=1e-9)
+    assert residual(b, run) < 1e-8
+
+
+def test_a_block_thrown_up_a_slope_stops_and_stays_or_comes_back():
+    """Way and time to the end of slip; below μ it sticks there, above it slides back."""
+    alpha, speed = 0.4, 1.3
+    uphill = np.array([-np.cos(alpha), 0.0, np.sin(alpha)])
+    for mu in (0.3, 0.6):
+        b = sloped(alpha, mu)
+        run = b.simulate(b.state(np.zeros(3), speed * uphill), np.linspace(0.0, 1.0, 11), "rk43")
+        up, down = G * (np.sin(alpha) + mu * np.cos(alpha)), G * (np.sin(alpha) - mu * np.cos(alpha))
+        stop, way = speed / up, 0.5 * speed**2 / up
+        t = run.sample_time
+        back = 0.5 * max(down, 0.0) * np.maximum(t - stop, 0.0) ** 2
+        along = np.where(t < stop, speed * t - 0.5 * up * t**2, way - back)
+        np.testing.assert_allclose(run.states("q"), along[:, None] * uphill, rtol=0, atol=1e-9)
+        if mu > np.tan(alpha):
+            ((when, _, kind),) = happened(run)
+            assert kind == ce.SLIP_STOP
+            assert when == pytest.approx(stop, abs=1e-10)
+        assert residual(b, run) < 1e-9
+
+
+def test_static_friction_above_kinetic():
+    """A slope between the two holds a block at rest, and lets one that moves go on."""
+    alpha = np.arctan(0.4)
+    downhill = np.array([np.cos(alpha), 0.0, -np.sin(alpha)])
+    b = sloped(alpha, 0.3, static_friction=0.45)
+    rests = b.simulate(b.state(np.zeros(3), np.zeros(3)), np.linspace(0.0, 1.0, 3), "rk43")
+    assert np.abs(rests.states("q")).max() <= 1e-12
+    b = sloped(alpha, 0.3, static_friction=0.45)
+    moves = b.simulate(b.state(np.zeros(3), 1e-3 * downhill), np.linspace(0.0, 1.0, 3), "rk43")
+    a = G * (np.sin(alpha) - 0.3 * np.cos(alpha))
+    t = moves.sample_time[:, None]
+    np.testing.assert_allclose(moves.states("q"), (1e-3 * t + 0.5 * a * t**2) * downhill, rtol=0, atol=1e-9)
+
+
+def test_slip_starts_where_a_pull_reaches_static_friction():
+    """A pull that grows with time, across a slope: onset at |m g∥ + F| = μ_s N, in the direction of that sum."""
+    mass, alpha, mu, rate = 3.0, 0.2, 0.5, 4.0
+    normal = np.array([np.sin(alpha), 0.0, np.cos(alpha)])
+    pull = Load(
+        "pull",
+        "z",
+        np.zeros(3),
+        False,
+        np.array([0.0, 10.0]),
+        np.array([[[0.0, 0.0, 0, 0], [0.0, rate, 0, 0], [0.0, 0.0, 0, 0]] + [[0.0] * 4] * 3]),
+        True,
+    )
+    contact = Contact("foot", "z", np.zeros(3), plane(normal), friction=mu, pulling_friction="signed")
+    b = bench(block(mass), [contact], loads=[pull], real=True)
+    run = b.simulate(b.state(np.zeros(3), np.zeros(3)), np.linspace(0.0, 5.0, 501), "rk43")
+    weight, hold = mass * G * np.sin(alpha), mu * mass * G * np.cos(alpha)
+    onset = np.sqrt(hold**2 - weight**2) / rate
+    (when, _, kind), *rest = happened(run)
+    assert kind == ce.SLIP_START
+    assert not rest
+    assert when == pytest.approx(onset, abs=1e-10)
+    downhill = np.array([np.cos(alpha), 0.0, -np.sin(alpha)])
+    sum_ = weight * downhill + rate * onset * np.array([0.0, 1.0, 0.0])
+    first = np.flatnonzero(run.sample_time > onset)[0] + 1
+    moved = run.states("q")[first] / np.linalg.norm(run.states("q")[first])
+    assert moved @ sum_ / np.linalg.norm(sum_) > 1.0 - 1e-3
+    # Of some 30 J of work.
+    assert residual_with_load(b, run) < 1e-6
+
+
+def residual_with_load(b: Bench, run: ki.Run) -> float:
+    stored = run.outputs("energy").sum(axis=1)
+    taken = run.states("ledger")[:, FRICTION] + run.states("loss").sum(axis=1)
+    return float(np.abs(stored - stored[0] + taken - run.states("load").sum(axis=1)).max())
+
+
+def test_a_carriage_that_slides_askew_stops():
+    """After v/(μ g), v²/(2 μ g) along its straight way."""
+    mass, mu, speed = 2.0, 0.3, 1.0
+    contact = Contact("foot", "z", np.zeros(3), plane(vector(0, 0, 1)), friction=mu, pulling_friction="signed")
+    b = bench(block(mass), [contact], real=True)
+    v = speed * np.array([np.cos(0.3), np.sin(0.3), 0.0])
+    run = b.simulate(b.state(np.zeros(3), v), np.linspace(0.0, 1.0, 11), "rk43")
+    ((when, _, kind),) = happened(run)
+    assert kind == ce.SLIP_STOP
+    assert when == pytest.approx(speed / (mu * G), abs=1e-10)
+    np.testing.assert_allclose(run.states("q")[-1], v / speed * speed**2 / (2 * mu * G), rtol=0, atol=1e-9)
+
+
+def pendulum(limit: float = np.inf, start: float = 1.0) -> Robot:
+    """A rod of 0.8 kg and 0.5 m that hangs from a hinge about y; q = 0 points up."""
+    rod = Inertia(0.8, vector(0, 0, 0.25), np.diag([0.8 * 0.25 / 12, 0.8 * 0.25 / 12, 0.0]))
+    link = Link("rod", "hinge", None, "revolute", vector(0, 1, 0), rod, upper=limit)
+    return Robot("pendulum", (link,), (), ("rod", vector(0, 0, 0.5)), q0=np.array([start]))
+
+
+def test_a_joint_stop_takes_the_momentum_of_a_falling_rod():
+    """It falls onto its stop at 90°: the loss is the kinetic energy, and the stop carries the moment of the weight."""
+    b = bench(pendulum(limit=0.5 * np.pi), [], real=True)
+    run = b.simulate(b.state(np.array([0.4]), np.zeros(1)), np.linspace(0.0, 2.0, 21), "rk43", rtol=1e-10)
+    fallen = 0.8 * G * 0.25 * np.cos(0.4)
+    assert run.states("loss")[-1, 1] == pytest.approx(fallen, rel=1e-8)
+    assert abs(run.states("loss")[-1, 0]) < 1e-15
+    np.testing.assert_allclose(run.states("q")[-1], 0.5 * np.pi, rtol=0, atol=1e-9)
+    assert run.outputs("stop")[-1, 0] == pytest.approx(0.8 * G * 0.25, rel=1e-9)
+    (code,) = run.log_event[: run.count[ki.LOGGED]]
+    assert code == ki.STOP_LOG + ce.STOP_HIT
+    assert residual(b, run) < 1e-8
+
+
+def rod(mu: float, phi: float, **law: float) -> tuple[Bench, float, float]:
+    """A thin rod in the plane y = 0, on a point at its lower end; φ is the angle of the rod from the vertical."""
+    mass, half = 1.0, 0.5
+    links = (
+        Link("cart", "x", None, "prismatic", vector(1, 0, 0), Inertia(0.0)),
+        Link("lift", "z", "cart", "prismatic", vector(0, 0, 1), Inertia(0.0)),
+        Link("rod", "turn", "lift", "revolute", vector(0, 1, 0),
+             Inertia(mass, np.zeros(3), np.diag([mass * half**2 / 3, mass * half**2 / 3, 0.0]))),
+    )
+    robot = Robot("rod", links, (), ("rod", vector(0, 0, -half)), q0=np.array([0.0, half * np.cos(phi), phi]))
+    contact = Contact("foot", "rod", vector(0, 0, -half), plane(vector(0, 0, 1)), friction=mu, pulling_friction="signed", **law)
+    return bench(robot, [contact], real=True), mass, half
+
+
+def test_a_leaning_rod_sticks_until_its_foot_slips():
+    """A rod that tips about its foot: friction and normal force by its angle, slip where |f_t| = μ_s f_n, then lift-off.
+
+    With ω² = (3 g/2 l) (cos φ0 − cos φ) (length 2 l... of the pivot at its end) the ratio of the forces is known in
+    closed form; its root is the onset.
+    """
+    from scipy.optimize import brentq
+
+    mu, start = 0.3, 0.2
+    b, mass, half = rod(mu, start)
+    run = b.simulate(b.state(b.robot.initial, np.zeros(3)), np.linspace(0.0, 1.5, 301), "rk43", rtol=1e-9)
+
+    def forces(phi: float) -> tuple[float, float]:
+        square, acc = 1.5 * G / half * (np.cos(start) - np.cos(phi)), 0.75 * G / half * np.sin(phi)
+        f_t = mass * half * (acc * np.cos(phi) - square * np.sin(phi))
+        f_n = mass * (G - half * (acc * np.sin(phi) + square * np.cos(phi)))
+        return f_t, f_n
+
+    onset = brentq(lambda phi: abs(forces(phi)[0]) - mu * forces(phi)[1], start, 1.2)
+    (when, _, kind), *_ = happened(run)
+    assert kind == ce.SLIP_START
+    before = run.sample_time < when
+    f_t, f_n = np.array([forces(phi) for phi in run.states("q")[before, 2]]).T
+    touch = run.outputs("contact")[before, 0]
+    np.testing.assert_allclose(touch[:, OUT_FORCE], f_n, rtol=1e-7)
+    np.testing.assert_allclose(touch[:, 1], f_t, rtol=1e-6, atol=1e-7)
+    # The angle at the onset: between the samples around it.
+    after = int(np.flatnonzero(~before)[0])
+    assert run.states("q")[after - 1, 2] <= onset <= run.states("q")[after, 2]
+    assert residual(b, run) < 1e-7
