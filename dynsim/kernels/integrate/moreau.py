@@ -7,6 +7,7 @@ import math
 from dynsim.kernels.arrays import (
     APPLIED,
     CIRCUIT,
+    COUPLED,
     CURRENT,
     D_M,
     DAMPING,
@@ -20,16 +21,19 @@ from dynsim.kernels.arrays import (
     K_M,
     MODE,
     NORMAL_FORCE,
+    OPEN,
     QD,
     QDD,
     RESISTANCE,
     ROWS,
+    SLIDING,
     STICKING,
     VOLTAGE,
     ModelArrays,
     Q,
     Workspace,
 )
+from dynsim.kernels.constraint.unilateral import DEEPEST, LOSS, TIME_OPEN, TIME_SLIDING, TIME_STICKING
 from dynsim.kernels.drive.law import drive, take_commands
 from dynsim.kernels.integrate.events import take_ticks
 from dynsim.kernels.integrate.output import write_output
@@ -54,6 +58,7 @@ from dynsim.kernels.integrate.run import (
 )
 from dynsim.kernels.integrate.steps import choose_step, finite
 from dynsim.kernels.integrate.time_stepping import (
+    BAD,
     GRIP,
     PENETRATION,
     close_contacts,
@@ -75,8 +80,10 @@ from dynsim.kernels.state import (
     ELECTRICAL,
     FRICTION,
     GEAR,
+    IMPACT_LOSS,
     IMPULSE,
     JOINT,
+    JOINT_STOP_LOSS,
     JOULE,
     MECHANICAL,
     SLIP,
@@ -196,10 +203,34 @@ def book(system: System, ws: Workspace, run: Run):
     y_new[start + JOINT] += h * joint
     y_new[start + FRICTION] += h * friction
     y_new[start + CONSTRAINT] += h * held
+    book_losses(system, s, ws, y_new, h)
     y_new[start + MECHANICAL] += h * mechanical
     y_new[start + SUPPLY] += h * max(electrical, 0.0)
     for k in range(system.loads.table.shape[0]):
         y_new[layout.load + k] += h * run.stage[1, layout.load + k]
+
+
+@internal_kernel
+def book_losses(system: System, s, ws: Workspace, y_new, h):
+    """Under the unilateral law what normals and joint stops take is a loss, not an error of the constraints."""
+    if system.unilateral is None:  # known to the compiler
+        return
+    layout, tally, couplings = system.layout, system.unilateral.tally, system.couplings.joint.shape[0]
+    for r in range(couplings, ws.counts[COUPLED]):
+        work = 0.5 * h * ws.rows[r, FORCE] * (s.rate[0, r] + s.rate[1, r])
+        y_new[layout.loss + JOINT_STOP_LOSS] -= work
+        y_new[layout.ledger + CONSTRAINT] -= work
+    for k in range(ws.contacts.shape[0]):
+        mode = OPEN
+        if ws.active[k, MODE] == STICKING:
+            r = ws.active[k, FIRST_ROW]
+            work = 0.5 * h * ws.rows[r, FORCE] * (s.rate[0, r] + s.rate[1, r])
+            y_new[layout.loss + IMPACT_LOSS] -= work
+            y_new[layout.ledger + CONSTRAINT] -= work
+            tally[k, LOSS] -= work
+            tally[k, DEEPEST] = max(tally[k, DEEPEST], -ws.contacts[k, GAP])
+            mode = SLIDING if abs(s.rate[1, r + 1]) + abs(s.rate[1, r + 2]) > BAD else STICKING
+        tally[k, TIME_OPEN if mode == OPEN else TIME_SLIDING if mode == SLIDING else TIME_STICKING] += h
 
 
 @internal_kernel
