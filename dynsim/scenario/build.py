@@ -108,7 +108,7 @@ def controller(
         raise ModelError("the scenario has no controller; its motors are short-circuited")
     if scenario.engine != families.member("controller", config.type).ENGINE:
         raise ModelError(f"controller {config.type!r} cannot drive a {scenario.plant.type!r}")
-    points = {} if isinstance(machine, SnakeDescription) else {c.name: c for c in contacts(scenario)}
+    points = {c.name: c for c in contacts(scenario)} if isinstance(machine, Model) else {}
     context = BuildContext(scenario.duration_s, machine, progress=progress, contacts=points)
     if isinstance(machine, Model):
         control = families.build("controller", config, context, JointControl)

@@ -236,7 +236,7 @@ def rod(mu: float, phi: float, **law: float) -> tuple[Bench, float, float]:
 
 
 def test_a_leaning_rod_sticks_until_its_foot_slips():
-    """A rod that tips about its foot: friction and normal force by its angle, slip where |f_t| = μ_s f_n, then lift-off.
+    """A rod that tips about its foot: friction and normal force by its angle, slip where |f_t| = μ_s f_n.
 
     With ω² = (3 g/2 l) (cos φ0 − cos φ) (length 2 l... of the pivot at its end) the ratio of the forces is known in
     closed form; its root is the onset.
