@@ -203,7 +203,7 @@ def book(system: System, ws: Workspace, run: Run):
     y_new[start + JOINT] += h * joint
     y_new[start + FRICTION] += h * friction
     y_new[start + CONSTRAINT] += h * held
-    book_losses(system, s, ws, y_new, h)
+    book_losses(system.unilateral, system, s, ws, y_new, h)
     y_new[start + MECHANICAL] += h * mechanical
     y_new[start + SUPPLY] += h * max(electrical, 0.0)
     for k in range(system.loads.table.shape[0]):
@@ -211,11 +211,11 @@ def book(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
-def book_losses(system: System, s, ws: Workspace, y_new, h):
+def book_losses(unilateral, system: System, s, ws: Workspace, y_new, h):
     """Under the unilateral law what normals and joint stops take is a loss, not an error of the constraints."""
-    if system.unilateral is None:  # known to the compiler
+    if unilateral is None:  # known to the compiler
         return
-    layout, tally, couplings = system.layout, system.unilateral.tally, system.couplings.joint.shape[0]
+    layout, tally, couplings = system.layout, unilateral.tally, system.couplings.joint.shape[0]
     for r in range(couplings, ws.counts[COUPLED]):
         work = 0.5 * h * ws.rows[r, FORCE] * (s.rate[0, r] + s.rate[1, r])
         y_new[layout.loss + JOINT_STOP_LOSS] -= work
