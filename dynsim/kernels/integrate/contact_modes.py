@@ -48,9 +48,12 @@ from dynsim.kernels.constraint.unilateral import (
     NEXT,
     NEXT_SPEED,
     OFFSET,
+    PLACED,
+    PROBLEM,
     REDUNDANT,
     REFERENCE,
     RESTITUTION,
+    SCRATCH,
     SECOND_PART,
     SETTLE,
     SIDE,
@@ -69,7 +72,7 @@ from dynsim.kernels.constraint.unilateral import (
     UnilateralArrays,
     slide_direction,
 )
-from dynsim.kernels.integrate.project import GAP_TOLERANCE, RATE_TOLERANCE, project_level
+from dynsim.kernels.integrate.project import RATE_TOLERANCE, project_level
 from dynsim.kernels.integrate.run import (
     EVALUATIONS,
     FORCES_REVERSED,
@@ -216,7 +219,7 @@ def impact(system: System, ws: Workspace, run: Run):
         vector[CONE_FRICTION],
         p,
         vector[SOLUTION],
-        unilateral.room,
+        unilateral.room[SCRATCH:],
         1e-2 * CONE_TOLERANCE * largest,
     )
     if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
@@ -270,13 +273,13 @@ def choose(system: System, ws: Workspace, run: Run):
         if run.count[STATUS] == FORCES_REVERSED:
             return
         residual = solve_cones(
-            unilateral.matrix,
+            unilateral.room[PROBLEM],
             vector[OFFSET],
             unilateral.place[KINDS],
             vector[CONE_FRICTION],
             size,
             vector[SOLUTION],
-            unilateral.room,
+            unilateral.room[SCRATCH:],
             1e-2 * CONE_TOLERANCE * largest,
         )
         if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
@@ -289,11 +292,7 @@ def choose(system: System, ws: Workspace, run: Run):
         run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
         return
     take_solution(system, ws, size, largest)
-    for k in range(mode.shape[0]):
-        if mode[k, TOUCHING] == 1 and mode[k, WANTED] == OPEN and ws.contacts[k, GAP] < -GAP_TOLERANCE:
-            # It stays open with nothing that drives it out: back to the surface, or it would land for ever.
-            project_level(system, ws, run.y, 0)
-            break
+    place_on_surfaces(system, ws, run)
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
     unilateral.number[REDUNDANT] = 0.0
     evaluate(system, ws, run)
@@ -304,6 +303,23 @@ def choose(system: System, ws: Workspace, run: Run):
     evaluate(system, ws, run)
     unilateral.number[REDUNDANT] = 1.0 if ws.counts[DEPENDENT] > before else 0.0
     ws.counts[DEPENDENT] = before
+
+
+@internal_kernel
+def place_on_surfaces(system: System, ws: Workspace, run: Run):
+    """Bring everything that touches onto its surface, along normals alone, and forget where it has stuck.
+
+    Anchors are dropped anew after it: those of points whose rows depend on each other must fit together to rounding.
+    And what stays open below its surface, with nothing that drives it out, would land for ever.
+    """
+    unilateral = system.unilateral
+    mode = unilateral.mode
+    for k in range(mode.shape[0]):
+        mode[k, PLACED] = SLIDING if mode[k, TOUCHING] == 1 else OPEN
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, PLACED])
+    evaluate(system, ws, run)
+    project_level(system, ws, run.y, 0)
+    evaluate(system, ws, run)
 
 
 @internal_kernel
@@ -367,8 +383,8 @@ def reduce_rows(system: System, ws: Workspace, run: Run, p):
             value = W[a, b]
             if vector[FIRST_PART, j] != 0.0 or vector[SECOND_PART, j] != 0.0:
                 value += vector[FIRST_PART, j] * W[a, b + 1] + vector[SECOND_PART, j] * W[a, b + 2]
-            unilateral.matrix[i, j] = value
-        if place[KINDS, i] == ONE_WAY and W[a, a] > 0.0 and unilateral.matrix[i, i] <= 1e-12 * W[a, a]:
+            unilateral.room[PROBLEM, i, j] = value
+        if place[KINDS, i] == ONE_WAY and W[a, a] > 0.0 and unilateral.room[PROBLEM, i, i] <= 1e-12 * W[a, a]:
             run.count[STATUS], run.clock[NOT_UNIQUE] = FORCES_REVERSED, run.clock[TIME]
     return size
 
@@ -378,7 +394,7 @@ def acceleration(unilateral: UnilateralArrays, i, size):
     """Acceleration along row i of the reduced problem."""
     total = unilateral.vector[OFFSET, i]
     for j in range(size):
-        total += unilateral.matrix[i, j] * unilateral.vector[SOLUTION, j]
+        total += unilateral.room[PROBLEM, i, j] * unilateral.vector[SOLUTION, j]
     return total
 
 
