@@ -26,6 +26,7 @@ from dynsim.kernels.arrays import (
     QD,
     QDD,
     RHS,
+    ROW_GAP,
     ROW_RATE,
     ROWS,
     SECOND_TANGENT,
@@ -69,7 +70,7 @@ from dynsim.kernels.constraint.unilateral import (
     UnilateralArrays,
     slide_direction,
 )
-from dynsim.kernels.integrate.project import RATE_TOLERANCE, project_level
+from dynsim.kernels.integrate.project import PROJECTION_LIMIT, RATE_TOLERANCE, project_level
 from dynsim.kernels.integrate.run import (
     EVALUATIONS,
     FORCES_REVERSED,
@@ -86,6 +87,8 @@ from dynsim.kernels.tree.articulated import accelerate
 
 # A point that approaches faster than this many tolerances of projected rates strikes.
 STRIKE = 3.0
+# What begins to touch is brought this close to its surface [m].
+FOOT_TOLERANCE = 1e-13
 # Of a solution of the cones: residual by the largest entry, and what of the largest force is none.
 CONE_TOLERANCE, FORCE_TOLERANCE = 1e-9, 1e-9
 # An acceleration along the surface below this fraction of the largest right-hand side is none.
@@ -168,6 +171,29 @@ def keep_touching(unilateral: UnilateralArrays, ws: Workspace):
 
 
 @internal_kernel
+def come_down(system: System, ws: Workspace, run: Run):
+    """Bring what touches onto its surface, to rounding, before it is held where it is.
+
+    A point lands a little below its surface. Where rows depend on each other, as those of a point on a body with one
+    degree of freedom, there might be no state at which its normal row and the tangential ones of a foot found above it
+    all vanish.
+    """
+    unilateral = system.unilateral
+    mode = unilateral.mode
+    for k in range(mode.shape[0]):
+        mode[k, WANTED] = OPEN if mode[k, TOUCHING] == 0 else STICKING if ws.active[k, MODE] == STICKING else SLIDING
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
+    for _ in range(PROJECTION_LIMIT):
+        evaluate(system, ws, run)
+        worst = 0.0
+        for r in range(ws.counts[ROWS]):
+            worst = max(worst, abs(ws.rows[r, ROW_GAP]))
+        if worst <= FOOT_TOLERANCE:
+            return
+        project_level(system, ws, run.y, 0)
+
+
+@internal_kernel
 def gather(system: System, ws: Workspace, run: Run):
     """Rows along normal and tangents of everything that touches, and their system, into the workspace.
 
@@ -175,6 +201,7 @@ def gather(system: System, ws: Workspace, run: Run):
     """
     unilateral = system.unilateral
     mode, place = unilateral.mode, unilateral.place
+    come_down(system, ws, run)
     for k in range(mode.shape[0]):
         mode[k, WANTED] = STICKING if mode[k, TOUCHING] == 1 else OPEN
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
