@@ -217,24 +217,21 @@ def gather(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
-def impact(system: System, ws: Workspace, run: Run):
-    """Impulses that stop what approaches: u = W P + b with b = J v and, of normals that strike, (1 + e) n·v.
+def impulses(system: System, ws: Workspace, p, largest, share):
+    """Solve for the impulses of :func:`impact` with so much of the restitutions; the loss of each row into FORCE [J].
 
-    Then v += M⁻¹ Jᵀ P, and the energy −½ P·(J v₋ + J v₊) is booked as impact loss.
+    False when there is no solution, or one that would create energy.
     """
-    unilateral, y, layout = system.unilateral, run.y, system.layout
-    vector, mode, rows, column = unilateral.vector, unilateral.mode, ws.rows, ws.column
-    p = gather(system, ws, run)
-    largest = 0.0
+    unilateral, rows = system.unilateral, ws.rows
+    vector, mode = unilateral.vector, unilateral.mode
     for r in range(p):
         vector[OFFSET, r], vector[SOLUTION, r] = rows[r, ROW_RATE], 0.0
-        largest = max(largest, abs(rows[r, ROW_RATE]))
     for k in range(mode.shape[0]):
         if mode[k, TOUCHING] == 1:
             r = ws.active[k, FIRST_ROW]
             vector[CONE_FRICTION, r] = system.contacts.point[k, MU]
             if mode[k, STRUCK] == 1 and -rows[r, ROW_RATE] > unilateral.tally[k, SETTLE]:
-                vector[OFFSET, r] *= 1.0 + unilateral.law[k, RESTITUTION]
+                vector[OFFSET, r] *= 1.0 + share * unilateral.law[k, RESTITUTION]
     residual = solve_cones(
         ws.small[0],
         vector[OFFSET],
@@ -246,6 +243,34 @@ def impact(system: System, ws: Workspace, run: Run):
         1e-2 * CONE_TOLERANCE * largest,
     )
     if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
+        return False
+    f, total, turnover = vector[SOLUTION], 0.0, 0.0
+    for r in range(p):
+        after = rows[r, ROW_RATE]
+        for s in range(p):
+            after += ws.small[0, r, s] * f[s]
+        # FORCE is free until the next evaluation.
+        rows[r, FORCE] = -0.5 * f[r] * (rows[r, ROW_RATE] + after)
+        total += rows[r, FORCE]
+        turnover += abs(rows[r, FORCE])
+    return total >= -CONE_TOLERANCE * turnover or share == 0.0
+
+
+@internal_kernel
+def impact(system: System, ws: Workspace, run: Run):
+    """Impulses that stop what approaches: u = W P + b with b = J v and, of normals that strike, (1 + e) n·v.
+
+    Then v += M⁻¹ Jᵀ P, and the energy −½ P·(J v₋ + J v₊) is booked as impact loss.
+    """
+    unilateral, y, layout = system.unilateral, run.y, system.layout
+    vector, mode, rows, column = unilateral.vector, unilateral.mode, ws.rows, ws.column
+    p = gather(system, ws, run)
+    largest = 0.0
+    for r in range(p):
+        largest = max(largest, abs(rows[r, ROW_RATE]))
+    # Newton's restitution may contradict friction: a point that is wedged cannot leave, and some would gain energy.
+    # Those impacts are without restitution, which always has a solution, and a loss.
+    if not impulses(system, ws, p, largest, 1.0) and not impulses(system, ws, p, largest, 0.0):
         run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
         return
     f = vector[SOLUTION]
@@ -256,12 +281,6 @@ def impact(system: System, ws: Workspace, run: Run):
     accelerate(system.model, ws)
     for i in range(ws.joints.shape[0]):
         y[layout.v + i] += ws.joints[i, QDD]
-    for r in range(p):
-        after = rows[r, ROW_RATE]
-        for s in range(p):
-            after += ws.small[0, r, s] * f[s]
-        # FORCE is free until the next evaluation: the loss of each row.
-        rows[r, FORCE] = -0.5 * f[r] * (rows[r, ROW_RATE] + after)
     for k in range(mode.shape[0]):
         if mode[k, TOUCHING] == 1:
             r = ws.active[k, FIRST_ROW]
