@@ -26,6 +26,7 @@ from dynsim.kernels.arrays import (
     QD,
     QDD,
     RHS,
+    ROW_GAP,
     ROW_RATE,
     ROWS,
     SECOND_TANGENT,
@@ -72,7 +73,7 @@ from dynsim.kernels.constraint.unilateral import (
     UnilateralArrays,
     slide_direction,
 )
-from dynsim.kernels.integrate.project import RATE_TOLERANCE, project_level
+from dynsim.kernels.integrate.project import PROJECTION_LIMIT, RATE_TOLERANCE, project_level
 from dynsim.kernels.integrate.run import (
     EVALUATIONS,
     FORCES_REVERSED,
@@ -89,6 +90,8 @@ from dynsim.kernels.tree.articulated import accelerate
 
 # A point that approaches faster than this many tolerances of projected rates strikes.
 STRIKE = 3.0
+# What begins to touch is brought this close to its surface [m].
+FOOT_TOLERANCE = 1e-13
 # Of a solution of the cones: residual by the largest entry, and what of the largest force is none.
 CONE_TOLERANCE, FORCE_TOLERANCE = 1e-9, 1e-9
 # An acceleration along the surface below this fraction of the largest right-hand side is none.
@@ -172,6 +175,29 @@ def keep_touching(unilateral: UnilateralArrays, ws: Workspace):
 
 
 @internal_kernel
+def come_down(system: System, ws: Workspace, run: Run):
+    """Bring what touches onto its surface, to rounding, before it is held where it is.
+
+    A point lands a little below its surface. Where rows depend on each other, as those of a point on a body with one
+    degree of freedom, there might be no state at which its normal row and the tangential ones of a foot found above it
+    all vanish.
+    """
+    unilateral = system.unilateral
+    mode = unilateral.mode
+    for k in range(mode.shape[0]):
+        mode[k, WANTED] = OPEN if mode[k, TOUCHING] == 0 else STICKING if ws.active[k, MODE] == STICKING else SLIDING
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
+    for _ in range(PROJECTION_LIMIT):
+        evaluate(system, ws, run)
+        worst = 0.0
+        for r in range(ws.counts[ROWS]):
+            worst = max(worst, abs(ws.rows[r, ROW_GAP]))
+        if worst <= FOOT_TOLERANCE:
+            return
+        project_level(system, ws, run.y, 0)
+
+
+@internal_kernel
 def gather(system: System, ws: Workspace, run: Run):
     """Rows along normal and tangents of everything that touches, and their system, into the workspace.
 
@@ -179,6 +205,7 @@ def gather(system: System, ws: Workspace, run: Run):
     """
     unilateral = system.unilateral
     mode, place = unilateral.mode, unilateral.place
+    come_down(system, ws, run)
     for k in range(mode.shape[0]):
         mode[k, WANTED] = STICKING if mode[k, TOUCHING] == 1 else OPEN
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
@@ -194,24 +221,21 @@ def gather(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
-def impact(system: System, ws: Workspace, run: Run):
-    """Impulses that stop what approaches: u = W P + b with b = J v and, of normals that strike, (1 + e) n·v.
+def impulses(system: System, ws: Workspace, p, largest, share):
+    """Solve for the impulses of :func:`impact` with so much of the restitutions; the loss of each row into FORCE [J].
 
-    Then v += M⁻¹ Jᵀ P, and the energy −½ P·(J v₋ + J v₊) is booked as impact loss.
+    False when there is no solution, or one that would create energy.
     """
-    unilateral, y, layout = system.unilateral, run.y, system.layout
-    vector, mode, rows, column = unilateral.vector, unilateral.mode, ws.rows, ws.column
-    p = gather(system, ws, run)
-    largest = 0.0
+    unilateral, rows = system.unilateral, ws.rows
+    vector, mode = unilateral.vector, unilateral.mode
     for r in range(p):
         vector[OFFSET, r], vector[SOLUTION, r] = rows[r, ROW_RATE], 0.0
-        largest = max(largest, abs(rows[r, ROW_RATE]))
     for k in range(mode.shape[0]):
         if mode[k, TOUCHING] == 1:
             r = ws.active[k, FIRST_ROW]
             vector[CONE_FRICTION, r] = system.contacts.point[k, MU]
             if mode[k, STRUCK] == 1 and -rows[r, ROW_RATE] > unilateral.tally[k, SETTLE]:
-                vector[OFFSET, r] *= 1.0 + unilateral.law[k, RESTITUTION]
+                vector[OFFSET, r] *= 1.0 + share * unilateral.law[k, RESTITUTION]
     residual = solve_cones(
         ws.small[0],
         vector[OFFSET],
@@ -223,6 +247,34 @@ def impact(system: System, ws: Workspace, run: Run):
         1e-2 * CONE_TOLERANCE * largest,
     )
     if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
+        return False
+    f, total, turnover = vector[SOLUTION], 0.0, 0.0
+    for r in range(p):
+        after = rows[r, ROW_RATE]
+        for s in range(p):
+            after += ws.small[0, r, s] * f[s]
+        # FORCE is free until the next evaluation.
+        rows[r, FORCE] = -0.5 * f[r] * (rows[r, ROW_RATE] + after)
+        total += rows[r, FORCE]
+        turnover += abs(rows[r, FORCE])
+    return total >= -CONE_TOLERANCE * turnover or share == 0.0
+
+
+@internal_kernel
+def impact(system: System, ws: Workspace, run: Run):
+    """Impulses that stop what approaches: u = W P + b with b = J v and, of normals that strike, (1 + e) n·v.
+
+    Then v += M⁻¹ Jᵀ P, and the energy −½ P·(J v₋ + J v₊) is booked as impact loss.
+    """
+    unilateral, y, layout = system.unilateral, run.y, system.layout
+    vector, mode, rows, column = unilateral.vector, unilateral.mode, ws.rows, ws.column
+    p = gather(system, ws, run)
+    largest = 0.0
+    for r in range(p):
+        largest = max(largest, abs(rows[r, ROW_RATE]))
+    # Newton's restitution may contradict friction: a point that is wedged cannot leave, and some would gain energy.
+    # Those impacts are without restitution, which always has a solution, and a loss.
+    if not impulses(system, ws, p, largest, 1.0) and not impulses(system, ws, p, largest, 0.0):
         run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
         return
     f = vector[SOLUTION]
@@ -233,12 +285,6 @@ def impact(system: System, ws: Workspace, run: Run):
     accelerate(system.model, ws)
     for i in range(ws.joints.shape[0]):
         y[layout.v + i] += ws.joints[i, QDD]
-    for r in range(p):
-        after = rows[r, ROW_RATE]
-        for s in range(p):
-            after += ws.small[0, r, s] * f[s]
-        # FORCE is free until the next evaluation: the loss of each row.
-        rows[r, FORCE] = -0.5 * f[r] * (rows[r, ROW_RATE] + after)
     for k in range(mode.shape[0]):
         if mode[k, TOUCHING] == 1:
             r = ws.active[k, FIRST_ROW]
