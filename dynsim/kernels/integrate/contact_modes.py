@@ -88,6 +88,9 @@ from dynsim.kernels.tree.articulated import accelerate
 STRIKE = 3.0
 # Of a solution of the cones: residual by the largest entry, and what of the largest force is none.
 CONE_TOLERANCE, FORCE_TOLERANCE = 1e-9, 1e-9
+# Where nothing is faster, or accelerated by more, residuals are not compared with it: behind closed brakes a point has
+# motions of 1e-30, and no force upon it is better than none [m/s, m/s²].
+IMMOBILE = 1e-3
 # An acceleration along the surface below this fraction of the largest right-hand side is none.
 SLIP_TOLERANCE = 1e-8
 # A friction force this close to the cone, as a fraction, is on it.
@@ -206,7 +209,9 @@ def impact(system: System, ws: Workspace, run: Run):
         if mode[k, TOUCHING] == 1:
             r = ws.active[k, FIRST_ROW]
             vector[CONE_FRICTION, r] = system.contacts.point[k, MU]
-            if mode[k, STRUCK] == 1 and -rows[r, ROW_RATE] > unilateral.tally[k, SETTLE]:
+            # What was closed had no speed to turn round: a brake or another impact has just given it this one.
+            falls = mode[k, STRUCK] == 1 and mode[k, BEFORE] == OPEN
+            if falls and -rows[r, ROW_RATE] > unilateral.tally[k, SETTLE]:
                 vector[OFFSET, r] *= 1.0 + unilateral.law[k, RESTITUTION]
     residual = solve_cones(
         ws.small[0],
@@ -216,7 +221,7 @@ def impact(system: System, ws: Workspace, run: Run):
         p,
         vector[SOLUTION],
         unilateral.room,
-        1e-2 * CONE_TOLERANCE * largest,
+        1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE),
     )
     if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
         run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
@@ -276,7 +281,7 @@ def choose(system: System, ws: Workspace, run: Run):
             size,
             vector[SOLUTION],
             unilateral.room,
-            1e-2 * CONE_TOLERANCE * largest,
+            1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE),
         )
         if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
             run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
