@@ -56,6 +56,7 @@ from dynsim.kernels.constraint.unilateral import (
     SIDE,
     SLOW,
     SOLUTION,
+    SPLIT,
     STATIC,
     STOP_BEFORE,
     STOP_CLOSED,
@@ -294,7 +295,8 @@ def choose(system: System, ws: Workspace, run: Run):
         return
     take_solution(system, ws, size, largest)
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
-    unilateral.number[REDUNDANT] = 0.0
+    # What was split before says nothing of these modes.
+    unilateral.number[REDUNDANT], unilateral.number[SPLIT] = 0.0, 0.0
     evaluate(system, ws, run)
     # What is left of rates after an impact that was let settle; of a point that has stopped, rounding.
     loss = project_level(system, ws, run.y, 1)
