@@ -15,8 +15,10 @@ from dynsim.kernels.constraint.unilateral import UnilateralArrays
 from dynsim.kernels.jit import integers, reals
 from dynsim.model.description import Contact, Robot
 
-# After an impact a point that leaves more slowly than this stays: bounces that accumulate come to an end [m/s].
-SETTLE_SPEED = 1e-5
+# After an impact a point that leaves more slowly than this stays: bounces that accumulate come to an end [m/s]. More
+# than points reach that fall through the depth at which they count as landed (6e-5 under gravity): two points that rock
+# would give each other that speed for ever.
+SETTLE_SPEED = 1e-4
 
 
 @dataclass(frozen=True)

@@ -53,8 +53,8 @@ STOP_LOSS = 4  # [J]
 CLOSED_TIME = 5  # [s]
 STOP_SIZE = 6
 # UnilateralArrays.mode, int: columns
-WANTED, BEFORE, TOUCHING, STRUCK, PLACED = 0, 1, 2, 3, 4
-MODE_SIZE = 5
+WANTED, BEFORE, TOUCHING, STRUCK = 0, 1, 2, 3
+MODE_SIZE = 4
 # UnilateralArrays.vector: three of the splits of forces, then those of the problem that chooses modes
 OFFSET, SOLUTION, CONE_FRICTION, FIRST_PART, SECOND_PART = 3, 4, 5, 6, 7
 VECTORS = 8

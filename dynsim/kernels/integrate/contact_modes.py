@@ -49,7 +49,6 @@ from dynsim.kernels.constraint.unilateral import (
     NEXT,
     NEXT_SPEED,
     OFFSET,
-    PLACED,
     PROBLEM,
     REDUNDANT,
     REFERENCE,
@@ -60,6 +59,7 @@ from dynsim.kernels.constraint.unilateral import (
     SIDE,
     SLOW,
     SOLUTION,
+    SPLIT,
     STATIC,
     STOP_BEFORE,
     STOP_CLOSED,
@@ -94,6 +94,9 @@ STRIKE = 3.0
 FOOT_TOLERANCE = 1e-13
 # Of a solution of the cones: residual by the largest entry, and what of the largest force is none.
 CONE_TOLERANCE, FORCE_TOLERANCE = 1e-9, 1e-9
+# Where nothing is faster, or accelerated by more, residuals are not compared with it: behind closed brakes a point has
+# motions of 1e-30, and no force upon it is better than none [m/s, m/s²].
+IMMOBILE = 1e-3
 # An acceleration along the surface below this fraction of the largest right-hand side is none.
 SLIP_TOLERANCE = 1e-8
 # A friction force this close to the cone, as a fraction, is on it.
@@ -234,7 +237,9 @@ def impulses(system: System, ws: Workspace, p, largest, share):
         if mode[k, TOUCHING] == 1:
             r = ws.active[k, FIRST_ROW]
             vector[CONE_FRICTION, r] = system.contacts.point[k, MU]
-            if mode[k, STRUCK] == 1 and -rows[r, ROW_RATE] > unilateral.tally[k, SETTLE]:
+            # What was closed had no speed to turn round: a brake or another impact has just given it this one.
+            falls = mode[k, STRUCK] == 1 and mode[k, BEFORE] == OPEN
+            if falls and -rows[r, ROW_RATE] > unilateral.tally[k, SETTLE]:
                 vector[OFFSET, r] *= 1.0 + share * unilateral.law[k, RESTITUTION]
     residual = solve_cones(
         ws.small[0],
@@ -244,7 +249,7 @@ def impulses(system: System, ws: Workspace, p, largest, share):
         p,
         vector[SOLUTION],
         unilateral.room[SCRATCH:],
-        1e-2 * CONE_TOLERANCE * largest,
+        1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE),
     )
     if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
         return False
@@ -326,7 +331,7 @@ def choose(system: System, ws: Workspace, run: Run):
             size,
             vector[SOLUTION],
             unilateral.room[SCRATCH:],
-            1e-2 * CONE_TOLERANCE * largest,
+            1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE),
         )
         if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
             run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
@@ -338,9 +343,9 @@ def choose(system: System, ws: Workspace, run: Run):
         run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
         return
     take_solution(system, ws, size, largest)
-    place_on_surfaces(system, ws, run)
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
-    unilateral.number[REDUNDANT] = 0.0
+    # What was split before says nothing of these modes.
+    unilateral.number[REDUNDANT], unilateral.number[SPLIT] = 0.0, 0.0
     evaluate(system, ws, run)
     # What is left of rates after an impact that was let settle; of a point that has stopped, rounding.
     loss = project_level(system, ws, run.y, 1)
@@ -349,23 +354,6 @@ def choose(system: System, ws: Workspace, run: Run):
     evaluate(system, ws, run)
     unilateral.number[REDUNDANT] = 1.0 if ws.counts[DEPENDENT] > before else 0.0
     ws.counts[DEPENDENT] = before
-
-
-@internal_kernel
-def place_on_surfaces(system: System, ws: Workspace, run: Run):
-    """Bring everything that touches onto its surface, along normals alone, and forget where it has stuck.
-
-    Anchors are dropped anew after it: those of points whose rows depend on each other must fit together to rounding.
-    And what stays open below its surface, with nothing that drives it out, would land for ever.
-    """
-    unilateral = system.unilateral
-    mode = unilateral.mode
-    for k in range(mode.shape[0]):
-        mode[k, PLACED] = SLIDING if mode[k, TOUCHING] == 1 else OPEN
-    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, PLACED])
-    evaluate(system, ws, run)
-    project_level(system, ws, run.y, 0)
-    evaluate(system, ws, run)
 
 
 @internal_kernel
