@@ -34,7 +34,7 @@ def forbid_conversion(schema: Any) -> None:
 class StrictConfig(BaseModel):
     """A mapping of a scenario file; unknown keys are errors, numbers must be finite, and neither texts nor true."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True, defer_build=True)
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> Any:

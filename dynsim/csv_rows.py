@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from dynsim.errors import DynsimError
@@ -33,20 +33,13 @@ def read_table(file: str, *headers: Sequence[str], what: str) -> tuple[tuple[str
     ValueError
         With file, line and reason: for validators of a scenario.
     """
-    try:
-        text = read_text(Path(file), DynsimError, SIZE_LIMIT)
-    except DynsimError as error:
-        raise ValueError(str(error)) from error
-    first, *lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    first, *lines = _lines(file)
     columns = tuple(name.strip() for name in first.split(","))
     if columns not in [tuple(header) for header in headers]:
         wanted = " or ".join(repr(",".join(header)) for header in headers)
         raise ValueError(f"{file}:1: the first line is {_shown(first)}; it must be {wanted}")
     rows: list[list[float]] = []
-    for number, line in enumerate(lines, 2):
-        content = line.partition("#")[0].strip(" \t")
-        if not content:
-            continue
+    for number, content in _contents(lines, 2):
         rows.append(_row(content, columns, f"{file}:{number}"))
         if len(rows) > 1 and not rows[-1][0] > rows[-2][0]:
             raise ValueError(
@@ -58,10 +51,44 @@ def read_table(file: str, *headers: Sequence[str], what: str) -> tuple[tuple[str
     return columns, rows
 
 
+def read_grid(file: str) -> list[list[float]]:
+    """The rows of a file of numbers without a header, all of one length.
+
+    Raises
+    ------
+    ValueError
+        With file, line and reason: for validators of a scenario.
+    """
+    rows: list[list[float]] = []
+    columns: Sequence[str] = ()
+    for number, content in _contents(_lines(file), 1):
+        columns = columns or [str(k + 1) for k in range(content.count(",") + 1)]
+        rows.append(_row(content, columns, f"{file}:{number}"))
+    if not rows:
+        raise ValueError(f"{file}: no rows of numbers")
+    return rows
+
+
+def _lines(file: str) -> list[str]:
+    try:
+        text = read_text(Path(file), DynsimError, SIZE_LIMIT)
+    except DynsimError as error:
+        raise ValueError(str(error)) from error
+    return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+
+
+def _contents(lines: Iterable[str], first: int) -> Iterator[tuple[int, str]]:
+    """Lines that hold more than a comment, with their numbers."""
+    for number, line in enumerate(lines, first):
+        if content := line.partition("#")[0].strip(" \t"):
+            yield number, content
+
+
 def _row(line: str, columns: Sequence[str], place: str) -> list[float]:
     cells = [cell.strip(" \t") for cell in line.split(",")]
     if len(cells) != len(columns):
-        raise ValueError(f"{place}: {len(cells)} values; there must be {len(columns)}: {','.join(columns)}")
+        names = f": {','.join(columns)}" if columns[0] != "1" else ", as in the first row"
+        raise ValueError(f"{place}: {len(cells)} values; there must be {len(columns)}{names}")
     if not all(_NUMBER.fullmatch(cell) and math.isfinite(float(cell)) for cell in cells):
         raise ValueError(f"{place}: {_shown(line)} is not {len(columns)} numbers, finite and in digits 0 to 9")
     return [float(cell) for cell in cells]

@@ -64,12 +64,25 @@ _imported: dict[tuple[str, str], Plugin] = {}
 
 
 @cache
-def shipped(family: str) -> tuple[str, ...]:
-    """Members in the package: the modules that expose ``Config``."""
+def _modules(family: str) -> tuple[str, ...]:
+    """Names of the modules in the package of a family."""
     package = importlib.import_module(FAMILIES[family].package)
-    names = [info.name for info in pkgutil.iter_modules(package.__path__) if not info.ispkg]
-    modules = {name: importlib.import_module(f"{package.__name__}.{name}") for name in names}
-    return tuple(sorted(name for name, module in modules.items() if hasattr(module, "Config")))
+    return tuple(sorted(info.name for info in pkgutil.iter_modules(package.__path__) if not info.ispkg))
+
+
+def _module(family: str, name: str) -> ModuleType:
+    return importlib.import_module(f"{FAMILIES[family].package}.{name}")
+
+
+@cache
+def shipped(family: str) -> tuple[str, ...]:
+    """Members in the package: the modules that expose ``Config``. Imports all of them."""
+    return tuple(name for name in _modules(family) if is_shipped(family, name))
+
+
+def is_shipped(family: str, name: str) -> bool:
+    """Whether a name is one of :func:`shipped`; imports that module at most."""
+    return name in _modules(family) and hasattr(_module(family, name), "Config")
 
 
 @cache
@@ -129,9 +142,7 @@ def member(family: str, name: str) -> ModuleType:
     PluginError
         There is none of that name, or it is a plug-in that does not work.
     """
-    if name in shipped(family):
-        return importlib.import_module(f"{FAMILIES[family].package}.{name}")
-    return _plugin(family, name).module
+    return _module(family, name) if is_shipped(family, name) else _plugin(family, name).module
 
 
 def build(family: str, config: Any, context: BuildContext, expected: type[T] | UnionType) -> T:
@@ -144,7 +155,7 @@ def build(family: str, config: Any, context: BuildContext, expected: type[T] | U
     """
     result = member(family, config.type).build(config, context)
     if not isinstance(result, expected):
-        wanted = getattr(expected, "__name__", expected)
+        wanted = " or ".join(one.__name__ for one in typing.get_args(expected) or (expected,))
         raise ModelError(f"{family} {config.type!r}: its build must return a {wanted}, not {shown(result)}")
     return cast(T, result)
 
@@ -210,7 +221,7 @@ def union(family: str, only: tuple[str, ...] = ()) -> Any:
 
 
 class Choice:
-    """Pydantic's side of :func:`union`: a union of the package's members by ``type``; plug-ins where it has none."""
+    """Pydantic's side of :func:`union`: the member that ``type`` names, and no other is imported to validate it."""
 
     def __init__(self, family: str, only: tuple[str, ...] = ()) -> None:
         self.family, self.only = family, only
@@ -223,13 +234,8 @@ class Choice:
         return [member(self.family, name).Config for name in shipped(self.family)] + plugins
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
-        choices = {
-            name: handler.generate_schema(member(self.family, name).Config)
-            for name in self.only or shipped(self.family)
-        }
-        return core_schema.no_info_wrap_validator_function(
+        return core_schema.no_info_plain_validator_function(
             self._validate,
-            core_schema.tagged_union_schema(choices, discriminator="type", from_attributes=True),
             # Each by its own class: that of a plug-in is not in the schema.
             serialization=core_schema.wrap_serializer_function_ser_schema(_dump, schema=core_schema.any_schema()),
         )
@@ -237,10 +243,12 @@ class Choice:
     def __get_pydantic_json_schema__(self, schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler) -> Any:
         return handler(_tagged({name: member(self.family, name).Config for name in self.only or members(self.family)}))
 
-    def _validate(self, value: Any, validate: core_schema.ValidatorFunctionWrapHandler) -> Any:
+    def _validate(self, value: Any) -> Any:
         name = value.get("type") if isinstance(value, Mapping) else getattr(value, "type", None)
-        if not isinstance(name, str) or self.only or name in shipped(self.family):
-            return validate(value)
+        if not isinstance(name, str) or (self.only and name not in self.only):
+            return _validator(self.family, self.only or shipped(self.family)).validate_python(value)
+        if is_shipped(self.family, name):
+            return _validator(self.family, (name,)).validate_python(value)
         if name not in _entry_points(self.family):
             known = ", ".join(map(repr, names(self.family)))
             raise PydanticKnownError(
@@ -252,7 +260,15 @@ class Choice:
             raise error_at("type", str(error)) from None
 
 
+@cache
+def _validator(family: str, names: tuple[str, ...]) -> SchemaValidator:
+    """Of a choice among these members of the package."""
+    return SchemaValidator(_tagged({name: member(family, name).Config for name in names}))
+
+
 def _tagged(configs: Mapping[str, type[StrictConfig]]) -> core_schema.CoreSchema:
+    for config in configs.values():
+        config.model_rebuild()  # the schema of a configuration is made when it is first asked for
     choices = {name: config.__pydantic_core_schema__ for name, config in configs.items()}
     return core_schema.tagged_union_schema(choices, discriminator="type", from_attributes=True)
 

@@ -29,6 +29,7 @@ from dynsim.model.joints.ball import ball, floating
 from dynsim.model.joints.planar import planar, rolling
 from dynsim.model.joints.wheels import wheeled
 from dynsim.model.model import Model
+from dynsim.model.shapes import compile_shapes
 from dynsim.model.unilateral import JointStop, compile_unilateral, joint_stops
 
 SURFACES = ("plane", "sphere", "cylinder")
@@ -232,6 +233,7 @@ class Bench:
         fixed: bool = False,
         rtol: float = 1e-6,
         atol: float | None = None,
+        stepping: Any = None,
     ) -> Run:
         """A run from y to the last of ``times``, recorded there, that has not begun.
 
@@ -252,6 +254,7 @@ class Bench:
             hand=(n - 1, self.robot.hand[1]),
             end=float(times[-1]),
             step=step,
+            stepping=stepping,
             step_max=step if fixed else np.inf,
             rtol=rtol,
             # With an absolute tolerance out of reach every step is accepted and the next one is as long as allowed.
@@ -300,6 +303,7 @@ def bench(
         loads=compile_loads(robot, loads or ()),
         dense=np.zeros((size, size + 1)) if m_star else None,
         couplings=compile_couplings(robot),
+        shapes=compile_shapes(robot, contacts or []),
         unilateral=compile_unilateral(robot, contacts or [], stops, slow) if real else None,
     )
     return Bench(robot, system, new_workspace(system), tuple(contacts or ()) if real else (), tuple(stops))

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.errors import UnreachableReference
+from dynsim.model.description import Contact
 from dynsim.model.mobile_base import base_row
 from dynsim.model.model import Model
+from dynsim.model.posture import gaps_and_rates
 
 Array = NDArray[np.float64]
 
@@ -30,6 +32,7 @@ def follow(
     tolerance: float,
     progress: Callable[[float], None] | None = None,
     base: Array | None = None,
+    braces: Sequence[Contact] = (),
 ) -> Array:
     """Positions of ``joints`` that put the hand on ``targets`` at ``times``; the others stay as in ``q``.
 
@@ -46,6 +49,7 @@ def follow(
     q : (nq,) configuration to start from; it selects the branch
     tolerance : distance that counts as reached [m]
     progress : called now and then with the time on the path [s], when it takes longer than a second
+    braces : points that stay on their surfaces on the way, as exactly as the hand is on its path
     base : (T, 4) coordinates of the mobile base at ``times``: its wheels [rad], x and y [m]; None: it stays
 
     Returns
@@ -60,7 +64,8 @@ def follow(
     columns = [model.joint_names.index(name) for name in joints]
     places = [model.robot.position_index[column] for column in columns]
     body, point = model.body_index(model.robot.hand[0]), model.robot.hand[1]
-    q, identity = q.copy(), np.eye(3)
+    q, rows = q.copy(), 3 + len(braces)
+    identity = np.eye(rows)
     carried = 0 if base is None else base_row(model.robot)[0]
     result = np.zeros((len(times), len(columns)))
     due = clock.perf_counter() + QUIET_S
@@ -70,7 +75,7 @@ def follow(
             due = clock.perf_counter() + REPORT_S
         if base is not None:
             q[carried : carried + 4] = base[k]
-        if k >= 3 and len(columns) <= 3:
+        if k >= 3 and len(columns) <= rows:
             # The parabola through the last three solutions leaves one iteration to do. Not for redundant joints: what
             # the hand does not determine would run away along it.
             q[places] = 3.0 * result[k - 1] - 3.0 * result[k - 2] + result[k - 3]
@@ -78,6 +83,9 @@ def follow(
         for _ in range(ITERATIONS):
             position, jacobian = model.point_position_and_jacobian(body, point, q)
             error = target - position
+            if braces:
+                gaps, rates = gaps_and_rates(model, braces, q)
+                error, jacobian = np.concatenate([error, -gaps]), np.vstack([jacobian, rates])
             distance = math.sqrt(error @ error)
             best = min(best, distance)
             # Two orders below the tolerance: the references shall be smooth, not just close.

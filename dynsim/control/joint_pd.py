@@ -11,10 +11,12 @@ from scipy.interpolate import CubicSpline
 
 from dynsim import families
 from dynsim.config import NonNegative, Positive, StrictConfig, check_waypoints
+from dynsim.control.feed_forward import planned_voltages
 from dynsim.control.inverse_kinematics import follow
 from dynsim.errors import ModelError
+from dynsim.model.bracing import MIN_N
 from dynsim.model.control import BasePath, HandPath, JointControl, spline_coefficients
-from dynsim.model.description import Robot
+from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Motor, Servo, TorqueSource
 from dynsim.model.mobile_base import base_row
 from dynsim.model.model import Model
@@ -37,6 +39,7 @@ class HandReference(StrictConfig):
 
     path: PathChoice
     joints: list[str] = Field(min_length=1, description="joints that follow the path; the others hold")
+    braces: list[str] = Field(default=[], description="contact points that the joints keep on their surfaces meanwhile")
     tolerance_m: Positive = Field(default=1e-6, description="a target further off than this is unreachable")
 
 
@@ -83,6 +86,14 @@ class Config(StrictConfig):
     base: BaseReference | None = Field(default=None, description="a path for the mobile base; none: it holds")
     joints: dict[str, JointPath] = Field(default={}, description="waypoints by joint name")
     torques: dict[str, TorquePath] = Field(default={}, description="torques of motors of type torque by joint name")
+    feed_forward: Literal["none", "gravity", "dynamics"] = Field(
+        default="none", description="planned voltages of DC motors along the references, beside the PD"
+    )
+    brace: Literal["optimal"] | dict[str, Positive] | None = Field(
+        default=None,
+        description="normal forces [N] by contact, or `optimal`: planned as `dynamics`, with these braces pressing",
+    )
+    min_N: NonNegative = Field(default=MIN_N, description="least normal force of every brace under brace: optimal")
     sample_time_s: Positive | None = Field(
         default=None, description="commands are taken at this period and held in between; default: continuous"
     )
@@ -93,6 +104,10 @@ class Config(StrictConfig):
         both = [name for name in self.joints if self.hand is not None and name in self.hand.joints]
         if both:
             raise ValueError(f"{both[0]} cannot follow both the hand path and waypoints of its own")
+        if self.brace is not None and self.feed_forward != "none":
+            raise ValueError("brace plans the whole dynamics; leave feed_forward away")
+        if self.min_N != MIN_N and self.brace != "optimal":
+            raise ValueError("min_N is for brace: optimal")
         return self
 
 
@@ -114,7 +129,8 @@ def build(config: Config, context: BuildContext) -> JointControl:
         path = families.build("path", config.hand.path, context, HandPath)
     base_path = None if config.base is None else _base_path(config.base, context)
     times, positions = np.zeros(0), dict[str, NDArray[np.float64]]()
-    if config.joints or config.torques or path is not None or base_path is not None:
+    planned = config.brace is not None or config.feed_forward != "none"
+    if config.joints or config.torques or path is not None or base_path is not None or planned:
         times = _knots(config.knot_spacing_s, context.duration)
         for name, joint in config.joints.items():
             positions[name] = _waypoints(joint.times_s, np.deg2rad(joint.angles_deg), times)
@@ -125,8 +141,9 @@ def build(config: Config, context: BuildContext) -> JointControl:
         if config.hand is not None and path is not None:
             hand, targets = config.hand, path.position(times)
             base = _base_coordinates(robot, positions, times)
+            braces = [_contact(context, name, "hand.braces") for name in hand.braces]
             followed = follow(
-                model, times, targets, hand.joints, robot.initial, hand.tolerance_m, context.progress, base
+                model, times, targets, hand.joints, robot.initial, hand.tolerance_m, context.progress, base, braces
             )
             positions |= dict(zip(hand.joints, followed.T, strict=True))
     return JointControl.following(
@@ -137,7 +154,26 @@ def build(config: Config, context: BuildContext) -> JointControl:
         positions=positions,
         path=path,
         sample_time=config.sample_time_s,
+        voltages=_planned(config, context, times, positions) if planned else None,
     )
+
+
+def _planned(
+    config: Config, context: BuildContext, times: NDArray[np.float64], positions: dict[str, NDArray[np.float64]]
+) -> NDArray[np.float64]:
+    """Voltages of the motors along the references, (T, na)."""
+    if config.brace is None:
+        return planned_voltages(context.model, times, positions, {}, whole=config.feed_forward == "dynamics")
+    forces = dict.fromkeys(context.contacts) if config.brace == "optimal" else dict(config.brace)
+    braces = {name: (_contact(context, name, "brace"), force) for name, force in forces.items()}
+    return planned_voltages(context.model, times, positions, braces, config.min_N)
+
+
+def _contact(context: BuildContext, name: str, key: str) -> Contact:
+    if name not in context.contacts:
+        known = ", ".join(context.contacts) or "none"
+        raise ModelError(f"controller.{key}: no contact {name!r}; those are: {known}", keys=("controller",))
+    return context.contacts[name]
 
 
 def _check_names(config: Config, model: Model) -> None:

@@ -17,6 +17,7 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.contact_events import NORMAL_GUARD, SLIP_GUARD, STOP_GUARD
 from dynsim.kernels.integrate.events import TIP_MARGIN
+from dynsim.kernels.integrate.time_stepping import stepping_arrays
 from dynsim.kernels.state import LOSSES, OutputLayout, StateLayout, block, output_layout, state_layout
 from dynsim.kernels.system import System, new_workspace
 from dynsim.kernels.tree.support import OUTPUTS
@@ -32,6 +33,7 @@ from dynsim.model.control import JointControl
 from dynsim.model.description import Array, Contact, Load, Robot
 from dynsim.model.drives import Drive, Motor
 from dynsim.model.model import Model
+from dynsim.model.shapes import compile_shapes
 from dynsim.model.unilateral import JointStop, compile_unilateral, joint_stops
 from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, build
@@ -83,8 +85,8 @@ def prepare(
     """
     described = build.robot(scenario)
     model = Model(described if motors is None else replace(described, motors=tuple(motors)))
-    robot, contacts = model.robot, build.contacts(scenario)
-    build.check_start(scenario, model)
+    robot, contacts = model.robot, build.contacts(scenario, model.robot)
+    build.check_start(scenario, model, contacts)
     loads = build.loads(scenario, robot)
     if pushable:
         loads = [*loads, *(_push(body) for body in robot.bodies)]
@@ -96,6 +98,8 @@ def prepare(
     if times is None:
         times = sample_times(scenario, layout, columns, n)
     _check_coordinates(scenario, robot)
+    if robot.base is not None and scenario.integrator.method == "time_stepping":
+        raise ScenarioError("integrator.method: time_stepping does not locate events, such as a mobile base that tips")
     _check_stiffness(scenario, robot)
     joint_rows = len(robot.couplings) + len(stops)
     _check_work(scenario, n, c + joint_rows)
@@ -104,7 +108,7 @@ def prepare(
         _check_references(scenario, robot, contacts, control)
     options, size = scenario.integrator, n + ka.row_limit(c, joint_rows) + robot.circuits
     method = ki.METHODS[options.method]
-    step = options.step_s or (1e-3 if method == ki.RK4 else 0.0)
+    step = options.step_s or (1e-3 if method in ki.FIXED_STEP else 0.0)
     system = System(
         layout=layout,
         model=model.arrays,
@@ -116,8 +120,12 @@ def prepare(
         loads=compile_loads(robot, loads),
         dense=np.zeros((size, size + 1)) if options.solver == "m_star" else None,
         couplings=compile_couplings(robot),
+        shapes=compile_shapes(robot, contacts),
         unilateral=compile_unilateral(robot, contacts, stops, slow_slip(options.atol)) if real else None,
     )
+    stepping = None
+    if method == ki.TIME_STEPPING:
+        stepping = stepping_arrays(model.arrays, system.contacts, na, joint_rows, options.theta)
     y = np.zeros(layout.size)
     y[block(layout, "q")] = robot.initial
     run = ki.new_run(
@@ -140,6 +148,7 @@ def prepare(
         breaks=_breaks(loads),
         events=guards(robot, contacts if real else (), stops),
         support=compile_support(robot),
+        stepping=stepping,
     )
     return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops)
 
@@ -239,7 +248,9 @@ def _check_work(scenario: Scenario, n: int, p: int) -> None:
     # A Jacobian by differences, and its factors.
     per_step = (2 * n + 6) * seconds + 3e-10 * n**3 if options.method == "rodas4" else 4.0 * seconds
     # Motors and friction hold the step at about a millisecond.
-    steps = scenario.duration_s / (options.step_s if options.step_s and options.method == "rk4" else 1e-3)
+    steps = scenario.duration_s / (
+        options.step_s if options.step_s and ki.METHODS[options.method] in ki.FIXED_STEP else 1e-3
+    )
     hours = steps * per_step / 3600.0
     if hours > options.time_limit_h:
         raise ScenarioError(

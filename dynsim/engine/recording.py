@@ -109,7 +109,7 @@ def make_record(
         deficient=deficient,
         extremes=run.extremes,
         spread=spread,
-        support=run.support.least,
+        support=np.zeros(0) if run.support is None else run.support.least,
         unilateral=prepared.system.unilateral,
         stops=tuple(prepared.stops),
     )

@@ -472,7 +472,7 @@ class Simulation:
             run.y[part] = values
         q = run.y[block(run.layout, "q")]
         check_couplings(model.robot, q)
-        check_start(self._scenario, model, q)
+        check_start(self._scenario, model, self._prepared.contacts, q)
 
     def _reach(self, until: float) -> None:
         """Integrate until the step that would pass a time is pending, or ends there."""
@@ -618,7 +618,7 @@ class Simulation:
             ("drives", system.drives._asdict()),
             ("reference", system.reference._asdict()),
             ("loads", system.loads._asdict()),
-            ("support", prepared.run.support._asdict()),
+            ("support", prepared.run.support._asdict() if prepared.run.support else {}),
             ("unilateral", {} if system.unilateral is None else system.unilateral._asdict()),
         ):
             found |= {f"{owner}.{name}": array for name, array in part.items() if isinstance(array, np.ndarray)}

@@ -31,6 +31,7 @@ from dynsim.figures.solids import faces, outline
 from dynsim.figures.style import Array
 from dynsim.measures import hand_target
 from dynsim.record import Record
+from dynsim.record.quaternion import rotated
 from dynsim.record.scene import Surface
 
 # An axis of the 3D view shorter than this share of the longest has two ticks.
@@ -253,13 +254,55 @@ def _space_view(
 
 
 def _draw_surface(axes: Axes3D, surface: Surface, low: Array, high: Array) -> None:
-    """The part of a quadric next to the arm: over its tangent plane, along the normal to the nearest root of C."""
+    """The part of a surface next to the arm."""
+    grids = [_field(surface)] if surface.kind == "height_field" else _faces(surface) if surface.kind == "box" else []
+    grids = [_within(grid, low, high) for grid in grids] or [_quadric(surface, low, high)]
+    cells = [
+        np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], axis=2).reshape(-1, 4, 3)
+        for grid in grids
+    ]
+    quads = np.concatenate(cells)
+    quads = quads[np.isfinite(quads).all(axis=(1, 2))]
+    if len(quads):
+        axes.add_collection3d(
+            Poly3DCollection(list(quads), facecolors="#BBBBBB", alpha=0.25, linewidths=0, zorder=0, antialiased=False),
+            autolim=False,
+        )
+
+
+def _field(surface: Surface) -> Array:
+    """Points of a height field, (ny, nx, 3)."""
+    x, y = np.meshgrid(*surface.grid)
+    return np.stack([x, y, np.array(surface.heights)], axis=-1)
+
+
+def _faces(surface: Surface) -> list[Array]:
+    """Points of the six faces of a box, its edges sharp, (n, n, 3) each."""
+    half, R = 0.5 * np.array(surface.edges), rotated(np.array(surface.orientation), np.eye(3))
+    u, v = np.meshgrid(*2 * [np.linspace(-1.0, 1.0, 13)])
+    found = []
+    for axis in range(3):
+        for side in (-1.0, 1.0):
+            local = np.roll(np.stack([np.full_like(u, side), u, v], axis=-1), axis, axis=-1) * half
+            found.append(np.array(surface.position) + local @ R.T)
+    return found
+
+
+def _within(grid: Array, low: Array, high: Array) -> Array:
+    """Points as they are near the arm, NaN elsewhere."""
+    room = 0.1 * float((high - low).max())
+    near = ((grid >= low - room) & (grid <= high + room)).all(axis=-1, keepdims=True)
+    return np.where(near, grid, np.nan)
+
+
+def _quadric(surface: Surface, low: Array, high: Array) -> Array:
+    """Points of a quadric: over its tangent plane next to the arm, along the normal to the nearest root of C."""
     anchor = 0.5 * (low + high)
     normal = np.zeros(3)
     for _ in range(20):
         slope = surface.gradient(anchor)
         if not np.linalg.norm(slope) > 1e-12:
-            return
+            return np.full((1, 1, 3), np.nan)
         normal = slope / np.linalg.norm(slope)
         anchor = anchor - surface.gap(anchor) * normal
     # Along the axes of the world where that is possible.
@@ -279,13 +322,7 @@ def _draw_surface(axes: Axes3D, surface: Surface, low: Array, high: Array) -> No
     step = -2.0 * c / (b + np.copysign(np.sqrt(np.where(inside >= 0.0, inside, np.nan)), b))
     points = start + step[..., None] * normal
     points[np.abs(step) > float((high - low).max())] = np.nan
-    quads = np.stack([points[:-1, :-1], points[1:, :-1], points[1:, 1:], points[:-1, 1:]], axis=2).reshape(-1, 4, 3)
-    quads = quads[np.isfinite(quads).all(axis=(1, 2))]
-    if len(quads):
-        axes.add_collection3d(
-            Poly3DCollection(list(quads), facecolors="#BBBBBB", alpha=0.25, linewidths=0, zorder=0, antialiased=False),
-            autolim=False,
-        )
+    return np.asarray(points)
 
 
 def _contact_mark(force: float) -> dict[str, Any]:

@@ -30,9 +30,11 @@ PARENT = 0  # index of the parent link, -1 for the world
 KIND = 1  # joint kind
 TURNED = 2  # 0 when R_PJ is the identity, so that one product can be skipped
 BRANCHES = 3  # number of children other than link i + 1
-POSITION_INDEX = 4  # where the row's coordinates begin in the block of positions
-BASE = 5  # index of the link that the row's joint is mounted on: that of its first row's parent, -1 for the world
-TREE_SIZE = 6
+TREE_SIZE = 4
+# ModelArrays.compound, int
+POSITION_INDEX = 0  # where the row's coordinates begin in the block of positions
+BASE = 1  # index of the link that the row's joint is mounted on: that of its first row's parent, -1 for the world
+COMPOUND_SIZE = 2
 # ModelArrays.body
 R_PJ = 0  # 9: rotation of the joint frame at q = 0 in the parent's frame, row-major
 P_PJ = 9  # 3: origin of the joint frame in the parent's frame [m]
@@ -183,6 +185,9 @@ class ModelArrays(NamedTuple):
     tree: np.ndarray  # (n, TREE_SIZE) int
     body: np.ndarray  # (n, BODY_SIZE)
     gravity: np.ndarray  # (3,) in W [m/s^2]
+    # (n, COMPOUND_SIZE) int: of robots with a joint beyond one angle or one sliding distance, see
+    # dynsim.kernels.tree.joints. None for the others, whose programs are compiled without what such joints need.
+    compound: np.ndarray | None = None
 
 
 class DriveArrays(NamedTuple):
@@ -200,6 +205,7 @@ class ReferenceArrays(NamedTuple):
     held: np.ndarray  # (na,) constant angle of a held joint
     grid: np.ndarray  # (2,) time of the first knot, knot distance [s]
     coefficients: np.ndarray  # (segments, splines, 6) ascending powers of t - t_knot
+    voltage: np.ndarray | None = None  # (segments, na, 6) added to the commands of DC motors [V]; None for none
 
 
 class ContactArrays(NamedTuple):

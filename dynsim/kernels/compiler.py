@@ -2,15 +2,13 @@
 
 - It keeps every callee twice, as a library of its own and as a copy in its caller, see :class:`_OwnCallees`.
 - It compiles a function again for each set of options that it is called from, see :func:`register_part`.
-- It compares sets of options, and tries the rules of array arithmetic on two numbers, some hundred thousand times a
-  kernel, see the end of this file.
+- It looks the same things up again and again, see dynsim.kernels.numba_habits.
 """
 
 from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Mapping
-from functools import cache
 from typing import Any, TypeVar
 
 import numba
@@ -20,9 +18,9 @@ from numba.core import typed_passes, types, untyped_passes
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.compiler_machinery import PassManager
-from numba.core.targetconfig import TargetConfig
-from numba.core.typing.npydecl import NumpyRulesArrayOperator
 from numba.core.typing.templates import infer, infer_global, make_overload_template
+
+from dynsim.kernels import numba_habits  # noqa: F401
 
 _NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
@@ -167,30 +165,3 @@ def _implementation(template: Any, args: Any, kws: Any) -> Any:
     if key not in template._impl_cache:
         template._build_impl(key, args, kws)
     return template._impl_cache[key]
-
-
-def _options(self: TargetConfig) -> dict[str, Any]:
-    return _defaults(type(self)) | self._values
-
-
-@cache
-def _defaults(kind: type[TargetConfig]) -> dict[str, Any]:
-    return {name: option.default for name, option in kind.options.items()}
-
-
-def _hash_of_options(self: TargetConfig) -> int:
-    return hash(type(self))
-
-
-_array_rules = NumpyRulesArrayOperator.generic
-
-
-def _only_arrays(self: NumpyRulesArrayOperator, args: Any, kws: Any) -> Any:
-    if any(isinstance(argument, types.ArrayCompatible) for argument in args):
-        return _array_rules(self, args, kws)
-    return None
-
-
-TargetConfig.__hash__ = _hash_of_options
-TargetConfig.values = _options
-NumpyRulesArrayOperator.generic = _only_arrays

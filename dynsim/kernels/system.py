@@ -33,8 +33,10 @@ from dynsim.kernels.arrays import (
     workspace,
 )
 from dynsim.kernels.constraint.delassus import solve_small
+from dynsim.kernels.constraint.distance import ShapeArrays
 from dynsim.kernels.constraint.m_star import solve_m_star
 from dynsim.kernels.constraint.rows import set_modes
+from dynsim.kernels.constraint.shapes import shaped_rows
 from dynsim.kernels.constraint.splits import admissible_forces
 from dynsim.kernels.constraint.surface import contact_rows, sign_changed
 from dynsim.kernels.constraint.unilateral import UnilateralArrays
@@ -62,6 +64,7 @@ class System(NamedTuple):
         integers(np.zeros((0, COUPLING_JOINT_SIZE))), reals(np.zeros((0, COUPLING_SIZE)))
     )
     unilateral: UnilateralArrays | None = None  # candidates are glued to their surfaces, and joints have no stops
+    shapes: ShapeArrays | None = None  # of candidates that are not points on quadrics; None: all are
 
 
 def new_workspace(system: System) -> Workspace:
@@ -116,7 +119,7 @@ def derivative(system: System, t, y, ws: Workspace, dy):
     # Most robots have a position for each rate; the others read and write their positions by kind of joint.
     plain = layout.extra == 0
     if not plain:
-        read_positions(model, y, layout.q, ws)
+        read_positions(model.compound, model, y, layout.q, ws)
     for i in range(n):
         if plain:
             joints[i, Q] = y[layout.q + i]
@@ -130,13 +133,14 @@ def derivative(system: System, t, y, ws: Workspace, dy):
     if system.loads.table.shape[0] > 0:
         add_loads(model, system.loads, t, ws, dy, layout.load)
     contact_rows(model, contacts, system.unilateral, ws)
+    shaped_rows(system.shapes, system.unilateral, model, contacts, ws)
     found = ws.counts[DEPENDENT]
     constrained_acceleration(model, ws)
     m_star_acceleration(system.dense, model, drives, ws, found)
     admissible_forces(system.unilateral, ws)
 
     if not plain:
-        position_rates(model, ws, dy, layout.q)
+        position_rates(model.compound, model, ws, dy, layout.q)
     for i in range(n):
         if plain:
             dy[layout.q + i] = joints[i, QD]

@@ -12,7 +12,7 @@ from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.tree import loads as kl
 from dynsim.kernels.tree import support as ks
 from dynsim.kernels.tree.loads import LoadArrays
-from dynsim.model.description import Contact, Coupling, Link, Load, Robot
+from dynsim.model.description import Contact, Coupling, Link, Load, Quadric, Robot
 from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
 from dynsim.model.servo import servo_row
 
@@ -44,6 +44,7 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
     joints: dict[str, int] = {}
     tree = np.zeros((len(links), ka.TREE_SIZE), dtype=np.int64)
     body = np.zeros((len(links), ka.BODY_SIZE))
+    compound = np.zeros((len(links), ka.COMPOUND_SIZE), dtype=np.int64)
     for i, link in enumerate(links):
         if link.kind == "revolute" and abs(initial[position[i]]) > ANGLE_LIMIT:
             raise ModelError(
@@ -71,9 +72,9 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         index[link.name], joints[link.joint] = i, i
         tree[i, ka.PARENT] = parent
         tree[i, ka.KIND] = _joint_kind(link)
-        tree[i, ka.POSITION_INDEX] = position[i]
+        compound[i, ka.POSITION_INDEX] = position[i]
         # Later rows of a joint are mounted where its first one is.
-        tree[i, ka.BASE] = parent if link.row.neutral else tree[parent, ka.BASE]
+        compound[i, ka.BASE] = parent if link.row.neutral else compound[parent, ka.BASE]
         tree[i, ka.TURNED] = int(not np.array_equal(R_PJ, np.eye(3)))
         if parent >= 0 and parent != i - 1:
             tree[parent, ka.BRANCHES] += 1
@@ -105,7 +106,12 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
             body[i, ka.GEAR_DAMPING] += motor.reflected_damping
     _check_movable(robot, tree, body)
     check_couplings(robot, robot.initial)
-    return ka.ModelArrays(tree=integers(tree), body=reals(body), gravity=reals(robot.gravity))
+    return ka.ModelArrays(
+        tree=integers(tree),
+        body=reals(body),
+        gravity=reals(robot.gravity),
+        compound=integers(compound) if (tree[:, ka.KIND] > ka.PRISMATIC).any() else None,
+    )
 
 
 def compile_drives(
@@ -173,14 +179,18 @@ def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArr
         if not contact.slip_smoothing > 0.0:
             raise ModelError(f"contact {contact.name}: slip smoothing {contact.slip_smoothing} m/s must be positive")
         surface = contact.surface
+        link[k, ka.LINK], link[k, ka.FRICTION_LAW] = body, _FRICTION[contact.pulling_friction]
+        point[k, ka.POINT : ka.POINT + 3] = on_body
+        point[k, ka.MU], point[k, ka.V_S] = contact.friction, contact.slip_smoothing
+        if not isinstance(surface, Quadric):  # any plane will do: its rows are overwritten
+            point[k, ka.QUADRIC + 8] = 1.0
+            continue
         curved = bool(surface.Q.any())
         scale = 1.0 if curved else 1.0 / float(np.linalg.norm(surface.b))
-        link[k] = body, _FRICTION[contact.pulling_friction], curved
-        point[k, ka.POINT : ka.POINT + 3] = on_body
+        link[k, ka.CURVED] = curved
         point[k, ka.QUADRIC : ka.QUADRIC + 6] = surface.Q[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
         point[k, ka.QUADRIC + 6 : ka.QUADRIC + 9] = scale * surface.b
         point[k, ka.QUADRIC + 9] = scale * surface.c
-        point[k, ka.MU], point[k, ka.V_S] = contact.friction, contact.slip_smoothing
     return ka.ContactArrays(link=integers(link), point=reals(point))
 
 
@@ -218,8 +228,8 @@ def compile_couplings(robot: Robot) -> ka.CouplingArrays:
     return ka.CouplingArrays(joint=integers(joint), law=reals(law))
 
 
-def compile_support(robot: Robot) -> ks.SupportArrays:
-    """Tables of the mobile base; empty for a robot without one.
+def compile_support(robot: Robot) -> ks.SupportArrays | None:
+    """Tables of the mobile base; None for a robot without one.
 
     Raises
     ------
@@ -227,10 +237,10 @@ def compile_support(robot: Robot) -> ks.SupportArrays:
         Its body or wheels are none of the robot's, or it has no triangle to stand on.
     """
     base = robot.base
-    index, *sizes = (ks.INDEX_SIZE, ks.BASE_SIZE, ks.STATE_SIZE, ks.LEAST_SIZE) if base else (0, 0, 0, 0)
-    arrays = ks.SupportArrays(integers(np.zeros(index)), *(reals(np.full(size, np.inf)) for size in sizes))
     if base is None:
-        return arrays
+        return None
+    sizes = ks.BASE_SIZE, ks.STATE_SIZE, ks.LEAST_SIZE
+    arrays = ks.SupportArrays(integers(np.zeros(ks.INDEX_SIZE)), *(reals(np.full(size, np.inf)) for size in sizes))
     bodies, joints = [link.name for link in robot.links], robot.joint_names
     if base.body not in bodies or not set(base.wheels) <= set(joints):
         raise ModelError(

@@ -8,9 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from dynsim.model.description import Array, Link, Quadric, Robot
+from dynsim.model.surfaces import Surface
 
 # Depth beyond its radius that does not count as passing below a surface [m]: what a contact may be off at the start.
 SLACK = 1e-6
+# Parts into which an axis is cut to find its depth in a box or a height field.
+POINTS = 16
 
 
 @dataclass(frozen=True)
@@ -79,15 +82,11 @@ def poses(robot: Robot, q: Array, bodies: Collection[str] | None = None) -> Iter
         yield link, R, p
 
 
-def sinking(robot: Robot, surfaces: Mapping[str, Quadric], q: Array) -> list[Sinking]:
-    """Bodies whose axes lie below a surface by more than their radius, at samples q, (T, nq).
+def axis_ends(robot: Robot) -> dict[str, list[Array]]:
+    """Of each link the other ends of its axes, (3,) in its frame [m]; they begin at its joint.
 
-    The axis of a body is the straight line from its joint to :attr:`Link.tip`; without one the lines to the joints that
-    it carries, and to the hand. A body of unknown radius has radius zero.
+    :attr:`Link.tip`; without one the joints that it carries, and the hand.
     """
-    found: list[Sinking] = []
-    if not surfaces or not len(q):
-        return found
     tips: dict[str, list[Array]] = {link.name: [] if link.tip is None else [link.tip] for link in robot.links}
     open_ended = {link.name for link in robot.links if link.tip is None}
     for link in robot.links:
@@ -95,7 +94,18 @@ def sinking(robot: Robot, surfaces: Mapping[str, Quadric], q: Array) -> list[Sin
             tips[link.parent].append(link.p_PJ)
     if robot.hand[0] in open_ended:
         tips[robot.hand[0]].append(robot.hand[1])
-    carriers = robot.carriers
+    return tips
+
+
+def sinking(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> list[Sinking]:
+    """Bodies whose axes lie below a surface by more than their radius, at samples q, (T, nq).
+
+    The axes of a body are those of :func:`axis_ends`. A body of unknown radius has radius zero.
+    """
+    found: list[Sinking] = []
+    if not surfaces or not len(q):
+        return found
+    tips, carriers = axis_ends(robot), robot.carriers
     # Of a run that diverged the last samples may be beyond what squares of floats can hold.
     with np.errstate(over="ignore", invalid="ignore"):
         for link, R, p in poses(robot, q):
@@ -110,13 +120,17 @@ def sinking(robot: Robot, surfaces: Mapping[str, Quadric], q: Array) -> list[Sin
     return found
 
 
-def _segment_gap(surface: Quadric, start: Array, along: Array) -> Array:
+def _segment_gap(surface: Surface, start: Array, along: Array) -> Array:
     """Least signed distance of the lines from ``start`` to ``start + along``, (T, 3), without that of their beginning.
 
-    Exact for plane, sphere and cylinder, whose distance grows with C: along a line C is a parabola.
+    Exact for plane, sphere and cylinder, whose distance grows with C: along a line C is a parabola. Of other surfaces
+    the least of some points on the lines.
     """
     gap = surface.gaps(start + along)
-    if surface.Q.any():
+    if not isinstance(surface, Quadric):
+        for share in np.arange(1, POINTS) / POINTS:
+            gap = np.minimum(gap, surface.gaps(start + share * along))
+    elif surface.Q.any():
         slope = np.sum((start @ surface.Q + surface.b) * along, axis=1)
         curvature = np.sum((along @ surface.Q) * along, axis=1)
         bowl = curvature > 0.0

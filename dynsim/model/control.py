@@ -79,6 +79,7 @@ class JointControl:
         positions: Mapping[str, JointMotion] | None = None,
         path: HandPath | None = None,
         sample_time: float | None = None,
+        voltages: ArrayLike | None = None,
     ) -> JointControl:
         """The voltage PD u = k_p (q_d − q) + k_d (v_d − v) on joint positions that are given as samples or functions.
 
@@ -92,6 +93,7 @@ class JointControl:
         positions : by joint, (T,) positions [rad or m], or a function that gives them for ``times``
         path : what the hand is to follow, for tracking errors in summary and figures
         sample_time : period of a zero-order hold of the voltages [s]; None: continuous
+        voltages : (T, na), planned ones that are added to those of DC motors [V]; None: none
 
         Raises
         ------
@@ -105,7 +107,7 @@ class JointControl:
         for name in positions:
             if name not in driven:
                 raise ModelError(f"{name!r} is no joint with a motor; those are: {', '.join(driven) or 'none'}")
-        if not positions:
+        if not positions and voltages is None:
             return cls(*gains, _reference(held), path, sample_time)
         grid = np.asarray(times, dtype=np.float64)
         if grid.ndim != 1 or len(grid) < 6 or not np.allclose(np.diff(grid), grid[1] - grid[0], rtol=1e-6, atol=0.0):
@@ -121,9 +123,17 @@ class JointControl:
         spline = np.full(len(driven), HELD_POSITION)
         for k, name in enumerate(positions):
             spline[driven.index(name)] = k
-        coefficients = spline_coefficients(grid, np.stack(columns, axis=1))
+        coefficients = np.zeros((len(grid) - 1, 0, 6))
+        if columns:
+            coefficients = spline_coefficients(grid, np.stack(columns, axis=1))
         begin, second = float(grid[0]), float(grid[1])
-        return cls(*gains, _reference(held, spline, (begin, second - begin), coefficients), path, sample_time)
+        reference = _reference(held, spline, (begin, second - begin), coefficients)
+        if voltages is not None:
+            planned = np.asarray(voltages, dtype=np.float64)
+            if planned.shape != (len(grid), len(driven)) or not np.isfinite(planned).all():
+                raise ModelError(f"voltages must be finite, one of each of {len(driven)} motors for each time")
+            reference = reference._replace(voltage=reals(spline_coefficients(grid, planned)))
+        return cls(*gains, reference, path, sample_time)
 
     @property
     def end(self) -> float:

@@ -17,6 +17,8 @@ from dynsim.errors import ModelError
 from dynsim.model.drives import Drive, Motor
 from dynsim.model.joints import Row, rows
 from dynsim.model.mobile_base import MobileBase
+from dynsim.model.surfaces import Quadric as Quadric
+from dynsim.model.surfaces import Surface
 from dynsim.record.scene import Shape
 
 Array = NDArray[np.float64]
@@ -203,52 +205,12 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Quadric:
-    """A surface C(r) = r·Q r/2 + b·r + c = 0; C > 0 is outside, where ∇C points."""
-
-    Q: Array
-    b: Array
-    c: float
-
-    def gap(self, position: Array) -> float:
-        """Signed distance [m] of a point along the normal; exact for plane, sphere and cylinder."""
-        from dynsim.kernels.constraint.surface import surface_distance
-
-        gradient = self.Q @ position + self.b
-        slope = float(np.linalg.norm(gradient))
-        normal = gradient / slope
-        value = float(0.5 * position @ self.Q @ position + self.b @ position + self.c)
-        return float(surface_distance(value, slope, float(normal @ self.Q @ normal)))
-
-    def gaps(self, positions: Array) -> Array:
-        """:meth:`gap` of many points, (T, 3) → (T,) [m]; where ∇C vanishes, as in the middle of a sphere, too."""
-        if not self.Q.any():
-            return np.asarray((positions @ self.b + self.c) / np.linalg.norm(self.b))
-        Qr = positions @ self.Q
-        gradient = Qr + self.b
-        value = np.sum((0.5 * Qr + self.b) * positions, axis=1) + self.c
-        square = np.sum(gradient * gradient, axis=1)
-        steepest = float(np.abs(np.linalg.eigvalsh(self.Q)).max())
-        bent = np.sum((gradient @ self.Q) * gradient, axis=1)
-        curvature = np.where(square > 0.0, bent / np.where(square > 0.0, square, 1.0), -steepest * np.sign(value))
-        inner = square - 2.0 * curvature * value
-        slope = np.sqrt(square)
-        return np.asarray(
-            np.where(
-                inner > 0.0,
-                2.0 * value / (slope + np.sqrt(np.maximum(inner, 1e-300))),
-                value / np.maximum(slope, 1e-300),
-            )
-        )
-
-
-@dataclass(frozen=True)
 class Contact:
-    """A body-fixed point held to a surface, or pushed by it alone.
+    """A point, sphere or capsule of a body, and the surface that it can touch.
 
     Attributes
     ----------
-    point : (3,) in the body's frame [m]
+    point : (3,) in the body's frame [m]: the point, the centre of the sphere, or one end of the capsule's axis
     friction : kinetic coefficient μ
     slip_smoothing : v_s [m/s] of the direction v_t/√(v_t² + v_s²); bilateral law
     pulling_friction : "signed" (f_t = μ f_n as [WM] prints it) or "dissipative" (f_t = μ |f_n|); bilateral law
@@ -256,12 +218,16 @@ class Contact:
     stribeck : speed [m/s] of μ + (μ_s − μ) exp(−(v/v_s)²); 0: μ from the first slip on
     viscous_friction : what each m/s adds to the coefficient [s/m]
     restitution : share of the normal speed that is left after an impact, with its sign turned
+    radius : of sphere or capsule [m]
+    tip : (3,) or None
+        The other end of a capsule's axis, in the same frame [m]. Where the surface bends away from the free side the
+        nearest point of the axis touches, elsewhere ``point``.
     """
 
     name: str
     body: str
     point: Array
-    surface: Quadric
+    surface: Surface
     surface_name: str = "floor"
     friction: float = 0.0
     slip_smoothing: float = 1e-3
@@ -270,6 +236,8 @@ class Contact:
     stribeck: float = 0.0
     viscous_friction: float = 0.0
     restitution: float = 0.0
+    radius: float = 0.0
+    tip: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels import ledger
 from dynsim.kernels.tree import articulated, joints, points, sweep
 from dynsim.model.arrays import compile_model
+from dynsim.model.bracing import Brace, BracePlanner, BraceStatics
 from dynsim.model.description import Array, Robot
 from dynsim.problems import listed
 
@@ -135,6 +136,30 @@ class Model:
         articulated.forward_dynamics(self._bodies, self._workspace)
         return self._workspace.joints[:, ka.QDD].copy()
 
+    def brace_statics(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike, braces: Mapping[str, Brace]) -> BraceStatics:
+        """Torques and brace forces that realise v̇ with the least heat, or a certificate that none do.
+
+        tau = M v̇ + h + g + J_m v̇ + (D + D_m) v − J_cᵀ f,   minimise Σ R i², K_m i = tau
+
+        over |f_t| ≤ μ f_n, f_n ≥ min_N (or f_n as commanded, or f_t against the slip), the limits of the motors at a
+        steady current, and tau = 0 where there is none. The optimum uses friction as far as the cone allows; what a
+        real brace takes is decided by its history. Torques are unique; of forces that no motor feels the split is one
+        inside the cones.
+
+        Parameters
+        ----------
+        q, v, vdot : (nq,), (n,), (n,)
+        braces : by name, :class:`~dynsim.model.bracing.Brace`
+
+        Raises
+        ------
+        ModelError
+            A brace on no body, without a direction, or with a force that pulls; a robot with coupled joints.
+        """
+        self._set(q, v)
+        self._workspace.joints[:, ka.QDD] = self._vector(vdot, "vdot", self.joint_names)
+        return BracePlanner(self.robot, self.arrays, braces).solve(self._workspace, np.asarray(v, float), braces)
+
     def point_position(self, body: str | int, point: ArrayLike, q: ArrayLike) -> Array:
         """World position of a point fixed on a body, or in a frame of one by its name, (3,) [m]."""
         index, on_body = self._attached(body, point)
@@ -210,7 +235,7 @@ class Model:
             self._workspace.joints[:, ka.Q] = positions
         else:
             self._q[:] = positions
-            joints.read_positions(self.arrays, self._q, 0, self._workspace)
+            joints.read_positions(self.arrays.compound, self.arrays, self._q, 0, self._workspace)
         self._workspace.joints[:, ka.QD] = 0.0 if v is None else self._vector(v, "v", self.joint_names)
 
     def _vector(self, values: ArrayLike, name: str, labels: tuple[str, ...]) -> Array:

@@ -6,17 +6,18 @@ the engines work with.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from dynsim.config import StrictConfig
 from dynsim.errors import ModelError
 from dynsim.model.control import BasePath, HandPath, JointControl
-from dynsim.model.description import Quadric, Robot
+from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Drive
 from dynsim.model.model import Model
 from dynsim.model.snake import SnakeDescription, TaskSpaceController
+from dynsim.model.surfaces import Box, HeightField, Quadric
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,7 @@ class BuildContext:
     duration : simulated time [s]
     machine : what a controller, or the path of a base, is built for; None for the other families
     joint : the joint of a motor, "" for the other families
+    contacts : contact points of the scenario by name
     progress : to be called with the time [s] that references have come to, when they take long; None: nobody listens
     """
 
@@ -35,6 +37,7 @@ class BuildContext:
     machine: Model | SnakeDescription | None = None
     joint: str = ""
     progress: Callable[[float], None] | None = None
+    contacts: Mapping[str, Contact] = field(default_factory=dict)
 
     def at_joint(self, joint: str) -> BuildContext:
         """The context of a motor on that joint."""
@@ -103,9 +106,9 @@ class BasePathModule(Member, Protocol):
 
 
 class SurfaceModule(Member, Protocol):
-    """A surface that contact points stay on."""
+    """A surface that can be touched."""
 
-    def build(self, config: Any, context: BuildContext) -> Quadric: ...
+    def build(self, config: Any, context: BuildContext) -> Quadric | Box | HeightField: ...
 
 
 class MotorModule(Member, Protocol):

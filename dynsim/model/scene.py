@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from dynsim.model.description import Array, Contact, Link, Quadric, Robot
+from dynsim.model.description import Array, Contact, Link, Robot
 from dynsim.model.mobile_base import SUPPORTS, MobileBase
 from dynsim.model.snake import SnakeDescription
+from dynsim.model.surfaces import Box, HeightField, Quadric
+from dynsim.model.surfaces import Surface as TouchedSurface
 from dynsim.record.quaternion import of_turn
 from dynsim.record.scene import (
     HERE,
@@ -26,6 +29,8 @@ from dynsim.record.scene import (
     vector3,
 )
 
+# Of a height field: as many lines each way as a picture can show.
+GRID_LINES = 61
 # Of a wheel, in parts of its radius; a snake's description has no width.
 WHEEL_WIDTH = 0.48
 BASE_WHEEL_WIDTH = 0.5
@@ -35,7 +40,7 @@ _ALONG_X: Quaternion = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
 _ALONG_Y: Quaternion = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)
 
 
-def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str, Quadric]) -> Scene | None:
+def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str, TouchedSurface]) -> Scene | None:
     """The scene of a tree of bodies whose joint positions are the signal ``q``; None where one has no kind for it."""
     index = {link.name: k for k, link in enumerate(robot.links)}
     bodies = []
@@ -56,11 +61,49 @@ def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str
         points.append(Point(contact.name, "contact", body, vector3(point), contact.surface_name))
     return Scene(
         tuple(bodies),
-        tuple(Surface.of_quadric(name, one.Q, one.b, one.c) for name, one in surfaces.items()),
+        tuple(_drawn(name, one) for name, one in surfaces.items()),
         tuple(points),
         robot.fixed_shapes,
         supports,
     )
+
+
+def _drawn(name: str, surface: TouchedSurface) -> Surface:
+    """A surface as a scene keeps it."""
+    nothing = np.zeros((3, 3))
+    if isinstance(surface, Box):
+        return replace(
+            Surface.of_quadric(name, nothing, np.zeros(3), 0.0),
+            kind="box",
+            position=vector3(surface.centre),
+            orientation=quaternion(surface.axes.T),
+            edges=vector3(surface.edges),
+            radius=float(surface.edge_radius),
+        )
+    if isinstance(surface, HeightField):
+        heights, (dx, dy) = surface.heights, surface.spacing.tolist()
+        heights, dx = _thinned(heights.T, dx)
+        heights, dy = _thinned(heights.T, dy)
+        return replace(
+            Surface.of_quadric(name, nothing, np.zeros(3), 0.0),
+            kind="height_field",
+            position=vector3([*surface.origin, 0.0]),
+            spacing=(dx, dy),
+            heights=tuple(tuple(row) for row in heights.tolist()),
+        )
+    assert isinstance(surface, Quadric)
+    return Surface.of_quadric(name, surface.Q, surface.b, surface.c)
+
+
+def _thinned(rows: Array, spacing: float) -> tuple[Array, float]:
+    """Rows at equal distances from the first to the last, no more than are drawn, and their distance [m]."""
+    count = len(rows)
+    if count <= GRID_LINES:
+        return rows, spacing
+    at = np.linspace(0.0, count - 1.0, GRID_LINES)
+    below = np.minimum(at.astype(int), count - 2)
+    share = (at - below)[:, None]
+    return (1.0 - share) * rows[below] + share * rows[below + 1], spacing * (count - 1) / (GRID_LINES - 1)
 
 
 def _wheels(base: MobileBase, body: int) -> list[Body]:

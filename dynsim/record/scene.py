@@ -30,6 +30,8 @@ WORLD = -1
 """Index of the world among the bodies."""
 HERE: Quaternion = (1.0, 0.0, 0.0, 0.0)
 """The orientation of what is not turned."""
+_FIELD = ("position", "spacing", "heights")
+"""What a height field has."""
 _CHECKS: Any = {"allow_inf_nan": False}
 """What pydantic is told of every class when it reads one."""
 
@@ -117,14 +119,18 @@ class Body:
 
 @dataclass(frozen=True)
 class Surface:
-    """A surface C(r) = r·Q r/2 + b·r + c = 0 in the world; C > 0 is the free side, where ∇C points.
+    """A surface C(r) = 0 in the world; C > 0 is the free side, where ∇C points.
 
     Attributes
     ----------
-    kind : "plane", "sphere", "cylinder" or "quadric"
-    position : on a plane, next to the world's origin; centre of a sphere; on the axis of a cylinder [m]
+    Q, b, c : C = r·Q r/2 + b·r + c of a quadric; zero of a box (C is the distance) and a height field (C = z − h)
+    kind : "plane", "sphere", "cylinder", "quadric", "box" or "height_field"
+    position : on a plane, next to the world's origin; centre of a sphere or box; on the axis of a cylinder; of the
+        first height of a field, whose z is zero [m]
     direction : normal of a plane, axis of a cylinder
-    radius : of a sphere or cylinder [m], negative where the free side is inside
+    radius : of a sphere or cylinder [m], negative where the free side is inside; of the edges of a box
+    orientation, edges : of a box
+    spacing, heights : of a field along x and y, a row for each y [m]; no more than are drawn
     """
 
     __pydantic_config__: ClassVar[Any] = _CHECKS
@@ -132,10 +138,19 @@ class Surface:
     Q: Matrix3
     b: Vector3
     c: float
-    kind: Literal["plane", "sphere", "cylinder", "quadric"] = "quadric"
+    kind: Literal["plane", "sphere", "cylinder", "quadric", "box", "height_field"] = "quadric"
     position: Vector3 | None = None
     direction: Vector3 | None = None
     radius: float | None = None
+    orientation: Quaternion | None = None
+    edges: Vector3 | None = None
+    spacing: tuple[float, float] | None = None
+    heights: tuple[tuple[float, ...], ...] | None = None
+
+    def __post_init__(self) -> None:
+        needed = {"box": ("position", "radius", "orientation", "edges"), "height_field": _FIELD}.get(self.kind, ())
+        if lacking := [name for name in needed if getattr(self, name) is None]:
+            raise RecordError(f"surface {self.name!r} is a {self.kind} without {lacking[0]}")
 
     @classmethod
     def of_quadric(cls, name: str, Q: ArrayLike, b: ArrayLike, c: float) -> Surface:
@@ -149,11 +164,23 @@ class Surface:
 
     def value(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """C at points, (…, 3) → (…)."""
+        if self.kind == "box":
+            core = 0.5 * np.array(self.edges) - (self.radius or 0.0)
+            beyond = np.abs((points - np.array(self.position)) @ rotated(np.array(self.orientation), np.eye(3))) - core
+            inside = np.minimum(beyond.max(axis=-1), 0.0)
+            return np.asarray(np.linalg.norm(np.maximum(beyond, 0.0), axis=-1) + inside - (self.radius or 0.0))
+        if self.kind == "height_field":
+            return np.asarray(points[..., 2] - self._height(points[..., 0], points[..., 1]))
         bent = np.einsum("...i,ij,...j", points, np.array(self.Q), points)
         return np.asarray(0.5 * bent + points @ np.array(self.b) + self.c)
 
     def gradient(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
         """∇C at a point, (3,)."""
+        if self.kind in ("box", "height_field"):
+            step = 1e-6
+            ends = point + step * np.stack([np.eye(3), -np.eye(3)])
+            value = self.value(ends)
+            return np.asarray((value[0] - value[1]) / (2.0 * step))
         return np.asarray(np.array(self.Q) @ point + np.array(self.b))
 
     def gap(self, point: NDArray[np.float64]) -> float:
@@ -164,6 +191,25 @@ class Surface:
         value, curvature = float(self.value(point)), float(normal @ np.array(self.Q) @ normal)
         inner = slope * slope - 2.0 * curvature * value
         return 2.0 * value / (slope + inner**0.5) if inner > 0.0 else value / slope
+
+    @property
+    def grid(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """x, (nx,), and y, (ny,), of the heights of a field [m]."""
+        start, heights = np.array(self.position), np.array(self.heights)
+        x, y = (start[s] + np.array(self.spacing)[s] * np.arange(heights.shape[1 - s]) for s in (0, 1))
+        return x, y
+
+    def _height(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Between the heights of the grid in straight lines; beyond it as at its edge."""
+        heights, place = np.array(self.heights), []
+        for values, lines in zip((y, x), self.grid[::-1], strict=True):
+            at = np.clip((values - lines[0]) / (lines[1] - lines[0]), 0.0, len(lines) - 1.0)
+            cell = np.minimum(at.astype(int), len(lines) - 2)
+            place.append((cell, at - cell))
+        (j, v), (i, u) = place
+        low = (1.0 - u) * heights[j, i] + u * heights[j, i + 1]
+        high = (1.0 - u) * heights[j + 1, i] + u * heights[j + 1, i + 1]
+        return np.asarray((1.0 - v) * low + v * high)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, overload
 
@@ -13,11 +13,15 @@ from dynsim import families
 from dynsim.config import BodyPoint
 from dynsim.errors import ModelError, ScenarioError, shown
 from dynsim.model.control import JointControl
-from dynsim.model.description import Array, Contact, Inertia, Load, Quadric, Robot
+from dynsim.model.description import Array, Contact, Inertia, Load, Robot
 from dynsim.model.model import Model
+from dynsim.model.posture import on_surfaces
 from dynsim.model.protocols import BuildContext
+from dynsim.model.shapes import contact_gap
 from dynsim.model.snake import SnakeDescription, TaskSpaceController
+from dynsim.model.surfaces import SURFACES, Surface
 from dynsim.problems import dotted, suggest
+from dynsim.scenario.candidates import candidates
 from dynsim.scenario.loads import Payload
 from dynsim.scenario.schema import ContactPoint, Contacts, Scenario
 
@@ -51,7 +55,15 @@ def robot(scenario: Scenario) -> Robot:
     links = list(bare.links)
     for body, parts in inertias.items():
         links[body] = replace(links[body], inertia=Inertia.merged(parts))
-    return replace(bare, links=tuple(links)) if inertias else bare
+    built = replace(bare, links=tuple(links)) if inertias else bare
+    initial = scenario.config.initial
+    if initial is None:
+        return built
+    points = {contact.name: contact for contact in contacts(scenario)}
+    try:
+        return replace(built, q0=on_surfaces(Model(built), points, initial.on_surface, initial.keep))
+    except ModelError as error:
+        raise ModelError(str(error), keys=("initial",)) from error
 
 
 def build_model(scenario: Scenario) -> Model:
@@ -91,7 +103,8 @@ def controller(
         raise ModelError("the scenario has no controller; its motors are short-circuited")
     if scenario.engine != families.member("controller", config.type).ENGINE:
         raise ModelError(f"controller {config.type!r} cannot drive a {scenario.plant.type!r}")
-    context = BuildContext(scenario.duration_s, machine, progress=progress)
+    points = {} if isinstance(machine, SnakeDescription) else {c.name: c for c in contacts(scenario)}
+    context = BuildContext(scenario.duration_s, machine, progress=progress, contacts=points)
     if isinstance(machine, Model):
         control = families.build("controller", config, context, JointControl)
         # The kernels would follow the last polynomial on.
@@ -102,16 +115,18 @@ def controller(
     return families.build("controller", config, context, TaskSpaceController)
 
 
-def surfaces(scenario: Scenario) -> dict[str, Quadric]:
+def surfaces(scenario: Scenario) -> dict[str, Surface]:
     """All surfaces by name, whether anything touches them or not."""
     context = BuildContext(scenario.duration_s)
     return {
-        name: families.build("surface", config, context, Quadric) for name, config in scenario.config.surfaces.items()
+        name: families.build("surface", config, context, SURFACES) for name, config in scenario.config.surfaces.items()
     }
 
 
-def contacts(scenario: Scenario) -> list[Contact]:
-    """All enabled contact points with their surfaces.
+def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact]:
+    """All enabled contact points with their surfaces, then the other candidates.
+
+    ``described`` : the robot of the scenario, when it is known already; candidates that are not points are its parts
 
     Raises
     ------
@@ -142,6 +157,10 @@ def contacts(scenario: Scenario) -> list[Contact]:
                 **(_bilateral(options) if options.law == "bilateral" else _unilateral(options, point)),
             )
         )
+    if options.candidates != "points":
+        law = {"friction": options.friction, **_unilateral(options, ContactPoint(body=""))}
+        described = robot(scenario) if described is None else described
+        result += [replace(one, **law) for one in candidates(options.candidates, described, known, result)]
     return result
 
 
@@ -206,23 +225,29 @@ def _payload(name: str, config: Payload, point: Array, axes: Array) -> Inertia:
     return payload
 
 
-def check_start(scenario: Scenario, model: Model, q: NDArray[np.float64] | None = None) -> None:
-    """Raise :class:`ModelError` unless every contact point is on a body of the robot and starts on its surface.
+def check_start(
+    scenario: Scenario, model: Model, touching: Sequence[Contact], q: NDArray[np.float64] | None = None
+) -> None:
+    """Raise :class:`ModelError` unless every contact is on a body of the robot and starts on its surface.
 
     ``q`` : coordinates at the start, (nq,) [rad or m]; default: the robot's initial ones
     """
-    for contact in contacts(scenario):
-        keys = ("contacts", "points", contact.name)
+    q = model.robot.initial if q is None else q
+    for contact in touching:
+        declared = contact.name in scenario.config.contacts.points
+        keys = ("contacts", "points", contact.name) if declared else ("contacts", "candidates")
         try:
-            position = model.point_position(contact.body, contact.point, model.robot.initial if q is None else q)
+            position = model.point_position(contact.body, contact.point, q)
         except ModelError as error:
             raise ModelError(f"{dotted((*keys, 'body'))}: {error}", keys=(*keys, "body")) from error
-        gap = contact.surface.gap(position)
+        end = None if contact.tip is None else model.point_position(contact.body, contact.tip, q)
+        gap = contact_gap(contact, position, end)
         if scenario.config.contacts.law == "unilateral" and gap > 0.0:
             continue
         if not abs(gap) <= START_TOLERANCE:
             raise ModelError(
-                f"{dotted(keys)}: its point starts {gap:+.4g} m from surface {contact.surface_name!r} "
+                f"{dotted(keys)}: {'its point' if declared else contact.name} starts {gap:+.4g} m "
+                f"from surface {contact.surface_name!r} "
                 f"(limit {START_TOLERANCE:g} m), at {position.tolist()}; "
                 "change the initial configuration or the surface, or disable the contact",
                 keys=keys,

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig
+from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig, error_at
 from dynsim.families import member, union
 from dynsim.problems import Origin, listed
 from dynsim.scenario.loads import LoadConfig
@@ -62,6 +62,10 @@ class Contacts(StrictConfig):
     reference_tolerance_m: Positive = Field(
         default=2e-3, description="references that take a contact point further off its surface than this are refused"
     )
+    candidates: Literal["points", "joints", "links"] = Field(
+        default="points",
+        description="what can touch beside the points: nothing, all joints and the hand, or the links as capsules",
+    )
     points: dict[str, ContactPoint] = {}
 
     @property
@@ -75,6 +79,10 @@ class Contacts(StrictConfig):
         set_here = [key for key in self.other_keys if key in self.model_fields_set]
         if set_here:
             raise ValueError(f"{listed(set_here)} {'is' if len(set_here) == 1 else 'are'} not of law {self.law}")
+        if self.law == "bilateral" and self.candidates != "points":
+            raise error_at(
+                "candidates", f"{self.candidates!r} would glue all of them to their surfaces; it needs law: unilateral"
+            )
         static = self.friction if self.static_friction is None else self.static_friction
         if static < self.friction:
             raise ValueError(f"static_friction {static:g} is less than friction {self.friction:g}")
@@ -89,17 +97,30 @@ class Contacts(StrictConfig):
         return self
 
 
+class Initial(StrictConfig):
+    """What the initial posture is changed by, as little as possible."""
+
+    on_surface: list[str] = Field(min_length=1, description="contact points that start exactly on their surfaces")
+    keep: list[str] = Field(default=[], description="joints that do not move for it, and `hand` for the hand's place")
+
+
 class Integrator(StrictConfig):
     """Time integration."""
 
-    method: Literal["rk43", "dopri5", "rk4", "rodas4"] = Field(
+    method: Literal["rk43", "dopri5", "rk4", "rodas4", "time_stepping"] = Field(
         default="rk43",
-        description="adaptive 4(3) or 5(4), fixed step, or adaptive linearly implicit for stiff motors",
+        description="adaptive 4(3) or 5(4), fixed step, adaptive linearly implicit for stiff motors, or fixed step "
+        "with contacts that open and close",
     )
     solver: Literal["articulated", "m_star"] = Field(default="articulated", description="O(n) sweeps or the dense M*")
     rtol: float = Field(default=1e-6, ge=1e-13, le=1e-1)
     atol: float = Field(default=1e-8, ge=1e-16, le=1e-1)
-    step_s: Positive | None = Field(default=None, description="fixed step of rk4 (default 0.001), else the first step")
+    step_s: Positive | None = Field(
+        default=None, description="fixed step of rk4 and time_stepping (default 0.001), else the first step"
+    )
+    theta: float = Field(
+        default=0.5, ge=0.5, le=1.0, description="time_stepping: 0.5 is second order between events, 1 damps"
+    )
     step_max_s: Positive | None = None
     time_limit_h: Positive = Field(default=24.0, description="runs estimated to integrate for longer are refused [h]")
 
@@ -128,6 +149,7 @@ class ScenarioConfig(StrictConfig):
     controller: union("controller") | None = None  # type: ignore[valid-type]
     surfaces: dict[str, union("surface")] = {}  # type: ignore[valid-type]
     contacts: Contacts = Contacts()
+    initial: Initial | None = Field(default=None, description="posture solved from the plant's initial one")
     loads: dict[str, LoadConfig] = Field(default={}, description="forces, torques and payloads by name")
     integrator: Integrator = Integrator()
     record: RecordOptions = RecordOptions()

@@ -1,8 +1,9 @@
 """The contact problem: closed forms, and random problems whose conditions are checked by independent code."""
 
 import numpy as np
+import pytest
 
-from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, CONE_ROOM, ONE_WAY, TANGENT, solve_cones
+from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, CONE_ROOM, NO_SOLUTION, ONE_WAY, TANGENT, solve_cones
 
 BLOCK = [CONE, TANGENT, TANGENT]
 
@@ -82,3 +83,69 @@ def test_directed_friction_makes_a_problem_of_one_way_rows_that_every_start_solv
             assert violation(W, b, [ONE_WAY] * p, np.zeros(p), f) <= 1e-11
             solutions.append(f)
         np.testing.assert_allclose(*solutions, atol=1e-11)
+
+
+def random_contacts(seed):
+    """Jacobian, inverse masses, velocity, kinds and friction of random contacts, with more or fewer rows than rates."""
+    random = np.random.default_rng(seed)
+    cones = int(random.integers(1, 15)) if random.random() < 0.7 else int(random.integers(1, 4))
+    blocks = [BLOCK] * cones + [[ONE_WAY]] * random.integers(0, 4) + [[BOTH_WAYS]] * random.integers(0, 4)
+    random.shuffle(blocks)
+    kind = np.concatenate(blocks)
+    p = len(kind)
+    n = int(random.integers(max(1, np.sum(kind == BOTH_WAYS)), p + 6))
+    inverse_mass = 10.0 ** -random.uniform(0.0, random.uniform(0.0, 6.0), n)
+    J = random.normal(size=(p, n))
+    if random.random() < 0.3:
+        J *= random.random(J.shape) < 0.4
+    first = np.flatnonzero(kind == CONE)
+    if random.random() < 0.3 and len(first) > 1:  # the same point twice
+        one, other = random.choice(first, 2, replace=False)
+        J[other : other + 3] = J[one : one + 3]
+    mu = np.where(kind == CONE, random.choice([0.0, 0.05, 0.3, 0.8, 1.5, 2.0], size=p), 0.0)
+    return J, inverse_mass, random.normal(size=n), kind, mu
+
+
+def random_problem(seed):
+    """A contact problem of mechanics: W = J M⁻¹ Jᵀ of any rank, b = J v."""
+    J, inverse_mass, v, kind, mu = random_contacts(seed)
+    return J @ (inverse_mass * J).T, J @ v, kind, mu
+
+
+@pytest.mark.parametrize(
+    "seeds", [range(2000), pytest.param(range(2000, 10000), marks=pytest.mark.slow)], ids=["2000", "8000 more"]
+)
+def test_random_problems(seeds):
+    unsolved = []
+    for seed in seeds:
+        W, b, kind, mu = random_problem(seed)
+        scale = np.abs(b).max()
+        residual, f = solve(W, b, kind, mu, tolerance=1e-10 * scale)
+        if not (0.0 <= residual <= 1e-9 * scale and violation(W, b, kind, mu, f) <= 3e-9 * scale):
+            unsolved.append((seed, residual / scale, violation(W, b, kind, mu, f) / scale))
+    assert not unsolved
+
+
+def test_the_residual_is_that_of_the_forces_returned():
+    W, b, kind, mu = random_problem(5)
+    residual, f = solve(W, b, kind, mu, tolerance=np.inf, start=np.ones(len(b)))
+    assert (f == 1.0).all()
+    assert residual >= 1e-3
+    assert violation(W, b, kind, mu, f) >= 1e-3
+
+
+def test_walls_that_close_in_from_both_sides_have_a_certificate():
+    """A body between two walls that come towards it: nothing keeps both off; nor does friction."""
+    random = np.random.default_rng(11)
+    for _ in range(100):
+        n = random.integers(4, 9)
+        inverse_mass = 10.0 ** -random.uniform(0.0, 3.0, n)
+        point = random.normal(size=(3, n))
+        J = np.vstack([point, [[-1.0], [1.0], [1.0]] * point])
+        b, W = J @ random.normal(size=n), J @ (inverse_mass * J).T
+        for friction in (0.0, 0.7):
+            # The other wall comes, or goes away.
+            residual, _ = solve(W, b - np.eye(6)[3], [*BLOCK, *BLOCK], friction, tolerance=1e-10)
+            assert residual == NO_SOLUTION
+            residual, _ = solve(W, b + np.eye(6)[3], [*BLOCK, *BLOCK], friction, tolerance=1e-10)
+            assert 0.0 <= residual <= 1e-10

@@ -253,7 +253,7 @@ def test_the_error_of_an_attitude_is_the_angle():
         angle = 1e-5 * rng.normal(size=3)
         turned = q + displacement(q, angle) + 1e-3 * q
         # ``q`` is off by what leads to ``turned``, whatever that adds to its length.
-        total, count = position_error(b.system.model, q, q, turned - q, 0, rtol, atol)
+        total, count = position_error(b.system.model.compound, b.system.model, q, q, turned - q, 0, rtol, atol)
         model = Model(robot)
         actual = angle_between(model.body_pose("body", q)[0], model.body_pose("body", turned)[0])
         assert count == 3
@@ -271,7 +271,7 @@ def test_the_error_of_a_rolling_base_counts_both_distances():
     robot = robot_of(rolling(body("body")))
     b = bench(robot)
     y, error = np.array([3.0, -0.5, 10.0]), np.array([1e-3, 2e-3, 5e-3])
-    total, count = position_error(b.system.model, y, y, error, 0, 0.1, 1.0)
+    total, count = position_error(b.system.model.compound, b.system.model, y, y, error, 0, 0.1, 1.0)
     assert count == 3
     assert total == pytest.approx(np.sum((error / (1.0 + 0.1 * np.abs(y))) ** 2), rel=1e-14)
 

@@ -219,11 +219,19 @@ def rod(mu: float, phi: float, **law: float) -> tuple[Bench, float, float]:
     links = (
         Link("cart", "x", None, "prismatic", vector(1, 0, 0), Inertia(0.0)),
         Link("lift", "z", "cart", "prismatic", vector(0, 0, 1), Inertia(0.0)),
-        Link("rod", "turn", "lift", "revolute", vector(0, 1, 0),
-             Inertia(mass, np.zeros(3), np.diag([mass * half**2 / 3, mass * half**2 / 3, 0.0]))),
+        Link(
+            "rod",
+            "turn",
+            "lift",
+            "revolute",
+            vector(0, 1, 0),
+            Inertia(mass, np.zeros(3), np.diag([mass * half**2 / 3, mass * half**2 / 3, 0.0])),
+        ),
     )
     robot = Robot("rod", links, (), ("rod", vector(0, 0, -half)), q0=np.array([0.0, half * np.cos(phi), phi]))
-    contact = Contact("foot", "rod", vector(0, 0, -half), plane(vector(0, 0, 1)), friction=mu, pulling_friction="signed", **law)
+    contact = Contact(
+        "foot", "rod", vector(0, 0, -half), plane(vector(0, 0, 1)), friction=mu, pulling_friction="signed", **law
+    )
     return bench(robot, [contact], real=True), mass, half
 
 

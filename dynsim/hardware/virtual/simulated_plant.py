@@ -178,8 +178,7 @@ def push(contact: Any, position: Array, gap: float, velocity: Array, mobility: A
     gap : below zero [m]
     mobility : J M⁻¹ Jᵀ of the point, (3, 3) [1/kg]
     """
-    normal = np.asarray(contact.surface.Q @ position + contact.surface.b)
-    normal = normal / np.linalg.norm(normal)
+    normal = np.asarray(contact.surface.normal(position))
     rate = float(normal @ velocity)
     along = float(normal @ mobility @ normal)
     damping = CONTACT_DAMPING / (1.0 + TICK * CONTACT_DAMPING * along)

@@ -9,30 +9,55 @@ Find f with u = W f + b (forces and accelerations, or impulses and velocities) s
 A CONE row is followed by its two TANGENT rows. Friction is not associated: u_n does not depend on μ |u_t|.
 
 The method is a semismooth Newton method on the natural map of Alart and Curnier (Computer Methods in Applied Mechanics
-and Engineering 92, 1991), from the caller's last forces; where that does not come closer, sweeps of block Gauss–Seidel
-with the exact solution of each block choose a new start. A proximal term keeps it regular when rows depend on each
-other; it vanishes at the solution.
+and Engineering 92, 1991), from the caller's last forces: a few steps where little has changed. Where it does not
+converge, sweeps of block Gauss–Seidel with the exact solution of each block, and scattered starts, take turns with it;
+then paths of problems whose blocks are less and less on their own. A proximal term keeps Newton's matrix regular when
+rows depend on each other; it has no part in the solution.
 """
 
 from __future__ import annotations
 
 import math
 
+from dynsim.kernels.constraint.cone_steps import (
+    ANCHOR,
+    BEST,
+    BOTH_WAYS,
+    CONE,
+    CONE_ROOM,
+    GOAL,
+    KEPT,
+    LAST,
+    MOBILITY,
+    NO_FRICTION,
+    ONE_WAY,
+    PROOF,
+    SHIFTED,
+    SHIFTED_RIGHT,
+    START,
+    SWEPT,
+    TANGENT,
+    block_size,
+    measure,
+    mobilities,
+    newton_step,
+    sweep,
+)
 from dynsim.kernels.jit import internal_kernel, kernel
 
-BOTH_WAYS, ONE_WAY, CONE, TANGENT = 0, 1, 2, 3
+__all__ = ["BOTH_WAYS", "CONE", "CONE_ROOM", "NO_SOLUTION", "ONE_WAY", "TANGENT", "approach", "solve_cones"]
+
 # What ``solve_cones`` returns instead of a residual when it has proved that there is no solution.
 NO_SOLUTION = -1.0
 
-# Blocks of the scratch: the Newton matrix, then vectors in first rows.
-MATRIX, MOTION, MOBILITY, STEP, BEST, RIGHT, ROWS_OF, FIRST, SECOND = 0, 1, 2, 3, 4, 5, 6, 7, 8
-CONE_ROOM = 9
-# Newton steps before sweeps take over, sweeps before Newton steps, and how often.
-NEWTON_STEPS, SWEEPS, ROUNDS = 12, 12, 40
-# Proximal term as a fraction of a row's own mobility: from a fraction of the relative residual down to what keeps
-# elimination far from rounding.
-LEAST_PROXIMAL, MOST_PROXIMAL = 1e-11, 1e-6
-ROOT_STEPS = 60
+# Newton's steps from one start; of these the first go all the way, the others only as far as they come nearer.
+NEWTON_STEPS, FULL_STEPS, HALVINGS = 20, 6, 8
+# Starts in all, sweeps that come before a start times its number, and where that number starts anew.
+ROUNDS, SWEEPS, SWEPT_ROUNDS = 200, 10, 40
+# Of paths: how many, steps of one, starts at each.
+PATHS, PATH_STEPS, PATH_ROUNDS = 40, 150, 8
+# A proof holds for all forces up to this times |b| / mobility; its problem is regularised by the second number.
+PROVED_FORCE, PROOF_SHIFT, PROOF_STEPS = 1e6, 1e-6, 4
 
 
 @kernel
@@ -53,316 +78,204 @@ def solve_cones(W, b, kind, mu, p, f, room, tolerance):
     room : (CONE_ROOM, p, p) or more, scratch
     tolerance : residual that is good enough [units of u]
     """
-    best = room[BEST, 0]
-    mobilities(W, kind, p, room)
-    residual = measure(W, b, kind, mu, p, f, room)
-    least = residual
-    for k in range(p):
-        best[k] = f[k]
-    for attempt in range(ROUNDS):
-        for _ in range(NEWTON_STEPS):
-            # Written so that NaN ends the Newton steps.
-            if not residual > tolerance:
-                break
-            newton_step(W, kind, mu, p, f, residual, b, room)
-            residual = measure(W, b, kind, mu, p, f, room)
-            if residual < least:
-                least = residual
-                for k in range(p):
-                    best[k] = f[k]
-        for k in range(p):
-            f[k] = best[k]
-        if least <= tolerance:
-            return least
-        for _ in range(SWEEPS * (1 + attempt)):
-            sweep(W, b, kind, mu, p, f, room)
-        residual = measure(W, b, kind, mu, p, f, room)
-        # A new start even where it is not nearer: Newton steps from the old one have been tried.
-        if residual < least or attempt > 0:
-            least = residual
-            for k in range(p):
-                best[k] = f[k]
-    return least
-
-
-@internal_kernel
-def mobilities(W, kind, p, room):
-    """Own mobility of each block into ``room[MOBILITY, 0]``: the mean of its diagonal entries."""
-    mobility = room[MOBILITY, 0]
-    largest = 0.0
-    for k in range(p):
-        largest = max(largest, abs(W[k, k]))
-    k = 0
-    while k < p:
-        size = 3 if kind[k] == CONE else 1
-        total = 0.0
-        for i in range(size):
-            total += abs(W[k + i, k + i])
-        # An immobile row has some mobility, so that what is divided by it stays finite.
-        total = max(total / size, 1e-14 * largest, 1e-300)
-        for i in range(size):
-            mobility[k + i] = total
-        k += size
-
-
-@internal_kernel
-def measure(W, b, kind, mu, p, f, room):
-    """u = W f + b into ``room[MOTION, 0]``; returns the residual."""
-    u, mobility = room[MOTION, 0], room[MOBILITY, 0]
-    for k in range(p):
-        total = b[k]
-        for m in range(p):
-            total += W[k, m] * f[m]
-        u[k] = total
-    residual, k = 0.0, 0
-    while k < p:
-        w = mobility[k]
-        if kind[k] == BOTH_WAYS:
-            error = abs(u[k])
-        else:
-            error = abs(min(w * f[k], u[k]))
-        # Written so that NaN stays.
-        residual = residual if error <= residual else error
-        if kind[k] == CONE:
-            x, y, radius = w * f[k + 1] - u[k + 1], w * f[k + 2] - u[k + 2], mu[k] * w * max(f[k], 0.0)
-            length = math.sqrt(x * x + y * y)
-            scale = radius / length if length > radius else 1.0
-            x, y = w * f[k + 1] - scale * x, w * f[k + 2] - scale * y
-            error = math.sqrt(x * x + y * y)
-            residual = residual if error <= residual else error
-            k += 3
-        else:
-            k += 1
+    residual = approach(W, b, kind, mu, p, f, room, tolerance, PATH_ROUNDS)
+    if residual <= tolerance:
+        return residual
+    if impossible(W, b, kind, mu, p, room):
+        return NO_SOLUTION
+    residual = approach(W, b, kind, mu, p, f, room, tolerance, ROUNDS)
+    if residual <= tolerance:
+        return residual
+    for attempt in range(PATHS):
+        residual = follow_path(W, b, kind, mu, p, f, room, tolerance, attempt)
+        if residual <= tolerance:
+            break
     return residual
 
 
 @internal_kernel
-def newton_step(W, kind, mu, p, f, residual, b, room):
-    """One step of f by Newton's method, u of f in ``room[MOTION, 0]``.
+def approach(W, b, kind, mu, p, f, room, tolerance, rounds):
+    """:func:`solve_cones` by Newton's method from so many starts: the first is f, then swept and scattered ones."""
+    best, swept, mobility = room[BEST, 0], room[SWEPT, 0], room[MOBILITY, 0]
+    mobilities(W, kind, p, room)
+    residual, merit = measure(W, b, kind, mu, p, f, room)
+    least, scale = residual, 0.0
+    for k in range(p):
+        best[k], swept[k] = f[k], f[k]
+        scale = max(scale, abs(b[k]))
+    for attempt in range(rounds):
+        scattered = attempt % 2 == 1 or attempt > SWEPT_ROUNDS
+        if attempt > 0:
+            if scattered:
+                largest = 0.0
+                for k in range(p):
+                    largest = max(largest, abs(best[k]) * mobility[k])
+                scatter(mobility, p, f, largest, attempt)
+            else:
+                for k in range(p):
+                    f[k] = swept[k]
+            for _ in range(SWEEPS * (attempt if attempt <= SWEPT_ROUNDS else attempt % SWEEPS)):
+                sweep(W, b, kind, mu, p, f, room)
+            if not scattered:
+                for k in range(p):
+                    swept[k] = f[k]
+            residual, merit = measure(W, b, kind, mu, p, f, room)
+        # What is too weak for some problems is too strong for others.
+        most = 1e-6 if attempt % 6 < 2 else 1e-3 if attempt % 6 < 4 else 1e-9
+        for step in range(NEWTON_STEPS + 1):
+            # Written so that NaN is never the best.
+            if residual < least:
+                least = residual
+                for k in range(p):
+                    best[k] = f[k]
+            if not residual > tolerance or step == NEWTON_STEPS:
+                break
+            relative = residual / scale if scale > 0.0 else 1.0
+            residual, merit = damped_step(W, b, kind, mu, p, f, room, relative, most, merit, step >= FULL_STEPS)
+        if least <= tolerance:
+            break
+    for k in range(p):
+        f[k] = best[k]
+    return least
 
-    Blocks that are off (z_n = w f_n − u_n ≤ 0) get f = 0 and have no unknown. The others have u_n' = 0, and with
-    z_t = w f_t − u_t inside the disc of radius μ z_n u_t' = 0. Outside, along d = z_t / |z_t| and e across it,
 
-        d·f_t' = μ f_n',    (1 − β) w e·f_t' + β e·u_t' = 0,    β = μ z_n / |z_t|,
+@internal_kernel
+def damped_step(W, b, kind, mu, p, f, room, relative, most, before, damped):
+    """One Newton step, which if ``damped`` is halved until the merit falls; returns residual and merit there."""
+    start, goal = room[START, 0], room[GOAL, 0]
+    for k in range(p):
+        start[k] = f[k]
+    newton_step(W, b, kind, mu, p, f, room, relative, most)
+    residual, merit = measure(W, b, kind, mu, p, f, room)
+    if not damped or merit < before:
+        return residual, merit
+    for k in range(p):
+        goal[k] = f[k]
+    t, at, least = 1.0, 1.0, merit
+    for _ in range(HALVINGS):
+        t *= 0.5
+        for k in range(p):
+            f[k] = start[k] + t * (goal[k] - start[k])
+        residual, merit = measure(W, b, kind, mu, p, f, room)
+        if merit < least:
+            least, at = merit, t
+        if merit < (1.0 - 0.5 * t) * before:
+            break
+    if at != t:
+        for k in range(p):
+            f[k] = start[k] + at * (goal[k] - start[k])
+        residual, merit = measure(W, b, kind, mu, p, f, room)
+    return residual, merit
 
-    so that such a block has the unknowns f_n and e·f_t. The rows n, e of the motion and the columns n + μ d, e of the
-    force make the matrix. To rows of u' = 0 a proximal term is added.
+
+@internal_kernel
+def scatter(mobility, p, f, size, attempt):
+    """A start of so large forces times mobility, without pattern, and the same in every run."""
+    for k in range(p):
+        f[k] = size / mobility[k] * math.sin(12.9898 * (k + 1) * attempt)
+
+
+@internal_kernel
+def shift(W, b, p, room, epsilon):
+    """W + ε w and b − ε w a of the anchor a into ``room[SHIFTED]``, ``room[SHIFTED_RIGHT, 0]``."""
+    shifted, right, mobility, anchor = room[SHIFTED], room[SHIFTED_RIGHT, 0], room[MOBILITY, 0], room[ANCHOR, 0]
+    for k in range(p):
+        for m in range(p):
+            shifted[k, m] = W[k, m]
+        shifted[k, k] += epsilon * mobility[k]
+        right[k] = b[k] - epsilon * mobility[k] * anchor[k]
+
+
+@internal_kernel
+def follow_path(W, b, kind, mu, p, f, room, tolerance, attempt):
+    """Follow the solution of (W + ε w) f + b − ε w a = 0, cones as before, from ε = 1 to none.
+
+    At first blocks hardly feel each other. Each ``attempt`` has its own anchor a, and so another path; steps of ε grow
+    while the solution can be followed and shrink where it cannot. Leaves f as it was when the end is no nearer.
     """
-    u, mobility, A, x = room[MOTION, 0], room[MOBILITY, 0], room[MATRIX], room[RIGHT, 0]
-    place, first, second = room[ROWS_OF, 0], room[FIRST, 0], room[SECOND, 0]
-    size = 0
+    shifted, right, mobility = room[SHIFTED], room[SHIFTED_RIGHT, 0], room[MOBILITY, 0]
+    kept, last, anchor = room[KEPT, 0], room[LAST, 0], room[ANCHOR, 0]
+    mobilities(W, kind, p, room)
+    least, _ = measure(W, b, kind, mu, p, f, room)
     scale = 0.0
     for k in range(p):
+        kept[k] = f[k]
         scale = max(scale, abs(b[k]))
-    proximal = min(max(1e-3 * residual / scale, LEAST_PROXIMAL), MOST_PROXIMAL) if scale > 0.0 else MOST_PROXIMAL
-    # place: 0 off, 1 u' = 0, 2 slides (at its normal row); first, second: direction of sliding; second of e: 1 − β.
-    k = 0
-    while k < p:
-        w = mobility[k]
-        if kind[k] == BOTH_WAYS or w * f[k] - u[k] > 0.0:
-            place[k] = 1.0
-            size += 1
-            if kind[k] == CONE:
-                normal = w * f[k] - u[k]
-                dx, dy = w * f[k + 1] - u[k + 1], w * f[k + 2] - u[k + 2]
-                length = math.sqrt(dx * dx + dy * dy)
-                if length <= mu[k] * normal:
-                    place[k + 1], place[k + 2] = 1.0, 1.0
-                    size += 2
-                else:
-                    place[k] = 2.0
-                    first[k], second[k] = dx / length, dy / length
-                    first[k + 1] = mu[k] * normal / length
-                    if first[k + 1] > 0.0:
-                        size += 1
+    scatter(mobility, p, anchor, attempt * scale, attempt)
+    for k in range(p):
+        if kind[k] == CONE or kind[k] == ONE_WAY:
+            anchor[k] = abs(anchor[k])
+        f[k], last[k] = anchor[k], anchor[k]
+    epsilon, factor = 1.0, 0.3
+    for _ in range(PATH_STEPS):
+        mobilities(W, kind, p, room)
+        shift(W, b, p, room, epsilon)
+        found = approach(shifted, right, kind, mu, p, f, room, max(tolerance, 1e-9 * scale), PATH_ROUNDS)
+        if found <= 1e-6 * scale:
+            for k in range(p):
+                last[k] = f[k]
+            if epsilon <= 1e-11:
+                break
+            factor = max(0.5 * factor, 0.01)
         else:
-            place[k] = 0.0
-            if kind[k] == CONE:
-                place[k + 1], place[k + 2] = 0.0, 0.0
-        k += 3 if kind[k] == CONE else 1
-    # Rows.
-    r, k = 0, 0
-    while k < p:
-        if place[k] == 0.0:
-            k += 3 if kind[k] == CONE else 1
-            continue
-        if place[k] == 1.0:
-            for i in range(3 if kind[k] == CONE else 1):
-                # u' = 0: W (f' − ...) in absolute forces: W f' = −b, the proximal term about f.
-                fill_row(W, kind, mu, p, k + i, k + i, 1.0, 0.0, place, first, second, A, r)
-                A[r, r] += proximal * mobility[k]
-                x[r] = -b[k + i] + proximal * mobility[k] * f[k + i]
-                r += 1
-        else:
-            fill_row(W, kind, mu, p, k, k, 1.0, 0.0, place, first, second, A, r)
-            A[r, r] += proximal * mobility[k]
-            x[r] = -b[k] + proximal * mobility[k] * f[k]
-            r += 1
-            beta = first[k + 1]
-            if beta > 0.0:
-                ex, ey = -second[k], first[k]
-                fill_row(W, kind, mu, p, k + 1, k + 2, ex, ey, place, first, second, A, r)
-                A[r, r] += (1.0 - beta) / beta * mobility[k] + proximal * mobility[k]
-                x[r] = -(ex * b[k + 1] + ey * b[k + 2]) + proximal * mobility[k] * (ex * f[k + 1] + ey * f[k + 2])
-                r += 1
-        k += 3 if kind[k] == CONE else 1
-    eliminate(A, x, size)
-    r, k = 0, 0
-    while k < p:
-        if place[k] == 0.0:
-            for i in range(3 if kind[k] == CONE else 1):
-                f[k + i] = 0.0
-        elif place[k] == 1.0:
-            for i in range(3 if kind[k] == CONE else 1):
-                f[k + i] = x[r]
-                r += 1
-        else:
-            f[k] = x[r]
-            across = 0.0
-            r += 1
-            if first[k + 1] > 0.0:
-                across = x[r]
-                r += 1
-            f[k + 1] = mu[k] * f[k] * first[k] - across * second[k]
-            f[k + 2] = mu[k] * f[k] * second[k] + across * first[k]
-        k += 3 if kind[k] == CONE else 1
+            for k in range(p):
+                f[k] = last[k]
+            epsilon /= factor
+            factor = math.sqrt(factor)
+            if factor > 0.98:
+                break
+        epsilon *= factor
+    residual = approach(W, b, kind, mu, p, f, room, tolerance, ROUNDS)
+    if not residual < least:
+        residual = least
+        for k in range(p):
+            f[k] = kept[k]
+    return residual
 
 
 @internal_kernel
-def fill_row(W, kind, mu, p, i, j, alpha, beta, place, first, second, A, r):
-    """Row r of the Newton matrix: that of the motion alpha u_i + beta u_j, over the unknowns."""
-    c, m = 0, 0
-    while m < p:
-        if place[m] == 1.0:
-            for s in range(3 if kind[m] == CONE else 1):
-                A[r, c] = alpha * W[i, m + s] + beta * W[j, m + s]
-                c += 1
-        elif place[m] == 2.0:
-            wn = alpha * W[i, m] + beta * W[j, m]
-            wx = alpha * W[i, m + 1] + beta * W[j, m + 1]
-            wy = alpha * W[i, m + 2] + beta * W[j, m + 2]
-            A[r, c] = wn + mu[m] * (first[m] * wx + second[m] * wy)
-            c += 1
-            if first[m + 1] > 0.0:
-                A[r, c] = first[m] * wy - second[m] * wx
-                c += 1
-        m += 3 if kind[m] == CONE else 1
+def impossible(W, b, kind, mu, p, room):
+    """True when it is proved that no forces up to PROVED_FORCE |b| / w solve the problem.
 
-
-@internal_kernel
-def eliminate(A, x, size):
-    """Solve the leading ``size`` rows of A y = x in place, with partial pivoting."""
-    for k in range(size):
-        best = k
-        for i in range(k + 1, size):
-            if abs(A[i, k]) > abs(A[best, k]):
-                best = i
-        if best != k:
-            x[k], x[best] = x[best], x[k]
-            for j in range(k, size):
-                A[k, j], A[best, j] = A[best, j], A[k, j]
-        if A[k, k] == 0.0:
-            A[k, k] = 1.0
-            x[k] = 0.0
-            for i in range(k + 1, size):
-                A[i, k] = 0.0
-            continue
-        inverse = 1.0 / A[k, k]
-        for i in range(k + 1, size):
-            factor = A[i, k] * inverse
-            if factor != 0.0:
-                for j in range(k + 1, size):
-                    A[i, j] -= factor * A[k, j]
-                x[i] -= factor * x[k]
-    for i in range(size - 1, -1, -1):
-        total = x[i]
-        for j in range(i + 1, size):
-            total -= A[i, j] * x[j]
-        x[i] = total / A[i, i]
-
-
-@internal_kernel
-def sweep(W, b, kind, mu, p, f, room):
-    """One sweep of block Gauss–Seidel: each block solved exactly with the others' forces as they are."""
-    mobility = room[MOBILITY, 0]
-    k = 0
-    while k < p:
-        if kind[k] == CONE:
-            n, x, y = b[k], b[k + 1], b[k + 2]
-            for m in range(p):
-                n += W[k, m] * f[m]
-                x += W[k + 1, m] * f[m]
-                y += W[k + 2, m] * f[m]
-            n -= W[k, k] * f[k] + W[k, k + 1] * f[k + 1] + W[k, k + 2] * f[k + 2]
-            x -= W[k + 1, k] * f[k] + W[k + 1, k + 1] * f[k + 1] + W[k + 1, k + 2] * f[k + 2]
-            y -= W[k + 2, k] * f[k] + W[k + 2, k + 1] * f[k + 1] + W[k + 2, k + 2] * f[k + 2]
-            solve_block(W, k, n, x, y, mu[k], f, 1e-12 * mobility[k])
-            k += 3
-            continue
-        total = b[k]
-        for m in range(p):
-            total += W[k, m] * f[m]
-        new = f[k] - total / max(W[k, k], 1e-12 * mobility[k]) if W[k, k] > 0.0 else 0.0
-        f[k] = new if kind[k] == BOTH_WAYS else max(new, 0.0)
-        k += 1
-
-
-@internal_kernel
-def solve_block(W, k, n, x, y, mu, f, least):
-    """Forces of the block at row k alone, whose motion without them is (n, x, y).
-
-    Off when n ≥ 0. Else u_n = 0 makes f_n = −(n + w·f_t) / W_nn, and what is left is (S + α) f_t = g with the Schur
-    complement S of W_nn, g = w n / W_nn − (x, y). It sticks when α = 0 lies in the cone; else α is the root of
-    |f_t| − μ f_n, which is positive at 0 and negative far out.
+    The proof is a combination d of motions, of any sign for BOTH_WAYS rows, not negative for ONE_WAY rows and normals,
+    zero for tangents. A solution has d·u ≥ 0; but d·u = (Wᵀd)·f + d·b, which is negative when d·b is, and no force that
+    is allowed makes (Wᵀd)·f positive: bodies that close in on each other from all sides. Such a d is what is left of
+    motion, −ε w f, when the problem without friction is solved with ε w added to W.
     """
-    f[k], f[k + 1], f[k + 2] = 0.0, 0.0, 0.0
-    normal = W[k, k]
-    if n >= 0.0 or not normal > least:
-        return
-    if mu == 0.0:
-        f[k] = -n / normal
-        return
-    wx, wy = W[k, k + 1] / normal, W[k, k + 2] / normal
-    a = W[k + 1, k + 1] - wx * W[k + 1, k] + least
-    c = W[k + 1, k + 2] - wx * W[k + 2, k]
-    d = W[k + 2, k + 2] - wy * W[k + 2, k] + least
-    gx, gy = wx * n - x, wy * n - y
-    fn, fx, fy, excess = slid(a, c, d, gx, gy, wx, wy, n / normal, mu, 0.0)
-    if excess > 0.0:
-        low, high, at_low = 0.0, a + d, excess
-        at_high = at_low
-        for _ in range(200):
-            fn, fx, fy, at_high = slid(a, c, d, gx, gy, wx, wy, n / normal, mu, high)
-            if at_high <= 0.0:
-                break
-            low, at_low = high, at_high
-            high *= 4.0
-        side = 0
-        for _ in range(ROOT_STEPS):
-            if at_high == 0.0 or high - low <= 1e-15 * high:
-                break
-            middle = low + (high - low) * at_low / (at_low - at_high)
-            if not (middle > low and middle < high):
-                middle = 0.5 * (low + high)
-            fn, fx, fy, excess = slid(a, c, d, gx, gy, wx, wy, n / normal, mu, middle)
-            if abs(excess) <= 1e-15 * mu * abs(fn):
-                break
-            if excess > 0.0:
-                low, at_low = middle, excess
-                at_high = 0.5 * at_high if side == 1 else at_high
-                side = 1
-            else:
-                high, at_high = middle, excess
-                at_low = 0.5 * at_low if side == -1 else at_low
-                side = -1
-    f[k], f[k + 1], f[k + 2] = fn, fx, fy
-
-
-@internal_kernel
-def slid(a, c, d, gx, gy, wx, wy, n, mu, alpha):
-    """(f_n, f_t, |f_t| − μ f_n) of ((a, c), (c, d)) + α."""
-    determinant = (a + alpha) * (d + alpha) - c * c
-    fx = ((d + alpha) * gx - c * gy) / determinant
-    fy = ((a + alpha) * gy - c * gx) / determinant
-    fn = -(n + wx * fx + wy * fy)
-    return fn, fx, fy, math.sqrt(fx * fx + fy * fy) - mu * fn
+    proof, none, scale = room[PROOF, 0], room[NO_FRICTION, 0], 0.0
+    right, mobility = room[SHIFTED_RIGHT, 0], room[MOBILITY, 0]
+    for k in range(p):
+        proof[k], none[k], room[ANCHOR, 0, k], scale = 0.0, 0.0, 0.0, max(scale, abs(b[k]))
+    mobilities(W, kind, p, room)
+    shift(W, b, p, room, PROOF_SHIFT)
+    # What is left of what is left: each time a millionth of what forces can move.
+    for _ in range(PROOF_STEPS):
+        approach(room[SHIFTED], right, kind, none, p, proof, room, 1e-9 * scale, PATH_ROUNDS)
+        mobilities(W, kind, p, room)
+        for k in range(p):
+            proof[k] = 0.0 if kind[k] == TANGENT else PROOF_SHIFT * mobility[k] * proof[k]
+            if kind[k] != BOTH_WAYS:
+                proof[k] = max(proof[k], 0.0)
+            right[k] = -proof[k]
+            room[LAST, 0, k] = proof[k]
+            proof[k] /= PROOF_SHIFT * mobility[k]
+    total = 0.0
+    for k in range(p):
+        proof[k] = room[LAST, 0, k]
+        total += proof[k] * b[k]
+    k = 0
+    while k < p:
+        power = 0.0
+        for m in range(p):
+            power += proof[m] * W[m, k]
+        if kind[k] == BOTH_WAYS:
+            power = abs(power)
+        elif kind[k] == CONE:
+            x, y = 0.0, 0.0
+            for m in range(p):
+                x += proof[m] * W[m, k + 1]
+                y += proof[m] * W[m, k + 2]
+            power += mu[k] * math.sqrt(x * x + y * y)
+        total += max(power, 0.0) * PROVED_FORCE * scale / mobility[k]
+        k += block_size(kind, k)
+    return total < 0.0

@@ -21,7 +21,7 @@ from dynsim.kernels.jit import integers, internal_kernel, kernel, reals
 
 ITERATIONS = 60
 # Of what must vanish, in units of a program whose numbers are near 1: the rounding of some dozen operations.
-TOLERANCE = 1e-14
+TOLERANCE = 1e-13
 # Products s · z of a cone that nothing is left of in double precision.
 GAP_MIN = 1e-16
 # Below CLOSE so many steps that do not halve what is left end the iteration.
@@ -32,8 +32,9 @@ REGULAR = 1e-13
 PIVOT_MIN = 1e-14
 # Pivots of equations below this part of what they are the difference of are dependent; and what they are replaced by.
 RANK_TOLERANCE, HUGE = 1e-10, 1e100
-# Part of the way to the boundary of the cones that a step takes.
-INSIDE = 0.99
+# Part of the way to the boundary of the cones that a step leaves. With a hundredth of it steps end beside the central
+# path, on the edge of a cone, and the next ones creep along it.
+ASIDE = 2e-2
 
 
 class ConeProgram(NamedTuple):
@@ -103,7 +104,7 @@ def solve_cone_program(program: ConeProgram, n, m, cones):
         gap = 0.0
         for i in range(rows):
             gap += s[i] * z[i]
-        gap /= cones
+        gap = gap / cones if cones > 0 else 1.0
         # Close to the boundary of the cones rounding ends the progress, or NaN.
         since += 1
         if error < least:
@@ -127,7 +128,7 @@ def solve_cone_program(program: ConeProgram, n, m, cones):
             jordan(work, SCALED_DS, SCALED_DZ, TARGET, first[c], first[c + 1], -1.0, 1.0)
             work[TARGET, first[c]] += centring * gap
         newton_step(program, n, m, cones)
-        reach = min(1.0, INSIDE * longest_step(program, cones))
+        reach = min(1.0, (1.0 - ASIDE) * longest_step(program, cones))
         if not reach > 1e-9:
             break
         for k in range(n):
@@ -245,8 +246,9 @@ def unscale(program: ConeProgram, c, u):
 
 @internal_kernel
 def factor_kkt(program: ConeProgram, n, m, rows, cones):
-    """L D Lᵀ of [H + Gᵀ W⁻² G, Aᵀ; A, 0], kept regular; D on the diagonal, L below it.
+    """L D Lᵀ of [H + Gᵀ W⁻² G + Aᵀ A, Aᵀ; A, 0], kept regular; D on the diagonal, L below it.
 
+    Aᵀ A, which the right-hand side makes up for, gives pivots to what only the equations determine.
     An equation that depends on those before it gets a pivot that stops its multiplier.
     """
     kkt, scaled = program.kkt, program.scaled
@@ -268,6 +270,8 @@ def factor_kkt(program: ConeProgram, n, m, rows, cones):
     for e in range(m):
         for k in range(n):
             kkt[n + e, k] = program.A[e, k]
+            for j in range(k + 1):
+                kkt[k, j] += program.A[e, k] * program.A[e, j]
         for j in range(e + 1):
             kkt[n + e, n + j] = 0.0
     for k in range(n + m):
@@ -314,6 +318,8 @@ def newton_step(program: ConeProgram, n, m, cones):
         for k in range(n):
             left += program.A[e, k] * x[k]
         step[n + e] = -left
+        for k in range(n):
+            step[k] -= program.A[e, k] * left
     size = n + m
     for k in range(size):
         for j in range(k):

@@ -159,9 +159,16 @@ def new_row(ws: Workspace, r, kind, owner, link):
 def drop_anchor(ws: Workspace, k):
     """Hold candidate k at the foot of its present position on the surface, along n and two tangents there."""
     state = ws.contacts
-    x, y, z = state[k, NORMAL], state[k, NORMAL + 1], state[k, NORMAL + 2]
     for s in range(3):
         state[k, ANCHOR + s] = state[k, POSITION + s] - state[k, GAP] * state[k, NORMAL + s]
+    tangents(ws, k)
+
+
+@internal_kernel
+def tangents(ws: Workspace, k):
+    """Two directions along the surface at the present normal of candidate k, for the rows of a point that sticks."""
+    state = ws.contacts
+    x, y, z = state[k, NORMAL], state[k, NORMAL + 1], state[k, NORMAL + 2]
     # n × the axis that is furthest from n.
     ax, ay, az = abs(x), abs(y), abs(z)
     if ax <= ay and ax <= az:

@@ -21,7 +21,7 @@ from dynsim.kernels.constraint.unilateral import (
     STOP_ROW,
     UnilateralArrays,
 )
-from dynsim.kernels.jit import apart_kernel, internal_kernel
+from dynsim.kernels.jit import apart_kernel, inlined_kernel, internal_kernel
 
 # A pivot below this fraction of the largest is a row that depends on the others.
 NULL_TOLERANCE = 1e-10
@@ -35,7 +35,7 @@ def margin(unilateral: UnilateralArrays, ws: Workspace, k):
     return unilateral.law[k, STATIC] * rows[r, FORCE] - math.sqrt(a * a + b * b)
 
 
-@internal_kernel
+@inlined_kernel
 def admissible_forces(unilateral: UnilateralArrays | None, ws: Workspace):
     """Replace the forces of dependent rows that stick where they do not lie in their cones; note those of stops.
 
@@ -43,6 +43,14 @@ def admissible_forces(unilateral: UnilateralArrays | None, ws: Workspace):
     """
     if unilateral is None:  # known to the compiler
         return
+    # Small, because it is merged into the right-hand side.
+    if unilateral.number[REDUNDANT] == 1.0 or unilateral.stop.shape[0] > 0:
+        look_at_forces(unilateral, ws)
+
+
+@apart_kernel
+def look_at_forces(unilateral: UnilateralArrays, ws: Workspace):
+    """:func:`admissible_forces` where there are dependent rows or stops."""
     table, stop = unilateral.stop_table, unilateral.stop
     for k in range(table.shape[0]):
         if table[k, STOP_CLOSED] == 1:

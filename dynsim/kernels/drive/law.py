@@ -91,6 +91,20 @@ def command(drives: DriveArrays, ws: Workspace, a):
 
 
 @inlined_kernel
+def fed_forward(voltage, grid, t, a, asked):
+    """The command of a drive with its planned voltage, where there are any."""
+    if voltage is None:  # known to the compiler
+        return asked
+    x = t - grid[0]
+    k = min(max(int(x / grid[1]), 0), voltage.shape[0] - 1)
+    x -= k * grid[1]
+    total = 0.0
+    for power in range(5, -1, -1):
+        total = total * x + voltage[k, a, power]
+    return asked + total
+
+
+@inlined_kernel
 def drive_dc(drives: DriveArrays, asked, i, ws: Workspace, a):
     """The DC motor a at a command [V] and a current [A]."""
     motors, motor, j = ws.motors, drives.motor, drives.table[a, DRIVEN]
@@ -113,6 +127,7 @@ def drive(drives: DriveArrays, reference: ReferenceArrays, t, y, layout: StateLa
         for a in range(na):
             j = table[a, DRIVEN]
             asked = dc_command(motor, a, motors[a, Q_REF], motors[a, V_REF], joints[j, Q], joints[j, QD])
+            asked = fed_forward(reference.voltage, reference.grid, t, a, asked)
             drive_dc(drives, asked, y[layout.current + a], ws, a)
         return
     for a in range(na):
@@ -120,6 +135,7 @@ def drive(drives: DriveArrays, reference: ReferenceArrays, t, y, layout: StateLa
         v = joints[j, QD]
         asked = drives.input[a, COMMAND] if table[a, SAMPLED] else command(drives, ws, a)
         if kind == DC_MOTOR:
+            asked = fed_forward(reference.voltage, reference.grid, t, a, asked)
             drive_dc(drives, asked, y[layout.current + table[a, CIRCUIT]], ws, a)
         elif kind == POSITION_SERVO:
             mode = drives.table[a, SERVO_MODE]
@@ -137,7 +153,8 @@ def take_commands(drives: DriveArrays, reference: ReferenceArrays, t, ws: Worksp
     evaluate_reference(drives, reference, t, ws)
     for a in range(ws.motors.shape[0]):
         if drives.table[a, SAMPLED] == AT_TICKS:
-            drives.input[a, COMMAND] = command(drives, ws, a)
+            asked = command(drives, ws, a)
+            drives.input[a, COMMAND] = fed_forward(reference.voltage, reference.grid, t, a, asked)
 
 
 @internal_kernel

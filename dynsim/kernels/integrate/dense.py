@@ -5,7 +5,7 @@ from __future__ import annotations
 from dynsim.kernels.arrays import Workspace
 from dynsim.kernels.integrate.output import write_output
 from dynsim.kernels.integrate.project import settle
-from dynsim.kernels.integrate.run import DOPRI5, END, RODAS4, SAMPLE, STEP, TIME, Run
+from dynsim.kernels.integrate.run import DOPRI5, END, RODAS4, SAMPLE, STEP, TIME, TIME_STEPPING, Run
 from dynsim.kernels.integrate.tableaux import D_RODAS
 from dynsim.kernels.jit import internal_kernel, kernel, merged_kernel
 from dynsim.kernels.system import System
@@ -19,7 +19,9 @@ def fill_dense(run: Run):
     for j in range(y.shape[0]):
         d[0, j] = y_new[j] - y[j]
         d[3, j] = 0.0
-        if run.method == RODAS4:
+        if run.method == TIME_STEPPING:
+            d[1, j], d[2, j] = 0.0, 0.0
+        elif run.method == RODAS4:
             d[1, j], d[2, j] = 0.0, 0.0
             for s in range(5):
                 d[1, j] += D_RODAS[0, s] * k[1 + s, j]
@@ -69,7 +71,7 @@ def sample_step(system: System, ws: Workspace, run: Run):
         for j in range(row.shape[0]):
             row[j] = run.y[j] + x * (d[0, j] + z * (d[1, j] + x * (d[2, j] + z * d[3, j])))
         if system.layout.extra > 0:
-            normalise(system.model, row, system.layout.q)
+            normalise(system.model.compound, system.model, row, system.layout.q)
         settle(system, run.sample_time[last], row, ws, run.stage[7], run)
         write_output(system, ws, run, last)
         last += 1

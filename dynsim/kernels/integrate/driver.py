@@ -9,7 +9,8 @@ Methods, all with dense output (so that records do not force steps):
   Solving Ordinary Differential Equations I, II.5–II.6). Better where accuracy sets the step;
 - ``RK4``: the classical method at a fixed step; cubic Hermite dense output;
 - ``RODAS4``: a linearly implicit (Rosenbrock) method of order 4(3), stiffly accurate, which keeps its order when the
-  inductance goes to zero (Hairer, Wanner: Solving Ordinary Differential Equations II, IV.7 and VI.4); adaptive.
+  inductance goes to zero (Hairer, Wanner: Solving Ordinary Differential Equations II, IV.7 and VI.4); adaptive;
+- ``TIME_STEPPING``: contacts that open and close within fixed steps, see ``time_stepping``; linear between their ends.
 
 After each accepted step q and v are projected onto the active rows when they have left them by more than
 ``GAP_TOLERANCE`` or ``RATE_TOLERANCE``.
@@ -31,6 +32,7 @@ from dynsim.kernels.integrate.contact_events import (
 from dynsim.kernels.integrate.dense import sample_step
 from dynsim.kernels.integrate.events import arm_events, cut_step, fire_events, take_ticks
 from dynsim.kernels.integrate.explicit import step_explicit
+from dynsim.kernels.integrate.moreau import advance_moreau
 from dynsim.kernels.integrate.project import off_surface, settle
 from dynsim.kernels.integrate.rosenbrock import step_rodas4
 from dynsim.kernels.integrate.run import (
@@ -57,6 +59,7 @@ from dynsim.kernels.integrate.run import (
     TAKE_COMMANDS,
     TICKED,
     TIME,
+    TIME_STEPPING,
     TRIMMED,
     Run,
 )
@@ -111,10 +114,10 @@ def accept(system: System, ws: Workspace, run: Run):
     watch(ws, run, h)
     watch_modes(system.unilateral, ws, h)
     # The event of tipping has asked for the ground's reaction at the end of this step.
-    if run.support.index.shape[0] > 0 and run.event.shape[0] > 0:
+    if run.event.shape[0] > 0:
         watch_support(run.support)
     if system.layout.extra > 0:
-        normalise(system.model, run.y_new, system.layout.q)
+        normalise(system.model.compound, system.model, run.y_new, system.layout.q)
     sample_step(system, ws, run)
     take_directions(system.unilateral, ws, run)
     for j in range(run.y.shape[0]):
@@ -246,6 +249,7 @@ def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:
     Returns before that when an event or a tick wants the caller to look (LOGGED, TICKED), and when the next step would
     end beyond HOLD: it is kept, PENDING, and accepted by the next call unless the caller drops it.
 
-    Two compiled functions behind one name, so that the linearly implicit method is only compiled when it is used.
+    Three compiled functions behind one name, so that each is only compiled when it is used.
     """
-    (advance_rodas4 if run.method == RODAS4 else advance_explicit)(system, ws, run, limit)
+    methods = {RODAS4: advance_rodas4, TIME_STEPPING: advance_moreau}
+    methods.get(run.method, advance_explicit)(system, ws, run, limit)

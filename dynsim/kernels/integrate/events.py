@@ -47,7 +47,7 @@ from dynsim.kernels.integrate.run import (
 from dynsim.kernels.jit import inlined_kernel, internal_kernel
 from dynsim.kernels.system import System
 from dynsim.kernels.tree.points import point_position
-from dynsim.kernels.tree.support import MARGIN, ground_reaction
+from dynsim.kernels.tree.support import tip_margin
 
 # Kinds of guards. A new one is a number here, a branch in ``guard`` and a name in GUARDS of dynsim.engine.stepped.
 # Those of the unilateral law, from NORMAL_GUARD on, are in dynsim.kernels.integrate.contact_events.
@@ -76,8 +76,7 @@ def guard(system: System, t, ws: Workspace, run: Run, e):
     elif kind == CONTACT_GAP:
         value = ws.contacts[k, GAP]
     elif kind == TIP_MARGIN:
-        ground_reaction(system.model, system.loads, t, ws, run.support)
-        value = run.support.state[MARGIN]
+        value = tip_margin(system.model, system.loads, t, ws, run.support)
     elif kind >= NORMAL_GUARD:
         value = contact_guard(system.unilateral, ws, kind, k)
     else:

@@ -27,7 +27,7 @@ from dynsim.kernels.ledger import kinetic_energy, magnetic_energy, potential_ene
 from dynsim.kernels.state import OUT_FORCE, OUT_GAP, OUT_MODE, OUT_SLIP, OUT_VECTOR, OUTPUTS_PER_CONTACT
 from dynsim.kernels.system import System
 from dynsim.kernels.tree.points import point_position
-from dynsim.kernels.tree.support import OUTPUTS, ground_reaction
+from dynsim.kernels.tree.support import OUTPUTS, SupportArrays, ground_reaction
 
 
 @internal_kernel
@@ -61,10 +61,7 @@ def write_output(system: System, ws: Workspace, run: Run, row):
             out[row, k + OUT_VECTOR + s] = state[c, FORCE_VECTOR + s]
             out[row, k + OUT_SLIP + s] = state[c, SLIP_VELOCITY + s]
         k += OUTPUTS_PER_CONTACT
-    if run.support.index.shape[0] > 0:
-        ground_reaction(system.model, system.loads, run.sample_time[row], ws, run.support)
-        for s in range(OUTPUTS):
-            out[row, columns.support + s] = run.support.state[s]
+    write_support(system, ws, run, row, run.support)
     stop_forces(system.unilateral, out[row, columns.stop :])
 
 
@@ -75,3 +72,13 @@ def stop_forces(unilateral: UnilateralArrays | None, out):
         return
     for k in range(unilateral.stop.shape[0]):
         out[k] = unilateral.stop[k, STOP_FORCE]
+
+
+@internal_kernel
+def write_support(system: System, ws: Workspace, run: Run, row, support: SupportArrays | None):
+    """What the ground carries of a mobile base, into the columns ``support``."""
+    if support is None:  # known to the compiler
+        return
+    ground_reaction(system.model, system.loads, run.sample_time[row], ws, support)
+    for s in range(OUTPUTS):
+        run.output[row, run.columns.support + s] = support.state[s]

@@ -8,12 +8,15 @@ import numpy as np
 
 from dynsim.kernels.arrays import BLOCK_SIZE, row_limit
 from dynsim.kernels.constraint.uniqueness import ROOM
+from dynsim.kernels.integrate.time_stepping import SteppingArrays
 from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.state import OUTPUTS_PER_CONTACT, OutputLayout, StateLayout, block
 from dynsim.kernels.tree.support import SupportArrays
 
-DOPRI5, RK4, RODAS4, RK43 = 0, 1, 2, 3
-METHODS = {"rk43": RK43, "dopri5": DOPRI5, "rk4": RK4, "rodas4": RODAS4}
+DOPRI5, RK4, RODAS4, RK43, TIME_STEPPING = 0, 1, 2, 3, 4
+METHODS = {"rk43": RK43, "dopri5": DOPRI5, "rk4": RK4, "rodas4": RODAS4, "time_stepping": TIME_STEPPING}
+# Methods of one step length.
+FIXED_STEP = (RK4, TIME_STEPPING)
 
 RUNNING, FINISHED, NOT_FINITE, STEP_TOO_SMALL, NOT_PROJECTED, NO_FORCES = 0, 1, 2, 3, 4, 5
 FORCES_REVERSED, SEVERAL_FORCES, STOPPED = 6, 7, 8
@@ -89,9 +92,10 @@ class Run(NamedTuple):
     log_event: np.ndarray  # (LOG_LENGTH,) int: which
     hand: np.ndarray  # (3,) room
     gaps: np.ndarray  # (c, 2) gaps and their rates at the start of the step
-    support: SupportArrays
+    support: SupportArrays | None
     columns: OutputLayout
     output: np.ndarray  # (T, columns.size)
+    stepping: SteppingArrays | None  # of time stepping alone
 
     def states(self, name: str) -> np.ndarray:
         """A block of the sampled states by its name, see :func:`dynsim.kernels.state.block`."""
@@ -126,6 +130,7 @@ def new_run(
     ticks: tuple[np.ndarray, np.ndarray] | None = None,
     breaks: np.ndarray | None = None,
     support: SupportArrays | None = None,
+    stepping: SteppingArrays | None = None,
 ) -> Run:
     """Allocate a :class:`Run` from t = 0 at state y, (layout.size,)."""
     m, p, rodas = len(y), row_limit(c, couplings), method == RODAS4
@@ -166,7 +171,8 @@ def new_run(
         log_event=np.zeros(LOG_LENGTH, dtype=np.int64),
         hand=np.zeros(3),
         gaps=np.zeros((c, 2)),
-        support=support or SupportArrays(integers([]), reals([]), reals([]), reals([])),
+        support=support,
         columns=columns,
         output=np.zeros((len(sample_time), columns.size)),
+        stepping=stepping,
     )

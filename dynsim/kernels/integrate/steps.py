@@ -9,6 +9,7 @@ from dynsim.kernels.integrate.events import next_tick
 from dynsim.kernels.integrate.run import (
     ATOL,
     END,
+    FIXED_STEP,
     LAST_ERROR,
     NO_FORCES,
     NOT_FINITE,
@@ -35,7 +36,8 @@ def error_norm(system: System, ws: Workspace, run: Run, error):
     y, y_new, atol, rtol, layout = run.y, run.y_new, run.clock[ATOL], run.clock[RTOL], system.layout
     total = 0.0
     if layout.extra > 0:
-        total, size = position_error(system.model, y, y_new, error, layout.q, rtol, atol)
+        model = system.model
+        total, size = position_error(model.compound, model, y, y_new, error, layout.q, rtol, atol)
         beyond = layout.q + ws.joints.shape[0] + layout.extra
         for j in range(layout.tracked):
             if j < layout.q or j >= beyond:
@@ -84,7 +86,7 @@ def choose_step(run: Run):
     until = next_tick(run, clock[END])
     remaining = until - clock[TIME]
     run.count[TRIMMED] = 1 if until < clock[END] and remaining < 2.0 * clock[STEP] else 0
-    if run.method == RK4:
+    if run.method in FIXED_STEP:
         if remaining < clock[STEP] * (1.0 + 1e-9):
             clock[STEP] = remaining
     elif remaining <= clock[STEP] * 1.0000001:

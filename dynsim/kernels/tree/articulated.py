@@ -14,16 +14,20 @@ from dynsim.kernels.arrays import (
     BODY_B,
     BRANCHES,
     DIRECTION,
+    FIRST_ROW,
     FORCE,
     IA,
     INVERSE_D,
     JOINT_ROW,
+    OWNER,
     PARENT,
     QDD,
     RHS,
     ROW,
     ROW_KIND,
     ROWS,
+    SLIDING_ROW,
+    STICKING_ROW,
     TARGET,
     U_OVER_D,
     F,
@@ -129,9 +133,14 @@ def row_system(model: ModelArrays, ws: Workspace):
     """
     tree, links, column, small, state = model.tree, ws.links, ws.column, ws.small, ws.rows
     for k in range(ws.counts[ROWS]):
-        if ws.active[k, BODY_B] >= 0:
-            two_ended_row(model, ws, k)
-            continue
+        if ws.active[k, ROW_KIND] != SLIDING_ROW:
+            if ws.active[k, BODY_B] >= 0:
+                two_ended_row(model, ws, k)
+                continue
+            if ws.active[k, ROW_KIND] == STICKING_ROW:
+                if k == ws.active[ws.active[k, OWNER], FIRST_ROW]:
+                    sticking_columns(model, ws, k)
+                continue
         r0, r1, r2 = state[k, ROW], state[k, ROW + 1], state[k, ROW + 2]
         r3, r4, r5 = state[k, ROW + 3], state[k, ROW + 4], state[k, ROW + 5]
         w0, w1, w2 = state[k, DIRECTION], state[k, DIRECTION + 1], state[k, DIRECTION + 2]
@@ -162,6 +171,70 @@ def row_system(model: ModelArrays, ws: Workspace):
             i = tree[i, PARENT]
         small[0, k, k] = own
         state[k, RHS] = total
+
+
+@apart_kernel
+def sticking_columns(model: ModelArrays, ws: Workspace, k):
+    """:func:`row_system` for the three rows of a point that sticks, k and the next two: their own directions.
+
+    One walk for all of them. What they have in common with the rows before is the same on both sides of the diagonal
+    unless the other one slides.
+    """
+    tree, links, column, small, state = model.tree, ws.links, ws.column, ws.small[0], ws.rows
+    a0, a1, a2, a3, a4, a5 = (
+        state[k, ROW], state[k, ROW + 1], state[k, ROW + 2], state[k, ROW + 3], state[k, ROW + 4], state[k, ROW + 5]
+    )  # fmt: skip
+    b, c = k + 1, k + 2
+    b0, b1, b2, b3, b4, b5 = (
+        state[b, ROW], state[b, ROW + 1], state[b, ROW + 2], state[b, ROW + 3], state[b, ROW + 4], state[b, ROW + 5]
+    )  # fmt: skip
+    c0, c1, c2, c3, c4, c5 = (
+        state[c, ROW], state[c, ROW + 1], state[c, ROW + 2], state[c, ROW + 3], state[c, ROW + 4], state[c, ROW + 5]
+    )  # fmt: skip
+    for r in range(3):
+        for m in range(k):
+            small[k + r, m] = 0.0
+            small[m, k + r] = 0.0
+    aa, ab, ac, bb, bc, cc = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    ta, tb, tc = state[k, TARGET], state[b, TARGET], state[c, TARGET]
+    i = ws.active[k, BODY_A]
+    while i >= 0:
+        s0, s1, s2 = links[i, S], links[i, S + 1], links[i, S + 2]
+        s3, s4, s5 = links[i, S + 3], links[i, S + 4], links[i, S + 5]
+        x = ((s0 * a0 + s1 * a1) + (s2 * a2 + s3 * a3)) + (s4 * a4 + s5 * a5)
+        y = ((s0 * b0 + s1 * b1) + (s2 * b2 + s3 * b3)) + (s4 * b4 + s5 * b5)
+        z = ((s0 * c0 + s1 * c1) + (s2 * c2 + s3 * c3)) + (s4 * c4 + s5 * c5)
+        column[i, 1 + 2 * k], column[i, 2 + 2 * k] = x, x
+        column[i, 1 + 2 * b], column[i, 2 + 2 * b] = y, y
+        column[i, 1 + 2 * c], column[i, 2 + 2 * c] = z, z
+        d = links[i, INVERSE_D]
+        dx, dy, dz = d * x, d * y, d * z
+        aa, ab, ac, bb, bc, cc = aa + dx * x, ab + dx * y, ac + dx * z, bb + dy * y, bc + dy * z, cc + dz * z
+        applied = column[i, 0]
+        ta, tb, tc = ta - dx * applied, tb - dy * applied, tc - dz * applied
+        for m in range(k):
+            w = column[i, 2 + 2 * m]
+            small[k, m] += dx * w
+            small[b, m] += dy * w
+            small[c, m] += dz * w
+            if ws.active[m, ROW_KIND] == SLIDING_ROW:
+                r = column[i, 1 + 2 * m]
+                small[m, k] += dx * r
+                small[m, b] += dy * r
+                small[m, c] += dz * r
+        s0, s1, s2 = links[i, U_OVER_D], links[i, U_OVER_D + 1], links[i, U_OVER_D + 2]
+        s3, s4, s5 = links[i, U_OVER_D + 3], links[i, U_OVER_D + 4], links[i, U_OVER_D + 5]
+        a0, a1, a2, a3, a4, a5 = a0 - s0 * x, a1 - s1 * x, a2 - s2 * x, a3 - s3 * x, a4 - s4 * x, a5 - s5 * x
+        b0, b1, b2, b3, b4, b5 = b0 - s0 * y, b1 - s1 * y, b2 - s2 * y, b3 - s3 * y, b4 - s4 * y, b5 - s5 * y
+        c0, c1, c2, c3, c4, c5 = c0 - s0 * z, c1 - s1 * z, c2 - s2 * z, c3 - s3 * z, c4 - s4 * z, c5 - s5 * z
+        i = tree[i, PARENT]
+    for m in range(k):
+        if ws.active[m, ROW_KIND] != SLIDING_ROW:
+            for r in range(3):
+                small[m, k + r] = small[k + r, m]
+    small[k, k], small[b, b], small[c, c] = aa, bb, cc
+    small[k, b], small[b, k], small[k, c], small[c, k], small[b, c], small[c, b] = ab, ab, ac, ac, bc, bc
+    state[k, RHS], state[b, RHS], state[c, RHS] = ta, tb, tc
 
 
 @apart_kernel

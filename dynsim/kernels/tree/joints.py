@@ -118,12 +118,12 @@ def row_motion(model: ModelArrays, ws: Workspace, i, b0, b1, b2, b3, b4, b5, b6,
 
 
 @inlined_kernel
-def row_rates(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
+def row_rates(compound, model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
     """V and A of link i from its axis S, for every kind of joint: V = V_p + S v, A = A_p + V_b × S v + S vdot.
 
     p is the parent, b what the joint is mounted on. ``forward_sweep`` writes this out for joints of one row.
     """
-    links, j, m = ws.links, model.tree[i, PARENT], model.tree[i, BASE]
+    links, j, m = ws.links, model.tree[i, PARENT], compound[i, BASE]
     sx, sy, sz = links[i, S], links[i, S + 1], links[i, S + 2]
     lx, ly, lz = links[i, S + 3], links[i, S + 4], links[i, S + 5]
     wx, wy, wz, ox, oy, oz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -146,11 +146,13 @@ def row_rates(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
 
 
 @apart_kernel
-def sweep_row(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
+def sweep_row(compound, model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
     """R, p, S, V and A of row i into ``ws.links``: what ``forward_sweep`` does for a link (dynsim.kernels.tree.sweep).
 
     v, vdot : rate and acceleration of the row with the sweep's factors; g : gravity likewise
     """
+    if compound is None:  # known to the compiler
+        return
     body, links, j = model.body, ws.links, model.tree[i, PARENT]
     b0, b1, b2 = body[i, R_PJ], body[i, R_PJ + 1], body[i, R_PJ + 2]
     b3, b4, b5 = body[i, R_PJ + 3], body[i, R_PJ + 4], body[i, R_PJ + 5]
@@ -177,15 +179,17 @@ def sweep_row(model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
     links[i, P], links[i, P + 1], links[i, P + 2] = px, py, pz
     links[i, S], links[i, S + 1], links[i, S + 2] = sx, sy, sz
     links[i, S + 3], links[i, S + 4], links[i, S + 5] = lx, ly, lz
-    row_rates(model, ws, i, v, vdot, gx, gy, gz)
+    row_rates(compound, model, ws, i, v, vdot, gx, gy, gz)
 
 
 @kernel
-def read_positions(model: ModelArrays, y, start, ws: Workspace):
+def read_positions(compound, model: ModelArrays, y, start, ws: Workspace):
     """Coordinates of all joints from y[start:] into the workspace."""
+    if compound is None:  # known to the compiler
+        return
     tree, joints = model.tree, ws.joints
     for i in range(tree.shape[0]):
-        k = start + tree[i, POSITION_INDEX]
+        k = start + compound[i, POSITION_INDEX]
         joints[i, Q] = y[k]
         if tree[i, KIND] == BALL_X or tree[i, KIND] == ROLL:
             joints[i, EXTRA] = y[k + 1]
@@ -194,14 +198,16 @@ def read_positions(model: ModelArrays, y, start, ws: Workspace):
 
 
 @apart_kernel
-def position_rates(model: ModelArrays, ws: Workspace, dy, start):
+def position_rates(compound, model: ModelArrays, ws: Workspace, dy, start):
     """q̇ = N(q) v into dy[start:]. Ball: ½ q ∘ (0, ω) with ω in the body; rolling: V (cos ψ, sin ψ), ω.
 
     Wheels: their own rates, and V = (r/2)(left + right) along the heading as of a rolling base.
     """
+    if compound is None:  # known to the compiler
+        return
     tree, joints = model.tree, ws.joints
     for i in range(tree.shape[0]):
-        k, kind = start + tree[i, POSITION_INDEX], tree[i, KIND]
+        k, kind = start + compound[i, POSITION_INDEX], tree[i, KIND]
         if kind == BALL_X:
             w, x, y, z = joints[i, Q], joints[i, EXTRA], joints[i + 1, Q], joints[i + 2, Q]
             a, b, c = 0.5 * joints[i, QD], 0.5 * joints[i + 1, QD], 0.5 * joints[i + 2, QD]
@@ -223,11 +229,13 @@ def position_rates(model: ModelArrays, ws: Workspace, dy, start):
 
 
 @internal_kernel
-def displace(model: ModelArrays, ws: Workspace, y, start):
+def displace(compound, model: ModelArrays, ws: Workspace, y, start):
     """Move the positions y[start:] by the small displacement in the QDD column, taken as velocities for a unit time."""
+    if compound is None:  # known to the compiler
+        return
     tree, joints = model.tree, ws.joints
     for i in range(tree.shape[0]):
-        k, kind = start + tree[i, POSITION_INDEX], tree[i, KIND]
+        k, kind = start + compound[i, POSITION_INDEX], tree[i, KIND]
         if kind == BALL_X:
             w, x, y0, z = y[k], y[k + 1], y[k + 2], y[k + 3]
             a, b, c = 0.5 * joints[i, QDD], 0.5 * joints[i + 1, QDD], 0.5 * joints[i + 2, QDD]
@@ -253,27 +261,31 @@ def displace(model: ModelArrays, ws: Workspace, y, start):
 
 
 @internal_kernel
-def normalise(model: ModelArrays, y, start):
+def normalise(compound, model: ModelArrays, y, start):
     """Give every quaternion in y[start:] unit length."""
+    if compound is None:  # known to the compiler
+        return
     tree = model.tree
     for i in range(tree.shape[0]):
         if tree[i, KIND] == BALL_X:
-            k = start + tree[i, POSITION_INDEX]
+            k = start + compound[i, POSITION_INDEX]
             scale = 1.0 / math.sqrt(y[k] * y[k] + y[k + 1] * y[k + 1] + y[k + 2] * y[k + 2] + y[k + 3] * y[k + 3])
             for s in range(4):
                 y[k + s] *= scale
 
 
 @internal_kernel
-def position_error(model: ModelArrays, y, y_new, error, start, rtol, atol):
+def position_error(compound, model: ModelArrays, y, y_new, error, start, rtol, atol):
     """Sum of squares of the errors of the positions, each per its tolerance, and their number: for the step control.
 
     The error of a quaternion counts as the three angles 2 vec(q̄ ∘ δq) of the rotation that undoes it, against
     atol + rtol [rad]: what a revolute joint one radian from zero is held to.
     """
+    if compound is None:  # known to the compiler
+        return 0.0, 0
     tree, total, count = model.tree, 0.0, 0
     for i in range(tree.shape[0]):
-        k, kind = start + tree[i, POSITION_INDEX], tree[i, KIND]
+        k, kind = start + compound[i, POSITION_INDEX], tree[i, KIND]
         if kind == BALL_X:
             w, x, y0, z = y_new[k], y_new[k + 1], y_new[k + 2], y_new[k + 3]
             dw, dx, dy, dz = error[k], error[k + 1], error[k + 2], error[k + 3]

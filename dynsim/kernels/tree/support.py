@@ -56,7 +56,7 @@ LEAST_SIZE = 4
 
 
 class SupportArrays(NamedTuple):
-    """The mobile base of a robot; all of its arrays are empty for robots that have none."""
+    """The mobile base of a robot."""
 
     index: np.ndarray  # (INDEX_SIZE,) int
     base: np.ndarray  # (BASE_SIZE,)
@@ -84,7 +84,7 @@ def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, sup
     index, base, state = support.index, support.base, support.state
     mx, my, mz, fx, fy, fz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(joints.shape[0]):
-        row_rates(model, ws, i, joints[i, QD], joints[i, QDD], gravity[0], gravity[1], gravity[2])
+        row_rates(model.compound, model, ws, i, joints[i, QD], joints[i, QDD], gravity[0], gravity[1], gravity[2])
         mass, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz = body_inertia(model, ws, i)
         n0, n1, n2, n3, n4, n5 = inertial_wrench(ws, i, mass, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz)
         mx, my, mz, fx, fy, fz = mx + n0, my + n1, mz + n2, fx + n3, fy + n4, fz + n5
@@ -139,8 +139,19 @@ def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, sup
 
 
 @internal_kernel
-def watch_support(support: SupportArrays):
+def tip_margin(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, support: SupportArrays | None):
+    """The tip margin by :func:`ground_reaction`; a robot without a mobile base does not tip."""
+    if support is None:  # known to the compiler
+        return math.inf
+    ground_reaction(model, loads, t, ws, support)
+    return support.state[MARGIN]
+
+
+@internal_kernel
+def watch_support(support: SupportArrays | None):
     """Least loads and margin so far, after :func:`ground_reaction` at the end of an accepted step."""
+    if support is None:  # known to the compiler
+        return
     state, least = support.state, support.least
     for k in range(3):
         least[k] = min(least[k], state[LOADS + k])

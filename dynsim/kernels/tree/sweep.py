@@ -180,7 +180,7 @@ def forward_sweep(model: ModelArrays, ws: Workspace, velocity, acceleration, gra
         )
         if k > PRISMATIC:
             # Apart from the rest, which keeps its values in registers.
-            sweep_row(model, ws, i, vi, ai, gx, gy, gz)
+            sweep_row(model.compound, model, ws, i, vi, ai, gx, gy, gz)
 
 
 @inlined_kernel

@@ -14,7 +14,7 @@ import numpy as np
 
 from dynsim.errors import ModelError
 from dynsim.model.control import JointControl
-from dynsim.model.description import Array, Contact, Inertia, Link
+from dynsim.model.description import Array, Contact, Inertia, Link, Quadric
 from dynsim.model.drives import Motor
 from dynsim.model.model import Model
 from dynsim.scenario import Scenario, build, build_model
@@ -93,6 +93,7 @@ class RotorModel:
         for k, contact in enumerate(self.contacts):
             J, drift = self._point(contact, q, v)
             position = self.model.point_position(contact.body, contact.point, q)
+            assert isinstance(contact.surface, Quadric)
             gradient = contact.surface.Q @ position + contact.surface.b
             slope = np.linalg.norm(gradient)
             normal, rdot = gradient / slope, J @ v

@@ -1,0 +1,269 @@
+"""One step of time stepping, its ledger, its samples, and the driver; the method is that of ``time_stepping``."""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.kernels.arrays import (
+    APPLIED,
+    CIRCUIT,
+    CURRENT,
+    D_M,
+    DAMPING,
+    DRAG,
+    DRIVEN,
+    FIRST_ROW,
+    FORCE,
+    GAP,
+    GEAR_DAMPING,
+    J_M,
+    K_M,
+    MODE,
+    NORMAL_FORCE,
+    QD,
+    QDD,
+    RESISTANCE,
+    ROWS,
+    STICKING,
+    VOLTAGE,
+    ModelArrays,
+    Q,
+    Workspace,
+)
+from dynsim.kernels.drive.law import drive, take_commands
+from dynsim.kernels.integrate.events import take_ticks
+from dynsim.kernels.integrate.output import write_output
+from dynsim.kernels.integrate.run import (
+    END,
+    EVALUATIONS,
+    FINISHED,
+    HOLD,
+    NOT_FINITE,
+    PENDING,
+    PROPOSED,
+    RUNNING,
+    SAMPLE,
+    STARTED,
+    STATUS,
+    STEP,
+    STEPS,
+    TAKE_COMMANDS,
+    TICKED,
+    TIME,
+    Run,
+)
+from dynsim.kernels.integrate.steps import choose_step, finite
+from dynsim.kernels.integrate.time_stepping import (
+    GRIP,
+    PENETRATION,
+    close_contacts,
+    geometry,
+    implicit_drives,
+    moved,
+    place_joints,
+    row_rates,
+    solve_contacts,
+    tangent_rows,
+)
+from dynsim.kernels.integrate.watch import watch
+from dynsim.kernels.jit import internal_kernel, kernel
+from dynsim.kernels.state import (
+    CONSTRAINT,
+    CONTACT_SIZE,
+    DRAWN,
+    ELECTRICAL,
+    FRICTION,
+    GEAR,
+    IMPULSE,
+    JOINT,
+    JOULE,
+    MECHANICAL,
+    SLIP,
+    SUPPLY,
+)
+from dynsim.kernels.system import System
+from dynsim.kernels.tree.articulated import accelerate, add_row_forces, factor, row_system
+from dynsim.kernels.tree.joints import normalise
+from dynsim.kernels.tree.loads import add_loads
+
+
+@internal_kernel
+def step_moreau(system: System, ws: Workspace, run: Run):
+    """One step from y to y_new; mean accelerations and forces stay in the workspace."""
+    s, t, h, y, y_new, layout = run.stepping, run.clock[TIME], run.clock[STEP], run.y, run.y_new, system.layout
+    joints, theta, n = ws.joints, s.theta, ws.joints.shape[0]
+    model = ModelArrays(system.model.tree, s.body, system.model.gravity)
+    v0, v_bias, last = s.before[0], s.before[1], s.before[2]
+    place_joints(system, ws, y)
+    for i in range(n):
+        v0[i] = y[layout.v + i]
+        v_bias[i] = v0[i] + theta * h * last[i]
+        joints[i, Q] += h * theta * v0[i]
+        joints[i, QD], joints[i, QDD] = v0[i], v0[i]
+        joints[i, APPLIED] = -(model.body[i, DAMPING] + model.body[i, GEAR_DAMPING]) * v0[i]
+    drive(system.drives, system.reference, t + theta * h, y, layout, ws)
+    implicit_drives(system, s, ws, h)
+
+    moved(system, ws, y, 0.5 * h, y_new)
+    place_joints(system, ws, y_new)
+    for i in range(n):
+        joints[i, QD], joints[i, QDD] = v_bias[i], 0.0
+    geometry(system, model, s, ws)
+    if close_contacts(system, s, ws):
+        # The last acceleration tells nothing of the next one.
+        for i in range(n):
+            joints[i, QD], last[i] = v0[i], 0.0
+        geometry(system, model, s, ws)
+    if system.loads.table.shape[0] > 0:
+        add_loads(model, system.loads, t + theta * h, ws, run.stage[1], layout.load)
+    tangent_rows(s, ws)
+    factor(model, ws)
+    row_rates(model, ws, v0, s.rate[0])
+    if ws.counts[ROWS] > 0:
+        row_system(model, ws)
+        solve_contacts(s, ws, h)
+        add_row_forces(model, ws)
+    accelerate(model, ws)
+    run.count[EVALUATIONS] += 1
+
+    for i in range(n):
+        last[i] = joints[i, QDD]
+        joints[i, QDD] = v0[i] + theta * h * last[i]
+    moved(system, ws, y, h, y_new)
+    for i in range(n):
+        y_new[layout.v + i] = v0[i] + h * last[i]
+        joints[i, QDD] = last[i]
+    row_rates(model, ws, y_new[layout.v : layout.v + n], s.rate[1])
+    for a in range(ws.motors.shape[0]):
+        k, j = system.drives.table[a, CIRCUIT], system.drives.table[a, DRIVEN]
+        if k >= 0:
+            y_new[layout.current + k] = y[layout.current + k] + s.eliminated[a, 0] + s.eliminated[a, 1] * h * last[j]
+    book(system, ws, run)
+
+
+@internal_kernel
+def book(system: System, ws: Workspace, run: Run):
+    """The ledger of the step into y_new: power at x_θ, and what contacts and couplings have done."""
+    s, t, h, y, y_new, layout = run.stepping, run.clock[TIME], run.clock[STEP], run.y, run.y_new, system.layout
+    joints, motors, motor, theta, n = ws.joints, ws.motors, system.drives.motor, s.theta, ws.joints.shape[0]
+    between, body = run.stage[2], system.model.body
+    for j in range(y.shape[0]):
+        between[j] = y[j] + theta * (y_new[j] - y[j])
+    gear, joint, mechanical = 0.0, 0.0, 0.0
+    place_joints(system, ws, y)
+    for i in range(n):
+        v = between[layout.v + i]
+        joints[i, Q] += h * theta * v
+        joints[i, QD], joints[i, APPLIED] = v, 0.0
+        gear += body[i, GEAR_DAMPING] * v * v
+        joint += body[i, DAMPING] * v * v
+    drive(system.drives, system.reference, t + theta * h, between, layout, ws)
+    electrical, drawn, joule = 0.0, 0.0, 0.0
+    for a in range(motors.shape[0]):
+        i = system.drives.table[a, DRIVEN]
+        current, v = motors[a, CURRENT], joints[i, QD]
+        power = motors[a, VOLTAGE] * current
+        electrical += power
+        drawn += max(power, 0.0)
+        joule += motor[a, RESISTANCE] * current * current
+        shaft = motor[a, K_M] * current - motor[a, J_M] * joints[i, QDD] - motor[a, D_M] * v - motors[a, DRAG]
+        mechanical += shaft * v
+        gear += motors[a, DRAG] * v
+    held, friction, first = 0.0, 0.0, layout.contact
+    for r in range(ws.counts[ROWS]):
+        held += 0.5 * ws.rows[r, FORCE] * (s.rate[0, r] + s.rate[1, r])
+    for k in range(ws.contacts.shape[0]):
+        ws.contacts[k, NORMAL_FORCE] = 0.0
+        if ws.active[k, MODE] == STICKING:
+            r = ws.active[k, FIRST_ROW]
+            x, z = 0.5 * (s.rate[0, r + 1] + s.rate[1, r + 1]), 0.5 * (s.rate[0, r + 2] + s.rate[1, r + 2])
+            power = ws.rows[r + 1, FORCE] * x + ws.rows[r + 2, FORCE] * z
+            friction -= power
+            held -= power
+            ws.contacts[k, NORMAL_FORCE] = ws.rows[r, FORCE]
+            s.found[PENETRATION] = max(s.found[PENETRATION], -ws.contacts[k, GAP])
+            x = x / s.law[k, GRIP] if s.law[k, GRIP] > 0.0 else 0.0
+            y_new[first + SLIP] += h * math.sqrt(x * x + z * z)
+            y_new[first + IMPULSE] += h * ws.rows[r, FORCE]
+        first += CONTACT_SIZE
+    start = layout.ledger
+    y_new[start + ELECTRICAL] += h * electrical
+    y_new[start + DRAWN] += h * drawn
+    y_new[start + JOULE] += h * joule
+    y_new[start + GEAR] += h * gear
+    y_new[start + JOINT] += h * joint
+    y_new[start + FRICTION] += h * friction
+    y_new[start + CONSTRAINT] += h * held
+    y_new[start + MECHANICAL] += h * mechanical
+    y_new[start + SUPPLY] += h * max(electrical, 0.0)
+    for k in range(system.loads.table.shape[0]):
+        y_new[layout.load + k] += h * run.stage[1, layout.load + k]
+
+
+@internal_kernel
+def sample_moreau(system: System, ws: Workspace, run: Run):
+    """Record every sample time within the step, the state linear in between; forces are the means of the step."""
+    t, h, last, clock = run.clock[TIME], run.clock[STEP], run.count[SAMPLE], run.clock
+    until = t + h + 1e-12 * max(1.0, clock[END])
+    while last < run.sample_time.shape[0] and run.sample_time[last] <= until:
+        x = min(max((run.sample_time[last] - t) / h, 0.0), 1.0)
+        row = run.sample[last]
+        for j in range(row.shape[0]):
+            row[j] = run.y[j] + x * (run.y_new[j] - run.y[j])
+        if system.layout.extra > 0:
+            normalise(system.model, row, system.layout.q)
+        place_joints(system, ws, row)
+        for i in range(ws.joints.shape[0]):
+            ws.joints[i, QD], ws.joints[i, APPLIED] = row[system.layout.v + i], 0.0
+        drive(system.drives, system.reference, run.sample_time[last], row, system.layout, ws)
+        geometry(system, system.model, run.stepping, ws)
+        write_output(system, ws, run, last)
+        last += 1
+    run.count[SAMPLE] = last
+
+
+@internal_kernel
+def commands_due(system: System, ws: Workspace, run: Run):
+    """Take sampled commands where they are due; True when the caller is to look."""
+    due = take_ticks(run)
+    if due & TAKE_COMMANDS:
+        place_joints(system, ws, run.y)
+        for i in range(ws.joints.shape[0]):
+            ws.joints[i, QD] = run.y[system.layout.v + i]
+        take_commands(system.drives, system.reference, run.clock[TIME], ws)
+    run.count[TICKED] = due & ~TAKE_COMMANDS
+    if run.count[STARTED] == 0:
+        run.count[STARTED] = 1
+        for i in range(ws.joints.shape[0]):
+            run.stepping.before[2, i] = 0.0
+    return run.count[TICKED] != 0
+
+
+@kernel
+def advance_moreau(system: System, ws: Workspace, run: Run, limit):
+    """``advance`` of time stepping."""
+    clock, count, taken = run.clock, run.count, 0
+    while not commands_due(system, ws, run):
+        if count[STATUS] == RUNNING and clock[END] - clock[TIME] <= 1e-12 * max(1.0, clock[END]):
+            count[STATUS] = FINISHED
+        if taken >= limit or count[STATUS] != RUNNING:
+            return
+        taken += 1
+        if count[PENDING] == 0:
+            clock[PROPOSED] = clock[STEP]
+            choose_step(run)
+            step_moreau(system, ws, run)
+            if not finite(run.y_new):
+                count[STATUS] = NOT_FINITE
+                return
+            if clock[TIME] + clock[STEP] > clock[HOLD]:
+                count[PENDING] = 1
+                return
+        count[PENDING] = 0
+        watch(ws, run, clock[STEP])
+        sample_moreau(system, ws, run)
+        for j in range(run.y.shape[0]):
+            run.y[j] = run.y_new[j]
+        clock[TIME] += clock[STEP]
+        clock[STEP] = clock[PROPOSED]
+        count[STEPS] += 1

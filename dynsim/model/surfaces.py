@@ -1,0 +1,175 @@
+"""What points, spheres and capsules can touch: quadrics, rounded boxes and height fields, with their distances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.record.scene import Surface as Drawn
+
+if TYPE_CHECKING:
+    from dynsim.kernels.constraint.distance import ShapeArrays
+
+Array = NDArray[np.float64]
+
+
+class Surface(Protocol):
+    """A surface; its free side is where the distance is positive."""
+
+    def gap(self, position: Array) -> float:
+        """Signed distance of a point, (3,), along the normal [m]."""
+
+    def gaps(self, positions: Array) -> Array:
+        """:meth:`gap` of many points, (T, 3) → (T,) [m]."""
+
+    def normal(self, position: Array) -> Array:
+        """Unit normal at a point, (3,), to the free side."""
+
+
+@dataclass(frozen=True)
+class Quadric:
+    """A surface C(r) = r·Q r/2 + b·r + c = 0; C > 0 is outside, where ∇C points."""
+
+    Q: Array
+    b: Array
+    c: float
+
+    def gap(self, position: Array) -> float:
+        """Signed distance [m] of a point along the normal; exact for plane, sphere and cylinder."""
+        from dynsim.kernels.constraint.surface import surface_distance
+
+        gradient = self.Q @ position + self.b
+        slope = float(np.linalg.norm(gradient))
+        normal = gradient / slope
+        value = float(0.5 * position @ self.Q @ position + self.b @ position + self.c)
+        return float(surface_distance(value, slope, float(normal @ self.Q @ normal)))
+
+    def gaps(self, positions: Array) -> Array:
+        """:meth:`gap` of many points, (T, 3) → (T,) [m]; where ∇C vanishes, as in the middle of a sphere, too."""
+        if not self.Q.any():
+            return np.asarray((positions @ self.b + self.c) / np.linalg.norm(self.b))
+        Qr = positions @ self.Q
+        gradient = Qr + self.b
+        value = np.sum((0.5 * Qr + self.b) * positions, axis=1) + self.c
+        square = np.sum(gradient * gradient, axis=1)
+        steepest = float(np.abs(np.linalg.eigvalsh(self.Q)).max())
+        bent = np.sum((gradient @ self.Q) * gradient, axis=1)
+        curvature = np.where(square > 0.0, bent / np.where(square > 0.0, square, 1.0), -steepest * np.sign(value))
+        inner = square - 2.0 * curvature * value
+        slope = np.sqrt(square)
+        return np.asarray(
+            np.where(
+                inner > 0.0,
+                2.0 * value / (slope + np.sqrt(np.maximum(inner, 1e-300))),
+                value / np.maximum(slope, 1e-300),
+            )
+        )
+
+    def normal(self, position: Array) -> Array:
+        """∇C/|∇C| at a point, (3,); zero where there is none, as in the middle of a sphere."""
+        gradient = self.Q @ position + self.b
+        slope = float(np.linalg.norm(gradient))
+        return np.asarray(gradient / slope) if slope > 0.0 else np.zeros(3)
+
+    @cached_property
+    def drawn(self) -> Drawn:
+        """The surface with the parameters of the simple kind that it is of, if any; without a name."""
+        return Drawn.of_quadric("", self.Q, self.b, self.c)
+
+
+class _Shaped:
+    """Distances by the kernels of dynsim.kernels.constraint.distance."""
+
+    @property
+    def shapes(self) -> ShapeArrays:
+        """Table of a point candidate on this surface."""
+        from dynsim.model.shapes import shape_arrays
+
+        return shape_arrays([(self, 0.0, np.zeros(3), False)])
+
+    def gap(self, position: Array) -> float:
+        """Signed distance of a point, (3,), along the normal [m]."""
+        return float(self._distances(np.asarray(position)[None])[0][0])
+
+    def gaps(self, positions: Array) -> Array:
+        """:meth:`gap` of many points, (T, 3) → (T,) [m]."""
+        return self._distances(positions)[0]
+
+    def normal(self, position: Array) -> Array:
+        """Unit normal at a point, (3,), to the free side."""
+        return np.asarray(self._distances(np.asarray(position)[None])[1][0])
+
+    def _distances(self, positions: Array) -> tuple[Array, Array]:
+        from dynsim.kernels.constraint.distance import surface_distances
+
+        points = np.array(positions, dtype=np.float64, order="C")
+        gaps, normals = np.zeros(len(points)), np.zeros((len(points), 3))
+        surface_distances(self.shapes, points, gaps, normals)
+        return gaps, normals
+
+
+@dataclass(frozen=True)
+class Box(_Shaped):
+    """A box whose edges and corners are rounded by ``edge_radius``; the free side is outside.
+
+    Attributes
+    ----------
+    centre : (3,) [m]
+    axes : (3, 3), the box's axes in W as rows
+    edges : (3,) lengths along them [m]
+    edge_radius : at most half the shortest edge [m]
+    """
+
+    centre: Array
+    axes: Array
+    edges: Array
+    edge_radius: float
+
+
+@dataclass(frozen=True)
+class HeightField(_Shaped):
+    """z = h(x, y) by a bicubic C² spline through heights on a grid; the free side is above.
+
+    Attributes
+    ----------
+    origin : (2,) x and y of the first height [m]
+    spacing : (2,) of the grid along x and y [m]
+    heights : (ny, nx), four or more each way: row j is at y_j, column i at x_i [m]
+    """
+
+    origin: Array
+    spacing: Array
+    heights: Array = field(repr=False)
+
+    @cached_property
+    def coefficients(self) -> Array:
+        """Of the uniform cubic B-splines, (ny + 2, nx + 2); the third derivative does not jump at the second lines.
+
+        So cubics are kept exactly (not-a-knot).
+        """
+        return _spline(_spline(self.heights).T).T
+
+
+SURFACES = Quadric | Box | HeightField
+"""What a member of the family ``surface`` may build."""
+
+
+def _spline(values: Array) -> Array:
+    """Coefficients of cubic B-splines along the first axis, (n, m) → (n + 2, m)."""
+    from scipy.linalg import solve_banded
+
+    n = len(values)
+    band = np.zeros((9, n + 2))  # entry (i, j) of the matrix at [4 + i - j, j]
+    inner = np.arange(1, n + 1)
+    for offset, weight in ((-1, 1.0 / 6.0), (0, 2.0 / 3.0), (1, 1.0 / 6.0)):
+        band[4 - offset, inner + offset] = weight
+    for offset, weight in enumerate((1.0, -4.0, 6.0, -4.0, 1.0)):
+        band[4 - offset, offset] = weight
+        band[4 + offset, n + 1 - offset] = weight
+    right = np.zeros((n + 2, values.shape[1]))
+    right[1:-1] = values
+    return np.asarray(solve_banded((4, 4), band, right))

@@ -1,0 +1,149 @@
+"""What can touch a surface where a scenario does not name points: all joints, or the links as capsules."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from dynsim.model.clearance import axis_ends
+from dynsim.model.description import Contact, Robot
+from dynsim.model.model import Model
+from dynsim.model.shapes import bends_outward
+from dynsim.model.surfaces import Array, Surface
+
+log = logging.getLogger(__name__)
+
+# Configurations at which points are compared and rows looked at: what is so at all of them is so by structure.
+CONFIGURATIONS = 6
+# Points that are always as close as this are one [m]; rows smaller than this always are none.
+SAME = 1e-9
+# What is between the ends of a capsule is so much thinner [m]: where an end is nearest, or the axis lies along a face,
+# the ends touch alone, and the rows do not depend on each other.
+THINNER = 1e-6
+# Of a capsule that moves along its axis, where its row is looked at.
+SHARES = (0.0, 0.3, 0.7, 1.0)
+
+
+def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declared: Iterable[Contact]) -> list[Contact]:
+    """Candidates of a robot against all surfaces, without friction, beside those that are declared.
+
+    ``joints``: the origins of all joints, and the hand, as points. ``links``: the axes of all links, with their radii.
+    A capsule is nearest to a flat or hollow surface, and to a height field, with one of the spheres at its ends; those
+    that neighbours share count once, on the link whose joint it is, with the larger radius. Spheres, cylinders and
+    boxes are touched from outside by these, and by the nearest point of the axis; that is :data:`THINNER`.
+
+    Left out are points that are declared or the same as others, and what cannot move along the normal (a log line
+    names it): it would have a row of zeros.
+    """
+    model = Model(robot)
+    configurations = _configurations(robot)
+    taken = [contact for contact in declared if contact.tip is None]
+    names = {contact.name for contact in declared}
+    found: list[Contact] = []
+    still: list[str] = []
+    for surface_name, surface in surfaces.items():
+        kept: list[tuple[Contact, Array]] = []
+        known = [
+            (contact, _places(model, contact, configurations))
+            for contact in taken
+            if contact.surface_name == surface_name
+        ]
+        for contact in (_joints if kind == "joints" else _links)(robot, surface, surface_name):
+            places = _places(model, contact, configurations)
+            if contact.tip is None:
+                if any(_same(places, other) and contact.radius == one.radius for one, other in known):
+                    continue
+                twin = next((k for k, (one, other) in enumerate(kept) if one.tip is None and _same(places, other)), -1)
+                if twin >= 0:
+                    one, other = kept[twin]
+                    kept[twin] = replace(one, radius=max(one.radius, contact.radius)), other
+                    continue
+            kept.append((contact, places))
+        for contact, _ in kept:
+            name = contact.name if len(surfaces) == 1 else f"{contact.name}_{surface_name}"
+            if _moves(model, contact, configurations):
+                found.append(replace(contact, name=_unused(name, names)))
+            else:
+                still.append(name)
+    if still:
+        log.info("contacts.candidates: left out, because nothing moves them along the normal: %s", ", ".join(still))
+    return found
+
+
+def _joints(robot: Robot, surface: Surface, name: str) -> list[Contact]:
+    """Origins of all joints, and the hand."""
+    carriers = robot.carriers
+    found = [
+        Contact(link.joint_of_rows or link.joint, link.name, np.zeros(3), surface, name)
+        for link in robot.links
+        if link.name not in carriers
+    ]
+    return [*found, Contact("hand", *robot.hand, surface, name)]
+
+
+def _links(robot: Robot, surface: Surface, on: str) -> list[Contact]:
+    """Axes of all links against a surface: spheres at their beginnings, then at their ends, and capsules between."""
+    starts, ends, capsules = [], [], []
+    tips, carriers = axis_ends(robot), robot.carriers
+    for link in robot.links:
+        axes = [tip for tip in tips[link.name] if np.linalg.norm(tip) > SAME]
+        if link.name in carriers:
+            continue
+        joint = link.joint_of_rows or link.joint
+        starts.append(Contact(joint, link.name, np.zeros(3), surface, on, radius=link.radius))
+        for k, tip in enumerate(axes):
+            name = link.name if len(axes) == 1 else f"{link.name}_{k + 1}"
+            ends.append(Contact(f"{name}_end", link.name, tip, surface, on, radius=link.radius))
+            thinner = max(link.radius - THINNER, 0.0)
+            capsules.append(Contact(name, link.name, np.zeros(3), surface, on, radius=thinner, tip=tip))
+    return [*starts, *ends, *capsules] if bends_outward(surface) else starts + ends
+
+
+def _configurations(robot: Robot) -> list[Array]:
+    """Random coordinates; quaternions are unit."""
+    rng = np.random.default_rng(0)
+    found = []
+    for _ in range(CONFIGURATIONS):
+        q = np.zeros(robot.nq)
+        for link, k in zip(robot.links, robot.position_index, strict=True):
+            size = len(link.row.neutral)
+            q[k : k + size] = rng.normal(size=size)
+            if size == 4:
+                q[k : k + 4] /= np.linalg.norm(q[k : k + 4])
+        found.append(q)
+    return found
+
+
+def _places(model: Model, contact: Contact, configurations: Iterable[Array]) -> Array:
+    """Positions of the point of a contact [m]."""
+    return np.array([model.point_position(contact.body, contact.point, q) for q in configurations])
+
+
+def _same(a: Array, b: Array) -> bool:
+    return bool(np.abs(a - b).max() <= SAME)
+
+
+def _moves(model: Model, contact: Contact, configurations: Iterable[Array]) -> bool:
+    """Whether any joint moves any part of a candidate along the normal."""
+    points = [contact.point]
+    if contact.tip is not None:
+        points = [contact.point + share * (contact.tip - contact.point) for share in SHARES]
+    for q in configurations:
+        for point in points:
+            position, jacobian = model.point_position_and_jacobian(contact.body, point, q)
+            if np.abs(contact.surface.normal(position) @ jacobian).max() > SAME:
+                return True
+    return False
+
+
+def _unused(name: str, names: set[str]) -> str:
+    """The name, with a number if another candidate has it; it is taken from then on."""
+    found, count = name, 1
+    while found in names:
+        count += 1
+        found = f"{name}_{count}"
+    names.add(found)
+    return found

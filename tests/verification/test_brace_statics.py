@@ -1,0 +1,244 @@
+"""Least-heat brace forces: each answer carries its own proof, checked with public methods of the model and numpy."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+
+import dynsim
+from dynsim.errors import ModelError
+from dynsim.model.bracing import Brace, BraceStatics
+from dynsim.model.model import Model
+
+seeds = st.integers(0, 2**32 - 1)
+# Of components of virtual velocities and gradients near 1 that would have to be zero or positive.
+ROUNDING = 1e-9
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def arm() -> Model:
+    """The published arm in its initial posture."""
+    return dynsim.build_model(dynsim.load_scenario("elbow_comparison", variant="two_elbows"))
+
+
+def elbows(**options) -> dict[str, Brace]:
+    return {f"elbow_{k}": Brace(f"link_{k}", np.zeros(3), UP, friction=0.1, **options) for k in (4, 7)}
+
+
+def free_torques(model: Model, q, v, vdot) -> np.ndarray:
+    return model.inverse_dynamics(q, v, vdot) + model.armature * vdot + model.damping * v
+
+
+def heat_weights(model: Model) -> np.ndarray:
+    weights = np.zeros(model.n)
+    for motor in model.robot.motors:
+        weights[model.joint_names.index(motor.joint)] = (
+            motor.resistance / (motor.torque_constant * motor.gear_ratio) ** 2
+        )
+    return weights
+
+
+def limits(model: Model, v) -> tuple[np.ndarray, np.ndarray]:
+    low, high = np.zeros(model.n), np.zeros(model.n)
+    for motor in model.robot.motors:
+        j, constant = model.joint_names.index(motor.joint), motor.torque_constant * motor.gear_ratio
+        low[j], high[j] = (
+            constant * (side * motor.voltage_limit - constant * v[j]) / motor.resistance for side in (-1, 1)
+        )
+    return low, high
+
+
+def least_work(brace: Brace, u: np.ndarray) -> float:
+    """min u · f over all forces that the brace may have; −inf where it is unbounded."""
+    normal = brace.normal / np.linalg.norm(brace.normal)
+    u_n, u_t = float(u @ normal), u - (u @ normal) * normal
+    if brace.sliding is None:
+        slope = u_n - brace.friction * float(np.linalg.norm(u_t))
+    else:
+        along = brace.sliding - (brace.sliding @ normal) * normal
+        slope = u_n - brace.friction * float(u_t @ along) / float(np.linalg.norm(along))
+    if brace.normal_force is not None:
+        return brace.normal_force * slope
+    return brace.min_N * slope if slope >= -ROUNDING else -math.inf
+
+
+def check_allowed(brace: Brace, f: np.ndarray, tolerance: float) -> None:
+    normal = brace.normal / np.linalg.norm(brace.normal)
+    f_n, f_t = float(f @ normal), f - (f @ normal) * normal
+    if brace.normal_force is None:
+        assert f_n >= brace.min_N - tolerance
+    else:
+        assert f_n == pytest.approx(brace.normal_force, abs=tolerance)
+    if brace.sliding is None:
+        assert np.linalg.norm(f_t) <= brace.friction * f_n + tolerance
+    else:
+        along = brace.sliding - (brace.sliding @ normal) * normal
+        assert f_t == pytest.approx(-brace.friction * f_n * along / np.linalg.norm(along), abs=tolerance)
+
+
+def check_optimal(model: Model, q, v, vdot, braces, found: BraceStatics) -> None:
+    """Equation of motion and constraints; and the duality gap: no allowed forces heat less, to first order."""
+    free = free_torques(model, q, v, vdot)
+    J = {name: model.point_jacobian(b.body, b.point, q) for name, b in braces.items()}
+    scale = 1.0 + np.abs(free).max()
+    balance = found.torques + sum(J[name].T @ f for name, f in found.forces.items()) - free
+    assert np.abs(balance).max() <= 1e-11 * scale
+    low, high = limits(model, v)
+    assert (found.torques >= low - 1e-8 * scale).all()
+    assert (found.torques <= high + 1e-8 * scale).all()
+    for name, brace in braces.items():
+        check_allowed(brace, found.forces[name], 1e-8 * scale)
+    weights = heat_weights(model)
+    assert found.heat == pytest.approx(weights @ found.torques**2, rel=1e-12)
+    if not np.isinf(high).all():
+        return
+    gap = 0.0
+    for name, brace in braces.items():
+        gradient = -2.0 * J[name] @ (weights * found.torques) / (1.0 + found.heat)
+        gap += gradient @ found.forces[name] - least_work(brace, gradient)
+    # Heat is convex: this is the part of it that could be saved at most.
+    # Braces close to the base take thousands of newtons to save the last bit: their rounding.
+    largest = max(float(np.linalg.norm(f)) for f in found.forces.values())
+    assert abs(gap) <= 1e-9 * (1.0 + (largest / 500.0) ** 2)
+
+
+def check_impossible(model: Model, q, v, vdot, braces, omega: np.ndarray) -> None:
+    """The most that ω·(tau + Jᵀ f) can be is less than what it would have to be."""
+    low, high = limits(model, v)
+    omega = omega / np.abs(omega).max()
+    # Rates of what is not limited are rounding; without a limit they would have to be exactly zero.
+    assert (np.abs(omega[np.isinf(high)]) <= 1e-9).all()
+    omega = np.where(np.isinf(high), 0.0, omega)
+    most = float(np.where(np.isinf(high), 0.0, np.where(omega > 0.0, high, low)) @ omega)
+    for brace in braces.values():
+        most -= least_work(brace, -model.point_jacobian(brace.body, brace.point, q) @ omega)
+    assert most < omega @ free_torques(model, q, v, vdot)
+
+
+def random_case(rng: np.random.Generator, model: Model, limited: bool):
+    q, v, vdot = rng.uniform(-2, 2, size=model.n), rng.normal(size=model.n), 2.0 * rng.normal(size=model.n)
+    if limited:
+        volts = 10.0 ** rng.uniform(-0.5, 2.0)
+        motors = tuple(replace(motor, voltage_limit=volts) for motor in model.robot.motors)
+        model = Model(replace(model.robot, motors=motors[int(rng.integers(0, 3)) :]))
+    bodies = rng.choice(np.arange(4, 11), size=rng.integers(1, 4), replace=False)
+    braces = {}
+    for k in bodies:
+        braces[f"brace_{k}"] = Brace(
+            f"link_{k}",
+            rng.normal(size=3) * 0.1,
+            rng.normal(size=3),
+            friction=float(rng.choice([0.0, rng.uniform(0.05, 1.0)])),
+            min_N=float(rng.choice([0.0, 0.5, 2.0])),
+            normal_force=float(rng.uniform(0.5, 10.0)) if rng.random() < 0.3 else None,
+            sliding=rng.normal(size=3) if rng.random() < 0.3 else None,
+        )
+    return model, q, v, vdot, braces
+
+
+@settings(max_examples=60)
+@given(seeds)
+def test_least_heat_of_any_braces(arm, seed):
+    rng = np.random.default_rng(seed)
+    model, q, v, vdot, braces = random_case(rng, arm, limited=False)
+    found = model.brace_statics(q, v, vdot, braces)
+    assert found.feasible
+    assert found.certificate is None
+    check_optimal(model, q, v, vdot, braces, found)
+    for name, brace in braces.items():
+        force = brace.normal_force
+        assert found.intervals[name] == ((brace.min_N, math.inf) if force is None else (force, force))
+
+
+@settings(max_examples=60)
+@given(seeds)
+def test_limited_and_missing_motors_give_forces_or_a_certificate(arm, seed):
+    rng = np.random.default_rng(seed)
+    model, q, v, vdot, braces = random_case(rng, arm, limited=True)
+    found = model.brace_statics(q, v, vdot, braces)
+    if not found.feasible:
+        check_impossible(model, q, v, vdot, braces, found.certificate)
+        return
+    check_optimal(model, q, v, vdot, braces, found)
+    name, brace = next(iter(braces.items()))
+    low, high = found.intervals[name]
+    assert low - 1e-6 <= found.normal_forces[name] <= high + 1e-6
+    if brace.normal_force is not None or high - low < 1e-3:
+        return
+    # Just inside of the ends it works, just outside there is a proof that it does not.
+    for force, feasible in ((low, True), (high, True), (low - 0.01, False), (high + 0.01, False)):
+        step = min(0.3 * (high - low), 1e-4) * (1.0 if force == low else -1.0 if force == high else 0.0)
+        if math.isinf(force) or force + step <= 0.0 or (not feasible and force < brace.min_N):
+            continue
+        asked = {**braces, name: replace(brace, normal_force=force + step, min_N=0.0)}
+        answer = model.brace_statics(q, v, vdot, asked)
+        assert answer.feasible == feasible
+        if not feasible:
+            check_impossible(model, q, v, vdot, asked, answer.certificate)
+
+
+def test_published_posture_against_slsqp(arm):
+    """The optimum without a least force leaves elbow 4 grazing; with one it has exactly that."""
+    q, rest = arm.robot.initial, np.zeros(arm.n)
+    J = np.vstack([arm.point_jacobian(f"link_{k}", np.zeros(3), q) for k in (4, 7)])
+    free, weights = free_torques(arm, q, rest, rest), heat_weights(arm)
+    for least in (0.0, 0.5):
+        found = arm.brace_statics(q, rest, rest, elbows(min_N=least))
+        result = minimize(
+            lambda f: weights @ (free - J.T @ f) ** 2,
+            np.array([0.0, 0.0, 3.0, 0.0, 0.0, 8.0]),
+            jac=lambda f: -2.0 * J @ (weights * (free - J.T @ f)),
+            constraints=[
+                {
+                    "type": "ineq",
+                    "fun": lambda f, least=least: np.array(
+                        [f[2] - least, f[5] - least]
+                        + [0.1 * f[k + 2] - math.sqrt(f[k] ** 2 + f[k + 1] ** 2 + 1e-30) for k in (0, 3)]
+                    ),
+                }
+            ],
+            method="SLSQP",
+            options={"ftol": 1e-16, "maxiter": 500},
+        )
+        assert found.heat == pytest.approx(result.fun, rel=1e-8)
+        assert found.normal_forces["elbow_4"] == pytest.approx(least, abs=1e-8)
+    commanded = {**elbows(), "elbow_4": replace(elbows()["elbow_4"], normal_force=3.0)}
+    assert arm.brace_statics(q, rest, rest, commanded).heat > found.heat
+
+
+def test_one_brace_by_hand():
+    """A level beam of two links, massless but for a tip: one support without friction takes what makes least heat."""
+    arm = dynsim.build_model(dynsim.load_scenario("single_pendulum"))
+    q, rest = np.array([math.radians(60.0)]), np.zeros(1)
+    position = arm.point_position(*arm.robot.hand, q)
+    brace = {"tip": Brace(arm.robot.hand[0], arm.robot.hand[1], UP, friction=0.0, min_N=0.0)}
+    found = arm.brace_statics(q, rest, rest, brace)
+    gravity = arm.bias_forces(q, rest)[0]
+    lever = arm.point_jacobian(*arm.robot.hand, q)[2, 0]
+    if gravity / lever > 0.0:  # the support can carry all of it
+        assert found.normal_forces["tip"] == pytest.approx(gravity / lever, rel=1e-8)
+    assert np.isfinite(position).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"normal_force": -1.0}, "cannot pull"),
+        ({"normal": np.zeros(3)}, "direction"),
+        ({"friction": -0.1}, "friction"),
+        ({"min_N": math.nan}, "min_N"),
+        ({"sliding": UP}, "no direction along"),
+        ({"body": "link_99"}, "no body"),
+    ],
+)
+def test_refused(arm, changes, said):
+    braces = {"elbow": replace(elbows()["elbow_4"], **changes)}
+    with pytest.raises(ModelError, match=said):
+        arm.brace_statics(arm.robot.initial, np.zeros(10), np.zeros(10), braces)

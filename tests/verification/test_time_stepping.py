@@ -1,0 +1,175 @@
+"""Time stepping: closed forms of sliding, sticking, landing and bouncing; order; what its ledger adds up to."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from random_robots import Bench, bench, random_robot
+
+from dynsim.kernels.integrate.run import STEPS, Run
+from dynsim.kernels.integrate.time_stepping import (
+    BAD,
+    CAPPED,
+    GRIP,
+    GRIP_AXIS,
+    PENETRATION,
+    RESTITUTION,
+    WORST,
+    stepping_arrays,
+)
+from dynsim.kernels.state import CONSTRAINT, ELECTRICAL, FRICTION, GEAR, JOINT, JOULE, OUT_FORCE
+from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
+from dynsim.model.drives import Servo
+from dynsim.model.joints.ball import floating
+
+G = 9.81
+
+
+def stepped(b: Bench, y: np.ndarray, times: np.ndarray, step: float, theta: float, law: dict | None = None) -> Run:
+    """A run by time stepping; law: columns of the contacts' law."""
+    stepping = stepping_arrays(b.system.model, b.system.contacts, len(b.robot.motors), len(b.robot.couplings), theta)
+    for column, value in (law or {}).items():
+        stepping.law[:, column] = value
+    return b.simulate(y, times, "time_stepping", step=step, stepping=stepping)
+
+
+def plane(normal: np.ndarray) -> Quadric:
+    return Quadric(np.zeros((3, 3)), normal, 0.0)
+
+
+def block(friction: float, slope: float = 0.0, mass: float = 2.0) -> Bench:
+    """A body that does not turn, with one point on a plane through the origin that falls towards +x."""
+    inertias = [Inertia(0.0), Inertia(0.0), Inertia(mass)]
+    links = [
+        Link(a, f"j{a}", "xy"[k - 1] if k else None, "prismatic", np.eye(3)[k], inertias[k])
+        for k, a in enumerate("xyz")
+    ]
+    normal = np.array([np.sin(slope), 0.0, np.cos(slope)])
+    return bench(
+        Robot("block", tuple(links), (), ("z", np.zeros(3))),
+        [Contact("foot", "z", np.zeros(3), plane(normal), friction=friction)],
+    )
+
+
+@pytest.mark.parametrize("theta", [0.5, 1.0])
+@pytest.mark.parametrize("slope", [0.2, 0.6])
+def test_a_block_sticks_on_a_slope_or_slides_down_it(slope, theta):
+    mu, b = 0.3, block(0.3, slope)
+    run = stepped(b, b.state(np.zeros(3), np.zeros(3)), np.array([0.0, 2.0]), 1e-2, theta)
+    acceleration = max(G * (np.sin(slope) - mu * np.cos(slope)), 0.0)
+    # From rest: θ = 1/2 is exact, θ = 1 ahead by half a step.
+    distance = 0.5 * acceleration * 2.0 * (2.0 + (1e-2 if theta == 1.0 else 0.0))
+    np.testing.assert_allclose(np.linalg.norm(run.states("q")[-1]), distance, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(run.outputs("contact")[-1, 0, OUT_FORCE], 2.0 * G * np.cos(slope), rtol=1e-9)
+    assert run.stepping.found[PENETRATION] < 1e-9
+
+
+@pytest.mark.parametrize(("theta", "order"), [(0.5, 2), (1.0, 1)])
+def test_order_of_a_motion_with_motors(theta, order):
+    """A random arm with motors against an adaptive method at a tolerance out of reach of the other."""
+    robot = random_robot(np.random.default_rng(3), 4)
+    b = bench(robot)
+    y = b.state(np.full(4, 0.3), np.full(4, 0.5), np.zeros(b.system.layout.circuits))
+    times = np.array([0.0, 0.2])
+    exact = b.simulate(y, times, "dopri5", rtol=1e-11).states("q")[-1]
+    errors = [np.abs(stepped(b, y, times, h, theta).states("q")[-1] - exact).max() for h in (4e-4, 2e-4, 1e-4)]
+    rates = np.log2(np.divide(errors[:-1], errors[1:]))
+    assert (np.abs(rates - order) < 0.15).all(), (errors, rates)
+
+
+@pytest.mark.parametrize("restitution", [0.0, 0.5])
+def test_a_block_lands_and_bounces(restitution):
+    """Height of the bounce e² of the fall; the ledger has lost (1 − e²) of the energy; errors shrink with the step."""
+    height, errors = 0.5, []
+    fall = np.sqrt(2.0 * height / G)
+    apex = fall * (1.0 + restitution)
+    for h in (2e-3, 1e-3, 5e-4):
+        b = block(0.4)
+        run = stepped(
+            b, b.state([0.0, 0.0, height], np.zeros(3)), np.array([0.0, apex]), h, 0.5, {RESTITUTION: restitution}
+        )
+        errors.append(abs(run.states("q")[-1, 2] - restitution**2 * height))
+        assert errors[-1] <= 2.0 * h * G * fall
+        energy = 2.0 * G * run.y[2] + np.sum(run.y[3:6] ** 2)
+        held = run.states("ledger")[-1, CONSTRAINT]
+        np.testing.assert_allclose(energy - 2.0 * G * height, held, atol=1e-9)
+        assert run.stepping.found[PENETRATION] <= h * G * fall
+    # A landing within a step is off by up to the whole step, one at its midpoint by nothing.
+    assert restitution == 0.0 or errors[-1] < 0.5 * errors[0]
+
+
+def test_what_slides_comes_to_rest_where_it_should():
+    mu, speed = 0.2, np.array([1.2, -0.9, 0.0])
+    b = block(mu)
+    run = stepped(b, b.state(np.zeros(3), speed), np.array([0.0, 2.0]), 1e-3, 0.5)
+    np.testing.assert_allclose(run.states("q")[-1], speed * 1.5 / (2.0 * mu * G), atol=1e-6)
+    ledger = run.states("ledger")[-1]
+    np.testing.assert_allclose(ledger[FRICTION], 0.5 * 2.0 * 1.5**2, rtol=1e-9)
+    assert np.abs(run.states("v")[-1]).max() < 1e-9
+
+
+def test_friction_that_differs_along_and_across():
+    """Two runs, each along one axis: friction along it alone; then both, in the direction of the ellipse's normal."""
+    mu, ratio, law = 0.4, 0.25, {GRIP: 0.25, GRIP_AXIS: 1.0}
+    for speed, friction in (([1.0, 0, 0], mu * ratio), ([0, 1.0, 0], mu)):
+        b = block(mu)
+        run = stepped(b, b.state(np.zeros(3), np.array(speed)), np.array([0.0, 0.1]), 1e-3, 0.5, law)
+        np.testing.assert_allclose(np.linalg.norm(run.states("v")[-1]), 1.0 - friction * G * 0.1, rtol=1e-9)
+    b = block(mu)
+    run = stepped(b, b.state(np.zeros(3), np.array([1.0, 1.0, 0.0])), np.array([0.0, 1e-5]), 1e-5, 0.5, law)
+    force = -2.0 * (run.states("v")[-1] - [1.0, 1.0, 0.0]) / 1e-5
+    normal = 2.0 * G
+    np.testing.assert_allclose((force[0] / ratio) ** 2 + force[1] ** 2, (mu * normal) ** 2, rtol=1e-6)
+    np.testing.assert_allclose(force[0] / force[1], ratio**2, rtol=1e-3)
+
+
+def snake(joints: int = 12, wheels: int = 14) -> tuple[Bench, np.ndarray]:
+    """A chain of yaw and pitch joints in turn that lies on a plane on wheels, two at each end and one at each joint."""
+    length, inertia = 0.1, Inertia(0.3, np.zeros(3), np.diag([2e-4, 4e-4, 4e-4]))
+    links = list(floating(Link("link_0", "root", None, "floating", np.eye(3)[0], inertia)))
+    for k in range(joints):
+        axis = np.eye(3)[2 if k % 2 == 0 else 1]
+        links.append(
+            Link(f"link_{k + 1}", f"joint_{k}", f"link_{k}", "revolute", axis, inertia, p_PJ=np.array([length, 0, 0]))
+        )
+    motors = [
+        Servo(f"joint_{k}", 1.5, 3.0, 60.0, 1.0, armature=5e-3, coulomb_friction=0.05, coulomb_speed=0.05)
+        for k in range(joints)
+    ]
+    contacts = [
+        Contact(
+            f"wheel_{k}",
+            f"link_{min(k, joints)}",
+            np.array([0.05 * (k > joints), 0.02 * (-1) ** k, -0.03]),
+            plane(np.eye(3)[2]),
+            friction=0.6,
+        )
+        for k in range(wheels)
+    ]
+    robot = Robot("snake", tuple(links), tuple(motors), (f"link_{joints}", np.zeros(3)))
+    held = np.array([0.35 * np.sin(0.8 * k) if k % 2 == 0 else 0.0 for k in range(joints)])
+    b = bench(robot, contacts, held=held)
+    q = np.zeros(robot.nq)
+    q[2], q[3] = 0.03, 1.0
+    return b, b.state(q, np.zeros(len(robot.links)))
+
+
+def test_a_scene_of_the_snakes_size_keeps_its_cones_and_its_ledger():
+    b, y = snake()
+    run = stepped(b, y, np.array([0.0, 0.5]), 1e-3, 0.5, {GRIP: 0.05, GRIP_AXIS: 1.0})
+    found = run.stepping.found
+    assert run.count[STEPS] == 500
+    assert found[CAPPED] == 0
+    assert found[WORST] <= BAD
+    assert found[PENETRATION] < 1e-3
+    ledger = run.states("ledger")[-1]
+    assert ledger[FRICTION] >= 0.0
+    change = run.outputs("energy")[-1].sum() - potential(b, y)
+    given = ledger[ELECTRICAL] - ledger[JOULE] - ledger[GEAR] - ledger[JOINT] - ledger[FRICTION] + ledger[CONSTRAINT]
+    np.testing.assert_allclose(change, given, atol=0.02 * ledger[ELECTRICAL])
+
+
+def potential(b: Bench, y: np.ndarray) -> float:
+    """Energy at rest [J]."""
+    mass = b.system.model.body[:, 15].sum()
+    return mass * G * y[2]
