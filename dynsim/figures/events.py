@@ -9,7 +9,6 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.transforms import ScaledTranslation
 
-from dynsim.figures import style
 from dynsim.record import Record
 from dynsim.record.content import Event
 
@@ -17,8 +16,8 @@ from dynsim.record.content import Event
 MARKS: dict[str, tuple[str, str, str]] = {
     "landing": ("v", "▼", "landing"),
     "lift_off": ("^", "▲", "lift-off"),
-    "bounce": (".", "•", "bounce"),
-    "slip_start": (">", "►", "slip starts"),
+    "bounce": ("o", "●", "bounce"),
+    "slip_start": (">", "▶", "slip starts"),
     "slip_stop": ("s", "■", "slip stops"),
     "stop_hit": ("P", "✚", "joint stop hit"),
     "stop_left": ("X", "✖", "joint stop left"),
@@ -69,7 +68,10 @@ def mark_all(rows: Iterable[Sequence[Axes]], record: Record) -> None:
 def explain(axes: Axes, events: Sequence[Event]) -> None:
     """A line under the label of the time axis: each mark that is drawn, what it means, and how often."""
     count = Counter(event.kind for event in events)
-    parts = [f"{sign} {text}" + (f" ({count[kind]})" if count[kind] > 1 else "")
-             for kind, (_, sign, text) in MARKS.items() if count[kind]]  # fmt: skip
+    parts = [
+        f"{sign} {text}" + (f" ({count[kind]})" if count[kind] > 1 else "")
+        for kind, (_, sign, text) in MARKS.items()
+        if count[kind]
+    ]
     if parts:
         axes.set_xlabel(f"{axes.get_xlabel()}\n{'   '.join(parts)}")
