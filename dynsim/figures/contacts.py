@@ -67,7 +67,7 @@ def forces_comparison(records: Mapping[str, Record]) -> Figure | None:
     if not names:
         return None
     chosen = _most_interesting(names, list(records.values()))
-    having = {name: {v: r for v, r in records.items() if name in contact_names([r])} for name in chosen}
+    having = {name: {v: r for v, r in records.items() if _touched(r, name)} for name in chosen}
     title = style.comparison_title(list(records.values()), "normal contact forces")
     # A legend has an entry for each variant and one for the shading.
     more = sum(-(-(len(having[name]) + 1) // 2) - 1 for name in chosen) * style.LEGEND_ROW / 72.0
