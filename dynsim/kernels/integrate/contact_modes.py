@@ -69,7 +69,7 @@ from dynsim.kernels.constraint.unilateral import (
     UnilateralArrays,
     slide_direction,
 )
-from dynsim.kernels.integrate.project import RATE_TOLERANCE, project_level
+from dynsim.kernels.integrate.project import GAP_TOLERANCE, RATE_TOLERANCE, project_level
 from dynsim.kernels.integrate.run import (
     EVALUATIONS,
     FORCES_REVERSED,
@@ -144,7 +144,8 @@ def find_touching(unilateral: UnilateralArrays, ws: Workspace, touch):
         mode[k, TOUCHING] = 1 if near else 0
         if near and state[k, GAP_RATE] < -limit:
             mode[k, STRUCK] = 1
-            strikes = True
+        # What lands ever so slowly is stopped too: nothing else would, should it stay open.
+        strikes = strikes or (near and state[k, GAP_RATE] < (-limit if closed else 0.0))
     for k in range(table.shape[0]):
         j = table[k, STOP_JOINT]
         gap, rate = stop[k, SIDE] * ws.joints[j, Q] - stop[k, LIMIT], stop[k, SIDE] * ws.joints[j, QD]
@@ -288,6 +289,11 @@ def choose(system: System, ws: Workspace, run: Run):
         run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
         return
     take_solution(system, ws, size, largest)
+    for k in range(mode.shape[0]):
+        if mode[k, TOUCHING] == 1 and mode[k, WANTED] == OPEN and ws.contacts[k, GAP] < -GAP_TOLERANCE:
+            # It stays open with nothing that drives it out: back to the surface, or it would land for ever.
+            project_level(system, ws, run.y, 0)
+            break
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
     unilateral.number[REDUNDANT] = 0.0
     evaluate(system, ws, run)
@@ -307,10 +313,10 @@ def begins_sliding(system: System, ws: Workspace, k):
     slide, state = unilateral.slide, ws.contacts
     speed = slip_speed(ws, k)
     if speed > 2.0 * unilateral.number[SLOW]:
-        if unilateral.mode[k, BEFORE] != SLIDING or unilateral.mode[k, STRUCK] == 1:
-            slide[k, FROZEN] = 0.0
-            for s in range(3):
-                slide[k, REFERENCE + s] = state[k, SLIP_VELOCITY + s] / speed
+        # An impact may have turned it.
+        slide[k, FROZEN] = 0.0
+        for s in range(3):
+            slide[k, REFERENCE + s] = state[k, SLIP_VELOCITY + s] / speed
         return True
     if unilateral.law[k, STATIC] == 0.0:
         slide[k, FROZEN] = 0.0
