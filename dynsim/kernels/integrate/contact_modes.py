@@ -26,6 +26,7 @@ from dynsim.kernels.arrays import (
     QD,
     QDD,
     RHS,
+    ROW_GAP,
     ROW_RATE,
     ROWS,
     SECOND_TANGENT,
@@ -48,14 +49,17 @@ from dynsim.kernels.constraint.unilateral import (
     NEXT,
     NEXT_SPEED,
     OFFSET,
+    PROBLEM,
     REDUNDANT,
     REFERENCE,
     RESTITUTION,
+    SCRATCH,
     SECOND_PART,
     SETTLE,
     SIDE,
     SLOW,
     SOLUTION,
+    SPLIT,
     STATIC,
     STOP_BEFORE,
     STOP_CLOSED,
@@ -69,7 +73,7 @@ from dynsim.kernels.constraint.unilateral import (
     UnilateralArrays,
     slide_direction,
 )
-from dynsim.kernels.integrate.project import GAP_TOLERANCE, RATE_TOLERANCE, project_level
+from dynsim.kernels.integrate.project import PROJECTION_LIMIT, RATE_TOLERANCE, project_level
 from dynsim.kernels.integrate.run import (
     EVALUATIONS,
     FORCES_REVERSED,
@@ -86,8 +90,13 @@ from dynsim.kernels.tree.articulated import accelerate
 
 # A point that approaches faster than this many tolerances of projected rates strikes.
 STRIKE = 3.0
+# What begins to touch is brought this close to its surface [m].
+FOOT_TOLERANCE = 1e-13
 # Of a solution of the cones: residual by the largest entry, and what of the largest force is none.
 CONE_TOLERANCE, FORCE_TOLERANCE = 1e-9, 1e-9
+# Where nothing is faster, or accelerated by more, residuals are not compared with it: behind closed brakes a point has
+# motions of 1e-30, and no force upon it is better than none [m/s, m/s²].
+IMMOBILE = 1e-3
 # An acceleration along the surface below this fraction of the largest right-hand side is none.
 SLIP_TOLERANCE = 1e-8
 # A friction force this close to the cone, as a fraction, is on it.
@@ -169,6 +178,29 @@ def keep_touching(unilateral: UnilateralArrays, ws: Workspace):
 
 
 @internal_kernel
+def come_down(system: System, ws: Workspace, run: Run):
+    """Bring what touches onto its surface, to rounding, before it is held where it is.
+
+    A point lands a little below its surface. Where rows depend on each other, as those of a point on a body with one
+    degree of freedom, there might be no state at which its normal row and the tangential ones of a foot found above it
+    all vanish.
+    """
+    unilateral = system.unilateral
+    mode = unilateral.mode
+    for k in range(mode.shape[0]):
+        mode[k, WANTED] = OPEN if mode[k, TOUCHING] == 0 else STICKING if ws.active[k, MODE] == STICKING else SLIDING
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
+    for _ in range(PROJECTION_LIMIT):
+        evaluate(system, ws, run)
+        worst = 0.0
+        for r in range(ws.counts[ROWS]):
+            worst = max(worst, abs(ws.rows[r, ROW_GAP]))
+        if worst <= FOOT_TOLERANCE:
+            return
+        project_level(system, ws, run.y, 0)
+
+
+@internal_kernel
 def gather(system: System, ws: Workspace, run: Run):
     """Rows along normal and tangents of everything that touches, and their system, into the workspace.
 
@@ -176,6 +208,7 @@ def gather(system: System, ws: Workspace, run: Run):
     """
     unilateral = system.unilateral
     mode, place = unilateral.mode, unilateral.place
+    come_down(system, ws, run)
     for k in range(mode.shape[0]):
         mode[k, WANTED] = STICKING if mode[k, TOUCHING] == 1 else OPEN
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
@@ -191,6 +224,48 @@ def gather(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
+def impulses(system: System, ws: Workspace, p, largest, share):
+    """Solve for the impulses of :func:`impact` with so much of the restitutions; the loss of each row into FORCE [J].
+
+    False when there is no solution, or one that would create energy.
+    """
+    unilateral, rows = system.unilateral, ws.rows
+    vector, mode = unilateral.vector, unilateral.mode
+    for r in range(p):
+        vector[OFFSET, r], vector[SOLUTION, r] = rows[r, ROW_RATE], 0.0
+    for k in range(mode.shape[0]):
+        if mode[k, TOUCHING] == 1:
+            r = ws.active[k, FIRST_ROW]
+            vector[CONE_FRICTION, r] = system.contacts.point[k, MU]
+            # What was closed had no speed to turn round: a brake or another impact has just given it this one.
+            falls = mode[k, STRUCK] == 1 and mode[k, BEFORE] == OPEN
+            if falls and -rows[r, ROW_RATE] > unilateral.tally[k, SETTLE]:
+                vector[OFFSET, r] *= 1.0 + share * unilateral.law[k, RESTITUTION]
+    residual = solve_cones(
+        ws.small[0],
+        vector[OFFSET],
+        unilateral.place[KINDS],
+        vector[CONE_FRICTION],
+        p,
+        vector[SOLUTION],
+        unilateral.room[SCRATCH:],
+        1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE),
+    )
+    if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
+        return False
+    f, total, turnover = vector[SOLUTION], 0.0, 0.0
+    for r in range(p):
+        after = rows[r, ROW_RATE]
+        for s in range(p):
+            after += ws.small[0, r, s] * f[s]
+        # FORCE is free until the next evaluation.
+        rows[r, FORCE] = -0.5 * f[r] * (rows[r, ROW_RATE] + after)
+        total += rows[r, FORCE]
+        turnover += abs(rows[r, FORCE])
+    return total >= -CONE_TOLERANCE * turnover or share == 0.0
+
+
+@internal_kernel
 def impact(system: System, ws: Workspace, run: Run):
     """Impulses that stop what approaches: u = W P + b with b = J v and, of normals that strike, (1 + e) n·v.
 
@@ -201,25 +276,10 @@ def impact(system: System, ws: Workspace, run: Run):
     p = gather(system, ws, run)
     largest = 0.0
     for r in range(p):
-        vector[OFFSET, r], vector[SOLUTION, r] = rows[r, ROW_RATE], 0.0
         largest = max(largest, abs(rows[r, ROW_RATE]))
-    for k in range(mode.shape[0]):
-        if mode[k, TOUCHING] == 1:
-            r = ws.active[k, FIRST_ROW]
-            vector[CONE_FRICTION, r] = system.contacts.point[k, MU]
-            if mode[k, STRUCK] == 1 and -rows[r, ROW_RATE] > unilateral.tally[k, SETTLE]:
-                vector[OFFSET, r] *= 1.0 + unilateral.law[k, RESTITUTION]
-    residual = solve_cones(
-        ws.small[0],
-        vector[OFFSET],
-        unilateral.place[KINDS],
-        vector[CONE_FRICTION],
-        p,
-        vector[SOLUTION],
-        unilateral.room,
-        1e-2 * CONE_TOLERANCE * largest,
-    )
-    if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
+    # Newton's restitution may contradict friction: a point that is wedged cannot leave, and some would gain energy.
+    # Those impacts are without restitution, which always has a solution, and a loss.
+    if not impulses(system, ws, p, largest, 1.0) and not impulses(system, ws, p, largest, 0.0):
         run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
         return
     f = vector[SOLUTION]
@@ -230,12 +290,6 @@ def impact(system: System, ws: Workspace, run: Run):
     accelerate(system.model, ws)
     for i in range(ws.joints.shape[0]):
         y[layout.v + i] += ws.joints[i, QDD]
-    for r in range(p):
-        after = rows[r, ROW_RATE]
-        for s in range(p):
-            after += ws.small[0, r, s] * f[s]
-        # FORCE is free until the next evaluation: the loss of each row.
-        rows[r, FORCE] = -0.5 * f[r] * (rows[r, ROW_RATE] + after)
     for k in range(mode.shape[0]):
         if mode[k, TOUCHING] == 1:
             r = ws.active[k, FIRST_ROW]
@@ -270,14 +324,14 @@ def choose(system: System, ws: Workspace, run: Run):
         if run.count[STATUS] == FORCES_REVERSED:
             return
         residual = solve_cones(
-            unilateral.matrix,
+            unilateral.room[PROBLEM],
             vector[OFFSET],
             unilateral.place[KINDS],
             vector[CONE_FRICTION],
             size,
             vector[SOLUTION],
-            unilateral.room,
-            1e-2 * CONE_TOLERANCE * largest,
+            unilateral.room[SCRATCH:],
+            1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE),
         )
         if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
             run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
@@ -289,13 +343,9 @@ def choose(system: System, ws: Workspace, run: Run):
         run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
         return
     take_solution(system, ws, size, largest)
-    for k in range(mode.shape[0]):
-        if mode[k, TOUCHING] == 1 and mode[k, WANTED] == OPEN and ws.contacts[k, GAP] < -GAP_TOLERANCE:
-            # It stays open with nothing that drives it out: back to the surface, or it would land for ever.
-            project_level(system, ws, run.y, 0)
-            break
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
-    unilateral.number[REDUNDANT] = 0.0
+    # What was split before says nothing of these modes.
+    unilateral.number[REDUNDANT], unilateral.number[SPLIT] = 0.0, 0.0
     evaluate(system, ws, run)
     # What is left of rates after an impact that was let settle; of a point that has stopped, rounding.
     loss = project_level(system, ws, run.y, 1)
@@ -367,8 +417,8 @@ def reduce_rows(system: System, ws: Workspace, run: Run, p):
             value = W[a, b]
             if vector[FIRST_PART, j] != 0.0 or vector[SECOND_PART, j] != 0.0:
                 value += vector[FIRST_PART, j] * W[a, b + 1] + vector[SECOND_PART, j] * W[a, b + 2]
-            unilateral.matrix[i, j] = value
-        if place[KINDS, i] == ONE_WAY and W[a, a] > 0.0 and unilateral.matrix[i, i] <= 1e-12 * W[a, a]:
+            unilateral.room[PROBLEM, i, j] = value
+        if place[KINDS, i] == ONE_WAY and W[a, a] > 0.0 and unilateral.room[PROBLEM, i, i] <= 1e-12 * W[a, a]:
             run.count[STATUS], run.clock[NOT_UNIQUE] = FORCES_REVERSED, run.clock[TIME]
     return size
 
@@ -378,7 +428,7 @@ def acceleration(unilateral: UnilateralArrays, i, size):
     """Acceleration along row i of the reduced problem."""
     total = unilateral.vector[OFFSET, i]
     for j in range(size):
-        total += unilateral.matrix[i, j] * unilateral.vector[SOLUTION, j]
+        total += unilateral.room[PROBLEM, i, j] * unilateral.vector[SOLUTION, j]
     return total
 
 
