@@ -83,7 +83,7 @@ def split_forces(unilateral: UnilateralArrays, ws: Workspace):
             room[0, i, j] = ws.small[0, row[i], row[j]]
     width = null_space(room[0], p, room[1], place[2])
     unilateral.number[SPLIT] = 1.0
-    unilateral.number[BEST_MARGIN] = best_split(force, room[1], width, first, mu, count, out, unilateral.split_room)
+    unilateral.number[BEST_MARGIN] = best_split(force[:p], room[1], width, first, mu, count, out[:p], unilateral.split_room)
     for i in range(p):
         rows[row[i], FORCE] = out[i]
 
