@@ -50,8 +50,9 @@ TICK_SLACK = 1e-12
 # End of a run without end [s]: far beyond any, and still a number to reckon with.
 _FAR = 1e300
 SERVO_MODES = {"position": ka.POSITION_MODE, "velocity": ka.VELOCITY_MODE, "off": ka.OFF}
-# Inertia of a joint whose brake is closed [kg m² or kg]: what no load moves.
-BRAKED = 1e12
+# Inertia of a joint whose brake is closed [kg m² or kg]: what no load moves, not even by a rounding of its angle, so
+# that a contact point behind closed brakes alone stays where it is.
+BRAKED = 1e30
 
 
 class Simulation:
@@ -330,8 +331,9 @@ class Simulation:
         """Close or open the brake that every joint is thought to have: it holds the joint where it is.
 
         A joint that turns is brought to rest by an impulse, Δv = −M⁻¹ e v_j / (eᵀ M⁻¹ e) with e the joint's unit vector
-        and M with rotors, and joint losses of the ledger take the kinetic energy, ½ v_j² / (eᵀ M⁻¹ e). Constraints are
-        met again by projection, which the ledger does not see.
+        and M with rotors, and joint losses of the ledger take the kinetic energy, ½ v_j² / (eᵀ M⁻¹ e). Contacts of the
+        unilateral law answer with impulses of their own; other constraints are met again by projection, which the
+        ledger does not see.
         """
         j = _index(self._joints, joint, "joint")
         if any(joint in (coupling.joint, coupling.leader) for coupling in self.robot.couplings):
@@ -349,6 +351,8 @@ class Simulation:
             v -= response * (v[j] / response[j])
             v[j] = 0.0
         armature[j] = BRAKED if closed else self._armature[j]
+        if run.count[ki.MODES_DUE] == 0:
+            run.count[ki.MODES_DUE] = ki.AFTER_JUMP
         self._restart()
 
     def release(self, joint: str) -> None:
@@ -619,6 +623,7 @@ class Simulation:
             ("reference", system.reference._asdict()),
             ("loads", system.loads._asdict()),
             ("support", prepared.run.support._asdict() if prepared.run.support else {}),
+            ("stepping", prepared.run.stepping._asdict() if prepared.run.stepping else {}),
             ("unilateral", {} if system.unilateral is None else system.unilateral._asdict()),
         ):
             found |= {f"{owner}.{name}": array for name, array in part.items() if isinstance(array, np.ndarray)}

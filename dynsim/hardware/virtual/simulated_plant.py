@@ -1,21 +1,20 @@
-"""A simulated robot behind the virtual servos: its bodies, gravity, and the surfaces its elbows are braced on.
+"""A simulated robot behind the virtual servos: its bodies, gravity, joint stops, and what its elbows are braced on.
 
-A :class:`dynsim.Simulation` moves it: the scenario's robot, with servos of the map's models for motors. Unlike the
-scenario's bilateral law a floor does not pull here. Contact points are pushed by a stiff spring and damper with
-regularised Coulomb friction, as wrenches on their bodies that are held for a tick Δt. With G = J M⁻¹ Jᵀ, the mobility
-of a point [1/kg], damping c and friction b take no more speed away in a tick than there is,
+A :class:`dynsim.Simulation` moves it: the scenario's robot, with servos of the map's models for motors. Contacts are
+those of the engine under the unilateral law, whatever law the scenario has: a real floor does not pull. The integrator
+is the default one, that of events.
 
-    f_n = max(0, −k g − c/(1 + Δt c nᵀG n) ġ)        f_t = −b/(1 + Δt b |G|) v_t,   b = μ f_n/√(v_t² + v_s²)
-
-Ticks are stable while k Δt/2 is less than what is left of c, which holds for points of more than 11 g. A load at rest
-is carried by k alone.
+What servos tell of a posture is rounded to ticks, so that a braced elbow may seem to be some tenths of a millimetre
+below its floor, or a joint beyond its stop. The arm then starts at the nearest posture that is possible.
 """
 
 from __future__ import annotations
 
+import logging
 import math
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,15 +25,17 @@ from dynsim.hardware.servo_map import ServoMap
 from dynsim.hardware.virtual.servo_plant import Drive, MotorLaw
 
 if TYPE_CHECKING:
-    from dynsim import Scenario, Simulation
+    from dynsim import Scenario
+    from dynsim.model.description import Contact
+    from dynsim.model.model import Model
 
 Array = NDArray[np.float64]
 
-TICK = 1e-3
-"""For so long a contact's force is held [s]; the servos' physics step is a multiple of it."""
-CONTACT_STIFFNESS = 2e4
-"""[N/m]: the 50 N of a braced elbow sink it by 2.5 mm."""
-CONTACT_DAMPING = 200.0  # N·s/m
+log = logging.getLogger(__name__)
+
+START_CHANGE = 5.0 * RAD_PER_TICK
+"""At the start joints are moved by this much at most to get off what they are in: ticks and backlash [rad]."""
+GAP = 1e-10  # [m]
 SLOW, STEADY = 1e-4, 1e-2
 """Slower [rad/s] and with less acceleration [rad/s²] a limp robot rests."""
 
@@ -51,12 +52,14 @@ class SimulatedArm:
         Whose robot it is, with payloads and contacts; forces that the scenario gives over time are left out.
     servo_map : ServoMap
     posture : array, shape (n,)
-        Where the joints are at first [rad], in the order of the model.
+        Where the joints are at first [rad], in the order of the model; see :func:`possible`.
 
     Raises
     ------
     ServoMapError
         The servos of the map are not the joints of the model.
+    ModelError
+        A contact point starts below its surface by more than ticks explain.
     """
 
     def __init__(self, scenario: Scenario, servo_map: ServoMap, posture: Array) -> None:
@@ -81,24 +84,18 @@ class SimulatedArm:
             for servo in self._law.servos(labels, np.abs(self._scale))
             for mass, point in [masses.get(servo.joint, (0.0, None))]
         ]
-        start = dynsim.State(0.0, np.asarray(posture, dtype=np.float64), np.zeros(len(joints)), np.zeros(0))
-        self._simulation = dynsim.Simulation(_bare(scenario), state=start, duration=math.inf, trace=0, motors=motors)
-        self._contacts = [
-            (contact, robot.links[index].name, index, point)
-            for contact in build.contacts(scenario)
-            for index, point in [robot.attach(contact.body, contact.point)]
-        ]
-        self._pushed: set[str] = set()  # bodies with a wrench
+        bare = _bare(scenario)
+        q = possible(bare, build.build_model(bare), np.asarray(posture, dtype=np.float64))
+        start = dynsim.State(0.0, q, np.zeros(len(joints)), np.zeros(0))
+        self.simulation = dynsim.Simulation(bare, state=start, duration=math.inf, trace=0, motors=motors)
         self._on_stand = np.ones(len(servos), dtype=bool)
         self._jammed = np.zeros(len(servos), dtype=bool)
         self._told = [("off", 0.0, 0.0)] * len(servos)
         for label in labels:
-            self._simulation.set_mode(label, "off")
-            self._simulation.set_brake(label, True)
-        self._simulation.every(TICK, self._push)
+            self.simulation.set_mode(label, "off")
+            self.simulation.set_brake(label, True)
         # Nothing moves yet; kernels are compiled now, not while a bus waits for an answer.
-        self._ticks = 1
-        self._simulation.advance(TICK)
+        self.simulation.advance(1e-3)
         self.rests = True
         self.torque = np.zeros(len(servos))
         self.position, self.velocity = self._shafts()
@@ -106,11 +103,11 @@ class SimulatedArm:
     @property
     def joint_positions(self) -> Array:
         """Joint angles [rad], shape (n,), in the order of the model."""
-        return self._simulation.state.q
+        return self.simulation.state.q
 
     def step(self, dt: float, drive: Drive) -> None:
         self._on_stand &= ~drive.enabled
-        simulation, before = self._simulation, self.velocity
+        simulation, before = self.simulation, self.velocity
         simulation.set_supply(max(drive.voltage, 0.0))
         positions = (drive.set_position - self._zero) / self._scale
         rates = drive.set_velocity / self._scale
@@ -125,8 +122,7 @@ class SimulatedArm:
                 simulation.set_reference(label, *told[1:])
                 self._told[k] = told
         self._jammed[:] = False
-        self._ticks += round(dt / TICK)
-        simulation.advance(self._ticks * TICK)
+        simulation.advance(simulation.time + dt)
         self.position, self.velocity = self._shafts()
         self.torque = self._law.torque(self.position, self.velocity, drive)
         steady = np.abs(self.velocity - before).max() < STEADY * dt
@@ -134,70 +130,70 @@ class SimulatedArm:
 
     def stop(self, index: int) -> None:
         self._jammed[index] = True
-        self._simulation.set_brake(self._labels[index], True)
+        self.simulation.set_brake(self._labels[index], True)
         self.position, self.velocity = self._shafts()
 
     def _shafts(self) -> tuple[Array, Array]:
         """Angles [rad] and speeds [rad/s] of the servos."""
-        state = self._simulation.state
+        state = self.simulation.state
         return self._zero + self._scale * state.q[self._order], self._scale * state.v[self._order]
 
-    def _push(self, simulation: Simulation) -> None:
-        """Write the contacts' forces at the present state, for a tick."""
-        state, model = simulation.state, simulation.model
-        # By body: where its first contact is, in its own frame and in the world, and the wrench there.
-        pushes: dict[str, tuple[Array, Array, Array]] = {}
-        compliance = None
-        for contact, body, index, point in self._contacts:
-            position, jacobian = model.point_position_and_jacobian(index, point, state.q)
-            gap = float(contact.surface.gap(position))
-            if gap >= 0.0:
-                continue
-            if compliance is None:
-                compliance = np.linalg.inv(model.mass_matrix(state.q) + np.diag(model.armature))
-            force = push(contact, position, gap, jacobian @ state.v, jacobian @ compliance @ jacobian.T)
-            if body in pushes:
-                _, centre, wrench = pushes[body]
-                wrench += np.concatenate([force, np.cross(position - centre, force)])
-            else:
-                pushes[body] = point, position, np.concatenate([force, np.zeros(3)])
-        for body, (point, _, wrench) in pushes.items():
-            simulation.set_wrench(body, wrench[:3], wrench[3:], point=point)
-        for body in self._pushed - pushes.keys():
-            simulation.set_wrench(body)
-        self._pushed = set(pushes)
 
+def possible(scenario: Scenario, model: Model, posture: Array) -> Array:
+    """The posture, (n,) [rad], with joints within their stops and contact points on their surfaces or above them.
 
-def push(contact: Any, position: Array, gap: float, velocity: Array, mobility: Array) -> Array:
-    """Force on a point below its surface, (3,) [N].
-
-    Parameters
-    ----------
-    contact : of the scenario
-    position, velocity : of the point, (3,) [m], [m/s]
-    gap : below zero [m]
-    mobility : J M⁻¹ Jᵀ of the point, (3, 3) [1/kg]
+    It is the nearest one to first order, Δq = −Jᵀ(J Jᵀ)⁺ gap for the points that were ever below, repeated until
+    gaps are rounding; what is moved is logged. A posture that would have to change by more than START_CHANGE is
+    returned as it is: the simulation refuses it by name.
     """
-    normal = np.asarray(contact.surface.normal(position))
-    rate = float(normal @ velocity)
-    along = float(normal @ mobility @ normal)
-    damping = CONTACT_DAMPING / (1.0 + TICK * CONTACT_DAMPING * along)
-    force = max(0.0, -CONTACT_STIFFNESS * gap - damping * rate)
-    slip = velocity - normal * rate
-    grip = contact.friction * force / math.hypot(float(np.linalg.norm(slip)), contact.slip_smoothing)
-    across = float(np.trace(mobility)) - along
-    return np.asarray(normal * force - slip * (grip / (1.0 + TICK * grip * across)))
+    from dynsim.model.shapes import contact_gap
+    from dynsim.scenario import build
+
+    contacts = build.contacts(scenario, model.robot)
+    links = model.robot.links
+
+    def gap(contact: Contact, q: Array) -> float:
+        ends = [model.point_position(contact.body, end, q) for end in (contact.point, contact.tip) if end is not None]
+        return contact_gap(contact, *ends)
+
+    def gaps(q: Array) -> Array:
+        return np.array([gap(contact, q) for contact in contacts])
+
+    q = np.clip(posture, [link.lower for link in links], [link.upper for link in links])
+    below = np.zeros(len(contacts), dtype=bool)
+    for _ in range(20):
+        depths = gaps(q)
+        below |= depths < -GAP
+        if np.abs(depths[below]).max(initial=0.0) <= GAP:
+            break
+        q = q - np.linalg.pinv(_slopes(gaps, q)[below]) @ depths[below]
+    change = np.abs(q - posture).max(initial=0.0)
+    if not 0.0 < change <= START_CHANGE:
+        return posture
+    log.info("a joint starts %.2g rad beside where its servo is: contact points on their surfaces, stops", change)
+    return q
+
+
+def _slopes(function: Callable[[Array], Array], q: Array, step: float = 1e-6) -> Array:
+    """Jacobian of a function of the joints by central differences, (c, n)."""
+    shifts = step * np.eye(len(q))
+    return np.array([(function(q + shift) - function(q - shift)) / (2.0 * step) for shift in shifts]).T
 
 
 def _bare(scenario: Scenario) -> Scenario:
-    """The plant of a scenario and its payloads: no controller, no contacts that hold, no forces over time."""
+    """The plant of a scenario, its payloads and what it can touch: no controller, no forces over time, no glue."""
     from dynsim.scenario.loads import Payload
+    from dynsim.scenario.schema import BILATERAL_KEYS, Contacts
 
     config = scenario.config
     payloads = {name: load for name, load in config.loads.items() if isinstance(load, Payload)}
-    free = config.contacts.model_copy(update={"points": {}})
-    integrator = type(config.integrator)()
-    changes = {"controller": None, "contacts": free, "loads": payloads, "integrator": integrator}
+    given = config.contacts.model_dump(exclude_unset=True, exclude=set(BILATERAL_KEYS))
+    changes = {
+        "controller": None,
+        "contacts": Contacts(**{**given, "law": "unilateral"}),
+        "loads": payloads,
+        "integrator": type(config.integrator)(),
+    }
     return replace(scenario, config=config.model_copy(update=changes))
 
 

@@ -159,16 +159,17 @@ def too_long(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
 
 @internal_kernel
 def note_gaps(ws: Workspace, gaps):
-    """Gaps and their rates at the start of a step, for :func:`passes_below`."""
+    """Gaps and their rates at the start of a step, for :func:`too_long`."""
     for k in range(gaps.shape[0]):
         gaps[k, 0], gaps[k, 1] = ws.contacts[k, GAP], ws.contacts[k, GAP_RATE]
 
 
 @internal_kernel
-def watch_modes(unilateral: UnilateralArrays | None, ws: Workspace, h):
-    """At an accepted step, before its samples: times in each mode, depths, and the directions of slip at its end."""
+def watch_modes(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
+    """At an accepted step, before its samples: times in each mode, depths, gaps and directions of slip at its end."""
     if unilateral is None:
         return
+    note_gaps(ws, gaps)
     state, tally, slide = ws.contacts, unilateral.tally, unilateral.slide
     for k in range(state.shape[0]):
         tally[k, TIME_OPEN + ws.active[k, MODE]] += h
@@ -199,6 +200,16 @@ def take_directions(unilateral: UnilateralArrays | None, ws: Workspace, run: Run
             for s in range(3):
                 slide[k, REFERENCE + s] = slide[k, NEXT + s]
         slide[k, FROZEN] = 0.0 if fast else 1.0
+
+
+@internal_kernel
+def at_limit(unilateral: UnilateralArrays, ws: Workspace, k):
+    """True when candidate k, whose guard of slip has fallen through zero, is one that gives way.
+
+    The guards of dependent rows fall together, with the best worst margin. Those with a better one hold.
+    """
+    slack = FORCE_SLACK * (1.0 + abs(ws.contacts[k, NORMAL_FORCE]))
+    return unilateral.number[SPLIT] == 0.0 or margin(unilateral, ws, k) <= unilateral.number[BEST_MARGIN] + slack
 
 
 @internal_kernel
@@ -340,6 +351,8 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
             mode[k, WANTED] = OPEN
             tell(system, run, k, LIFT_OFF)
         elif mode[k, WANTED] == STICKING:
+            if not at_limit(unilateral, ws, k):
+                continue
             r = ws.active[k, FIRST_ROW]
             begin_slip(system, ws, k, ws.rows[r + 1, FORCE], ws.rows[r + 2, FORCE])
             mode[k, WANTED] = SLIDING

@@ -49,14 +49,17 @@ from dynsim.kernels.constraint.unilateral import (
     NEXT,
     NEXT_SPEED,
     OFFSET,
+    PROBLEM,
     REDUNDANT,
     REFERENCE,
     RESTITUTION,
+    SCRATCH,
     SECOND_PART,
     SETTLE,
     SIDE,
     SLOW,
     SOLUTION,
+    SPLIT,
     STATIC,
     STOP_BEFORE,
     STOP_CLOSED,
@@ -91,6 +94,9 @@ STRIKE = 3.0
 FOOT_TOLERANCE = 1e-13
 # Of a solution of the cones: residual by the largest entry, and what of the largest force is none.
 CONE_TOLERANCE, FORCE_TOLERANCE = 1e-9, 1e-9
+# Where nothing is faster, or accelerated by more, residuals are not compared with it: behind closed brakes a point has
+# motions of 1e-30, and no force upon it is better than none [m/s, m/s²].
+IMMOBILE = 1e-3
 # An acceleration along the surface below this fraction of the largest right-hand side is none.
 SLIP_TOLERANCE = 1e-8
 # A friction force this close to the cone, as a fraction, is on it.
@@ -147,7 +153,8 @@ def find_touching(unilateral: UnilateralArrays, ws: Workspace, touch):
         mode[k, TOUCHING] = 1 if near else 0
         if near and state[k, GAP_RATE] < -limit:
             mode[k, STRUCK] = 1
-            strikes = True
+        # What lands ever so slowly is stopped too: nothing else would, should it stay open.
+        strikes = strikes or (near and state[k, GAP_RATE] < (-limit if closed else 0.0))
     for k in range(table.shape[0]):
         j = table[k, STOP_JOINT]
         gap, rate = stop[k, SIDE] * ws.joints[j, Q] - stop[k, LIMIT], stop[k, SIDE] * ws.joints[j, QD]
@@ -230,7 +237,9 @@ def impulses(system: System, ws: Workspace, p, largest, share):
         if mode[k, TOUCHING] == 1:
             r = ws.active[k, FIRST_ROW]
             vector[CONE_FRICTION, r] = system.contacts.point[k, MU]
-            if mode[k, STRUCK] == 1 and -rows[r, ROW_RATE] > unilateral.tally[k, SETTLE]:
+            # What was closed had no speed to turn round: a brake or another impact has just given it this one.
+            falls = mode[k, STRUCK] == 1 and mode[k, BEFORE] == OPEN
+            if falls and -rows[r, ROW_RATE] > unilateral.tally[k, SETTLE]:
                 vector[OFFSET, r] *= 1.0 + share * unilateral.law[k, RESTITUTION]
     residual = solve_cones(
         ws.small[0],
@@ -239,8 +248,8 @@ def impulses(system: System, ws: Workspace, p, largest, share):
         vector[CONE_FRICTION],
         p,
         vector[SOLUTION],
-        unilateral.room,
-        1e-2 * CONE_TOLERANCE * largest,
+        unilateral.room[SCRATCH:],
+        1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE),
     )
     if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
         return False
@@ -315,14 +324,14 @@ def choose(system: System, ws: Workspace, run: Run):
         if run.count[STATUS] == FORCES_REVERSED:
             return
         residual = solve_cones(
-            unilateral.matrix,
+            unilateral.room[PROBLEM],
             vector[OFFSET],
             unilateral.place[KINDS],
             vector[CONE_FRICTION],
             size,
             vector[SOLUTION],
-            unilateral.room,
-            1e-2 * CONE_TOLERANCE * largest,
+            unilateral.room[SCRATCH:],
+            1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE),
         )
         if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
             run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
@@ -335,7 +344,8 @@ def choose(system: System, ws: Workspace, run: Run):
         return
     take_solution(system, ws, size, largest)
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
-    unilateral.number[REDUNDANT] = 0.0
+    # What was split before says nothing of these modes.
+    unilateral.number[REDUNDANT], unilateral.number[SPLIT] = 0.0, 0.0
     evaluate(system, ws, run)
     # What is left of rates after an impact that was let settle; of a point that has stopped, rounding.
     loss = project_level(system, ws, run.y, 1)
@@ -353,10 +363,10 @@ def begins_sliding(system: System, ws: Workspace, k):
     slide, state = unilateral.slide, ws.contacts
     speed = slip_speed(ws, k)
     if speed > 2.0 * unilateral.number[SLOW]:
-        if unilateral.mode[k, BEFORE] != SLIDING or unilateral.mode[k, STRUCK] == 1:
-            slide[k, FROZEN] = 0.0
-            for s in range(3):
-                slide[k, REFERENCE + s] = state[k, SLIP_VELOCITY + s] / speed
+        # An impact may have turned it.
+        slide[k, FROZEN] = 0.0
+        for s in range(3):
+            slide[k, REFERENCE + s] = state[k, SLIP_VELOCITY + s] / speed
         return True
     if unilateral.law[k, STATIC] == 0.0:
         slide[k, FROZEN] = 0.0
@@ -407,8 +417,8 @@ def reduce_rows(system: System, ws: Workspace, run: Run, p):
             value = W[a, b]
             if vector[FIRST_PART, j] != 0.0 or vector[SECOND_PART, j] != 0.0:
                 value += vector[FIRST_PART, j] * W[a, b + 1] + vector[SECOND_PART, j] * W[a, b + 2]
-            unilateral.matrix[i, j] = value
-        if place[KINDS, i] == ONE_WAY and W[a, a] > 0.0 and unilateral.matrix[i, i] <= 1e-12 * W[a, a]:
+            unilateral.room[PROBLEM, i, j] = value
+        if place[KINDS, i] == ONE_WAY and W[a, a] > 0.0 and unilateral.room[PROBLEM, i, i] <= 1e-12 * W[a, a]:
             run.count[STATUS], run.clock[NOT_UNIQUE] = FORCES_REVERSED, run.clock[TIME]
     return size
 
@@ -418,7 +428,7 @@ def acceleration(unilateral: UnilateralArrays, i, size):
     """Acceleration along row i of the reduced problem."""
     total = unilateral.vector[OFFSET, i]
     for j in range(size):
-        total += unilateral.matrix[i, j] * unilateral.vector[SOLUTION, j]
+        total += unilateral.room[PROBLEM, i, j] * unilateral.vector[SOLUTION, j]
     return total
 
 

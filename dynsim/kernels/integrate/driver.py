@@ -36,6 +36,7 @@ from dynsim.kernels.integrate.moreau import advance_moreau
 from dynsim.kernels.integrate.project import off_surface, settle
 from dynsim.kernels.integrate.rosenbrock import step_rodas4
 from dynsim.kernels.integrate.run import (
+    AT_START,
     DOPRI5,
     END,
     ERROR,
@@ -90,10 +91,10 @@ def start_contacts(unilateral: UnilateralArrays | None, system: System, ws: Work
     """Derivative at the start of a step, on the constraints; under the unilateral law with modes that agree with it."""
     if unilateral is None:  # known to the compiler, as it is below: system.unilateral would not be
         return settle(system, run.clock[TIME], run.y, ws, run.stage[0], run)
-    first = run.count[MODES_DUE] == 1
-    if first:
+    due, first = run.count[MODES_DUE] > 0, run.count[MODES_DUE] == AT_START
+    if due:
         run.count[MODES_DUE] = 0
-        solve_modes(system, ws, run, True)
+        solve_modes(system, ws, run, first)
     if run.count[STATUS] != RUNNING or not settle(system, run.clock[TIME], run.y, ws, run.stage[0], run):
         return False
     if consistent(system, ws):
@@ -112,7 +113,7 @@ def accept(system: System, ws: Workspace, run: Run):
     if not (clearly_unique(ws) or forces_unique(system, ws, run, t + h)):
         return
     watch(ws, run, h)
-    watch_modes(system.unilateral, ws, h)
+    watch_modes(system.unilateral, ws, h, run.gaps)
     # The event of tipping has asked for the ground's reaction at the end of this step.
     if run.event.shape[0] > 0:
         watch_support(run.support)

@@ -174,7 +174,6 @@ def passes_over(system: System, ws: Workspace, run: Run):
         run.clock[STEP] *= part
         return True
     run.count[GRAZING] = 0
-    note_gaps(ws, run.gaps)
     return False
 
 

@@ -36,9 +36,10 @@ STEPS, REJECTED, EVALUATIONS, PROJECTIONS, SAMPLE, STATUS, STARTED = 0, 1, 2, 3,
 # at a tick; events in the log; bits of the ticks that the caller is to look at.
 PENDING, SEARCHING, TURNED_BACK, FIRED, TRIMMED, LOGGED, TICKED = 7, 8, 9, 10, 11, 12, 13
 NEXT_BREAK = 14  # index of the first of Run.breaks that is not past
-MODES_DUE = 15  # 1: contact modes are to be chosen at the next start
+MODES_DUE = 15  # contact modes are to be chosen at the next start, which is that of the run, or follows a jump of rates
 GRAZING = 16  # how often the step was shortened because it passed over a contact
 COUNT_SIZE = 17
+AT_START, AFTER_JUMP = 1, 2
 # Run.event, and Run.event_table, int
 EVENT_LEVEL, SIDE, START_VALUE, VALUE, AT_LOW, AT_HIGH = 0, 1, 2, 3, 4, 5
 EVENT_SIZE = 6
@@ -142,7 +143,7 @@ def new_run(
     extremes = np.zeros((c, EXTREMES_SIZE))
     extremes[:, FORCE_MIN], extremes[:, FORCE_MAX], extremes[:, LOCAL_SINCE] = np.inf, -np.inf, np.inf
     count = np.zeros(COUNT_SIZE, dtype=np.int64)
-    count[MODES_DUE] = 1
+    count[MODES_DUE] = AT_START
     return Run(
         method=method,
         layout=layout,
