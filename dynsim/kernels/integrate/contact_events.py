@@ -98,6 +98,9 @@ WINDOW, MOST_EVENTS, MOST_SETTLE = 1.0, 200, 1e-2
 # So many changes at one instant, or chatter so often at one candidate, end the run.
 MOST_CHANGES, MOST_CHATTER = 60, 100
 INSTANT = 1e-11
+# A point that slips against its direction at less than this has not stopped yet [m/s]: of what begins to slip with next
+# to no acceleration the speed is rounding.
+BACKWARD = 2e-11
 # Forces that contradict their modes by less than this, absolute [N] and of the largest, are rounding.
 FORCE_SLACK = 1e-9
 
@@ -116,11 +119,14 @@ def contact_guard(unilateral: UnilateralArrays | None, ws: Workspace, kind, k):
     if kind == NORMAL_GUARD:
         return ws.contacts[k, GAP] + DEPTH if mode == OPEN else ws.contacts[k, NORMAL_FORCE]
     if mode == SLIDING and unilateral.law[k, STATIC] > 0.0:
-        return unilateral.slide[k, SPEED]
+        return unilateral.slide[k, SPEED] + BACKWARD
     if mode == STICKING:
-        own = margin(unilateral, ws, k)
-        # Of dependent rows the forces in the workspace may be the least that fit: they say nothing of what is left.
-        return min(own, unilateral.number[BEST_MARGIN]) if unilateral.number[SPLIT] == 1.0 else own
+        best = unilateral.number[BEST_MARGIN]
+        # Dependent rows, where the least norm fits no cones: the forces are the least that do, on some cone, and say
+        # nothing of what is left. Once none fit, those of the best margin show which contacts give way.
+        if unilateral.number[SPLIT] == 1.0 and best > 0.0:
+            return best
+        return margin(unilateral, ws, k)
     return 1.0
 
 

@@ -343,13 +343,20 @@ def choose(system: System, ws: Workspace, run: Run):
         run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
         return
     take_solution(system, ws, size, largest)
-    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
+    # What is left of rates after an impact that was let settle, and of points that were solved for as if at rest: those
+    # that begin to slip would else go against the direction that they are given, and stop, and begin again.
+    for k in range(mode.shape[0]):
+        starts = mode[k, WANTED] == SLIDING and unilateral.slide[k, FROZEN] == 1.0
+        rests = starts and slip_speed(ws, k) <= 2.0 * unilateral.number[SLOW]
+        mode[k, TOUCHING] = STICKING if rests else mode[k, WANTED]
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, TOUCHING])
     # What was split before says nothing of these modes.
     unilateral.number[REDUNDANT], unilateral.number[SPLIT] = 0.0, 0.0
     evaluate(system, ws, run)
-    # What is left of rates after an impact that was let settle; of a point that has stopped, rounding.
     loss = project_level(system, ws, run.y, 1)
     run.y[system.layout.loss + IMPACT_LOSS] += loss
+    evaluate(system, ws, run)
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
     before = ws.counts[DEPENDENT]
     evaluate(system, ws, run)
     unilateral.number[REDUNDANT] = 1.0 if ws.counts[DEPENDENT] > before else 0.0
