@@ -101,7 +101,7 @@ def joint_stops(robot: Robot) -> list[JointStop]:
                 beyond = side * (limit - robot.initial[k])
                 if beyond > START_TOLERANCE:
                     raise ModelError(
-                        f"{link.joint}: starts at {robot.initial[k]:.6g} {link.units[0]}, beyond its stop at {limit:.6g}; "
+                        f"{link.joint}: starts at {robot.initial[k]:.6g} {link.units[0]}, beyond its stop {limit:.6g}; "
                         "contacts.law: unilateral enforces it: change its initial position or its limit"
                     )
                 found.append(JointStop(link.joint, side, float(limit)))
