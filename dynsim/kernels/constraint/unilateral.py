@@ -28,7 +28,8 @@ FROZEN = 3  # 1: slip is too slow to have a direction of its own, that of REFERE
 SPEED = 4  # v_t · REFERENCE [m/s]
 NEXT = 5  # 3: direction at the end of the step
 NEXT_SPEED = 8  # |v_t| there [m/s]
-SLIDE_SIZE = 9
+HEADWAY = 9  # what it began to slip with against its direction, because the rows could not take it away [m/s]
+SLIDE_SIZE = 10
 # UnilateralArrays.tally, of a candidate
 TIME_OPEN, TIME_SLIDING, TIME_STICKING = 0, 1, 2  # in the order of the modes [s]
 LIFT_OFFS, LANDINGS, SLIP_STARTS, BOUNCES = 3, 4, 5, 6

@@ -37,6 +37,7 @@ from dynsim.kernels.constraint.unilateral import (
     CLOSED_TIME,
     DEEPEST,
     FROZEN,
+    HEADWAY,
     HITS,
     LANDINGS,
     LAST_CHANGE,
@@ -119,7 +120,7 @@ def contact_guard(unilateral: UnilateralArrays | None, ws: Workspace, kind, k):
     if kind == NORMAL_GUARD:
         return ws.contacts[k, GAP] + DEPTH if mode == OPEN else ws.contacts[k, NORMAL_FORCE]
     if mode == SLIDING and unilateral.law[k, STATIC] > 0.0:
-        return unilateral.slide[k, SPEED] + BACKWARD
+        return unilateral.slide[k, SPEED] + unilateral.slide[k, HEADWAY] + BACKWARD
     if mode == STICKING:
         own = margin(unilateral, ws, k)
         # Of dependent rows the forces in the workspace may be the least that fit: they say nothing of what is left.
