@@ -300,7 +300,7 @@ def test_an_arm_that_goes_limp_falls_on_its_contact_points_and_gains_no_energy(l
 
 def test_a_braced_arm_bears_jams_and_servos_without_power() -> None:
     """Brakes close and open with elbows on the floor: forces stay finite, the floor firm, shafts where they are."""
-    line, plant, model = armed("two_elbows")
+    _, plant, model = armed("two_elbows")
     held = plant.joint_positions.copy()
     drive = asked(10, enabled=True, at=plant.position)
     rng = np.random.default_rng(4)

@@ -26,6 +26,7 @@ from dynsim.kernels.arrays import (
     QD,
     QDD,
     RHS,
+    ROW_GAP,
     ROW_RATE,
     ROWS,
     SECOND_TANGENT,
@@ -72,7 +73,7 @@ from dynsim.kernels.constraint.unilateral import (
     UnilateralArrays,
     slide_direction,
 )
-from dynsim.kernels.integrate.project import RATE_TOLERANCE, project_level
+from dynsim.kernels.integrate.project import GAP_TOLERANCE, RATE_TOLERANCE, project_level
 from dynsim.kernels.integrate.run import (
     EVALUATIONS,
     FORCES_REVERSED,
@@ -264,6 +265,13 @@ def choose(system: System, ws: Workspace, run: Run):
     unilateral = system.unilateral
     mode, vector = unilateral.mode, unilateral.vector
     p = gather(system, ws, run)
+    deepest = 0.0
+    for r in range(p):
+        deepest = max(deepest, -ws.rows[r, ROW_GAP])
+    if deepest > GAP_TOLERANCE:
+        # What has landed lies below its surface, and would land again at once if it turned out to leave.
+        project_level(system, ws, run.y, 0)
+        evaluate(system, ws, run)
     largest = 0.0
     for r in range(p):
         largest = max(largest, abs(ws.rows[r, RHS]))
