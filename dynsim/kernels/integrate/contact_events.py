@@ -39,6 +39,7 @@ from dynsim.kernels.constraint.unilateral import (
     DEEPEST,
     DEPTH,
     FROZEN,
+    HEADWAY,
     HITS,
     LANDINGS,
     LANDS_AT,
@@ -120,7 +121,7 @@ def contact_guard(unilateral: UnilateralArrays | None, ws: Workspace, kind, k):
     if kind == NORMAL_GUARD:
         return ws.contacts[k, GAP] + unilateral.slide[k, LANDS_AT] if mode == OPEN else ws.contacts[k, NORMAL_FORCE]
     if mode == SLIDING and unilateral.law[k, STATIC] > 0.0:
-        return unilateral.slide[k, SPEED] + BACKWARD
+        return unilateral.slide[k, SPEED] + unilateral.slide[k, HEADWAY] + BACKWARD
     if mode == STICKING:
         best = unilateral.number[BEST_MARGIN]
         # Dependent rows, where the least norm fits no cones: the forces are the least that do, on some cone, and say

@@ -43,6 +43,7 @@ from dynsim.kernels.constraint.unilateral import (
     CONE_FRICTION,
     FIRST_PART,
     FROZEN,
+    HEADWAY,
     KINDS,
     LIMIT,
     LOSS,
@@ -59,6 +60,7 @@ from dynsim.kernels.constraint.unilateral import (
     SIDE,
     SLOW,
     SOLUTION,
+    SPEED,
     SPLIT,
     STATIC,
     STOP_BEFORE,
@@ -364,6 +366,9 @@ def choose(system: System, ws: Workspace, run: Run):
     evaluate(system, ws, run)
     unilateral.number[REDUNDANT] = 1.0 if ws.counts[DEPENDENT] > before else 0.0
     ws.counts[DEPENDENT] = before
+    for k in range(mode.shape[0]):
+        starts = mode[k, WANTED] == SLIDING and mode[k, TOUCHING] == STICKING
+        unilateral.slide[k, HEADWAY] = max(0.0, -unilateral.slide[k, SPEED]) if starts else 0.0
 
 
 @internal_kernel
