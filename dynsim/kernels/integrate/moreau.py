@@ -126,7 +126,7 @@ def step_moreau(system: System, ws: Workspace, run: Run):
         add_loads(model, system.loads, t + theta * h, ws, run.stage[1], layout.load)
     tangent_rows(system, s, ws)
     factor(model, ws)
-    row_rates(model, ws, v0, s.rate[0])
+    row_rates(model, ws, y, layout.v, s.rate[0])
     if ws.counts[ROWS] > 0:
         row_system(model, ws)
         solve_contacts(s, ws, h)
@@ -142,7 +142,7 @@ def step_moreau(system: System, ws: Workspace, run: Run):
     for i in range(n):
         y_new[layout.v + i] = v0[i] + h * last[i]
         joints[i, QDD] = last[i]
-    row_rates(model, ws, y_new[layout.v : layout.v + n], s.rate[1])
+    row_rates(model, ws, y_new, layout.v, s.rate[1])
     for a in range(ws.motors.shape[0]):
         k, j = system.drives.table[a, CIRCUIT], system.drives.table[a, DRIVEN]
         if k >= 0:

@@ -285,18 +285,18 @@ def tangent_rows(system, s: SteppingArrays, ws: Workspace):
 
 
 @internal_kernel
-def row_rates(model: ModelArrays, ws: Workspace, v, out):
-    """J v of all rows; v: (n,). A row's rate climbs from its link to the world."""
+def row_rates(model: ModelArrays, ws: Workspace, y, first, out):
+    """J v of all rows, v from ``first`` on in y. A row's rate climbs from its link to the world."""
     rows, links, active = ws.rows, ws.links, ws.active
     for r in range(ws.counts[ROWS]):
         if r < ws.counts[COUPLED]:
-            out[r] = rows[r, ROW] * v[active[r, BODY_A]] + rows[r, ROW + 1] * v[active[r, BODY_B]]
+            out[r] = rows[r, ROW] * y[first + active[r, BODY_A]] + rows[r, ROW + 1] * y[first + active[r, BODY_B]]
             continue
         a, b, c = rows[r, ROW], rows[r, ROW + 1], rows[r, ROW + 2]
         d, e, f = rows[r, ROW + 3], rows[r, ROW + 4], rows[r, ROW + 5]
         total, i = 0.0, active[r, BODY_A]
         while i >= 0:
-            total += v[i] * (
+            total += y[first + i] * (
                 ((a * links[i, S] + b * links[i, S + 1]) + (c * links[i, S + 2] + d * links[i, S + 3]))
                 + (e * links[i, S + 4] + f * links[i, S + 5])
             )
