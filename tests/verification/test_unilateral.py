@@ -11,6 +11,7 @@ from dynsim.kernels.integrate import contact_events as ce
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.state import FRICTION, OUT_FORCE, OUT_GAP, OUT_MODE
 from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot, vector
+from dynsim.model.unilateral import SETTLE_SPEED
 
 G = 9.81
 ORIGIN = np.zeros(3)
@@ -98,10 +99,10 @@ def test_a_bouncing_ball():
     times = np.array([t for t, _, _ in found])
     flights = 2.0 * first * e ** np.arange(1, 11)
     np.testing.assert_allclose(times[:10], first + np.concatenate([[0.0], np.cumsum(flights)[:9]]), rtol=0, atol=1e-8)
-    # Bounces slower than 1e-5 m/s are let settle.
+    # Bounces slower than SETTLE_SPEED are let settle.
     end = first * (1.0 + e) / (1.0 - e)
     assert found[-1][2] == ce.LANDING
-    assert times[-1] == pytest.approx(end, abs=2.0 * 1e-5 / G / (1.0 - e))
+    assert times[-1] == pytest.approx(end, abs=2.0 * SETTLE_SPEED / G / (1.0 - e))
     assert all(kind == ce.BOUNCE for _, _, kind in found[:-1])
     assert np.abs(run.states("q")[-1]).max() <= 1e-9
     assert run.states("loss")[-1, 0] == pytest.approx(0.7 * G * height, rel=1e-9)
