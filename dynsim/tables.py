@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rich import box
@@ -53,6 +53,8 @@ _ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = 
     ("mechanical work [J]", lambda s: s.get("mechanical_work_J"), _number),
     ("Joule heat [J]", lambda s: s.get("joule_heat_J"), _number),
     ("friction heat [J]", lambda s: s.get("friction_heat_J"), _number),
+    ("impact loss [J]", lambda s: s.get("impact_loss_J"), _number),
+    ("stop loss [J]", lambda s: s.get("stop_loss_J") or None, _number),
     ("hand error, rms [mm]", lambda s: s.get("hand_error_rms_m"), lambda v: _number(v, 1e3)),
     ("  max [mm]", lambda s: s.get("hand_error_max_m"), lambda v: _number(v, 1e3)),
     ("  vertical, rms [mm]", lambda s: s.get("hand_error_z_rms_m"), lambda v: _number(v, 1e3)),
@@ -91,8 +93,10 @@ def print_summary(console: Console, summary: Summary) -> None:
         if value is not None:
             table.add_row(escaped_line(heading), show(value))
     for contact in summary.get("contacts", ()):
-        for heading, show_contact in _CONTACT_ROWS:
-            table.add_row(escaped_line(_of(contact["name"], heading)), show_contact(contact))
+        for heading, cells in _contact_rows(contact["name"], [contact]):
+            table.add_row(heading, *cells)
+    for heading, value in _stop_rows(summary):
+        table.add_row(heading, value)
     console.print(table)
     _print_warnings(console, {"": summary})
 
@@ -126,9 +130,8 @@ def _print_columns(console: Console, summaries: Mapping[str, Summary], names: Se
     contacts = list(dict.fromkeys(c["name"] for s in summaries.values() for c in s.get("contacts", ())))
     for contact in contacts:
         by_variant = [next((c for c in s["contacts"] if c["name"] == contact), None) for s in shown]
-        for heading, show_contact in _CONTACT_ROWS:
-            cells = (show_contact(c) if c else "–" for c in by_variant)
-            table.add_row(escaped_line(_of(contact, heading)), *cells)
+        for heading, cells in _contact_rows(contact, by_variant):
+            table.add_row(heading, *cells)
     console.print(table)
 
 
@@ -169,12 +172,45 @@ def _pulling(contact: Summary) -> str:
     return f"[bold red]{pulling:.1f}[/]" if pulling > 0.0 else "0"
 
 
-_CONTACT_ROWS: tuple[tuple[str, Callable[[Summary], str]], ...] = (
-    ("force, mean [N]", lambda c: f"{c['normal_force_mean_N']:.2f}"),
-    ("  min [N]", lambda c: f"{c['normal_force_min_N']:.2f}"),
-    ("  max [N]", lambda c: f"{c['normal_force_max_N']:.2f}"),
-    ("  pulling [% of time]", _pulling),
+def _percent(key: str) -> Callable[[Summary], str]:
+    return lambda contact: f"{100.0 * contact[key]:.1f}" if 0.0 < contact[key] < 1.0 else f"{100.0 * contact[key]:.0f}"
+
+
+def _is_real(contact: Summary) -> bool:
+    """Whether it followed the unilateral law."""
+    return "sticking_fraction" in contact
+
+
+# Heading, how to show it, and whether it is said of contacts of the bilateral (False) or unilateral law (True) only.
+_CONTACT_ROWS: tuple[tuple[str, Callable[[Summary], str], bool | None], ...] = (
+    ("force, mean [N]", lambda c: f"{c['normal_force_mean_N']:.2f}", None),
+    ("  min [N]", lambda c: f"{c['normal_force_min_N']:.2f}", None),
+    ("  max [N]", lambda c: f"{c['normal_force_max_N']:.2f}", None),
+    ("  pulling [% of time]", _pulling, False),
+    ("  closed [% of time]", _percent("closed_fraction"), True),
+    ("  sticking [% of time]", _percent("sticking_fraction"), True),
+    ("  lift-offs, landings", lambda c: f"{c['lift_offs']}, {c['landings']}", True),
+    ("  bounces, slip starts", lambda c: f"{c['bounces']}, {c['slip_starts']}", True),
+    ("  impact loss [J]", lambda c: _number(c["impact_loss_J"], digits=3), True),
 )
+
+
+def _contact_rows(name: str, contacts: Sequence[Summary | None]) -> Iterator[tuple[str, list[str]]]:
+    """Rows of a contact, a cell for each run; None where a run does not have it. No rows if it never touched."""
+    having = [contact for contact in contacts if contact]
+    if not any(contact["closed_fraction"] > 0.0 for contact in having):
+        return
+    for heading, show, real in _CONTACT_ROWS:
+        if real is None or any(_is_real(contact) == real for contact in having):
+            cells = [show(c) if c and real in (None, _is_real(c)) else "–" for c in contacts]
+            yield escaped_line(_of(name, heading)), cells
+
+
+def _stop_rows(summary: Summary) -> Iterator[tuple[str, str]]:
+    """Joint stops that were touched."""
+    for stop in summary.get("joint_stops", ()):
+        yield escaped_line(f"{stop['joint']}: hits of its stop"), str(stop["hits"])
+        yield "  impact loss [J]", _number(stop["impact_loss_J"], digits=3)
 
 
 def _of(contact: str, heading: str) -> str:

@@ -98,8 +98,11 @@ def prepare(
     if times is None:
         times = sample_times(scenario, layout, columns, n)
     _check_coordinates(scenario, robot)
-    if robot.base is not None and scenario.integrator.method == "time_stepping":
-        raise ScenarioError("integrator.method: time_stepping does not locate events, such as a mobile base that tips")
+    if scenario.integrator.method == "time_stepping":
+        if robot.base is not None:
+            raise ScenarioError("integrator.method: time_stepping locates no events, such as a mobile base that tips")
+        if contacts and not real:
+            raise ScenarioError("integrator.method: time_stepping needs `contacts: {law: unilateral}`")
     _check_stiffness(scenario, robot)
     joint_rows = len(robot.couplings) + len(stops)
     _check_work(scenario, n, c + joint_rows)
@@ -125,7 +128,7 @@ def prepare(
     )
     stepping = None
     if method == ki.TIME_STEPPING:
-        stepping = stepping_arrays(model.arrays, system.contacts, na, joint_rows, options.theta)
+        stepping = stepping_arrays(model.arrays, system.contacts, na, joint_rows, options.theta, system.unilateral)
     y = np.zeros(layout.size)
     y[block(layout, "q")] = robot.initial
     run = ki.new_run(

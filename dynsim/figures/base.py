@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dynsim.figures import style
+from dynsim.figures import events, style
 from dynsim.figures.style import Array
 from dynsim.measures import TIP_OVER
 from dynsim.record import Record
@@ -56,6 +56,7 @@ def overturning(record: Record) -> Figure | None:
         note.append(f"none without load on a wheel: {100.0 * missing:.2g} % of the samples")
     last = rows[2][-1]
     last.set_xlabel("\n".join([last.get_xlabel(), *note]))
+    events.mark_all(rows, record)
     return figure
 
 
@@ -121,6 +122,7 @@ def tracking(record: Record) -> Figure | None:
     for panels, label in zip(rows, labels, strict=True):
         panels[0].set_ylabel(label)
         style.legend_above(panels[-1], columns=4)
+    events.mark_all(rows, record)
     figure.align_ylabels([panels[0] for panels in rows])
     return figure
 

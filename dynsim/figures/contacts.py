@@ -1,4 +1,8 @@
-"""Normal forces of the contacts, with the region in which the surface would have to pull."""
+"""Normal forces of the contacts, with the region in which the surface would have to pull, or with what they do.
+
+Under the bilateral law a force may have either sign, and what lies below zero is shaded. Under the unilateral one
+there is a mode at each instant instead: bands show when a contact is open, slides and sticks.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dynsim.figures import style
+from dynsim.figures import events, style
 from dynsim.figures.style import Array
 from dynsim.record import Record
 
@@ -17,22 +21,33 @@ from dynsim.record import Record
 ROWS = 8
 # More samples than this are not drawn as dots.
 DOTS = 150
+# Modes by their number: what a contact does, the colour of its bands, and what of the summary says for how long.
+MODE = "contact_mode"
+MODES = (
+    ("open", "#EFEFEF", "closed_fraction"),
+    ("slides", "#FCE3B0", "sliding_fraction"),
+    ("sticks", "#BFE6D8", "sticking_fraction"),
+)
 
 
 def forces(record: Record) -> Figure | None:
-    """Normal force of each contact; None without contacts."""
-    names = contact_names([record])
+    """Normal force of each contact; None without contacts, or if none ever touched."""
+    names = touching_names([record])
     if not names:
         return None
     chosen = _most_interesting(names, [record])
-    note = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} contacts (lowest forces)"
+    note = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} contacts ({_choice([record])})"
     figure = style.new_figure(1.0 + 1.5 * len(chosen), style.title(record, f"normal contact forces{note}"))
     rows = style.time_rows(figure, [_series(record, name) for name in chosen], style.settle_time(record))
     for name, panels in zip(chosen, rows, strict=True):
         force = _force(record, name)
         for axes in panels:
-            style.line(axes, record.time, force, color=style.BLUE, label=pulling_label(record, name))
+            style.line(axes, record.time, force, color=style.BLUE, label=force_label(record, name))
             _draw_extremes(axes, record, name, style.BLUE)
+            if is_real(record):
+                _draw_modes(axes, record, name)
+                events.mark(axes, events.marked(record, [name]))
+                continue
             axes.fill_between(
                 *_thin_negative(record.time, force), 0.0, color=style.PULLING, alpha=0.3, linewidth=0, label="_pulling"
             )
@@ -40,18 +55,19 @@ def forces(record: Record) -> Figure | None:
         if len(panels) > 1:
             _draw_samples(panels[0], record, name, style.BLUE)
         panels[0].set_ylabel(f"{name}\n$f_n$ [N]")
-        style.legend_above(panels[-1])
+        style.legend_above(panels[-1], columns=4 if is_real(record) else 3)
     _note_sampling(rows[-1], [record])
+    events.explain(rows[-1][-1], events.marked(record, chosen))
     return figure
 
 
 def forces_comparison(records: Mapping[str, Record]) -> Figure | None:
     """Normal force of each contact, all variants that have it over each other."""
-    names = contact_names(list(records.values()))
+    names = touching_names(list(records.values()))
     if not names:
         return None
     chosen = _most_interesting(names, list(records.values()))
-    having = {name: {v: r for v, r in records.items() if name in contact_names([r])} for name in chosen}
+    having = {name: {v: r for v, r in records.items() if _touched(r, name)} for name in chosen}
     title = style.comparison_title(list(records.values()), "normal contact forces")
     # A legend has an entry for each variant and one for the shading.
     more = sum(-(-(len(having[name]) + 1) // 2) - 1 for name in chosen) * style.LEGEND_ROW / 72.0
@@ -63,16 +79,20 @@ def forces_comparison(records: Mapping[str, Record]) -> Figure | None:
     for name, panels in zip(chosen, rows, strict=True):
         for axes in panels:
             for variant, record in having[name].items():
-                label = f"{variant}: pulling {_share(record, name)}{_within(record, name)}"
+                label = f"{variant}: {_share(record, name)}{_within(record, name)}"
+                colour = str(styles[variant]["color"])
                 style.line(axes, record.time, _force(record, name), label=label, **styles[variant])
-                _draw_extremes(axes, record, name, str(styles[variant]["color"]))
-            _mark_pulling(axes)
+                _draw_extremes(axes, record, name, colour)
+                events.mark(axes, events.marked(record, [name]), colour, row=list(having[name]).index(variant))
+            if not all(map(is_real, having[name].values())):
+                _mark_pulling(axes)
         if len(panels) > 1:
             for variant, record in having[name].items():
                 _draw_samples(panels[0], record, name, str(styles[variant]["color"]))
         panels[0].set_ylabel(f"{name}\n$f_n$ [N]")
         style.legend_above(panels[-1], columns=2)
     _note_sampling(rows[-1], list(records.values()))
+    events.explain(rows[-1][-1], [event for record in records.values() for event in events.marked(record, chosen)])
     return figure
 
 
@@ -84,14 +104,33 @@ def contact_names(records: Sequence[Record]) -> list[str]:
     return list(found)
 
 
-def pulling_label(record: Record, name: str) -> str:
-    """Share of the run in which the contact pulls, and the extremes of its force."""
-    return f"{name}: pulling {_share(record, name)} of the run{_within(record, name)}"
+def touching_names(records: Sequence[Record]) -> list[str]:
+    """Those that touched: under the unilateral law many may, and most never do."""
+    return [name for name in contact_names(records) if any(_touched(record, name) for record in records)]
+
+
+def _touched(record: Record, name: str) -> bool:
+    return name in contact_names([record]) and _summary(record, name).get("closed_fraction", 1.0) > 0.0
+
+
+def is_real(record: Record) -> bool:
+    """Whether its contacts follow the unilateral law."""
+    return MODE in record
+
+
+def force_label(record: Record, name: str) -> str:
+    """Share of the run in which the contact pulls or, if real, is closed, and the extremes of its force."""
+    return f"{name}: {_share(record, name)} of the run{_within(record, name)}"
 
 
 def _share(record: Record, name: str) -> str:
+    what, key = ("closed", "closed_fraction") if is_real(record) else ("pulling", "pulling_fraction")
     contact = _summary(record, name)
-    return f"{100.0 * contact['pulling_fraction']:.1f} %" if contact else "unknown part"
+    return f"{what} {_percent(contact[key])}" if contact else f"{what} unknown part"
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.1f} %"
 
 
 def _within(record: Record, name: str) -> str:
@@ -149,12 +188,50 @@ def _force(record: Record, name: str) -> Array:
 
 
 def _most_interesting(names: list[str], records: Sequence[Record]) -> list[str]:
-    """All contacts, or the ``ROWS`` with the lowest forces, in the order of ``names``."""
+    """All contacts, or ``ROWS`` of them, in their order: those that pull hardest, or if real press hardest."""
     if len(names) <= ROWS:
         return names
-    lowest = {n: min(float(_force(r, n).min()) for r in records if n in contact_names([r])) for n in names}
-    chosen = sorted(names, key=lowest.__getitem__)[:ROWS]
+    real = any(map(is_real, records))
+
+    def rank(name: str) -> float:
+        values = [_force(r, name) for r in records if name in contact_names([r])]
+        return -max(float(one.max()) for one in values) if real else min(float(one.min()) for one in values)
+
+    chosen = sorted(names, key=rank)[:ROWS]
     return [name for name in names if name in chosen]
+
+
+def _choice(records: Sequence[Record]) -> str:
+    return "highest forces" if any(map(is_real, records)) else "lowest forces"
+
+
+def mode_bands(record: Record, name: str) -> list[tuple[float, float, int]]:
+    """Begin, end [s] and mode of each stretch of samples in one mode, cut at the contact's events if there are some."""
+    mode = np.rint(record[MODE][:, record.labels[MODE].index(name)]).astype(int)
+    changes = [event.time for event in events.marked(record, [name])]
+    time, bands, since = record.time, [], float(record.time[0])
+    for k in np.flatnonzero(np.diff(mode)):
+        between = [t for t in changes if time[k] < t <= time[k + 1]]
+        at = between[-1] if between else float(time[k + 1])
+        bands.append((since, at, int(mode[k])))
+        since = at
+    return [*bands, (since, float(time[-1]), int(mode[-1]))]
+
+
+def _draw_modes(axes: Axes, record: Record, name: str) -> None:
+    """Bands behind the curve: when the contact is open, slides and sticks, with the share of the run in the legend."""
+    bands, contact = mode_bands(record, name), _summary(record, name)
+    limits = axes.get_xlim()
+    for mode, (text, colour, key) in enumerate(MODES):
+        spans = [(begin, end - begin) for begin, end, which in bands if which == mode]
+        share = None if not contact else contact[key] if mode else 1.0 - contact[key]
+        if not spans and not share:
+            continue
+        label = text if share is None else f"{text} {_percent(share)}"
+        axes.broken_barh(
+            spans, (0.0, 1.0), transform=axes.get_xaxis_transform(), color=colour, linewidth=0, zorder=0.2, label=label
+        )
+    axes.set_xlim(limits)
 
 
 def _thin_negative(time: Array, force: Array) -> tuple[Array, Array]:

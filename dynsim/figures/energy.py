@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from dynsim.figures import style
+from dynsim.figures import events, style
 from dynsim.figures.style import Array
 from dynsim.measures import RESIDUAL_LIMIT, energy_turnover
 from dynsim.record import Record
@@ -20,6 +20,8 @@ TERMS = {
     "loss_gear": ("gear losses", "#56B4E9"),
     "loss_joint": ("joint losses", "#0072B2"),
     "heat_friction": ("contact friction", "#882255"),
+    "loss_impact": ("impacts of contacts", "#8C6D31"),
+    "loss_stop": ("impacts at joint stops", "#F0E442"),
     "energy_kinetic": ("Δ kinetic energy", "#009E73"),
     "energy_potential": ("Δ potential energy", "#CC79A7"),
     "energy_magnetic": ("Δ magnetic energy", "#7F7F7F"),
@@ -54,6 +56,7 @@ def energy(record: Record) -> Figure | None:
     bottom.axhline(0.0, color=style.GREY, linewidth=0.6)
     bottom.set_ylabel("mechanical work [J]")
     bottom.set_xlabel("time [s]")
+    events.mark_all([(top,), (bottom,)], record)
     for axes in (top, bottom):
         axes.legend(loc="best")
     return figure
@@ -93,7 +96,7 @@ def ledger(record: Record) -> Figure | None:
     """Where the energy went, stacked, and what the ledger does not explain; None without a ledger."""
     if "energy_residual" not in record:
         return None
-    terms = {name: record[name] - record[name][:1] for name in TERMS}
+    terms = {name: record[name] - record[name][:1] for name in TERMS if name in record}
     supplied = record["energy_electrical"] + record["work_constraint"]
     source = "electrical energy"
     if "work_loads" in record:
@@ -109,6 +112,7 @@ def ledger(record: Record) -> Figure | None:
         _stack(panels[1], record.time, rest, supplied - terms["heat_joule"], source)
         panels[1].set_ylabel("the same without\nJoule heat [J]")
     _residual(panels[-1], record, turnover)
+    events.mark_all([(axes,) for axes in panels], record)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dynsim.figures import style
+from dynsim.figures import events, style
 from dynsim.figures.style import Array
 from dynsim.measures import hand_error, hand_target
 from dynsim.record import Record
@@ -77,6 +77,7 @@ def error(record: Record) -> Figure | None:
     bottom.set_ylim(bottom=0.0)
     bottom.set_xlabel("time [s]")
     _mark_settle((top, bottom), record)
+    events.mark_all([(top,), (bottom,)], record)
     style.legend_above(top, columns=4)
     style.legend_above(bottom)
     return figure

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dynsim.figures import style
+from dynsim.figures import events, style
 from dynsim.record import Record
 
 # Up to ALL motors a line each; beyond that the LARGEST few and the envelope of all.
@@ -37,6 +37,7 @@ def motors(record: Record) -> Figure | None:
         for axes in panels:
             _draw(axes, record, name, shown)
         panels[0].set_ylabel(label)
+    events.mark_all(rows, record)
     figure.legend(*rows[0][-1].get_legend_handles_labels(), loc="outside right center")
     return figure
 

@@ -69,17 +69,24 @@ class Skeleton:
         return list(dict.fromkeys(rows[np.linspace(0, len(rows) - 1, FAINT + 1).astype(int)].tolist()))
 
     def contacts(self) -> list[tuple[Point, Surface, Array, float]]:
-        """Contact, its surface, position and normal force at the end; NaN for a force that is not known."""
+        """Contact, its surface, position and normal force at the end; NaN for a force that is not known.
+
+        Of those that could touch, under the unilateral law, the ones that did in some sample.
+        """
         record = self.record
         if not np.isfinite(record[POSITION][-1]).all():
             return []
         forces: dict[str, float] = {}
         if "contact_normal_force" in record:
             forces = dict(zip(record.labels["contact_normal_force"], record["contact_normal_force"][-1], strict=True))
+        untouched: set[str] = set()
+        if "contact_mode" in record:
+            open_always = (record["contact_mode"] == 0.0).all(axis=0)
+            untouched = {name for name, one in zip(record.labels["contact_mode"], open_always, strict=True) if one}
         return [
             (point, surface, point_positions(record, point, len(record) - 1), float(forces.get(point.name, np.nan)))
             for point in self.scene.contacts
-            if (surface := self.scene.surface(point.surface)) is not None
+            if (surface := self.scene.surface(point.surface)) is not None and point.name not in untouched
         ]
 
 

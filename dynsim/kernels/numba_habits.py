@@ -1,7 +1,8 @@
 """Habits of numba that cost a third of the time it takes to make a kernel, mended: it looks the same things up again
 and again. None of this changes what is compiled.
 
-numba is pinned to one minor version, see pyproject.toml; a test compiles with and without, to the same machine code.
+numba is pinned to one minor version, see pyproject.toml; a test compiles with and without this, to the same machine
+code.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from dynsim.config import StrictConfig
 from dynsim.errors import ModelError
@@ -16,8 +16,10 @@ from dynsim.model.control import BasePath, HandPath, JointControl
 from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Drive
 from dynsim.model.model import Model
-from dynsim.model.snake import SnakeDescription, TaskSpaceController
 from dynsim.model.surfaces import Box, HeightField, Quadric
+
+if TYPE_CHECKING:
+    from dynsim.model.snake import SnakeDescription, TaskSpaceController
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,9 @@ class BuildContext:
     @property
     def snake(self) -> SnakeDescription:
         """The snake to be controlled; ModelError where there is none."""
+        # Imported here: an arm needs nothing of a snake.
+        from dynsim.model.snake import SnakeDescription
+
         if not isinstance(self.machine, SnakeDescription):
             raise ModelError("there is no snake to build this for")
         return self.machine

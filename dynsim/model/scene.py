@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dynsim.model.description import Array, Contact, Link, Robot
 from dynsim.model.mobile_base import SUPPORTS, MobileBase
-from dynsim.model.snake import SnakeDescription
 from dynsim.model.surfaces import Box, HeightField, Quadric
 from dynsim.model.surfaces import Surface as TouchedSurface
 from dynsim.record.quaternion import of_turn
@@ -28,6 +28,9 @@ from dynsim.record.scene import (
     quaternion,
     vector3,
 )
+
+if TYPE_CHECKING:
+    from dynsim.model.snake import SnakeDescription
 
 # Of a height field: as many lines each way as a picture can show.
 GRID_LINES = 61

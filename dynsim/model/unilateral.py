@@ -10,8 +10,7 @@ import numpy as np
 from dynsim.errors import ModelError
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.constraint import unilateral as ku
-from dynsim.kernels.constraint.cone import CONE_ROOM
-from dynsim.kernels.constraint.socp import split_room
+from dynsim.kernels.constraint.socp import split_size
 from dynsim.kernels.constraint.unilateral import UnilateralArrays
 from dynsim.kernels.jit import integers, reals
 from dynsim.model.description import Contact, Robot
@@ -75,12 +74,10 @@ def compile_unilateral(
         tally=reals(tally),
         stop_table=integers(stop_table),
         stop=reals(stop),
-        place=integers(np.zeros((ku.PLACES, p))),
+        place=integers(np.zeros((ku.PLACES, max(p, c + 2)))),
         vector=reals(np.zeros((ku.VECTORS, p))),
-        split=reals(np.zeros((2, p, p))),
-        split_room=split_room(3 * c, c),
-        matrix=reals(np.zeros((p, p))),
-        room=reals(np.zeros((CONE_ROOM, p, p))),
+        room=reals(np.zeros((ku.ROOM, p, p))),
+        split_room=reals(np.zeros(split_size(3 * c, c))),
         number=reals(number),
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +18,14 @@ from dynsim.model.model import Model
 from dynsim.model.posture import on_surfaces
 from dynsim.model.protocols import BuildContext
 from dynsim.model.shapes import contact_gap
-from dynsim.model.snake import SnakeDescription, TaskSpaceController
 from dynsim.model.surfaces import SURFACES, Surface
 from dynsim.problems import dotted, suggest
 from dynsim.scenario.candidates import candidates
 from dynsim.scenario.loads import Payload
 from dynsim.scenario.schema import ContactPoint, Contacts, Scenario
+
+if TYPE_CHECKING:
+    from dynsim.model.snake import SnakeDescription, TaskSpaceController
 
 # A contact point must start this close to its surface [m].
 START_TOLERANCE = 1e-6
@@ -32,6 +34,9 @@ START_TOLERANCE = 1e-6
 def machine(scenario: Scenario) -> Robot | SnakeDescription:
     """What the plant of the scenario is, a tree of bodies or a snake."""
     if scenario.engine == "kinematic":
+        # Imported here and below: an arm needs nothing of a snake.
+        from dynsim.model.snake import SnakeDescription
+
         return families.build("plant", scenario.plant, BuildContext(scenario.duration_s), SnakeDescription)
     return robot(scenario)
 
@@ -103,7 +108,7 @@ def controller(
         raise ModelError("the scenario has no controller; its motors are short-circuited")
     if scenario.engine != families.member("controller", config.type).ENGINE:
         raise ModelError(f"controller {config.type!r} cannot drive a {scenario.plant.type!r}")
-    points = {} if isinstance(machine, SnakeDescription) else {c.name: c for c in contacts(scenario)}
+    points = {c.name: c for c in contacts(scenario)} if isinstance(machine, Model) else {}
     context = BuildContext(scenario.duration_s, machine, progress=progress, contacts=points)
     if isinstance(machine, Model):
         control = families.build("controller", config, context, JointControl)
@@ -112,6 +117,8 @@ def controller(
             ends = f"end at {control.end:g} s, the run at {scenario.duration_s:g} s"
             raise ModelError(f"controller {config.type!r}: its references {ends}")
         return control
+    from dynsim.model.snake import TaskSpaceController
+
     return families.build("controller", config, context, TaskSpaceController)
 
 

@@ -284,10 +284,9 @@ def save_comparison(records: Mapping[str, Record], folder: Path) -> None:
     columns = ["variant"] + [key for one in flat.values() for key, value in one.items() if _is_scalar(value)]
     columns = list(dict.fromkeys(columns))
     contacts = list(dict.fromkeys(c["name"] for s in summaries.values() for c in s.get("contacts", ())))
-    contact_keys = (
-        "normal_force_min_N", "normal_force_mean_N", "normal_force_max_N", "closed_fraction", "pulling_fraction",
-        "slip_distance_m",
-    )  # fmt: skip
+    # Those of the unilateral law are there if some variant has it.
+    keys = [key for s in summaries.values() for c in s.get("contacts", ()) for key, v in c.items() if not _is_text(v)]
+    contact_keys = list(dict.fromkeys(keys))
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow([*columns, *(f"{name}.{key}" for name in contacts for key in contact_keys)])
@@ -300,6 +299,10 @@ def save_comparison(records: Mapping[str, Record], folder: Path) -> None:
     replace_together(
         folder, {"comparison.json": table.encode("utf-8"), "comparison.csv": stream.getvalue().encode("utf-8")}
     )
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
 
 
 def _is_scalar(value: Any) -> bool:

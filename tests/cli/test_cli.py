@@ -1,5 +1,6 @@
 """The command line as a user meets it: files, exit codes, one-line errors, Ctrl-C."""
 
+import csv
 import json
 import os
 import subprocess
@@ -64,6 +65,31 @@ def test_compare_prints_the_table_and_writes_the_comparison(tmp_path: Path):
     assert rows[0].startswith("variant,")
     assert [row.split(",")[0] for row in rows[1:]] == list(variants)
     assert {"elbow_4.closed_fraction", "elbow_4.slip_distance_m"} <= set(rows[0].split(","))
+
+
+def test_compare_says_what_real_contacts_did(tmp_path: Path):
+    result = dynsim("compare", "elbow_comparison_floor", "--no-figures", *SHORT, folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    rows = {line.strip()[:24].strip(): line for line in result.stdout.splitlines()}
+    assert "pulling [% of time]" not in rows
+    assert {"closed [% of time]", "sticking [% of time]", "lift-offs, landings", "impact loss [J]"} <= set(rows)
+    folder = tmp_path / "results" / "elbow_comparison_floor"
+    with (folder / "comparison.csv").open(newline="") as stream:
+        by_variant = {row["variant"]: row for row in csv.DictReader(stream)}
+    for variant, summary in json.loads((folder / "comparison.json").read_text())["variants"].items():
+        assert float(by_variant[variant]["impact_loss_J"]) == summary["impact_loss_J"]
+        having = {contact["name"]: contact for contact in summary["contacts"]}
+        for name in ("elbow_4", "elbow_7"):
+            for key in (
+                "sticking_fraction",
+                "sliding_fraction",
+                "lift_offs",
+                "landings",
+                "slip_starts",
+                "impact_loss_J",
+            ):
+                cell = by_variant[variant][f"{name}.{key}"]
+                assert cell == (str(having[name][key]) if name in having else "")
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,9 @@ import pytest
 from matplotlib.figure import Figure
 
 import dynsim
-from dynsim import figures, metrics
+from dynsim import figures, measures, metrics
 from dynsim.errors import RecordError
-from dynsim.figures import arm, contacts, energy, hand, motors, posture, skeleton, style
+from dynsim.figures import arm, contacts, energy, events, hand, motors, posture, skeleton, style
 from dynsim.record import Record
 from dynsim.scenario import load_scenario
 
@@ -229,7 +230,7 @@ def test_ledger_stack_adds_up_to_the_electrical_energy(braced: Record) -> None:
     total = max(y.max() for y in at_end) + min(y.min() for y in at_end)
     expected = braced["energy_electrical"] + braced["work_constraint"] - braced["energy_residual"]
     assert total == pytest.approx(expected[-1], rel=1e-12)
-    assert set(energy.TERMS) == {*metrics.SINKS, *metrics.STORES}
+    assert set(energy.TERMS) == {*measures.SINKS, *measures.IMPACT_SINKS, *metrics.STORES}
 
 
 def test_hand_path_panels_have_one_scale_and_all_points(braced: Record) -> None:
@@ -383,3 +384,97 @@ def test_a_free_body_hangs_on_nothing(tmp_path: Path):
     assert body is not None
     drawn = [segment for segment in body.segments(0) if np.ptp(segment, axis=0).any()]
     np.testing.assert_allclose(drawn, [[[1, 2, 3], [1.5, 2, 3]], [[1.5, 2, 3], [1.7, 2, 3]]], atol=1e-15)
+
+
+@pytest.fixture(scope="module")
+def real() -> Record:
+    return dynsim.simulate(load_scenario("elbow_comparison_floor", "two_elbows", SHORT))
+
+
+def test_real_contacts_have_bands_that_end_at_their_events(real: Record) -> None:
+    """Elbow 7 slides, leaves, lands and slides: each band is of one mode, and what they add up to is the summary's."""
+    for contact in real.summary["contacts"]:
+        bands = contacts.mode_bands(real, contact["name"])
+        assert bands[0][0] == 0.0
+        assert bands[-1][1] == real.time[-1]
+        assert all(one[1] == following[0] for one, following in itertools.pairwise(bands))
+        times = {event.time for event in real.events if event.name == contact["name"]}
+        assert {begin for begin, _, _ in bands[1:]} <= times
+        open_for = sum(end - begin for begin, end, mode in bands if mode == 0)
+        # Phases between two samples have no band.
+        assert open_for / real.time[-1] == pytest.approx(1.0 - contact["closed_fraction"], abs=0.005 / real.time[-1])
+
+
+def test_real_contact_figure_names_modes_and_marks_events(real: Record) -> None:
+    figure = drawn(contacts.forces(real))
+    assert "surface pulls" not in texts(figure)
+    for contact in real.summary["contacts"]:
+        assert f"{contact['name']}: closed {100 * contact['closed_fraction']:.1f} % of the run" in texts(figure)
+        assert f"slides {100 * contact['sliding_fraction']:.1f} %" in texts(figure)
+    kinds = {event.kind for event in real.events}
+    assert {"lift_off", "landing"} <= kinds
+    explained = figure.axes[-1].get_xlabel()
+    for kind in kinds:
+        sign, text = events.MARKS[kind][1:]
+        assert f"{sign} {text}" in explained
+    # The panel of the whole run; that of the transient shows what is in it.
+    marks = [line for line in figure.axes[-1].get_lines() if line.get_label() == "_event"]
+    shown = sorted(float(t) for line in marks for t in line.get_xdata())
+    assert shown == sorted(event.time for event in real.events if event.name == "elbow_7")
+
+
+def test_every_time_figure_marks_the_events_of_contacts(real: Record, braced: Record) -> None:
+    for draw in (hand.error, energy.energy, energy.ledger, motors.motors):
+        figure = drawn(draw(real))
+        for axes in figure.axes:
+            marks = [line for line in axes.get_lines() if line.get_label() == "_event"]
+            low, high = axes.get_xlim()
+            assert sum(len(line.get_xdata()) for line in marks) == sum(low <= e.time <= high for e in real.events)
+        # Nothing happens to what is glued.
+        for axes in drawn(draw(braced)).axes:
+            assert "_event" not in [line.get_label() for line in axes.get_lines()]
+
+
+def test_many_events_are_marks_without_lines(pendulum: Record) -> None:
+    record = copy.copy(pendulum)
+    record.events = []
+    for k in range(events.LINES + 1):
+        record.add_event(0.01 * k, "bounce", "tip")
+    axes = style.new_figure(2.0, "").subplots()
+    axes.set_xlim(0.0, 1.0)
+    events.mark(axes, events.marked(record))
+    assert len(axes.get_lines()) == 1
+    assert events.marked(record, ["other"]) == []
+    events.mark(axes, events.marked(record)[:3])
+    assert len(axes.get_lines()) == 5
+    assert axes.get_xlim() == (0.0, 1.0)
+
+
+def test_ledger_figure_has_the_losses_of_impacts(real: Record, braced: Record) -> None:
+    assert "impacts of contacts" in texts(drawn(energy.ledger(real)))
+    assert "impacts" not in texts(drawn(energy.ledger(braced)))
+
+
+def test_contacts_that_never_touch_are_not_drawn(real: Record) -> None:
+    """Of candidates on every joint most stay in the air; comparing, only those runs that touched have a curve."""
+    overrides = {**SHORT, "contacts.candidates": "joints", "contacts.points": {}}
+    record = dynsim.simulate(load_scenario("elbow_comparison_floor", "two_elbows", overrides))
+    assert len(record.summary["contacts"]) > 5
+    figure = drawn(contacts.forces(record))
+    assert {axes.get_ylabel().split("\n")[0] for axes in figure.axes} - {""} == {"joint_4", "joint_7"}
+    body, _ = skeleton.skeleton(record)
+    assert body is not None
+    assert [point.name for point, *_ in body.contacts()] == ["joint_4", "joint_7"]
+    mixed = drawn(contacts.forces_comparison({"points": real, "joints": record}))
+    assert {axes.get_ylabel().split("\n")[0] for axes in mixed.axes} - {""} == {
+        "elbow_4", "elbow_7", "joint_4", "joint_7",
+    }  # fmt: skip
+    assert "surface pulls" not in texts(mixed)
+
+
+def test_glued_beside_real(real: Record, braced: Record, tmp_path: Path) -> None:
+    figure = drawn(contacts.forces_comparison({"glued": braced, "real": real}))
+    assert "glued: pulling" in texts(figure)
+    assert "real: closed" in texts(figure)
+    assert "surface pulls" in texts(figure)
+    assert_pngs(figures.draw_comparison({"glued": braced, "real": real}, tmp_path), tmp_path, COMPARISONS)

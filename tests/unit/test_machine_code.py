@@ -76,6 +76,45 @@ def test_no_function_can_be_replaced_by_one_loaded_earlier() -> None:
         assert _weak_functions(library[2][0]) == 0, file.name
 
 
+MACHINE_CODE = """
+import hashlib, pickle, sys
+import numpy as np
+from types import ModuleType
+
+if "unmended" in sys.argv:
+    sys.modules["dynsim.kernels.numba_habits"] = ModuleType("numba_habits")
+import numba.core.types.functions as functions
+from dynsim.kernels import jit
+from dynsim.kernels.tree.sweep import kinematics
+from tests.random_robots import bench, random_robot
+
+print(functions.BaseFunction.get_call_type.__module__)
+b = bench(random_robot(np.random.default_rng(1), 3))
+kinematics(b.system.model, b.ws)
+(file,) = jit.cache_folder().glob("*.kinematics-*")
+print(hashlib.sha256(pickle.loads(file.read_bytes()[32:])[0][2][0]).hexdigest())
+"""
+
+
+def _machine_code(folder: Path, *how: str) -> list[str]:
+    """Where numba's rules are looked up, and a hash of a kernel compiled in an empty cache."""
+    environment = {**os.environ, "XDG_CACHE_HOME": str(folder), "PYTHONPATH": os.pathsep.join(sys.path)}
+    environment.pop("NUMBA_CACHE_DIR", None)
+    done = subprocess.run(
+        [sys.executable, "-c", MACHINE_CODE, *how],
+        capture_output=True, text=True, check=True, timeout=300, env=environment,
+    )  # fmt: skip
+    return done.stdout.split()
+
+
+def test_mended_habits_of_numba_change_no_machine_code(tmp_path: Path) -> None:
+    where, mended = _machine_code(tmp_path / "mended")
+    assert where == "dynsim.kernels.numba_habits"
+    where, unmended = _machine_code(tmp_path / "unmended", "unmended")
+    assert where == "numba.core.types.functions"
+    assert mended == unmended
+
+
 @pytest.fixture
 def kernel_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache folder of its own."""

@@ -69,6 +69,7 @@ FALLBACK = {
 # Branches on time, which is one number for all lanes. Lanes at times of their own must lie in one segment.
 TIME = {
     Place("drive/law.py", "evaluate_reference", "segment = min(max(int(x / spacing), 0), c.shape[0] - 1)"): SEGMENT,
+    Place("drive/law.py", "fed_forward", "k = min(max(int(x / grid[1]), 0), voltage.shape[0] - 1)"): SEGMENT,
     Place("tree/loads.py", "segment_start", "if t < loads.data[first] or t >= end:"): SEGMENT,
     Place("tree/loads.py", "segment_start", "if loads.data[first + middle * SEGMENT_SIZE] <= t:"): SEGMENT,
 }
@@ -232,6 +233,7 @@ def driven(t: float, t_step: float = 0.0) -> Case:
         reals(rng.normal(size=4)),
         reals([0.0, 0.5]),
         reals(rng.normal(size=(4, 2, 6))),
+        reals(rng.normal(size=(4, 4, 6))),
     )
     b.system = b.system._replace(reference=reference)
     b.system.drives.input[3, [ka.LINE_START, ka.LINE_RATE, ka.LINE_SINCE]] = rng.normal(size=3)

@@ -201,7 +201,7 @@ def pendulum(limit: float = np.inf, start: float = 1.0) -> Robot:
 
 
 def test_a_joint_stop_takes_the_momentum_of_a_falling_rod():
-    """It falls onto its stop at 90°: the loss is the kinetic energy, and the stop carries the moment of the weight."""
+    """It falls onto its stop at 90°: the kinetic energy is lost, and the stop carries the moment of the weight."""
     b = bench(pendulum(limit=0.5 * np.pi), [], real=True)
     run = b.simulate(b.state(np.array([0.4]), np.zeros(1)), np.linspace(0.0, 2.0, 21), "rk43", rtol=1e-10)
     fallen = 0.8 * G * 0.25 * np.cos(0.4)
@@ -237,7 +237,7 @@ def rod(mu: float, phi: float, **law: float) -> tuple[Bench, float, float]:
 
 
 def test_a_leaning_rod_sticks_until_its_foot_slips():
-    """A rod that tips about its foot: friction and normal force by its angle, slip where |f_t| = μ_s f_n, then lift-off.
+    """A rod that tips about its foot: friction and normal force by its angle, slip where |f_t| = μ_s f_n.
 
     With ω² = (3 g/2 l) (cos φ0 − cos φ) (length 2 l... of the pivot at its end) the ratio of the forces is known in
     closed form; its root is the onset.

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.jit import integers, internal_kernel, kernel, reals
+from dynsim.kernels.jit import inlined_kernel, integers, internal_kernel, kernel, reals
 
 ITERATIONS = 60
 # Of what must vanish, in units of a program whose numbers are near 1: the rounding of some dozen operations.
@@ -65,25 +65,56 @@ LAMBDA, RESIDUAL, TARGET, DS, DZ, SCALED_DS, SCALED_DZ = 0, 1, 2, 3, 4, 5, 6
 
 def cone_program(n: int, m: int, cones: int, rows: int) -> ConeProgram:
     """Allocate a :class:`ConeProgram` for n unknowns, m equations and so many cones of ``rows`` rows altogether."""
+    flat, first = reals(np.zeros(program_size(n, m, cones, rows))), integers(np.zeros(cones + 1))
+    return laid_out(flat, first, n, m, cones, rows)
+
+
+def program_size(n: int, m: int, cones: int, rows: int) -> int:
+    """Numbers that :func:`laid_out` needs for a program."""
+    return n * n + n + m * n + m + 3 * rows + n + m + (n + m) ** 2 + n + m + 2 * rows * n + 10 * rows + cones + n + m
+
+
+@inlined_kernel
+def laid_out(flat, first, n, m, cones, rows):
+    """A :class:`ConeProgram` in one array: a table with many arrays would be handed through every function.
+
+    flat : (program_size(...),); first : (cones + 1,) int
+    """
+    a = n * n
+    b = a + n
+    c = b + m * n
+    d = c + m
+    e = d + rows * n
+    f = e + rows
+    g = f + n
+    h = g + m
+    i = h + rows
+    j = i + rows
+    k = j + (n + m) * (n + m)
+    o = k + n + m
+    p = o + rows * n
+    q = p + rows
+    r = q + cones
+    s = r + 7 * rows
     return ConeProgram(
-        H=reals(np.zeros((n, n))),
-        g=reals(np.zeros(n)),
-        A=reals(np.zeros((m, n))),
-        b=reals(np.zeros(m)),
-        G=reals(np.zeros((rows, n))),
-        h=reals(np.zeros(rows)),
-        first=integers(np.zeros(cones + 1)),
-        x=reals(np.zeros(n)),
-        y=reals(np.zeros(m)),
-        s=reals(np.zeros(rows)),
-        z=reals(np.zeros(rows)),
-        kkt=reals(np.zeros((n + m, n + m))),
-        step=reals(np.zeros(n + m)),
-        scaled=reals(np.zeros((rows, n))),
-        scaling=reals(np.zeros(rows)),
-        size=reals(np.zeros(cones)),
-        work=reals(np.zeros((7, rows))),
-        kept=reals(np.zeros(n + m + 2 * rows)),
+        flat[:a].reshape((n, n)),
+        flat[a:b],
+        flat[b:c].reshape((m, n)),
+        flat[c:d],
+        flat[d:e].reshape((rows, n)),
+        flat[e:f],
+        first,
+        flat[f:g],
+        flat[g:h],
+        flat[h:i],
+        flat[i:j],
+        flat[j:k].reshape((n + m, n + m)),
+        flat[k:o],
+        flat[o:p].reshape((rows, n)),
+        flat[p:q],
+        flat[q:r],
+        flat[r:s].reshape((7, rows)),
+        flat[s : s + n + m + 2 * rows],
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from dynsim.kernels.arrays import MOST_ROWS
-from dynsim.kernels.constraint.cone_program import ConeProgram, cone_program, solve_cone_program
+from dynsim.kernels.constraint.cone_program import ConeProgram, cone_program, laid_out, program_size, solve_cone_program
 from dynsim.kernels.jit import internal_kernel, kernel
 
 # Weight of |z|² beside the margin: makes the best split unique where forces do not matter to any contact.
@@ -18,7 +18,23 @@ FORCE_TOLERANCE = 1e-9
 
 def split_room(r: int, count: int) -> ConeProgram:
     """The room of :func:`best_split` for null spaces of up to r columns and so many contacts."""
-    return cone_program(r + 1, 2 * count, count + 1, MOST_ROWS * count + 1)
+    return cone_program(*split_sizes(r, count))
+
+
+def split_size(r: int, count: int) -> int:
+    """Numbers in that room, see :func:`split_room_in`."""
+    return program_size(*split_sizes(r, count))
+
+
+def split_sizes(r: int, count: int) -> tuple[int, int, int, int]:
+    """Unknowns, equations, cones and rows of the larger of its programs."""
+    return r + 1, 2 * count, count + 1, MOST_ROWS * count + 1
+
+
+@internal_kernel
+def split_room_in(flat, first, r, count):
+    """:func:`split_room` in given arrays, (split_size(r, count),) and (count + 2,) int."""
+    return laid_out(flat, first, r + 1, 2 * count, count + 1, MOST_ROWS * count + 1)
 
 
 @kernel

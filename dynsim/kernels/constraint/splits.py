@@ -10,11 +10,13 @@ from __future__ import annotations
 import math
 
 from dynsim.kernels.arrays import FIRST_ROW, FORCE, MODE, STICKING, Workspace
-from dynsim.kernels.constraint.socp import best_split
+from dynsim.kernels.constraint.socp import best_split, split_room_in
 from dynsim.kernels.constraint.unilateral import (
     BEST_MARGIN,
+    NULL_SPACE,
     REDUNDANT,
     SPLIT,
+    SPLIT_MATRIX,
     STATIC,
     STOP_CLOSED,
     STOP_FORCE,
@@ -66,7 +68,7 @@ def look_at_forces(unilateral: UnilateralArrays, ws: Workspace):
 @apart_kernel
 def split_forces(unilateral: UnilateralArrays, ws: Workspace):
     """The best split of the forces of all that sticks, into FORCE of its rows; its worst margin into BEST_MARGIN."""
-    room, place, mu, rows = unilateral.split, unilateral.place, unilateral.vector[0], ws.rows
+    room, place, mu, rows = unilateral.room, unilateral.place, unilateral.vector[0], ws.rows
     first, row = place[0], place[1]
     count, p = 0, 0
     for k in range(ws.contacts.shape[0]):
@@ -80,10 +82,12 @@ def split_forces(unilateral: UnilateralArrays, ws: Workspace):
     for i in range(p):
         force[i] = rows[row[i], FORCE]
         for j in range(p):
-            room[0, i, j] = ws.small[0, row[i], row[j]]
-    width = null_space(room[0], p, room[1], place[2])
+            room[SPLIT_MATRIX, i, j] = ws.small[0, row[i], row[j]]
+    width = null_space(room[SPLIT_MATRIX], p, room[NULL_SPACE], place[2])
     unilateral.number[SPLIT] = 1.0
-    unilateral.number[BEST_MARGIN] = best_split(force, room[1], width, first, mu, count, out, unilateral.split_room)
+    programs = split_room_in(unilateral.split_room, place[3], width, count)
+    worst = best_split(force[:p], room[NULL_SPACE], width, first, mu, count, out[:p], programs)
+    unilateral.number[BEST_MARGIN] = worst
     for i in range(p):
         rows[row[i], FORCE] = out[i]
 

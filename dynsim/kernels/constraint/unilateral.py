@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.kernels.arrays import MU, ContactArrays
-from dynsim.kernels.constraint.cone_program import ConeProgram
+from dynsim.kernels.constraint.cone import CONE_ROOM
 from dynsim.kernels.jit import inlined_kernel
 
 # UnilateralArrays.law; the kinetic coefficient is ContactArrays.point[:, MU].
@@ -59,9 +59,12 @@ MODE_SIZE = 4
 # UnilateralArrays.vector: three of the splits of forces, then those of the problem that chooses modes
 OFFSET, SOLUTION, CONE_FRICTION, FIRST_PART, SECOND_PART = 3, 4, 5, 6, 7
 VECTORS = 8
-# UnilateralArrays.place, int: three of the splits of forces; kinds of the problem's rows, and which of the table's
-KINDS, TABLE_ROW = 3, 4
-PLACES = 5
+# UnilateralArrays.place, int: four of the splits of forces; kinds of the problem's rows, and which of the table's
+KINDS, TABLE_ROW = 4, 5
+PLACES = 6
+# UnilateralArrays.room
+SPLIT_MATRIX, NULL_SPACE, PROBLEM, SCRATCH = 0, 1, 2, 3
+ROOM = SCRATCH + CONE_ROOM
 # UnilateralArrays.number
 REDUNDANT = 0  # 1: the rows of what sticks depend on each other
 BEST_MARGIN = 1  # the worst margin of the best split of their forces [N], where the least norm fits no cones
@@ -80,12 +83,10 @@ class UnilateralArrays(NamedTuple):
     tally: np.ndarray  # (c, TALLY_SIZE)
     stop_table: np.ndarray  # (s, STOP_TABLE_SIZE) int
     stop: np.ndarray  # (s, STOP_SIZE)
-    place: np.ndarray  # (PLACES, p) int
+    place: np.ndarray  # (PLACES, p or c + 2) int
     vector: np.ndarray  # (VECTORS, p)
-    split: np.ndarray  # (2, p, p)
-    split_room: ConeProgram  # scratch of best_split
-    matrix: np.ndarray  # (p, p)
-    room: np.ndarray  # scratch of solve_cones
+    room: np.ndarray  # (ROOM, p, p) two matrices of the splits, one of the problem that chooses modes, its scratch
+    split_room: np.ndarray  # scratch of the splits
     number: np.ndarray  # (NUMBERS,)
 
 

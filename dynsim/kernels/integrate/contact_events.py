@@ -122,9 +122,12 @@ def contact_guard(unilateral: UnilateralArrays | None, ws: Workspace, kind, k):
     if mode == SLIDING and unilateral.law[k, STATIC] > 0.0:
         return unilateral.slide[k, SPEED] + unilateral.slide[k, HEADWAY] + BACKWARD
     if mode == STICKING:
-        own = margin(unilateral, ws, k)
-        # Of dependent rows the forces in the workspace may be the least that fit: they say nothing of what is left.
-        return min(own, unilateral.number[BEST_MARGIN]) if unilateral.number[SPLIT] == 1.0 else own
+        best = unilateral.number[BEST_MARGIN]
+        # Dependent rows, where the least norm fits no cones: the forces are the least that do, on some cone, and say
+        # nothing of what is left. Once none fit, those of the best margin show which contacts give way.
+        if unilateral.number[SPLIT] == 1.0 and best > 0.0:
+            return best
+        return margin(unilateral, ws, k)
     return 1.0
 
 

@@ -50,9 +50,11 @@ from dynsim.kernels.constraint.unilateral import (
     NEXT,
     NEXT_SPEED,
     OFFSET,
+    PROBLEM,
     REDUNDANT,
     REFERENCE,
     RESTITUTION,
+    SCRATCH,
     SECOND_PART,
     SETTLE,
     SIDE,
@@ -73,7 +75,7 @@ from dynsim.kernels.constraint.unilateral import (
     UnilateralArrays,
     slide_direction,
 )
-from dynsim.kernels.integrate.project import GAP_TOLERANCE, RATE_TOLERANCE, project_level
+from dynsim.kernels.integrate.project import PROJECTION_LIMIT, RATE_TOLERANCE, project_level
 from dynsim.kernels.integrate.run import (
     EVALUATIONS,
     FORCES_REVERSED,
@@ -90,6 +92,8 @@ from dynsim.kernels.tree.articulated import accelerate
 
 # A point that approaches faster than this many tolerances of projected rates strikes.
 STRIKE = 3.0
+# What begins to touch is brought this close to its surface [m].
+FOOT_TOLERANCE = 1e-13
 # Of a solution of the cones: residual by the largest entry, and what of the largest force is none.
 CONE_TOLERANCE, FORCE_TOLERANCE = 1e-9, 1e-9
 # Where nothing is faster, or accelerated by more, residuals are not compared with it: behind closed brakes a point has
@@ -151,7 +155,8 @@ def find_touching(unilateral: UnilateralArrays, ws: Workspace, touch):
         mode[k, TOUCHING] = 1 if near else 0
         if near and state[k, GAP_RATE] < -limit:
             mode[k, STRUCK] = 1
-            strikes = True
+        # What lands ever so slowly is stopped too: nothing else would, should it stay open.
+        strikes = strikes or (near and state[k, GAP_RATE] < (-limit if closed else 0.0))
     for k in range(table.shape[0]):
         j = table[k, STOP_JOINT]
         gap, rate = stop[k, SIDE] * ws.joints[j, Q] - stop[k, LIMIT], stop[k, SIDE] * ws.joints[j, QD]
@@ -175,6 +180,29 @@ def keep_touching(unilateral: UnilateralArrays, ws: Workspace):
 
 
 @internal_kernel
+def come_down(system: System, ws: Workspace, run: Run):
+    """Bring what touches onto its surface, to rounding, before it is held where it is.
+
+    A point lands a little below its surface. Where rows depend on each other, as those of a point on a body with one
+    degree of freedom, there might be no state at which its normal row and the tangential ones of a foot found above it
+    all vanish.
+    """
+    unilateral = system.unilateral
+    mode = unilateral.mode
+    for k in range(mode.shape[0]):
+        mode[k, WANTED] = OPEN if mode[k, TOUCHING] == 0 else STICKING if ws.active[k, MODE] == STICKING else SLIDING
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
+    for _ in range(PROJECTION_LIMIT):
+        evaluate(system, ws, run)
+        worst = 0.0
+        for r in range(ws.counts[ROWS]):
+            worst = max(worst, abs(ws.rows[r, ROW_GAP]))
+        if worst <= FOOT_TOLERANCE:
+            return
+        project_level(system, ws, run.y, 0)
+
+
+@internal_kernel
 def gather(system: System, ws: Workspace, run: Run):
     """Rows along normal and tangents of everything that touches, and their system, into the workspace.
 
@@ -182,6 +210,7 @@ def gather(system: System, ws: Workspace, run: Run):
     """
     unilateral = system.unilateral
     mode, place = unilateral.mode, unilateral.place
+    come_down(system, ws, run)
     for k in range(mode.shape[0]):
         mode[k, WANTED] = STICKING if mode[k, TOUCHING] == 1 else OPEN
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
@@ -197,6 +226,48 @@ def gather(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
+def impulses(system: System, ws: Workspace, p, largest, share):
+    """Solve for the impulses of :func:`impact` with so much of the restitutions; the loss of each row into FORCE [J].
+
+    False when there is no solution, or one that would create energy.
+    """
+    unilateral, rows = system.unilateral, ws.rows
+    vector, mode = unilateral.vector, unilateral.mode
+    for r in range(p):
+        vector[OFFSET, r], vector[SOLUTION, r] = rows[r, ROW_RATE], 0.0
+    for k in range(mode.shape[0]):
+        if mode[k, TOUCHING] == 1:
+            r = ws.active[k, FIRST_ROW]
+            vector[CONE_FRICTION, r] = system.contacts.point[k, MU]
+            # What was closed had no speed to turn round: a brake or another impact has just given it this one.
+            falls = mode[k, STRUCK] == 1 and mode[k, BEFORE] == OPEN
+            if falls and -rows[r, ROW_RATE] > unilateral.tally[k, SETTLE]:
+                vector[OFFSET, r] *= 1.0 + share * unilateral.law[k, RESTITUTION]
+    residual = solve_cones(
+        ws.small[0],
+        vector[OFFSET],
+        unilateral.place[KINDS],
+        vector[CONE_FRICTION],
+        p,
+        vector[SOLUTION],
+        unilateral.room[SCRATCH:],
+        1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE),
+    )
+    if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
+        return False
+    f, total, turnover = vector[SOLUTION], 0.0, 0.0
+    for r in range(p):
+        after = rows[r, ROW_RATE]
+        for s in range(p):
+            after += ws.small[0, r, s] * f[s]
+        # FORCE is free until the next evaluation.
+        rows[r, FORCE] = -0.5 * f[r] * (rows[r, ROW_RATE] + after)
+        total += rows[r, FORCE]
+        turnover += abs(rows[r, FORCE])
+    return total >= -CONE_TOLERANCE * turnover or share == 0.0
+
+
+@internal_kernel
 def impact(system: System, ws: Workspace, run: Run):
     """Impulses that stop what approaches: u = W P + b with b = J v and, of normals that strike, (1 + e) n·v.
 
@@ -207,27 +278,10 @@ def impact(system: System, ws: Workspace, run: Run):
     p = gather(system, ws, run)
     largest = 0.0
     for r in range(p):
-        vector[OFFSET, r], vector[SOLUTION, r] = rows[r, ROW_RATE], 0.0
         largest = max(largest, abs(rows[r, ROW_RATE]))
-    for k in range(mode.shape[0]):
-        if mode[k, TOUCHING] == 1:
-            r = ws.active[k, FIRST_ROW]
-            vector[CONE_FRICTION, r] = system.contacts.point[k, MU]
-            # What was closed had no speed to turn round: a brake or another impact has just given it this one.
-            falls = mode[k, STRUCK] == 1 and mode[k, BEFORE] == OPEN
-            if falls and -rows[r, ROW_RATE] > unilateral.tally[k, SETTLE]:
-                vector[OFFSET, r] *= 1.0 + unilateral.law[k, RESTITUTION]
-    residual = solve_cones(
-        ws.small[0],
-        vector[OFFSET],
-        unilateral.place[KINDS],
-        vector[CONE_FRICTION],
-        p,
-        vector[SOLUTION],
-        unilateral.room,
-        1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE),
-    )
-    if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
+    # Newton's restitution may contradict friction: a point that is wedged cannot leave, and some would gain energy.
+    # Those impacts are without restitution, which always has a solution, and a loss.
+    if not impulses(system, ws, p, largest, 1.0) and not impulses(system, ws, p, largest, 0.0):
         run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
         return
     f = vector[SOLUTION]
@@ -238,12 +292,6 @@ def impact(system: System, ws: Workspace, run: Run):
     accelerate(system.model, ws)
     for i in range(ws.joints.shape[0]):
         y[layout.v + i] += ws.joints[i, QDD]
-    for r in range(p):
-        after = rows[r, ROW_RATE]
-        for s in range(p):
-            after += ws.small[0, r, s] * f[s]
-        # FORCE is free until the next evaluation: the loss of each row.
-        rows[r, FORCE] = -0.5 * f[r] * (rows[r, ROW_RATE] + after)
     for k in range(mode.shape[0]):
         if mode[k, TOUCHING] == 1:
             r = ws.active[k, FIRST_ROW]
@@ -265,13 +313,6 @@ def choose(system: System, ws: Workspace, run: Run):
     unilateral = system.unilateral
     mode, vector = unilateral.mode, unilateral.vector
     p = gather(system, ws, run)
-    deepest = 0.0
-    for r in range(p):
-        deepest = max(deepest, -ws.rows[r, ROW_GAP])
-    if deepest > GAP_TOLERANCE:
-        # What has landed lies below its surface, and would land again at once if it turned out to leave.
-        project_level(system, ws, run.y, 0)
-        evaluate(system, ws, run)
     largest = 0.0
     for r in range(p):
         largest = max(largest, abs(ws.rows[r, RHS]))
@@ -285,13 +326,13 @@ def choose(system: System, ws: Workspace, run: Run):
         if run.count[STATUS] == FORCES_REVERSED:
             return
         residual = solve_cones(
-            unilateral.matrix,
+            unilateral.room[PROBLEM],
             vector[OFFSET],
             unilateral.place[KINDS],
             vector[CONE_FRICTION],
             size,
             vector[SOLUTION],
-            unilateral.room,
+            unilateral.room[SCRATCH:],
             1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE),
         )
         if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
@@ -334,10 +375,10 @@ def begins_sliding(system: System, ws: Workspace, k):
     slide, state = unilateral.slide, ws.contacts
     speed = slip_speed(ws, k)
     if speed > 2.0 * unilateral.number[SLOW]:
-        if unilateral.mode[k, BEFORE] != SLIDING or unilateral.mode[k, STRUCK] == 1:
-            slide[k, FROZEN] = 0.0
-            for s in range(3):
-                slide[k, REFERENCE + s] = state[k, SLIP_VELOCITY + s] / speed
+        # An impact may have turned it.
+        slide[k, FROZEN] = 0.0
+        for s in range(3):
+            slide[k, REFERENCE + s] = state[k, SLIP_VELOCITY + s] / speed
         return True
     if unilateral.law[k, STATIC] == 0.0:
         slide[k, FROZEN] = 0.0
@@ -388,8 +429,8 @@ def reduce_rows(system: System, ws: Workspace, run: Run, p):
             value = W[a, b]
             if vector[FIRST_PART, j] != 0.0 or vector[SECOND_PART, j] != 0.0:
                 value += vector[FIRST_PART, j] * W[a, b + 1] + vector[SECOND_PART, j] * W[a, b + 2]
-            unilateral.matrix[i, j] = value
-        if place[KINDS, i] == ONE_WAY and W[a, a] > 0.0 and unilateral.matrix[i, i] <= 1e-12 * W[a, a]:
+            unilateral.room[PROBLEM, i, j] = value
+        if place[KINDS, i] == ONE_WAY and W[a, a] > 0.0 and unilateral.room[PROBLEM, i, i] <= 1e-12 * W[a, a]:
             run.count[STATUS], run.clock[NOT_UNIQUE] = FORCES_REVERSED, run.clock[TIME]
     return size
 
@@ -399,7 +440,7 @@ def acceleration(unilateral: UnilateralArrays, i, size):
     """Acceleration along row i of the reduced problem."""
     total = unilateral.vector[OFFSET, i]
     for j in range(size):
-        total += unilateral.matrix[i, j] * unilateral.vector[SOLUTION, j]
+        total += unilateral.room[PROBLEM, i, j] * unilateral.vector[SOLUTION, j]
     return total
 
 

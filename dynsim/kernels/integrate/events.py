@@ -55,8 +55,9 @@ JOINT_POSITION, JOINT_RATE, MOTOR_CURRENT, MOTOR_VOLTAGE, CONTACT_FORCE, CONTACT
 HAND_X, HAND_Y, HAND_Z = 6, 7, 8
 TIP_MARGIN = 9
 
-# Steps that a root may take; regula falsi with halving (Illinois) needs about eight.
-SEARCH_LIMIT = 60
+# Steps that a root may take; regula falsi with halving (Illinois) needs about eight. Guards that jump, as forces do
+# where another split of them begins, are bisected in the end.
+SEARCH_LIMIT, FALSI_LIMIT = 60, 16
 
 
 @inlined_kernel
@@ -157,7 +158,7 @@ def cut_step(system: System, ws: Workspace, run: Run):
         a, b = event[e, AT_LOW], event[e, AT_HIGH]
         if happened(run, e, b) and not happened(run, e, a):
             trial = min(trial, low + (high - low) * a / (a - b))
-    if not low < trial < high:
+    if not low < trial < high or count[SEARCHING] > FALSI_LIMIT:
         trial = 0.5 * (low + high)
     clock[STEP] = trial
     return True

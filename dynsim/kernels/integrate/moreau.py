@@ -7,6 +7,7 @@ import math
 from dynsim.kernels.arrays import (
     APPLIED,
     CIRCUIT,
+    COUPLED,
     CURRENT,
     D_M,
     DAMPING,
@@ -20,16 +21,19 @@ from dynsim.kernels.arrays import (
     K_M,
     MODE,
     NORMAL_FORCE,
+    OPEN,
     QD,
     QDD,
     RESISTANCE,
     ROWS,
+    SLIDING,
     STICKING,
     VOLTAGE,
     ModelArrays,
     Q,
     Workspace,
 )
+from dynsim.kernels.constraint.unilateral import DEEPEST, LOSS, TIME_OPEN, TIME_SLIDING, TIME_STICKING
 from dynsim.kernels.drive.law import drive, take_commands
 from dynsim.kernels.integrate.events import take_ticks
 from dynsim.kernels.integrate.output import write_output
@@ -54,6 +58,7 @@ from dynsim.kernels.integrate.run import (
 )
 from dynsim.kernels.integrate.steps import choose_step, finite
 from dynsim.kernels.integrate.time_stepping import (
+    BAD,
     GRIP,
     PENETRATION,
     close_contacts,
@@ -63,6 +68,7 @@ from dynsim.kernels.integrate.time_stepping import (
     place_joints,
     row_rates,
     solve_contacts,
+    stop_forces,
     tangent_rows,
 )
 from dynsim.kernels.integrate.watch import watch
@@ -74,8 +80,10 @@ from dynsim.kernels.state import (
     ELECTRICAL,
     FRICTION,
     GEAR,
+    IMPACT_LOSS,
     IMPULSE,
     JOINT,
+    JOINT_STOP_LOSS,
     JOULE,
     MECHANICAL,
     SLIP,
@@ -92,7 +100,7 @@ def step_moreau(system: System, ws: Workspace, run: Run):
     """One step from y to y_new; mean accelerations and forces stay in the workspace."""
     s, t, h, y, y_new, layout = run.stepping, run.clock[TIME], run.clock[STEP], run.y, run.y_new, system.layout
     joints, theta, n = ws.joints, s.theta, ws.joints.shape[0]
-    model = ModelArrays(system.model.tree, s.body, system.model.gravity)
+    model = ModelArrays(system.model.tree, s.body, system.model.gravity, system.model.compound)
     v0, v_bias, last = s.before[0], s.before[1], s.before[2]
     place_joints(system, ws, y)
     for i in range(n):
@@ -116,12 +124,13 @@ def step_moreau(system: System, ws: Workspace, run: Run):
         geometry(system, model, s, ws)
     if system.loads.table.shape[0] > 0:
         add_loads(model, system.loads, t + theta * h, ws, run.stage[1], layout.load)
-    tangent_rows(s, ws)
+    tangent_rows(system, s, ws)
     factor(model, ws)
     row_rates(model, ws, v0, s.rate[0])
     if ws.counts[ROWS] > 0:
         row_system(model, ws)
         solve_contacts(s, ws, h)
+        stop_forces(system.unilateral, ws)
         add_row_forces(model, ws)
     accelerate(model, ws)
     run.count[EVALUATIONS] += 1
@@ -194,10 +203,34 @@ def book(system: System, ws: Workspace, run: Run):
     y_new[start + JOINT] += h * joint
     y_new[start + FRICTION] += h * friction
     y_new[start + CONSTRAINT] += h * held
+    book_losses(system.unilateral, system, s, ws, y_new, h)
     y_new[start + MECHANICAL] += h * mechanical
     y_new[start + SUPPLY] += h * max(electrical, 0.0)
     for k in range(system.loads.table.shape[0]):
         y_new[layout.load + k] += h * run.stage[1, layout.load + k]
+
+
+@internal_kernel
+def book_losses(unilateral, system: System, s, ws: Workspace, y_new, h):
+    """Under the unilateral law what normals and joint stops take is a loss, not an error of the constraints."""
+    if unilateral is None:  # known to the compiler
+        return
+    layout, tally, couplings = system.layout, unilateral.tally, system.couplings.joint.shape[0]
+    for r in range(couplings, ws.counts[COUPLED]):
+        work = 0.5 * h * ws.rows[r, FORCE] * (s.rate[0, r] + s.rate[1, r])
+        y_new[layout.loss + JOINT_STOP_LOSS] -= work
+        y_new[layout.ledger + CONSTRAINT] -= work
+    for k in range(ws.contacts.shape[0]):
+        mode = OPEN
+        if ws.active[k, MODE] == STICKING:
+            r = ws.active[k, FIRST_ROW]
+            work = 0.5 * h * ws.rows[r, FORCE] * (s.rate[0, r] + s.rate[1, r])
+            y_new[layout.loss + IMPACT_LOSS] -= work
+            y_new[layout.ledger + CONSTRAINT] -= work
+            tally[k, LOSS] -= work
+            tally[k, DEEPEST] = max(tally[k, DEEPEST], -ws.contacts[k, GAP])
+            mode = SLIDING if abs(s.rate[1, r + 1]) + abs(s.rate[1, r + 2]) > BAD else STICKING
+        tally[k, TIME_OPEN if mode == OPEN else TIME_SLIDING if mode == SLIDING else TIME_STICKING] += h
 
 
 @internal_kernel
@@ -211,7 +244,7 @@ def sample_moreau(system: System, ws: Workspace, run: Run):
         for j in range(row.shape[0]):
             row[j] = run.y[j] + x * (run.y_new[j] - run.y[j])
         if system.layout.extra > 0:
-            normalise(system.model, row, system.layout.q)
+            normalise(system.model.compound, system.model, row, system.layout.q)
         place_joints(system, ws, row)
         for i in range(ws.joints.shape[0]):
             ws.joints[i, QD], ws.joints[i, APPLIED] = row[system.layout.v + i], 0.0

@@ -69,9 +69,22 @@ from dynsim.kernels.arrays import (
     Workspace,
     row_limit,
 )
-from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, CONE_ROOM, TANGENT, approach
+from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, CONE_ROOM, ONE_WAY, TANGENT, approach
 from dynsim.kernels.constraint.rows import set_modes
+from dynsim.kernels.constraint.shapes import shaped_rows
 from dynsim.kernels.constraint.surface import contact_rows
+from dynsim.kernels.constraint.unilateral import (
+    LANDINGS,
+    LIFT_OFFS,
+    LIMIT,
+    SIDE,
+    STOP_CLOSED,
+    STOP_FORCE,
+    STOP_JOINT,
+    STOP_ROW,
+    UnilateralArrays,
+)
+from dynsim.kernels.constraint.unilateral import RESTITUTION as LAW_RESTITUTION
 from dynsim.kernels.drive.law import drive_block
 from dynsim.kernels.jit import integers, internal_kernel, reals
 from dynsim.kernels.tree.joints import displace, normalise, read_positions
@@ -110,12 +123,21 @@ class SteppingArrays(NamedTuple):
     found: np.ndarray  # (FOUND_SIZE,)
 
 
-def stepping_arrays(model: ModelArrays, contacts: ContactArrays, na: int, couplings: int, theta: float):
-    """Allocate :class:`SteppingArrays`: friction of the contacts, no restitution, isotropic."""
+def stepping_arrays(
+    model: ModelArrays,
+    contacts: ContactArrays,
+    na: int,
+    joint_rows: int,
+    theta: float,
+    unilateral: UnilateralArrays | None = None,
+) -> SteppingArrays:
+    """Allocate :class:`SteppingArrays`: friction of the contacts and the law's restitution; isotropic."""
     n, c = model.body.shape[0], contacts.link.shape[0]
-    p = row_limit(c, couplings)
+    p = row_limit(c, joint_rows)
     law = np.zeros((c, LAW_SIZE))
     law[:, FRICTION_OF], law[:, GRIP], law[:, GRIP_AXIS] = contacts.point[:, MU], 1.0, 1.0
+    if unilateral is not None:
+        law[:, RESTITUTION] = unilateral.law[:, LAW_RESTITUTION]
     return SteppingArrays(
         theta=float(theta),
         law=law,
@@ -147,8 +169,8 @@ def moved(system, ws: Workspace, y, scale, out):
         for i in range(ws.joints.shape[0]):
             out[layout.q + i] += ws.joints[i, QDD]
     else:
-        displace(system.model, ws, out, layout.q)
-        normalise(system.model, out, layout.q)
+        displace(system.model.compound, system.model, ws, out, layout.q)
+        normalise(system.model.compound, system.model, out, layout.q)
 
 
 @internal_kernel
@@ -156,7 +178,7 @@ def place_joints(system, ws: Workspace, y):
     """Positions of y into ``ws.joints``."""
     layout = system.layout
     if layout.extra > 0:
-        read_positions(system.model, y, layout.q, ws)
+        read_positions(system.model.compound, system.model, y, layout.q, ws)
         return
     for i in range(ws.joints.shape[0]):
         ws.joints[i, Q] = y[layout.q + i]
@@ -166,7 +188,8 @@ def place_joints(system, ws: Workspace, y):
 def geometry(system, model: ModelArrays, s: SteppingArrays, ws: Workspace):
     """Poses, gaps and rows at the positions and rates in ``ws.joints``; tangents along and across the grip axis."""
     forward_sweep(model, ws, 1.0, 0.0, 1.0)
-    contact_rows(model, system.contacts, ws)
+    contact_rows(model, system.contacts, system.unilateral, ws)
+    shaped_rows(system.shapes, system.unilateral, model, system.contacts, ws)
     state = ws.contacts
     for k in range(state.shape[0]):
         i, nx, ny, nz = system.contacts.link[k, LINK], state[k, NORMAL], state[k, NORMAL + 1], state[k, NORMAL + 2]
@@ -190,18 +213,50 @@ def geometry(system, model: ModelArrays, s: SteppingArrays, ws: Workspace):
 @internal_kernel
 def close_contacts(system, s: SteppingArrays, ws: Workspace):
     """Rows for the candidates whose gap is not open; the table of rows is rebuilt only when these change."""
-    changed = False
+    changed = close_stops(system.unilateral, ws)
     for k in range(ws.contacts.shape[0]):
         mode = STICKING if ws.contacts[k, GAP] <= MARGIN else OPEN
-        changed = changed or mode != s.modes[k]
+        if mode != s.modes[k]:
+            changed = True
+            count_change(system.unilateral, k, s.modes[k], mode)
         s.modes[k] = mode
     if changed:
-        set_modes(system.contacts, system.couplings, ws, s.modes)
+        set_modes(system.contacts, system.couplings, system.unilateral, ws, s.modes)
     return changed
 
 
 @internal_kernel
-def tangent_rows(s: SteppingArrays, ws: Workspace):
+def close_stops(unilateral: UnilateralArrays | None, ws: Workspace):
+    """Close the joint stops whose gap is not open, open the others; True when one has changed."""
+    if unilateral is None:  # known to the compiler
+        return False
+    table, stop, changed = unilateral.stop_table, unilateral.stop, False
+    for k in range(table.shape[0]):
+        closed = 1 if stop[k, SIDE] * ws.joints[table[k, STOP_JOINT], Q] - stop[k, LIMIT] <= MARGIN else 0
+        changed = changed or closed != table[k, STOP_CLOSED]
+        table[k, STOP_CLOSED] = closed
+    return changed
+
+
+@internal_kernel
+def count_change(unilateral: UnilateralArrays | None, k, before, mode):
+    """A landing or a lift-off of candidate k; what it begins with is neither."""
+    if unilateral is not None and before >= 0:
+        unilateral.tally[k, LANDINGS if mode == STICKING else LIFT_OFFS] += 1.0
+
+
+@internal_kernel
+def stop_forces(unilateral: UnilateralArrays | None, ws: Workspace):
+    """Forces of the joint stops, after the contact problem."""
+    if unilateral is None:  # known to the compiler
+        return
+    for k in range(unilateral.stop.shape[0]):
+        closed = unilateral.stop_table[k, STOP_CLOSED] == 1
+        unilateral.stop[k, STOP_FORCE] = ws.rows[unilateral.stop_table[k, STOP_ROW], FORCE] if closed else 0.0
+
+
+@internal_kernel
+def tangent_rows(system, s: SteppingArrays, ws: Workspace):
     """Rows of the closed candidates and the kinds of the contact problem; TARGET is the acceleration zero.
 
     The second tangent is scaled by GRIP, friction along the axis being that times friction across: the ellipse of
@@ -209,7 +264,9 @@ def tangent_rows(s: SteppingArrays, ws: Workspace):
     """
     state, rows, active = ws.contacts, ws.rows, ws.active
     for r in range(ws.counts[COUPLED]):
-        s.kind[r], s.mu[r], rows[r, TARGET] = BOTH_WAYS, 0.0, 0.0
+        # Behind the couplings come joint stops.
+        s.kind[r] = BOTH_WAYS if r < system.couplings.joint.shape[0] else ONE_WAY
+        s.mu[r], rows[r, TARGET] = 0.0, 0.0
     for k in range(state.shape[0]):
         if active[k, MODE] != STICKING:
             continue

@@ -1,0 +1,77 @@
+"""What happened at an instant, as marks over time axes: landings, lift-offs, begins and ends of slip, joint stops."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.transforms import ScaledTranslation
+
+from dynsim.record import Record
+from dynsim.record.content import Event
+
+# Kind of event → mark of matplotlib, the same as a character, and words for it. Other kinds have figures of their own.
+MARKS: dict[str, tuple[str, str, str]] = {
+    "landing": ("v", "▼", "landing"),
+    "lift_off": ("^", "▲", "lift-off"),
+    "bounce": ("o", "●", "bounce"),
+    "slip_start": (">", "▶", "slip starts"),
+    "slip_stop": ("s", "■", "slip stops"),
+    "stop_hit": ("P", "✚", "joint stop hit"),
+    "stop_left": ("X", "✖", "joint stop left"),
+    "chatter": ("*", "★", "chatter"),
+}
+COLOUR = "#555555"
+# Lines of more events than this would hide the curves; their marks stay.
+LINES = 40
+# Marks lie so far below the upper edge [point].
+BELOW = 4.0
+
+
+def marked(record: Record, names: Iterable[str] | None = None) -> list[Event]:
+    """Events that are marked, of the contacts and joints named or of all."""
+    chosen = None if names is None else set(names)
+    return [event for event in record.events if event.kind in MARKS and (chosen is None or event.name in chosen)]
+
+
+def mark(axes: Axes, events: Sequence[Event], colour: str = COLOUR, *, row: int = 0) -> None:
+    """Draw events that lie within the axes: a faint line each and its mark, in a row from the upper edge down."""
+    low, high = axes.get_xlim()
+    inside = [event for event in events if low <= event.time <= high]
+    down = ScaledTranslation(0.0, -BELOW * (1.0 + 1.5 * row) / 72.0, axes.figure.dpi_scale_trans)
+    place = axes.get_xaxis_transform() + down
+    look: dict[str, Any] = {"color": colour, "markersize": 3.2, "markeredgewidth": 0.0, "zorder": 6, "clip_on": False}
+    for kind, (marker, _, _) in MARKS.items():
+        times = [event.time for event in inside if event.kind == kind]
+        if not times:
+            continue
+        axes.plot(times, [1.0] * len(times), marker, transform=place, label="_event", **look)
+        if len(inside) <= LINES:
+            for time in times:
+                axes.axvline(time, color=colour, linewidth=0.5, alpha=0.35, zorder=0.5)
+    axes.set_xlim(low, high)
+
+
+def mark_all(rows: Iterable[Sequence[Axes]], record: Record) -> None:
+    """Mark all events of a run in every panel, and name the marks under the last one."""
+    found = marked(record)
+    if not found:
+        return
+    for panels in (rows := list(rows)):
+        for axes in panels:
+            mark(axes, found)
+    explain(rows[-1][-1], found)
+
+
+def explain(axes: Axes, events: Sequence[Event]) -> None:
+    """A line under the label of the time axis: each mark that is drawn, what it means, and how often."""
+    count = Counter(event.kind for event in events)
+    parts = [
+        f"{sign} {text}" + (f" ({count[kind]})" if count[kind] > 1 else "")
+        for kind, (_, sign, text) in MARKS.items()
+        if count[kind]
+    ]
+    if parts:
+        axes.set_xlabel(f"{axes.get_xlabel()}\n{'   '.join(parts)}")

@@ -1,0 +1,155 @@
+"""Braced postures, hand paths with braces, planned voltages, and braces that press as they are told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import dynsim
+from dynsim.errors import DynsimError
+from dynsim.model.bracing import Brace
+from dynsim.model.posture import gaps_and_rates
+from dynsim.scenario import build
+
+ELBOWS = ["elbow_4", "elbow_7"]
+FORCES = {"elbow_4": 3.0, "elbow_7": 8.0}
+
+
+def scenario(variant: str = "two_elbows", **overrides):
+    return dynsim.load_scenario("elbow_comparison", variant=variant, overrides=overrides)
+
+
+def real_floor(tmp_path, **overrides):
+    """The published arm on a floor that only pushes."""
+    text = dynsim.load_scenario("elbow_comparison", variant="two_elbows").source.read_text()
+    for line in ("  slip_smoothing_m_s: 0.001 ", "  pulling_friction: signed "):
+        assert line in text
+        text = text.replace(line, "  # ")
+    path = tmp_path / "real_floor.yaml"
+    path.write_text(text.replace("law: bilateral", "law: unilateral"))
+    return dynsim.load_scenario(path, variant="two_elbows", overrides=overrides)
+
+
+OFF = [0, 40, 92, -80, 50, 45, -95, 45, -45, 45]
+
+
+@pytest.mark.parametrize("keep", [[], ["joint_2", "joint_5"], ["hand"], ["hand", "joint_1"]])
+def test_posture_on_the_surfaces_with_least_change(keep):
+    """Gaps to 1e-12, what is kept stays, and no motion along the surfaces comes closer to the posture asked for."""
+    asked = dynsim.build_model(scenario(**{"plant.initial_deg": OFF}))
+    case = scenario(**{"plant.initial_deg": OFF, "initial": {"on_surface": ELBOWS, "keep": keep}})
+    model = dynsim.build_model(case)
+    q, q_0 = model.robot.initial, asked.robot.initial
+    gaps, J = gaps_and_rates(model, build.contacts(case), q)
+    assert np.abs(gaps).max() <= 1e-12
+    assert np.abs(gaps_and_rates(model, build.contacts(case), q_0)[0]).max() > 1e-3
+    free = np.array([name not in keep for name in model.joint_names])
+    assert np.array_equal(q[~free], q_0[~free])
+    if "hand" in keep:
+        hand = model.robot.hand
+        assert model.point_position(*hand, q) == pytest.approx(model.point_position(*hand, q_0), abs=1e-12)
+        J = np.vstack([J, model.point_jacobian(*hand, q)])
+    along = np.linalg.svd(J[:, free])[2][np.linalg.matrix_rank(J[:, free], tol=1e-9) :]
+    assert np.abs(along @ (q - q_0)[free]).max() <= 1e-7
+
+
+def test_posture_that_no_joint_can_reach_is_refused():
+    everything = [f"joint_{k}" for k in range(1, 11)]
+    with pytest.raises(DynsimError, match=r"initial: the joints that may move do not bring elbow_4, elbow_7"):
+        dynsim.build_model(
+            scenario(**{"plant.initial_deg": OFF, "initial": {"on_surface": ELBOWS, "keep": everything}})
+        )
+    with pytest.raises(DynsimError, match=r"initial.on_surface: no contact 'elbow_5'"):
+        dynsim.build_model(scenario(initial={"on_surface": ["elbow_5"]}))
+
+
+def test_the_whole_chain_follows_the_hand_with_its_braces_on_the_floor():
+    chain = [f"joint_{k}" for k in range(1, 11)]
+    case = scenario(duration_s=2.0, **{"controller.hand.joints": chain, "controller.hand.braces": ELBOWS})
+    model = dynsim.build_model(case)
+    control = build.controller(case, model)
+    contacts = build.contacts(case)
+    moved = np.zeros(10)
+    for times, positions in control.positions(model.robot):
+        target = control.target(times)
+        for q, wanted in zip(positions[::4], target[::4], strict=True):  # at the knots
+            assert np.abs(gaps_and_rates(model, contacts, q)[0]).max() <= 1e-9
+            assert np.linalg.norm(model.point_position(*model.robot.hand, q) - wanted) <= 1e-9
+            moved = np.maximum(moved, np.abs(q - model.robot.initial))
+    assert (moved > 1e-6).sum() >= 4  # more joints than without braces: yaw and the last two
+
+
+def test_planned_voltages_are_what_the_motion_takes():
+    """Without feedback the arm follows its references, and each circuit is in balance: u = R i + L di/dt + K_m v."""
+    gains = {"controller.k_p_V_per_rad": 0.0, "controller.k_d_V_s_per_rad": 0.0}
+    case = scenario(duration_s=0.3, **gains, **{"controller.brace": FORCES})
+    record = dynsim.simulate(case)
+    model, control = dynsim.build_model(case), build.controller(case, dynsim.build_model(case))
+    k = np.searchsorted(record.time, 0.2)
+    powers = (record.time[k] % control.reference.grid[1]) ** np.arange(6)
+    segment = int(record.time[k] / control.reference.grid[1] + 1e-9)
+    planned = control.reference.voltage[segment] @ np.where(powers < 1e-12, np.eye(6)[0], powers)
+    assert record["voltage"][k] == pytest.approx(planned, abs=1e-6)
+    assert np.abs(planned).max() > 1.0
+    assert len(model.robot.motors) == 10
+
+
+def test_default_programs_have_no_planned_voltages():
+    model = dynsim.build_model(scenario())
+    assert build.controller(scenario(), model).reference.voltage is None
+
+
+@pytest.mark.parametrize("law", ["bilateral", "unilateral"])
+def test_elbows_press_as_commanded(law, tmp_path):
+    """Within 2 % (they are within 1e-4) after a second, glued floor and real one; and the hand follows better."""
+    make = (lambda **more: real_floor(tmp_path, **more)) if law == "unilateral" else scenario
+    short = {"duration_s": 3.0, "metrics.settle_s": 1.0}
+    plain, pressing = (dynsim.simulate(make(**short, **more)) for more in ({}, {"controller.brace": FORCES}))
+    late = pressing.time >= 1.0
+    forces = pressing["contact_normal_force"][late]
+    assert np.abs(forces / np.array([3.0, 8.0]) - 1.0).max() <= 1e-4
+    assert np.abs(plain["contact_normal_force"][late] / np.array([3.0, 8.0]) - 1.0).max() > 0.02
+    assert pressing.summary["hand_error_rms_m"] < 0.2 * plain.summary["hand_error_rms_m"]
+    assert pressing.summary["electrical_energy_J"] > plain.summary["electrical_energy_J"]
+
+
+def test_least_heat_keeps_both_elbows_on_the_real_floor(tmp_path):
+    """No less than min_N, and no more heat than any commanded pair of forces nearby."""
+    short = {"duration_s": 3.0, "metrics.settle_s": 1.0}
+    best = dynsim.simulate(real_floor(tmp_path, **short, **{"controller.brace": "optimal"}))
+    late = best.time >= 1.0
+    assert best["contact_normal_force"][late].min() >= 0.5 * (1.0 - 1e-3)
+    k = np.flatnonzero(late)[0]
+    at = dict(zip(ELBOWS, best["contact_normal_force"][k], strict=True))
+    heat = np.sum(1.1 * best["current"][k] ** 2)
+    case = real_floor(tmp_path)
+    model = dynsim.build_model(case)
+    for change in (-0.2, 0.2):
+        braces = {
+            c.name: Brace(
+                c.body,
+                c.point,
+                np.array([0.0, 0.0, 1.0]),
+                friction=0.1,
+                normal_force=at[c.name] + (change if c.name == "elbow_7" else 0.0),
+                sliding=best["contact_slip_velocity"][k, i],
+            )
+            for i, c in enumerate(build.contacts(case))
+        }
+        found = model.brace_statics(best["q"][k], best["v"][k], best["vdot"][k], braces)
+        assert found.heat > heat * (1.0 - 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        ({"controller.brace": {"elbow_9": 1.0}}, "no contact 'elbow_9'"),
+        ({"controller.brace": {"elbow_4": -1.0}}, "controller.brace"),
+        ({"controller.brace": "optimal", "controller.feed_forward": "gravity"}, "leave feed_forward away"),
+        ({"controller.min_N": 1.0}, "min_N is for brace: optimal"),
+    ],
+)
+def test_refused(overrides, said):
+    model = dynsim.build_model(scenario())
+    with pytest.raises(DynsimError, match=said):
+        build.controller(scenario(**overrides), model)
