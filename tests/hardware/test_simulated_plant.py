@@ -319,9 +319,9 @@ def test_a_braced_arm_bears_jams_and_servos_without_power() -> None:
     # Servos and friction: not the same place, but near it.
     np.testing.assert_allclose(plant.joint_positions, held, rtol=0, atol=0.1)
     # All jammed for a long time, an arm on the floor neither sinks nor rises.
-    at = plant.joint_positions.copy()
     for k in range(10):
         plant.stop(k)
+    at = plant.joint_positions.copy()
     drive.enabled[:] = False
     for _ in range(300):
         plant.step(PHYSICS_STEP, drive)
