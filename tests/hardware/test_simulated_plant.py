@@ -327,7 +327,8 @@ def test_a_braced_arm_bears_jams_and_servos_without_power() -> None:
         plant.step(PHYSICS_STEP, drive)
         for k in range(10):
             plant.stop(k)
-    np.testing.assert_allclose(plant.joint_positions, at, rtol=0, atol=1e-12)
+    # Whoever is below the floor by a rounding is brought onto it, against brakes too.
+    np.testing.assert_allclose(plant.joint_positions, at, rtol=0, atol=1e-11)
 
 
 def test_a_posture_in_ticks_starts_on_the_floor_and_a_deeper_one_is_refused(caplog) -> None:
