@@ -319,15 +319,16 @@ def test_a_braced_arm_bears_jams_and_servos_without_power() -> None:
     # Servos and friction: not the same place, but near it.
     np.testing.assert_allclose(plant.joint_positions, held, rtol=0, atol=0.1)
     # All jammed for a long time, an arm on the floor neither sinks nor rises.
-    at = plant.joint_positions.copy()
     for k in range(10):
         plant.stop(k)
+    at = plant.joint_positions.copy()
     drive.enabled[:] = False
     for _ in range(300):
         plant.step(PHYSICS_STEP, drive)
         for k in range(10):
             plant.stop(k)
-    np.testing.assert_allclose(plant.joint_positions, at, rtol=0, atol=1e-12)
+    # Whoever is below the floor by a rounding is brought onto it, against brakes too.
+    np.testing.assert_allclose(plant.joint_positions, at, rtol=0, atol=1e-11)
 
 
 def test_a_posture_in_ticks_starts_on_the_floor_and_a_deeper_one_is_refused(caplog) -> None:
