@@ -29,6 +29,7 @@ from dynsim.kernels.arrays import (
 from dynsim.kernels.constraint.rows import set_modes
 from dynsim.kernels.constraint.splits import margin
 from dynsim.kernels.constraint.unilateral import (
+    AT_ROOT,
     BEFORE,
     BEST_MARGIN,
     BOUNCES,
@@ -36,9 +37,12 @@ from dynsim.kernels.constraint.unilateral import (
     CHATTERED,
     CLOSED_TIME,
     DEEPEST,
+    DEPTH,
     FROZEN,
+    HEADWAY,
     HITS,
     LANDINGS,
+    LANDS_AT,
     LAST_CHANGE,
     LIFT_OFFS,
     LIMIT,
@@ -89,8 +93,6 @@ NORMAL_GUARD, SLIP_GUARD, STOP_GUARD = 10, 11, 12
 LANDING, LIFT_OFF, SLIP_START, SLIP_STOP, BOUNCE, CHATTERS, STOP_HIT, STOP_LEFT = 0, 1, 2, 3, 4, 5, 6, 7
 LOG_KINDS = 8
 
-# Below its surface by this much a point has landed [m]; projection leaves closed ones within half of it.
-DEPTH = 2e-10
 # A candidate that starts, or comes to rest, this close to its surface touches it [m].
 TOUCH = 1e-9
 # More events of a candidate than MOST_EVENTS in WINDOW [s] are chatter; SETTLE grows tenfold then, up to MOST_SETTLE.
@@ -117,9 +119,9 @@ def contact_guard(unilateral: UnilateralArrays | None, ws: Workspace, kind, k):
         return stop[k, SIDE] * ws.joints[j, Q] - stop[k, LIMIT] + DEPTH
     mode = ws.active[k, MODE]
     if kind == NORMAL_GUARD:
-        return ws.contacts[k, GAP] + DEPTH if mode == OPEN else ws.contacts[k, NORMAL_FORCE]
+        return ws.contacts[k, GAP] + unilateral.slide[k, LANDS_AT] if mode == OPEN else ws.contacts[k, NORMAL_FORCE]
     if mode == SLIDING and unilateral.law[k, STATIC] > 0.0:
-        return unilateral.slide[k, SPEED] + BACKWARD
+        return unilateral.slide[k, SPEED] + unilateral.slide[k, HEADWAY] + BACKWARD
     if mode == STICKING:
         best = unilateral.number[BEST_MARGIN]
         # Dependent rows, where the least norm fits no cones: the forces are the least that do, on some cone, and say
@@ -177,6 +179,10 @@ def watch_modes(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
     for k in range(state.shape[0]):
         tally[k, TIME_OPEN + ws.active[k, MODE]] += h
         tally[k, DEEPEST] = max(tally[k, DEEPEST], -state[k, GAP])
+        if ws.active[k, MODE] != OPEN:
+            slide[k, LANDS_AT] = DEPTH
+        elif state[k, GAP] > DEPTH:
+            slide[k, LANDS_AT] = AT_ROOT
         speed = slip_speed(ws, k)
         slide[k, NEXT_SPEED] = speed
         for s in range(3):
