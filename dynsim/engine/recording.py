@@ -112,6 +112,7 @@ def make_record(
         support=np.zeros(0) if run.support is None else run.support.least,
         unilateral=prepared.system.unilateral,
         stops=tuple(prepared.stops),
+        stepping=None if run.stepping is None else run.stepping.found,
     )
     record.summary = metrics.summarise(record, scenario, contacts, robot, counts)
     return record

@@ -112,8 +112,13 @@ def slide_direction(unilateral: UnilateralArrays, contacts: ContactArrays, k, x,
         scale = 1.0 / size if along >= 0.0 else -1.0 / size
         a, b, c = x * scale, y * scale, z * scale
         speed = size if along >= 0.0 else -size
-    mu = contacts.point[k, MU]
+    return a, b, c, sliding_friction(law, k, contacts.point[k, MU], speed)
+
+
+@inlined_kernel
+def sliding_friction(law, k, mu, speed):
+    """Coefficient of friction of candidate k that slides at this speed, mu being the kinetic one."""
     if law[k, STRIBECK] > 0.0:
         ratio = speed / law[k, STRIBECK]
         mu += (law[k, STATIC] - mu) * math.exp(-ratio * ratio)
-    return a, b, c, mu + law[k, VISCOUS] * speed
+    return mu + law[k, VISCOUS] * speed
