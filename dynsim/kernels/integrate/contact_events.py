@@ -18,6 +18,7 @@ from dynsim.kernels.arrays import (
     GAP,
     GAP_RATE,
     MODE,
+    NORMAL,
     NORMAL_FORCE,
     OPEN,
     SLIDING,
@@ -105,6 +106,8 @@ INSTANT = 1e-11
 BACKWARD = 2e-11
 # Forces that contradict their modes by less than this, absolute [N] and of the largest, are rounding.
 FORCE_SLACK = 1e-9
+# Of the largest force: what counts as none where a point that sticks gives way.
+NO_FORCE = 1e-8
 
 
 @internal_kernel
@@ -209,6 +212,21 @@ def take_directions(unilateral: UnilateralArrays | None, ws: Workspace, run: Run
             for s in range(3):
                 slide[k, REFERENCE + s] = slide[k, NEXT + s]
         slide[k, FROZEN] = 0.0 if fast else 1.0
+        if not fast:
+            stay_tangential(slide, ws, k)
+
+
+@internal_kernel
+def stay_tangential(slide, ws: Workspace, k):
+    """Keep a frozen direction along the surface, whose normal turns as the point moves on."""
+    state, size, along = ws.contacts, 0.0, 0.0
+    for s in range(3):
+        along += slide[k, REFERENCE + s] * state[k, NORMAL + s]
+    for s in range(3):
+        slide[k, REFERENCE + s] -= along * state[k, NORMAL + s]
+        size += slide[k, REFERENCE + s] ** 2
+    for s in range(3):
+        slide[k, REFERENCE + s] /= math.sqrt(size)
 
 
 @internal_kernel
@@ -342,8 +360,10 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
         return
     # Samples may have left another state in the workspace.
     evaluate(system, ws, run)
+    strongest = 0.0
     for k in range(mode.shape[0]):
         mode[k, WANTED] = ws.active[k, MODE]
+        strongest = max(strongest, ws.contacts[k, NORMAL_FORCE])
     for e in range(run.event.shape[0]):
         kind, k = run.event_table[e, EVENT_KIND], run.event_table[e, EVENT_INDEX]
         if kind < NORMAL_GUARD or run.event[e, VALUE] > 0.0:
@@ -363,6 +383,11 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
             if not at_limit(unilateral, ws, k):
                 continue
             r = ws.active[k, FIRST_ROW]
+            if ws.rows[r, FORCE] <= NO_FORCE * strongest:
+                # At the apex of its cone it leaves; there is no direction in which it could slip.
+                mode[k, WANTED] = OPEN
+                tell(system, run, k, LIFT_OFF)
+                continue
             begin_slip(system, ws, k, ws.rows[r + 1, FORCE], ws.rows[r + 2, FORCE])
             mode[k, WANTED] = SLIDING
             tell(system, run, k, SLIP_START)
