@@ -171,7 +171,9 @@ def test_a_bead_in_a_bowl_reverses_or_sticks(law):
         Link("x", "jx", None, "prismatic", X, Inertia(0.0)),
         Link("z", "jz", "x", "prismatic", Z, Inertia(mass)),
     )
-    b = bench(Robot("bead", links, (), ("z", np.zeros(3))), [touching("z", np.zeros(3), bowl(radius), **law)], real=True)
+    b = bench(
+        Robot("bead", links, (), ("z", np.zeros(3))), [touching("z", np.zeros(3), bowl(radius), **law)], real=True
+    )
 
     def coefficient(speed: float) -> float:
         mu = law["friction"] + law.get("viscous_friction", 0.0) * speed
@@ -226,7 +228,9 @@ def test_four_feet_hold_as_long_as_any_split_of_their_forces_does(direction):
     contacts = [touching("body", foot, friction=mu) for foot in feet]
     b = free_body(Inertia(mass, np.zeros(3), np.diag([0.1, 0.1, 0.15])), contacts, [pull(rate, along)])
     onset = mu * mass * G / rate
-    run = b.simulate(placed(b, height * Z, np.zeros(3), np.zeros(3)), np.linspace(0.0, 1.2 * onset, 61), "dopri5", **TIGHT)
+    run = b.simulate(
+        placed(b, height * Z, np.zeros(3), np.zeros(3)), np.linspace(0.0, 1.2 * onset, 61), "dopri5", **TIGHT
+    )
     found = events(run)
     assert {kind for _, _, kind in found} == {ce.SLIP_START}
     assert len(found) == 4
