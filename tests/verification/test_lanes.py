@@ -52,7 +52,7 @@ FALLBACK = {
     Place(
         "constraint/delassus.py",
         "eliminate",
-        "least_norm(small, state, active, p, k if least > POOR_PIVOT * largest else 0)",
+        "least_norm(small, state, active, p, k if least > POOR_PIVOT * largest else 0, largest)",
     ): DEPENDENT,
     Place(
         "constraint/delassus.py", "eliminate_to_rank", "if abs(matrix[row, column]) <= RANK_TOLERANCE * largest:"
