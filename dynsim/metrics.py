@@ -14,7 +14,7 @@ from dynsim.kernels.constraint import unilateral as ku
 from dynsim.kernels.constraint.unilateral import UnilateralArrays
 from dynsim.kernels.integrate.contact_events import MOST_EVENTS, WINDOW
 from dynsim.kernels.integrate.run import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, LOCAL_SINCE, PULLING
-from dynsim.kernels.integrate.time_stepping import BAD, CAPPED, LONG_SOLVES, PENETRATION, SOLVES, WORST
+from dynsim.kernels.integrate.time_stepping import BAD
 from dynsim.measures import (
     RESIDUAL_LIMIT,
     STORES,
@@ -93,7 +93,7 @@ class Counts:
     support : (4,) least loads of wheels and caster and least tip margin of a mobile base over all steps, else empty
     unilateral : tables of the unilateral law with what they have counted; None under the other one
     stops : joint stops, in their order there
-    stepping : what time stepping has found, see dynsim.kernels.integrate.time_stepping; None of other methods
+    stepping : how time stepping has solved its contact problems, for the summary; None of other methods
     """
 
     wall: float
@@ -107,7 +107,7 @@ class Counts:
     support: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     unilateral: UnilateralArrays | None = None
     stops: tuple[JointStop, ...] = ()
-    stepping: NDArray[np.float64] | None = None
+    stepping: dict[str, Any] | None = None
 
 
 def energy_residual(record: Record) -> NDArray[np.float64]:
@@ -187,7 +187,7 @@ def summarise(
     if counts.unilateral is not None:
         summary["joint_stops"] = _stops(counts, duration)
     if counts.stepping is not None:
-        summary["time_stepping"] = _stepping(counts.stepping)
+        summary["time_stepping"] = counts.stepping
     summary["warnings"] = _warnings(record, scenario, contacts, robot, counts, summary) + _sunk(record, sunk)
     return summary
 
@@ -267,17 +267,6 @@ def _stops(counts: Counts, duration: float) -> list[dict[str, Any]]:
     return found
 
 
-def _stepping(found: NDArray[np.float64]) -> dict[str, Any]:
-    """How well time stepping has solved its contact problems, and how deep points came to lie."""
-    return {
-        "contact_solves": int(found[SOLVES]),
-        "long_solves": int(found[LONG_SOLVES]),
-        "capped_solves": int(found[CAPPED]),
-        "residual_max_m_s": float(found[WORST]),
-        "penetration_max_m": float(found[PENETRATION]),
-    }
-
-
 def _capped(stepping: dict[str, Any]) -> list[str]:
     """Contact problems that were not solved; what lies deep in a surface is no drift, but shrinks with the step."""
     if not stepping["capped_solves"]:
@@ -339,7 +328,7 @@ def _warnings(
             "tighten integrator.rtol or the step"
         )
     if counts.stepping is not None:
-        found.extend(_capped(summary["time_stepping"]))
+        found.extend(_capped(counts.stepping))
     elif summary["constraint_drift_max_m"] > DRIFT_LIMIT_M:
         found.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
     if counts.deficient:
