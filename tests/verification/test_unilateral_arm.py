@@ -159,7 +159,8 @@ def test_a_rod_falls_flat(mu):
     b = rod(mu, 0.2, 2)
     run = b.simulate(b.state(b.robot.initial, np.zeros(3)), np.linspace(0.0, 3.0, 301), "dopri5", rtol=1e-10)
     kinds = [kind for _, k, kind in events(run) if k == 0]
-    assert kinds[0] == ce.SLIP_START
+    # At the start it is held if μ is above what a rod at rest needs, 0.14.
+    assert (kinds[0] == ce.SLIP_START) == (mu > 0.2)
     assert any(k == 1 and kind == ce.LANDING for _, k, kind in events(run))
     touch, q = run.outputs("contact"), run.states("q")
     assert touch[:, :, OUT_GAP].min() >= -1e-9
@@ -196,14 +197,14 @@ def test_the_paradox_of_a_sliding_rod_is_named(turn, sense):
 def test_nothing_creeps_for_an_hour(scene):
     """Below its cone a point that sticks stays where it is: MuJoCo 4 creeps by 50 to 900 µm/s."""
     if scene == "propped arm":
-        # Two rods from a hinge at the height of 0.3 m to a hand on the floor, slip of which μ = 0.9 prevents.
+        # An arch of two rods from a hinge to a hand on the floor, which thrusts outwards by a third of its load.
         slim = Inertia(0.6, vector(0.0, 0.0, -0.15), np.diag([0.0045, 0.0045, 0.0]))
         links = (
-            Link("upper", "shoulder", None, "revolute", -Y, slim, p_PJ=0.3 * Z),
+            Link("upper", "shoulder", None, "revolute", -Y, slim, p_PJ=0.3 * (np.cos(2.2) + np.cos(0.5)) * Z),
             Link("fore", "elbow", "upper", "revolute", -Y, slim, p_PJ=-0.3 * Z),
         )
-        q = np.array([1.2, np.arccos(1.0 - np.cos(1.2)) - 1.2])
-        b = bench(Robot("arm", links, (), ("fore", -0.3 * Z), q0=q), [touching("fore", -0.3 * Z, friction=0.9)], real=True)
+        q = np.array([2.2, 0.5 - 2.2])
+        b = bench(Robot("arm", links, (), ("fore", -0.3 * Z), q0=q), [touching("fore", -0.3 * Z, friction=0.5)], real=True)
     else:
         names = "xyz"
         links = tuple(
@@ -219,5 +220,6 @@ def test_nothing_creeps_for_an_hour(scene):
     touch = run.outputs("contact")
     assert (touch[:, 0, OUT_MODE] == ka.STICKING).all()
     f, force = touch[0, 0, OUT_FORCE], touch[0, 0, OUT_VECTOR : OUT_VECTOR + 3]
-    assert 0.5 * f < float(np.linalg.norm(force)) < 2.0 * f
+    # It leans on its friction.
+    assert float(np.linalg.norm(force)) > 1.04 * f
     assert np.abs(run.states("q") - q).max() <= 1e-10

@@ -128,7 +128,7 @@ def test_a_ball_slides_and_then_rolls(spin):
         run.states("q")[:, :3] - radius * Z, v0 * t + 0.5 * brake * t**2 + (v0 - 2.0 / 7.0 * slip) * rest, atol=1e-8
     )
     if not spin.any():
-        np.testing.assert_allclose(run.states("v")[-1, :3], 5.0 / 7.0 * v0, rtol=1e-8)
+        np.testing.assert_allclose(run.states("v")[-1, :3], 5.0 / 7.0 * v0, rtol=1e-8, atol=1e-12)
     # Energy: what the slip had, half of m/(1 + 5/2) u².
     assert run.states("ledger")[-1, 5] == pytest.approx(mass / 7.0 * float(slip @ slip), rel=1e-8)
     assert np.abs(ledger_residual(run)).max() < 1e-9
@@ -255,9 +255,9 @@ def test_four_feet_hold_as_long_as_any_split_of_their_forces_does(direction):
     onset = mu * mass * G / rate
     run = b.simulate(placed(b, height * Z, np.zeros(3), np.zeros(3)), np.linspace(0.0, 1.2 * onset, 61), "dopri5", **TIGHT)
     found = events(run)
-    assert {kind for _, _, kind in found} == {ce.SLIP_START}
-    assert len(found) == 4
-    np.testing.assert_allclose([t for t, _, _ in found], onset, rtol=0, atol=1e-8)
+    # Rounding may let one foot go, and be caught by the others, before all do at that instant.
+    np.testing.assert_allclose([t for t, _, _ in found], onset, rtol=0, atol=1e-10)
+    assert {k: kind for _, k, kind in found} == dict.fromkeys(range(4), ce.SLIP_START)
     touch = run.outputs("contact")
     before = run.sample_time < onset
     force = touch[before][:, :, OUT_VECTOR : OUT_VECTOR + 3]
