@@ -33,46 +33,74 @@ def placed(b: Bench, place: np.ndarray, velocity: np.ndarray, turning: np.ndarra
     return b.state(np.concatenate([place, [1.0, 0.0, 0.0, 0.0]]), np.concatenate([velocity, turning]))
 
 
-def test_a_disc_on_three_feet_slides_and_spins_until_both_stop():
-    """Weight and overturning moment of friction give the feet's forces; the path, the spin and the common stop."""
+def test_a_disc_on_three_feet_slides_pivots_and_stops():
+    """Weight and overturning moment of friction give the feet's forces; one foot stops first, the others turn about it.
+
+    The path and the spin while all slide, the stop of the first foot, and that of the others: a tripod does not end
+    sliding and spinning at once, as a smooth disc does.
+    """
     mass, inertia, height, mu = 2.0, 0.011, 0.03, 0.3
     angle = 0.3 + 2.0 * np.pi / 3.0 * np.arange(3)
     feet = 0.1 * np.array([np.cos(angle), np.sin(angle)]).T
-    contacts = [touching("body", np.append(foot, -height), friction=mu) for foot in feet]
-    b = free_body(Inertia(mass, np.zeros(3), np.diag([0.006, 0.006, inertia])), contacts)
     start = np.array([0.0, 0.0, 0.0, 1.0, 0.3, 8.0])
 
-    def rate(_: float, s: np.ndarray) -> np.ndarray:
+    def geometry(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         c, n = np.cos(s[2]), np.sin(s[2])
         arm = feet @ np.array([[c, n], [-n, c]])
-        slip = s[3:5] + s[5] * np.array([-arm[:, 1], arm[:, 0]]).T
+        return arm, s[3:5] + s[5] * np.array([-arm[:, 1], arm[:, 0]]).T
+
+    def solve(s: np.ndarray, pivot: bool) -> np.ndarray:
+        """Acceleration (2), spin rate: unknowns n (3), ax, ay, spin rate, and friction of foot 0 if it is the pivot."""
+        arm, slip = geometry(s)
         t = slip / np.linalg.norm(slip, axis=1)[:, None]
-        moments = np.array([np.ones(3), arm[:, 1] - height * mu * t[:, 1], height * mu * t[:, 0] - arm[:, 0]])
-        f = np.linalg.solve(moments, np.array([mass * G, 0.0, 0.0]))
-        force = -mu * f[:, None] * t
-        spin = (arm[:, 0] * force[:, 1] - arm[:, 1] * force[:, 0]).sum() / inertia
-        return np.concatenate([s[3:], force.sum(axis=0) / mass, [spin]])
+        K, r = np.zeros((8, 8)), np.zeros(8)
+        K[0, :3], r[0] = 1.0, mass * G
+        for i in range(3):
+            f = np.array([0.0, 0.0]) if pivot and i == 0 else -mu * t[i]
+            K[1:3, i] = arm[i, 1] + height * f[1], -height * f[0] - arm[i, 0]
+            K[3:5, i], K[5, i] = f, arm[i, 0] * f[1] - arm[i, 1] * f[0]
+        K[3, 3], K[4, 4], K[5, 5] = -mass, -mass, -inertia
+        if pivot:
+            K[1, 7], K[2, 6] = height, -height
+            K[3, 6], K[4, 7], K[5, 6], K[5, 7] = 1.0, 1.0, -arm[0, 1], arm[0, 0]
+            K[6, 3], K[6, 5], r[6] = 1.0, -arm[0, 1], s[5] ** 2 * arm[0, 0]
+            K[7, 4], K[7, 5], r[7] = 1.0, arm[0, 0], s[5] ** 2 * arm[0, 1]
+        else:
+            K[6, 6], K[7, 7] = 1.0, 1.0
+        return np.linalg.solve(K, r)[3:6]
 
-    def moving(_: float, s: np.ndarray) -> float:
-        return float(np.hypot(s[3], s[4]) + 0.1 * abs(s[5]) - 1e-6)
+    def sliding(_: float, s: np.ndarray) -> np.ndarray:
+        return np.concatenate([s[3:], solve(s, False)])
 
-    moving.terminal = True  # type: ignore[attr-defined]
-    found = solve_ivp(rate, (0.0, 2.0), start, "DOP853", rtol=1e-12, atol=1e-14, events=moving, dense_output=True)
-    stop = found.t[-1] + 1e-6 / np.linalg.norm(rate(0.0, found.y[:, -1])[3:5])
+    def pivoting(_: float, s: np.ndarray) -> np.ndarray:
+        return np.concatenate([s[3:], solve(s, True)])
+
+    def held(_: float, s: np.ndarray) -> float:
+        return float(np.linalg.norm(geometry(s)[1][0])) - 1e-5
+
+    def still(_: float, s: np.ndarray) -> float:
+        return float(s[5]) - 1e-6
+
+    held.terminal = still.terminal = True  # type: ignore[attr-defined]
+    first = solve_ivp(sliding, (0.0, 0.35), start, "DOP853", rtol=1e-12, atol=1e-14, dense_output=True)
+    last = solve_ivp(sliding, (0.35, 1.0), first.y[:, -1], "Radau", rtol=1e-9, atol=1e-11, events=held)
+    turn = solve_ivp(pivoting, (last.t[-1], 1.0), last.y[:, -1], "DOP853", rtol=1e-10, atol=1e-12, events=still)
+
+    contacts = [touching("body", np.append(foot, -height), friction=mu) for foot in feet]
+    b = free_body(Inertia(mass, np.zeros(3), np.diag([0.006, 0.006, inertia])), contacts)
     y = placed(b, vector(0, 0, height), np.append(start[3:5], 0.0), vector(0, 0, start[5]))
     run = b.simulate(y, np.linspace(0.0, 0.6, 61), "dopri5", **TIGHT)
-    early = run.sample_time < found.t[-1]
-    assert 10 < early.sum() < 61
-    q, v = run.states("q"), run.states("v")
-    expected = found.sol(run.sample_time[early])
-    np.testing.assert_allclose(q[early, :2], expected[:2].T, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(2.0 * np.arctan2(q[early, 6], q[early, 3]), expected[2], rtol=0, atol=1e-7)
-    np.testing.assert_allclose(v[early][:, [0, 1, 5]], expected[3:].T, rtol=0, atol=1e-7)
-    times = [t for t, _, kind in events(run) if kind == ce.SLIP_STOP]
-    assert times
-    # The end of slip is told from speeds of 2e-5 m/s on.
-    np.testing.assert_allclose(times, stop, rtol=0, atol=2e-5)
-    np.testing.assert_allclose(q[-1, :2], found.y[:2, -1], rtol=0, atol=1e-8)
+    early = run.sample_time <= 0.35
+    q, v, expected = run.states("q"), run.states("v"), first.sol(run.sample_time[early])
+    np.testing.assert_allclose(q[early, :2], expected[:2].T, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(2.0 * np.arctan2(q[early, 6], q[early, 3]), expected[2], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(v[early][:, [0, 1, 5]], expected[3:].T, rtol=0, atol=1e-8)
+    times = [(t, k) for t, k, kind in events(run) if kind == ce.SLIP_STOP]
+    assert times[0][1] == 0
+    # From 1e-5 m/s on, at some 0.5 m/s².
+    assert times[0][0] == pytest.approx(last.t[-1], abs=1e-4)
+    np.testing.assert_allclose([t for t, _ in times[1:]], turn.t[-1], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(q[-1, :2], turn.y[:2, -1], rtol=0, atol=1e-6)
     assert np.abs(v[-1]).max() < 1e-8
     assert (run.outputs("contact")[-1, :, OUT_MODE] == ka.STICKING).all()
     assert np.abs(ledger_residual(run)).max() < 1e-9
@@ -82,7 +110,6 @@ def test_a_disc_on_three_feet_slides_and_spins_until_both_stop():
 def test_a_ball_slides_and_then_rolls(spin):
     """Slip u falls along itself by (7/2) μ g and is gone at 2 |u|/(7 μ g); v by 2 u/7; spin along n stays."""
     mass, radius, mu, v0 = 0.6, 0.05, 0.2, vector(1.0, 0.2, 0.0)
-    b = free_body(Inertia.solid_sphere(mass, radius, np.zeros(3)), [touching("body", np.zeros(3), friction=mu)])
     contact = Contact("ball", "body", np.zeros(3), FLOOR, friction=mu, radius=radius, pulling_friction="signed")
     b = free_body(Inertia.solid_sphere(mass, radius, np.zeros(3)), [contact])
     run = b.simulate(placed(b, radius * Z, v0, spin), np.linspace(0.0, 1.0, 41), "dopri5", **TIGHT)
@@ -99,7 +126,7 @@ def test_a_ball_slides_and_then_rolls(spin):
         run.states("q")[:, :3] - radius * Z, v0 * t + 0.5 * brake * t**2 + (v0 - 2.0 / 7.0 * slip) * rest, atol=1e-8
     )
     if not spin.any():
-        np.testing.assert_allclose(run.states("v")[-1, :3], 5.0 / 7.0 * v0, rtol=1e-8)
+        np.testing.assert_allclose(run.states("v")[-1, :3], 5.0 / 7.0 * v0, rtol=1e-8, atol=1e-12)
     # Energy: what the slip had, half of m/(1 + 5/2) u².
     assert run.states("ledger")[-1, 5] == pytest.approx(mass / 7.0 * float(slip @ slip), rel=1e-8)
     assert np.abs(ledger_residual(run)).max() < 1e-9
@@ -230,9 +257,9 @@ def test_four_feet_hold_as_long_as_any_split_of_their_forces_does(direction):
         placed(b, height * Z, np.zeros(3), np.zeros(3)), np.linspace(0.0, 1.2 * onset, 61), "dopri5", **TIGHT
     )
     found = events(run)
-    assert {kind for _, _, kind in found} == {ce.SLIP_START}
-    assert len(found) == 4
-    np.testing.assert_allclose([t for t, _, _ in found], onset, rtol=0, atol=1e-8)
+    # Rounding may let one foot go, and be caught by the others, before all do at that instant.
+    np.testing.assert_allclose([t for t, _, _ in found], onset, rtol=0, atol=1e-10)
+    assert {k: kind for _, k, kind in found} == dict.fromkeys(range(4), ce.SLIP_START)
     touch = run.outputs("contact")
     before = run.sample_time < onset
     force = touch[before][:, :, OUT_VECTOR : OUT_VECTOR + 3]
