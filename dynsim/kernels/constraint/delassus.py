@@ -159,6 +159,8 @@ def eliminate_to_rank(small, state, active, p, start, largest):
         column, row = k, largest_in_column(matrix, k, k, p)
         if abs(matrix[row, column]) <= RANK_TOLERANCE * largest:
             last -= 1
+            while last > k and abs(matrix[largest_in_column(matrix, last, k, p), last]) <= RANK_TOLERANCE * largest:
+                last -= 1
             swap_columns(matrix, active, p, k, last)
             continue
         for _ in range(p):
