@@ -155,7 +155,7 @@ def test_friction_that_depends_on_the_speed_is_followed_to_first_order():
     paper = (1.0 + mu / c) * np.exp(-G * c * times) - mu / c
     stribeck = solve_ivp(
         lambda t, v: -G * (mu + (static - mu) * np.exp(-((v / v_s) ** 2))), (0.0, times), [1.0], rtol=1e-11
-    ).y[0, -1]
+    )["y"][0, -1]
     for b, exact in (
         (block(mu, viscous_friction=c), paper),
         (block(mu, static_friction=static, stribeck=v_s), stribeck),

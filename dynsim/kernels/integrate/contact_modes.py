@@ -7,6 +7,8 @@ approaches is stopped by impulses (Moreau's law with Newton's restitution and Co
 
 is solved for what is at rest along its surface, with one unknown, f_n (n − μ t), for each point that slides already.
 The solution says which points leave, which stick, and where slip begins, in which direction.
+
+Long because: impacts and the choice of modes share the rows, the system and the scratch of one gathered problem.
 """
 
 from __future__ import annotations
