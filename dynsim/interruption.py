@@ -1,8 +1,9 @@
 """Signals that ask a run to stop: heeded at once where that loses nothing, kept while a result is made or saved.
 
-Python raises KeyboardInterrupt wherever it happens to be. Within a callback of the garbage collector it is lost, and
-between the last step and the saved record it would take the record with it. So a signal is also remembered, long work
-asks for it (:func:`check`), and between :func:`keep` and :func:`heed` it waits.
+Python raises KeyboardInterrupt wherever it happens to be. Within a callback of the garbage collector it is lost, within
+one of the compiler it crashes the process, and between the last step and the saved record it would take the record with
+it. So a signal is also remembered, long work asks for it (:func:`check`), and within a callback of the compiler, and
+between :func:`keep` and :func:`heed`, it waits.
 """
 
 from __future__ import annotations
@@ -10,12 +11,24 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from types import FrameType
 
 STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
+# Functions of llvmlite that LLVM calls for compiled code from and to the cache: it goes on with what they return.
+_OF_THE_COMPILER = ("_raw_object_cache_notify", "_raw_object_cache_getbuffer")
+
 _pending = False
 _kept = False
+
+
+def _compiler_waits(frame: FrameType | None) -> bool:
+    """True within a callback of the compiler."""
+    while frame is not None:
+        if frame.f_code.co_name in _OF_THE_COMPILER:
+            return True
+        frame = frame.f_back
+    return False
 
 
 @contextmanager
@@ -27,11 +40,11 @@ def heeded() -> Iterator[list[int]]:
     global _pending, _kept
     received: list[int] = []
 
-    def hear(number: int, frame: Any) -> None:
+    def hear(number: int, frame: FrameType | None) -> None:
         global _pending
         received.append(number)
         _pending = True
-        if not _kept:
+        if not (_kept or _compiler_waits(frame)):
             raise KeyboardInterrupt
 
     before = {}

@@ -1,0 +1,39 @@
+"""Signals wait where raising for them would crash the process."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+from llvmlite.binding import ExecutionEngine
+
+from dynsim import interruption
+
+
+def _raw_object_cache_getbuffer() -> str:
+    """Named as llvmlite's: what LLVM calls when it wants compiled code from the cache."""
+    return deeper()
+
+
+def deeper() -> str:
+    signal.raise_signal(signal.SIGINT)
+    return "went on"
+
+
+def test_a_signal_within_a_callback_of_the_compiler_waits():
+    """Raised there, it is lost, and LLVM goes on without the code that it has asked for: a segmentation fault."""
+    with interruption.heeded() as received:
+        assert _raw_object_cache_getbuffer() == "went on"
+        assert received == [signal.SIGINT]
+        with pytest.raises(KeyboardInterrupt):
+            interruption.check()
+
+
+def test_elsewhere_it_does_not():
+    with interruption.heeded(), pytest.raises(KeyboardInterrupt):
+        deeper()
+
+
+def test_the_compiler_has_these_callbacks():
+    assert interruption._OF_THE_COMPILER
+    assert all(hasattr(ExecutionEngine, name) for name in interruption._OF_THE_COMPILER)
