@@ -331,9 +331,14 @@ def _warnings(
         found.extend(_capped(counts.stepping))
     elif summary["constraint_drift_max_m"] > DRIFT_LIMIT_M:
         found.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
-    if counts.deficient:
+    if counts.deficient and counts.unilateral is None:
         found.append(
             f"contact rows depended on each other in {counts.deficient} evaluations: forces are the split of least norm"
+        )
+    elif counts.deficient:
+        found.append(
+            f"points that stick shared forces which the motion does not determine, in {counts.deficient} evaluations: "
+            "they are the split of least norm among those that lie in all friction cones"
         )
     if counts.spread is not None:
         s = counts.spread

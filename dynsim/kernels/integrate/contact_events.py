@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 
 from dynsim.kernels.arrays import (
+    DEPENDENT,
     FIRST_ROW,
     FORCE,
     GAP,
@@ -262,7 +263,10 @@ def consistent(system: System, ws: Workspace):
 @apart_kernel
 def solve_modes(system: System, ws: Workspace, run: Run, first):
     """Choose all modes anew, and log what that changes; ``first``: nothing of it is an event."""
+    before = ws.counts[DEPENDENT]
     resolve(system, ws, run, TOUCH)
+    # Of rows that were held together only to see what they do.
+    ws.counts[DEPENDENT] = before
     if not first:
         log_changes(system, ws, run)
     rearm(run)

@@ -367,7 +367,6 @@ def choose(system: System, ws: Workspace, run: Run):
     before = ws.counts[DEPENDENT]
     evaluate(system, ws, run)
     unilateral.number[REDUNDANT] = 1.0 if ws.counts[DEPENDENT] > before else 0.0
-    ws.counts[DEPENDENT] = before
     for k in range(mode.shape[0]):
         starts = mode[k, WANTED] == SLIDING and mode[k, TOUCHING] == STICKING
         unilateral.slide[k, HEADWAY] = max(0.0, -unilateral.slide[k, SPEED]) if starts else 0.0
