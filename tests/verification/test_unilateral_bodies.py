@@ -83,8 +83,8 @@ def test_a_disc_on_three_feet_slides_pivots_and_stops():
 
     held.terminal = still.terminal = True  # type: ignore[attr-defined]
     first = solve_ivp(sliding, (0.0, 0.35), start, "DOP853", rtol=1e-12, atol=1e-14, dense_output=True)
-    last = solve_ivp(sliding, (0.35, 1.0), first.y[:, -1], "Radau", rtol=1e-9, atol=1e-11, events=held)
-    turn = solve_ivp(pivoting, (last.t[-1], 1.0), last.y[:, -1], "DOP853", rtol=1e-10, atol=1e-12, events=still)
+    last = solve_ivp(sliding, (0.35, 1.0), first["y"][:, -1], "Radau", rtol=1e-9, atol=1e-11, events=held)
+    turn = solve_ivp(pivoting, (last.t[-1], 1.0), last["y"][:, -1], "DOP853", rtol=1e-10, atol=1e-12, events=still)
 
     contacts = [touching("body", np.append(foot, -height), friction=mu) for foot in feet]
     b = free_body(Inertia(mass, np.zeros(3), np.diag([0.006, 0.006, inertia])), contacts)
@@ -100,7 +100,7 @@ def test_a_disc_on_three_feet_slides_pivots_and_stops():
     # From 1e-5 m/s on, at some 0.5 m/s².
     assert times[0][0] == pytest.approx(last.t[-1], abs=1e-4)
     np.testing.assert_allclose([t for t, _ in times[1:]], turn.t[-1], rtol=0, atol=1e-5)
-    np.testing.assert_allclose(q[-1, :2], turn.y[:2, -1], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(q[-1, :2], turn["y"][:2, -1], rtol=0, atol=1e-6)
     assert np.abs(v[-1]).max() < 1e-8
     assert (run.outputs("contact")[-1, :, OUT_MODE] == ka.STICKING).all()
     assert np.abs(ledger_residual(run)).max() < 1e-9
@@ -221,7 +221,7 @@ def test_a_bead_in_a_bowl_reverses_or_sticks(law):
             rate, (t, t + 10.0), [phi, 0.0], "DOP853", rtol=1e-13, atol=1e-15, events=turn, dense_output=True
         )
         path.append(found.sol)
-        t, phi, sign = found.t[-1], found.y[0, -1], -sign
+        t, phi, sign = found.t[-1], found["y"][0, -1], -sign
         reversals.append(t)
     y = b.state(radius * vector(np.sin(start), 1.0 - np.cos(start), 0.0)[:2], np.zeros(2))
     run = b.simulate(y, np.linspace(0.0, t + 0.5, 201), "dopri5", **TIGHT)
