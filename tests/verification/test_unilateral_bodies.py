@@ -198,7 +198,9 @@ def test_a_bead_in_a_bowl_reverses_or_sticks(law):
         Link("x", "jx", None, "prismatic", X, Inertia(0.0)),
         Link("z", "jz", "x", "prismatic", Z, Inertia(mass)),
     )
-    b = bench(Robot("bead", links, (), ("z", np.zeros(3))), [touching("z", np.zeros(3), bowl(radius), **law)], real=True)
+    b = bench(
+        Robot("bead", links, (), ("z", np.zeros(3))), [touching("z", np.zeros(3), bowl(radius), **law)], real=True
+    )
 
     def coefficient(speed: float) -> float:
         mu = law["friction"] + law.get("viscous_friction", 0.0) * speed
@@ -253,7 +255,9 @@ def test_four_feet_hold_as_long_as_any_split_of_their_forces_does(direction):
     contacts = [touching("body", foot, friction=mu) for foot in feet]
     b = free_body(Inertia(mass, np.zeros(3), np.diag([0.1, 0.1, 0.15])), contacts, [pull(rate, along)])
     onset = mu * mass * G / rate
-    run = b.simulate(placed(b, height * Z, np.zeros(3), np.zeros(3)), np.linspace(0.0, 1.2 * onset, 61), "dopri5", **TIGHT)
+    run = b.simulate(
+        placed(b, height * Z, np.zeros(3), np.zeros(3)), np.linspace(0.0, 1.2 * onset, 61), "dopri5", **TIGHT
+    )
     found = events(run)
     # Rounding may let one foot go, and be caught by the others, before all do at that instant.
     np.testing.assert_allclose([t for t, _, _ in found], onset, rtol=0, atol=1e-10)
