@@ -21,7 +21,7 @@ LIMITS = {
 
 
 def test_every_sample_of_random_robots_keeps_to_the_law():
-    finished, worst = 0, dict.fromkeys(LIMITS, 0.0)
+    finished = 0
     for seed in range(80):
         b, y = random_touch(seed)
         run = b.advance(b.new_run(y, np.linspace(0.0, 0.5, 51), "dopri5", rtol=1e-8), 20_000)
@@ -30,6 +30,4 @@ def test_every_sample_of_random_robots_keeps_to_the_law():
         if run.count[ki.SAMPLE] > 0:
             for rule, size in violations(b, run).items():
                 assert size <= LIMITS[rule], (seed, rule, size)
-                worst[rule] = max(worst[rule], size)
     assert finished >= 68
-    print(finished, worst)
