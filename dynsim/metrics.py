@@ -14,6 +14,7 @@ from dynsim.kernels.constraint import unilateral as ku
 from dynsim.kernels.constraint.unilateral import UnilateralArrays
 from dynsim.kernels.integrate.contact_events import MOST_EVENTS, WINDOW
 from dynsim.kernels.integrate.run import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, LOCAL_SINCE, PULLING
+from dynsim.kernels.integrate.time_stepping import BAD
 from dynsim.measures import (
     RESIDUAL_LIMIT,
     STORES,
@@ -92,6 +93,7 @@ class Counts:
     support : (4,) least loads of wheels and caster and least tip margin of a mobile base over all steps, else empty
     unilateral : tables of the unilateral law with what they have counted; None under the other one
     stops : joint stops, in their order there
+    stepping : how time stepping has solved its contact problems, for the summary; None of other methods
     """
 
     wall: float
@@ -105,6 +107,7 @@ class Counts:
     support: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     unilateral: UnilateralArrays | None = None
     stops: tuple[JointStop, ...] = ()
+    stepping: dict[str, Any] | None = None
 
 
 def energy_residual(record: Record) -> NDArray[np.float64]:
@@ -183,6 +186,8 @@ def summarise(
     }
     if counts.unilateral is not None:
         summary["joint_stops"] = _stops(counts, duration)
+    if counts.stepping is not None:
+        summary["time_stepping"] = counts.stepping
     summary["warnings"] = _warnings(record, scenario, contacts, robot, counts, summary) + _sunk(record, sunk)
     return summary
 
@@ -262,6 +267,17 @@ def _stops(counts: Counts, duration: float) -> list[dict[str, Any]]:
     return found
 
 
+def _capped(stepping: dict[str, Any]) -> list[str]:
+    """Contact problems that were not solved; what lies deep in a surface is no drift, but shrinks with the step."""
+    if not stepping["capped_solves"]:
+        return []
+    return [
+        f"time stepping: {stepping['capped_solves']} of {stepping['contact_solves']} contact problems were given up "
+        f"above {BAD:g} m/s, the worst at {stepping['residual_max_m_s']:.1e} m/s: their forces are not quite "
+        "Coulomb's; shorten integrator.step_s"
+    ]
+
+
 def _warnings(
     record: Record,
     scenario: Scenario,
@@ -311,11 +327,18 @@ def _warnings(
             f"the energy ledger does not close: residual {summary['energy_residual_relative']:.1e} of the turnover; "
             "tighten integrator.rtol or the step"
         )
-    if summary["constraint_drift_max_m"] > DRIFT_LIMIT_M:
+    if counts.stepping is not None:
+        found.extend(_capped(counts.stepping))
+    elif summary["constraint_drift_max_m"] > DRIFT_LIMIT_M:
         found.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
-    if counts.deficient:
+    if counts.deficient and counts.unilateral is None:
         found.append(
             f"contact rows depended on each other in {counts.deficient} evaluations: forces are the split of least norm"
+        )
+    elif counts.deficient:
+        found.append(
+            f"points that stick shared forces which the motion does not determine, in {counts.deficient} evaluations: "
+            "they are the split of least norm among those that lie in all friction cones"
         )
     if counts.spread is not None:
         s = counts.spread

@@ -12,7 +12,7 @@ import importlib
 import linecache
 import operator
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from inspect import isfunction
 from pathlib import Path
@@ -224,13 +224,14 @@ def plain(function: Any) -> FunctionType:
     return getattr(function, "py_func", function)
 
 
-def reached(root: Any) -> list[FunctionType]:
-    """The function and all kernels that it calls, directly or not."""
+def reached(root: Any, without: Sequence[Any] = ()) -> list[FunctionType]:
+    """The function and all kernels that it calls, directly or not, and not through one of ``without`` alone."""
+    left_out = {plain(function).__code__ for function in without}
     found: dict[CodeType, FunctionType] = {}
     waiting = [plain(root)]
     while waiting:
         function = waiting.pop()
-        if function.__code__ in found:
+        if function.__code__ in found or function.__code__ in left_out:
             continue
         found[function.__code__] = function
         for name in function.__code__.co_names:

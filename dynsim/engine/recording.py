@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from dynsim.engine.provenance import provenance
 from dynsim.engine.uniqueness import motion_spread
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.integrate import time_stepping
 from dynsim.kernels.state import CONTACT_SIZE, IMPULSE, OUT_FORCE, OUT_GAP, OUT_MODE, OUT_SLIP, OUT_VECTOR, SLIP
 from dynsim.kernels.tree import support as ks
 from dynsim.model.description import Link
@@ -112,9 +114,21 @@ def make_record(
         support=np.zeros(0) if run.support is None else run.support.least,
         unilateral=prepared.system.unilateral,
         stops=tuple(prepared.stops),
+        stepping=None if run.stepping is None else _stepping(run.stepping.found),
     )
     record.summary = metrics.summarise(record, scenario, contacts, robot, counts)
     return record
+
+
+def _stepping(found: np.ndarray) -> dict[str, Any]:
+    """How well time stepping has solved its contact problems, and how deep points came to lie."""
+    return {
+        "contact_solves": int(found[time_stepping.SOLVES]),
+        "long_solves": int(found[time_stepping.LONG_SOLVES]),
+        "capped_solves": int(found[time_stepping.CAPPED]),
+        "residual_max_m_s": float(found[time_stepping.WORST]),
+        "penetration_max_m": float(found[time_stepping.PENETRATION]),
+    }
 
 
 def _add_unilateral(record: Record, prepared: Prepared) -> None:

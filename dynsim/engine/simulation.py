@@ -249,7 +249,14 @@ class Simulation:
         ------
         ModelError
             No such kind or subject.
+        ScenarioError
+            Under ``integrator.method: time_stepping``, which locates nothing within its steps.
         """
+        if self._prepared.run.method == ki.TIME_STEPPING:
+            raise ScenarioError(
+                "integrator.method: time_stepping locates no events: look with every(), at the step's times, or take "
+                "another method"
+            )
         if kind not in GUARDS:
             raise ModelError(f"no event {shown(kind)}; events: {', '.join(GUARDS)}")
         number, family = GUARDS[kind]

@@ -15,6 +15,8 @@ from dynsim.kernels.constraint.unilateral import UnilateralArrays
 from dynsim.kernels.jit import integers, reals
 from dynsim.model.description import Contact, Robot
 
+# A joint may start this far beyond its stop [rad or m].
+START_TOLERANCE = 1e-6
 # After an impact a point that leaves more slowly than this stays: bounces that accumulate come to an end [m/s]. More
 # than points reach that fall through the depth at which they count as landed (6e-5 under gravity): two points that rock
 # would give each other that speed for ever.
@@ -64,12 +66,14 @@ def compile_unilateral(
     for k, limit in enumerate(stops):
         stop_table[k, ku.STOP_JOINT] = robot.joint_names.index(limit.joint)
         stop[k, ku.SIDE], stop[k, ku.LIMIT] = limit.side, limit.side * limit.position
+    slide = np.zeros((c, ku.SLIDE_SIZE))
+    slide[:, ku.LANDS_AT] = ku.DEPTH
     tally, number = np.zeros((c, ku.TALLY_SIZE)), np.zeros(ku.NUMBERS)
     tally[:, ku.SETTLE], tally[:, ku.WINDOW_START], number[ku.LAST_CHANGE] = SETTLE_SPEED, -np.inf, -np.inf
     number[ku.SLOW] = slow
     return UnilateralArrays(
         law=reals(law),
-        slide=reals(np.zeros((c, ku.SLIDE_SIZE))),
+        slide=reals(slide),
         mode=integers(np.zeros((c, ku.MODE_SIZE))),
         tally=reals(tally),
         stop_table=integers(stop_table),
@@ -83,10 +87,22 @@ def compile_unilateral(
 
 
 def joint_stops(robot: Robot) -> list[JointStop]:
-    """The stops of a robot's joints: their finite limits, the lower one first."""
+    """The stops of a robot's joints: their finite limits, the lower one first.
+
+    Raises
+    ------
+    ModelError
+        A joint starts beyond its stop.
+    """
     found = []
-    for link in robot.links:
+    for link, k in zip(robot.links, robot.position_index, strict=True):
         for side, limit in ((1.0, link.lower), (-1.0, link.upper)):
             if np.isfinite(limit):
+                beyond = side * (limit - robot.initial[k])
+                if beyond > START_TOLERANCE:
+                    raise ModelError(
+                        f"{link.joint}: starts at {robot.initial[k]:.6g} {link.units[0]}, beyond its stop {limit:.6g}; "
+                        "contacts.law: unilateral enforces it: change its initial position or its limit"
+                    )
                 found.append(JointStop(link.joint, side, float(limit)))
     return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator, model_validator
@@ -17,6 +17,9 @@ ENGINE = "dynamics"
 
 MotorChoice: Any = families.union("motor")
 AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
+
+
+Limits = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 class LinkKeys(StrictConfig):
@@ -37,6 +40,8 @@ class LinkKeys(StrictConfig):
     damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="viscous loss of a revolute joint")
     damping_N_s_per_m: NonNegative = Field(default=0.0, description="viscous loss of a prismatic joint")
     motor: MotorChoice | None = Field(default=None, description="motor of the joint; none: the joint swings free")
+    limit_deg: Limits | None = Field(default=None, description="stops of a revolute joint; default: it turns freely")
+    limit_m: Limits | None = Field(default=None, description="stops of a prismatic joint")
     initial_deg: float = Field(default=0.0, description="initial angle of a revolute joint")
     initial_m: float = Field(default=0.0, description="initial position of a prismatic joint")
 
@@ -49,7 +54,11 @@ class LinkKeys(StrictConfig):
 
 
 # Keys that only one kind of joint has → their counterpart for the other kind.
-ONLY_REVOLUTE = {"damping_N_m_s_per_rad": "damping_N_s_per_m", "initial_deg": "initial_m"}
+ONLY_REVOLUTE = {
+    "damping_N_m_s_per_rad": "damping_N_s_per_m",
+    "initial_deg": "initial_m",
+    "limit_deg": "limit_m",
+}
 ONLY_PRISMATIC = {angular: linear for linear, angular in ONLY_REVOLUTE.items()}
 
 
@@ -64,8 +73,12 @@ class LinkConfig(LinkKeys):
     @model_validator(mode="after")
     def _check(self) -> Self:
         for key, instead in _of_other_kind(self.kind).items():
-            if getattr(self, key) != 0.0:
+            if getattr(self, key) not in (0.0, None):
                 raise error_at(key, f"a {self.kind} joint has {instead} instead")
+        for key in ("limit_deg", "limit_m"):
+            limits = getattr(self, key)
+            if limits is not None and not limits[0] < limits[1]:
+                raise error_at(key, f"the lower limit {limits[0]:g} is not below the upper one {limits[1]:g}")
         return self
 
     @property
@@ -77,6 +90,14 @@ class LinkConfig(LinkKeys):
     def initial(self) -> float:
         """Initial position [rad, or m when prismatic]."""
         return self.initial_m if self.kind == "prismatic" else float(np.deg2rad(self.initial_deg))
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Lower and upper limit [rad, or m when prismatic], infinite without."""
+        if self.limit_deg is not None:
+            low, high = np.deg2rad(self.limit_deg).tolist()
+            return low, high
+        return (self.limit_m[0], self.limit_m[1]) if self.limit_m is not None else (-np.inf, np.inf)
 
     def unit_axis(self) -> np.ndarray:
         """Joint axis, (3,), of length one."""
@@ -185,6 +206,8 @@ def build(config: Config, context: BuildContext) -> Robot:
                     R_PJ=turn if first else np.eye(3),
                     p_PJ=np.array(config.base.position_m) if first else vector(0.0, 0.0, reach),
                     damping=group.damping,
+                    lower=group.limits[0],
+                    upper=group.limits[1],
                     radius=group.radius_m,
                     tip=vector(0.0, 0.0, group.length_m),
                 )

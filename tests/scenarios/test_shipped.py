@@ -10,6 +10,7 @@ import pytest
 
 import dynsim
 from dynsim.engine import check
+from dynsim.model.unilateral import SETTLE_SPEED
 from dynsim.scenario import shipped_scenarios, variant_names
 
 CASES = [(path.stem, variant) for path in shipped_scenarios() for variant in (variant_names(path) or [None])]
@@ -147,9 +148,9 @@ def test_a_link_bounces_away_its_energy(run):
         assert record.events[-1].kind == "landing"
         bounces = [event for event in record.events if event.kind == "bounce"]
         assert len(bounces) == len(record.events) - 1
-        # Slower than 1e-5 m/s it stays: v_0 e^k ≤ 1e-5, v_0 of a rod of moment m l²/3.
+        # Slower than that it stays: v_0 e^k ≤ SETTLE_SPEED, v_0 of a rod of moment m l²/3.
         speed = math.sqrt(3.0 * 9.81 * 0.5 * 0.5)
-        assert len(bounces) == (math.floor(math.log(1e-5 / speed) / math.log(e)) if e else 0)
+        assert len(bounces) == (math.floor(math.log(SETTLE_SPEED / speed) / math.log(e)) if e else 0)
 
 
 def test_a_limp_arm_rocks_and_comes_to_rest(run):
@@ -199,3 +200,16 @@ def test_postures_of_the_arm_whose_links_touch():
         q = model.robot.initial
         low = {k for k in range(3, 11) if model.point_position(f"link_{k}", [0, 0, 0], q)[2] < 1e-9}
         assert low == elbows
+
+
+def test_elbows_press_as_commanded(run):
+    """From 2 s on within 2 %; the optimum is the cheapest, and gravity alone unloads the braces and costs most."""
+    settled = {name: run("pressing", name).time >= 2.0 for name in variant_names("pressing")}
+    force = {name: run("pressing", name)["contact_normal_force"][late] for name, late in settled.items()}
+    np.testing.assert_allclose(force["commanded"], np.tile([3.0, 8.0], (len(force["commanded"]), 1)), rtol=0.02)
+    assert force["optimal"].min() >= 0.98 * 0.5
+    assert not force["plain"][:, 0].any()
+    energy = {name: run("pressing", name).summary["electrical_energy_J"] for name in settled}
+    assert sorted(energy, key=energy.__getitem__) == ["optimal", "plain", "commanded", "gravity"]
+    error = {name: run("pressing", name).summary["hand_error_rms_m"] for name in settled}
+    assert max(error["optimal"], error["commanded"]) < 0.1 * error["plain"]

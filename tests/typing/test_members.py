@@ -28,13 +28,13 @@ from dynsim.model.protocols import (
 )
 from dynsim.motors import dc, servo, torque, wang_minami
 from dynsim.plants import pws_arm, serial_arm, snake, urdf_arm
-from dynsim.surfaces import cylinder, plane, sphere
+from dynsim.surfaces import box, cylinder, height_field, plane, sphere
 
 PLANTS: Sequence[PlantModule] = (pws_arm, serial_arm, snake, urdf_arm)
 CONTROLLERS: Sequence[ControllerModule] = (joint_pd, task_space)
 PATHS: Sequence[PathModule] = (circle, csv, line, waypoints)
 BASE_PATHS: Sequence[BasePathModule] = (arc, base_csv, hold, straight, base_waypoints)
-SURFACES: Sequence[SurfaceModule] = (cylinder, plane, sphere)
+SURFACES: Sequence[SurfaceModule] = (box, cylinder, height_field, plane, sphere)
 MOTORS: Sequence[MotorModule] = (dc, servo, torque, wang_minami)
 
 FAMILIES: dict[str, Sequence[Member]] = {

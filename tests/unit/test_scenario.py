@@ -174,7 +174,7 @@ def test_the_schema_is_about_the_type_that_is_named():
     found = {(".".join(map(str, error.path)), error.message) for error in validator.iter_errors(scenario)}
     assert found == {
         ("plant", "Additional properties are not allowed ('bas' was unexpected)"),
-        ("surfaces.floor.type", "'plan' is not one of ['cylinder', 'plane', 'sphere']"),
+        ("surfaces.floor.type", "'plan' is not one of ['box', 'cylinder', 'height_field', 'plane', 'sphere']"),
         ("controller.hand.path", "Additional properties are not allowed ('radius' was unexpected)"),
     }
     assert json_schema()["properties"]["plant"]["discriminator"]["propertyName"] == "type"

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from random_robots import Bench, bench
+from random_robots import CONTINUOUS, Bench, bench
 from scipy.special import ellipk
 
 from dynsim.kernels import arrays as ka
-from dynsim.kernels.integrate.run import DRIFT_MAX, METHODS
+from dynsim.kernels.integrate.run import DRIFT_MAX
 from dynsim.kernels.state import FRICTION, OUT_FORCE
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.model.drives import Motor
@@ -16,7 +16,7 @@ from dynsim.model.drives import Motor
 G = 9.81
 X, Y, Z = np.eye(3)
 PLANE = np.zeros((3, 3))
-every_method = pytest.mark.parametrize("method", METHODS)
+every_method = pytest.mark.parametrize("method", CONTINUOUS)
 
 
 def step_of(method: str, step: float) -> float:

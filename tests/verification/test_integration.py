@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from random_robots import Bench, bench
+from random_robots import CONTINUOUS, Bench, bench
 
 from dynsim.kernels.integrate.run import DRIFT_MAX, FINISHED, METHODS, REJECTED, STATUS, STEPS, Run
 from dynsim.kernels.state import CONSTRAINT, ELECTRICAL, FRICTION, GEAR, JOINT, JOULE, OUT_GAP
@@ -108,7 +108,8 @@ def test_order_of_the_dense_output(method, order, steps):
 
 
 def test_every_method_is_in_these_tests():
-    assert set(METHODS) == {*ADAPTIVE, "rk4"}
+    assert {*CONTINUOUS} == {*ADAPTIVE, "rk4"}
+    assert {*METHODS} - {*CONTINUOUS} == {"time_stepping"}  # order, ledger and pieces: test_time_stepping
 
 
 @pytest.mark.parametrize("method", ADAPTIVE)
@@ -166,7 +167,7 @@ def test_explicit_steps_at_the_stability_limit_are_hardly_ever_rejected():
     assert run.count[REJECTED] <= 0.02 * run.count[STEPS]
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", CONTINUOUS)
 def test_contacts_do_not_drift(method):
     b, y = arm(braced=True, v_s=1e-3)
     run = b.simulate(y, np.linspace(0.0, 2.0, 41), method, step=1e-3 if method == "rk4" else 0.0)
@@ -200,7 +201,7 @@ def test_energy_ledger_closes_at_the_order_of_the_method():
     assert found.min() >= 3.5, found
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", CONTINUOUS)
 def test_a_run_in_pieces_is_the_same_run(method):
     b, y = arm(braced=True)
     step = 1e-3 if method == "rk4" else 0.0

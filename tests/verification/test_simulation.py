@@ -430,3 +430,125 @@ def test_states_of_other_robots_and_off_the_floor_are_refused():
         dynsim.Simulation(arm(), state=lifted)
     with pytest.raises(ModelError, match="kinematic"):
         dynsim.Simulation(dynsim.load_scenario("snake_circle"))
+
+
+def real_arm(folder: Path, **overrides: object) -> dynsim.Scenario:
+    """The published arm on a real floor."""
+    text = (Path(__file__).parents[2] / "scenarios" / "elbow_comparison.yaml").read_text()
+    for line in text.splitlines(keepends=True):
+        if line.lstrip().startswith(("slip_smoothing_m_s", "pulling_friction")):
+            text = text.replace(line, "")
+    path = folder / "real.yaml"
+    path.write_text(text.replace("law: bilateral", "law: unilateral"))
+    return dynsim.load_scenario(path, "two_elbows", {"duration_s": 1.0, "contacts.friction": 0.3, **overrides})
+
+
+def elbows(simulation: dynsim.Simulation) -> np.ndarray:
+    """Their heights [m]."""
+    q = simulation.state.q
+    return np.array([simulation.model.point_position(body, np.zeros(3), q)[2] for body in ("link_4", "link_7")])
+
+
+@pytest.mark.parametrize("integrator", [{}, {"integrator.method": "time_stepping", "integrator.step_s": 1e-3}])
+def test_a_snapshot_with_contacts_has_the_same_future(tmp_path, integrator):
+    """Taken while points stick, and within a step; in between others land, slip and lift off."""
+    simulation = dynsim.Simulation(real_arm(tmp_path, **integrator))
+    simulation.advance(0.1237)
+    snapshot = simulation.snapshot()
+
+    def future() -> tuple[bytes, tuple]:
+        simulation.set_wrench("link_7", force=[0.0, 0.0, 25.0])
+        simulation.advance(0.3)
+        simulation.set_wrench("link_7")
+        return simulation.advance(0.8).q.tobytes(), simulation.happened
+
+    first = future()
+    simulation.restore(snapshot)
+    assert future() == first
+    if not integrator:
+        assert {"lift_off", "landing"} <= {event.kind for event in first[1] if event.time > 0.13}
+
+
+def test_a_wrench_that_is_rewritten_lifts_a_point_that_sticks(tmp_path):
+    """Every millisecond, alternating: it leaves, and the floor never gives way."""
+    simulation = dynsim.Simulation(real_arm(tmp_path))
+    lowest, highest = [], []
+
+    def push(s: dynsim.Simulation) -> None:
+        up = math.sin(60.0 * s.time) > 0.0
+        s.set_wrench("link_7", force=[0.0, 0.0, 25.0 if up else -5.0])
+        lowest.append(elbows(s).min())
+        highest.append(elbows(s)[1])
+
+    simulation.every(1e-3, push)
+    simulation.advance(1.0)
+    assert min(lowest) > -1e-9
+    assert max(highest) > 1e-4
+    assert "lift_off" in [event.kind for event in simulation.happened if event.name == "elbow_7"]
+
+
+def test_ticks_that_do_nothing_change_no_event(tmp_path):
+    """Steps that end at ticks are shorter: events are where they were, to the tolerance of the integration."""
+    runs = []
+    for ticks in (False, True):
+        simulation = dynsim.Simulation(real_arm(tmp_path, **{"integrator.rtol": 1e-9, "integrator.atol": 1e-11}))
+        if ticks:
+            simulation.every(7.3e-4, lambda s: None)
+        simulation.advance(1.0)
+        runs.append(simulation.happened)
+    assert len(runs[0]) >= 2
+    assert [(e.kind, e.name) for e in runs[0]] == [(e.kind, e.name) for e in runs[1]]
+    np.testing.assert_allclose([e.time for e in runs[0]], [e.time for e in runs[1]], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("joints", [["joint_1"], ["joint_2"], ["joint_2", "joint_3"], ["joint_4", "joint_6"], None])
+def test_brakes_close_and_open_on_an_arm_that_stands_on_the_floor(tmp_path, joints):
+    """A braked joint does not move, the floor does not give way, nothing is pulled down or gains energy."""
+    simulation = dynsim.Simulation(real_arm(tmp_path), trace=0)
+    joints = list(simulation.robot.joint_names) if joints is None else joints
+    index = [simulation.robot.joint_names.index(joint) for joint in joints]
+    simulation.advance(0.05)
+    simulation.set_wrench("link_7", force=[2.0, 1.0, -3.0])
+    simulation.advance(0.0603)
+    for joint in joints:
+        simulation.set_brake(joint, True)
+    held = simulation.state.q[index]
+    for until in np.linspace(0.07, 0.4, 12):
+        state = simulation.advance(until)
+        np.testing.assert_allclose(state.q[index], held, rtol=0, atol=1e-13)
+        assert elbows(simulation).min() > -1e-9
+        assert np.isfinite(state.v).all()
+    for joint in joints:
+        simulation.set_brake(joint, False)
+    assert elbows(simulation).min() > -1e-9
+    simulation.advance(0.6)
+    assert elbows(simulation).min() > -1e-9
+    assert np.abs(simulation.state.q[index] - held).max() > 1e-9
+
+
+def test_a_brake_that_closes_throws_a_point_off_the_floor_and_not_into_it(tmp_path):
+    """The impulse of the brake and those of the floor together are those of one linear complementarity problem."""
+    simulation = dynsim.Simulation(real_arm(tmp_path, **{"contacts.friction": 0.0}))
+    simulation.advance(0.2)
+    for joint, rate in (("joint_4", 3.0), ("joint_5", -3.0), ("joint_6", 2.0)):
+        simulation.set_reference(joint, simulation.state.q[3], rate)
+    simulation.advance(0.23)
+    before = simulation.state
+    model, armature = simulation.model, simulation.model.armature
+    contacts = [body for body, height in zip(("link_4", "link_7"), elbows(simulation), strict=True) if height < 1e-9]
+    J = np.array([model.point_position_and_jacobian(body, np.zeros(3), before.q)[1][2] for body in contacts])
+    simulation.set_brake("joint_5", True)
+    after = simulation.advance(0.23 + 1e-9)
+    # e_j and the normals that press, by trying all sets.
+    M = model.mass_matrix(before.q) + np.diag(armature)
+    found = None
+    for mask in range(1 << len(contacts)):
+        rows = [k for k in range(len(contacts)) if mask >> k & 1]
+        A = np.vstack([np.eye(10)[4], *J[rows]])
+        impulse = np.linalg.solve(A @ np.linalg.solve(M, A.T), -A @ before.v)
+        v = before.v + np.linalg.solve(M, A.T @ impulse)
+        if (impulse[1:] >= -1e-12).all() and (J @ v >= -1e-9).all():
+            found = v
+            break
+    assert abs(before.v[4]) > 1e-3
+    np.testing.assert_allclose(after.v, found, rtol=0, atol=1e-5)

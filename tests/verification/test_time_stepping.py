@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from random_robots import Bench, bench, random_robot
+from scipy.integrate import solve_ivp
 
-from dynsim.kernels.integrate.run import STEPS, Run
+from dynsim.kernels.integrate.run import FINISHED, STATUS, STEPS, Run
 from dynsim.kernels.integrate.time_stepping import (
     BAD,
     CAPPED,
@@ -19,7 +20,7 @@ from dynsim.kernels.integrate.time_stepping import (
 )
 from dynsim.kernels.state import CONSTRAINT, ELECTRICAL, FRICTION, GEAR, JOINT, JOULE, OUT_FORCE
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
-from dynsim.model.drives import Servo
+from dynsim.model.drives import Motor, Servo
 from dynsim.model.joints.ball import floating
 
 G = 9.81
@@ -37,8 +38,11 @@ def plane(normal: np.ndarray) -> Quadric:
     return Quadric(np.zeros((3, 3)), normal, 0.0)
 
 
-def block(friction: float, slope: float = 0.0, mass: float = 2.0) -> Bench:
-    """A body that does not turn, with one point on a plane through the origin that falls towards +x."""
+def block(friction: float, slope: float = 0.0, mass: float = 2.0, **law: float) -> Bench:
+    """A body that does not turn, with one point on a plane through the origin that falls towards +x.
+
+    law: more of the contact, which is then under the unilateral law.
+    """
     inertias = [Inertia(0.0), Inertia(0.0), Inertia(mass)]
     links = [
         Link(a, f"j{a}", "xy"[k - 1] if k else None, "prismatic", np.eye(3)[k], inertias[k])
@@ -47,7 +51,8 @@ def block(friction: float, slope: float = 0.0, mass: float = 2.0) -> Bench:
     normal = np.array([np.sin(slope), 0.0, np.cos(slope)])
     return bench(
         Robot("block", tuple(links), (), ("z", np.zeros(3))),
-        [Contact("foot", "z", np.zeros(3), plane(normal), friction=friction)],
+        [Contact("foot", "z", np.zeros(3), plane(normal), friction=friction, **law)],
+        real=bool(law),
     )
 
 
@@ -90,7 +95,7 @@ def test_a_block_lands_and_bounces(restitution):
         )
         errors.append(abs(run.states("q")[-1, 2] - restitution**2 * height))
         assert errors[-1] <= 2.0 * h * G * fall
-        energy = 2.0 * G * run.y[2] + np.sum(run.y[3:6] ** 2)
+        energy = 2.0 * G * b.part(run.y, "q")[2] + np.sum(b.part(run.y, "v") ** 2)
         held = run.states("ledger")[-1, CONSTRAINT]
         np.testing.assert_allclose(energy - 2.0 * G * height, held, atol=1e-9)
         assert run.stepping.found[PENETRATION] <= h * G * fall
@@ -121,6 +126,62 @@ def test_friction_that_differs_along_and_across():
     normal = 2.0 * G
     np.testing.assert_allclose((force[0] / ratio) ** 2 + force[1] ** 2, (mu * normal) ** 2, rtol=1e-6)
     np.testing.assert_allclose(force[0] / force[1], ratio**2, rtol=1e-3)
+
+
+def slide(b: Bench, speed: float, until: float, h: float) -> Run:
+    """The block slides along x at first."""
+    return b.simulate(b.state(np.zeros(3), [speed, 0.0, 0.0]), np.array([0.0, until]), "time_stepping", step=h)
+
+
+def test_static_friction_holds_more_than_it_gives_once_it_slides():
+    """tan(slope) between both coefficients: at rest it stays; pushed, it slides at μ_k; stopped by μ_k, it stays."""
+    slope, kinetic, static = np.arctan(0.4), 0.3, 0.5
+    down = np.array([np.cos(slope), 0.0, -np.sin(slope)])
+    b = block(kinetic, slope, static_friction=static)
+    rest = b.simulate(b.state(np.zeros(3), np.zeros(3)), np.array([2.0]), "time_stepping", step=1e-2)
+    assert np.abs(rest.states("q")).max() < 1e-12
+    acceleration = G * np.cos(slope) * (0.4 - kinetic)
+    pushed = b.simulate(b.state(np.zeros(3), 0.2 * down), np.array([1.0]), "time_stepping", step=1e-2)
+    np.testing.assert_allclose(pushed.states("v")[-1] @ down, 0.2 + acceleration, rtol=1e-9)
+    b = block(0.45, slope, static_friction=static)
+    stopped = b.simulate(b.state(np.zeros(3), 0.2 * down), np.array([2.0]), "time_stepping", step=1e-3)
+    assert np.abs(stopped.states("v")[-1]).max() < 1e-9
+    np.testing.assert_allclose(stopped.states("q")[-1] @ down, 0.02 / (G * np.cos(slope) * 0.05), atol=2e-4)
+
+
+def test_friction_that_depends_on_the_speed_is_followed_to_first_order():
+    """v̇ = −g μ(v): viscous friction on paper, v + μ/c = (v_0 + μ/c) exp(−g c t); Stribeck's by quadrature."""
+    mu, c, v_s, static, times = 0.1, 0.2, 0.4, 0.3, 0.25
+    paper = (1.0 + mu / c) * np.exp(-G * c * times) - mu / c
+    stribeck = solve_ivp(
+        lambda t, v: -G * (mu + (static - mu) * np.exp(-((v / v_s) ** 2))), (0.0, times), [1.0], rtol=1e-11
+    ).y[0, -1]
+    for b, exact in (
+        (block(mu, viscous_friction=c), paper),
+        (block(mu, static_friction=static, stribeck=v_s), stribeck),
+    ):
+        errors = np.array([slide(b, 1.0, times, h).states("v")[-1, 0] - exact for h in (4e-3, 2e-3, 1e-3)])
+        np.testing.assert_allclose(np.log2(errors[:-1] / errors[1:]), 1.0, atol=0.05)
+
+
+def test_a_run_in_pieces_is_the_same_run():
+    b, y = snake()
+    whole = stepped(b, y, np.array([0.05]), 1e-3, 0.5)
+    run = b.new_run(y, np.array([0.05]), "time_stepping", step=1e-3)
+    while run.count[STATUS] != FINISHED:
+        b.advance(run, 7)
+    np.testing.assert_array_equal(run.y, whole.y)
+
+
+def test_current_in_a_blocked_motor_is_that_of_the_trapezoidal_rule():
+    heavy = Link("wheel", "shaft", None, "revolute", np.eye(3)[2], Inertia(1.0, np.zeros(3), 1e15 * np.eye(3)))
+    motor = Motor("shaft", 0.2, resistance=1.1, inductance=1.7e-3, rotor_inertia=0.0, gear_ratio=3.0)
+    b = bench(Robot("motor", (heavy,), (motor,), ("wheel", np.zeros(3))), held=np.array([0.4]), k_p=30.0, k_d=0.0)
+    run = stepped(b, b.state([0.0], [0.0]), np.array([8e-3]), 1e-3, 0.5)
+    x = 0.5e-3 * 1.1 / 1.7e-3
+    np.testing.assert_allclose(
+        run.states("current")[0, 0], 12.0 / 1.1 * (1.0 - ((1.0 - x) / (1.0 + x)) ** 8), rtol=1e-12
+    )
 
 
 def snake(joints: int = 12, wheels: int = 14) -> tuple[Bench, np.ndarray]:

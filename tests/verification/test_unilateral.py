@@ -11,6 +11,7 @@ from dynsim.kernels.integrate import contact_events as ce
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.state import FRICTION, OUT_FORCE, OUT_GAP, OUT_MODE
 from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot, vector
+from dynsim.model.unilateral import SETTLE_SPEED
 
 G = 9.81
 ORIGIN = np.zeros(3)
@@ -98,10 +99,10 @@ def test_a_bouncing_ball():
     times = np.array([t for t, _, _ in found])
     flights = 2.0 * first * e ** np.arange(1, 11)
     np.testing.assert_allclose(times[:10], first + np.concatenate([[0.0], np.cumsum(flights)[:9]]), rtol=0, atol=1e-8)
-    # Bounces slower than 1e-5 m/s are let settle.
+    # Slower bounces are let settle.
     end = first * (1.0 + e) / (1.0 - e)
     assert found[-1][2] == ce.LANDING
-    assert times[-1] == pytest.approx(end, abs=2.0 * 1e-5 / G / (1.0 - e))
+    assert times[-1] == pytest.approx(end, abs=2.0 * SETTLE_SPEED / G / (1.0 - e))
     assert all(kind == ce.BOUNCE for _, _, kind in found[:-1])
     assert np.abs(run.states("q")[-1]).max() <= 1e-9
     assert run.states("loss")[-1, 0] == pytest.approx(0.7 * G * height, rel=1e-9)
@@ -265,3 +266,48 @@ def test_a_leaning_rod_sticks_until_its_foot_slips():
     after = int(np.flatnonzero(~before)[0])
     assert run.states("q")[after - 1, 2] <= onset <= run.states("q")[after, 2]
     assert residual(b, run) < 1e-7
+
+
+def stopped_arm(tmp_path, *lines: str):
+    from dynsim import load_scenario
+
+    path = tmp_path / "arm.yaml"
+    path.write_text(
+        "duration_s: 1.5\nplant:\n  type: serial_arm\n  chain:\n    - {axis: y, mass_kg: 0.8, length_m: 0.5, "
+        + ", ".join(lines)
+        + "}\ncontacts: {law: unilateral}\n"
+    )
+    return load_scenario(path)
+
+
+def test_joint_stops_of_a_scenario(tmp_path):
+    """A link falls onto its stop: force, loss, event and times are in record and summary."""
+    from dynsim import simulate
+
+    record = simulate(stopped_arm(tmp_path, "limit_deg: [-30, 90]", "initial_deg: 20"))
+    (event,) = record.events
+    assert (event.kind, event.name) == ("stop_hit", "joint_1")
+    np.testing.assert_allclose(record["q"][-1], 0.5 * np.pi, rtol=0, atol=1e-9)
+    assert record["stop_force"][-1, 0] == pytest.approx(-0.8 * G * 0.25, rel=1e-8)
+    fallen = 0.8 * G * 0.25 * np.cos(np.deg2rad(20.0))
+    assert record.summary["stop_loss_J"] == pytest.approx(fallen, rel=1e-5)
+    (stop,) = record.summary["joint_stops"]
+    assert stop["hits"] == 1
+    assert stop["closed_fraction"] == pytest.approx(1.0 - event.time / 1.5, abs=1e-9)
+    assert record.summary["energy_residual_relative"] < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        (("limit_deg: [0, 90]", "initial_deg: -20"), "joint_1: starts at -0.349"),
+        (("limit_deg: [90, 0]",), "the lower limit 90 is not below"),
+        (("limit_m: [0, 1]",), "has limit_deg instead"),
+    ],
+)
+def test_stops_that_cannot_be(tmp_path, lines, words):
+    from dynsim import simulate
+    from dynsim.errors import DynsimError
+
+    with pytest.raises(DynsimError, match=words):
+        simulate(stopped_arm(tmp_path, *lines))

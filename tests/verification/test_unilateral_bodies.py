@@ -108,7 +108,7 @@ def test_a_disc_on_three_feet_slides_pivots_and_stops():
 
 @pytest.mark.parametrize("spin", [np.zeros(3), vector(7.0, -4.0, 3.0)])
 def test_a_ball_slides_and_then_rolls(spin):
-    """Slip u falls along its own direction by 7 μ g/2, ends after 2 |u|/(7 μ g); v falls by 2 u/7; spin about n stays."""
+    """Slip u falls along itself by (7/2) μ g and is gone at 2 |u|/(7 μ g); v by 2 u/7; spin along n stays."""
     mass, radius, mu, v0 = 0.6, 0.05, 0.2, vector(1.0, 0.2, 0.0)
     contact = Contact("ball", "body", np.zeros(3), FLOOR, friction=mu, radius=radius, pulling_friction="signed")
     b = free_body(Inertia.solid_sphere(mass, radius, np.zeros(3)), [contact])
@@ -134,7 +134,7 @@ def test_a_ball_slides_and_then_rolls(spin):
 
 @pytest.mark.parametrize(("mu", "fall"), [(0.05, 2.0), (0.4, 2.0)])
 def test_an_oblique_bounce_of_a_ball(mu, fall):
-    """Newton's restitution along n; the impulse takes 2 u/7 of slip u, or μ (1 + e) v_n if that is less."""
+    """Newton's restitution along n; of slip u the impulse takes 2 u/7 of the speed, or μ (1 + e) v_n if less."""
     mass, radius, e, v0, spin = 0.6, 0.05, 0.7, vector(1.1, -0.4, -fall), vector(3.0, 5.0, 2.0)
     law = {"friction": mu, "restitution": e}
     contact = Contact("ball", "body", np.zeros(3), FLOOR, radius=radius, pulling_friction="signed", **law)

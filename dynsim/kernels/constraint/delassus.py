@@ -63,7 +63,7 @@ def eliminate(small, state, active, p):
                 best = i
         # Written so that NaN falls through to the plain elimination and is seen by the integrator.
         if abs(small[1, best, k]) <= RANK_TOLERANCE * largest:
-            least_norm(small, state, active, p, k if least > POOR_PIVOT * largest else 0)
+            least_norm(small, state, active, p, k if least > POOR_PIVOT * largest else 0, largest)
             return 1
         least = min(least, abs(small[1, best, k]))
         if best != k:
@@ -86,7 +86,7 @@ def eliminate(small, state, active, p):
 
 
 @internal_kernel
-def least_norm(small, state, active, p, start):
+def least_norm(small, state, active, p, start, largest):
     """Least-squares solution of least norm, from an elimination of which ``start`` columns are done.
 
     The elimination goes on with rook pivoting (the largest entry of its row and of its column) and leaves
@@ -102,7 +102,7 @@ def least_norm(small, state, active, p, start):
             state[i, FORCE] = state[i, RHS]
             for j in range(p):
                 matrix[i, j] = small[0, i, j]
-    r = eliminate_to_rank(small, state, active, p, start)
+    r = eliminate_to_rank(small, state, active, p, start, largest)
     d = p - r
     # Wᵀ = L1⁻ᵀ L2ᵀ, (r, d).
     for k in range(r - 1, -1, -1):
@@ -144,21 +144,23 @@ def least_norm(small, state, active, p, start):
 
 
 @internal_kernel
-def eliminate_to_rank(small, state, active, p, start):
+def eliminate_to_rank(small, state, active, p, start, largest):
     """Rank of ``small[1]`` by its elimination from column ``start`` on; multipliers stay below the diagonal.
+
+    ``largest``: of the entries of ``small[0]``.
 
     A column without a pivot goes to the end and is done with: what elimination adds to it is no larger.
     """
-    matrix, largest = small[1], 0.0
+    matrix = small[1]
     for i in range(p):
         active[i, ORDER] = i
-        for j in range(p):
-            largest = max(largest, abs(small[0, i, j]))
     k, last = start, p
     while k < last:
         column, row = k, largest_in_column(matrix, k, k, p)
         if abs(matrix[row, column]) <= RANK_TOLERANCE * largest:
             last -= 1
+            while last > k and abs(matrix[largest_in_column(matrix, last, k, p), last]) <= RANK_TOLERANCE * largest:
+                last -= 1
             swap_columns(matrix, active, p, k, last)
             continue
         for _ in range(p):
@@ -226,6 +228,14 @@ def apply_normal(small, state, p, r):
     The result, (r,), in the last row of ``small[3]``; that of ``small[2]``, which X leaves free, is scratch.
     """
     X, gram, x, t, d = small[2], small[3], small[3, p - 1], small[2, p - 1], p - r
+    if d == 1:  # as two braces that stick on a planar arm have it
+        total = 1.0
+        for k in range(r):
+            total += X[k, 0] * X[k, 0]
+        factor = state[r, FORCE] / total
+        for k in range(r):
+            x[k] = factor * X[k, 0]
+        return
     for a in range(d):
         t[a] = state[r + a, FORCE]
     if d <= r:

@@ -28,7 +28,12 @@ FROZEN = 3  # 1: slip is too slow to have a direction of its own, that of REFERE
 SPEED = 4  # v_t · REFERENCE [m/s]
 NEXT = 5  # 3: direction at the end of the step
 NEXT_SPEED = 8  # |v_t| there [m/s]
-SLIDE_SIZE = 9
+LANDS_AT = 9  # depth below its surface at which a candidate that is off it has landed [m]
+HEADWAY = 10  # what it began to slip with against its direction, because the rows could not take it away [m/s]
+SLIDE_SIZE = 11
+# It lands at DEPTH until it has been higher than that, because projection leaves closed ones within half of it on
+# either side; then at the root itself.
+DEPTH, AT_ROOT = 2e-10, 1e-13
 # UnilateralArrays.tally, of a candidate
 TIME_OPEN, TIME_SLIDING, TIME_STICKING = 0, 1, 2  # in the order of the modes [s]
 LIFT_OFFS, LANDINGS, SLIP_STARTS, BOUNCES = 3, 4, 5, 6
@@ -107,8 +112,13 @@ def slide_direction(unilateral: UnilateralArrays, contacts: ContactArrays, k, x,
         scale = 1.0 / size if along >= 0.0 else -1.0 / size
         a, b, c = x * scale, y * scale, z * scale
         speed = size if along >= 0.0 else -size
-    mu = contacts.point[k, MU]
+    return a, b, c, sliding_friction(law, k, contacts.point[k, MU], speed)
+
+
+@inlined_kernel
+def sliding_friction(law, k, mu, speed):
+    """Coefficient of friction of candidate k that slides at this speed, mu being the kinetic one."""
     if law[k, STRIBECK] > 0.0:
         ratio = speed / law[k, STRIBECK]
         mu += (law[k, STATIC] - mu) * math.exp(-ratio * ratio)
-    return a, b, c, mu + law[k, VISCOUS] * speed
+    return mu + law[k, VISCOUS] * speed

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 
 from dynsim.kernels.arrays import (
+    DEPENDENT,
     FIRST_ROW,
     FORCE,
     GAP,
@@ -30,6 +31,7 @@ from dynsim.kernels.arrays import (
 from dynsim.kernels.constraint.rows import set_modes
 from dynsim.kernels.constraint.splits import margin
 from dynsim.kernels.constraint.unilateral import (
+    AT_ROOT,
     BEFORE,
     BEST_MARGIN,
     BOUNCES,
@@ -37,9 +39,12 @@ from dynsim.kernels.constraint.unilateral import (
     CHATTERED,
     CLOSED_TIME,
     DEEPEST,
+    DEPTH,
     FROZEN,
+    HEADWAY,
     HITS,
     LANDINGS,
+    LANDS_AT,
     LAST_CHANGE,
     LIFT_OFFS,
     LIMIT,
@@ -90,8 +95,6 @@ NORMAL_GUARD, SLIP_GUARD, STOP_GUARD = 10, 11, 12
 LANDING, LIFT_OFF, SLIP_START, SLIP_STOP, BOUNCE, CHATTERS, STOP_HIT, STOP_LEFT = 0, 1, 2, 3, 4, 5, 6, 7
 LOG_KINDS = 8
 
-# Below its surface by this much a point has landed [m]; projection leaves closed ones within half of it.
-DEPTH = 2e-10
 # A candidate that starts, or comes to rest, this close to its surface touches it [m].
 TOUCH = 1e-9
 # More events of a candidate than MOST_EVENTS in WINDOW [s] are chatter; SETTLE grows tenfold then, up to MOST_SETTLE.
@@ -99,6 +102,9 @@ WINDOW, MOST_EVENTS, MOST_SETTLE = 1.0, 200, 1e-2
 # So many changes at one instant, or chatter so often at one candidate, end the run.
 MOST_CHANGES, MOST_CHATTER = 60, 100
 INSTANT = 1e-11
+# A point that slips against its direction at less than this has not stopped yet [m/s]: of what begins to slip with next
+# to no acceleration the speed is rounding.
+BACKWARD = 2e-11
 # Forces that contradict their modes by less than this, absolute [N] and of the largest, are rounding.
 FORCE_SLACK = 1e-9
 # Of the largest force: what counts as none where a point that sticks gives way.
@@ -117,9 +123,9 @@ def contact_guard(unilateral: UnilateralArrays | None, ws: Workspace, kind, k):
         return stop[k, SIDE] * ws.joints[j, Q] - stop[k, LIMIT] + DEPTH
     mode = ws.active[k, MODE]
     if kind == NORMAL_GUARD:
-        return ws.contacts[k, GAP] + DEPTH if mode == OPEN else ws.contacts[k, NORMAL_FORCE]
+        return ws.contacts[k, GAP] + unilateral.slide[k, LANDS_AT] if mode == OPEN else ws.contacts[k, NORMAL_FORCE]
     if mode == SLIDING and unilateral.law[k, STATIC] > 0.0:
-        return unilateral.slide[k, SPEED]
+        return unilateral.slide[k, SPEED] + unilateral.slide[k, HEADWAY] + BACKWARD
     if mode == STICKING:
         best = unilateral.number[BEST_MARGIN]
         # Dependent rows, where the least norm fits no cones: the forces are the least that do, on some cone, and say
@@ -177,6 +183,10 @@ def watch_modes(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
     for k in range(state.shape[0]):
         tally[k, TIME_OPEN + ws.active[k, MODE]] += h
         tally[k, DEEPEST] = max(tally[k, DEEPEST], -state[k, GAP])
+        if ws.active[k, MODE] != OPEN:
+            slide[k, LANDS_AT] = DEPTH
+        elif state[k, GAP] > DEPTH:
+            slide[k, LANDS_AT] = AT_ROOT
         speed = slip_speed(ws, k)
         slide[k, NEXT_SPEED] = speed
         for s in range(3):
@@ -253,7 +263,10 @@ def consistent(system: System, ws: Workspace):
 @apart_kernel
 def solve_modes(system: System, ws: Workspace, run: Run, first):
     """Choose all modes anew, and log what that changes; ``first``: nothing of it is an event."""
+    before = ws.counts[DEPENDENT]
     resolve(system, ws, run, TOUCH)
+    # Of rows that were held together only to see what they do.
+    ws.counts[DEPENDENT] = before
     if not first:
         log_changes(system, ws, run)
     rearm(run)

@@ -43,6 +43,7 @@ from dynsim.kernels.constraint.unilateral import (
     CONE_FRICTION,
     FIRST_PART,
     FROZEN,
+    HEADWAY,
     KINDS,
     LIMIT,
     LOSS,
@@ -59,6 +60,7 @@ from dynsim.kernels.constraint.unilateral import (
     SIDE,
     SLOW,
     SOLUTION,
+    SPEED,
     SPLIT,
     STATIC,
     STOP_BEFORE,
@@ -183,12 +185,15 @@ def come_down(system: System, ws: Workspace, run: Run):
 
     A point lands a little below its surface. Where rows depend on each other, as those of a point on a body with one
     degree of freedom, there might be no state at which its normal row and the tangential ones of a foot found above it
-    all vanish.
+    all vanish. What is about to bounce is not held: lifted at each bounce, it would go on for ever.
     """
     unilateral = system.unilateral
     mode = unilateral.mode
     for k in range(mode.shape[0]):
-        mode[k, WANTED] = OPEN if mode[k, TOUCHING] == 0 else STICKING if ws.active[k, MODE] == STICKING else SLIDING
+        fast = mode[k, STRUCK] == 1 and ws.contacts[k, GAP_RATE] < -unilateral.tally[k, SETTLE]
+        bounces = fast and mode[k, BEFORE] == OPEN and unilateral.law[k, RESTITUTION] > 0.0
+        held = mode[k, TOUCHING] == 1 and not bounces
+        mode[k, WANTED] = OPEN if not held else STICKING if ws.active[k, MODE] == STICKING else SLIDING
     set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
     for _ in range(PROJECTION_LIMIT):
         evaluate(system, ws, run)
@@ -343,17 +348,26 @@ def choose(system: System, ws: Workspace, run: Run):
         run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
         return
     take_solution(system, ws, size, largest)
-    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
+    # What is left of rates after an impact that was let settle, and of points that were solved for as if at rest: those
+    # that begin to slip would else go against the direction that they are given, and stop, and begin again.
+    for k in range(mode.shape[0]):
+        starts = mode[k, WANTED] == SLIDING and unilateral.slide[k, FROZEN] == 1.0
+        rests = starts and slip_speed(ws, k) <= 2.0 * unilateral.number[SLOW]
+        mode[k, TOUCHING] = STICKING if rests else mode[k, WANTED]
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, TOUCHING])
     # What was split before says nothing of these modes.
     unilateral.number[REDUNDANT], unilateral.number[SPLIT] = 0.0, 0.0
     evaluate(system, ws, run)
-    # What is left of rates after an impact that was let settle; of a point that has stopped, rounding.
     loss = project_level(system, ws, run.y, 1)
     run.y[system.layout.loss + IMPACT_LOSS] += loss
+    evaluate(system, ws, run)
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
     before = ws.counts[DEPENDENT]
     evaluate(system, ws, run)
     unilateral.number[REDUNDANT] = 1.0 if ws.counts[DEPENDENT] > before else 0.0
-    ws.counts[DEPENDENT] = before
+    for k in range(mode.shape[0]):
+        starts = mode[k, WANTED] == SLIDING and mode[k, TOUCHING] == STICKING
+        unilateral.slide[k, HEADWAY] = max(0.0, -unilateral.slide[k, SPEED]) if starts else 0.0
 
 
 @internal_kernel

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
 from dynsim.kernels.arrays import (
     APPLIED,
     CIRCUIT,
-    COUPLED,
     CURRENT,
     D_M,
     DAMPING,
@@ -33,7 +30,16 @@ from dynsim.kernels.arrays import (
     Q,
     Workspace,
 )
-from dynsim.kernels.constraint.unilateral import DEEPEST, LOSS, TIME_OPEN, TIME_SLIDING, TIME_STICKING
+from dynsim.kernels.constraint.unilateral import (
+    CLOSED_TIME,
+    DEEPEST,
+    LOSS,
+    SLIP_STARTS,
+    STOP_CLOSED,
+    STOP_LOSS,
+    STOP_ROW,
+    UnilateralArrays,
+)
 from dynsim.kernels.drive.law import drive, take_commands
 from dynsim.kernels.integrate.events import take_ticks
 from dynsim.kernels.integrate.output import write_output
@@ -59,7 +65,6 @@ from dynsim.kernels.integrate.run import (
 from dynsim.kernels.integrate.steps import choose_step, finite
 from dynsim.kernels.integrate.time_stepping import (
     BAD,
-    GRIP,
     PENETRATION,
     close_contacts,
     geometry,
@@ -67,6 +72,7 @@ from dynsim.kernels.integrate.time_stepping import (
     moved,
     place_joints,
     row_rates,
+    slip_speed,
     solve_contacts,
     stop_forces,
     tangent_rows,
@@ -86,6 +92,8 @@ from dynsim.kernels.state import (
     JOINT_STOP_LOSS,
     JOULE,
     MECHANICAL,
+    OUT_MODE,
+    OUTPUTS_PER_CONTACT,
     SLIP,
     SUPPLY,
 )
@@ -126,10 +134,10 @@ def step_moreau(system: System, ws: Workspace, run: Run):
         add_loads(model, system.loads, t + theta * h, ws, run.stage[1], layout.load)
     tangent_rows(system, s, ws)
     factor(model, ws)
-    row_rates(model, ws, v0, s.rate[0])
+    row_rates(model, ws, y, layout.v, s.rate[0])
     if ws.counts[ROWS] > 0:
         row_system(model, ws)
-        solve_contacts(s, ws, h)
+        solve_contacts(system.unilateral, s, ws, h)
         stop_forces(system.unilateral, ws)
         add_row_forces(model, ws)
     accelerate(model, ws)
@@ -142,7 +150,7 @@ def step_moreau(system: System, ws: Workspace, run: Run):
     for i in range(n):
         y_new[layout.v + i] = v0[i] + h * last[i]
         joints[i, QDD] = last[i]
-    row_rates(model, ws, y_new[layout.v : layout.v + n], s.rate[1])
+    row_rates(model, ws, y_new, layout.v, s.rate[1])
     for a in range(ws.motors.shape[0]):
         k, j = system.drives.table[a, CIRCUIT], system.drives.table[a, DRIVEN]
         if k >= 0:
@@ -182,7 +190,7 @@ def book(system: System, ws: Workspace, run: Run):
     for r in range(ws.counts[ROWS]):
         held += 0.5 * ws.rows[r, FORCE] * (s.rate[0, r] + s.rate[1, r])
     for k in range(ws.contacts.shape[0]):
-        ws.contacts[k, NORMAL_FORCE] = 0.0
+        ws.contacts[k, NORMAL_FORCE], motion = 0.0, OPEN
         if ws.active[k, MODE] == STICKING:
             r = ws.active[k, FIRST_ROW]
             x, z = 0.5 * (s.rate[0, r + 1] + s.rate[1, r + 1]), 0.5 * (s.rate[0, r + 2] + s.rate[1, r + 2])
@@ -191,9 +199,12 @@ def book(system: System, ws: Workspace, run: Run):
             held -= power
             ws.contacts[k, NORMAL_FORCE] = ws.rows[r, FORCE]
             s.found[PENETRATION] = max(s.found[PENETRATION], -ws.contacts[k, GAP])
-            x = x / s.law[k, GRIP] if s.law[k, GRIP] > 0.0 else 0.0
-            y_new[first + SLIP] += h * math.sqrt(x * x + z * z)
+            y_new[first + SLIP] += h * slip_speed(s, k, x, z)
             y_new[first + IMPULSE] += h * ws.rows[r, FORCE]
+            motion = SLIDING if slip_speed(s, k, s.rate[1, r + 1], s.rate[1, r + 2]) > BAD else STICKING
+            if motion == SLIDING and s.motion[k] == STICKING:
+                count_slip_start(system.unilateral, k)
+        s.motion[k] = motion
         first += CONTACT_SIZE
     start = layout.ledger
     y_new[start + ELECTRICAL] += h * electrical
@@ -211,17 +222,28 @@ def book(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
-def book_losses(unilateral, system: System, s, ws: Workspace, y_new, h):
+def count_slip_start(unilateral: UnilateralArrays | None, k):
+    """Candidate k has stuck at the start of the step, and slides at its end."""
+    if unilateral is not None:
+        unilateral.tally[k, SLIP_STARTS] += 1.0
+
+
+@internal_kernel
+def book_losses(unilateral: UnilateralArrays | None, system: System, s, ws: Workspace, y_new, h):
     """Under the unilateral law what normals and joint stops take is a loss, not an error of the constraints."""
     if unilateral is None:  # known to the compiler
         return
-    layout, tally, couplings = system.layout, unilateral.tally, system.couplings.joint.shape[0]
-    for r in range(couplings, ws.counts[COUPLED]):
+    layout, tally = system.layout, unilateral.tally
+    for k in range(unilateral.stop.shape[0]):
+        if unilateral.stop_table[k, STOP_CLOSED] == 0:
+            continue
+        r = unilateral.stop_table[k, STOP_ROW]
         work = 0.5 * h * ws.rows[r, FORCE] * (s.rate[0, r] + s.rate[1, r])
+        unilateral.stop[k, CLOSED_TIME] += h
+        unilateral.stop[k, STOP_LOSS] -= work
         y_new[layout.loss + JOINT_STOP_LOSS] -= work
         y_new[layout.ledger + CONSTRAINT] -= work
     for k in range(ws.contacts.shape[0]):
-        mode = OPEN
         if ws.active[k, MODE] == STICKING:
             r = ws.active[k, FIRST_ROW]
             work = 0.5 * h * ws.rows[r, FORCE] * (s.rate[0, r] + s.rate[1, r])
@@ -229,8 +251,7 @@ def book_losses(unilateral, system: System, s, ws: Workspace, y_new, h):
             y_new[layout.ledger + CONSTRAINT] -= work
             tally[k, LOSS] -= work
             tally[k, DEEPEST] = max(tally[k, DEEPEST], -ws.contacts[k, GAP])
-            mode = SLIDING if abs(s.rate[1, r + 1]) + abs(s.rate[1, r + 2]) > BAD else STICKING
-        tally[k, TIME_OPEN if mode == OPEN else TIME_SLIDING if mode == SLIDING else TIME_STICKING] += h
+        tally[k, s.motion[k]] += h  # the times in the order of the modes
 
 
 @internal_kernel
@@ -251,6 +272,9 @@ def sample_moreau(system: System, ws: Workspace, run: Run):
         drive(system.drives, system.reference, run.sample_time[last], row, system.layout, ws)
         geometry(system, system.model, run.stepping, ws)
         write_output(system, ws, run, last)
+        for k in range(ws.contacts.shape[0]):
+            # The rows are those of sticking even where it slides.
+            run.output[last, run.columns.contact + k * OUTPUTS_PER_CONTACT + OUT_MODE] = run.stepping.motion[k]
         last += 1
     run.count[SAMPLE] = last
 

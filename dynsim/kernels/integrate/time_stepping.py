@@ -8,6 +8,8 @@ q_m = q + h v / 2 and x_θ = x + θ (x' − x):
 Drives are implicit, by their linear blocks: i' is eliminated, and what is left of voltage loops, back-EMF and damping
 comes to the diagonal of M. The impulses p solve one contact problem (dynsim.kernels.constraint.cone) over all
 candidates with gap(q_m) ≤ 0: J v' + e J v (of an approach) ≥ 0 ⟂ p_n ≥ 0, Coulomb's cone, and couplings both ways.
+Its coefficient is that of the slip at the start of the step: the static one at rest, else that of the speed (first
+order, where it depends on it).
 
 θ = 1 damps and is of first order; θ = 1/2 is of second order where no contact changes, and keeps the energy of linear
 systems, contacts aside, to rounding. A landing leaves a penetration of up to h times its speed, which stays until the
@@ -48,6 +50,7 @@ from dynsim.kernels.arrays import (
     OPEN,
     PARENT,
     POSITION,
+    QD,
     QDD,
     RATE_I,
     RATE_Q,
@@ -74,15 +77,18 @@ from dynsim.kernels.constraint.rows import set_modes
 from dynsim.kernels.constraint.shapes import shaped_rows
 from dynsim.kernels.constraint.surface import contact_rows
 from dynsim.kernels.constraint.unilateral import (
+    HITS,
     LANDINGS,
     LIFT_OFFS,
     LIMIT,
     SIDE,
+    STATIC,
     STOP_CLOSED,
     STOP_FORCE,
     STOP_JOINT,
     STOP_ROW,
     UnilateralArrays,
+    sliding_friction,
 )
 from dynsim.kernels.constraint.unilateral import RESTITUTION as LAW_RESTITUTION
 from dynsim.kernels.drive.law import drive_block
@@ -98,9 +104,10 @@ MARGIN = 1e-10
 # SteppingArrays.law
 FRICTION_OF, RESTITUTION, GRIP, GRIP_AXIS = 0, 1, 2, 3
 LAW_SIZE = 6
-# SteppingArrays.found: largest residual [m/s], solves above BAD, largest penetration [m].
-WORST, CAPPED, PENETRATION = 0, 1, 2
-FOUND_SIZE = 3
+# SteppingArrays.found: largest residual [m/s], solves above BAD, largest penetration [m]; solves, and those that took
+# more than the quick rounds.
+WORST, CAPPED, PENETRATION, SOLVES, LONG_SOLVES = 0, 1, 2, 3, 4
+FOUND_SIZE = 5
 
 
 class SteppingArrays(NamedTuple):
@@ -118,7 +125,8 @@ class SteppingArrays(NamedTuple):
     b: np.ndarray  # (p,)
     mu: np.ndarray  # (p,)
     kind: np.ndarray  # (p,) int
-    modes: np.ndarray  # (c,) int
+    modes: np.ndarray  # (c,) int: OPEN, or STICKING for three rows
+    motion: np.ndarray  # (c,) int: OPEN, SLIDING or STICKING at the end of the step
     room: np.ndarray  # (CONE_ROOM, p, p)
     found: np.ndarray  # (FOUND_SIZE,)
 
@@ -152,6 +160,7 @@ def stepping_arrays(
         mu=np.zeros(p),
         kind=integers(np.zeros(p)),
         modes=integers(np.full(c, -1)),
+        motion=integers(np.full(c, OPEN)),
         room=np.zeros((CONE_ROOM, p, p)),
         found=np.zeros(FOUND_SIZE),
     )
@@ -232,7 +241,10 @@ def close_stops(unilateral: UnilateralArrays | None, ws: Workspace):
         return False
     table, stop, changed = unilateral.stop_table, unilateral.stop, False
     for k in range(table.shape[0]):
-        closed = 1 if stop[k, SIDE] * ws.joints[table[k, STOP_JOINT], Q] - stop[k, LIMIT] <= MARGIN else 0
+        joint = ws.joints[table[k, STOP_JOINT]]
+        closed = 1 if stop[k, SIDE] * joint[Q] - stop[k, LIMIT] <= MARGIN else 0
+        if closed > table[k, STOP_CLOSED] and stop[k, SIDE] * joint[QD] < -BAD:
+            stop[k, HITS] += 1.0
         changed = changed or closed != table[k, STOP_CLOSED]
         table[k, STOP_CLOSED] = closed
     return changed
@@ -281,22 +293,22 @@ def tangent_rows(system, s: SteppingArrays, ws: Workspace):
             rows[r, TARGET] = 0.0
             for j in range(6):
                 rows[r, DIRECTION + j] = rows[r, ROW + j]
-            s.kind[r], s.mu[r] = CONE if m == 0 else TANGENT, s.law[k, FRICTION_OF]
+            s.kind[r] = CONE if m == 0 else TANGENT
 
 
 @internal_kernel
-def row_rates(model: ModelArrays, ws: Workspace, v, out):
-    """J v of all rows; v: (n,). A row's rate climbs from its link to the world."""
+def row_rates(model: ModelArrays, ws: Workspace, y, first, out):
+    """J v of all rows, v from ``first`` on in y. A row's rate climbs from its link to the world."""
     rows, links, active = ws.rows, ws.links, ws.active
     for r in range(ws.counts[ROWS]):
         if r < ws.counts[COUPLED]:
-            out[r] = rows[r, ROW] * v[active[r, BODY_A]] + rows[r, ROW + 1] * v[active[r, BODY_B]]
+            out[r] = rows[r, ROW] * y[first + active[r, BODY_A]] + rows[r, ROW + 1] * y[first + active[r, BODY_B]]
             continue
         a, b, c = rows[r, ROW], rows[r, ROW + 1], rows[r, ROW + 2]
         d, e, f = rows[r, ROW + 3], rows[r, ROW + 4], rows[r, ROW + 5]
         total, i = 0.0, active[r, BODY_A]
         while i >= 0:
-            total += v[i] * (
+            total += y[first + i] * (
                 ((a * links[i, S] + b * links[i, S + 1]) + (c * links[i, S + 2] + d * links[i, S + 3]))
                 + (e * links[i, S + 4] + f * links[i, S + 5])
             )
@@ -329,7 +341,23 @@ def implicit_drives(system, s: SteppingArrays, ws: Workspace, h):
 
 
 @internal_kernel
-def solve_contacts(s: SteppingArrays, ws: Workspace, h):
+def friction_of(unilateral: UnilateralArrays | None, s: SteppingArrays, k, speed):
+    """Coefficient of friction of candidate k in a step that begins at this speed of slip."""
+    mu = s.law[k, FRICTION_OF]
+    if unilateral is None:  # known to the compiler
+        return mu
+    return unilateral.law[k, STATIC] if speed <= BAD else sliding_friction(unilateral.law, k, mu, speed)
+
+
+@internal_kernel
+def slip_speed(s: SteppingArrays, k, x, y):
+    """Slip of candidate k from the rates x, y of its tangents [m/s]."""
+    x = x / s.law[k, GRIP] if s.law[k, GRIP] > 0.0 else 0.0
+    return math.sqrt(x * x + y * y)
+
+
+@internal_kernel
+def solve_contacts(unilateral: UnilateralArrays | None, s: SteppingArrays, ws: Workspace, h):
     """Impulses of all rows, by the last ones as a start; their mean forces into ``ws.rows``. Returns the residual."""
     p, coupled, rows = ws.counts[ROWS], ws.counts[COUPLED], ws.rows
     last = 3 * ws.contacts.shape[0]
@@ -341,10 +369,13 @@ def solve_contacts(s: SteppingArrays, ws: Workspace, h):
         if ws.active[k, MODE] == STICKING:
             r = ws.active[k, FIRST_ROW]
             s.b[r] += s.law[k, RESTITUTION] * min(s.rate[0, r], 0.0)
+            s.mu[r] = friction_of(unilateral, s, k, slip_speed(s, k, s.rate[0, r + 1], s.rate[0, r + 2]))
             for m in range(MOST_ROWS):
                 s.f[r + m] = s.impulse[3 * k + m]
     residual = approach(ws.small[0], s.b, s.kind, s.mu, p, s.f, s.room, GOOD, QUICK_ROUNDS)
+    s.found[SOLVES] += 1.0
     if not residual <= BAD:
+        s.found[LONG_SOLVES] += 1.0
         residual = approach(ws.small[0], s.b, s.kind, s.mu, p, s.f, s.room, GOOD, LAST_ROUNDS)
     if not residual <= BAD:
         s.found[CAPPED] += 1.0
