@@ -1,8 +1,4 @@
-<<<<<<< HEAD
-"""Real contact of an arm's elbow against equations of motion by hand, a rod that falls flat, rest, and paradoxes."""
-=======
 """Real contact of an arm's elbow against equations made by hand, a rod that falls flat, rest, and paradoxes."""
->>>>>>> hH5
 
 from __future__ import annotations
 
@@ -144,11 +140,7 @@ def test_an_arm_with_one_elbow_on_the_floor_sticks_slips_and_lifts_off(swing):
 
 
 def rod(mu: float, phi: float, contacts: int = 1, **law: float) -> Bench:
-<<<<<<< HEAD
-    """A thin rod of 1 kg and 1 m in the plane y = 0, leaning by φ, its lower end and maybe both on the floor."""
-=======
     """A thin rod of 1 kg and 1 m in the plane y = 0, leaning by φ, its lower or both ends on the floor."""
->>>>>>> hH5
     half = 0.5
     inertia = Inertia(1.0, np.zeros(3), np.diag([half**2 / 3, half**2 / 3, 0.0]))
     links = (
