@@ -227,8 +227,10 @@ def stay_tangential(slide, ws: Workspace, k):
     for s in range(3):
         slide[k, REFERENCE + s] -= along * state[k, NORMAL + s]
         size += slide[k, REFERENCE + s] ** 2
-    for s in range(3):
-        slide[k, REFERENCE + s] /= math.sqrt(size)
+    # Without friction there may be none yet.
+    if size > 0.0:
+        for s in range(3):
+            slide[k, REFERENCE + s] /= math.sqrt(size)
 
 
 @internal_kernel
