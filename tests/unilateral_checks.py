@@ -25,6 +25,7 @@ from dynsim.kernels.state import (
     OUT_VECTOR,
 )
 from dynsim.model.description import Contact, Quadric
+from dynsim.model.model import Model
 
 
 def raised(contact: Contact, height: float) -> Contact:
@@ -98,7 +99,8 @@ def violations(b: Bench, run: ki.Run) -> dict[str, float]:
             force, slip = touch[s, k, OUT_VECTOR : OUT_VECTOR + 3], touch[s, k, OUT_SLIP : OUT_SLIP + 3]
             q = run.states("q")[s]
             normal = _normal(b, contact, q)
-            assert abs(force @ normal - f[s, k]) <= 1e-9 * scale[s, 0]
+            # A frozen direction of slip is tangential at the ends of steps; a curved surface turns under it within one.
+            assert abs(force @ normal - f[s, k]) <= 1e-5 * scale[s, 0]
             tangential, speed = force - f[s, k] * normal, float(np.linalg.norm(slip))
             if mode[s, k] == ka.STICKING:
                 cone = (float(np.linalg.norm(tangential)) - static * f[s, k]) / scale[s, 0]
@@ -114,8 +116,6 @@ def violations(b: Bench, run: ki.Run) -> dict[str, float]:
 
 
 def _normal(b: Bench, contact: Contact, q: np.ndarray) -> np.ndarray:
-    from dynsim.model.model import Model
-
     place = Model(b.robot).point_position(contact.body, contact.point, q)
     slope = contact.surface.Q @ place + contact.surface.b
     return slope / np.linalg.norm(slope)

@@ -69,7 +69,8 @@ from dynsim.kernels.constraint.unilateral import (
     WINDOW_START,
     UnilateralArrays,
 )
-from dynsim.kernels.integrate.contact_modes import begin_slip, evaluate, resolve, slip_speed
+from dynsim.kernels.integrate.contact_modes import begin_slip, resolve
+from dynsim.kernels.integrate.impacts import evaluate, slip_speed
 from dynsim.kernels.integrate.run import (
     CHATTER,
     CONTACT_LOG,

@@ -19,27 +19,18 @@ from dynsim.kernels.arrays import (
     DEPENDENT,
     FIRST_ROW,
     FIRST_TANGENT,
-    FORCE,
-    GAP,
-    GAP_RATE,
     MODE,
     MU,
     OPEN,
-    QD,
-    QDD,
     RHS,
-    ROW_GAP,
-    ROW_RATE,
-    ROWS,
     SECOND_TANGENT,
     SLIDING,
     SLIP_VELOCITY,
     STICKING,
-    Q,
     Workspace,
 )
 from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, ONE_WAY, TANGENT, solve_cones
-from dynsim.kernels.constraint.rows import row_errors, set_modes
+from dynsim.kernels.constraint.rows import set_modes
 from dynsim.kernels.constraint.unilateral import (
     BEFORE,
     CONE_FRICTION,
@@ -47,19 +38,14 @@ from dynsim.kernels.constraint.unilateral import (
     FROZEN,
     HEADWAY,
     KINDS,
-    LIMIT,
-    LOSS,
     NEXT,
     NEXT_SPEED,
     OFFSET,
     PROBLEM,
     REDUNDANT,
     REFERENCE,
-    RESTITUTION,
     SCRATCH,
     SECOND_PART,
-    SETTLE,
-    SIDE,
     SLOW,
     SOLUTION,
     SPEED,
@@ -67,8 +53,6 @@ from dynsim.kernels.constraint.unilateral import (
     STATIC,
     STOP_BEFORE,
     STOP_CLOSED,
-    STOP_JOINT,
-    STOP_LOSS,
     STRIBECK,
     STRUCK,
     TABLE_ROW,
@@ -77,9 +61,19 @@ from dynsim.kernels.constraint.unilateral import (
     UnilateralArrays,
     slide_direction,
 )
-from dynsim.kernels.integrate.project import PROJECTION_LIMIT, RATE_TOLERANCE, project_level
+from dynsim.kernels.integrate.impacts import (
+    CONE_TOLERANCE,
+    FORCE_TOLERANCE,
+    IMMOBILE,
+    evaluate,
+    find_touching,
+    gather,
+    impact,
+    keep_touching,
+    slip_speed,
+)
+from dynsim.kernels.integrate.project import project_level
 from dynsim.kernels.integrate.run import (
-    EVALUATIONS,
     FORCES_REVERSED,
     NO_CONTACT_FORCES,
     NOT_UNIQUE,
@@ -88,39 +82,13 @@ from dynsim.kernels.integrate.run import (
     Run,
 )
 from dynsim.kernels.jit import internal_kernel
-from dynsim.kernels.state import CONTACT_SIZE, IMPACT_LOSS, IMPULSE, JOINT_STOP_LOSS
-from dynsim.kernels.system import System, derivative
-from dynsim.kernels.tree.articulated import accelerate
+from dynsim.kernels.state import IMPACT_LOSS
+from dynsim.kernels.system import System
 
-# A point that approaches faster than this many tolerances of projected rates strikes.
-STRIKE = 3.0
-# What begins to touch is brought this close to its surface [m].
-FOOT_TOLERANCE = 1e-13
-# Of a solution of the cones: residual by the largest entry, and what of the largest force is none.
-CONE_TOLERANCE, FORCE_TOLERANCE = 1e-9, 1e-9
-# Where nothing is faster, or accelerated by more, residuals are not compared with it: behind closed brakes a point has
-# motions of 1e-30, and no force upon it is better than none [m/s, m/s²].
-IMMOBILE = 1e-3
 # An acceleration along the surface below this fraction of the largest right-hand side is none.
 SLIP_TOLERANCE = 1e-8
 # A friction force this close to the cone, as a fraction, is on it.
 ON_CONE = 1e-7
-
-
-@internal_kernel
-def slip_speed(ws: Workspace, k):
-    """|v_t| of candidate k [m/s]."""
-    state = ws.contacts
-    x, y, z = state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2]
-    return math.sqrt(x * x + y * y + z * z)
-
-
-@internal_kernel
-def evaluate(system: System, ws: Workspace, run: Run):
-    """The right-hand side at the present state, with the present modes, and how its rows are off."""
-    derivative(system, run.clock[TIME], run.y, ws, run.stage[0])
-    run.count[EVALUATIONS] += 1
-    row_errors(ws)
 
 
 @internal_kernel
@@ -143,173 +111,6 @@ def resolve(system: System, ws: Workspace, run: Run, touch):
         evaluate(system, ws, run)
         keep_touching(unilateral, ws)
     choose(system, ws, run)
-
-
-@internal_kernel
-def find_touching(unilateral: UnilateralArrays, ws: Workspace, touch):
-    """Note what touches and does not leave; True when some of it approaches."""
-    state, mode, table, stop = ws.contacts, unilateral.mode, unilateral.stop_table, unilateral.stop
-    strikes = False
-    for k in range(mode.shape[0]):
-        limit = STRIKE * RATE_TOLERANCE * (1.0 + slip_speed(ws, k))
-        closed = ws.active[k, MODE] != OPEN
-        near = closed or (state[k, GAP] <= touch and state[k, GAP_RATE] <= limit)
-        mode[k, TOUCHING] = 1 if near else 0
-        if near and state[k, GAP_RATE] < -limit:
-            mode[k, STRUCK] = 1
-        # What lands ever so slowly is stopped too: nothing else would, should it stay open.
-        strikes = strikes or (near and state[k, GAP_RATE] < (-limit if closed else 0.0))
-    for k in range(table.shape[0]):
-        j = table[k, STOP_JOINT]
-        gap, rate = stop[k, SIDE] * ws.joints[j, Q] - stop[k, LIMIT], stop[k, SIDE] * ws.joints[j, QD]
-        limit = STRIKE * RATE_TOLERANCE
-        near = table[k, STOP_CLOSED] == 1 or (gap <= touch and rate <= limit)
-        table[k, STOP_CLOSED] = 1 if near else 0
-        strikes = strikes or (near and rate < -limit)
-    return strikes
-
-
-@internal_kernel
-def keep_touching(unilateral: UnilateralArrays, ws: Workspace):
-    """After an impact: what leaves faster than SETTLE touches no more."""
-    state, mode, table, stop = ws.contacts, unilateral.mode, unilateral.stop_table, unilateral.stop
-    for k in range(mode.shape[0]):
-        if state[k, GAP_RATE] > unilateral.tally[k, SETTLE]:
-            mode[k, TOUCHING] = 0
-    for k in range(table.shape[0]):
-        if stop[k, SIDE] * ws.joints[table[k, STOP_JOINT], QD] > STRIKE * RATE_TOLERANCE:
-            table[k, STOP_CLOSED] = 0
-
-
-@internal_kernel
-def come_down(system: System, ws: Workspace, run: Run):
-    """Bring what touches onto its surface, to rounding, before it is held where it is.
-
-    A point lands a little below its surface. Where rows depend on each other, as those of a point on a body with one
-    degree of freedom, there might be no state at which its normal row and the tangential ones of a foot found above it
-    all vanish. What is about to bounce is not held: lifted at each bounce, it would go on for ever.
-    """
-    unilateral = system.unilateral
-    mode = unilateral.mode
-    for k in range(mode.shape[0]):
-        fast = mode[k, STRUCK] == 1 and ws.contacts[k, GAP_RATE] < -unilateral.tally[k, SETTLE]
-        bounces = fast and mode[k, BEFORE] == OPEN and unilateral.law[k, RESTITUTION] > 0.0
-        held = mode[k, TOUCHING] == 1 and not bounces
-        mode[k, WANTED] = OPEN if not held else STICKING if ws.active[k, MODE] == STICKING else SLIDING
-    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
-    for _ in range(PROJECTION_LIMIT):
-        evaluate(system, ws, run)
-        worst = 0.0
-        for r in range(ws.counts[ROWS]):
-            worst = max(worst, abs(ws.rows[r, ROW_GAP]))
-        if worst <= FOOT_TOLERANCE:
-            return
-        project_level(system, ws, run.y, 0)
-
-
-@internal_kernel
-def gather(system: System, ws: Workspace, run: Run):
-    """Rows along normal and tangents of everything that touches, and their system, into the workspace.
-
-    Kinds and table rows of the rows into ``unilateral.place``; returns how many there are.
-    """
-    unilateral = system.unilateral
-    mode, place = unilateral.mode, unilateral.place
-    come_down(system, ws, run)
-    for k in range(mode.shape[0]):
-        mode[k, WANTED] = STICKING if mode[k, TOUCHING] == 1 else OPEN
-    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
-    evaluate(system, ws, run)
-    couplings, p = system.couplings.joint.shape[0], ws.counts[ROWS]
-    for r in range(p):
-        place[KINDS, r] = BOTH_WAYS if r < couplings else ONE_WAY
-    for k in range(mode.shape[0]):
-        if mode[k, WANTED] == STICKING:
-            r = ws.active[k, FIRST_ROW]
-            place[KINDS, r], place[KINDS, r + 1], place[KINDS, r + 2] = CONE, TANGENT, TANGENT
-    return p
-
-
-@internal_kernel
-def impulses(system: System, ws: Workspace, p, largest, share):
-    """Solve for the impulses of :func:`impact` with so much of the restitutions; the loss of each row into FORCE [J].
-
-    False when there is no solution, or one that would create energy.
-    """
-    unilateral, rows = system.unilateral, ws.rows
-    vector, mode = unilateral.vector, unilateral.mode
-    for r in range(p):
-        vector[OFFSET, r], vector[SOLUTION, r] = rows[r, ROW_RATE], 0.0
-    for k in range(mode.shape[0]):
-        if mode[k, TOUCHING] == 1:
-            r = ws.active[k, FIRST_ROW]
-            vector[CONE_FRICTION, r] = system.contacts.point[k, MU]
-            # What was closed had no speed to turn round: a brake or another impact has just given it this one.
-            falls = mode[k, STRUCK] == 1 and mode[k, BEFORE] == OPEN
-            if falls and -rows[r, ROW_RATE] > unilateral.tally[k, SETTLE]:
-                vector[OFFSET, r] *= 1.0 + share * unilateral.law[k, RESTITUTION]
-    residual = solve_cones(
-        ws.small[0],
-        vector[OFFSET],
-        unilateral.place[KINDS],
-        vector[CONE_FRICTION],
-        p,
-        vector[SOLUTION],
-        unilateral.room[SCRATCH:],
-        1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE),
-    )
-    if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
-        return False
-    f, total, turnover = vector[SOLUTION], 0.0, 0.0
-    for r in range(p):
-        after = rows[r, ROW_RATE]
-        for s in range(p):
-            after += ws.small[0, r, s] * f[s]
-        # FORCE is free until the next evaluation.
-        rows[r, FORCE] = -0.5 * f[r] * (rows[r, ROW_RATE] + after)
-        total += rows[r, FORCE]
-        turnover += abs(rows[r, FORCE])
-    return total >= -CONE_TOLERANCE * turnover or share == 0.0
-
-
-@internal_kernel
-def impact(system: System, ws: Workspace, run: Run):
-    """Impulses that stop what approaches: u = W P + b with b = J v and, of normals that strike, (1 + e) n·v.
-
-    Then v += M⁻¹ Jᵀ P, and the energy −½ P·(J v₋ + J v₊) is booked as impact loss.
-    """
-    unilateral, y, layout = system.unilateral, run.y, system.layout
-    vector, mode, rows, column = unilateral.vector, unilateral.mode, ws.rows, ws.column
-    p = gather(system, ws, run)
-    largest = 0.0
-    for r in range(p):
-        largest = max(largest, abs(rows[r, ROW_RATE]))
-    # Newton's restitution may contradict friction: a point that is wedged cannot leave, and some would gain energy.
-    # Those impacts are without restitution, which always has a solution, and a loss.
-    if not impulses(system, ws, p, largest, 1.0) and not impulses(system, ws, p, largest, 0.0):
-        run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
-        return
-    f = vector[SOLUTION]
-    for i in range(ws.joints.shape[0]):
-        column[i, 0] = 0.0
-        for r in range(p):
-            column[i, 0] += f[r] * column[i, 1 + 2 * r]
-    accelerate(system.model, ws)
-    for i in range(ws.joints.shape[0]):
-        y[layout.v + i] += ws.joints[i, QDD]
-    for k in range(mode.shape[0]):
-        if mode[k, TOUCHING] == 1:
-            r = ws.active[k, FIRST_ROW]
-            loss = rows[r, FORCE] + rows[r + 1, FORCE] + rows[r + 2, FORCE]
-            unilateral.tally[k, LOSS] += loss
-            y[layout.loss + IMPACT_LOSS] += loss
-            y[layout.contact + CONTACT_SIZE * k + IMPULSE] += f[r]
-    r = system.couplings.joint.shape[0]
-    for k in range(unilateral.stop_table.shape[0]):
-        if unilateral.stop_table[k, STOP_CLOSED] == 1:
-            unilateral.stop[k, STOP_LOSS] += rows[r, FORCE]
-            y[layout.loss + JOINT_STOP_LOSS] += rows[r, FORCE]
-            r += 1
 
 
 @internal_kernel
