@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import dynsim
+from dynsim import metrics
 from dynsim.errors import ScenarioError
 from dynsim.record import Record
 
@@ -96,6 +98,17 @@ def test_events_cannot_be_watched(falling: Path):
     np.testing.assert_allclose(ticks, np.arange(0.0, 0.105, 0.01), atol=1e-12)
 
 
+def test_what_it_does_not_do_is_refused(falling: Path):
+    for more, message in (
+        ({"integrator.solver": "m_star"}, "integrator.solver: m_star is not of integrator.method: time_stepping"),
+        ({"contacts.law": "bilateral", "contacts.candidates": "points", "contacts.points.hand.body": "link_2",
+          "surfaces.floor.point_m": [0, 0, 0.15]},
+         "time_stepping needs `contacts: {law: unilateral}`"),
+    ):  # fmt: skip
+        with pytest.raises(ScenarioError, match=re.escape(message)):
+            dynsim.simulate(dynsim.load_scenario(falling, overrides=stepping(1e-3, 0.5) | more))
+
+
 def test_joint_stops_are_counted(falling: Path):
     """A joint that falls on its limit: one hit, the energy of it, and closed from then on."""
     limited = {"plant.chain.0.limit_deg": [-90.0, 70.0], "surfaces.floor.point_m": [0, 0, -5.0], **EXACT}
@@ -108,8 +121,6 @@ def test_joint_stops_are_counted(falling: Path):
 
 
 def test_contact_problems_that_were_given_up_are_told(falling: Path, monkeypatch: pytest.MonkeyPatch):
-    from dynsim import metrics
-
     solved = {"contact_solves": 10, "capped_solves": 0, "residual_max_m_s": 1e-9}
     assert metrics._capped(solved) == []
     (text,) = metrics._capped(solved | {"capped_solves": 2, "residual_max_m_s": 3e-4})
