@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim._version import __version__
-from dynsim.kernels.constraint import unilateral as ku
+from dynsim.contact_metrics import capped, chattered, modes, touched_stops
 from dynsim.kernels.constraint.unilateral import UnilateralArrays
-from dynsim.kernels.integrate.contact_events import MOST_EVENTS, WINDOW
 from dynsim.kernels.integrate.run import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, LOCAL_SINCE, PULLING
-from dynsim.kernels.integrate.time_stepping import BAD
 from dynsim.measures import (
     RESIDUAL_LIMIT,
     STORES,
@@ -185,7 +183,7 @@ def summarise(
         ],
     }
     if counts.unilateral is not None:
-        summary["joint_stops"] = _stops(counts, duration)
+        summary["joint_stops"] = touched_stops(counts.stops, counts.unilateral, duration)
     if counts.stepping is not None:
         summary["time_stepping"] = counts.stepping
     summary["warnings"] = _warnings(record, scenario, contacts, robot, counts, summary) + _sunk(record, sunk)
@@ -212,7 +210,7 @@ def _loads(record: Record) -> dict[str, Any]:
 
 def _contact(record: Record, k: int, contact: Contact, counts: Counts, duration: float) -> dict[str, Any]:
     force = record["contact_normal_force"][:, k]
-    real = {} if counts.unilateral is None else _modes(counts.unilateral, k, duration)
+    real = {} if counts.unilateral is None else modes(counts.unilateral, k, duration)
     # Under the unilateral law a force ends at zero; what lies below is the tolerance of that event.
     least = -np.inf if counts.unilateral is None else 0.0
     extremes = counts.extremes[k] if counts.steps else np.zeros(EXTREMES_SIZE)
@@ -230,54 +228,6 @@ def _contact(record: Record, k: int, contact: Contact, counts: Counts, duration:
     }
 
 
-def _modes(unilateral: UnilateralArrays, k: int, duration: float) -> dict[str, Any]:
-    """What a candidate has done under the unilateral law."""
-    tally = unilateral.tally[k]
-    fractions = tally[[ku.TIME_STICKING, ku.TIME_SLIDING]] / duration if duration > 0.0 else np.zeros(2)
-    sticking, sliding = np.minimum(fractions, 1.0).tolist()
-    return {
-        "closed_fraction": min(sticking + sliding, 1.0),
-        "pulling_fraction": 0.0,
-        "sticking_fraction": sticking,
-        "sliding_fraction": sliding,
-        "lift_offs": int(tally[ku.LIFT_OFFS]),
-        "landings": int(tally[ku.LANDINGS]),
-        "slip_starts": int(tally[ku.SLIP_STARTS]),
-        "bounces": int(tally[ku.BOUNCES]),
-        "impact_loss_J": float(tally[ku.LOSS]),
-        "penetration_max_m": float(tally[ku.DEEPEST]),
-    }
-
-
-def _stops(counts: Counts, duration: float) -> list[dict[str, Any]]:
-    """The joint stops that were touched."""
-    assert counts.unilateral is not None
-    found = []
-    for stop, row in zip(counts.stops, counts.unilateral.stop, strict=True):
-        if row[ku.HITS] > 0 or row[ku.CLOSED_TIME] > 0.0:
-            found.append(
-                {
-                    "joint": stop.joint,
-                    "limit": stop.position,
-                    "hits": int(row[ku.HITS]),
-                    "closed_fraction": min(float(row[ku.CLOSED_TIME]) / duration, 1.0) if duration > 0.0 else 0.0,
-                    "impact_loss_J": float(row[ku.STOP_LOSS]),
-                }
-            )
-    return found
-
-
-def _capped(stepping: dict[str, Any]) -> list[str]:
-    """Contact problems that were not solved; what lies deep in a surface is no drift, but shrinks with the step."""
-    if not stepping["capped_solves"]:
-        return []
-    return [
-        f"time stepping: {stepping['capped_solves']} of {stepping['contact_solves']} contact problems were given up "
-        f"above {BAD:g} m/s, the worst at {stepping['residual_max_m_s']:.1e} m/s: their forces are not quite "
-        "Coulomb's; shorten integrator.step_s"
-    ]
-
-
 def _warnings(
     record: Record,
     scenario: Scenario,
@@ -288,7 +238,7 @@ def _warnings(
 ) -> list[str]:
     found = []
     if counts.unilateral is not None:
-        found.extend(_chattered(contacts, counts.unilateral))
+        found.extend(chattered(contacts, counts.unilateral))
     for contact in summary["contacts"]:
         if contact["normal_force_min_N"] < 0.0:
             found.append(
@@ -328,7 +278,7 @@ def _warnings(
             "tighten integrator.rtol or the step"
         )
     if counts.stepping is not None:
-        found.extend(_capped(counts.stepping))
+        found.extend(capped(counts.stepping))
     elif summary["constraint_drift_max_m"] > DRIFT_LIMIT_M:
         found.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
     if counts.deficient and counts.unilateral is None:
@@ -347,18 +297,6 @@ def _warnings(
             f"of {s.joint} is anything from {s.low:.4g} to {s.high:.4g} {s.unit} over the splits of the normal forces "
             f"that keep their signs (this run: {s.taken:.4g}); take away braces until the rest are independent"
         )
-    return found
-
-
-def _chattered(contacts: Sequence[Contact], unilateral: UnilateralArrays) -> list[str]:
-    """Contacts whose events came too fast to be followed one by one."""
-    found = []
-    for contact, tally in zip(contacts, unilateral.tally, strict=True):
-        if tally[ku.CHATTERED]:
-            found.append(
-                f"{contact.name}: chatter, more than {MOST_EVENTS} contact events within {WINDOW:g} s; what left more "
-                f"slowly than {tally[ku.SETTLE]:.0e} m/s was kept on the surface"
-            )
     return found
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import dynsim
-from dynsim import metrics
+from dynsim.contact_metrics import capped
 from dynsim.errors import ScenarioError
 from dynsim.record import Record
 
@@ -122,8 +122,8 @@ def test_joint_stops_are_counted(falling: Path):
 
 def test_contact_problems_that_were_given_up_are_told(falling: Path, monkeypatch: pytest.MonkeyPatch):
     solved = {"contact_solves": 10, "capped_solves": 0, "residual_max_m_s": 1e-9}
-    assert metrics._capped(solved) == []
-    (text,) = metrics._capped(solved | {"capped_solves": 2, "residual_max_m_s": 3e-4})
+    assert capped(solved) == []
+    (text,) = capped(solved | {"capped_solves": 2, "residual_max_m_s": 3e-4})
     assert "2 of 10 contact problems" in text
     assert "3.0e-04 m/s" in text
     assert "integrator.step_s" in text

@@ -1,0 +1,74 @@
+"""What candidates and joint stops have done under the unilateral law, for summaries, and what to warn of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from dynsim.kernels.constraint import unilateral as ku
+from dynsim.kernels.constraint.unilateral import UnilateralArrays
+from dynsim.kernels.integrate.contact_events import MOST_EVENTS, WINDOW
+from dynsim.kernels.integrate.time_stepping import BAD
+from dynsim.model.description import Contact
+from dynsim.model.unilateral import JointStop
+
+
+def modes(unilateral: UnilateralArrays, k: int, duration: float) -> dict[str, Any]:
+    """What a candidate has done under the unilateral law."""
+    tally = unilateral.tally[k]
+    fractions = tally[[ku.TIME_STICKING, ku.TIME_SLIDING]] / duration if duration > 0.0 else np.zeros(2)
+    sticking, sliding = np.minimum(fractions, 1.0).tolist()
+    return {
+        "closed_fraction": min(sticking + sliding, 1.0),
+        "pulling_fraction": 0.0,
+        "sticking_fraction": sticking,
+        "sliding_fraction": sliding,
+        "lift_offs": int(tally[ku.LIFT_OFFS]),
+        "landings": int(tally[ku.LANDINGS]),
+        "slip_starts": int(tally[ku.SLIP_STARTS]),
+        "bounces": int(tally[ku.BOUNCES]),
+        "impact_loss_J": float(tally[ku.LOSS]),
+        "penetration_max_m": float(tally[ku.DEEPEST]),
+    }
+
+
+def touched_stops(stops: Sequence[JointStop], unilateral: UnilateralArrays, duration: float) -> list[dict[str, Any]]:
+    """The joint stops that were touched."""
+    found = []
+    for stop, row in zip(stops, unilateral.stop, strict=True):
+        if row[ku.HITS] > 0 or row[ku.CLOSED_TIME] > 0.0:
+            found.append(
+                {
+                    "joint": stop.joint,
+                    "limit": stop.position,
+                    "hits": int(row[ku.HITS]),
+                    "closed_fraction": min(float(row[ku.CLOSED_TIME]) / duration, 1.0) if duration > 0.0 else 0.0,
+                    "impact_loss_J": float(row[ku.STOP_LOSS]),
+                }
+            )
+    return found
+
+
+def chattered(contacts: Sequence[Contact], unilateral: UnilateralArrays) -> list[str]:
+    """Contacts whose events came too fast to be followed one by one."""
+    found = []
+    for contact, tally in zip(contacts, unilateral.tally, strict=True):
+        if tally[ku.CHATTERED]:
+            found.append(
+                f"{contact.name}: chatter, more than {MOST_EVENTS} contact events within {WINDOW:g} s; what left more "
+                f"slowly than {tally[ku.SETTLE]:.0e} m/s was kept on the surface"
+            )
+    return found
+
+
+def capped(stepping: dict[str, Any]) -> list[str]:
+    """Contact problems that were not solved; what lies deep in a surface is no drift, but shrinks with the step."""
+    if not stepping["capped_solves"]:
+        return []
+    return [
+        f"time stepping: {stepping['capped_solves']} of {stepping['contact_solves']} contact problems were given up "
+        f"above {BAD:g} m/s, the worst at {stepping['residual_max_m_s']:.1e} m/s: their forces are not quite "
+        "Coulomb's; shorten integrator.step_s"
+    ]
