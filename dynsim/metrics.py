@@ -253,7 +253,8 @@ def _warnings(
                 "diagonal of J M⁻¹F, Painlevé's paradox at one contact): only the other braces hold it there, and "
                 "whether real ones do depends on their stiffness; lower contacts.friction or take another posture"
             )
-    if summary["friction_heat_J"] < 0.0:
+    # Within an impact friction may give what the normal impulse takes: only their sum is a loss.
+    if summary["friction_heat_J"] < -summary.get("impact_loss_J", 0.0):
         found.append(
             f"friction has put {-summary['friction_heat_J']:.3g} J into the arm: f_t = μ f_n reverses with a pulling "
             "normal force (contacts.pulling_friction: dissipative takes μ |f_n|)"
