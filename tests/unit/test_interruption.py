@@ -10,6 +10,14 @@ from llvmlite.binding import ExecutionEngine
 from dynsim import interruption
 
 
+@pytest.fixture(autouse=True)
+def interruptible():
+    """Background processes of a shell ignore the signal, and what is ignored stays so."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def _raw_object_cache_getbuffer() -> str:
     """Named as llvmlite's: what LLVM calls when it wants compiled code from the cache."""
     return deeper()
