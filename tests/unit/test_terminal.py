@@ -37,7 +37,7 @@ def test_a_terminal_shows_texts_as_they_are_written(colours: bool):
 def test_tables_show_names_as_they_are_written():
     contact = {
         "name": EVIL, "normal_force_mean_N": 1.0, "normal_force_min_N": 1.0, "normal_force_max_N": 1.0,
-        "pulling_fraction": 0.5,
+        "pulling_fraction": 0.5, "closed_fraction": 1.0,
     }  # fmt: skip
     summary = {"scenario": EVIL, "variant": EVIL, "electrical_energy_J": 1.0, "warnings": [EVIL], "contacts": [contact]}
     for show in (lambda t: print_summary(t, summary), lambda t: print_comparison(t, {EVIL: summary})):
