@@ -50,6 +50,8 @@ INTEGRALS = {
 LOSSES = {"loss_impact": "energy that impacts of contacts take", "loss_stop": "energy that impacts at joint stops take"}
 
 DRIFT_LIMIT_M = 1e-9
+# Friction heat below zero by no more than this share of the turnover is rounding.
+FRICTION_ROUNDING = 1e-12
 # Limits in files are rounded: a joint that starts at 1.5707963 = 90° is not beyond it.
 LIMIT_SLACK = 1e-6
 
@@ -303,7 +305,7 @@ def _warnings(
                 "diagonal of J M⁻¹F, Painlevé's paradox at one contact): only the other braces hold it there, and "
                 "whether real ones do depends on their stiffness; lower contacts.friction or take another posture"
             )
-    if summary["friction_heat_J"] < 0.0:
+    if summary["friction_heat_J"] < -FRICTION_ROUNDING * summary["energy_turnover_J"]:
         found.append(
             f"friction has put {-summary['friction_heat_J']:.3g} J into the arm: f_t = μ f_n reverses with a pulling "
             "normal force (contacts.pulling_friction: dissipative takes μ |f_n|)"
