@@ -306,10 +306,13 @@ def _warnings(
                 "whether real ones do depends on their stiffness; lower contacts.friction or take another posture"
             )
     if summary["friction_heat_J"] < -FRICTION_ROUNDING * summary["energy_turnover_J"]:
-        found.append(
-            f"friction has put {-summary['friction_heat_J']:.3g} J into the arm: f_t = μ f_n reverses with a pulling "
-            "normal force (contacts.pulling_friction: dissipative takes μ |f_n|)"
-        )
+        put = f"friction has put {-summary['friction_heat_J']:.3g} J into the arm: "
+        if counts.unilateral is None:
+            put += "f_t = μ f_n reverses with a pulling normal force "
+            put += "(contacts.pulling_friction: dissipative takes μ |f_n|)"
+        else:
+            put += "an error of the integration; shorten integrator.step_s or tighten integrator.rtol"
+        found.append(put)
     for a, motor in enumerate(robot.motors):
         for what, signal, limit, unit in _limits_of(motor):
             saturated = np.abs(record[signal][:, a]) >= limit

@@ -20,7 +20,7 @@ STEP_MAX = 0.3  # [rad or m] per iteration, so that the branch of the start is k
 
 
 def gaps_and_rates(model: Model, contacts: Sequence[Contact], q: Array) -> tuple[Array, Array]:
-    """Distances of points and spheres from their surfaces, (c,) [m], and their change with the joints, (c, n) [m/rad]."""
+    """Distances of points and spheres from their surfaces, (c,) [m], and their rates by joint, (c, n) [m/rad]."""
     gaps, rates = np.zeros(len(contacts)), np.zeros((len(contacts), model.n))
     for k, contact in enumerate(contacts):
         position, jacobian = model.point_position_and_jacobian(contact.body, contact.point, q)
