@@ -48,6 +48,8 @@ INTEGRALS = {
 LOSSES = {"loss_impact": "energy that impacts of contacts take", "loss_stop": "energy that impacts at joint stops take"}
 
 DRIFT_LIMIT_M = 1e-9
+# Friction heat below zero by no more than this share of the turnover is rounding.
+FRICTION_ROUNDING = 1e-12
 # Limits in files are rounded: a joint that starts at 1.5707963 = 90° is not beyond it.
 LIMIT_SLACK = 1e-6
 
@@ -254,11 +256,15 @@ def _warnings(
                 "whether real ones do depends on their stiffness; lower contacts.friction or take another posture"
             )
     # Within an impact friction may give what the normal impulse takes: only their sum is a loss.
-    if summary["friction_heat_J"] < -summary.get("impact_loss_J", 0.0):
-        found.append(
-            f"friction has put {-summary['friction_heat_J']:.3g} J into the arm: f_t = μ f_n reverses with a pulling "
-            "normal force (contacts.pulling_friction: dissipative takes μ |f_n|)"
-        )
+    given = -summary["friction_heat_J"] - max(summary.get("impact_loss_J", 0.0), 0.0)
+    if given > FRICTION_ROUNDING * summary["energy_turnover_J"]:
+        put = f"friction has put {given:.3g} J into the arm: "
+        if counts.unilateral is None:
+            put += "f_t = μ f_n reverses with a pulling normal force "
+            put += "(contacts.pulling_friction: dissipative takes μ |f_n|)"
+        else:
+            put += "an error of the integration; shorten integrator.step_s or tighten integrator.rtol"
+        found.append(put)
     for a, motor in enumerate(robot.motors):
         for what, signal, limit, unit in _limits_of(motor):
             saturated = np.abs(record[signal][:, a]) >= limit

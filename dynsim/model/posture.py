@@ -20,11 +20,11 @@ STEP_MAX = 0.3  # [rad or m] per iteration, so that the branch of the start is k
 
 
 def gaps_and_rates(model: Model, contacts: Sequence[Contact], q: Array) -> tuple[Array, Array]:
-    """Distances of points from their surfaces, (c,) [m], and what they change by with the joints, (c, n) [m/rad]."""
+    """Distances of points and spheres from their surfaces, (c,) [m], and their rates by joint, (c, n) [m/rad]."""
     gaps, rates = np.zeros(len(contacts)), np.zeros((len(contacts), model.n))
     for k, contact in enumerate(contacts):
         position, jacobian = model.point_position_and_jacobian(contact.body, contact.point, q)
-        gaps[k], rates[k] = contact.surface.gap(position), contact.surface.normal(position) @ jacobian
+        gaps[k], rates[k] = contact.surface.gap(position) - contact.radius, contact.surface.normal(position) @ jacobian
     return gaps, rates
 
 
@@ -42,12 +42,14 @@ def on_surfaces(model: Model, contacts: Mapping[str, Contact], names: Sequence[s
     Raises
     ------
     ModelError
-        An unknown name, or surfaces that the points do not reach.
+        An unknown name, that of an axis, or surfaces that the points do not reach.
     """
     robot = model.robot
     for name in names:
         if name not in contacts:
             raise ModelError(f"initial.on_surface: no contact {name!r}; those are: {', '.join(contacts) or 'none'}")
+        if contacts[name].tip is not None:
+            raise ModelError(f"initial.on_surface: {name!r} is the axis of a link; name the points at its ends")
     fixed = [name for name in keep if name != HAND]
     for name in fixed:
         if name not in robot.joint_names:

@@ -64,7 +64,7 @@ def robot(scenario: Scenario) -> Robot:
     initial = scenario.config.initial
     if initial is None:
         return built
-    points = {contact.name: contact for contact in contacts(scenario)}
+    points = {contact.name: contact for contact in contacts(scenario, built)}
     try:
         return replace(built, q0=on_surfaces(Model(built), points, initial.on_surface, initial.keep))
     except ModelError as error:

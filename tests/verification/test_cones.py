@@ -19,6 +19,14 @@ def solve(W, b, kind, mu=0.0, start=None, tolerance=1e-12):
     return residual, f
 
 
+def test_no_rows_are_solved_by_no_forces():
+    """Also where nothing is compiled, which would not look at a room that is not there."""
+    no = np.zeros(0)
+    for solve_them in (solve_cones, getattr(solve_cones, "py_func", solve_cones)):
+        room = np.zeros((CONE_ROOM, 0, 0))
+        assert solve_them(np.zeros((0, 0)), no, np.zeros(0, dtype=np.int64), no, 0, no, room, 1e-12) == 0.0
+
+
 def violation(W, b, kind, mu, f):
     """The worst violation of the conditions as they are written, in the units of u, without any natural map."""
     u, worst, k = W @ f + b, 0.0, 0

@@ -53,6 +53,25 @@ def test_posture_on_the_surfaces_with_least_change(keep):
     assert np.abs(along @ (q - q_0)[free]).max() <= 1e-7
 
 
+def test_candidates_are_put_on_their_surfaces_too():
+    """Ends of links rest a radius above the floor; the axis of a link is no point that could be put anywhere."""
+    start = {"plant.initial_deg": OFF, "surfaces.floor.point_m": [0, 0, -0.02]}
+    case = dynsim.load_scenario(
+        "elbow_comparison_links", overrides={**start, "initial": {"on_surface": ["joint_4", "joint_7"]}}
+    )
+    model = dynsim.build_model(case)
+    for body in ("link_4", "link_7"):
+        assert model.point_position(body, [0, 0, 0], model.robot.initial)[2] == pytest.approx(-0.01, abs=1e-12)
+    pillar = {"type": "sphere", "center_m": [0, 0, -9], "radius_m": 1}
+    with pytest.raises(DynsimError, match=r"initial.on_surface: 'link_4' is the axis of a link"):
+        dynsim.build_model(
+            dynsim.load_scenario(
+                "elbow_comparison_links",
+                overrides={"surfaces": {"floor": pillar}, "initial": {"on_surface": ["link_4"]}},
+            )
+        )
+
+
 def test_posture_that_no_joint_can_reach_is_refused():
     everything = [f"joint_{k}" for k in range(1, 11)]
     with pytest.raises(DynsimError, match=r"initial: the joints that may move do not bring elbow_4, elbow_7"):

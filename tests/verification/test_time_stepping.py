@@ -7,6 +7,7 @@ import pytest
 from random_robots import Bench, bench, random_robot
 from scipy.integrate import solve_ivp
 
+import dynsim
 from dynsim.kernels.integrate.run import FINISHED, STATUS, STEPS, Run
 from dynsim.kernels.integrate.time_stepping import (
     BAD,
@@ -162,6 +163,25 @@ def test_friction_that_depends_on_the_speed_is_followed_to_first_order():
     ):
         errors = np.array([slide(b, 1.0, times, h).states("v")[-1, 0] - exact for h in (4e-3, 2e-3, 1e-3)])
         np.testing.assert_allclose(np.log2(errors[:-1] / errors[1:]), 1.0, atol=0.05)
+
+
+def test_friction_that_gives_energy_is_told_in_words_of_the_law(tmp_path):
+    """On a real floor nothing pulls: what a coarse step lets friction give is an error of that step."""
+    path = tmp_path / "slam.yaml"
+    path.write_text(
+        "duration_s: 0.5\n"
+        "plant:\n  type: serial_arm\n"
+        "  link: {mass_kg: 0.2, length_m: 0.25, damping_N_m_s_per_rad: 0.002}\n  chain: [{axis: y, initial_deg: 80}]\n"
+        "surfaces: {floor: {type: plane}}\n"
+        "contacts:\n  {law: unilateral, friction: 0.3, restitution: 0.5, "
+        "points: {tip: {body: link_1, point_m: [0, 0, 0.25]}}}\n"
+        "integrator: {method: time_stepping, step_s: 0.001}\n"
+    )
+    summary = dynsim.simulate(dynsim.load_scenario(path)).summary
+    assert summary["friction_heat_J"] < 0.0
+    (told,) = [text for text in summary["warnings"] if "friction has put" in text]
+    assert "integrator.step_s" in told
+    assert "pulling" not in told
 
 
 def test_a_run_in_pieces_is_the_same_run():

@@ -84,6 +84,25 @@ def test_a_block_on_a_slope_rests_or_slides(method, mu):
     assert residual(b, run) < 1e-8
 
 
+@pytest.mark.parametrize("method", ["rk43", "dopri5", "rk4", "rodas4"])
+@pytest.mark.parametrize("height", [0.0, 0.3])
+def test_a_block_without_friction_that_never_slips_stays(method, height):
+    """It slides, by mode, in no direction, at rest from the start or after it has fallen straight down."""
+    b = sloped(0.0, 0.0)
+    run = b.simulate(
+        b.state(vector(0.0, 0.0, height), np.zeros(3)),
+        np.linspace(0.0, 1.0, 5),
+        method,
+        step=1e-2 if method == "rk4" else 0.0,
+    )
+    touch, q = run.outputs("contact")[:, 0], run.states("q")
+    down = run.sample_time > np.sqrt(2.0 * height / G)
+    np.testing.assert_allclose(q[down], 0.0, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(touch[down, OUT_FORCE], 3.0 * G, rtol=1e-9)
+    assert (touch[down, OUT_MODE] == ka.SLIDING).all()
+    assert residual(b, run) < 1e-8
+
+
 def test_a_bouncing_ball():
     """Impact times of a ball with restitution e, and the time at which its bounces have come to an end."""
     e, height = 0.6, 0.5

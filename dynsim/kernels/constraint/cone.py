@@ -78,6 +78,8 @@ def solve_cones(W, b, kind, mu, p, f, room, tolerance):
     room : (CONE_ROOM, p, p) or more, scratch
     tolerance : residual that is good enough [units of u]
     """
+    if p == 0:  # of a system that nothing can touch, there is no room either
+        return 0.0
     residual = approach(W, b, kind, mu, p, f, room, tolerance, PATH_ROUNDS)
     if residual <= tolerance:
         return residual

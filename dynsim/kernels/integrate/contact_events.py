@@ -220,7 +220,10 @@ def take_directions(unilateral: UnilateralArrays | None, ws: Workspace, run: Run
 
 @internal_kernel
 def stay_tangential(slide, ws: Workspace, k):
-    """Keep a frozen direction along the surface, whose normal turns as the point moves on."""
+    """Keep a frozen direction along the surface, whose normal turns as the point moves on.
+
+    A point without friction may never have slipped, and has none then, or rounding that was along the normal: zero.
+    """
     state, size, along = ws.contacts, 0.0, 0.0
     for s in range(3):
         along += slide[k, REFERENCE + s] * state[k, NORMAL + s]
