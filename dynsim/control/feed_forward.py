@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 
 # Slip of the references [m/s] over which planned friction grows to its value: a jump would make the voltages ring.
 SLIP_SCALE = 5e-3
+# Further off its surface than this, by the references, a brace carries nothing [m].
+GAP_MAX = 2e-3
 
 
 def planned_voltages(
@@ -45,7 +47,8 @@ def planned_voltages(
     Raises
     ------
     ModelError
-        Joints without DC motors, or no forces that carry the motion.
+        Joints without DC motors, a brace that is no point or that the references take off its surface, or no forces
+        that carry the motion.
     """
     robot = model.robot
     driven = [motor.joint for motor in robot.motors]
@@ -54,6 +57,8 @@ def planned_voltages(
     q = np.tile(robot.initial, (len(times), 1))
     for name, values in positions.items():
         q[:, model.joint_names.index(name)] = values
+    for name, (contact, _) in braces.items():
+        _check_brace(model, name, contact, times, q)
     spline = make_interp_spline(times, q, k=5)
     v, vdot = spline(times, 1), spline(times, 2)
     rest = np.zeros(model.n)
@@ -80,6 +85,25 @@ def planned_voltages(
         return np.asarray(resistance * current)
     rate = make_interp_spline(times, current, k=5)(times, 1)
     return np.asarray(resistance * current + inductance * rate + constant * v[:, columns])
+
+
+def _check_brace(model: Model, name: str, contact: Contact, times: Array, q: Array) -> None:
+    """Refuse a brace that nothing can press against."""
+    keys = ("controller", "brace")
+    if contact.radius > 0.0 or contact.tip is not None:
+        raise ModelError(
+            f"controller.brace: {name} is no point but has a radius; name points of contacts.points that are to press",
+            keys=keys,
+        )
+    gaps = np.array([contact.surface.gap(model.point_position(contact.body, contact.point, row)) for row in q])
+    k = int(np.abs(gaps).argmax())
+    if abs(gaps[k]) > GAP_MAX:
+        raise ModelError(
+            f"controller.brace: the references take {name} {gaps[k]:+.4g} m off surface {contact.surface_name!r} at "
+            f"t = {times[k]:.3f} s (limit {GAP_MAX:g} m); let controller.hand.braces keep it there, or take "
+            "initial.on_surface",
+            keys=keys,
+        )
 
 
 def _brace(model: Model, contact: Contact, force: float | None, min_N: float, q: Array, v: Array) -> Brace:

@@ -55,6 +55,11 @@ FALLBACK = {
         "least_norm(small, state, active, p, k if least > POOR_PIVOT * largest else 0, largest)",
     ): DEPENDENT,
     Place(
+        "constraint/delassus.py",
+        "eliminate_to_rank",
+        "while last > k and abs(matrix[largest_in_column(matrix, last, k, p), last]) <= RANK_TOLERANCE * largest:",
+    ): DEPENDENT,
+    Place(
         "constraint/delassus.py", "eliminate_to_rank", "if abs(matrix[row, column]) <= RANK_TOLERANCE * largest:"
     ): DEPENDENT,
     Place("constraint/delassus.py", "eliminate_to_rank", "if abs(matrix[row, j]) > abs(matrix[row, other]):"): PIVOT,

@@ -172,3 +172,11 @@ def test_refused(overrides, said):
     model = dynsim.build_model(scenario())
     with pytest.raises(DynsimError, match=said):
         build.controller(scenario(**overrides), model)
+
+
+def test_a_brace_in_the_air_is_refused(tmp_path):
+    """Nothing would carry what is planned for it."""
+    raised = {"plant.base.position_m": [0.0, 0.0, 0.3], "controller.hand.path.center_m": [1.5, 1.5, 0.7]}
+    case = real_floor(tmp_path, **{"controller.brace": FORCES}, **raised)
+    with pytest.raises(DynsimError, match=r"elbow_4 \+0.3 m off surface 'floor'"):
+        dynsim.simulate(case)
