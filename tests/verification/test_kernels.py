@@ -67,7 +67,12 @@ def default_programs(kernel: Any) -> list[Any]:
         system_type = signature[0]
         part = dict(zip(system_type.fields, system_type.types, strict=True))
         part |= dict(zip(part["model"].fields, part["model"].types, strict=True))
-        if part["compound"] == part["shapes"] == part["unilateral"] == types.none:
+        part |= dict(zip(part["reference"].fields, part["reference"].types, strict=True))
+        absent = [part[name] for name in ("compound", "shapes", "unilateral", "voltage")]
+        for other in signature[1:]:
+            run = dict(zip(getattr(other, "fields", ()), getattr(other, "types", ()), strict=True))
+            absent += [run[name] for name in ("support", "stepping") if name in run]
+        if all(kind == types.none for kind in absent):
             found.append(signature)
     return found
 
