@@ -246,6 +246,7 @@ DOWN = np.array([np.cos(SLOPE), 0.0, -np.sin(SLOPE)])
 NORMAL = np.array([np.sin(SLOPE), 0.0, np.cos(SLOPE)])
 
 
+@pytest.mark.slow  # a program of its own to compile
 @pytest.mark.parametrize(("shape", "share"), [("sphere", 5.0 / 7.0), ("cylinder", 2.0 / 3.0)])
 def test_a_ball_and_a_cylinder_roll_down_a_slope(shape, share):
     """a = g sin α / (1 + I/(m r²)): 5/7 of a solid ball, 2/3 of a solid cylinder on the two spheres of its ends."""

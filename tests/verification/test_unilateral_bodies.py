@@ -33,6 +33,7 @@ def placed(b: Bench, place: np.ndarray, velocity: np.ndarray, turning: np.ndarra
     return b.state(np.concatenate([place, [1.0, 0.0, 0.0, 0.0]]), np.concatenate([velocity, turning]))
 
 
+@pytest.mark.slow  # a program of its own, which takes half a minute to compile
 def test_a_disc_on_three_feet_slides_pivots_and_stops():
     """Weight and overturning moment of friction give the feet's forces; one foot stops first, the others turn about it.
 
@@ -106,6 +107,7 @@ def test_a_disc_on_three_feet_slides_pivots_and_stops():
     assert np.abs(ledger_residual(run)).max() < 1e-9
 
 
+@pytest.mark.slow  # a program of its own, which takes half a minute to compile
 @pytest.mark.parametrize("spin", [np.zeros(3), vector(7.0, -4.0, 3.0)])
 def test_a_ball_slides_and_then_rolls(spin):
     """Slip u falls along itself by (7/2) μ g and is gone at 2 |u|/(7 μ g); v by 2 u/7; spin along n stays."""
@@ -132,6 +134,7 @@ def test_a_ball_slides_and_then_rolls(spin):
     assert np.abs(ledger_residual(run)).max() < 1e-9
 
 
+@pytest.mark.slow  # a program of its own, which takes half a minute to compile
 @pytest.mark.parametrize(("mu", "fall"), [(0.05, 2.0), (0.4, 2.0)])
 def test_an_oblique_bounce_of_a_ball(mu, fall):
     """Newton's restitution along n; of slip u the impulse takes 2 u/7 of the speed, or μ (1 + e) v_n if less."""
@@ -244,6 +247,7 @@ def pull(rate: float, along: np.ndarray) -> Load:
     return Load("pull", "body", np.zeros(3), False, np.array([0.0, 10.0]), coefficients, True)
 
 
+@pytest.mark.slow  # a program of its own, which takes half a minute to compile
 @pytest.mark.parametrize("direction", [0.0, 0.4, 2.5])
 def test_four_feet_hold_as_long_as_any_split_of_their_forces_does(direction):
     """A table pulled at its centre of mass: least norm would let it go early; all feet go at F = μ m g, together."""
