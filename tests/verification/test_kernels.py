@@ -77,6 +77,12 @@ def default_programs(kernel: Any) -> list[Any]:
     return found
 
 
+def has_compound_joints(model: Any) -> bool:
+    """True for the type of tables of a model that has joints with several velocities."""
+    part = dict(zip(getattr(model, "fields", ()), getattr(model, "types", ()), strict=True))
+    return part.get("compound", types.none) != types.none
+
+
 @pytest.mark.skipif(config.DISABLE_JIT, reason="nothing is compiled")
 def test_every_public_kernel_has_one_compiled_signature():
     run_everything()
@@ -93,7 +99,9 @@ def test_every_public_kernel_has_one_compiled_signature():
         ledger.kinetic_energy,
         ledger.potential_energy,
     ):
-        assert len(kernel.signatures) == 1, kernel
+        # Other tests of the process bring robots with joints of several velocities.
+        plain = [signature for signature in kernel.signatures if not has_compound_joints(signature[0])]
+        assert len(plain) == 1, kernel
 
 
 def test_kernels_run_as_plain_python(tmp_path):
