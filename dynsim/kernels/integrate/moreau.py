@@ -5,27 +5,20 @@ from __future__ import annotations
 from dynsim.kernels.arrays import (
     APPLIED,
     CIRCUIT,
-    CURRENT,
-    D_M,
     DAMPING,
-    DRAG,
     DRIVEN,
     FIRST_ROW,
     FORCE,
     GAP,
     GEAR_DAMPING,
-    J_M,
-    K_M,
     MODE,
     NORMAL_FORCE,
     OPEN,
     QD,
     QDD,
-    RESISTANCE,
     ROWS,
     SLIDING,
     STICKING,
-    VOLTAGE,
     ModelArrays,
     Q,
     Workspace,
@@ -46,12 +39,10 @@ from dynsim.kernels.integrate.output import write_output
 from dynsim.kernels.integrate.run import (
     END,
     EVALUATIONS,
-    FINISHED,
     HOLD,
     NOT_FINITE,
     PENDING,
     PROPOSED,
-    RUNNING,
     SAMPLE,
     STARTED,
     STATUS,
@@ -62,23 +53,24 @@ from dynsim.kernels.integrate.run import (
     TIME,
     Run,
 )
-from dynsim.kernels.integrate.steps import choose_step, finite
+from dynsim.kernels.integrate.steps import choose_step, finished, finite
 from dynsim.kernels.integrate.time_stepping import (
     BAD,
     PENETRATION,
     close_contacts,
+    constraint_rates,
     geometry,
     implicit_drives,
     moved,
     place_joints,
-    row_rates,
-    slip_speed,
+    slip_of_rates,
     solve_contacts,
     stop_forces,
     tangent_rows,
 )
 from dynsim.kernels.integrate.watch import watch
 from dynsim.kernels.jit import internal_kernel, kernel
+from dynsim.kernels.ledger import drive_powers
 from dynsim.kernels.state import (
     CONSTRAINT,
     CONTACT_SIZE,
@@ -134,7 +126,7 @@ def step_moreau(system: System, ws: Workspace, run: Run):
         add_loads(model, system.loads, t + theta * h, ws, run.stage[1], layout.load)
     tangent_rows(system, s, ws)
     factor(model, ws)
-    row_rates(model, ws, y, layout.v, s.rate[0])
+    constraint_rates(model, ws, y, layout.v, s.rate[0])
     if ws.counts[ROWS] > 0:
         row_system(model, ws)
         solve_contacts(system.unilateral, s, ws, h)
@@ -150,7 +142,7 @@ def step_moreau(system: System, ws: Workspace, run: Run):
     for i in range(n):
         y_new[layout.v + i] = v0[i] + h * last[i]
         joints[i, QDD] = last[i]
-    row_rates(model, ws, y_new, layout.v, s.rate[1])
+    constraint_rates(model, ws, y_new, layout.v, s.rate[1])
     for a in range(ws.motors.shape[0]):
         k, j = system.drives.table[a, CIRCUIT], system.drives.table[a, DRIVEN]
         if k >= 0:
@@ -162,11 +154,11 @@ def step_moreau(system: System, ws: Workspace, run: Run):
 def book(system: System, ws: Workspace, run: Run):
     """The ledger of the step into y_new: power at x_θ, and what contacts and couplings have done."""
     s, t, h, y, y_new, layout = run.stepping, run.clock[TIME], run.clock[STEP], run.y, run.y_new, system.layout
-    joints, motors, motor, theta, n = ws.joints, ws.motors, system.drives.motor, s.theta, ws.joints.shape[0]
+    joints, theta, n = ws.joints, s.theta, ws.joints.shape[0]
     between, body = run.stage[2], system.model.body
     for j in range(y.shape[0]):
         between[j] = y[j] + theta * (y_new[j] - y[j])
-    gear, joint, mechanical = 0.0, 0.0, 0.0
+    gear, joint = 0.0, 0.0
     place_joints(system, ws, y)
     for i in range(n):
         v = between[layout.v + i]
@@ -175,17 +167,7 @@ def book(system: System, ws: Workspace, run: Run):
         gear += body[i, GEAR_DAMPING] * v * v
         joint += body[i, DAMPING] * v * v
     drive(system.drives, system.reference, t + theta * h, between, layout, ws)
-    electrical, drawn, joule = 0.0, 0.0, 0.0
-    for a in range(motors.shape[0]):
-        i = system.drives.table[a, DRIVEN]
-        current, v = motors[a, CURRENT], joints[i, QD]
-        power = motors[a, VOLTAGE] * current
-        electrical += power
-        drawn += max(power, 0.0)
-        joule += motor[a, RESISTANCE] * current * current
-        shaft = motor[a, K_M] * current - motor[a, J_M] * joints[i, QDD] - motor[a, D_M] * v - motors[a, DRAG]
-        mechanical += shaft * v
-        gear += motors[a, DRAG] * v
+    electrical, drawn, joule, mechanical, drag = drive_powers(system.drives, ws)
     held, friction, first = 0.0, 0.0, layout.contact
     for r in range(ws.counts[ROWS]):
         held += 0.5 * ws.rows[r, FORCE] * (s.rate[0, r] + s.rate[1, r])
@@ -199,9 +181,9 @@ def book(system: System, ws: Workspace, run: Run):
             held -= power
             ws.contacts[k, NORMAL_FORCE] = ws.rows[r, FORCE]
             s.found[PENETRATION] = max(s.found[PENETRATION], -ws.contacts[k, GAP])
-            y_new[first + SLIP] += h * slip_speed(s, k, x, z)
+            y_new[first + SLIP] += h * slip_of_rates(s, k, x, z)
             y_new[first + IMPULSE] += h * ws.rows[r, FORCE]
-            motion = SLIDING if slip_speed(s, k, s.rate[1, r + 1], s.rate[1, r + 2]) > BAD else STICKING
+            motion = SLIDING if slip_of_rates(s, k, s.rate[1, r + 1], s.rate[1, r + 2]) > BAD else STICKING
             if motion == SLIDING and s.motion[k] == STICKING:
                 count_slip_start(system.unilateral, k)
         s.motion[k] = motion
@@ -210,7 +192,7 @@ def book(system: System, ws: Workspace, run: Run):
     y_new[start + ELECTRICAL] += h * electrical
     y_new[start + DRAWN] += h * drawn
     y_new[start + JOULE] += h * joule
-    y_new[start + GEAR] += h * gear
+    y_new[start + GEAR] += h * (gear + drag)
     y_new[start + JOINT] += h * joint
     y_new[start + FRICTION] += h * friction
     y_new[start + CONSTRAINT] += h * held
@@ -301,9 +283,7 @@ def advance_moreau(system: System, ws: Workspace, run: Run, limit):
     """``advance`` of time stepping."""
     clock, count, taken = run.clock, run.count, 0
     while not commands_due(system, ws, run):
-        if count[STATUS] == RUNNING and clock[END] - clock[TIME] <= 1e-12 * max(1.0, clock[END]):
-            count[STATUS] = FINISHED
-        if taken >= limit or count[STATUS] != RUNNING:
+        if finished(run) or taken >= limit:
             return
         taken += 1
         if count[PENDING] == 0:

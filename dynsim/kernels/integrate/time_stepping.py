@@ -73,7 +73,7 @@ from dynsim.kernels.arrays import (
     row_limit,
 )
 from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, CONE_ROOM, ONE_WAY, TANGENT, approach
-from dynsim.kernels.constraint.rows import set_modes
+from dynsim.kernels.constraint.rows import point_row, set_modes
 from dynsim.kernels.constraint.shapes import shaped_rows
 from dynsim.kernels.constraint.surface import contact_rows
 from dynsim.kernels.constraint.unilateral import (
@@ -288,8 +288,7 @@ def tangent_rows(system, s: SteppingArrays, ws: Workspace):
             r, d = first + m, NORMAL if m == 0 else FIRST_TANGENT if m == 1 else SECOND_TANGENT
             scale = s.law[k, GRIP] if m == 1 else 1.0
             dx, dy, dz = scale * state[k, d], scale * state[k, d + 1], scale * state[k, d + 2]
-            rows[r, ROW], rows[r, ROW + 1], rows[r, ROW + 2] = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
-            rows[r, ROW + 3], rows[r, ROW + 4], rows[r, ROW + 5] = dx, dy, dz
+            point_row(rows, r, x, y, z, dx, dy, dz)
             rows[r, TARGET] = 0.0
             for j in range(6):
                 rows[r, DIRECTION + j] = rows[r, ROW + j]
@@ -297,7 +296,7 @@ def tangent_rows(system, s: SteppingArrays, ws: Workspace):
 
 
 @internal_kernel
-def row_rates(model: ModelArrays, ws: Workspace, y, first, out):
+def constraint_rates(model: ModelArrays, ws: Workspace, y, first, out):
     """J v of all rows, v from ``first`` on in y. A row's rate climbs from its link to the world."""
     rows, links, active = ws.rows, ws.links, ws.active
     for r in range(ws.counts[ROWS]):
@@ -350,7 +349,7 @@ def friction_of(unilateral: UnilateralArrays | None, s: SteppingArrays, k, speed
 
 
 @internal_kernel
-def slip_speed(s: SteppingArrays, k, x, y):
+def slip_of_rates(s: SteppingArrays, k, x, y):
     """Slip of candidate k from the rates x, y of its tangents [m/s]."""
     x = x / s.law[k, GRIP] if s.law[k, GRIP] > 0.0 else 0.0
     return math.sqrt(x * x + y * y)
@@ -369,7 +368,7 @@ def solve_contacts(unilateral: UnilateralArrays | None, s: SteppingArrays, ws: W
         if ws.active[k, MODE] == STICKING:
             r = ws.active[k, FIRST_ROW]
             s.b[r] += s.law[k, RESTITUTION] * min(s.rate[0, r], 0.0)
-            s.mu[r] = friction_of(unilateral, s, k, slip_speed(s, k, s.rate[0, r + 1], s.rate[0, r + 2]))
+            s.mu[r] = friction_of(unilateral, s, k, slip_of_rates(s, k, s.rate[0, r + 1], s.rate[0, r + 2]))
             for m in range(MOST_ROWS):
                 s.f[r + m] = s.impulse[3 * k + m]
     residual = approach(ws.small[0], s.b, s.kind, s.mu, p, s.f, s.room, GOOD, QUICK_ROUNDS)
