@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.arrays import MU, ContactArrays
+from dynsim.kernels.arrays import FORCE, MU, ContactArrays, Q, Workspace
 from dynsim.kernels.constraint.cone import CONE_ROOM
 from dynsim.kernels.jit import inlined_kernel
 
@@ -113,6 +113,22 @@ def slide_direction(unilateral: UnilateralArrays, contacts: ContactArrays, k, x,
         a, b, c = x * scale, y * scale, z * scale
         speed = size if along >= 0.0 else -size
     return a, b, c, sliding_friction(law, k, contacts.point[k, MU], speed)
+
+
+@inlined_kernel
+def stop_gap(unilateral: UnilateralArrays, ws: Workspace, k):
+    """What joint stop k leaves its joint to go, ≥ 0 [rad or m]."""
+    stop = unilateral.stop
+    return stop[k, SIDE] * ws.joints[unilateral.stop_table[k, STOP_JOINT], Q] - stop[k, LIMIT]
+
+
+@inlined_kernel
+def note_stop_forces(unilateral: UnilateralArrays, ws: Workspace):
+    """Forces of the joint stops from their rows; none where they are open."""
+    table = unilateral.stop_table
+    for k in range(table.shape[0]):
+        closed = table[k, STOP_CLOSED] == 1
+        unilateral.stop[k, STOP_FORCE] = ws.rows[table[k, STOP_ROW], FORCE] if closed else 0.0
 
 
 @inlined_kernel

@@ -29,7 +29,7 @@ from dynsim.kernels.arrays import (
     STICKING,
     Workspace,
 )
-from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, ONE_WAY, TANGENT, solve_cones
+from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, ONE_WAY, TANGENT
 from dynsim.kernels.constraint.rows import set_modes
 from dynsim.kernels.constraint.unilateral import (
     BEFORE,
@@ -44,7 +44,6 @@ from dynsim.kernels.constraint.unilateral import (
     PROBLEM,
     REDUNDANT,
     REFERENCE,
-    SCRATCH,
     SECOND_PART,
     SLOW,
     SOLUTION,
@@ -62,15 +61,14 @@ from dynsim.kernels.constraint.unilateral import (
     slide_direction,
 )
 from dynsim.kernels.integrate.impacts import (
-    CONE_TOLERANCE,
     FORCE_TOLERANCE,
-    IMMOBILE,
     evaluate,
     find_touching,
     gather,
     impact,
     keep_touching,
     slip_speed,
+    solve_problem,
 )
 from dynsim.kernels.integrate.project import project_level
 from dynsim.kernels.integrate.run import (
@@ -117,7 +115,7 @@ def resolve(system: System, ws: Workspace, run: Run, touch):
 def choose(system: System, ws: Workspace, run: Run):
     """Modes by the accelerations of all that touches; the rates of what is closed are brought to zero."""
     unilateral = system.unilateral
-    mode, vector = unilateral.mode, unilateral.vector
+    mode = unilateral.mode
     p = gather(system, ws, run)
     largest = 0.0
     for r in range(p):
@@ -131,22 +129,10 @@ def choose(system: System, ws: Workspace, run: Run):
         size = reduce_rows(system, ws, run, p)
         if run.count[STATUS] == FORCES_REVERSED:
             return
-        residual = solve_cones(
-            unilateral.room[PROBLEM],
-            vector[OFFSET],
-            unilateral.place[KINDS],
-            vector[CONE_FRICTION],
-            size,
-            vector[SOLUTION],
-            unilateral.room[SCRATCH:],
-            1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE),
-        )
-        if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
-            run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
-            return
-        if not give_way(system, ws, size, largest):
-            solved = True
+        solved = solve_problem(unilateral, unilateral.room[PROBLEM], size, largest)
+        if not solved or not give_way(system, ws, size, largest):
             break
+        solved = False
     if not solved:
         run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
         return
@@ -177,18 +163,24 @@ def choose(system: System, ws: Workspace, run: Run):
 def begins_sliding(system: System, ws: Workspace, k):
     """True for a candidate that slides already, or has no friction to stick with; sets its direction."""
     unilateral = system.unilateral
-    slide, state = unilateral.slide, ws.contacts
-    speed = slip_speed(ws, k)
-    if speed > 2.0 * unilateral.number[SLOW]:
-        # An impact may have turned it.
-        slide[k, FROZEN] = 0.0
-        for s in range(3):
-            slide[k, REFERENCE + s] = state[k, SLIP_VELOCITY + s] / speed
+    # An impact may have turned it.
+    if slip_on(unilateral, ws, k, 2.0 * unilateral.number[SLOW]):
         return True
     if unilateral.law[k, STATIC] == 0.0:
-        slide[k, FROZEN] = 0.0
+        unilateral.slide[k, FROZEN] = 0.0
         return True
     return False
+
+
+@internal_kernel
+def slip_on(unilateral: UnilateralArrays, ws: Workspace, k, least):
+    """Let candidate k slide along its own slip, v_t/|v_t|, where that is faster than ``least`` [m/s]; True if it is."""
+    slide, speed = unilateral.slide, slip_speed(ws, k)
+    if speed > least:
+        slide[k, FROZEN] = 0.0
+        for s in range(3):
+            slide[k, REFERENCE + s] = ws.contacts[k, SLIP_VELOCITY + s] / speed
+    return speed > least
 
 
 @internal_kernel

@@ -80,15 +80,14 @@ from dynsim.kernels.constraint.unilateral import (
     HITS,
     LANDINGS,
     LIFT_OFFS,
-    LIMIT,
     SIDE,
     STATIC,
     STOP_CLOSED,
-    STOP_FORCE,
     STOP_JOINT,
-    STOP_ROW,
     UnilateralArrays,
+    note_stop_forces,
     sliding_friction,
+    stop_gap,
 )
 from dynsim.kernels.constraint.unilateral import RESTITUTION as LAW_RESTITUTION
 from dynsim.kernels.drive.law import drive_block
@@ -242,7 +241,7 @@ def close_stops(unilateral: UnilateralArrays | None, ws: Workspace):
     table, stop, changed = unilateral.stop_table, unilateral.stop, False
     for k in range(table.shape[0]):
         joint = ws.joints[table[k, STOP_JOINT]]
-        closed = 1 if stop[k, SIDE] * joint[Q] - stop[k, LIMIT] <= MARGIN else 0
+        closed = 1 if stop_gap(unilateral, ws, k) <= MARGIN else 0
         if closed > table[k, STOP_CLOSED] and stop[k, SIDE] * joint[QD] < -BAD:
             stop[k, HITS] += 1.0
         changed = changed or closed != table[k, STOP_CLOSED]
@@ -262,9 +261,7 @@ def stop_forces(unilateral: UnilateralArrays | None, ws: Workspace):
     """Forces of the joint stops, after the contact problem."""
     if unilateral is None:  # known to the compiler
         return
-    for k in range(unilateral.stop.shape[0]):
-        closed = unilateral.stop_table[k, STOP_CLOSED] == 1
-        unilateral.stop[k, STOP_FORCE] = ws.rows[unilateral.stop_table[k, STOP_ROW], FORCE] if closed else 0.0
+    note_stop_forces(unilateral, ws)
 
 
 @internal_kernel
