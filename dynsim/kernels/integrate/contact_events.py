@@ -40,6 +40,7 @@ from dynsim.kernels.constraint.unilateral import (
     DEEPEST,
     DEPTH,
     FROZEN,
+    GIVES_WAY,
     HEADWAY,
     HITS,
     LANDINGS,
@@ -66,7 +67,7 @@ from dynsim.kernels.constraint.unilateral import (
     UnilateralArrays,
     stop_gap,
 )
-from dynsim.kernels.integrate.contact_modes import begin_slip, resolve, slip_on
+from dynsim.kernels.integrate.contact_modes import begin_slip, drops, resolve, slip_on
 from dynsim.kernels.integrate.impacts import evaluate, slip_speed
 from dynsim.kernels.integrate.run import (
     CHATTER,
@@ -391,6 +392,10 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
                 # At the apex of its cone it leaves; there is no direction in which it could slip.
                 mode[k, WANTED] = OPEN
                 tell(system, run, k, LIFT_OFF)
+                continue
+            if drops(system, k):
+                # Forces jump, and with them the direction of slip.
+                mode[k, GIVES_WAY], by_hand = 1, False
                 continue
             begin_slip(system, ws, k, ws.rows[r + 1, FORCE], ws.rows[r + 2, FORCE])
             mode[k, WANTED] = SLIDING

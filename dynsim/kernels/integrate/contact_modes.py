@@ -36,6 +36,7 @@ from dynsim.kernels.constraint.unilateral import (
     CONE_FRICTION,
     FIRST_PART,
     FROZEN,
+    GIVES_WAY,
     HEADWAY,
     KINDS,
     NEXT,
@@ -79,7 +80,7 @@ from dynsim.kernels.integrate.run import (
     TIME,
     Run,
 )
-from dynsim.kernels.jit import internal_kernel
+from dynsim.kernels.jit import inlined_kernel, internal_kernel
 from dynsim.kernels.state import IMPACT_LOSS
 from dynsim.kernels.system import System
 
@@ -123,6 +124,7 @@ def choose(system: System, ws: Workspace, run: Run):
     for k in range(mode.shape[0]):
         if mode[k, TOUCHING] == 1:
             mode[k, WANTED] = SLIDING if begins_sliding(system, ws, k) else STICKING
+            mode[k, GIVES_WAY] = 1 if mode[k, GIVES_WAY] == 1 and drops(system, k) else 0
     solved = False
     # Where static friction gives way to a smaller kinetic one, the others' forces change.
     for _ in range(1 + mode.shape[0]):
@@ -155,6 +157,7 @@ def choose(system: System, ws: Workspace, run: Run):
     evaluate(system, ws, run)
     unilateral.number[REDUNDANT] = 1.0 if ws.counts[DEPENDENT] > before else 0.0
     for k in range(mode.shape[0]):
+        mode[k, GIVES_WAY] = 0
         starts = mode[k, WANTED] == SLIDING and mode[k, TOUCHING] == STICKING
         unilateral.slide[k, HEADWAY] = max(0.0, -unilateral.slide[k, SPEED]) if starts else 0.0
 
@@ -213,7 +216,7 @@ def reduce_rows(system: System, ws: Workspace, run: Run, p):
             place[KINDS, size] = ONE_WAY
             size += 1
         else:
-            vector[CONE_FRICTION, size] = unilateral.law[k, STATIC]
+            vector[CONE_FRICTION, size] = friction_at_rest(system, k)
             for s in range(3):
                 place[KINDS, size] = CONE if s == 0 else TANGENT
                 place[TABLE_ROW, size], vector[FIRST_PART, size], vector[SECOND_PART, size] = r + s, 0.0, 0.0
@@ -265,21 +268,38 @@ def begin_slip(system: System, ws: Workspace, k, fx, fy):
     slide[k, NEXT_SPEED] = 0.0
 
 
+@inlined_kernel
+def drops(system: System, k):
+    """True for a candidate whose friction falls from a static coefficient to a smaller kinetic one when it slips."""
+    law = system.unilateral.law
+    return law[k, STRIBECK] == 0.0 and law[k, STATIC] > system.contacts.point[k, MU]
+
+
+@inlined_kernel
+def friction_at_rest(system: System, k):
+    """Coefficient of the cone of candidate k, which is at rest along its surface."""
+    gives_way = system.unilateral.mode[k, GIVES_WAY] == 1
+    return system.contacts.point[k, MU] if gives_way else system.unilateral.law[k, STATIC]
+
+
 @internal_kernel
 def give_way(system: System, ws: Workspace, size, largest):
-    """Let what slips over a static coefficient that is larger than the kinetic one slide; True if something does."""
+    """Give what slips over a static coefficient the smaller kinetic one; True if something does.
+
+    It stays a cone: the direction in which it begins to slip is not that of the larger force, unless its mobility is
+    the same in all directions.
+    """
     unilateral = system.unilateral
-    place, mode, law, f = unilateral.place, unilateral.mode, unilateral.law, unilateral.vector[SOLUTION]
+    place, mode, f = unilateral.place, unilateral.mode, unilateral.vector[SOLUTION]
     changed, i = False, 0
     for k in range(mode.shape[0]):
         if mode[k, TOUCHING] == 0:
             continue
         while place[TABLE_ROW, i] != ws.active[k, FIRST_ROW]:
             i += 1
-        drops = law[k, STRIBECK] == 0.0 and law[k, STATIC] > system.contacts.point[k, MU] and f[i] > 0.0
-        if mode[k, WANTED] == STICKING and drops and slips(system, i, size, largest, law[k, STATIC]):
-            begin_slip(system, ws, k, f[i + 1], f[i + 2])
-            mode[k, WANTED] = SLIDING
+        holds = mode[k, WANTED] == STICKING and mode[k, GIVES_WAY] == 0 and f[i] > 0.0
+        if holds and drops(system, k) and slips(system, i, size, largest, unilateral.law[k, STATIC]):
+            mode[k, GIVES_WAY] = 1
             changed = True
     return changed
 
@@ -305,6 +325,6 @@ def take_solution(system: System, ws: Workspace, size, largest):
             i += 1
         if not f[i] > FORCE_TOLERANCE * strongest:
             mode[k, WANTED] = OPEN
-        elif mode[k, WANTED] == STICKING and slips(system, i, size, largest, unilateral.law[k, STATIC]):
+        elif mode[k, WANTED] == STICKING and slips(system, i, size, largest, friction_at_rest(system, k)):
             begin_slip(system, ws, k, f[i + 1], f[i + 2])
             mode[k, WANTED] = SLIDING
