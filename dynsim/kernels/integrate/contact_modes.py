@@ -34,11 +34,13 @@ from dynsim.kernels.constraint.rows import set_modes
 from dynsim.kernels.constraint.unilateral import (
     BEFORE,
     CONE_FRICTION,
+    DEPTH,
     FIRST_PART,
     FROZEN,
     GIVES_WAY,
     HEADWAY,
     KINDS,
+    LANDS_AT,
     NEXT,
     NEXT_SPEED,
     OFFSET,
@@ -130,13 +132,18 @@ def choose(system: System, ws: Workspace, run: Run):
     for _ in range(1 + mode.shape[0]):
         size = reduce_rows(system, ws, run, p)
         if run.count[STATUS] == FORCES_REVERSED:
-            return
+            break
         solved = solve_problem(unilateral, unilateral.room[PROBLEM], size, largest)
         if not solved or not give_way(system, ws, size, largest):
             break
         solved = False
     if not solved:
-        run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
+        if run.count[STATUS] != FORCES_REVERSED:
+            run.count[STATUS] = NO_CONTACT_FORCES
+        run.clock[NOT_UNIQUE] = run.clock[TIME]
+        # Whoever looks for the cause finds the rows that contradict the law.
+        set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
+        evaluate(system, ws, run)
         return
     take_solution(system, ws, size, largest)
     # What is left of rates after an impact that was let settle, and of points that were solved for as if at rest: those
@@ -231,7 +238,7 @@ def reduce_rows(system: System, ws: Workspace, run: Run, p):
                 value += vector[FIRST_PART, j] * W[a, b + 1] + vector[SECOND_PART, j] * W[a, b + 2]
             unilateral.room[PROBLEM, i, j] = value
         if place[KINDS, i] == ONE_WAY and W[a, a] > 0.0 and unilateral.room[PROBLEM, i, i] <= 1e-12 * W[a, a]:
-            run.count[STATUS], run.clock[NOT_UNIQUE] = FORCES_REVERSED, run.clock[TIME]
+            run.count[STATUS] = FORCES_REVERSED
     return size
 
 
@@ -324,7 +331,8 @@ def take_solution(system: System, ws: Workspace, size, largest):
         while place[TABLE_ROW, i] != ws.active[k, FIRST_ROW]:
             i += 1
         if not f[i] > FORCE_TOLERANCE * strongest:
-            mode[k, WANTED] = OPEN
+            # It touches without a force, maybe a little below its surface: only if it goes on does it land.
+            mode[k, WANTED], unilateral.slide[k, LANDS_AT] = OPEN, DEPTH
         elif mode[k, WANTED] == STICKING and slips(system, i, size, largest, friction_at_rest(system, k)):
             begin_slip(system, ws, k, f[i + 1], f[i + 2])
             mode[k, WANTED] = SLIDING

@@ -29,6 +29,7 @@ from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, ONE_WAY, TANGENT, so
 from dynsim.kernels.constraint.rows import row_errors, set_modes
 from dynsim.kernels.constraint.unilateral import (
     BEFORE,
+    CHANGES,
     CONE_FRICTION,
     KINDS,
     LOSS,
@@ -63,6 +64,8 @@ from dynsim.kernels.tree.articulated import accelerate
 
 # A point that approaches faster than this many tolerances of projected rates strikes.
 STRIKE = 3.0
+# Impacts at one instant, of which each is the cause of the next, before restitution is none.
+MOST_BOUNCES = 30.0
 # What begins to touch is brought this close to its surface [m].
 FOOT_TOLERANCE = 1e-13
 # Of a solution of the cones: residual by the largest entry, and what of the largest force is none.
@@ -237,8 +240,10 @@ def impact(system: System, ws: Workspace, run: Run):
     for r in range(p):
         largest = max(largest, abs(rows[r, ROW_RATE]))
     # Newton's restitution may contradict friction: a point that is wedged cannot leave, and some would gain energy.
-    # Those impacts are without restitution, which always has a solution, and a loss.
-    if not impulses(system, ws, p, largest, 1.0) and not impulses(system, ws, p, largest, 0.0):
+    # Those impacts are without restitution, which always has a solution, and a loss. So are those of points that throw
+    # each other back and forth at one instant: what accumulates ends in contact.
+    bouncing = unilateral.number[CHANGES] <= MOST_BOUNCES and impulses(system, ws, p, largest, 1.0)
+    if not bouncing and not impulses(system, ws, p, largest, 0.0):
         run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
         return
     f = vector[SOLUTION]
