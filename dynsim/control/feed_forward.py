@@ -18,6 +18,7 @@ from dynsim.model.bracing import MIN_N, Brace
 from dynsim.model.description import Contact
 from dynsim.model.drives import Motor
 from dynsim.model.model import Model
+from dynsim.model.shapes import gap_at
 
 Array = NDArray[np.float64]
 
@@ -78,7 +79,7 @@ def planned_voltages(
         torques[k] = found.torques
     columns = [model.joint_names.index(joint) for joint in driven]
     motors = [motor for motor in robot.motors if isinstance(motor, Motor)]
-    constant = np.array([motor.torque_constant * motor.gear_ratio for motor in motors])
+    constant = np.array([motor.joint_constant for motor in motors])
     resistance, inductance = (np.array([getattr(m, key) for m in motors]) for key in ("resistance", "inductance"))
     current = torques[:, columns] / constant
     if not whole:
@@ -95,7 +96,7 @@ def _check_brace(model: Model, name: str, contact: Contact, times: Array, q: Arr
             f"controller.brace: {name} is no point but has a radius; name points of contacts.points that are to press",
             keys=keys,
         )
-    gaps = np.array([contact.surface.gap(model.point_position(contact.body, contact.point, row)) for row in q])
+    gaps = np.array([gap_at(model, contact, row) for row in q])
     k = int(np.abs(gaps).argmax())
     if abs(gaps[k]) > GAP_MAX:
         raise ModelError(

@@ -79,7 +79,7 @@ class BracePlanner:
         for j, joint in enumerate(robot.joint_names):
             motor = self._drives.get(joint)
             if motor is not None and not isinstance(motor, TorqueSource):
-                motors[j, kb.HEAT] = motor.resistance / _constant(motor) ** 2
+                motors[j, kb.HEAT] = motor.resistance / motor.joint_constant**2
         link = integers([robot.attach(brace.body, brace.point)[0] for brace in braces.values()])
         self._arrays = kb.brace_arrays(link, reals(np.zeros((len(braces), kb.BRACE_SIZE))), motors)
 
@@ -137,18 +137,13 @@ def _brace_row(robot: Robot, name: str, brace: Brace) -> Array:
     return row
 
 
-def _constant(motor: Motor | Servo) -> float:
-    """K_m [N m/A] at the joint."""
-    return motor.torque_constant * (motor.gear_ratio if isinstance(motor, Motor) else 1.0)
-
-
 def _torque_limits(motor: Motor | Servo | TorqueSource | None, v: float) -> tuple[float, float]:
     """Least and largest torque of a motor at a steady current and a rate v: |R i + K_m v| ≤ U, |i| ≤ I."""
     if motor is None:
         return 0.0, 0.0
     if isinstance(motor, TorqueSource):
         return -motor.torque_limit, motor.torque_limit
-    constant = _constant(motor)
+    constant = motor.joint_constant
     current = motor.greatest_current if isinstance(motor, Servo) else np.inf
     low = max(-current, (-motor.voltage_limit - constant * v) / motor.resistance)
     high = min(current, (motor.voltage_limit - constant * v) / motor.resistance)
