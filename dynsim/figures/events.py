@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -26,6 +26,8 @@ MARKS: dict[str, tuple[str, str, str]] = {
 COLOUR = "#555555"
 # Lines of more events than this would hide the curves; their marks stay.
 LINES = 40
+# Comparisons with more variants than this would need more room for the rows of their marks than for their curves.
+VARIANTS = 6
 # Marks lie so far below the upper edge [point].
 BELOW = 4.0
 
@@ -36,7 +38,7 @@ def marked(record: Record, names: Iterable[str] | None = None) -> list[Event]:
     return [event for event in record.events if event.kind in MARKS and (chosen is None or event.name in chosen)]
 
 
-def mark(axes: Axes, events: Sequence[Event], colour: str = COLOUR, *, row: int = 0) -> None:
+def mark(axes: Axes, events: Sequence[Event], colour: str = COLOUR, *, row: int = 0, lines: bool = True) -> None:
     """Draw events that lie within the axes: a faint line each and its mark, in a row from the upper edge down."""
     low, high = axes.get_xlim()
     inside = [event for event in events if low <= event.time <= high]
@@ -48,7 +50,7 @@ def mark(axes: Axes, events: Sequence[Event], colour: str = COLOUR, *, row: int 
         if not times:
             continue
         axes.plot(times, [1.0] * len(times), marker, transform=place, label="_event", **look)
-        if len(inside) <= LINES:
+        if lines and len(inside) <= LINES:
             for time in times:
                 axes.axvline(time, color=colour, linewidth=0.5, alpha=0.35, zorder=0.5)
     axes.set_xlim(low, high)
@@ -63,6 +65,23 @@ def mark_all(rows: Iterable[Sequence[Axes]], record: Record) -> None:
         for axes in panels:
             mark(axes, found)
     explain(rows[-1][-1], found)
+
+
+def mark_variants(
+    rows: Iterable[Sequence[Axes]], records: Mapping[str, Record], colours: Mapping[str, str]
+) -> list[Event]:
+    """Mark the events of several runs, a row of marks in its colour for each that has some; returns what is marked.
+
+    Lines through the panels are left out: those of one variant would cross the curves of all the others.
+    """
+    having = {name: found for name, record in records.items() if (found := marked(record))}
+    if len(having) > VARIANTS:
+        return []
+    for panels in (rows := list(rows)):
+        for axes in panels:
+            for row, (name, found) in enumerate(having.items()):
+                mark(axes, found, colours[name], row=row, lines=False)
+    return [event for found in having.values() for event in found]
 
 
 def explain(axes: Axes, events: Sequence[Event]) -> None:
