@@ -100,9 +100,15 @@ def joint_stops(robot: Robot) -> list[JointStop]:
             if np.isfinite(limit):
                 beyond = side * (limit - robot.initial[k])
                 if beyond > START_TOLERANCE:
+                    start, stop = (_told(value, link.units[0]) for value in (robot.initial[k], limit))
                     raise ModelError(
-                        f"{link.joint}: starts at {robot.initial[k]:.6g} {link.units[0]}, beyond its stop {limit:.6g}; "
+                        f"{link.joint}: starts at {start}, beyond its stop {stop}; "
                         "contacts.law: unilateral enforces it: change its initial position or its limit"
                     )
                 found.append(JointStop(link.joint, side, float(limit)))
     return found
+
+
+def _told(position: float, unit: str) -> str:
+    """A position as scenarios have it: angles in degrees."""
+    return f"{np.degrees(position):.6g}°" if unit == "rad" else f"{position:.6g} {unit}"
