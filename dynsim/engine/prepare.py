@@ -93,12 +93,13 @@ def prepare(
     n, na, c = model.n, len(robot.motors), len(contacts)
     real = scenario.config.contacts.law == "unilateral"
     stops = joint_stops(robot) if real else []
-    layout = state_layout(model.nq, n, robot.circuits, c, len(loads), LOSSES if real else 0)
+    stepped = scenario.integrator.method == "time_stepping"
+    layout = state_layout(model.nq, n, robot.circuits, c, len(loads), LOSSES if real else 0, 1 if stepped else 0)
     columns = output_layout(n, na, c, OUTPUTS if robot.base else 0, len(stops))
     if times is None:
         times = sample_times(scenario, layout, columns, n)
     _check_coordinates(scenario, robot)
-    if scenario.integrator.method == "time_stepping" and robot.base is not None:
+    if stepped and robot.base is not None:
         raise ScenarioError("integrator.method: time_stepping locates no events, such as a mobile base that tips")
     _check_stiffness(scenario, robot)
     joint_rows = len(robot.couplings) + len(stops)
