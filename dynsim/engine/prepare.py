@@ -99,16 +99,8 @@ def prepare(
     if times is None:
         times = sample_times(scenario, layout, columns, n)
     _check_coordinates(scenario, robot)
-    if stepped:
-        if robot.base is not None:
-            raise ScenarioError("integrator.method: time_stepping locates no events, such as a mobile base that tips")
-        if contacts and not real:
-            raise ScenarioError("integrator.method: time_stepping needs `contacts: {law: unilateral}`")
-        if scenario.integrator.solver != "articulated":
-            raise ScenarioError(
-                f"integrator.solver: {scenario.integrator.solver} is not of integrator.method: time_stepping, which "
-                "solves with articulated sweeps; remove it"
-            )
+    if stepped and robot.base is not None:
+        raise ScenarioError("integrator.method: time_stepping locates no events, such as a mobile base that tips")
     _check_stiffness(scenario, robot)
     joint_rows = len(robot.couplings) + len(stops)
     _check_work(scenario, n, c + joint_rows)

@@ -108,7 +108,8 @@ def joint_stops(robot: Robot) -> list[JointStop]:
                     raise ModelError(
                         f"{link.joint}: starts at {told(robot.initial[k], link.units[0])}, beyond its stop at "
                         f"{told(limit, link.units[0])}; "
-                        "contacts.law: unilateral enforces it: change its initial position or its limit"
+                        "contacts.law: unilateral enforces it: change its initial position or its limit",
+                        keys=("plant",),
                     )
                 found.append(JointStop(link.joint, side, float(limit)))
     return found
