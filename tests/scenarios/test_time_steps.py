@@ -47,7 +47,7 @@ def test_bounces_are_landings_and_lift_offs_when_events_have_them():
     contact = record.summary["contacts"][0]
     assert len(times(record, "landing")) == contact["landings"] > 3
     assert len(times(record, "lift_off")) == contact["lift_offs"]
-    kinds = [event.kind for event in record.events]
+    kinds = [event.kind for event in record.events if "slip" not in event.kind]
     assert kinds == ["landing", "lift_off"] * (len(kinds) // 2) + ["landing"] * (len(kinds) % 2)
 
 
@@ -70,9 +70,10 @@ def test_a_stop_is_hit_and_left(tmp_path: Path):
     assert exact.events
     found = [(event.kind, event.name) for event in stepped.events]
     assert found == [(event.kind, event.name) for event in exact.events]
-    np.testing.assert_allclose(
-        [event.time for event in stepped.events], [event.time for event in exact.events], atol=2 * H
-    )
+    # It is left once the joint is out again of what it sank in, h times the speed of the blow.
+    late = np.subtract([event.time for event in stepped.events], [event.time for event in exact.events])
+    assert (late >= 0.0).all()
+    assert (late <= [2 * H, 10 * H]).all()
     assert stepped.summary["joint_stops"][0]["hits"] == exact.summary["joint_stops"][0]["hits"] == 1
     assert stepped.summary["energy_residual_relative"] < 1e-9
 
@@ -125,7 +126,7 @@ def test_a_snake_on_wheels(tmp_path: Path):
         "  motor: {type: servo, voltage_V: 12, stall_torque_N_m: 6, no_load_speed_rad_per_s: 8, "
         "k_p_V_per_rad: 60, k_d_V_s_per_rad: 1, rotor_inertia_kg_m2: 0.005, coulomb_friction_N_m: 0.05, "
         "coulomb_speed_rad_per_s: 0.05}\n"
-        "loads: {pull: {type: force, body: link_12, force_N: [2, 0, 0]}}\n"
+        "loads: {pull: {type: constant, body: link_12, force_N: [2, 0, 0]}}\n"
         "surfaces: {floor: {type: plane}}\n"
         f"contacts:\n  law: unilateral\n  friction: 0.6\n  points:\n{wheels}"
         "integrator: {method: time_stepping, step_s: 0.001}\n"
