@@ -83,9 +83,9 @@ def prepare(
     ScenarioError
         The record would be larger than ``record.size_limit_GB``, or the explicit method would need too many steps.
     """
-    described = build.robot(scenario)
+    described, contacts = build.robot_and_contacts(scenario)
     model = Model(described if motors is None else replace(described, motors=tuple(motors)))
-    robot, contacts = model.robot, build.contacts(scenario, model.robot)
+    robot = model.robot
     build.check_start(scenario, model, contacts)
     loads = build.loads(scenario, robot)
     if pushable:
@@ -112,7 +112,7 @@ def prepare(
     _check_stiffness(scenario, robot)
     joint_rows = len(robot.couplings) + len(stops)
     _check_work(scenario, n, c + joint_rows)
-    control = _control(scenario, model, progress)
+    control = _control(scenario, model, contacts, progress)
     if not real:
         _check_references(scenario, robot, contacts, control)
     options, size = scenario.integrator, n + ka.row_limit(c, joint_rows) + robot.circuits
@@ -271,12 +271,14 @@ def _check_work(scenario: Scenario, n: int, p: int) -> None:
         )
 
 
-def _control(scenario: Scenario, model: Model, progress: Progress | None) -> JointControl:
+def _control(scenario: Scenario, model: Model, contacts: Sequence[Contact], progress: Progress | None) -> JointControl:
     if scenario.controller is None:
         return JointControl.absent(model.robot)
     log.info("%s: planning references over %g s", scenario.title, scenario.duration_s)
     started = clock.perf_counter()
-    control = build.controller(scenario, model, None if progress is None else partial(progress, stage=REFERENCES))
+    control = build.controller(
+        scenario, model, None if progress is None else partial(progress, stage=REFERENCES), contacts
+    )
     log.info("%s: planned references in %.3f s", scenario.title, clock.perf_counter() - started)
     if not isinstance(control, JointControl):
         raise ModelError(f"controller {scenario.controller.type!r} cannot drive a {scenario.plant.type!r}")

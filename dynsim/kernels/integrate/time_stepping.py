@@ -75,18 +75,15 @@ from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, CONE_ROOM, ONE_WAY, 
 from dynsim.kernels.constraint.rows import point_row, set_modes
 from dynsim.kernels.constraint.shapes import shaped_rows
 from dynsim.kernels.constraint.surface import contact_rows
+from dynsim.kernels.constraint.unilateral import RESTITUTION as LAW_RESTITUTION
 from dynsim.kernels.constraint.unilateral import (
-    LIMIT,
-    SIDE,
     STATIC,
     STOP_CLOSED,
-    STOP_FORCE,
-    STOP_JOINT,
-    STOP_ROW,
     UnilateralArrays,
+    note_stop_forces,
     sliding_friction,
+    stop_gap,
 )
-from dynsim.kernels.constraint.unilateral import RESTITUTION as LAW_RESTITUTION
 from dynsim.kernels.drive.law import drive_block
 from dynsim.kernels.jit import integers, internal_kernel, reals
 from dynsim.kernels.tree.joints import displace, normalise, read_positions
@@ -246,10 +243,9 @@ def close_stops(unilateral: UnilateralArrays | None, ws: Workspace):
     """Close the joint stops whose gap is not open, open the others; True when one has changed."""
     if unilateral is None:  # known to the compiler
         return False
-    table, stop, changed = unilateral.stop_table, unilateral.stop, False
+    table, changed = unilateral.stop_table, False
     for k in range(table.shape[0]):
-        joint = ws.joints[table[k, STOP_JOINT]]
-        closed = 1 if stop[k, SIDE] * joint[Q] - stop[k, LIMIT] <= MARGIN else 0
+        closed = 1 if stop_gap(unilateral, ws, k) <= MARGIN else 0
         changed = changed or closed != table[k, STOP_CLOSED]
         table[k, STOP_CLOSED] = closed
     return changed
@@ -260,9 +256,7 @@ def stop_forces(unilateral: UnilateralArrays | None, ws: Workspace):
     """Forces of the joint stops, after the contact problem."""
     if unilateral is None:  # known to the compiler
         return
-    for k in range(unilateral.stop.shape[0]):
-        closed = unilateral.stop_table[k, STOP_CLOSED] == 1
-        unilateral.stop[k, STOP_FORCE] = ws.rows[unilateral.stop_table[k, STOP_ROW], FORCE] if closed else 0.0
+    note_stop_forces(unilateral, ws)
 
 
 @internal_kernel
