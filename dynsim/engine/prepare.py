@@ -17,7 +17,7 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.contact_events import NORMAL_GUARD, SLIP_GUARD, STOP_GUARD
 from dynsim.kernels.integrate.events import TIP_MARGIN
-from dynsim.kernels.integrate.time_stepping import stepping_arrays
+from dynsim.kernels.integrate.time_stepping import GRIP, GRIP_AXIS, stepping_arrays
 from dynsim.kernels.state import LOSSES, OutputLayout, StateLayout, block, output_layout, state_layout
 from dynsim.kernels.system import System, new_workspace
 from dynsim.kernels.tree.support import OUTPUTS
@@ -34,7 +34,7 @@ from dynsim.model.description import Array, Contact, Load, Robot
 from dynsim.model.drives import Drive, Motor
 from dynsim.model.model import Model
 from dynsim.model.shapes import compile_shapes
-from dynsim.model.unilateral import JointStop, compile_unilateral, joint_stops
+from dynsim.model.unilateral import JointStop, compile_grips, compile_unilateral, joint_stops
 from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, build
 
@@ -127,6 +127,7 @@ def prepare(
     stepping = None
     if method == ki.TIME_STEPPING:
         stepping = stepping_arrays(model.arrays, system.contacts, na, joint_rows, options.theta, system.unilateral)
+        stepping.law[:, GRIP : GRIP_AXIS + 3] = compile_grips(robot, contacts)
     y = np.zeros(layout.size)
     y[block(layout, "q")] = robot.initial
     run = ki.new_run(

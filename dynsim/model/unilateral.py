@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynsim.errors import ModelError
 from dynsim.kernels import arrays as ka
@@ -89,6 +90,15 @@ def compile_unilateral(
         split_room=reals(np.zeros(split_size(3 * c, c))),
         number=reals(number),
     )
+
+
+def compile_grips(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float64]:
+    """Friction along an axis per that across, and the axis in the link's frame, (c, 4); 1 where it is isotropic."""
+    grips = np.ones((len(contacts), 4))
+    for row, contact in zip(grips, contacts, strict=True):
+        if contact.grip_axis is not None:
+            row[0], row[1:] = contact.grip, robot.attached_axes(contact.body) @ contact.grip_axis
+    return grips
 
 
 def joint_stops(robot: Robot) -> list[JointStop]:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig, error_at
+from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig, Vector3, error_at
 from dynsim.families import member, union
 from dynsim.problems import Origin, listed
 from dynsim.scenario.loads import LoadConfig
@@ -20,10 +20,24 @@ NAME_LIMIT = 255
 
 # Keys that only one law reads.
 BILATERAL_KEYS = ("slip_smoothing_m_s", "pulling_friction")
-UNILATERAL_KEYS = ("static_friction", "stribeck_m_s", "viscous_friction_s_per_m", "restitution")
+UNILATERAL_KEYS = ("static_friction", "stribeck_m_s", "viscous_friction_s_per_m", "restitution", "grip")
 # The trapezoidal rule of time stepping.
 THETA = 0.5
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
+
+
+class Grip(StrictConfig):
+    """Friction that differs along and across an axis of the body, as that of a wheel."""
+
+    axis: Vector3 = Field(description="in the axes of the body or frame: along it, as far as it lies in the surface")
+    ratio: Share = Field(description="friction along the axis as a fraction of that across; 0: it rolls freely")
+
+    @field_validator("axis")
+    @classmethod
+    def _check_axis(cls, value: list[float]) -> list[float]:
+        if not any(value):
+            raise ValueError("has no direction")
+        return value
 
 
 class ContactPoint(BodyPoint):
@@ -33,6 +47,7 @@ class ContactPoint(BodyPoint):
     friction: NonNegative | None = Field(default=None, description="kinetic coefficient; default: that of contacts")
     static_friction: NonNegative | None = Field(default=None, description="default: that of contacts; unilateral law")
     restitution: Share | None = Field(default=None, description="default: that of contacts; unilateral law")
+    grip: Grip | None = Field(default=None, description="anisotropic friction; only of integrator.method time_stepping")
     enabled: bool = True
 
 
@@ -179,6 +194,18 @@ class ScenarioConfig(StrictConfig):
         glued = self.contacts.law == "bilateral" and any(point.enabled for point in self.contacts.points.values())
         if glued and self.integrator.method == "time_stepping":
             raise error_at("integrator.method", "needs `contacts: {law: unilateral}`")
+        return self
+
+    @model_validator(mode="after")
+    def _check_grips(self) -> Self:
+        """The event-driven methods know round cones only."""
+        for name, point in self.contacts.points.items():
+            if point.grip is not None and self.integrator.method != "time_stepping":
+                raise error_at(
+                    f"contacts.points.{name}.grip",
+                    f"needs integrator.method: time_stepping; {self.integrator.method} finds begin and end of slip by "
+                    "one coefficient for all directions",
+                )
         return self
 
     @field_validator("name", "variant")
