@@ -83,11 +83,19 @@ class Limits(StrictModel):
         Highest joint speed [rad/s].
     torque : float
         Joint torque at which the replay aborts [N·m].
+    acceleration : float
+        Highest acceleration of the path, between samples too [rad/s²]. The default lets the start of the published
+        arm's record pass, which jumps to 2.6 rad/s within 5 ms; a joint that turns a load wants less.
+    jerk : float
+        Highest change of acceleration, averaged in magnitude over 0.1 s [rad/s³]
+        (:meth:`dynsim.hardware.replay.trajectory.Path.jerk`). The default refuses a zigzag of 2 mrad every 5 ms.
     """
 
     position_deg: tuple[Finite, Finite] | None = None
     velocity: Positive
     torque: Positive
+    acceleration: Positive = 2000.0
+    jerk: Positive = 60_000.0
 
 
 # For editors; what loading says about it is in _position_limits_fit_the_mode.
