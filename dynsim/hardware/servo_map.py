@@ -27,6 +27,7 @@ from dynsim.hardware.bus.control_table import (
     OperatingMode,
     ServoModel,
 )
+from dynsim.hardware.data_sheet import objections_to_limits, objections_to_safety
 from dynsim.hardware.errors import ServoMapError
 from dynsim.inputs import is_file, parse_yaml, read_text
 from dynsim.problems import Origin, explain, unknown_keys
@@ -142,6 +143,16 @@ class Kind(StrictModel):
             raise error_at("limits", "a servo in position mode needs limits.position_deg: [lowest, highest]")
         if limits is not None and not limits[0] < limits[1]:
             raise error_at("limits.position_deg", f"{limits[0]} is not below {limits[1]}")
+        for key, text in objections_to_limits(
+            MODELS[self.model],
+            self.gear,
+            turns_to_angle=self.mode == "position",
+            position_deg=limits,
+            velocity=self.limits.velocity,
+            torque=self.limits.torque,
+            following_error=self.following_error,
+        ):
+            raise error_at(key, text)
         return self
 
 
@@ -207,6 +218,8 @@ class Safety(StrictModel):
         Acceleration of the stretch added where a record begins or ends in motion [rad/s²].
     approach_velocity : float
         Top speed of the move to the start posture [rad/s].
+    start_distance : float
+        A joint further than this from the start posture is asked about once more [rad].
     watchdog : float
         Servos stop by themselves when the bus is silent for this long [s].
     missed_cycles, late_cycles, following_cycles, torque_cycles : int
@@ -219,14 +232,15 @@ class Safety(StrictModel):
     """
 
     policy: FaultPolicy = "decelerate"
-    stop_time: Positive = 0.3
+    stop_time: Annotated[float, Field(gt=0, le=3.0)] = 0.3
     run_up: Positive = 2.0
     approach_velocity: Positive = 0.3
+    start_distance: Positive = 0.5
     watchdog: Annotated[float, Field(ge=0.02, le=2.54)] = 0.2
-    missed_cycles: Annotated[int, Field(ge=1)] = 3
-    late_cycles: Annotated[int, Field(ge=1)] = 5
-    following_cycles: Annotated[int, Field(ge=1)] = 5
-    torque_cycles: Annotated[int, Field(ge=1)] = 10
+    missed_cycles: Annotated[int, Field(ge=1, le=100)] = 3
+    late_cycles: Annotated[int, Field(ge=1, le=1000)] = 5
+    following_cycles: Annotated[int, Field(ge=1, le=100)] = 5
+    torque_cycles: Annotated[int, Field(ge=1, le=100)] = 10
     temperature_max: Positive = 65.0
     supply: Supply = Supply()
     at_end: Literal["off", "hold"] = "off"
@@ -254,6 +268,37 @@ class _MapFile(StrictModel):
             if entry.id in owner:
                 raise error_at(f"servos.{joint}.id", f"is also the ID of {owner[entry.id]}")
             owner[entry.id] = joint
+        return self
+
+    @model_validator(mode="after")
+    def _columns_have_one_follower(self) -> _MapFile:
+        follower: dict[tuple[str, str], str] = {}
+        for joint, entry in self.servos.items():
+            if entry.hold_at_deg is not None:
+                continue
+            column = (self.kinds[entry.kind].follows.position, entry.label or joint)
+            if column in follower:
+                raise error_at(
+                    f"servos.{joint}.label", f"{follower[column]} already follows {column[1]!r} of {column[0]!r}"
+                )
+            follower[column] = joint
+        return self
+
+    @model_validator(mode="after")
+    def _safety_fits_the_servos(self) -> _MapFile:
+        safety, supply = self.safety, self.safety.supply
+        used = {name: self.kinds[name] for name in dict.fromkeys(entry.kind for entry in self.servos.values())}
+        models = [MODELS[kind.model] for kind in used.values()]
+        for key, text in objections_to_safety(models, safety.temperature_max, (supply.lowest, supply.highest)):
+            raise error_at(f"safety.{key}", text)
+        if self.bus.latency >= safety.watchdog:
+            raise error_at("bus.latency", "is not below safety.watchdog: one lost answer would trip the watchdogs")
+        for name, kind in used.items():
+            limits = kind.limits
+            if kind.mode == "position" and safety.approach_velocity > limits.velocity:
+                raise error_at("safety.approach_velocity", f"is above kinds.{name}.limits.velocity")
+            if (needed := limits.velocity / safety.stop_time) > limits.acceleration:
+                raise error_at("safety.stop_time", f"stops kinds.{name} with {needed:.4g} rad/s², above its limit")
         return self
 
 

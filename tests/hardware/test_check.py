@@ -220,7 +220,8 @@ def test_a_single_jump_of_the_rate_is_bounded_by_the_acceleration(write_map) -> 
 
 @pytest.mark.parametrize("quantity", ["acceleration: 9.0", "jerk: 35.0"])
 def test_a_slower_replay_that_is_offered_passes(write_map, quantity: str) -> None:
-    servo_map = load_servo_map(write_map(("[-60, 60], velocity", f"[-60, 60], {quantity}, velocity"), ("20", "5")))
+    limits = ("[-60, 60], velocity", f"[-60, 60], {quantity}, velocity")
+    servo_map = load_servo_map(write_map(limits, ("run_up: 20", "run_up: 5, stop_time: 0.5")))
     with pytest.raises(CheckRefused, match=r"--speed 0\.\d+ would pass") as refusal:
         check_motion(swing(), servo_map)
     slower = float(str(refusal.value).split("--speed ")[1].split()[0])
@@ -260,6 +261,12 @@ def test_a_rate_the_bus_cannot_carry_is_refused_with_one_it_can(rig) -> None:
         plan_cycle(rig.map, 2000)
     possible = int(str(refusal.value).split("--rate ")[1].split()[0])
     assert plan_cycle(rig.map, possible).health_every <= 10
+
+
+def test_a_rate_at_which_the_watchdogs_would_trip_is_refused(rig) -> None:
+    with pytest.raises(CheckRefused, match=r"watchdogs of 0.2 s would trip within 3 cycles. Use --rate 15 or more"):
+        plan_cycle(rig.map, 14)
+    plan_cycle(rig.map, 15)
 
 
 @pytest.mark.parametrize(("baud", "rate"), [(1_000_000, 142), (3_000_000, 277)])

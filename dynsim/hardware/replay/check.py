@@ -24,6 +24,8 @@ TURNAROUND = 50e-6
 """Planned time per status beyond its bytes and return delay [s] (unverified; servos and adapter both contribute)."""
 USB_TRANSACTION = 1e-3
 """Planned cost of waiting for an answer through a USB adapter with its latency timer at 1 ms [s]."""
+WATCHDOG_CYCLES = 3
+"""The servos' watchdogs must outlast so many cycles."""
 BUS_SHARE = 0.97
 """Largest part of the period the bus may be busy."""
 
@@ -36,8 +38,8 @@ UNITS: dict[Quantity, str] = {
     "torque": "N m",
 }
 SLOWED: dict[Quantity, int] = {"velocity": 1, "acceleration": 2, "jerk": 2}
-"""Power of the speed with which a quantity falls, or falls at least: the window over which a jerk is averaged holds less
-of a path that is run through more slowly."""
+"""Power of the speed with which a quantity falls, or falls at least: the window over which a jerk is averaged holds
+less of a path that is run through more slowly."""
 
 ROUNDING = 1e-9
 """A joint of a record that rests at its very limit may be off by rounding of this size; a tick is 1.5e-3 rad."""
@@ -171,6 +173,11 @@ def plan_cycle(servo_map: ServoMap, rate: float) -> CyclePlan:
     """
     if not (math.isfinite(rate) and rate > 0):
         raise CheckRefused(f"--rate must be positive, not {rate}")
+    if rate * servo_map.safety.watchdog < WATCHDOG_CYCLES:
+        raise CheckRefused(
+            f"at {rate:g} Hz the servos' watchdogs of {servo_map.safety.watchdog:g} s would trip within "
+            f"{WATCHDOG_CYCLES} cycles. Use --rate {math.ceil(WATCHDOG_CYCLES / servo_map.safety.watchdog)} or more"
+        )
     count = len(servo_map.servos)
     groups = [sum(servo.in_position_mode is mode for servo in servo_map.servos) for mode in (True, False)]
     written = sum(14 + 5 * members for members in groups if members)

@@ -20,7 +20,7 @@ from dynsim.record import TIME, Record
 REST = 1e-6
 """Joint speed [rad/s] below which a record counts as at rest."""
 HOLE, LONG = 2.5, 1.5
-"""Steps of so many times the median step: a motion that is not known in between; one sample missing, worth a warning."""
+"""Steps of so many times the median step: a motion that is not known in between; one sample missing."""
 JERK_WINDOW = 0.1
 """Over which the change of acceleration is averaged [s]: twice the lag of these servos (43.5 ms). A single jump in the
 velocity of a record is a knock, and bounded by the acceleration; jumps one after the other wear the gears."""
@@ -110,9 +110,9 @@ class Path:
         """Change of acceleration per time, averaged in magnitude over ``window`` [s] of path time.
 
         j(t) = (1/window) Σ |a_{k+1} − a_k| over the knots between t − window and t, in which a_k is the mean of what
-        the interpolant has on both sides of knot k, plus the step in rate there. It is the mean of |d³q/dt³| for a smooth
-        path, 2 |a| f for one that knocks to and fro f times a second, whatever the window, and Δa/window for a single
-        jump. Between knots a is taken as straight.
+        the interpolant has on both sides of knot k, plus the step in rate there. It is the mean of |d³q/dt³| for a
+        smooth path, 4 |a| f for one that is thrown to and fro f times a second, whatever the window, and Δa/window for
+        a single jump. Between knots a is taken as straight.
 
         Returns
         -------
