@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
-from dynsim.config import error_at, forbid_conversion
+from dynsim.config import error_at
 from dynsim.errors import shown
 from dynsim.hardware.bus.control_table import (
     BAUD_RATES,
@@ -29,8 +29,8 @@ from dynsim.hardware.bus.control_table import (
 )
 from dynsim.hardware.data_sheet import objections_to_limits, objections_to_safety
 from dynsim.hardware.errors import ServoMapError
-from dynsim.inputs import is_file, parse_yaml, read_text
-from dynsim.problems import Origin, explain, unknown_keys
+from dynsim.hardware.strict_yaml import Finite, Positive, StrictModel, read_yaml
+from dynsim.inputs import is_file
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent / "scenarios" / "hardware"
@@ -38,20 +38,6 @@ SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else _PACKAGE / "shipped_scenarios" / 
 """Folder of the servo maps that come with dynsim."""
 
 FaultPolicy = Literal["hold", "decelerate", "off"]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-
-
-class StrictModel(BaseModel):
-    """Unknown keys are errors, and numbers neither texts nor true."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    @classmethod
-    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> Any:
-        schema = handler(source)
-        forbid_conversion(schema)
-        return schema
 
 
 class Follows(StrictModel):
@@ -422,24 +408,3 @@ def json_schema() -> dict[str, Any]:
     limit is below the upper one. Loading checks these.
     """
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **_MapFile.model_json_schema()}
-
-
-_Schema = TypeVar("_Schema", bound=BaseModel)
-
-
-def read_yaml(path: Path, schema: type[_Schema]) -> _Schema:
-    """Read YAML into a pydantic model.
-
-    Raises
-    ------
-    ServoMapError
-        Missing file, bad YAML or bad entry; the message holds file, line and key.
-    """
-    data = parse_yaml(read_text(path, ServoMapError), ServoMapError, str(path))
-    if not isinstance(data, dict):
-        raise ServoMapError(f"{path}: expected a mapping with the keys {', '.join(schema.model_fields)}")
-    try:
-        return schema.model_validate(data)
-    except ValidationError as error:
-        origin = Origin(path, (data,))
-        raise ServoMapError(explain(error, data, origin, unknown_keys(error, data, origin, schema))) from None

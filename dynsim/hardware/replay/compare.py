@@ -15,7 +15,7 @@ from dynsim.errors import RecordError, shown
 from dynsim.files import replacing
 from dynsim.hardware.errors import ComparisonGateFailed
 from dynsim.hardware.replay.states import State
-from dynsim.hardware.servo_map import StrictModel, read_yaml
+from dynsim.hardware.strict_yaml import StrictModel, read_yaml
 from dynsim.record import Record
 
 Array = NDArray[np.float64]

@@ -25,6 +25,7 @@ from dynsim.hardware.replay.journal import Journal
 from dynsim.hardware.replay.loop import FIELDS, Loop
 from dynsim.hardware.replay.measured import describe
 from dynsim.hardware.replay.motion import Approach
+from dynsim.hardware.replay.registers import difference_lines
 from dynsim.hardware.replay.rules import Cause, Fault
 from dynsim.hardware.replay.run_log import Recorder, RunLog
 from dynsim.hardware.replay.states import UNARMED, Progress, ReplayResult, State, Stopped, StopRequest
@@ -138,7 +139,10 @@ class Replay:
         self.journal.enter(State.VERIFY)
         if self.write_eeprom:
             configure(self.bus, self.map, self.journal.say)
-        problems = verify(self.bus, self.map, self.motion, poll=self.stop.check)
+        problems, limits = verify(self.bus, self.map, self.motion, poll=self.stop.check)
+        self.result.limits = tuple(limits)
+        for line in difference_lines(limits):
+            self.journal.say(line)
         if self._dump_folder:
             dump_registers(self.bus, self.map, self._dump_folder / "registers.json")
         if problems:

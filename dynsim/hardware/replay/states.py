@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, Literal
 
+from dynsim.hardware.replay.registers import LimitRow
 from dynsim.hardware.replay.rules import Cause, Fault
 from dynsim.hardware.replay.run_log import TimingStatistics
 from dynsim.record import Record
@@ -91,6 +92,8 @@ class ReplayResult:
     timing : TimingStatistics | None
     torque_still_on : tuple of int
         IDs that did not confirm torque off.
+    limits : tuple of LimitRow
+        Limits that the servos have stored, beside the map's.
     """
 
     end_state: EndState = "not armed"
@@ -101,6 +104,7 @@ class ReplayResult:
     record: Record = field(default_factory=lambda: Record([]))
     timing: TimingStatistics | None = None
     torque_still_on: tuple[int, ...] = ()
+    limits: tuple[LimitRow, ...] = ()
 
 
 class Stopped(Exception):
