@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 from ruamel.yaml import YAML
 
-from dynsim.hardware.calibrate import read_zero_ticks, write_zero_ticks
+from dynsim.hardware.calibrate import read_zero_ticks, write_into_map
 from dynsim.hardware.errors import ServoMapError, VerificationFailed
 from dynsim.hardware.servo_map import json_schema, load_servo_map
 
@@ -155,7 +155,7 @@ def test_calibration_writes_zero_ticks_and_keeps_the_rest(rig, write_map) -> Non
     run = rig.prepare()
     ticks = read_zero_ticks(run.replay.bus, rig.map.servos[:2])
     assert ticks == {"shoulder": rig.map.servos[0].to_ticks(0.1), "elbow": rig.map.servos[1].to_ticks(0.2)}
-    write_zero_ticks(load_servo_map(path), ticks, path)
+    write_into_map(load_servo_map(path), "zero_tick", ticks, path)
     again = load_servo_map(path)
     assert [servo.zero_tick for servo in again.servos[:2]] == list(ticks.values())
     assert "# left" in path.read_text(encoding="utf-8")
@@ -173,5 +173,5 @@ def test_calibration_refuses_torque_movement_and_impossible_zeros(rig, write_map
     path = write_map()
     before = path.read_text(encoding="utf-8")
     with pytest.raises(ServoMapError, match="position mode ends at 0 and 4095"):
-        write_zero_ticks(load_servo_map(path), {"shoulder": 200}, path)
+        write_into_map(load_servo_map(path), "zero_tick", {"shoulder": 200}, path)
     assert path.read_text(encoding="utf-8") == before

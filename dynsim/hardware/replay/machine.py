@@ -24,7 +24,7 @@ from dynsim.hardware.replay.ending import Ending
 from dynsim.hardware.replay.journal import Journal
 from dynsim.hardware.replay.loop import FIELDS, Loop
 from dynsim.hardware.replay.measured import describe
-from dynsim.hardware.replay.motion import Approach
+from dynsim.hardware.replay.motion import QUINTIC_PEAK, Approach
 from dynsim.hardware.replay.registers import difference_lines
 from dynsim.hardware.replay.rules import Cause, Fault
 from dynsim.hardware.replay.run_log import Recorder, RunLog
@@ -186,7 +186,7 @@ class Replay:
         in_position_mode = np.array([servo.in_position_mode for servo in self._servos])
         goal = np.where(in_position_mode, self.motion.path.position[0], here)
         distance = float(np.abs(goal - here).max())
-        duration = max(1.875 * distance / self.map.safety.approach_velocity, self.loop.period)
+        duration = max(QUINTIC_PEAK * distance / self.map.safety.approach_velocity, self.loop.period)
         self.journal.enter(State.MOVE_TO_START)
         self.journal.say(f"{distance:.3f} rad in {duration:.1f} s")
         self.loop.begin()
