@@ -98,7 +98,7 @@ class Replay:
         self._servos = servo_map.servos
         self._found_holding = False
         self._recorder = Recorder(servo_map)
-        self.journal = Journal(clock, self._recorder, log or RunLog(None), observer)
+        self.journal = Journal(clock, self._recorder, log or RunLog(None), observer, self.stop)
         self.loop = Loop(motion, servo_map, bus, clock, self.stop, self._recorder, self.journal)
         self.result = ReplayResult(policy_goals=self.loop.policy_goals)
         self._ending = Ending(self.loop, self.journal, self.result, self.policy)

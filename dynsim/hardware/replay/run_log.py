@@ -20,6 +20,12 @@ class RunLog:
     """Lines "time [s]  state  text", each on disk as soon as it is written.
 
     A disk that fails does not keep a robot from being stopped: from then on the lines are only in ``lines``.
+
+    Attributes
+    ----------
+    lines : list of str
+    failure : OSError or None
+        Why the file ends before the run did.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -28,6 +34,7 @@ class RunLog:
             path.open("w", encoding="utf-8", errors="backslashreplace", buffering=1) if path else None
         )
         self.lines: list[str] = []
+        self.failure: OSError | None = None
 
     def write(self, time: float, state: str, text: str) -> None:
         line = plain(f"{time:10.4f}  {state:<13}  {text}")
@@ -36,6 +43,7 @@ class RunLog:
             try:
                 self._file.write(line + "\n")
             except OSError as error:
+                self.failure = error
                 self.close()
                 self.lines.append(f"the log could not be written on: {error.strerror}")
 
