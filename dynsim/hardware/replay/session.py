@@ -105,9 +105,11 @@ def raise_for(result: ReplayResult, folder: Path) -> None:
         unconfirmed = f"; torque off NOT confirmed by ID {', '.join(map(str, result.torque_still_on))}"
     left = f"robot left {result.end_state}{unconfirmed}; see {folder / 'replay.log'}"
     if fault.cause == Cause.INTERRUPTED:
-        raise ReplayInterrupted(f"interrupted in {state.name}; {left}", result=result)
+        others = "".join(f"{other.cause}: {other.text}; " for other in result.faults[1:])
+        raise ReplayInterrupted(f"interrupted in {state.name}; {others}{left}", result=result)
     if fault.cause == Cause.VERIFICATION:
         raise VerificationFailed(fault.text)
     if fault.cause == Cause.PORT and result.end_state == "not armed":
         raise PortError(fault.text)
-    raise ReplayAborted(f"{fault.cause} in {state.name}: {fault.text}; {left}", result=result)
+    others = "".join(f"; {other.cause}: {other.text}" for other in result.faults[1:])
+    raise ReplayAborted(f"{fault.cause} in {state.name}: {fault.text}{others}; {left}", result=result)
