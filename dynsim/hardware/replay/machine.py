@@ -258,6 +258,8 @@ class Replay:
         self._tell_end()
         if armed and result.end_state != "unreachable":
             self._dump("registers_after_fault.json")
+            if self._ending.release_at_last():
+                self._tell_end()
 
     def _tell_end(self) -> None:
         self.journal.say(f"end state: {self.result.end_state}")
