@@ -21,10 +21,12 @@ from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused
 from dynsim.hardware.errors import PortError
 from dynsim.hardware.replay.check import CheckedMotion, velocity_limit
 from dynsim.hardware.replay.ending import Ending
+from dynsim.hardware.replay.folder import REGISTERS, REGISTERS_AFTER_FAULT
 from dynsim.hardware.replay.journal import Journal
 from dynsim.hardware.replay.loop import FIELDS, Loop
 from dynsim.hardware.replay.measured import describe
 from dynsim.hardware.replay.motion import Approach
+from dynsim.hardware.replay.rows import Layout, measured_record, timing_of
 from dynsim.hardware.replay.rules import Cause, Fault
 from dynsim.hardware.replay.run_log import Recorder, RunLog
 from dynsim.hardware.replay.states import UNARMED, Progress, ReplayResult, State, Stopped, StopRequest
@@ -66,6 +68,12 @@ class Replay:
         Called with a Progress after every cycle and on every change of state.
     provenance : dict
         Kept in the measured record.
+
+    Attributes
+    ----------
+    recorder : Recorder
+    layout : Layout
+        Of the record made of its rows.
     """
 
     def __init__(
@@ -97,9 +105,10 @@ class Replay:
         self._provenance |= provenance or {}
         self._servos = servo_map.servos
         self._found_holding = False
-        self._recorder = Recorder(servo_map)
-        self.journal = Journal(clock, self._recorder, log or RunLog(None), observer, self.stop)
-        self.loop = Loop(motion, servo_map, bus, clock, self.stop, self._recorder, self.journal)
+        self.recorder = Recorder(servo_map)
+        self.layout = Layout.of(servo_map, self._provenance)
+        self.journal = Journal(clock, self.recorder, log or RunLog(None), observer, self.stop)
+        self.loop = Loop(motion, servo_map, bus, clock, self.stop, self.recorder, self.journal)
         self.result = ReplayResult(policy_goals=self.loop.policy_goals)
         self._ending = Ending(self.loop, self.journal, self.result, self.policy)
 
@@ -140,7 +149,7 @@ class Replay:
             configure(self.bus, self.map, self.journal.say)
         problems = verify(self.bus, self.map, self.motion, poll=self.stop.check)
         if self._dump_folder:
-            dump_registers(self.bus, self.map, self._dump_folder / "registers.json")
+            dump_registers(self.bus, self.map, self._dump_folder / REGISTERS)
         if problems:
             raise Stopped(Fault(Cause.VERIFICATION, "\n  ".join([f"{len(problems)} problem(s):", *problems])))
         self.journal.say(f"{len(self._servos)} servos as the map says")
@@ -251,7 +260,7 @@ class Replay:
         if not self._dump_folder or self.result.end_state in ("not armed", "unreachable"):
             return
         try:
-            dump_registers(self.bus, self.map, self._dump_folder / "registers_after_fault.json")
+            dump_registers(self.bus, self.map, self._dump_folder / REGISTERS_AFTER_FAULT)
         except (PortError, RecordError) as error:
             self.journal.say(f"no register dump: {error}")
 
@@ -261,9 +270,10 @@ class Replay:
             held = self.map.safety.at_end == "hold"
             result.end_state = "not armed" if not self.live else "holding" if held else "off"
         started = self.loop.path_started if self.loop.path_started is not None else self.loop.origin
-        result.record = describe(self._recorder.record(started, self._provenance), self.motion.scene, State)
+        rows = self.recorder.rows.all()
+        result.record = describe(measured_record(rows, self.layout, started), self.motion.scene, State)
         result.record.complete = result.fault is None
-        result.timing = self._recorder.timing()
+        result.timing = timing_of(rows)
         summary: dict[str, Any] = {"end_state": result.end_state}
         if result.fault is not None:
             fault = result.fault

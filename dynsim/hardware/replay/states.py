@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, Literal
 
+from dynsim.hardware.replay.rows import TimingStatistics
 from dynsim.hardware.replay.rules import Cause, Fault
-from dynsim.hardware.replay.run_log import TimingStatistics
 from dynsim.record import Record
 
 
