@@ -98,20 +98,15 @@ class Recorder:
                 self._celsius[self._columns[id_]] = registers["present_temperature"]
             self.hottest = float(np.nanmax(self._celsius))
         self.rows.add(
-            time=time,
-            origin=origin,
-            path_time=path_time,
-            lateness=cycle.lateness,
-            exchange=exchange,
-            state=state,
-            stray=stray,
-            skipped=skipped,
-            goal_position=cycle.goal_position,
-            goal_velocity=cycle.goal_velocity,
-            position=cycle.position,
-            velocity=cycle.velocity,
-            torque=cycle.torque,
-            volts=self._volts,
-            celsius=self._celsius,
-            alert=cycle.alert,
+            (time, origin, path_time, cycle.lateness, exchange, state, stray, skipped),
+            (
+                cycle.goal_position,
+                cycle.goal_velocity,
+                cycle.position,
+                cycle.velocity,
+                cycle.torque,
+                self._volts,
+                self._celsius,
+                cycle.alert,
+            ),
         )

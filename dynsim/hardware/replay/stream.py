@@ -91,11 +91,10 @@ class RowStream:
             raise
 
     def pump(self) -> None:
-        before = self._written
-        for piece in self._rows.since(before):
-            self._file.append(piece.tobytes())
-            self._written += len(piece)
-        if self._written > before:
+        rows = self._rows.since(self._written)
+        if rows:
+            self._written += len(rows) // self._rows.type.itemsize
+            self._file.append(rows)
             self._file.sync()
 
     def close(self) -> None:
