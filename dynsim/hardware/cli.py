@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -174,7 +174,9 @@ def replay(
     with _client_library():
         from dynsim.hardware.errors import ServoMapError
         from dynsim.hardware.ports import VIRTUAL, bus_on
-        from dynsim.hardware.replay.session import run_replay, stop_on_signals
+        from dynsim.hardware.replay.display import displayed
+        from dynsim.hardware.replay.session import run_replay
+        from dynsim.hardware.replay.signals import stop_on_signals
         from dynsim.hardware.replay.states import StopRequest
         from dynsim.hardware.virtual.faults import load_fault_script
 
@@ -190,7 +192,7 @@ def replay(
         if live and port != VIRTUAL and not yes:
             _confirm(servo_map, motion)
         stop = StopRequest()
-        with stop_on_signals(stop), _progress(enabled=not quiet) as observer:
+        with stop_on_signals(stop), nullcontext() if quiet else displayed(console) as observer:
             result = run_replay(
                 motion,
                 servo_map,
@@ -236,38 +238,6 @@ def _confirm(servo_map: Any, motion: Any) -> None:
         raise ReplayInterrupted("not confirmed; nothing was moved")
 
 
-@contextmanager
-def _progress(*, enabled: bool) -> Iterator[Any]:
-    """A bar with state, following error and temperature; gives the observer that feeds it."""
-    if not enabled:
-        yield None
-        return
-    from rich.progress import BarColumn, TextColumn
-    from rich.progress import Progress as Bar
-
-    columns = (
-        TextColumn("{task.description:<13}"),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f} %"),
-        TextColumn("following error {task.fields[error]:6.4f} rad"),
-        TextColumn("hottest {task.fields[temperature]}"),
-    )
-    with Bar(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("", total=1.0, error=0.0, temperature="-")
-
-        def observe(progress: Any) -> None:
-            known = progress.temperature == progress.temperature
-            bar.update(
-                task,
-                description=progress.state.name,
-                completed=progress.fraction,
-                error=progress.following_error,
-                temperature=f"{progress.temperature:.0f} °C" if known else "-",
-            )
-
-        yield observe
-
-
 def _print_timing(result: Any) -> None:
     timing = result.timing
     if timing is None:
@@ -277,6 +247,17 @@ def _print_timing(result: Any) -> None:
         f"lateness 99 % {timing.lateness_p99 * 1e3:.3f} ms, bus {timing.exchange_mean * 1e3:.2f} ms a cycle, "
         f"{timing.skipped_cycles} skipped, {timing.missed_statuses} statuses missed"
     )
+
+
+@hw.command(epilog="Example: dynsim hw recover results/arm_replay")
+def recover(folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="of a replay whose process died")]) -> None:
+    """Make a measured record, marked incomplete, of the cycles that a replay had written when it died."""
+    from dynsim.hardware.replay import recover as recovery
+    from dynsim.hardware.replay.folder import MEASURED
+
+    record = recovery.recover(folder)
+    span = f", {record.time[0]:.2f} to {record.time[-1]:.2f} s" if len(record) else ""
+    console.print(f"{len(record)} cycles{span}{'' if record.complete else ', incomplete'}: {folder / MEASURED}")
 
 
 @hw.command(
@@ -321,7 +302,7 @@ def virtual(
 ) -> None:
     """Virtual servos behind a pseudo-terminal, for any Dynamixel tool. Ctrl-C ends it."""
     with _client_library():
-        from dynsim.hardware.replay.session import stop_on_signals
+        from dynsim.hardware.replay.signals import stop_on_signals
         from dynsim.hardware.replay.states import StopRequest
         from dynsim.hardware.servo_map import load_servo_map
         from dynsim.hardware.virtual.faults import load_fault_script

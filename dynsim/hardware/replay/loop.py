@@ -205,6 +205,7 @@ class Loop:
             self._recorder.add,
             time=began,
             path_time=self.following_time if self.path_started is not None else math.nan,
+            origin=math.nan if self.path_started is None else self.path_started,
             state=int(self._journal.state),
             exchange=exchange,
             stray=block.stray_bytes,

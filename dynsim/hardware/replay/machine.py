@@ -21,26 +21,26 @@ from dynsim.hardware.bus.control_table import RAD_S2_PER_UNIT, RAD_S_PER_UNIT, W
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused
 from dynsim.hardware.errors import PortError
 from dynsim.hardware.replay.check import CheckedMotion, velocity_limit
+from dynsim.hardware.replay.end_state import AT_REST
 from dynsim.hardware.replay.ending import Ending
+from dynsim.hardware.replay.folder import REGISTERS, REGISTERS_AFTER_FAULT
 from dynsim.hardware.replay.journal import Journal
 from dynsim.hardware.replay.loop import FIELDS, Loop
 from dynsim.hardware.replay.measured import describe
 from dynsim.hardware.replay.motion import Approach
+from dynsim.hardware.replay.rows import Layout, measured_record, timing_of
 from dynsim.hardware.replay.rules import Cause, Fault, watchdog_units
 from dynsim.hardware.replay.run_log import Recorder, RunLog
 from dynsim.hardware.replay.states import UNARMED, Progress, ReplayResult, State, Stopped, StopRequest
 from dynsim.hardware.replay.trajectory import Path
 from dynsim.hardware.replay.verify import all_registers, configure, verify
 from dynsim.hardware.servo_map import FaultPolicy, Servo, ServoMap
-from dynsim.record import Record
 
 APPROACH_ACCELERATION = 10.0
 """Profile acceleration the firmware is given for the move to the start [rad/s²]."""
 SETTLE_CYCLES = 10
 SETTLE_TIME = 3.0
 """Longest wait for the servos to come to rest [s]."""
-SETTLE_VELOCITY = 0.1
-"""[rad/s], a few units of the velocity register."""
 DRY_RUN_TIME = 1.0
 """Reading without moving, to time the bus [s]."""
 
@@ -68,6 +68,12 @@ class Replay:
         Called with a Progress after every cycle and on every change of state.
     provenance : dict
         Kept in the measured record.
+
+    Attributes
+    ----------
+    recorder : Recorder
+    layout : Layout
+        Of the record made of its rows.
     """
 
     def __init__(
@@ -99,9 +105,10 @@ class Replay:
         self._provenance |= provenance or {}
         self._servos = servo_map.servos
         self._found_holding = False
-        self._recorder = Recorder(servo_map)
-        self.journal = Journal(clock, self._recorder, log or RunLog(None), observer, self.stop)
-        self.loop = Loop(motion, servo_map, bus, clock, self.stop, self._recorder, self.journal)
+        self.recorder = Recorder(servo_map)
+        self.layout = Layout.of(servo_map, self._provenance)
+        self.journal = Journal(clock, self.recorder, log or RunLog(None), observer, self.stop)
+        self.loop = Loop(motion, servo_map, bus, clock, self.stop, self.recorder, self.journal)
         self.result = ReplayResult(policy_goals=self.loop.policy_goals)
         self._ending = Ending(self.loop, self.journal, self.result, self.policy)
 
@@ -142,7 +149,7 @@ class Replay:
         if self.write_eeprom:
             configure(self.bus, self.map, self.journal.say)
         problems = verify(self.bus, self.map, self.motion, poll=self.stop.check)
-        self._dump("registers.json")
+        self._dump(REGISTERS)
         if problems:
             raise Stopped(Fault(Cause.VERIFICATION, "\n  ".join([f"{len(problems)} problem(s):", *problems])))
         self.journal.say(f"{len(self._servos)} servos as the map says")
@@ -199,7 +206,7 @@ class Replay:
             cycle = loop.stay(goal)
             error = np.abs(loop.rules.following_error(cycle))
             limit = np.array([servo.kind.following_error for servo in self._servos])
-            still = (error < limit) & (np.abs(cycle.velocity) < SETTLE_VELOCITY)
+            still = (error < limit) & (np.abs(cycle.velocity) < AT_REST)
             quiet = quiet + 1 if np.all(still | cycle.missed) else 0
             cycles += 1
             if cycles * loop.period > SETTLE_TIME:
@@ -257,7 +264,7 @@ class Replay:
                 self._ending.read_back(armed=armed)
         self._tell_end()
         if armed and result.end_state != "unreachable":
-            self._dump("registers_after_fault.json")
+            self._dump(REGISTERS_AFTER_FAULT)
             if self._ending.release_at_last():
                 self._tell_end()
 
@@ -280,20 +287,17 @@ class Replay:
         self.journal.guard(name, write_json, self._dump_folder / name, registers)
 
     def _finish(self) -> None:
-        result = self.result
-        started = self.loop.path_started if self.loop.path_started is not None else self.loop.origin
-        result.timing = self._recorder.timing()
-        if result.timing:
-            timing = ", ".join(f"{name} {value:.6g}" for name, value in result.timing.as_dict().items())
-            self.journal.say(f"timing: {timing}")
-        record = self.journal.guard("measured record", self._measured, started)
-        result.record = record if record is not None else result.record
-        result.output_failures = self.journal.failures
+        self.journal.guard("measured record", self._sum_up)
+        timing = self.result.timing
+        if timing:
+            self.journal.say(f"timing: {', '.join(f'{name} {value:.6g}' for name, value in timing.as_dict().items())}")
 
-    def _measured(self, started: float) -> Record:
-        """The record of the run; ``started`` is the clock time of its time 0 [s]."""
-        result = self.result
-        record = describe(self._recorder.record(started, self._provenance), self.motion.scene, State)
+    def _sum_up(self) -> None:
+        """Record and timing of the run."""
+        result, rows = self.result, self.recorder.rows.all()
+        result.timing = timing_of(rows)
+        started = self.loop.path_started if self.loop.path_started is not None else self.loop.origin
+        record = describe(measured_record(rows, self.layout, started), self.motion.scene, State)
         record.complete = result.fault is None
         for fault in result.faults:
             record.add_event(fault.time - started, "fault", fault.cause.value, description=fault.text)
@@ -306,4 +310,4 @@ class Replay:
                     {"cause": fault.cause.value, "text": fault.text, "ids": fault.ids} for fault in result.faults
                 ],
             }
-        return record
+        result.record = record

@@ -8,8 +8,8 @@ from enum import IntEnum
 from typing import Any
 
 from dynsim.hardware.replay.end_state import ServoEnd
+from dynsim.hardware.replay.rows import TimingStatistics
 from dynsim.hardware.replay.rules import Cause, Fault
-from dynsim.hardware.replay.run_log import TimingStatistics
 from dynsim.record import Record
 
 
@@ -96,8 +96,6 @@ class ReplayResult:
     timing : TimingStatistics | None
     torque_still_on : tuple of int
         IDs that did not confirm torque off.
-    output_failures : dict
-        Errors of the outputs that failed on the way, by their names.
     """
 
     end_state: str = NOT_ARMED
@@ -109,7 +107,6 @@ class ReplayResult:
     record: Record = field(default_factory=lambda: Record([]))
     timing: TimingStatistics | None = None
     torque_still_on: tuple[int, ...] = ()
-    output_failures: dict[str, BaseException] = field(default_factory=dict)
 
     @property
     def fault(self) -> Fault | None:
