@@ -21,9 +21,15 @@ class _Timed(StrictModel):
 
     def active(self, since_torque: float) -> bool:
         """True at ``since_torque`` [s] after the first torque enable (−∞ before it)."""
+        start, end = self.span
+        return start <= since_torque < end
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """When it begins and ends [s after the first torque enable]; −∞ and ∞ for one that is always there."""
         if self.at is None:
-            return True
-        return self.at <= since_torque < self.at + (self.duration or math.inf)
+            return -math.inf, math.inf
+        return self.at, self.at + (self.duration or math.inf)
 
 
 class LineFault(_Timed):
@@ -35,7 +41,7 @@ class LineFault(_Timed):
 
 
 class LateStatus(_Timed):
-    """Status packets come later by ``delay`` [s]."""
+    """Status packets come later by ``delay`` [s]: by n periods of the loop, and cycle k + n gets the answer of cycle k."""
 
     kind: Literal["late_status"]
     id: int | None = None
@@ -79,6 +85,14 @@ class VoltageSag(_Timed):
     drop: Annotated[float, Field(gt=0)]
 
 
+class SupplyLoss(_Timed):
+    """No volts for ``duration`` [s]: every servo is limp and silent, then starts anew with what its EEPROM holds."""
+
+    kind: Literal["supply_loss"]
+    at: Annotated[float, Field(ge=0)]
+    duration: Annotated[float, Field(gt=0)] = 0.3
+
+
 class TemperatureRamp(_Timed):
     """A servo warms by ``heating_rate`` [K/s] on top of its own losses."""
 
@@ -88,7 +102,15 @@ class TemperatureRamp(_Timed):
 
 
 Fault = Annotated[
-    LineFault | LateStatus | PortFault | ServoFault | WrongRegister | AngleFault | VoltageSag | TemperatureRamp,
+    LineFault
+    | LateStatus
+    | PortFault
+    | ServoFault
+    | WrongRegister
+    | AngleFault
+    | VoltageSag
+    | SupplyLoss
+    | TemperatureRamp,
     Field(discriminator="kind"),
 ]
 

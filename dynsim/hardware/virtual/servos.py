@@ -84,6 +84,7 @@ class VirtualServos:
         self.torque_since = math.inf
         self.heard = 0.0
         self.dead: set[int] = set()
+        self._powered = True
         self._script = script
         count = len(self.ids)
         self._drive = Drive(
@@ -113,11 +114,17 @@ class VirtualServos:
         since = self.time - self.torque_since
         return [fault for fault in self._script.faults if fault.active(since)]
 
+    def _next_fault(self) -> float:
+        """When the next fault begins or ends [s]."""
+        changes = [self.torque_since + time for fault in self._script.faults for time in fault.span]
+        return min((time for time in changes if time > self.time), default=math.inf)
+
     # -- requests -----------------------------------------------------------------------------------------------------
 
     def listens(self, id_: int) -> bool:
         """Whether a servo hears what is sent."""
-        return id_ in self.registers and id_ not in self.dead and self.time >= self._boot_until.get(id_, 0.0)
+        there = self._powered and id_ in self.registers and id_ not in self.dead
+        return there and self.time >= self._boot_until.get(id_, 0.0)
 
     def read(self, id_: int, address: int, length: int) -> bytes | None:
         """Bytes of a servo's control table as they are now; None outside of it."""
@@ -149,6 +156,14 @@ class VirtualServos:
         self._boot_until[id_] = self.time + BOOT_TIME
         self.reload(index)
 
+    def set_power(self, *, on: bool) -> None:
+        """Switch the supply of all servos; they start anew when it comes back."""
+        if on == self._powered:
+            return
+        self._powered = on
+        for id_ in self.ids:
+            self.reboot(id_)
+
     def forget_turns(self, index: int) -> None:
         """Count turns from here."""
         self._turns[index] = self._sense(index) * round(self.plant.position[index] / RAD_PER_TICK) // TICKS_PER_TURN
@@ -159,7 +174,7 @@ class VirtualServos:
         """One physics step, or when nothing moves all that fit in before ``until`` [s]."""
         if not self._drive.enabled.any() and self.plant.rests:
             # Nothing moves: one long step for the temperatures, so that waiting for pings costs nothing.
-            steps = int((until - self.time) / PHYSICS_STEP)
+            steps = max(1, int((min(until, self._next_fault()) - self.time) / PHYSICS_STEP))
             self.time += steps * PHYSICS_STEP
             self._warm(steps * PHYSICS_STEP)
         else:
@@ -194,7 +209,7 @@ class VirtualServos:
         self.temperature += (target - self.temperature) * -math.expm1(-dt / THERMAL_TIME)
         self._overload = np.where(torque > self._overload_torque, self._overload + dt, 0.0)
         sag = sum(fault.drop for fault in self.active_faults() if isinstance(fault, VoltageSag))
-        self._drive.voltage = self.supply - sag - SUPPLY_RESISTANCE * float(current.sum())
+        self._drive.voltage = (self.supply - sag - SUPPLY_RESISTANCE * float(current.sum())) * self._powered
         for fault in self.active_faults():
             if isinstance(fault, TemperatureRamp) and fault.id in self.registers:
                 self.temperature[self.ids.index(fault.id)] += dt * fault.heating_rate
