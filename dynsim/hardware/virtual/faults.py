@@ -41,7 +41,7 @@ class LineFault(_Timed):
 
 
 class LateStatus(_Timed):
-    """Status packets come later by ``delay`` [s]: by n periods of the loop, and cycle k + n gets the answer of cycle k."""
+    """Status packets come later by ``delay`` [s]: by n periods, and cycle k + n gets the answer of cycle k."""
 
     kind: Literal["late_status"]
     id: int | None = None
