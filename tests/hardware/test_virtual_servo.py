@@ -74,7 +74,7 @@ def test_the_watchdog_stops_the_servo_and_makes_goals_read_only(line) -> None:
     write(line, 1, "torque_enable", 1)
     write(line, 1, "bus_watchdog", 5)
     write(line, 1, "goal_position", 3000)
-    line.servos.heard = line.time
+    line.servos.heard[:] = line.time
     line.advance(line.time + 0.11)
     stopped_at = line.servos.registers[1]["goal_position"]
     line.advance(line.time + 1.0)

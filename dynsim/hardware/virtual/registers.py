@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from dynsim.hardware.bus.control_table import (
+    BAUD_RATES,
     INDIRECT_BLOCKS,
-    RAD_S_PER_UNIT,
     TABLE_SIZE,
     Field,
     OperatingMode,
@@ -31,11 +33,8 @@ class ServoRegisters:
         self.model = model
         self._table = bytearray(TABLE_SIZE)
         self._field_at = {field.address: name for name, field in model.fields.items()}
-        for name, field in model.fields.items():
-            self[name] = field.default
-        self["model_number"], self["id"], self["baud"] = model.number, id_, baud_code
-        self["velocity_limit"] = round(1.1 * model.no_load_speed / RAD_S_PER_UNIT)
-        self.restart()
+        self.reset()
+        self["id"], self["baud"] = id_, baud_code
 
     def __getitem__(self, name: str) -> int:
         field = self.model.fields[name]
@@ -46,6 +45,19 @@ class ServoRegisters:
         self._table[field.address : field.address + field.size] = value.to_bytes(
             field.size, "little", signed=field.signed
         )
+
+    @property
+    def baud(self) -> int:
+        """[bit/s]."""
+        return BAUD_RATES[self["baud"]]
+
+    def reset(self, keep: Collection[str] = ()) -> None:
+        """All as delivered, but for the registers named in ``keep``."""
+        kept = {name: self[name] for name in keep}
+        for name, field in self.model.fields.items():
+            self[name] = kept.get(name, field.default)
+        self["model_number"] = self.model.number
+        self.restart()
 
     def restart(self) -> None:
         """RAM as after power-on."""

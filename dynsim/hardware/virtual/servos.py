@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 
@@ -22,6 +22,8 @@ from dynsim.hardware.virtual.registers import ServoRegisters
 from dynsim.hardware.virtual.servo_plant import Drive, InertialLoad, ServoPlant
 
 PHYSICS_STEP = 2e-3
+COMMUNICATION_END = 14
+"""ID, bit rate and protocol stand at lower addresses."""
 BOOT_TIME = 0.3
 """Silence after a reboot [s] (unverified)."""
 AMBIENT = 25.0  # °C
@@ -39,7 +41,7 @@ class VirtualServos:
     Parameters
     ----------
     registers : mapping of int to ServoRegisters
-        By ID.
+        By ID. A servo that is given another one keeps its place here, and its name in fault scripts.
     positions : iterable of float
         Initial servo angles [rad], 0 at tick 0.
     plant : ServoPlant or None
@@ -52,14 +54,15 @@ class VirtualServos:
     Attributes
     ----------
     registers : dict
-        ServoRegisters by ID.
+        ServoRegisters by the ID that a servo had at first.
     ids : list of int
+        Those IDs.
     time : float
         [s].
     torque_since : float
         When torque was first switched on [s]; infinite before.
-    heard : float
-        Time of the last packet, for the watchdogs [s].
+    heard : array, shape (N,)
+        Time of the last packet that each servo could understand, for the watchdogs [s].
     dead : set of int
         IDs without power or cable.
     temperature, play : array, shape (N,)
@@ -82,11 +85,11 @@ class VirtualServos:
         self.supply = supply
         self.time = 0.0
         self.torque_since = math.inf
-        self.heard = 0.0
         self.dead: set[int] = set()
         self._powered = True
         self._script = script
         count = len(self.ids)
+        self.heard = np.zeros(count)
         self._drive = Drive(
             np.zeros(count, dtype=bool), np.ones(count, dtype=bool), self.plant.position.copy(), np.zeros(count), supply
         )
@@ -106,6 +109,7 @@ class VirtualServos:
         for index in range(count):
             self.hold_here(index)
             self.reload(index)
+        self._sort_by_line()
 
     def active_faults(self) -> list[Fault]:
         """Faults of the script that are active now."""
@@ -120,6 +124,29 @@ class VirtualServos:
         return min((time for time in changes if time > self.time), default=math.inf)
 
     # -- requests -----------------------------------------------------------------------------------------------------
+
+    def _sort_by_line(self) -> None:
+        """Sort the servos by bit rate, protocol and ID, as they are set now."""
+        self._hearing: dict[tuple[int, int], dict[int, list[int]]] = {}
+        self._protocols: dict[int, list[int]] = {}
+        for first_id, registers in self.registers.items():
+            line = registers.baud, registers["protocol"]
+            if line not in self._hearing:
+                self._protocols.setdefault(line[0], []).append(line[1])
+            self._hearing.setdefault(line, {}).setdefault(registers["id"], []).append(first_id)
+        self._members = {
+            line: np.array([self.ids.index(first_id) for group in servos.values() for first_id in group])
+            for line, servos in self._hearing.items()
+        }
+
+    def protocols(self, baud: int) -> list[int]:
+        """Protocols of the servos that are set to a bit rate [bit/s]; none where nobody is."""
+        return self._protocols.get(baud, [])
+
+    def hear(self, baud: int, protocol: int, now: float) -> dict[int, list[int]]:
+        """A packet was on the line at ``now`` [s]: those who understand it, by the ID they have."""
+        self.heard[self._members[baud, protocol]] = now
+        return self._hearing[baud, protocol]
 
     def listens(self, id_: int) -> bool:
         """Whether a servo hears what is sent."""
@@ -145,7 +172,15 @@ class VirtualServos:
             if self.torque_since == math.inf:
                 self.torque_since = self.time
         self.reload(index)
+        if address < COMMUNICATION_END:
+            self._sort_by_line()
         return StatusError.NONE
+
+    def reset(self, id_: int, keep: Collection[str]) -> None:
+        """As delivered but for the registers ``keep``, then a restart."""
+        self.registers[id_].reset(keep)
+        self._sort_by_line()
+        self.reboot(id_)
 
     def reboot(self, id_: int) -> None:
         """Power-on state; the servo is silent for a while."""
