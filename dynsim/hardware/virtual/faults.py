@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, ValidationInfo, model_validator
 
+from dynsim.config import error_at
 from dynsim.hardware.servo_map import StrictModel, read_yaml
 
 Probability = Annotated[float, Field(ge=0, le=1)]
@@ -128,13 +130,24 @@ class FaultScript(StrictModel):
     seed: int = 0
     faults: list[Fault] = Field(default_factory=list)
 
+    @model_validator(mode="after")
+    def _servos_are_there(self, info: ValidationInfo) -> FaultScript:
+        """Validated with the context ``{"ids": ...}`` a fault of a servo that is not among them is an error."""
+        ids = info.context["ids"] if info.context else None
+        for number, fault in enumerate(self.faults):
+            id_ = getattr(fault, "id", None)
+            if ids is not None and id_ is not None and id_ not in ids:
+                there = ", ".join(map(str, sorted(ids)))
+                raise error_at(f"faults.{number}.id", f"no servo has this ID; there are {there}")
+        return self
 
-def load_fault_script(path: str | Path) -> FaultScript:
-    """Read a fault script.
+
+def load_fault_script(path: str | Path, ids: Collection[int] | None = None) -> FaultScript:
+    """Read a fault script for servos with these IDs, of which it may name no others (any if not given).
 
     Raises
     ------
     ServoMapError
         Missing file, bad YAML or bad entry, with file and line.
     """
-    return read_yaml(Path(path), FaultScript)
+    return read_yaml(Path(path), FaultScript, {"ids": ids})

@@ -176,12 +176,8 @@ class Protocol2:
 
     def _read_many(self, entries: Sequence[tuple[int, int, int]], hearing: Hearing) -> Iterator[Answer]:
         for id_, address, length in entries:
-            frames = {}
-            for servo in self._firmware.awake(hearing, id_):
-                reply = self._read(servo, id_, address, length)
-                if reply:
-                    frames[servo] = encode(reply)
-            if frames:
+            replies = {servo: self._read(servo, id_, address, length) for servo in self._firmware.awake(hearing, id_)}
+            if frames := {servo: encode(reply) for servo, reply in replies.items() if reply}:
                 yield together(frames)
 
     def _fast_read(self, entries: Sequence[tuple[int, int, int]], hearing: Hearing) -> Iterator[Answer]:

@@ -33,18 +33,21 @@ class ServoRegisters:
         self.model = model
         self._table = bytearray(TABLE_SIZE)
         self._field_at = {field.address: name for name, field in model.fields.items()}
+        # Each read of a state asks for a dozen registers: their places are looked up once.
+        self._places = {
+            name: (slice(field.address, field.address + field.size), field.size, field.signed)
+            for name, field in model.fields.items()
+        }
         self.reset()
         self["id"], self["baud"] = id_, baud_code
 
     def __getitem__(self, name: str) -> int:
-        field = self.model.fields[name]
-        return int.from_bytes(self._table[field.address : field.address + field.size], "little", signed=field.signed)
+        place, _, signed = self._places[name]
+        return int.from_bytes(self._table[place], "little", signed=signed)
 
     def __setitem__(self, name: str, value: int) -> None:
-        field = self.model.fields[name]
-        self._table[field.address : field.address + field.size] = value.to_bytes(
-            field.size, "little", signed=field.signed
-        )
+        place, size, signed = self._places[name]
+        self._table[place] = value.to_bytes(size, "little", signed=signed)
 
     @property
     def baud(self) -> int:

@@ -102,11 +102,13 @@ class VirtualServos:
         self._overload = np.zeros(count)
         self.play = self.plant.position.copy()
         self._turns = np.zeros(count, dtype=np.int64)
+        self._sense = [1] * count
         self._boot_until: dict[int, float] = {}
         self._overload_torque = OVERLOAD_FRACTION * np.array([model.stall_torque for model in self._models])
         self._resistance = np.array([12.0 / model.stall_current for model in self._models])
         self._ampere_per_newtonmetre = np.array([1 / model.torque_constant for model in self._models])
         for index in range(count):
+            self.reload(index)
             self.hold_here(index)
             self.reload(index)
         self._sort_by_line()
@@ -166,6 +168,7 @@ class VirtualServos:
         if error:
             return error
         if registers["operating_mode"] != mode:
+            self.reload(index)
             self.forget_turns(index)
         if registers["torque_enable"] and not torque:
             self.hold_here(index)
@@ -179,6 +182,7 @@ class VirtualServos:
     def reset(self, id_: int, keep: Collection[str]) -> None:
         """As delivered but for the registers ``keep``, then a restart."""
         self.registers[id_].reset(keep)
+        self.reload(self.ids.index(id_))
         self._sort_by_line()
         self.reboot(id_)
 
@@ -201,7 +205,7 @@ class VirtualServos:
 
     def forget_turns(self, index: int) -> None:
         """Count turns from here."""
-        self._turns[index] = self._sense(index) * round(self.plant.position[index] / RAD_PER_TICK) // TICKS_PER_TURN
+        self._turns[index] = self._sense[index] * round(self.plant.position[index] / RAD_PER_TICK) // TICKS_PER_TURN
 
     # -- motion, heat, supply -----------------------------------------------------------------------------------------
 
@@ -283,19 +287,14 @@ class VirtualServos:
 
     # -- registers and motion -----------------------------------------------------------------------------------------
 
-    def _sense(self, index: int) -> int:
-        # Reverse mode turns the shaft's sense, not that of the homing offset.
-        return -1 if self.registers[self.ids[index]]["drive_mode"] & 1 else 1
-
     def _present_ticks(self, index: int, angle: float) -> int:
-        registers = self.registers[self.ids[index]]
-        ticks = self._sense(index) * round(angle / RAD_PER_TICK) - int(self._turns[index]) * TICKS_PER_TURN
-        return ticks + registers["homing_offset"]
+        ticks = self._sense[index] * round(angle / RAD_PER_TICK) - int(self._turns[index]) * TICKS_PER_TURN
+        return ticks + self.registers[self.ids[index]]["homing_offset"]
 
     def _angle(self, index: int, ticks: int) -> float:
         registers = self.registers[self.ids[index]]
         raw = ticks - registers["homing_offset"] + int(self._turns[index]) * TICKS_PER_TURN
-        return self._sense(index) * raw * RAD_PER_TICK
+        return self._sense[index] * raw * RAD_PER_TICK
 
     def hold_here(self, index: int) -> None:
         """Set point and goals := where the shaft is."""
@@ -308,7 +307,9 @@ class VirtualServos:
 
     def reload(self, index: int) -> None:
         """Take over what the motion needs from the registers."""
-        registers, sense = self.registers[self.ids[index]], self._sense(index)
+        registers = self.registers[self.ids[index]]
+        # Reverse mode turns the shaft's sense, not that of the homing offset.
+        self._sense[index] = sense = -1 if registers["drive_mode"] & 1 else 1
         self._drive.enabled[index] = bool(registers["torque_enable"])
         self._drive.in_position_mode[index] = registers["operating_mode"] != OperatingMode.VELOCITY
         self._goal_position[index] = self._angle(index, registers["goal_position"])
@@ -322,7 +323,7 @@ class VirtualServos:
     def measure(self, index: int) -> None:
         """Bring the registers of one servo up to date before they are read."""
         id_ = self.ids[index]
-        registers, sense = self.registers[id_], self._sense(index)
+        registers, sense = self.registers[id_], self._sense[index]
         angle = self.plant.position[index]
         for fault in self.active_faults():
             if isinstance(fault, AngleFault) and fault.id == id_:
