@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -175,14 +175,16 @@ def replay(
         from dynsim.hardware.dialog import confirm_replay, print_limits
         from dynsim.hardware.errors import ServoMapError
         from dynsim.hardware.ports import VIRTUAL, bus_on
-        from dynsim.hardware.replay.session import run_replay, stop_on_signals
+        from dynsim.hardware.replay.display import displayed
+        from dynsim.hardware.replay.session import run_replay
+        from dynsim.hardware.replay.signals import stop_on_signals
         from dynsim.hardware.replay.states import StopRequest
         from dynsim.hardware.virtual.faults import load_fault_script
 
         if (faults or plant) and port != VIRTUAL:
             raise ServoMapError("--faults and --plant are for virtual servos: --port virtual")
         simulated, servo_map, motion = _checked(record, map_file, rate, speed)
-        script = load_fault_script(faults) if faults else None
+        script = load_fault_script(faults, servo_map.ids) if faults else None
         robot = _plant(plant, variant, servo_map, motion) if plant else None
         folder = out or Path("results") / file_name(f"{servo_map.robot}_replay")
         for warning in motion.warnings:
@@ -191,7 +193,7 @@ def replay(
         if live and port != VIRTUAL:
             confirm_replay(console, servo_map, motion, port, asked=not yes)
         stop = StopRequest()
-        with stop_on_signals(stop), _progress(enabled=not quiet) as observer:
+        with stop_on_signals(stop), nullcontext() if quiet else displayed(console) as observer:
             result = run_replay(
                 motion,
                 servo_map,
@@ -222,38 +224,6 @@ def _plant(scenario: str, variant: str | None, servo_map: Any, motion: Any) -> A
     return simulated_arm(scenario, variant, servo_map, posture)
 
 
-@contextmanager
-def _progress(*, enabled: bool) -> Iterator[Any]:
-    """A bar with state, following error and temperature; gives the observer that feeds it."""
-    if not enabled:
-        yield None
-        return
-    from rich.progress import BarColumn, TextColumn
-    from rich.progress import Progress as Bar
-
-    columns = (
-        TextColumn("{task.description:<13}"),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f} %"),
-        TextColumn("following error {task.fields[error]:6.4f} rad"),
-        TextColumn("hottest {task.fields[temperature]}"),
-    )
-    with Bar(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("", total=1.0, error=0.0, temperature="-")
-
-        def observe(progress: Any) -> None:
-            known = progress.temperature == progress.temperature
-            bar.update(
-                task,
-                description=progress.state.name,
-                completed=progress.fraction,
-                error=progress.following_error,
-                temperature=f"{progress.temperature:.0f} °C" if known else "-",
-            )
-
-        yield observe
-
-
 def _print_timing(result: Any) -> None:
     timing = result.timing
     if timing is None:
@@ -263,6 +233,17 @@ def _print_timing(result: Any) -> None:
         f"lateness 99 % {timing.lateness_p99 * 1e3:.3f} ms, bus {timing.exchange_mean * 1e3:.2f} ms a cycle, "
         f"{timing.skipped_cycles} skipped, {timing.missed_statuses} statuses missed"
     )
+
+
+@hw.command(epilog="Example: dynsim hw recover results/arm_replay")
+def recover(folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="of a replay whose process died")]) -> None:
+    """Make a measured record, marked incomplete, of the cycles that a replay had written when it died."""
+    from dynsim.hardware.replay import recover as recovery
+    from dynsim.hardware.replay.folder import MEASURED
+
+    record = recovery.recover(folder)
+    span = f", {record.time[0]:.2f} to {record.time[-1]:.2f} s" if len(record) else ""
+    console.print(f"{len(record)} cycles{span}{'' if record.complete else ', incomplete'}: {folder / MEASURED}")
 
 
 @hw.command(
@@ -304,19 +285,23 @@ def virtual(
     map_file: MapFile,
     faults: Annotated[Path | None, typer.Option("--faults", help="fault script")] = None,
     link: Annotated[Path | None, typer.Option("--link", help="name the device by this symbolic link")] = None,
+    plant: Annotated[str | None, typer.Option("--plant", help="scenario whose robot the servos move")] = None,
+    variant: Annotated[str | None, typer.Option("--variant", help="variant of that scenario")] = None,
 ) -> None:
     """Virtual servos behind a pseudo-terminal, for any Dynamixel tool. Ctrl-C ends it."""
     with _client_library():
-        from dynsim.hardware.replay.session import stop_on_signals
+        from dynsim.hardware.replay.signals import stop_on_signals
         from dynsim.hardware.replay.states import StopRequest
         from dynsim.hardware.servo_map import load_servo_map
         from dynsim.hardware.virtual.faults import load_fault_script
         from dynsim.hardware.virtual.line import line_for_map
         from dynsim.hardware.virtual.pseudo_terminal import PseudoTerminal
+        from dynsim.hardware.virtual.simulated_plant import simulated_arm
 
         servo_map = load_servo_map(map_file)
-        script = load_fault_script(faults) if faults else None
-        terminal = PseudoTerminal(line_for_map(servo_map, script=script), link)
+        script = load_fault_script(faults, servo_map.ids) if faults else None
+        robot = simulated_arm(plant, variant, servo_map, {}) if plant else None
+        terminal = PseudoTerminal(line_for_map(servo_map, script=script, plant=robot), link)
         stop = StopRequest()
         # A plain line: other programs wait for it.
         print(

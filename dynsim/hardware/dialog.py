@@ -16,7 +16,7 @@ from dynsim.hardware.nudge import ANGLE, Nudge, nudge, swapped
 from dynsim.hardware.ports import VIRTUAL, bus_on
 from dynsim.hardware.replay.check import CheckedMotion
 from dynsim.hardware.replay.registers import QUANTITIES, LimitRow, differences
-from dynsim.hardware.replay.session import stop_on_signals
+from dynsim.hardware.replay.signals import stop_on_signals
 from dynsim.hardware.replay.start import way_to_start
 from dynsim.hardware.replay.states import StopRequest
 from dynsim.hardware.servo_map import Servo, ServoMap

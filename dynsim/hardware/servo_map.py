@@ -100,7 +100,7 @@ class Kind(StrictModel):
     Attributes
     ----------
     model : str
-        "MX-106" or "MX-28".
+        A name of :data:`dynsim.hardware.bus.control_table.MODELS`.
     mode : "position" or "velocity"
     firmware_min : int
         Oldest firmware accepted.
@@ -112,7 +112,7 @@ class Kind(StrictModel):
         Servo turns per joint turn.
     """
 
-    model: Literal["MX-106", "MX-28"]
+    model: Literal["MX-106", "MX-28", "XL430-W250", "XM430-W210", "XM430-W350", "XH540-W150", "XH540-W270"]
     mode: Literal["position", "velocity"]
     firmware_min: int = 41
     follows: Follows

@@ -31,8 +31,8 @@ class StrictModel(BaseModel):
 _Schema = TypeVar("_Schema", bound=BaseModel)
 
 
-def read_yaml(path: Path, schema: type[_Schema]) -> _Schema:
-    """Read YAML into a pydantic model.
+def read_yaml(path: Path, schema: type[_Schema], context: dict[str, Any] | None = None) -> _Schema:
+    """Read YAML into a pydantic model, whose validators are given ``context``.
 
     Raises
     ------
@@ -43,7 +43,7 @@ def read_yaml(path: Path, schema: type[_Schema]) -> _Schema:
     if not isinstance(data, dict):
         raise ServoMapError(f"{path}: expected a mapping with the keys {', '.join(schema.model_fields)}")
     try:
-        return schema.model_validate(data)
+        return schema.model_validate(data, context=context)
     except ValidationError as error:
         origin = Origin(path, (data,))
         raise ServoMapError(explain(error, data, origin, unknown_keys(error, data, origin, schema))) from None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from dynsim.hardware.replay.registers import compare_limits, difference_lines, needs_of, needs_of_map
@@ -80,9 +82,9 @@ def test_servos_as_delivered_differ_in_nothing_and_are_shown(rig) -> None:
     assert not any(row.refused or row.differs for row in result.limits)
     lines = difference_lines(result.limits)
     assert len(lines) == 2 + 3
-    # Ticks 0 and 4095 about the elbow's zero at 1900, whose sense is turned; 230 and 252 units; 2047 units of current.
+    # Ticks 0 and 4095 about the elbow's zero at 1900, whose sense is turned; 230 units of 0.229 rpm; 2047 of 3.36 mA.
     assert result.limits[1].cells[0] == ("-193 to 167", "-60 to 60")
-    assert result.limits[2].cells[:3] == (("-", "-"), ("6.33", "5.00"), ("-", "1.8"))
+    assert result.limits[2].cells[:3] == (("-", "-"), ("5.52", "5.00"), ("-", "1.8"))
     assert result.limits[0].cells[2:] == (("11.1", "6.0"), ("80", "65"), ("9.5 to 16", "10.5 to 14"))
     assert all(line in "\n".join(run.replay.journal.log.lines) for line in lines)
 
@@ -103,5 +105,6 @@ def test_limits_scale_with_the_gear(write_map, rig) -> None:
     shoulder = servo_map.servos[0]
     row = compare_limits(shoulder, snapshot(run.replay.bus, shoulder), servo_map.safety, needs_of_map(shoulder))
     assert row.cells[0] == ("-120 to 120", "-60 to 60")
-    assert row.cells[1] == (f"{5.18 / 1.5:.2f}", "2.50")
+    own = run.line.servos.registers[1]["velocity_limit"] * 0.229 * 2 * math.pi / 60
+    assert row.cells[1] == (f"{own / 1.5:.2f}", "2.50")
     assert row.cells[2] == ("16.7", "6.0")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dynsim.hardware.bus.control_table import AMPERE_PER_UNIT, HARDWARE_ERRORS, RAD_S_PER_UNIT, VOLT_PER_UNIT
+from dynsim.hardware.bus.control_table import HARDWARE_ERRORS, RAD_S_PER_UNIT, VOLT_PER_UNIT
 from dynsim.hardware.replay.check import CheckedMotion
 from dynsim.hardware.servo_map import Safety, Servo
 
@@ -137,7 +137,7 @@ def _torque(servo: Servo, registers: dict[str, int]) -> _Compared:
     if "current_limit" not in registers:
         return _Compared(NOT_LIMITED, f"{told:.1f}")
     # It bounds the goals of the modes that control current; neither of those that a map can name is one.
-    own = registers["current_limit"] * AMPERE_PER_UNIT * servo.model.torque_constant * servo.gear
+    own = servo.gear * servo.model.torque(registers["current_limit"])
     below = f"its current limit is worth {own:.1f} N m, below the map's" if own < told else ""
     return _Compared(f"{own:.1f}", f"{told:.1f}", differs=below)
 
