@@ -206,6 +206,19 @@ def test_the_jerk_of_a_zigzag_does_not_depend_on_the_window() -> None:
         assert path.jerk(window)[0][0] == pytest.approx(4 * 0.012 / 0.005**3, rel=1e-9)
 
 
+def test_what_is_no_number_any_more_is_refused_and_no_speed_offered(rig) -> None:
+    """Speeds beyond all measure: 0 stays 0 for joints at rest, and a motion overflows."""
+    time = 0.01 * np.arange(5)
+    at_rest = record_of(time, np.zeros(5), np.zeros(5))
+    assert check_motion(at_rest, rig.map, speed=1e300).speed == 1e300
+    with pytest.raises(CheckRefused, match="shoulder: jerk inf") as refusal:
+        check_motion(swing(), rig.map, speed=1e300)
+    assert "would pass" not in str(refusal.value)
+    tiny = record_of(np.array([0.0, 1e-200, 2e-200]), np.array([0.0, 0.1, 0.2]), np.zeros(3))
+    with pytest.raises(CheckRefused, match="shoulder: acceleration"):
+        check_motion(tiny, rig.map)
+
+
 def test_a_single_jump_of_the_rate_is_bounded_by_the_acceleration(write_map) -> None:
     """As the published arm's record begins: 2.5 rad/s within one sample of 5 ms, at a constant rate from there."""
     time = 0.005 * np.arange(40)

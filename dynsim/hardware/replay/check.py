@@ -41,6 +41,7 @@ SLOWED: dict[Quantity, int] = {"velocity": 1, "acceleration": 2, "jerk": 2}
 """Power of the speed with which a quantity falls, or falls at least: the window over which a jerk is averaged holds
 less of a path that is run through more slowly."""
 
+SLOWEST_OFFERED = 0.01
 ROUNDING = 1e-9
 """A joint of a record that rests at its very limit may be off by rounding of this size; a tick is 1.5e-3 rad."""
 
@@ -148,14 +149,16 @@ def check_motion(
     plan = plan_cycle(servo_map, rate if rate is not None else servo_map.bus.rate)
     path = path_of_record(record, servo_map)
     margins = _motion_margins(path, servo_map, speed) + _torque_margins(record, servo_map)
-    violations = [margin for margin in margins if margin.margin < -ROUNDING]
+    # What overflows to no number at all is no motion either.
+    violations = [margin for margin in margins if not margin.margin >= -ROUNDING]
     if violations:
         lines = [f"{len(violations)} limit(s) violated, nothing was sent:", *(f"  {entry}" for entry in violations)]
         if all(entry.quantity in SLOWED for entry in violations):
             slower = speed * min(
                 (entry.limit / abs(entry.value)) ** (1 / SLOWED[entry.quantity]) for entry in violations
             )
-            lines.append(f"  --speed {math.floor(100 * slower) / 100:g} would pass")
+            if slower >= SLOWEST_OFFERED:
+                lines.append(f"  --speed {math.floor(100 * slower) / 100:g} would pass")
         raise CheckRefused("\n".join(lines))
     warnings = [] if record.complete else ["the record is marked incomplete: it ends before its scenario does"]
     if missing := long_steps(record, LONG):
@@ -200,6 +203,10 @@ def _motion_margins(path: Path, servo_map: ServoMap, speed: float) -> list[Margi
     extremes = path.extremes()
     # The window is one of the robot's time, of which `speed` seconds of the path pass in a second.
     jerk, jerk_time = path.jerk(JERK_WINDOW * speed)
+    with np.errstate(over="ignore"):
+        velocity = speed * extremes.velocity
+        acceleration = speed * (speed * extremes.acceleration)
+        jerk = speed * (speed * (speed * jerk))
     margins = []
     for column, servo in enumerate(servo_map.servos):
         if servo.in_position_mode:
@@ -212,9 +219,9 @@ def _motion_margins(path: Path, servo_map: ServoMap, speed: float) -> list[Margi
                 margins.append(_margin(servo, "position", position[above], high, high - position[above], at[above]))
         limits = servo.kind.limits
         for quantity, values, times, limit in (
-            ("velocity", extremes.velocity * speed, extremes.velocity_time, velocity_limit(servo)),
-            ("acceleration", extremes.acceleration * speed**2, extremes.acceleration_time, limits.acceleration),
-            ("jerk", jerk * speed**3, jerk_time, limits.jerk),
+            ("velocity", velocity, extremes.velocity_time, velocity_limit(servo)),
+            ("acceleration", acceleration, extremes.acceleration_time, limits.acceleration),
+            ("jerk", jerk, jerk_time, limits.jerk),
         ):
             of_joint, at = values[..., column].ravel(), times[..., column].ravel()
             worst = int(np.abs(of_joint).argmax())

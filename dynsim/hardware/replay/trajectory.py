@@ -92,7 +92,8 @@ class Path:
         velocity = (m0 + at_velocity * (2 * b + 3 * at_velocity * a)) / h
         left = self.time[:-1, None]
         ends = np.stack([left, left + h, left]) + np.zeros_like(a)
-        acceleration = np.stack([2 * b / h**2, (2 * b + 6 * a) / h**2, self._steps()])
+        with np.errstate(over="ignore"):  # an infinite one is beyond any limit
+            acceleration = np.stack([2 * b / h / h, (2 * b + 6 * a) / h / h, self._steps()])
         return Extremes(left + h * at_position, position, left + h * at_velocity, velocity, ends, acceleration)
 
     def _steps(self) -> NDArray[np.float64]:
@@ -123,15 +124,18 @@ class Path:
         """
         h = np.diff(self.time)[:, None]
         m0, m1, rise = h * self.rate_after, h * self.rate_before, np.diff(self.position, axis=0)
-        first, last = (6 * rise - 4 * m0 - 2 * m1) / h**2, (-6 * rise + 2 * m0 + 4 * m1) / h**2
-        at_knots = np.concatenate([first[:1], 0.5 * (last[:-1] + first[1:]) + self._steps()[1:], last[-1:]])
-        variation = np.concatenate([np.zeros_like(first[:1]), np.cumsum(np.abs(np.diff(at_knots, axis=0)), axis=0)])
+        with np.errstate(over="ignore", invalid="ignore"):
+            first, last = (6 * rise - 4 * m0 - 2 * m1) / h / h, (-6 * rise + 2 * m0 + 4 * m1) / h / h
+            at_knots = np.concatenate([first[:1], 0.5 * (last[:-1] + first[1:]) + self._steps()[1:], last[-1:]])
+            variation = np.cumsum(np.abs(np.diff(at_knots, axis=0)), axis=0)
+        variation = np.concatenate([np.zeros_like(first[:1]), variation])
         jerk, where = np.empty(self.position.shape[1]), np.empty(self.position.shape[1])
         # The variation within a window is straight between those that begin or end at a knot.
         ends = np.concatenate([self.time, self.time + window])
         for joint in range(len(jerk)):
             v = variation[:, joint]
-            within = np.interp(ends, self.time, v) - np.interp(ends - window, self.time, v)
+            with np.errstate(over="ignore", invalid="ignore"):
+                within = np.interp(ends, self.time, v) - np.interp(ends - window, self.time, v)
             worst = int(within.argmax())
             jerk[joint], where[joint] = within[worst] / window, min(ends[worst], self.end)
         return jerk, where
@@ -185,7 +189,9 @@ def _check_time(record: Record) -> None:
     if not known.all():
         bad = int(np.flatnonzero(~known)[0])
         raise CheckRefused(f"the record's time is {record.time[bad]} at sample {bad}, of {len(record)} samples")
-    later = np.diff(record.time) > 0
+    with np.errstate(over="ignore"):
+        steps = np.diff(record.time)
+    later = np.isfinite(steps) & (steps > 0)
     if not later.all():
         bad = int(np.flatnonzero(~later)[0]) + 1
         raise CheckRefused(f"the record's time does not increase at sample {bad} (t = {record.time[bad]:g} s)")
