@@ -20,8 +20,9 @@ from __future__ import annotations
 import errno
 import select
 import termios
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +30,17 @@ import serial
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PortHandler, Protocol2PacketHandler
 
 from dynsim.hardware.bus.control_table import BROADCAST_ID, Field
-from dynsim.hardware.bus.packet import ALERT, HEADER, STATUS, Decoder, StatusError
+from dynsim.hardware.bus.packet import ALERT, HEADER, STATUS, Decoder, Packet, StatusError
 from dynsim.hardware.bus.protocol import BlockRead, NoAnswer, RequestRefused, ServoReply
 from dynsim.hardware.errors import PortError
 
 WRITE_TIMEOUT = 0.25
 READ_WAIT = 5e-4
 """Longest wait for a byte before time-outs are looked at [s]."""
+MARKS = 4
+"""Kinds of requests for one block that can be told apart by the length of their answers."""
+CALM = 20
+"""Complete sync reads after which no late answer is expected any more."""
 RETRIES = 2
 """Further attempts of a single read or write; the timed loop makes none."""
 TORQUE_ENABLE = 64
@@ -110,6 +115,28 @@ def latency_timer(port_name: str) -> int | None:
         return None
 
 
+@dataclass
+class Mark:
+    """By how many bytes the next request for a block is longer, so that answers to earlier ones have a wrong length.
+
+    A status says whose it is, not what it answers: a servo that is two periods late would pass for one that is up to
+    date. Nothing is outstanding as long as all answer, so that only a missed answer makes the next requests longer,
+    one byte more each time, until nobody has been missed for a while.
+    """
+
+    extra: int = 0
+    calm: int = 0
+
+    def turn(self, *, complete: bool) -> None:
+        """After a request, which all answered in time or not."""
+        if not complete:
+            self.extra, self.calm = (self.extra + 1) % MARKS, 0
+        elif self.extra:
+            self.calm += 1
+            if self.calm == CALM:
+                self.extra = 0
+
+
 class DynamixelBus:
     """Servos on one port.
 
@@ -128,6 +155,7 @@ class DynamixelBus:
         self.latency = latency
         self.return_delay = return_delay
         self._library = Protocol2PacketHandler()
+        self._marks: dict[int, Mark] = {}
 
     @property
     def name(self) -> str:
@@ -173,32 +201,42 @@ class DynamixelBus:
             raise PortError(f"{self.name}: {self._library.getTxRxResult(result)}")
 
     def sync_read(self, ids: Sequence[int], address: int, length: int) -> BlockRead:
+        mark = self._marks.setdefault(address, Mark())
+        asked = length + mark.extra
         with self._transaction():
             stray = self.port.getBytesAvailable()
-            result = self._library.syncReadTx(self.port, address, length, list(ids), len(ids), False)
+            result = self._library.syncReadTx(self.port, address, asked, list(ids), len(ids), False)
             if result != COMM_SUCCESS:
                 raise PortError(f"{self.name}: {self._library.getTxRxResult(result)}")
-            answer_bytes = len(ids) * (11 + length)
+            answer_bytes = len(ids) * (11 + asked)
             milliseconds = self.port.tx_time_per_byte * (answer_bytes + 14 + len(ids))
             milliseconds += 1e3 * (len(ids) * (self.return_delay + 50e-6) + self.latency)
             self.port.setPacketTimeoutMillis(milliseconds)
-            replies: dict[int, ServoReply] = {}
+            answers: dict[int, Packet] = {}
+            outdated: set[int] = set()
             decoder = Decoder()
-            while len(replies) < len(ids) and not self.port.isPacketTimeout():
-                for packet in decoder.feed(self.port.readPort(answer_bytes)):
-                    self._sort_in(packet, ids, length, replies)
+
+            def sort_in(packets: Iterable[Packet]) -> None:
+                for packet in packets:
+                    # Requests echoed by the adapter are no status.
+                    if packet.instruction == STATUS and packet.id in ids:
+                        if len(packet.parameters) == asked:
+                            answers[packet.id] = packet
+                        elif length <= len(packet.parameters) < length + MARKS:
+                            outdated.add(packet.id)
+
+            while len(answers) < len(ids) and not self.port.isPacketTimeout():
+                sort_in(decoder.feed(self.port.readPort(answer_bytes)))
             # What came while this process was not running is here, however late it is.
             late = self.port.getBytesAvailable()
-            arrived = [*decoder.feed(self.port.readPort(late))] if late else []
-            for packet in [*arrived, *decoder.flush()]:
-                self._sort_in(packet, ids, length, replies)
-        return BlockRead(replies, stray + decoder.garbage)
-
-    @staticmethod
-    def _sort_in(packet: Any, ids: Sequence[int], length: int, replies: dict[int, ServoReply]) -> None:
-        # Requests echoed by the adapter are no status; a wrong length is a stale answer to another request.
-        if packet.instruction == STATUS and packet.id in ids and len(packet.parameters) == length:
-            replies[packet.id] = ServoReply(packet.parameters, bool(packet.error & ALERT))
+            if late:
+                sort_in(decoder.feed(self.port.readPort(late)))
+            sort_in(decoder.flush())
+        mark.turn(complete=len(answers) == len(ids))
+        replies = {
+            id_: ServoReply(packet.parameters[:length], bool(packet.error & ALERT)) for id_, packet in answers.items()
+        }
+        return BlockRead(replies, stray + decoder.garbage, frozenset(outdated))
 
     def torque_off_all(self) -> None:
         for _ in range(3):

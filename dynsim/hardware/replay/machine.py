@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 
-from dynsim.errors import RecordError
+from dynsim.files import write_json
 from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.bus.control_table import RAD_S2_PER_UNIT, RAD_S_PER_UNIT, WATCHDOG_SECONDS_PER_UNIT
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused
@@ -26,13 +27,14 @@ from dynsim.hardware.replay.journal import Journal
 from dynsim.hardware.replay.loop import FIELDS, Loop
 from dynsim.hardware.replay.measured import describe
 from dynsim.hardware.replay.motion import Approach
-from dynsim.hardware.replay.rows import Layout, measured_record, timing_of
-from dynsim.hardware.replay.rules import Cause, Fault
+from dynsim.hardware.replay.rows import Layout, Rows, measured_record, timing_of
+from dynsim.hardware.replay.rules import Cause, Fault, watchdog_units
 from dynsim.hardware.replay.run_log import Recorder, RunLog
 from dynsim.hardware.replay.states import UNARMED, Progress, ReplayResult, State, Stopped, StopRequest
 from dynsim.hardware.replay.trajectory import Path
-from dynsim.hardware.replay.verify import configure, dump_registers, verify
+from dynsim.hardware.replay.verify import all_registers, configure, verify
 from dynsim.hardware.servo_map import FaultPolicy, Servo, ServoMap
+from dynsim.record import Record
 
 APPROACH_ACCELERATION = 10.0
 """Profile acceleration the firmware is given for the move to the start [rad/s²]."""
@@ -41,6 +43,8 @@ SETTLE_TIME = 3.0
 """Longest wait for the servos to come to rest [s]."""
 SETTLE_VELOCITY = 0.1
 """[rad/s], a few units of the velocity register."""
+RECORD = "measured record"
+"""Name of that output among those that failed."""
 DRY_RUN_TIME = 1.0
 """Reading without moving, to time the bus [s]."""
 
@@ -113,10 +117,10 @@ class Replay:
         self._ending = Ending(self.loop, self.journal, self.result, self.policy)
 
     def run(self) -> ReplayResult:
-        """Carry the replay through, to its end or to a fault; never raises for trouble on the bus.
+        """Carry the replay through, to its end or to a fault; never raises for trouble on the bus or with outputs.
 
-        An exception of another kind (of the observer, a KeyboardInterrupt without :class:`StopRequest`) is raised again
-        after the fault policy was carried out.
+        An exception of another kind (a KeyboardInterrupt without :class:`StopRequest`) is raised again after the fault
+        policy was carried out.
         """
         try:
             self._verify()
@@ -128,7 +132,7 @@ class Replay:
             else:
                 self._dry_run()
         except Stopped as stopped:
-            self._fault(stopped.fault)
+            self._fault(*stopped.faults)
         except PortError as error:
             self._fault(Fault(Cause.PORT, str(error)))
         except (NoAnswer, RequestRefused) as error:
@@ -137,6 +141,7 @@ class Replay:
         except BaseException as error:
             # A robot with its torque on must not be left to itself, whatever went wrong.
             self._fault(Fault(Cause.PROGRAM, repr(error)))
+            self._finish()
             raise
         self._finish()
         return self.result
@@ -148,8 +153,7 @@ class Replay:
         if self.write_eeprom:
             configure(self.bus, self.map, self.journal.say)
         problems = verify(self.bus, self.map, self.motion, poll=self.stop.check)
-        if self._dump_folder:
-            dump_registers(self.bus, self.map, self._dump_folder / REGISTERS)
+        self._dump(REGISTERS)
         if problems:
             raise Stopped(Fault(Cause.VERIFICATION, "\n  ".join([f"{len(problems)} problem(s):", *problems])))
         self.journal.say(f"{len(self._servos)} servos as the map says")
@@ -180,7 +184,7 @@ class Replay:
             if not self.bus.read(servo.id, FIELDS["torque_enable"]):
                 raise Stopped(Fault(Cause.ARMING, f"{servo.joint} (ID {servo.id}): torque stays off", (servo.id,)))
             self.loop.take_over(index, goal, servo.to_angle(present))
-        units = math.ceil(self.map.safety.watchdog / WATCHDOG_SECONDS_PER_UNIT)
+        units = watchdog_units(self.map.safety)
         for servo in self._servos:
             self.bus.write(servo.id, FIELDS["bus_watchdog"], units)
         self.loop.all_taken_over()
@@ -228,6 +232,12 @@ class Replay:
     def _disarm(self) -> None:
         self.journal.enter(State.DISARM)
         self._ending.regular()
+        self._ending.read_back(armed=True)
+        asked = "holding" if self.map.safety.at_end == "hold" else "off"
+        if self.result.end_state != asked:
+            cause = Cause.INTERRUPTED if self.stop.for_release else Cause.END_STATE
+            raise Stopped(Fault(cause, f"should be {asked}, but is {self.result.end_state}"))
+        self._tell_end()
 
     def _profile(self, servo: Servo, *, approaching: bool) -> dict[str, int]:
         """The firmware's own limits: slow towards the start, the joint's speed limit during the replay.
@@ -243,43 +253,59 @@ class Replay:
             "profile_acceleration": math.ceil(acceleration * servo.gear / RAD_S2_PER_UNIT),
         }
 
-    def _fault(self, fault: Fault) -> None:
-        struck = self.journal.state
-        self.result.fault, self.result.fault_state, self.result.fault_time = fault, struck, self.clock.now()
-        self.journal.enter(State.FAULT)
-        self.journal.say(f"in {struck.name}: {fault.cause}: {fault.text}")
-        try:
-            self.result.end_state = self._ending.after_fault(fault, struck, found_holding=self._found_holding)
-        except PortError as error:
-            self.result.end_state = "not armed" if struck in UNARMED else "unreachable"
-            self.journal.say(f"{error}; armed servos stop by their bus watchdog")
-        self.journal.say(f"end state: {self.result.end_state}")
-        self._dump_after_fault()
+    def _fault(self, *faults: Fault) -> None:
+        struck, result = self.journal.state, self.result
+        # The robot first: whatever writes, is told afterwards.
+        with self.journal.held_back():
+            result.fault_state, result.fault_time = struck, self.clock.now()
+            self.journal.enter(State.FAULT)
+            for fault in faults:
+                result.declare(replace(fault, time=result.fault_time))
+                self.journal.say(f"in {struck.name}: {fault.cause}: {fault.text}")
+            self._ending.after_fault(struck, found_holding=self._found_holding)
+            armed = struck not in UNARMED or self.stop.for_release
+            if armed or faults[0].cause != Cause.PORT:
+                self._ending.read_back(armed=armed)
+        self._tell_end()
+        if armed and result.end_state != "unreachable":
+            self._dump(REGISTERS_AFTER_FAULT)
 
-    def _dump_after_fault(self) -> None:
-        if not self._dump_folder or self.result.end_state in ("not armed", "unreachable"):
+    def _tell_end(self) -> None:
+        self.journal.say(f"end state: {self.result.end_state}")
+        for servo in self.result.servos:
+            self.journal.say(str(servo))
+
+    def _dump(self, name: str) -> None:
+        """Registers of all servos into a file of the dump folder."""
+        if not self._dump_folder:
             return
         try:
-            dump_registers(self.bus, self.map, self._dump_folder / REGISTERS_AFTER_FAULT)
-        except (PortError, RecordError) as error:
+            registers = all_registers(self.bus, self.map)
+        except PortError as error:
+            if self.result.fault is None:
+                raise
             self.journal.say(f"no register dump: {error}")
+            return
+        self.journal.guard(name, write_json, self._dump_folder / name, registers)
 
     def _finish(self) -> None:
         result = self.result
-        if result.fault is None:
-            held = self.map.safety.at_end == "hold"
-            result.end_state = "not armed" if not self.live else "holding" if held else "off"
         started = self.loop.path_started if self.loop.path_started is not None else self.loop.origin
         rows = self.recorder.rows.all()
-        result.record = describe(measured_record(rows, self.layout, started), self.motion.scene, State)
-        result.record.complete = result.fault is None
         result.timing = timing_of(rows)
-        summary: dict[str, Any] = {"end_state": result.end_state}
-        if result.fault is not None:
-            fault = result.fault
-            result.record.add_event(result.fault_time - started, "fault", fault.cause.value, description=fault.text)
-            summary |= {"fault": fault.cause.value, "fault_text": fault.text}
-        result.record.summary |= summary
         if result.timing:
             timing = ", ".join(f"{name} {value:.6g}" for name, value in result.timing.as_dict().items())
             self.journal.say(f"timing: {timing}")
+        record = self.journal.guard(RECORD, self._measured, rows, started)
+        result.record = record if record is not None else result.record
+        result.output_failures = self.journal.failures
+
+    def _measured(self, rows: Rows, started: float) -> Record:
+        """The record of the run; ``started`` is the clock time of its time 0 [s]."""
+        result = self.result
+        record = describe(measured_record(rows, self.layout, started), self.motion.scene, State)
+        record.complete = result.fault is None
+        for fault in result.faults:
+            record.add_event(fault.time - started, "fault", fault.cause.value, description=fault.text)
+        record.summary |= result.summary()
+        return record

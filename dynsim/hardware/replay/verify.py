@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path as FilePath
 
-from dynsim.files import write_json
 from dynsim.hardware.bus.control_table import (
     HEALTH_BLOCK,
     MODEL_BY_NUMBER,
@@ -45,15 +43,15 @@ def snapshot(bus: Bus, servo: Servo) -> Registers:
     }
 
 
-def dump_registers(bus: Bus, servo_map: ServoMap, path: FilePath) -> None:
-    """Write the registers of every servo that answers as JSON."""
+def all_registers(bus: Bus, servo_map: ServoMap) -> dict[str, Registers | str]:
+    """Registers of every servo by joint, or why it did not answer. Raises PortError."""
     contents: dict[str, Registers | str] = {}
     for servo in servo_map.servos:
         try:
             contents[servo.joint] = snapshot(bus, servo)
         except (NoAnswer, RequestRefused) as error:
             contents[servo.joint] = str(error)
-    write_json(path, contents)
+    return contents
 
 
 def configure(bus: Bus, servo_map: ServoMap, report: Callable[[str], None]) -> None:
