@@ -79,7 +79,7 @@ def test_exit_codes_of_refusal_verification_and_abort(call, files: Path) -> None
     code, _, error = call("hw", "replay", record, *options)
     assert code == 4
     assert "missed status" in error
-    assert "robot left holding" in error
+    assert "robot left mixed: 2 holding; elbow does not answer" in error
     summary = json.loads((files / "out" / "summary.json").read_text(encoding="utf-8"))
     assert summary["fault"] == "missed status"
     assert not Record.load(files / "out" / "measured.h5").complete

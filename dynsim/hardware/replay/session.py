@@ -119,7 +119,10 @@ def _save(result: ReplayResult, folder: Path, failures: Failures) -> None:
     try:
         if RECORD not in failures:
             summary = result.record.summary | {"outputs_failed": _named(failures)}
-            contents = {MEASURED: result.record.to_hdf5(), SUMMARY: json_text(summary).encode()}
+            contents: dict[str, bytes | memoryview] = {
+                MEASURED: result.record.to_hdf5(),
+                SUMMARY: json_text(summary).encode(),
+            }
             replace_together(folder, contents)
             (folder / PART).unlink()
             return
