@@ -181,9 +181,9 @@ class Replay:
                 raise Stopped(Fault(Cause.ARMING, f"{servo.joint} (ID {servo.id}): torque stays off", (servo.id,)))
             self.loop.take_over(index, goal, servo.to_angle(present))
         units = watchdog_units(self.map.safety)
+        self.loop.all_taken_over()
         for servo in self._servos:
             self.bus.write(servo.id, FIELDS["bus_watchdog"], units)
-        self.loop.all_taken_over()
         self.journal.say(f"torque on, bus watchdogs at {units * WATCHDOG_SECONDS_PER_UNIT * 1e3:.0f} ms")
 
     def _move_to_start(self) -> None:

@@ -123,9 +123,16 @@ class ReplayResult:
         for number, known in enumerate(self.faults):
             if known.cause == fault.cause:
                 ids = known.ids + tuple(id_ for id_ in fault.ids if id_ not in known.ids)
-                self.faults[number] = replace(known, text=f"{known.text}; {fault.text}", ids=ids)
+                self.faults[number] = replace(known, text=_joined(known.text, fault.text), ids=ids)
                 return
         self.faults.append(fault)
+
+
+def _joined(first: str, second: str) -> str:
+    """Texts "who: what" of one cause; what befell several is said once."""
+    who, _, what = first.partition(": ")
+    other, _, the_same = second.partition(": ")
+    return f"{who}, {other}: {what}" if what and what == the_same else f"{first}; {second}"
 
 
 class Stopped(Exception):
