@@ -183,7 +183,7 @@ def replay(
         if (faults or plant) and port != VIRTUAL:
             raise ServoMapError("--faults and --plant are for virtual servos: --port virtual")
         simulated, servo_map, motion = _checked(record, map_file, rate, speed)
-        script = load_fault_script(faults) if faults else None
+        script = load_fault_script(faults, servo_map.ids) if faults else None
         robot = _plant(plant, variant, servo_map, motion) if plant else None
         folder = out or Path("results") / file_name(f"{servo_map.robot}_replay")
         for warning in motion.warnings:
@@ -299,6 +299,8 @@ def virtual(
     map_file: MapFile,
     faults: Annotated[Path | None, typer.Option("--faults", help="fault script")] = None,
     link: Annotated[Path | None, typer.Option("--link", help="name the device by this symbolic link")] = None,
+    plant: Annotated[str | None, typer.Option("--plant", help="scenario whose robot the servos move")] = None,
+    variant: Annotated[str | None, typer.Option("--variant", help="variant of that scenario")] = None,
 ) -> None:
     """Virtual servos behind a pseudo-terminal, for any Dynamixel tool. Ctrl-C ends it."""
     with _client_library():
@@ -308,10 +310,12 @@ def virtual(
         from dynsim.hardware.virtual.faults import load_fault_script
         from dynsim.hardware.virtual.line import line_for_map
         from dynsim.hardware.virtual.pseudo_terminal import PseudoTerminal
+        from dynsim.hardware.virtual.simulated_plant import simulated_arm
 
         servo_map = load_servo_map(map_file)
-        script = load_fault_script(faults) if faults else None
-        terminal = PseudoTerminal(line_for_map(servo_map, script=script), link)
+        script = load_fault_script(faults, servo_map.ids) if faults else None
+        robot = simulated_arm(plant, variant, servo_map, {}) if plant else None
+        terminal = PseudoTerminal(line_for_map(servo_map, script=script, plant=robot), link)
         stop = StopRequest()
         # A plain line: other programs wait for it.
         print(

@@ -105,7 +105,7 @@ class Kind(StrictModel):
     Attributes
     ----------
     model : str
-        "MX-106" or "MX-28".
+        A name of :data:`dynsim.hardware.bus.control_table.MODELS`.
     mode : "position" or "velocity"
     firmware_min : int
         Oldest firmware accepted.
@@ -117,7 +117,7 @@ class Kind(StrictModel):
         Servo turns per joint turn.
     """
 
-    model: Literal["MX-106", "MX-28"]
+    model: Literal["MX-106", "MX-28", "XL430-W250", "XM430-W210", "XM430-W350", "XH540-W150", "XH540-W270"]
     mode: Literal["position", "velocity"]
     firmware_min: int = 41
     follows: Follows
@@ -374,8 +374,8 @@ def json_schema() -> dict[str, Any]:
 _Schema = TypeVar("_Schema", bound=BaseModel)
 
 
-def read_yaml(path: Path, schema: type[_Schema]) -> _Schema:
-    """Read YAML into a pydantic model.
+def read_yaml(path: Path, schema: type[_Schema], context: dict[str, Any] | None = None) -> _Schema:
+    """Read YAML into a pydantic model, whose validators are given ``context``.
 
     Raises
     ------
@@ -386,7 +386,7 @@ def read_yaml(path: Path, schema: type[_Schema]) -> _Schema:
     if not isinstance(data, dict):
         raise ServoMapError(f"{path}: expected a mapping with the keys {', '.join(schema.model_fields)}")
     try:
-        return schema.model_validate(data)
+        return schema.model_validate(data, context=context)
     except ValidationError as error:
         origin = Origin(path, (data,))
         raise ServoMapError(explain(error, data, origin, unknown_keys(error, data, origin, schema))) from None

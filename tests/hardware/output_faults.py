@@ -140,17 +140,21 @@ def _watched(outputs: Outputs, what: str, call: Any, *, wrap: bool = False) -> A
 
 def _take_turns(outputs: Outputs, patch: pytest.MonkeyPatch) -> None:
     turns: dict[Background, int] = {}
-    each, enter, exchange = Background._each, Journal.enter, Loop.exchange
+    make, each = Background.__init__, Background._each
+    enter, exchange = Journal.enter, Loop.exchange
     tell_end, run = Replay._tell_end, Replay.run
 
+    def made(self: Background, *arguments: Any) -> None:
+        turns[self] = 0
+        make(self, *arguments)
+
     def counted(self: Background, method: str) -> None:
-        turns.setdefault(self, 0)
         each(self, method)
         turns[self] += 1
 
     def wait() -> None:
-        before, end = dict(turns), time.monotonic() + 5.0
-        for background, count in before.items():
+        for background, count in dict(turns).items():
+            end = time.monotonic() + 5.0
             while turns[background] < count + 2 and background._thread.is_alive() and time.monotonic() < end:
                 background.wake()
                 time.sleep(0)
@@ -160,6 +164,7 @@ def _take_turns(outputs: Outputs, patch: pytest.MonkeyPatch) -> None:
     def entered(self: Journal, state: Any) -> None:
         nonlocal cycles
         cycles = 0
+        wait()
         outputs.state = state.name
         enter(self, state)
         wait()
@@ -173,15 +178,19 @@ def _take_turns(outputs: Outputs, patch: pytest.MonkeyPatch) -> None:
         return result
 
     def left(self: Replay) -> None:
+        wait()
         outputs.state = LEFT
         tell_end(self)
+        wait()
 
     def finished(self: Replay) -> Any:
         try:
             return run(self)
         finally:
+            wait()
             outputs.state = AFTER
 
+    patch.setattr(Background, "__init__", made)
     patch.setattr(Background, "_each", counted)
     patch.setattr(Journal, "enter", entered)
     patch.setattr(Loop, "exchange", exchanged)

@@ -22,7 +22,6 @@ import select
 import termios
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +36,8 @@ from dynsim.hardware.errors import PortError
 WRITE_TIMEOUT = 0.25
 READ_WAIT = 5e-4
 """Longest wait for a byte before time-outs are looked at [s]."""
-MARKS = 4
-"""Kinds of requests for one block that can be told apart by the length of their answers."""
-CALM = 20
-"""Complete sync reads after which no late answer is expected any more."""
+MARKS = 16
+"""Sync reads of one block after which an answer that was missed is not expected any more."""
 RETRIES = 2
 """Further attempts of a single read or write; the timed loop makes none."""
 TORQUE_ENABLE = 64
@@ -115,26 +112,29 @@ def latency_timer(port_name: str) -> int | None:
         return None
 
 
-@dataclass
-class Mark:
+class Marks:
     """By how many bytes the next request for a block is longer, so that answers to earlier ones have a wrong length.
 
     A status says whose it is, not what it answers: a servo that is two periods late would pass for one that is up to
-    date. Nothing is outstanding as long as all answer, so that only a missed answer makes the next requests longer,
-    one byte more each time, until nobody has been missed for a while.
+    date. Where all have answered nothing can come late, and nothing is longer; a request that somebody missed keeps its
+    length to itself for the next MARKS - 1 requests.
     """
 
-    extra: int = 0
-    calm: int = 0
+    def __init__(self) -> None:
+        self._number = 0
+        self._missed: dict[int, int] = {}  # number of the request by its bytes more
 
-    def turn(self, *, complete: bool) -> None:
-        """After a request, which all answered in time or not."""
-        if not complete:
-            self.extra, self.calm = (self.extra + 1) % MARKS, 0
-        elif self.extra:
-            self.calm += 1
-            if self.calm == CALM:
-                self.extra = 0
+    def choose(self) -> int:
+        """For a request to be sent now."""
+        self._number += 1
+        if not self._missed:
+            return 0
+        self._missed = {extra: number for extra, number in self._missed.items() if self._number - number < MARKS}
+        return next(extra for extra in range(MARKS) if extra not in self._missed)
+
+    def miss(self, extra: int) -> None:
+        """Somebody has not answered the request sent last, which was ``extra`` bytes longer."""
+        self._missed[extra] = self._number
 
 
 class DynamixelBus:
@@ -155,7 +155,7 @@ class DynamixelBus:
         self.latency = latency
         self.return_delay = return_delay
         self._library = Protocol2PacketHandler()
-        self._marks: dict[int, Mark] = {}
+        self._marks: dict[int, Marks] = {}
 
     @property
     def name(self) -> str:
@@ -201,8 +201,9 @@ class DynamixelBus:
             raise PortError(f"{self.name}: {self._library.getTxRxResult(result)}")
 
     def sync_read(self, ids: Sequence[int], address: int, length: int) -> BlockRead:
-        mark = self._marks.setdefault(address, Mark())
-        asked = length + mark.extra
+        marks = self._marks.setdefault(address, Marks())
+        extra = marks.choose()
+        asked = length + extra
         with self._transaction():
             stray = self.port.getBytesAvailable()
             result = self._library.syncReadTx(self.port, address, asked, list(ids), len(ids), False)
@@ -232,7 +233,8 @@ class DynamixelBus:
             if late:
                 sort_in(decoder.feed(self.port.readPort(late)))
             sort_in(decoder.flush())
-        mark.turn(complete=len(answers) == len(ids))
+        if len(answers) < len(ids):
+            marks.miss(extra)
         replies = {
             id_: ServoReply(packet.parameters[:length], bool(packet.error & ALERT)) for id_, packet in answers.items()
         }

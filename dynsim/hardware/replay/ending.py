@@ -46,7 +46,7 @@ class Ending:
         self._policy = policy
         self._servos = loop.map.servos
         self._troubled: set[int] = set()
-        self._held = False
+        self._held = self._released = False
         self._at_rest = False
 
     def regular(self) -> None:
@@ -85,6 +85,14 @@ class Ending:
                 self._try(self._hold)
             self._try(self._come_to_rest)
             self._try(self._release if self._policy == "off" else self._leave_holding)
+
+    def release_at_last(self) -> bool:
+        """Torque off if the user has asked for it since the policy was carried out; raises nothing."""
+        if self._released or not self._loop.stop.for_release:
+            return False
+        self._try(self._release)
+        self.read_back(armed=True)
+        return True
 
     def read_back(self, *, armed: bool) -> None:
         """Ask every servo what it does, and derive from it what the robot does; raises nothing."""
@@ -246,6 +254,7 @@ class Ending:
     def _release(self) -> None:
         """Torque off by broadcast, until every servo confirms or REST_TIME is over. Raises PortError."""
         loop, until = self._loop, self._loop.now() + REST_TIME
+        self._released = True
         while True:
             loop.bus.torque_off_all()
             health = read_health(loop.bus, self._servos)

@@ -21,28 +21,26 @@ from dynsim.hardware.bus.control_table import RAD_S2_PER_UNIT, RAD_S_PER_UNIT, W
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused
 from dynsim.hardware.errors import PortError
 from dynsim.hardware.replay.check import CheckedMotion, velocity_limit
+from dynsim.hardware.replay.end_state import AT_REST
 from dynsim.hardware.replay.ending import Ending
 from dynsim.hardware.replay.folder import REGISTERS, REGISTERS_AFTER_FAULT
 from dynsim.hardware.replay.journal import Journal
 from dynsim.hardware.replay.loop import FIELDS, Loop
 from dynsim.hardware.replay.measured import describe
 from dynsim.hardware.replay.motion import Approach
-from dynsim.hardware.replay.rows import Layout, Rows, measured_record, timing_of
+from dynsim.hardware.replay.rows import Layout, measured_record, timing_of
 from dynsim.hardware.replay.rules import Cause, Fault, watchdog_units
 from dynsim.hardware.replay.run_log import Recorder, RunLog
 from dynsim.hardware.replay.states import UNARMED, Progress, ReplayResult, State, Stopped, StopRequest
 from dynsim.hardware.replay.trajectory import Path
-from dynsim.hardware.replay.verify import all_registers, configure, verify
+from dynsim.hardware.replay.verify import Registers, all_registers, configure, verify
 from dynsim.hardware.servo_map import FaultPolicy, Servo, ServoMap
-from dynsim.record import Record
 
 APPROACH_ACCELERATION = 10.0
 """Profile acceleration the firmware is given for the move to the start [rad/s²]."""
 SETTLE_CYCLES = 10
 SETTLE_TIME = 3.0
 """Longest wait for the servos to come to rest [s]."""
-SETTLE_VELOCITY = 0.1
-"""[rad/s], a few units of the velocity register."""
 RECORD = "measured record"
 """Name of that output among those that failed."""
 DRY_RUN_TIME = 1.0
@@ -153,7 +151,7 @@ class Replay:
         if self.write_eeprom:
             configure(self.bus, self.map, self.journal.say)
         problems = verify(self.bus, self.map, self.motion, poll=self.stop.check)
-        self._dump(REGISTERS)
+        self._dump(self._read_registers(), REGISTERS)
         if problems:
             raise Stopped(Fault(Cause.VERIFICATION, "\n  ".join([f"{len(problems)} problem(s):", *problems])))
         self.journal.say(f"{len(self._servos)} servos as the map says")
@@ -185,9 +183,9 @@ class Replay:
                 raise Stopped(Fault(Cause.ARMING, f"{servo.joint} (ID {servo.id}): torque stays off", (servo.id,)))
             self.loop.take_over(index, goal, servo.to_angle(present))
         units = watchdog_units(self.map.safety)
+        self.loop.all_taken_over()
         for servo in self._servos:
             self.bus.write(servo.id, FIELDS["bus_watchdog"], units)
-        self.loop.all_taken_over()
         self.journal.say(f"torque on, bus watchdogs at {units * WATCHDOG_SECONDS_PER_UNIT * 1e3:.0f} ms")
 
     def _move_to_start(self) -> None:
@@ -210,7 +208,7 @@ class Replay:
             cycle = loop.stay(goal)
             error = np.abs(loop.rules.following_error(cycle))
             limit = np.array([servo.kind.following_error for servo in self._servos])
-            still = (error < limit) & (np.abs(cycle.velocity) < SETTLE_VELOCITY)
+            still = (error < limit) & (np.abs(cycle.velocity) < AT_REST)
             quiet = quiet + 1 if np.all(still | cycle.missed) else 0
             cycles += 1
             if cycles * loop.period > SETTLE_TIME:
@@ -268,44 +266,44 @@ class Replay:
                 self._ending.read_back(armed=armed)
         self._tell_end()
         if armed and result.end_state != "unreachable":
-            self._dump(REGISTERS_AFTER_FAULT)
+            registers = self._read_registers()
+            if self._ending.release_at_last():
+                self._tell_end()
+            self._dump(registers, REGISTERS_AFTER_FAULT)
 
     def _tell_end(self) -> None:
         self.journal.say(f"end state: {self.result.end_state}")
         for servo in self.result.servos:
             self.journal.say(str(servo))
 
-    def _dump(self, name: str) -> None:
-        """Registers of all servos into a file of the dump folder."""
-        if not self._dump_folder:
-            return
+    def _read_registers(self) -> dict[str, Registers | str] | None:
+        """Of all servos, for a dump; None where the port died after a fault."""
         try:
-            registers = all_registers(self.bus, self.map)
+            return all_registers(self.bus, self.map)
         except PortError as error:
             if self.result.fault is None:
                 raise
             self.journal.say(f"no register dump: {error}")
-            return
-        self.journal.guard(name, write_json, self._dump_folder / name, registers)
+            return None
+
+    def _dump(self, registers: dict[str, Registers | str] | None, name: str) -> None:
+        if self._dump_folder and registers is not None:
+            self.journal.guard(name, write_json, self._dump_folder / name, registers)
 
     def _finish(self) -> None:
-        result = self.result
-        started = self.loop.path_started if self.loop.path_started is not None else self.loop.origin
-        rows = self.recorder.rows.all()
-        result.timing = timing_of(rows)
-        if result.timing:
-            timing = ", ".join(f"{name} {value:.6g}" for name, value in result.timing.as_dict().items())
-            self.journal.say(f"timing: {timing}")
-        record = self.journal.guard(RECORD, self._measured, rows, started)
-        result.record = record if record is not None else result.record
-        result.output_failures = self.journal.failures
+        self.journal.guard(RECORD, self._sum_up)
+        timing = self.result.timing
+        if timing:
+            self.journal.say(f"timing: {', '.join(f'{name} {value:.6g}' for name, value in timing.as_dict().items())}")
 
-    def _measured(self, rows: Rows, started: float) -> Record:
-        """The record of the run; ``started`` is the clock time of its time 0 [s]."""
-        result = self.result
+    def _sum_up(self) -> None:
+        """Record and timing of the run."""
+        result, rows = self.result, self.recorder.rows.all()
+        result.timing = timing_of(rows)
+        started = self.loop.path_started if self.loop.path_started is not None else self.loop.origin
         record = describe(measured_record(rows, self.layout, started), self.motion.scene, State)
         record.complete = result.fault is None
         for fault in result.faults:
             record.add_event(fault.time - started, "fault", fault.cause.value, description=fault.text)
         record.summary |= result.summary()
-        return record
+        result.record = record

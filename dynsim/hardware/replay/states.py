@@ -96,8 +96,6 @@ class ReplayResult:
     timing : TimingStatistics | None
     torque_still_on : tuple of int
         IDs that did not confirm torque off.
-    output_failures : dict
-        Errors of the outputs that failed on the way, by their names.
     """
 
     end_state: str = NOT_ARMED
@@ -109,7 +107,6 @@ class ReplayResult:
     record: Record = field(default_factory=lambda: Record([]))
     timing: TimingStatistics | None = None
     torque_still_on: tuple[int, ...] = ()
-    output_failures: dict[str, BaseException] = field(default_factory=dict)
 
     @property
     def fault(self) -> Fault | None:
@@ -139,9 +136,16 @@ class ReplayResult:
         for number, known in enumerate(self.faults):
             if known.cause == fault.cause:
                 ids = known.ids + tuple(id_ for id_ in fault.ids if id_ not in known.ids)
-                self.faults[number] = replace(known, text=f"{known.text}; {fault.text}", ids=ids)
+                self.faults[number] = replace(known, text=_joined(known.text, fault.text), ids=ids)
                 return
         self.faults.append(fault)
+
+
+def _joined(first: str, second: str) -> str:
+    """Texts "who: what" of one cause; what befell several is said once."""
+    who, _, what = first.partition(": ")
+    other, _, the_same = second.partition(": ")
+    return f"{who}, {other}: {what}" if what and what == the_same else f"{first}; {second}"
 
 
 class Stopped(Exception):
