@@ -99,9 +99,10 @@ def _end(servo: Servo, registers: dict[str, int]) -> ServoEnd:
 
 
 def of_the_whole(servos: Sequence[ServoEnd]) -> str:
-    """One phrase for all servos: "holding", "off", "unreachable", or what the minority does by name.
+    """One phrase for all servos: "holding", "off", "unreachable", or who does what.
 
-    The largest group is counted, as in "mixed: 16 holding; elbow limp: overload; wheel1, wheel2 does not answer".
+    The largest group is counted, the others are named, as in
+    "mixed: 16 holding; wheel1, wheel2 does not answer; elbow limp: overload".
     """
     groups: dict[str, list[str]] = {}
     for servo in servos:
@@ -109,7 +110,9 @@ def of_the_whole(servos: Sequence[ServoEnd]) -> str:
     if len(groups) <= 1:
         doing = next(iter(groups), SILENT)
         return WHOLE.get(doing, doing)
-    (largest, members), *others = sorted(groups.items(), key=lambda group: -len(group[1]))
-    return "; ".join(
-        [f"mixed: {len(members)} {largest}", *(f"{', '.join(joints)} {doing}" for doing, joints in others)]
-    )
+    largest = max(groups, key=lambda doing: len(groups[doing]))
+    told = [
+        f"{len(joints)} {doing}" if doing == largest and len(joints) > 1 else f"{', '.join(joints)} {doing}"
+        for doing, joints in sorted(groups.items(), key=lambda group: -len(group[1]))
+    ]
+    return f"mixed: {'; '.join(told)}"

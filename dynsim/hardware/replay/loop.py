@@ -92,7 +92,7 @@ class Loop:
         self.goal[index] = self.measured[index] = angle
 
     def all_taken_over(self) -> None:
-        """All are armed, and their watchdogs run."""
+        """All are armed; from now on silence makes their watchdogs trip."""
         self._sent_at = self._heard_at = self._clock.now()
 
     def stall(self) -> Fault | None:

@@ -189,6 +189,7 @@ class AbortRules:
 
     def stall(self, silence: float) -> Fault:
         """Nobody spoke to the servos for ``silence`` [s]."""
+        self._new(Cause.STALL)
         text = f"stalled for {silence:.2f} s: the servos' bus watchdogs ({self._watchdog:.2f} s) have tripped"
         return Fault(Cause.STALL, text)
 
@@ -220,7 +221,7 @@ class AbortRules:
 
         if registers["hardware_error"]:
             add(Cause.ALERT, describe_hardware_error(registers["hardware_error"]))
-        elif registers["bus_watchdog"] == -1:
+        elif registers["bus_watchdog"] == -1 and (Cause.STALL, None) not in self._declared:
             add(Cause.WATCHDOG, "its bus watchdog has tripped, it ignores goals")
         elif not registers["torque_enable"]:
             add(Cause.TORQUE_LOST, "torque is off (restarted, or switched off by another program)")
@@ -242,7 +243,7 @@ class AbortRules:
         outdated = [servo for servo in hit if servo.id in cycle.outdated]
         if outdated:
             text += f"; answers to earlier requests come from {_names(outdated)}"
-        if len(hit) == len(self._servos) > 1:
+        if len(indices) == len(self._servos) > 1:
             text += "; nobody answers: is the supply or the line lost?"
         return [Fault(Cause.MISSED_STATUS, text, tuple(servo.id for servo in hit))]
 
