@@ -224,6 +224,32 @@ class Safety(StrictModel):
     at_end: Literal["off", "hold"] = "off"
 
 
+class Lifts(StrictModel):
+    """How wheel pairs that the record lifts are lifted.
+
+    Attributes
+    ----------
+    signal : str
+        Signal of the record with 1 where a wheel pair is on the ground, 0 where it is lifted.
+    joints : tuple of str
+        The pitch joints on the axles of the first, second, ... pair: every pair but the last has one. Lifting is added
+        to what they do otherwise; the first, on the axle that carries the head, follows the record and keeps the head
+        where it is.
+    clearance_mm : float
+        Height of the lower wheel of a lifted pair above the floor.
+    blend_s : float
+        Time to lift a pair, and to put it down [s of record time].
+    tilt_mm : float
+        A record is refused where one wheel of a grounded pair would be further above the floor: a bent base twists.
+    """
+
+    signal: str = "grounded"
+    joints: Annotated[tuple[str, ...], Field(min_length=1)]
+    clearance_mm: Positive = 5.0
+    blend_s: Positive = 0.3
+    tilt_mm: Positive = 2.5
+
+
 class _MapFile(StrictModel):
     """A servo map: which servo follows which column of a record, and what that joint may do."""
 
@@ -232,6 +258,7 @@ class _MapFile(StrictModel):
     robot: str
     bus: Bus = Bus()
     safety: Safety = Safety()
+    lifts: Lifts | None = None
     kinds: dict[str, Kind]
     servos: Annotated[dict[str, ServoEntry], Field(json_schema_extra={"minProperties": 1})]
 
@@ -246,6 +273,16 @@ class _MapFile(StrictModel):
             if entry.id in owner:
                 raise error_at(f"servos.{joint}.id", f"is also the ID of {owner[entry.id]}")
             owner[entry.id] = joint
+        for joint in self.lifts.joints if self.lifts else ():
+            if joint not in self.servos:
+                raise error_at("lifts.joints", f"{joint} is none of the servos")
+            if self.kinds[self.servos[joint].kind].mode != "position" or self.servos[joint].hold_at_deg not in (
+                None,
+                0,
+            ):
+                raise error_at(
+                    "lifts.joints", f"{joint} must be in position mode and follow the record or be held at 0"
+                )
         return self
 
 
@@ -323,6 +360,7 @@ class ServoMap:
     path : Path
     bus : Bus
     safety : Safety
+    lifts : Lifts or None
     servos : tuple of Servo
     """
 
@@ -331,6 +369,7 @@ class ServoMap:
         self.robot = content.robot
         self.bus = content.bus
         self.safety = content.safety
+        self.lifts = content.lifts
         self.servos = tuple(Servo(joint, entry, content.kinds[entry.kind]) for joint, entry in content.servos.items())
 
     @property
