@@ -1,25 +1,25 @@
 """The part of a snake that stands on its wheels, folded along its axles.
 
-Between two axles there are two links and a yaw joint, whose axis stands on both: a segment is a flat plate, whatever its
-yaw angle. A pitch joint turns about the axle it sits on, so the base part is a strip of plates hinged at its axles.
-With R_j the attitude of the plate behind axle j and a_j, b_(j+1) the links before and behind its yaw joint,
+Between two axles there are two links and a yaw joint, whose axis is normal to both: a segment is a flat plate, whatever
+its yaw angle. A pitch joint turns about the axle it sits on, so the base part is a strip of plates hinged at its axles.
+With R_j the attitude of the plate behind axle j, a_j and b_j its links before and behind its yaw joint theta_j,
 
-    R_j = R_(j-1) Rz(theta_j) Ry(psi_j),   R_0 Rz(theta_0) = 1 (the floor)
-    p_(j+1) = p_j - R_j (a_j e_x + b_(j+1) Rz(theta_(j+1)) e_x),   y_(j+1) = R_j Rz(theta_(j+1)) e_y
+    R_j = R_(j-1) Rz(theta_(j-1)) Ry(psi_j),     R_1 = Ry(psi_1)
+    p_(j+1) = p_j - R_j (a_j e_x + b_j Rz(theta_j) e_x),     y_(j+1) = R_j Rz(theta_j) e_y
 
-and a wheel beside axle j at s h_j (s = +1 left, -1 right) is above the floor by
+and the wheel beside axle j at s h_j (s = +1 left, -1 right), a thin disc of radius r, is above the floor by
 
-    z_j + s h_j e_z.y_j - r sqrt(1 - (e_z.y_j)^2)                                        (a thin disc of radius r)
+    z_j + s h_j e_z.y_j - r sqrt(1 - (e_z.y_j)^2)
 
-psi_j alone sets the height of axle j+1, given all before. Going tailward, every psi_j is the smallest one that leaves no
-wheel of pair j+1 below the height asked for: the lower one is exactly there. Pair 1 stays flat on the floor, so that the
-head does not move; its pitch joint turns psi back from the head's side.
+psi_j alone sets the height of axle j+1, given all before. Going tailward, every psi_j is the smallest that leaves no
+wheel of pair j+1 below the height asked for: the lower one is exactly there. Pair 1 stays flat on the floor; its pitch
+joint takes psi_1 back from the head's side, so that the head does not move.
 
-Both wheels of a pair can be there only where the strip folds without a twist. A line on a plate meets the axle before
-it in a point that does not move when the plate turns about that axle. Two grounded axles with one lifted between: the lifted
-one would have to pass through its meeting points with both, and lies on the floor with them unless the three axles meet
-in one point or are parallel (base straight, or bent in an arc). Otherwise one wheel of the next grounded pair stays in
-the air by :attr:`Fold.tilt`; no angles of the pitch joints can help that.
+Both wheels of a grounded pair are on the floor only where the strip folds without a twist. A line on a plate meets the
+axle before it in a point that stays where it is when the plate turns about that axle. With one axle lifted between two
+on the floor, the lifted one passes through its meeting points with both, and lies on the floor with them, unless the
+three axles meet in one point or are parallel (a straight base, or one bent in an arc). Otherwise one wheel of the next
+pair stays above the floor by :attr:`Fold.tilt`, whatever the pitch angles.
 """
 
 from __future__ import annotations
@@ -186,7 +186,10 @@ def base_part(record: Record, pairs: tuple[str, ...]) -> BasePart:
 
 
 def _wheels(scene: Scene, body: Body, index: int) -> tuple[float, float, float]:
-    """Where along a body its axle is, half track and radius [m]; a wheel is a shape of it, or a body that turns on it."""
+    """Where along a body its axle is, half track and radius [m].
+
+    A wheel is a shape of the body, or a body that turns on it.
+    """
     beside = [(*shape.position[:2], shape.size[0]) for shape in body.shapes if shape.position[1] != 0.0]
     beside += [
         (*other.joint.position[:2], other.shapes[0].size[0])

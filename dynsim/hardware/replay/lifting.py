@@ -4,8 +4,8 @@ The record says which pairs are on the ground, 0 or 1; the robot needs time for 
 
     eta(t) = clearance s((t - t_up)/blend) s((t_down - t)/blend),   s(u) = 10 u^3 - 15 u^4 + 6 u^5
 
-from the sample t_up on in which it is first lifted, and is zero again at t_down, when it is first grounded: a pair is in
-the air only while the record says so. Pitch angles follow from the heights and the yaw angles of every sample
+from the sample t_up on in which it is first lifted, and is zero again at t_down, when it is first grounded: a pair is
+in the air only while the record says so. Pitch angles follow from the heights and the yaw angles of every sample
 (:mod:`dynsim.hardware.replay.base_part`), before anything moves.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.hardware.errors import CheckRefused
-from dynsim.hardware.replay.base_part import BasePart, Fold, base_part
+from dynsim.hardware.replay.base_part import Fold, base_part
 from dynsim.hardware.servo_map import Lifts, ServoMap
 from dynsim.record import TIME, Record
 
@@ -38,11 +38,11 @@ def wheel_offsets(record: Record, servo_map: ServoMap) -> dict[str, Array]:
     if lifts is None:
         _refuse_lifted_wheels(record)
         return {}
-    return dict(zip(lifts.joints, lifted(record, lifts)[1].hinge.T, strict=False))
+    return dict(zip(lifts.joints, lifted(record, lifts).hinge.T, strict=True))
 
 
-def lifted(record: Record, lifts: Lifts) -> tuple[BasePart, Fold]:
-    """The base part of a record and how it is folded at every sample.
+def lifted(record: Record, lifts: Lifts) -> Fold:
+    """How the base part of a record is folded at every sample.
 
     Raises
     ------
@@ -58,26 +58,27 @@ def lifted(record: Record, lifts: Lifts) -> tuple[BasePart, Fold]:
         )
     time = record.time - record.time[0]
     _refuse_what_cannot_stand(grounded, pairs, time)
-    part = base_part(record, pairs)
     height = np.column_stack(
         [_height(column, time, lifts, name) for column, name in zip(grounded.T, pairs, strict=True)]
     )
     if not height.any():
-        return part, Fold(np.zeros_like(height[:, 1:]), height, np.zeros_like(height))
+        return Fold(np.zeros_like(height[:, 1:]), height, np.zeros_like(height))
     if (step := float(np.diff(time).max())) * SAMPLES_PER_BLEND > lifts.blend_s:
         raise CheckRefused(
             f"wheels are lifted in blend_s = {lifts.blend_s:g} s, and the record has a sample every {step:g} s: record "
             f"at {SAMPLES_PER_BLEND / lifts.blend_s:.0f} Hz or more, or lift them slower"
         )
+    part = base_part(record, pairs)
     try:
         fold = part.fold(part.yaw_angles(record), height)
     except ArithmeticError as lost:
         row, pair = lost.args
         raise CheckRefused(
-            f"{pairs[pair]} cannot be brought to {1e3 * height[row, pair]:g} mm above the floor at t = {time[row]:.3f} s"
+            f"no pitch angle brings {pairs[pair]} to {1e3 * height[row, pair]:g} mm above the floor at "
+            f"t = {time[row]:.3f} s"
         ) from None
     _refuse_twist(np.where(height == 0.0, fold.tilt, 0.0), lifts, pairs, time)
-    return part, fold
+    return fold
 
 
 def _refuse_lifted_wheels(record: Record) -> None:
@@ -144,7 +145,8 @@ def _refuse_twist(tilt: Array, lifts: Lifts, pairs: tuple[str, ...], time: Array
     row, pair = np.unravel_index(int(tilt.argmax()), tilt.shape)
     if tilt[row, pair] > 1e-3 * lifts.tilt_mm:
         raise CheckRefused(
-            f"{pairs[pair]} would stand on one wheel at t = {time[row]:.3f} s, the other {1e3 * tilt[row, pair]:.1f} mm "
-            f"above the floor (lifts.tilt_mm: {lifts.tilt_mm:g}): the axles before it do not meet in one point, so that "
-            "one between them cannot be lifted without a twist. Less clearance, or a base that is bent less"
+            f"{pairs[pair]} would stand on one wheel at t = {time[row]:.3f} s, the other "
+            f"{1e3 * tilt[row, pair]:.1f} mm above the floor (lifts.tilt_mm: {lifts.tilt_mm:g}): the axles before it "
+            "do not meet in one point, so that one between them cannot be lifted without a twist. Less clearance, or a "
+            "base that is bent less"
         )
