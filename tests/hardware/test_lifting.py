@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import pinocchio as pin
@@ -103,9 +104,18 @@ def posed(record: Record, servo_map: ServoMap) -> Posed:
     return Posed(record, *(np.array(part) for part in zip(*found, strict=True)))
 
 
+Find = Callable[[str, "str | None"], Posed]
+
+
 @pytest.fixture(scope="module")
-def operator(simulated: Callable[[str, str | None], Record]) -> Posed:
-    return posed(simulated("snake_operator", None), snake_map())
+def posed_run(simulated: Callable[[str, str | None], Record]) -> Find:
+    """Record of a scenario and variant, as the shipped map has it replayed."""
+    return cache(lambda scenario, variant: posed(simulated(scenario, variant), snake_map()))
+
+
+@pytest.fixture(scope="module")
+def operator(posed_run: Find) -> Posed:
+    return posed_run("snake_operator", None)
 
 
 def settled(record: Record) -> np.ndarray:
@@ -120,9 +130,9 @@ def settled(record: Record) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("scenario", "variant"), PASSING)
-def test_lifted_wheels_clear_the_floor_and_grounded_pairs_touch_it(simulated, scenario, variant) -> None:
+def test_lifted_wheels_clear_the_floor_and_grounded_pairs_touch_it(posed_run, scenario, variant) -> None:
     """At every sample of the records, blends and all; both wheels of what is lifted, the lower one of the others."""
-    found = posed(simulated(scenario, variant), snake_map())
+    found = posed_run(scenario, variant)
     record, up = found.record, settled(found.record)
     assert (record["grounded"] == 0).any()
     assert up.sum() > 0.9 * (record["grounded"] == 0).sum()
@@ -140,9 +150,9 @@ def test_the_operator_lifts_in_all_samples_and_every_mode(operator) -> None:
 
 
 @pytest.mark.parametrize(("scenario", "variant"), PASSING)
-def test_the_head_stays_where_the_record_has_it(simulated, scenario, variant) -> None:
+def test_the_head_stays_where_the_record_has_it(posed_run, scenario, variant) -> None:
     """From the recorded head down the chain pair 1 is met at its recorded place, flat on the floor."""
-    found = posed(simulated(scenario, variant), snake_map())
+    found = posed_run(scenario, variant)
     base = found.record["base_pose"]
     np.testing.assert_allclose(found.middle[:, 0, :2], base[:, :2], atol=1e-8)
     np.testing.assert_allclose(found.wheel[:, 0], 0.0, atol=1e-8)
@@ -183,7 +193,7 @@ def test_pairs_are_in_the_air_only_while_the_record_says_so(operator) -> None:
 
 
 def test_rates_and_accelerations_are_those_of_the_blend(operator) -> None:
-    """Straight base: |psi''| is at most 4 times clearance s''/l_seg (a hinge between two lifted pairs that part ways)."""
+    """Base almost straight: |psi''| is at most 4 times clearance s''/2l, at an axle between two that go the other way."""
     servo_map = snake_map()
     path, segment = path_of_record(operator.record, servo_map), 2 * LINK
     for name in PITCH[1:]:
@@ -195,13 +205,16 @@ def test_rates_and_accelerations_are_those_of_the_blend(operator) -> None:
         assert np.abs(acceleration).max() < 4 * 5.774 * CLEARANCE / BLEND**2 / segment
 
 
-def test_the_grounded_part_keeps_its_kinematics_to_second_order(operator, simulated) -> None:
+def test_the_grounded_part_keeps_its_kinematics_to_second_order(operator) -> None:
     """Axles that are on the ground are where the flat base of the record has them, up to clearance^2."""
     record = operator.record
     flat = record["posture"][:, 6::2, :2]  # after the controlled point and five joints
     grounded = operator.grounded
     off = np.linalg.norm(operator.middle[..., :2] - flat, axis=2)[grounded].max()
-    assert off < 0.6e-3
+    assert off < 0.3e-3
+    yaw = np.cumsum(np.column_stack([record["base_pose"][:, 2], record["phi"][:, 6:]]), axis=1)
+    along = np.cos(yaw) * operator.axle[..., 0] + np.sin(yaw) * operator.axle[..., 1]  # sine of the axles' error in yaw
+    assert np.abs(along[grounded]).max() < 0.05e-3
     lower = posed(record, with_lifts(snake_map(), clearance_mm=2.5))
     half = np.linalg.norm(lower.middle[..., :2] - flat, axis=2)[grounded].max()
     assert half == pytest.approx(off / 4, rel=0.05)
@@ -220,7 +233,7 @@ def test_clearance_and_blend_can_be_set(simulated) -> None:
 
 
 def a_snake(yaw: np.ndarray, grounded: np.ndarray, simulated, rate: float = 200.0) -> Record:
-    """A record with the scene of a real one: base part at these yaw angles (T, 6), pairs on the ground or not (T, 7)."""
+    """A record with the scene of a real one: yaw angles (T, 6) of the base part, pairs on the ground or not (T, 7)."""
     real = simulated("snake_positioning", "z")
     record = Record(np.arange(len(yaw)) / rate)
     phi = np.repeat(real["phi"][:1], len(yaw), axis=0)
@@ -319,7 +332,7 @@ def blinking(away: dict[int, tuple[float, float]], duration: float = 2.0, rate: 
     ("away", "words"),
     [
         ({1: (0.5, 1.5)}, ["pair1", "head", "0.5"]),
-        ({k: (0.5, 1.5) for k in range(2, 8)}, ["only pair1"]),
+        (dict.fromkeys(range(2, 8), (0.5, 1.5)), ["only pair1"]),
         ({4: (0.5, 0.9)}, ["pair4", "0.4", "0.6 s", "blend_s"]),
         ({4: (1.8, 9.0)}, ["pair4", "0.3 s"]),
     ],
@@ -335,7 +348,7 @@ def test_what_cannot_be_lifted_is_refused(away, words, simulated) -> None:
 def test_a_twist_beyond_the_bound_is_refused_and_the_bound_can_be_set(simulated) -> None:
     grounded = blinking({3: (0.0, 9.0)})
     record = a_snake(np.tile([0.0, 0.6, -0.6, 0.0, 0.0, 0.0], (len(grounded), 1)), grounded, simulated)
-    with pytest.raises(CheckRefused, match="would stand on one wheel .* tilt_mm: 2.5"):
+    with pytest.raises(CheckRefused, match=r"would stand on one wheel .*tilt_mm: 2\.5"):
         check_motion(record, snake_map())
     assert check_motion(record, with_lifts(snake_map(), tilt_mm=9))
 
