@@ -193,7 +193,7 @@ def test_pairs_are_in_the_air_only_while_the_record_says_so(operator) -> None:
 
 
 def test_rates_and_accelerations_are_those_of_the_blend(operator) -> None:
-    """Base almost straight: |psi''| is at most 4 times clearance s''/2l, at an axle between two that go the other way."""
+    """Base almost straight: no hinge needs more than 4 clearance s''/2l, between neighbours that go the other way."""
     servo_map = snake_map()
     path, segment = path_of_record(operator.record, servo_map), 2 * LINK
     for name in PITCH[1:]:
