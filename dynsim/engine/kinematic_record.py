@@ -214,7 +214,7 @@ def _warnings(run: Run, record: Record, summary: dict[str, Any]) -> list[str]:
         why = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in summary["waiting_for_s"].items())
         found.append(f"the target waited for {summary['waiting_s']:.2f} s ({share:.0f} % of the run): {why}")
     if (gone := summary["out_of_reach"]) is not None:
-        place = ", ".join(f"{value:.3g}" for value in record["w_target"][-1])
+        place = ", ".join(f"{value:.3f}" for value in record["w_target"][-1])
         found.append(
             f"the path is out of reach from t = {gone['since_s']:.2f} s on ({gone['reason']}): the target waited there "
             f"to the end of the run, at ({', '.join(COORDINATES)}) = ({place})"

@@ -49,6 +49,8 @@ SLOW_DOWNS = 5
 ROOM = 0.98
 # A target that would have to be slower than this part of its commanded speed waits.
 LEAST_SPEED = 0.01
+# A joint that is nearer to its limit than this [rad] is at it; one further off that is in the way was too fast.
+AT_LIMIT = 0.05
 
 
 @internal_kernel
@@ -100,6 +102,31 @@ def slow_down(model, law, u, phi):
     for j in range(u.shape[0]):
         u[j] *= factor
     return factor < 1.0
+
+
+@internal_kernel
+def is_too_fast(model, law, work, found, phi):
+    """A slower target would pass: joints are too fast, and what comes too fast to a limit is not at it yet."""
+    for j in range(phi.shape[0]):
+        if work.at_limit[j] == 2:
+            left = model.upper[j] - phi[j] if work.u[j] > 0.0 else phi[j] - model.lower[j]
+            if left < AT_LIMIT and abs(work.u[j]) <= law.rate_limit:
+                return False
+    return found in (RATE_LIMIT, JOINT_LIMIT)
+
+
+@internal_kernel
+def fitting_part(model, law, work, phi):
+    """Part of the rates ``work.u`` that keeps the rate limit and comes to no limit too fast, and a little less."""
+    part = 1.0
+    for j in range(phi.shape[0]):
+        allowed, rate = law.rate_limit, abs(work.u[j])
+        if work.at_limit[j] == 2:
+            left = model.upper[j] - phi[j] if work.u[j] > 0.0 else phi[j] - model.lower[j]
+            allowed = min(allowed, law.limit_rate * max(left, 0.0))
+        if rate > allowed:
+            part = min(part, allowed / rate)
+    return ROOM * part
 
 
 @internal_kernel
@@ -190,9 +217,9 @@ def tick(model, law, schedule, state, velocity, moving, slows, rig):
         if found == RATE_LIMIT and reductions < NULL_REDUCTIONS and null_gain != 0.0:
             reductions += 1
             null_gain *= 0.0 if reductions == NULL_REDUCTIONS else 0.9 * law.rate_limit / fastest
-        elif found == RATE_LIMIT and slows and commanded and not waits and tries < SLOW_DOWNS:
+        elif slows and commanded and tries < SLOW_DOWNS and not waits and is_too_fast(model, law, work, found, phi):
             tries += 1
-            speed *= ROOM * law.rate_limit / fastest
+            speed *= fitting_part(model, law, work, phi)
             if speed < LEAST_SPEED:
                 tries = SLOW_DOWNS
             else:
