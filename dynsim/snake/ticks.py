@@ -44,9 +44,11 @@ WITHHELD = 1e-5
 BETA_LIMIT = 0.5 * math.pi - 0.02
 # Steps in which a null-space motion that is too fast is reduced, the last of them to nothing.
 NULL_REDUCTIONS = 4
-# Tries to find a speed of the target that keeps the rate limit, each with this part of what the last one leaves.
-SLOW_DOWNS = 5
+# Tries to find a speed of the target that keeps the limits: each takes ROOM of what the last one leaves, but not less
+# than LEAST_PART of its speed, because the predicted middle of a period that is much too fast says little.
+SLOW_DOWNS = 8
 ROOM = 0.98
+LEAST_PART = 0.25
 # A target that would have to be slower than this part of its commanded speed waits.
 LEAST_SPEED = 0.01
 # A joint that is nearer to its limit than this [rad] is at it; one further off that is in the way was too fast.
@@ -117,7 +119,7 @@ def is_too_fast(model, law, work, found, phi):
 
 @internal_kernel
 def fitting_part(model, law, work, phi):
-    """Part of the rates ``work.u`` that keeps the rate limit and comes to no limit too fast, and a little less."""
+    """Part of the rates ``work.u`` that keeps the rate limit and comes to no limit too fast, by a step at a time."""
     part = 1.0
     for j in range(phi.shape[0]):
         allowed, rate = law.rate_limit, abs(work.u[j])
@@ -126,7 +128,7 @@ def fitting_part(model, law, work, phi):
             allowed = min(allowed, law.limit_rate * max(left, 0.0))
         if rate > allowed:
             part = min(part, allowed / rate)
-    return ROOM * part
+    return max(ROOM * part, LEAST_PART)
 
 
 @internal_kernel
