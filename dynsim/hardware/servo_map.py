@@ -380,6 +380,14 @@ class ServoMap:
     def joints(self) -> tuple[str, ...]:
         return tuple(servo.joint for servo in self.servos)
 
+    @property
+    def lifting(self) -> dict[str, Any]:
+        """The entry ``lifts``, if there is one, with the columns of a record instead of the joints: for provenance."""
+        if self.lifts is None:
+            return {}
+        label = {servo.joint: servo.label for servo in self.servos}
+        return {"lifts": self.lifts.model_dump() | {"joints": [label[joint] for joint in self.lifts.joints]}}
+
 
 def load_servo_map(path: str | Path) -> ServoMap:
     """Read and validate a servo map: the file of that path, or the one of that name that comes with dynsim ("arm").
