@@ -15,10 +15,14 @@ import pinocchio as pin
 import pytest
 from scipy.optimize import linprog
 
+from dynsim.errors import RecordError
 from dynsim.hardware.errors import CheckRefused, ServoMapError
+from dynsim.hardware.ports import bus_on
 from dynsim.hardware.replay.base_part import Fold, base_part
 from dynsim.hardware.replay.check import check_motion
+from dynsim.hardware.replay.compare import compare_records
 from dynsim.hardware.replay.lifting import lifted
+from dynsim.hardware.replay.machine import Replay
 from dynsim.hardware.replay.trajectory import path_of_record
 from dynsim.hardware.servo_map import SHIPPED, Lifts, ServoMap, load_servo_map
 from dynsim.record import Record
@@ -409,3 +413,42 @@ def test_a_record_without_a_scene_has_no_lengths(simulated) -> None:
         check_motion(record, snake_map())
     with pytest.raises(CheckRefused, match="no wheel pair"):
         base_part(simulated("snake_positioning", "z"), ("pair1", "pair9"))
+
+
+def test_what_was_lifted_is_no_error_of_the_replay(simulated) -> None:
+    """psi3 with the lifting added, psi4 to psi8 that the record does not have: compared with what they were to do."""
+    record, servo_map = simulated("snake_positioning", "z"), snake_map()
+    fold = lifted(record, servo_map.lifts)
+    measured = Record(record.time, provenance=servo_map.lifting)
+    psi_3 = record["phi"][:, record.labels["phi"].index("psi3")]
+    measured.add("phi", np.column_stack([psi_3, np.zeros((len(record), 5))]) + fold.hinge, "rad", labels=PITCH)
+    comparison = compare_records(record, measured)
+    assert {joint.joint for joint in comparison.joints} == set(PITCH)
+    assert max(joint.max for joint in comparison.joints) < 1e-12
+    measured.provenance = {}
+    (only,) = compare_records(record, measured).joints
+    assert only.joint == "psi3"
+    measured.provenance = {"lifts": {"joints": 3}}
+    with pytest.raises(RecordError, match="says lifts"):
+        compare_records(record, measured)
+
+
+@pytest.mark.slow
+def test_lifting_on_virtual_servos(simulated, tmp_path) -> None:
+    """The goals are the path's, and the servos follow them."""
+    record, servo_map = simulated("snake_positioning", "x"), snake_map()
+    motion = check_motion(record, servo_map)
+    with bus_on("virtual", servo_map) as (bus, clock):
+        result = Replay(motion, servo_map, bus, clock).run()
+    assert result.fault is None
+    comparison = compare_records(record, result.record)
+    of = {joint.joint: joint for joint in comparison.joints}
+    assert set(PITCH) < set(of)
+    assert max(of[name].max for name in PITCH) < 0.01
+    goals = result.record["phi_goal"][:, [result.record.labels["phi_goal"].index(name) for name in PITCH[1:]]]
+    rows = np.isfinite(result.record["record_time"])
+    wanted = np.array([motion.path.at(time)[0] for time in result.record["record_time"][rows]])
+    columns = [servo_map.joints.index(name) for name in PITCH[1:]]
+    np.testing.assert_allclose(goals[rows], wanted[:, columns], atol=1e-12)
+    assert np.abs(goals[rows]).max() > 0.05
+    assert len(comparison.wheels) == 7
