@@ -255,7 +255,7 @@ def compare(
     gate: Annotated[Path | None, typer.Option("--gate", help="YAML with bounds; exit code 5 beyond them")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="folder [that of MEASURED]")] = None,
 ) -> None:
-    """Delay, rms and largest error between a simulated and a measured run, with a figure."""
+    """Delay, rms and largest error between a simulated and a measured run, joints and wheels, with a figure."""
     from dynsim.hardware.replay.compare import check_gate, compare_records, draw_comparison, load_gate
     from dynsim.record import Record
 
@@ -272,6 +272,21 @@ def compare(
             "-" if joint.delay != joint.delay else f"{joint.delay * 1e3:.1f}",
         )
     console.print(table)
+    if comparison.wheels:
+        wheels = Table(
+            "wheel", "rate: rms [rad/s]", "max [rad/s]", "at [s]", "turned [rad]", "error: max [rad]", "at end"
+        )
+        for wheel in comparison.wheels:
+            wheels.add_row(
+                wheel.wheel,
+                f"{wheel.rate_rms:.4f}",
+                f"{wheel.rate_max:.4f}",
+                f"{wheel.time_of_max:.3f}",
+                f"{wheel.turned:.3f}",
+                f"{wheel.angle_max:.4f}",
+                f"{wheel.angle_end:+.4f}",
+            )
+        console.print(wheels)
     console.print(f"delay {comparison.delay * 1e3:.1f} ms, worst joint {comparison.worst.joint}")
     folder = out or measured.parent
     write_json(folder / "comparison.json", comparison.summary())

@@ -232,6 +232,32 @@ class Safety(StrictModel):
     at_end: Literal["off", "hold"] = "off"
 
 
+class Lifts(StrictModel):
+    """How wheel pairs that the record lifts are lifted.
+
+    Attributes
+    ----------
+    signal : str
+        Signal of the record with 1 where a wheel pair is on the ground, 0 where it is lifted.
+    joints : tuple of str
+        The pitch joints on the axles of the first, second, ... pair: every pair but the last has one. Lifting is added
+        to what they do otherwise; the first, on the axle that carries the head, follows the record and keeps the head
+        where it is.
+    clearance_mm : float
+        Height of the lower wheel of a lifted pair above the floor.
+    blend_s : float
+        Time to lift a pair, and to put it down [s of record time].
+    tilt_mm : float
+        A record is refused where one wheel of a grounded pair would be further above the floor: a bent base twists.
+    """
+
+    signal: str = "grounded"
+    joints: Annotated[tuple[str, ...], Field(min_length=1)]
+    clearance_mm: Positive = 5.0
+    blend_s: Positive = 0.3
+    tilt_mm: Positive = 2.5
+
+
 class _MapFile(StrictModel):
     """A servo map: which servo follows which column of a record, and what that joint may do."""
 
@@ -240,6 +266,7 @@ class _MapFile(StrictModel):
     robot: str
     bus: Bus = Bus()
     safety: Safety = Safety()
+    lifts: Lifts | None = None
     kinds: dict[str, Kind]
     servos: Annotated[dict[str, ServoEntry], Field(json_schema_extra={"minProperties": 1})]
 
@@ -248,26 +275,26 @@ class _MapFile(StrictModel):
         if not self.servos:
             raise error_at("servos", "the map names none")
         owner: dict[int, str] = {}
+        follower: dict[tuple[str, str], str] = {}
         for joint, entry in self.servos.items():
             if entry.kind not in self.kinds:
                 raise error_at(f"servos.{joint}.kind", f"is not one of {', '.join(self.kinds)}")
             if entry.id in owner:
                 raise error_at(f"servos.{joint}.id", f"is also the ID of {owner[entry.id]}")
             owner[entry.id] = joint
-        return self
-
-    @model_validator(mode="after")
-    def _columns_have_one_follower(self) -> _MapFile:
-        follower: dict[tuple[str, str], str] = {}
-        for joint, entry in self.servos.items():
-            if entry.hold_at_deg is not None:
-                continue
             column = (self.kinds[entry.kind].follows.position, entry.label or joint)
-            if column in follower:
+            if entry.hold_at_deg is None and (other := follower.setdefault(column, joint)) != joint:
+                raise error_at(f"servos.{joint}.label", f"{other} already follows {column[1]!r} of {column[0]!r}")
+        for joint in self.lifts.joints if self.lifts else ():
+            if joint not in self.servos:
+                raise error_at("lifts.joints", f"{joint} is none of the servos")
+            if self.kinds[self.servos[joint].kind].mode != "position" or self.servos[joint].hold_at_deg not in (
+                None,
+                0,
+            ):
                 raise error_at(
-                    f"servos.{joint}.label", f"{follower[column]} already follows {column[1]!r} of {column[0]!r}"
+                    "lifts.joints", f"{joint} must be in position mode and follow the record or be held at 0"
                 )
-            follower[column] = joint
         return self
 
     @model_validator(mode="after")
@@ -362,6 +389,7 @@ class ServoMap:
     path : Path
     bus : Bus
     safety : Safety
+    lifts : Lifts or None
     servos : tuple of Servo
     """
 
@@ -370,6 +398,7 @@ class ServoMap:
         self.robot = content.robot
         self.bus = content.bus
         self.safety = content.safety
+        self.lifts = content.lifts
         self.servos = tuple(Servo(joint, entry, content.kinds[entry.kind]) for joint, entry in content.servos.items())
 
     @property
@@ -379,6 +408,14 @@ class ServoMap:
     @property
     def joints(self) -> tuple[str, ...]:
         return tuple(servo.joint for servo in self.servos)
+
+    @property
+    def lifting(self) -> dict[str, Any]:
+        """The entry ``lifts``, if there is one, with the columns of a record instead of the joints: for provenance."""
+        if self.lifts is None:
+            return {}
+        label = {servo.joint: servo.label for servo in self.servos}
+        return {"lifts": self.lifts.model_dump() | {"joints": [label[joint] for joint in self.lifts.joints]}}
 
 
 def load_servo_map(path: str | Path) -> ServoMap:

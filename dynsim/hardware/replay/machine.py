@@ -105,7 +105,7 @@ class Replay:
         self.stop = stop or StopRequest()
         self._dump_folder = dump_folder
         self._provenance = {"robot": servo_map.robot, "speed": motion.speed, "rate_Hz": motion.plan.rate}
-        self._provenance |= provenance or {}
+        self._provenance |= servo_map.lifting | (provenance or {})
         self._servos = servo_map.servos
         self._found_holding = False
         self.recorder = Recorder(servo_map)

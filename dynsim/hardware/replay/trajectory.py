@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.hardware.errors import CheckRefused
+from dynsim.hardware.replay.lifting import wheel_offsets
 from dynsim.hardware.servo_map import Servo, ServoMap
 from dynsim.record import TIME, Record
 
@@ -177,6 +178,11 @@ def path_of_record(record: Record, servo_map: ServoMap) -> Path:
             rate_after[:, column] = rate_before[:, column] = np.diff(position[:, column]) / np.diff(time)
         else:
             rate_after[:, column], rate_before[:, column] = velocity[:-1], velocity[1:]
+    for joint, offset in wheel_offsets(record, servo_map).items():
+        column, rate = servo_map.joints.index(joint), np.gradient(offset, time)
+        position[:, column] += offset
+        rate_after[:, column] += rate[:-1]
+        rate_before[:, column] += rate[1:]
     return _at_rest_at_both_ends(
         Path(time, position, rate_after, rate_before, float(time[-1])), servo_map.safety.run_up
     )
