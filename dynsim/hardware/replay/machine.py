@@ -33,7 +33,7 @@ from dynsim.hardware.replay.rules import Cause, Fault, watchdog_units
 from dynsim.hardware.replay.run_log import Recorder, RunLog
 from dynsim.hardware.replay.states import UNARMED, Progress, ReplayResult, State, Stopped, StopRequest
 from dynsim.hardware.replay.trajectory import Path
-from dynsim.hardware.replay.verify import all_registers, configure, verify
+from dynsim.hardware.replay.verify import Registers, all_registers, configure, verify
 from dynsim.hardware.servo_map import FaultPolicy, Servo, ServoMap
 
 APPROACH_ACCELERATION = 10.0
@@ -41,6 +41,8 @@ APPROACH_ACCELERATION = 10.0
 SETTLE_CYCLES = 10
 SETTLE_TIME = 3.0
 """Longest wait for the servos to come to rest [s]."""
+RECORD = "measured record"
+"""Name of that output among those that failed."""
 DRY_RUN_TIME = 1.0
 """Reading without moving, to time the bus [s]."""
 
@@ -149,7 +151,7 @@ class Replay:
         if self.write_eeprom:
             configure(self.bus, self.map, self.journal.say)
         problems = verify(self.bus, self.map, self.motion, poll=self.stop.check)
-        self._dump(REGISTERS)
+        self._dump(self._read_registers(), REGISTERS)
         if problems:
             raise Stopped(Fault(Cause.VERIFICATION, "\n  ".join([f"{len(problems)} problem(s):", *problems])))
         self.journal.say(f"{len(self._servos)} servos as the map says")
@@ -264,30 +266,32 @@ class Replay:
                 self._ending.read_back(armed=armed)
         self._tell_end()
         if armed and result.end_state != "unreachable":
-            self._dump(REGISTERS_AFTER_FAULT)
+            registers = self._read_registers()
             if self._ending.release_at_last():
                 self._tell_end()
+            self._dump(registers, REGISTERS_AFTER_FAULT)
 
     def _tell_end(self) -> None:
         self.journal.say(f"end state: {self.result.end_state}")
         for servo in self.result.servos:
             self.journal.say(str(servo))
 
-    def _dump(self, name: str) -> None:
-        """Registers of all servos into a file of the dump folder."""
-        if not self._dump_folder:
-            return
+    def _read_registers(self) -> dict[str, Registers | str] | None:
+        """Of all servos, for a dump; None where the port died after a fault."""
         try:
-            registers = all_registers(self.bus, self.map)
+            return all_registers(self.bus, self.map)
         except PortError as error:
             if self.result.fault is None:
                 raise
             self.journal.say(f"no register dump: {error}")
-            return
-        self.journal.guard(name, write_json, self._dump_folder / name, registers)
+            return None
+
+    def _dump(self, registers: dict[str, Registers | str] | None, name: str) -> None:
+        if self._dump_folder and registers is not None:
+            self.journal.guard(name, write_json, self._dump_folder / name, registers)
 
     def _finish(self) -> None:
-        self.journal.guard("measured record", self._sum_up)
+        self.journal.guard(RECORD, self._sum_up)
         timing = self.result.timing
         if timing:
             self.journal.say(f"timing: {', '.join(f'{name} {value:.6g}' for name, value in timing.as_dict().items())}")
@@ -301,13 +305,5 @@ class Replay:
         record.complete = result.fault is None
         for fault in result.faults:
             record.add_event(fault.time - started, "fault", fault.cause.value, description=fault.text)
-        record.summary |= {"end_state": result.end_state, "servos": [servo.as_dict() for servo in result.servos]}
-        if result.fault is not None:
-            record.summary |= {
-                "fault": result.fault.cause.value,
-                "fault_text": result.fault.text,
-                "faults": [
-                    {"cause": fault.cause.value, "text": fault.text, "ids": fault.ids} for fault in result.faults
-                ],
-            }
+        record.summary |= result.summary()
         result.record = record

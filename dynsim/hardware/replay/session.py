@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from dynsim.files import json_text, replace_together, write_text
+from dynsim.files import json_text, replace_together, write_json
 from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.bus.protocol import Bus
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted, ReplayInterrupted, VerificationFailed
 from dynsim.hardware.replay.check import CheckedMotion
 from dynsim.hardware.replay.folder import LOG, MEASURED, SUMMARY, move_away
-from dynsim.hardware.replay.machine import Replay
+from dynsim.hardware.replay.machine import RECORD, Replay
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.run_log import RunLog
 from dynsim.hardware.replay.states import Progress, ReplayResult, StopRequest
@@ -116,19 +116,23 @@ def _stream(replay: Replay, log: RunLog, folder: Path) -> Background:
 
 def _save(result: ReplayResult, folder: Path, failures: Failures) -> None:
     """Write record and summary, and remove the streamed record that they replace; errors join ``failures``."""
-    summary = result.record.summary
     try:
-        summary["outputs_failed"] = _named(failures)
-        replace_together(
-            folder, {MEASURED: result.record.to_hdf5(), SUMMARY: json_text(summary).encode("utf-8", "backslashreplace")}
-        )
-        (folder / PART).unlink()
+        if RECORD not in failures:
+            summary = result.record.summary | {"outputs_failed": _named(failures)}
+            contents: dict[str, bytes | memoryview] = {
+                MEASURED: result.record.to_hdf5(),
+                SUMMARY: json_text(summary).encode(),
+            }
+            replace_together(folder, contents)
+            (folder / PART).unlink()
+            return
     except Exception as error:
-        failures["measured record"] = error
-        # What happened to the robot is also told where its record cannot be: that is much larger.
-        summary["outputs_failed"] = _named(failures)
-        with suppress(Exception):
-            write_text(folder / SUMMARY, json_text(summary))
+        failures[RECORD] = error
+    # What happened to the robot is told even where there is no room for its record.
+    try:
+        write_json(folder / SUMMARY, result.summary() | {"outputs_failed": _named(failures)})
+    except Exception as error:
+        failures["summary"] = error
 
 
 def _named(failures: Failures) -> dict[str, str]:

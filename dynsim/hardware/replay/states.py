@@ -118,6 +118,19 @@ class ReplayResult:
         """All causes and what is known of them, the first one first; empty without a fault."""
         return "; ".join(f"{fault.cause}: {fault.text}" for fault in self.faults)
 
+    def summary(self) -> dict[str, Any]:
+        """How it ended, for ``summary.json``."""
+        summary: dict[str, Any] = {
+            "end_state": self.end_state,
+            "servos": [servo.as_dict() for servo in self.servos],
+        }
+        if self.fault is not None:
+            summary |= {"fault": self.fault.cause.value, "fault_text": self.fault.text}
+            summary["faults"] = [
+                {"cause": fault.cause.value, "text": fault.text, "ids": fault.ids} for fault in self.faults
+            ]
+        return summary
+
     def declare(self, fault: Fault) -> None:
         """Add a fault; what has the cause of an earlier one joins it."""
         for number, known in enumerate(self.faults):
