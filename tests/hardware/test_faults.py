@@ -42,6 +42,7 @@ CASES = [
     Case("lost_status, now and then", {"kind": "lost_status", "probability": 0.01}, ANY),
     Case("lost_status, for good", {"kind": "lost_status"}, ANY, (Cause.MISSED_STATUS,)),
     Case("late_status", {"kind": "late_status", "delay": 0.005}, ANY, (Cause.MISSED_STATUS,)),
+    Case("late_status, by two periods", {"kind": "late_status", "delay": 0.02}, ANY, (Cause.MISSED_STATUS,)),
     Case("truncated_status", {"kind": "truncated_status"}, ANY, (Cause.MISSED_STATUS,)),
     Case("bad_crc", {"kind": "bad_crc"}, ANY, (Cause.MISSED_STATUS,)),
     Case("noise", {"kind": "noise"}),

@@ -20,6 +20,8 @@ WATCHDOG_SECONDS_PER_UNIT = 0.020
 RETURN_DELAY_SECONDS_PER_UNIT = 2e-6
 BROADCAST_ID = 254
 MAX_ID = 252
+EEPROM_END = 64
+"""What stands at lower addresses is kept without power."""
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
 """Bits per second by the code stored at address 8. The Python client library refuses 4.5 Mbit/s."""
@@ -72,7 +74,7 @@ class Field:
     @property
     def in_eeprom(self) -> bool:
         """Kept without power, and writable only with torque off."""
-        return self.address < 64
+        return self.address < EEPROM_END
 
     def decode(self, data: bytes) -> int:
         """Integer in ``data``, with the field's own sign (the client library's getData knows only unsigned ones)."""

@@ -213,31 +213,28 @@ class DynamixelBus:
             milliseconds = self.port.tx_time_per_byte * (answer_bytes + 14 + len(ids))
             milliseconds += 1e3 * (len(ids) * (self.return_delay + 50e-6) + self.latency)
             self.port.setPacketTimeoutMillis(milliseconds)
-            answers: dict[int, Packet] = {}
+            replies: dict[int, ServoReply] = {}
             outdated: set[int] = set()
-            decoder = Decoder()
+            decoder, asked_of = Decoder(), frozenset(ids)
 
             def sort_in(packets: Iterable[Packet]) -> None:
                 for packet in packets:
                     # Requests echoed by the adapter are no status.
-                    if packet.instruction == STATUS and packet.id in ids:
+                    if packet.instruction == STATUS and packet.id in asked_of:
                         if len(packet.parameters) == asked:
-                            answers[packet.id] = packet
+                            replies[packet.id] = ServoReply(packet.parameters[:length], bool(packet.error & ALERT))
                         elif length <= len(packet.parameters) < length + MARKS:
                             outdated.add(packet.id)
 
-            while len(answers) < len(ids) and not self.port.isPacketTimeout():
+            while len(replies) < len(ids) and not self.port.isPacketTimeout():
                 sort_in(decoder.feed(self.port.readPort(answer_bytes)))
             # What came while this process was not running is here, however late it is.
             late = self.port.getBytesAvailable()
             if late:
                 sort_in(decoder.feed(self.port.readPort(late)))
             sort_in(decoder.flush())
-        if len(answers) < len(ids):
+        if len(replies) < len(ids):
             marks.miss(extra)
-        replies = {
-            id_: ServoReply(packet.parameters[:length], bool(packet.error & ALERT)) for id_, packet in answers.items()
-        }
         return BlockRead(replies, stray + decoder.garbage, frozenset(outdated))
 
     def torque_off_all(self) -> None:

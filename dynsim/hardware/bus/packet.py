@@ -7,8 +7,8 @@ checksum. Wherever FF FF FD turns up between the length and the checksum the sen
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 from dynsim.hardware.bus.control_table import BROADCAST_ID
 
@@ -92,8 +92,7 @@ def unstuff(body: bytes) -> bytes:
     return body.replace(HEADER + b"\xfd", HEADER)
 
 
-@dataclass(frozen=True)
-class Packet:
+class Packet(NamedTuple):
     """One packet of either direction.
 
     Attributes

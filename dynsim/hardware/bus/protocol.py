@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from dynsim.hardware.bus.control_table import Field
 
 
-@dataclass(frozen=True)
-class ServoReply:
+class ServoReply(NamedTuple):
     """Contents of one status packet.
 
     Attributes

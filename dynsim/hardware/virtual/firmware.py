@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from dynsim.hardware.bus.control_table import BROADCAST_ID, RAD_S_PER_UNIT
+from dynsim.hardware.bus.control_table import BROADCAST_ID, EEPROM_END, RAD_S_PER_UNIT
 from dynsim.hardware.bus.packet import ALERT, STATUS, Instruction, Packet, StatusError, encode, encode_fast
+from dynsim.hardware.virtual.addresses import Hearing
 from dynsim.hardware.virtual.servos import VirtualServos
 
 CLEAR_TURNS = b"\x01\x44\x58\x4c\x22"
@@ -14,8 +15,8 @@ RESET_ALL = 0xFF
 KEPT_BY_RESET: dict[int, tuple[str, ...]] = {RESET_ALL: (), 0x01: ("id",), 0x02: ("id", "baud")}
 """Registers that a factory reset leaves alone, by its parameter."""
 
-Hearing = Mapping[int, Sequence[int]]
-"""Servos that understand a packet: the IDs they had at first, by the ID they have now."""
+SHADOWED = (Instruction.WRITE, Instruction.REG_WRITE)
+"""What a servo does without an answer when it is sent to its secondary ID, in RAM."""
 
 
 class Answer(NamedTuple):
@@ -59,7 +60,11 @@ class Firmware:
 
     def awake(self, hearing: Hearing, id_: int) -> list[int]:
         """Servos that have an ID and are not dead, off or starting."""
-        return [servo for servo in hearing.get(id_, ()) if self.servos.listens(servo)]
+        return [servo for servo in hearing.by_id.get(id_, ()) if self.servos.listens(servo)]
+
+    def shadows(self, hearing: Hearing, id_: int) -> list[int]:
+        """Servos of which it is the secondary ID."""
+        return [servo for servo in hearing.by_shadow.get(id_, ()) if self.servos.listens(servo)]
 
     def write(self, servo: int, address: int, data: bytes) -> StatusError:
         return self.servos.write(servo, address, data)
@@ -126,13 +131,17 @@ class Protocol2:
                 yield from self._answers_of_each(packet, hearing)
 
     def _write_silently(self, id_: int, address: int, data: bytes, hearing: Hearing) -> None:
-        for servo in self._firmware.awake(hearing, id_):
+        shadows = self._firmware.shadows(hearing, id_) if address >= EEPROM_END else []
+        for servo in [*self._firmware.awake(hearing, id_), *shadows]:
             self._firmware.write(servo, address, data)
 
     def _answers_of_each(self, packet: Packet, hearing: Hearing) -> Iterator[Answer]:
         broadcast = packet.id == BROADCAST_ID
+        for servo in self._firmware.shadows(hearing, packet.id):
+            if packet.instruction in SHADOWED and int.from_bytes(packet.parameters[0:2], "little") >= EEPROM_END:
+                self._reply(servo, packet.id, packet)
         # A list: the instruction may give a servo another ID.
-        for id_ in sorted(hearing) if broadcast else [packet.id]:
+        for id_ in sorted(hearing.by_id) if broadcast else [packet.id]:
             frames = {}
             for servo in self._firmware.awake(hearing, id_):
                 reply = self._reply(servo, id_, packet)

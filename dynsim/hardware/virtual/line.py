@@ -110,16 +110,17 @@ class VirtualLine:
         given_up = start - self._heard > BYTE_TIMEOUT
         self._heard = end
         # To servos at another bit rate this is noise.
-        for protocol in tuple(self.servos.protocols(baud)):
+        for protocol in self.servos.addresses.protocols(baud):
             decoder = self._decoders.setdefault((baud, protocol), Decoder() if protocol == 2 else Decoder1())
             packets = [*decoder.flush()] if given_up else []
             for packet in [*packets, *decoder.feed(data)]:
-                if packet.instruction != STATUS and protocol in self.servos.protocols(baud):
+                if packet.instruction != STATUS and protocol in self.servos.addresses.protocols(baud):
                     arrivals += self._execute(packet, protocol, end, baud)
         return arrivals
 
     def _execute(self, packet: Packet, protocol: int, now: float, baud: int) -> list[tuple[float, bytes]]:
-        hearing = self.servos.hear(baud, protocol, now)
+        hearing = self.servos.addresses.hearing(baud, protocol)
+        self.servos.hear(hearing, now)
         if self.listener and protocol == 2:
             self.listener(now, packet)
         arrivals: list[tuple[float, bytes]] = []

@@ -10,7 +10,8 @@ from collections.abc import Iterator
 
 from dynsim.hardware.bus.control_table import BROADCAST_ID
 from dynsim.hardware.bus.packet import Instruction, Packet, StatusError
-from dynsim.hardware.virtual.firmware import KEPT_BY_RESET, RESET_ALL, Answer, Firmware, Hearing, together
+from dynsim.hardware.virtual.addresses import Hearing
+from dynsim.hardware.virtual.firmware import KEPT_BY_RESET, RESET_ALL, Answer, Firmware, together
 
 HEADER = b"\xff\xff"
 HARDWARE_BITS = 0b100101
@@ -81,7 +82,7 @@ class Protocol1:
                     self._firmware.write(servo, address, p[k + 1 : k + 1 + length])
             return
         broadcast = packet.id == BROADCAST_ID
-        for id_ in sorted(hearing) if broadcast else [packet.id]:
+        for id_ in sorted(hearing.by_id) if broadcast else [packet.id]:
             frames = {}
             for servo in self._firmware.awake(hearing, id_):
                 frame = self._reply(servo, id_, packet)

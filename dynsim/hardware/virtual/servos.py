@@ -17,13 +17,16 @@ from dynsim.hardware.bus.control_table import (
     OperatingMode,
 )
 from dynsim.hardware.bus.packet import StatusError
+from dynsim.hardware.virtual.addresses import Addresses, Hearing
 from dynsim.hardware.virtual.faults import AngleFault, Fault, FaultScript, TemperatureRamp, VoltageSag
 from dynsim.hardware.virtual.registers import ServoRegisters
 from dynsim.hardware.virtual.servo_plant import Drive, InertialLoad, ServoPlant
 
 PHYSICS_STEP = 2e-3
 COMMUNICATION_END = 14
-"""ID, bit rate and protocol stand at lower addresses."""
+"""IDs, bit rate and protocol stand at lower addresses."""
+TRAJECTORY = 136, 144
+"""Where the profile's own speed and position stand; kept up to date only for those who read them."""
 BOOT_TIME = 0.3
 """Silence after a reboot [s] (unverified)."""
 AMBIENT = 25.0  # °C
@@ -57,6 +60,8 @@ class VirtualServos:
         ServoRegisters by the ID that a servo had at first.
     ids : list of int
         Those IDs.
+    addresses : Addresses
+        Who hears what.
     time : float
         [s].
     torque_since : float
@@ -80,6 +85,7 @@ class VirtualServos:
     ) -> None:
         self.registers = dict(registers)
         self.ids = list(registers)
+        self.addresses = Addresses(self.registers)
         self._models = [table.model for table in registers.values()]
         self.plant: ServoPlant = plant or InertialLoad(self._models, np.array(list(positions), dtype=np.float64))
         self.supply = supply
@@ -111,7 +117,6 @@ class VirtualServos:
             self.reload(index)
             self.hold_here(index)
             self.reload(index)
-        self._sort_by_line()
 
     def active_faults(self) -> list[Fault]:
         """Faults of the script that are active now."""
@@ -127,28 +132,9 @@ class VirtualServos:
 
     # -- requests -----------------------------------------------------------------------------------------------------
 
-    def _sort_by_line(self) -> None:
-        """Sort the servos by bit rate, protocol and ID, as they are set now."""
-        self._hearing: dict[tuple[int, int], dict[int, list[int]]] = {}
-        self._protocols: dict[int, list[int]] = {}
-        for first_id, registers in self.registers.items():
-            line = registers.baud, registers["protocol"]
-            if line not in self._hearing:
-                self._protocols.setdefault(line[0], []).append(line[1])
-            self._hearing.setdefault(line, {}).setdefault(registers["id"], []).append(first_id)
-        self._members = {
-            line: np.array([self.ids.index(first_id) for group in servos.values() for first_id in group])
-            for line, servos in self._hearing.items()
-        }
-
-    def protocols(self, baud: int) -> list[int]:
-        """Protocols of the servos that are set to a bit rate [bit/s]; none where nobody is."""
-        return self._protocols.get(baud, [])
-
-    def hear(self, baud: int, protocol: int, now: float) -> dict[int, list[int]]:
-        """A packet was on the line at ``now`` [s]: those who understand it, by the ID they have."""
-        self.heard[self._members[baud, protocol]] = now
-        return self._hearing[baud, protocol]
+    def hear(self, hearing: Hearing, now: float) -> None:
+        """Those who understood a packet at ``now`` [s] are content for as long as their watchdogs wait."""
+        self.heard[hearing.members] = now
 
     def listens(self, id_: int) -> bool:
         """Whether a servo hears what is sent."""
@@ -157,7 +143,13 @@ class VirtualServos:
 
     def read(self, id_: int, address: int, length: int) -> bytes | None:
         """Bytes of a servo's control table as they are now; None outside of it."""
-        self.measure(self.ids.index(id_))
+        index = self.ids.index(id_)
+        self.measure(index)
+        if address < TRAJECTORY[1] and address + length > TRAJECTORY[0]:
+            registers = self.registers[id_]
+            registers["position_trajectory"] = self._present_ticks(index, self._drive.set_position[index])
+            rate = self._set_rate[index] if self._drive.in_position_mode[index] else self._drive.set_velocity[index]
+            registers["velocity_trajectory"] = round(self._sense[index] * float(rate) / RAD_S_PER_UNIT)
         return self.registers[id_].read(address, length)
 
     def write(self, id_: int, address: int, data: bytes) -> StatusError:
@@ -176,14 +168,14 @@ class VirtualServos:
                 self.torque_since = self.time
         self.reload(index)
         if address < COMMUNICATION_END:
-            self._sort_by_line()
+            self.addresses.sort()
         return StatusError.NONE
 
     def reset(self, id_: int, keep: Collection[str]) -> None:
         """As delivered but for the registers ``keep``, then a restart."""
         self.registers[id_].reset(keep)
         self.reload(self.ids.index(id_))
-        self._sort_by_line()
+        self.addresses.sort()
         self.reboot(id_)
 
     def reboot(self, id_: int) -> None:
