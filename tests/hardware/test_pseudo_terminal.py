@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -172,12 +173,31 @@ def test_a_second_replay_is_refused_and_stop_works_beside_the_first(servos: Serv
 @pytest.mark.parametrize(("presses", "left"), [(1, [1, 1, 1]), (2, [0, 0, 0])])
 def test_ctrl_c_in_a_running_replay(servos: Servos, presses: int, left: list[int]) -> None:
     with replaying(servos) as running:
-        for press in range(presses):
+        os.kill(running.process.pid, signal.SIGINT)
+        for _ in range(presses - 1):
+            # Two that come before the first is handled are one, and nothing is told before the robot is at rest.
+            time.sleep(0.2)
             os.kill(running.process.pid, signal.SIGINT)
-            if press == 0 and presses == 2:
-                wait_for(lambda: "stopped by the user" in servos.log)
         assert running.end() == 130, running.stderr
     assert running.stderr.startswith("error: interrupted in REPLAY")
+    assert servos.torque() == left
+
+
+@pytest.mark.parametrize(("policy", "left"), [("hold", [1, 1, 1]), ("off", [0, 0, 0])])
+def test_a_replay_that_was_stopped_for_longer_than_the_watchdogs_names_it(
+    servos: Servos, policy: str, left: list[int]
+) -> None:
+    with started(
+        servos.replay("--live", "--yes", "--speed", "0.1", "--policy", policy), servos.folder / "stderr"
+    ) as running:
+        wait_for(lambda: "REPLAY         enter" in servos.log)
+        os.kill(running.process.pid, signal.SIGSTOP)
+        time.sleep(2.5)
+        os.kill(running.process.pid, signal.SIGCONT)
+        assert running.end() == 4, running.stderr
+    assert running.stderr.startswith("error: stall in REPLAY: stalled for ")
+    assert "bus watchdogs (2.00 s) have tripped" in running.stderr
+    assert f"robot left {'holding' if policy == 'hold' else 'off'}" in running.stderr
     assert servos.torque() == left
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from dynsim.hardware.bus.control_table import (
+    BAUD_RATES,
     INDIRECT_BLOCKS,
-    RAD_S_PER_UNIT,
     TABLE_SIZE,
     Field,
     OperatingMode,
@@ -31,21 +33,34 @@ class ServoRegisters:
         self.model = model
         self._table = bytearray(TABLE_SIZE)
         self._field_at = {field.address: name for name, field in model.fields.items()}
-        for name, field in model.fields.items():
-            self[name] = field.default
-        self["model_number"], self["id"], self["baud"] = model.number, id_, baud_code
-        self["velocity_limit"] = round(1.1 * model.no_load_speed / RAD_S_PER_UNIT)
-        self.restart()
+        # Each read of a state asks for a dozen registers: their places are looked up once.
+        self._places = {
+            name: (slice(field.address, field.address + field.size), field.size, field.signed)
+            for name, field in model.fields.items()
+        }
+        self.reset()
+        self["id"], self["baud"] = id_, baud_code
 
     def __getitem__(self, name: str) -> int:
-        field = self.model.fields[name]
-        return int.from_bytes(self._table[field.address : field.address + field.size], "little", signed=field.signed)
+        place, _, signed = self._places[name]
+        return int.from_bytes(self._table[place], "little", signed=signed)
 
     def __setitem__(self, name: str, value: int) -> None:
-        field = self.model.fields[name]
-        self._table[field.address : field.address + field.size] = value.to_bytes(
-            field.size, "little", signed=field.signed
-        )
+        place, size, signed = self._places[name]
+        self._table[place] = value.to_bytes(size, "little", signed=signed)
+
+    @property
+    def baud(self) -> int:
+        """[bit/s]."""
+        return BAUD_RATES[self["baud"]]
+
+    def reset(self, keep: Collection[str] = ()) -> None:
+        """All as delivered, but for the registers named in ``keep``."""
+        kept = {name: self[name] for name in keep}
+        for name, field in self.model.fields.items():
+            self[name] = kept.get(name, field.default)
+        self["model_number"] = self.model.number
+        self.restart()
 
     def restart(self) -> None:
         """RAM as after power-on."""
