@@ -115,8 +115,10 @@ class ReplayResult:
 
     @property
     def fault_text(self) -> str:
-        """All causes and what is known of them, the first one first; empty without a fault."""
-        return "; ".join(f"{fault.cause}: {fault.text}" for fault in self.faults)
+        """All faults in words, the first one with the state it struck in; empty without one."""
+        first = f" in {self.fault_state.name}" if self.fault_state is not None else ""
+        texts = [f"{fault.cause}{'' if number else first}: {fault.text}" for number, fault in enumerate(self.faults)]
+        return "; ".join(texts)
 
     def summary(self) -> dict[str, Any]:
         """How it ended, for ``summary.json``."""
