@@ -268,18 +268,13 @@ def test_a_straight_base_folds_in_a_plane(mode, simulated) -> None:
     np.testing.assert_allclose(fold.tilt, 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("away", [(3,), (3, 6), (2, 3), (4, 5)])
+@pytest.mark.parametrize("away", [(3,), (3, 6), (2, 5)])
 def test_a_base_bent_in_an_arc_folds_without_a_twist(away, simulated) -> None:
-    """All axles meet in the middle of the arc. Half tracks differ and so do the angles, the other wheel stays down."""
-    arc = held([0.3] * 6, away, simulated)
-    zigzag = held([0.3, -0.3] * 3, away, simulated)
+    """All axles meet in the middle of the arc: both wheels of what is grounded stay down. In a zigzag they cannot."""
+    arc, zigzag = held([0.3] * 6, away, simulated), held([0.3, -0.3] * 3, away, simulated)
     grounded = ~np.isin(np.arange(1, 8), away)
-    pair = max(away)  # index of the first one behind
-    single = len(away) != 2 or away[1] != away[0] + 1
-    if single:
-        assert arc.tilt[0, grounded].max() < 0.02e-3
-        assert zigzag.tilt[0, grounded].max() > 1e-3
-    assert arc.lower[0, pair] == pytest.approx(0.0, abs=1e-9)
+    assert arc.tilt[0, grounded].max() < 0.02e-3
+    assert zigzag.tilt[0, grounded].max() > 1e-3
 
 
 def best_deviation(yaw: np.ndarray, away: set[int]) -> float:
