@@ -107,7 +107,7 @@ class Initial(StrictConfig):
 class Integrator(StrictConfig):
     """Time integration."""
 
-    method: Literal["rk43", "dopri5", "rk4", "rodas4", "time_stepping"] = Field(
+    method: Literal["rk43", "dopri5", "rk4", "rodas4", "radau5", "time_stepping"] = Field(
         default="rk43",
         description="adaptive 4(3) or 5(4), fixed step, adaptive linearly implicit for stiff motors, or fixed step "
         "with contacts that open and close",

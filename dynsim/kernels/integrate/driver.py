@@ -33,7 +33,9 @@ from dynsim.kernels.integrate.dense import sample_step
 from dynsim.kernels.integrate.events import arm_events, cut_step, fire_events, take_ticks
 from dynsim.kernels.integrate.explicit import step_explicit
 from dynsim.kernels.integrate.moreau import advance_moreau
+from dynsim.kernels.integrate.newton import forget
 from dynsim.kernels.integrate.project import off_surface, settle
+from dynsim.kernels.integrate.radau import after_step, step_radau5
 from dynsim.kernels.integrate.rosenbrock import step_rodas4
 from dynsim.kernels.integrate.run import (
     AT_START,
@@ -50,6 +52,7 @@ from dynsim.kernels.integrate.run import (
     PENDING,
     PROPOSED,
     RK4,
+    RADAU5,
     RODAS4,
     RUNNING,
     SEARCHING,
@@ -83,6 +86,7 @@ def start(system: System, ws: Workspace, run: Run):
         watch(ws, run, 0.0)
         if run.clock[STEP] <= 0.0:
             first_step(system, ws, run)
+    forget(run.newton, run.count[STEPS])
     run.count[STARTED] = 1
 
 
@@ -244,6 +248,25 @@ def advance_rodas4(system: System, ws: Workspace, run: Run, limit):
             return
 
 
+@kernel
+def advance_radau5(system: System, ws: Workspace, run: Run, limit):
+    """:func:`advance` of RADAU5."""
+    taken, error = 0, 0.0
+    while waiting(system, ws, run):
+        if taken >= limit or finished(run):
+            return
+        taken += 1
+        if run.count[PENDING] == 0:
+            propose(run)
+            error = step_radau5(system, ws, run)
+        steps, h = run.count[STEPS], run.clock[STEP]
+        done = conclude(system, ws, run, error, 4.0)
+        if run.count[STEPS] > steps:
+            after_step(run, h)
+        if done:
+            return
+
+
 def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:
     """Take up to ``limit`` steps towards END; run.count[STATUS] says how it ended.
 
@@ -252,5 +275,5 @@ def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:
 
     Three compiled functions behind one name, so that each is only compiled when it is used.
     """
-    methods = {RODAS4: advance_rodas4, TIME_STEPPING: advance_moreau}
+    methods = {RODAS4: advance_rodas4, RADAU5: advance_radau5, TIME_STEPPING: advance_moreau}
     methods.get(run.method, advance_explicit)(system, ws, run, limit)

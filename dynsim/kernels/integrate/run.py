@@ -8,13 +8,14 @@ import numpy as np
 
 from dynsim.kernels.arrays import BLOCK_SIZE, row_limit
 from dynsim.kernels.constraint.uniqueness import ROOM
+from dynsim.kernels.integrate.newton import NewtonArrays, newton_arrays
 from dynsim.kernels.integrate.time_stepping import SteppingArrays
 from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.state import OUTPUTS_PER_CONTACT, OutputLayout, StateLayout, block
 from dynsim.kernels.tree.support import SupportArrays
 
-DOPRI5, RK4, RODAS4, RK43, TIME_STEPPING = 0, 1, 2, 3, 4
-METHODS = {"rk43": RK43, "dopri5": DOPRI5, "rk4": RK4, "rodas4": RODAS4, "time_stepping": TIME_STEPPING}
+DOPRI5, RK4, RODAS4, RK43, TIME_STEPPING, RADAU5 = 0, 1, 2, 3, 4, 5
+METHODS = {"rk43": RK43, "dopri5": DOPRI5, "rk4": RK4, "rodas4": RODAS4, "radau5": RADAU5, "time_stepping": TIME_STEPPING}
 # Methods of one step length.
 FIXED_STEP = (RK4, TIME_STEPPING)
 
@@ -97,6 +98,7 @@ class Run(NamedTuple):
     columns: OutputLayout
     output: np.ndarray  # (T, columns.size)
     stepping: SteppingArrays | None  # of time stepping alone
+    newton: NewtonArrays | None  # of radau5 alone
 
     def states(self, name: str) -> np.ndarray:
         """A block of the sampled states by its name, see :func:`dynsim.kernels.state.block`."""
@@ -176,4 +178,5 @@ def new_run(
         columns=columns,
         output=np.zeros((len(sample_time), columns.size)),
         stepping=stepping,
+        newton=newton_arrays(n, na, layout.circuits, layout.tracked, m) if method == RADAU5 else None,
     )
