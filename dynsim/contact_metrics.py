@@ -11,8 +11,10 @@ from dynsim.kernels.constraint import unilateral as ku
 from dynsim.kernels.constraint.unilateral import UnilateralArrays
 from dynsim.kernels.integrate.contact_events import MOST_EVENTS, WINDOW
 from dynsim.kernels.integrate.time_stepping import BAD
-from dynsim.model.description import Contact
-from dynsim.model.unilateral import JointStop
+from dynsim.model.control import JointControl
+from dynsim.model.description import Contact, Robot
+from dynsim.model.unilateral import START_TOLERANCE, JointStop, told
+from dynsim.record import Record
 
 
 def modes(unilateral: UnilateralArrays, k: int, duration: float) -> dict[str, Any]:
@@ -34,21 +36,54 @@ def modes(unilateral: UnilateralArrays, k: int, duration: float) -> dict[str, An
     }
 
 
-def touched_stops(stops: Sequence[JointStop], unilateral: UnilateralArrays, duration: float) -> list[dict[str, Any]]:
+def touched_stops(
+    record: Record, robot: Robot, stops: Sequence[JointStop], unilateral: UnilateralArrays, duration: float
+) -> list[dict[str, Any]]:
     """The joint stops that were touched."""
+    units = {link.joint: link.units for link in robot.links}
     found = []
     for stop, row in zip(stops, unilateral.stop, strict=True):
         if row[ku.HITS] > 0 or row[ku.CLOSED_TIME] > 0.0:
+            # One column for both stops of a joint, positive at the lower one.
+            force = stop.side * record["stop_force"][:, record.labels["stop_force"].index(stop.joint)]
             found.append(
                 {
                     "joint": stop.joint,
                     "limit": stop.position,
+                    "unit": units[stop.joint][0],
+                    "force_max": float(force.max(initial=0.0)),
+                    "force_unit": units[stop.joint][3],
                     "hits": int(row[ku.HITS]),
                     "closed_fraction": min(float(row[ku.CLOSED_TIME]) / duration, 1.0) if duration > 0.0 else 0.0,
                     "impact_loss_J": float(row[ku.STOP_LOSS]),
                 }
             )
     return found
+
+
+def beyond_stops(robot: Robot, stops: Sequence[JointStop], control: JointControl) -> list[str]:
+    """References that lie beyond a joint stop: the controller will push against it, and miss what it follows."""
+    follows = {motor.joint: bool(k_p > 0.0) for motor, k_p in zip(robot.motors, control.k_p, strict=True)}
+    places = dict(zip(robot.joint_names, robot.position_index, strict=True))
+    units = {link.joint: link.units[0] for link in robot.links}
+    watched = [stop for stop in stops if follows.get(stop.joint, False)]
+    if not watched or not np.isfinite(control.end):
+        return []
+    worst: dict[JointStop, tuple[float, float]] = {}
+    first: dict[JointStop, float] = {}
+    for times, q in control.positions(robot):
+        for stop in watched:
+            beyond = stop.side * (stop.position - q[:, places[stop.joint]])
+            k = int(beyond.argmax())
+            if beyond[k] > START_TOLERANCE:
+                first.setdefault(stop, float(times[beyond > START_TOLERANCE][0]))
+                worst[stop] = max(worst.get(stop, (0.0, 0.0)), (float(beyond[k]), float(times[k])))
+    return [
+        f"{stop.joint}: its reference goes beyond its stop at {told(stop.position, units[stop.joint])} by up to "
+        f"{told(most, units[stop.joint])}, first at t = {first[stop]:.4g} s, most at t = {time:.4g} s; "
+        "the motor pushes against the stop and misses its path: change the path or the limit"
+        for stop, (most, time) in worst.items()
+    ]
 
 
 def chattered(contacts: Sequence[Contact], unilateral: UnilateralArrays) -> list[str]:

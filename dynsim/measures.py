@@ -11,8 +11,8 @@ from dynsim.record import Record
 
 # Where the electrical energy goes, in the order in which it is drawn and printed.
 SINKS = ("heat_joule", "loss_gear", "loss_joint", "heat_friction")
-# Sinks that only runs under the unilateral law have.
-IMPACT_SINKS = ("loss_impact", "loss_stop")
+# Sinks that only some runs have: under the unilateral law, by time stepping.
+MORE_SINKS = ("loss_impact", "loss_stop", "loss_scheme")
 STORES = ("energy_kinetic", "energy_potential", "energy_magnetic")
 
 RESIDUAL_LIMIT = 1e-6
@@ -23,7 +23,7 @@ TIP_OVER = "tip_over"
 
 def sinks(record: Record) -> tuple[str, ...]:
     """The sinks of energy that a record has."""
-    return SINKS + tuple(name for name in IMPACT_SINKS if name in record)
+    return SINKS + tuple(name for name in MORE_SINKS if name in record)
 
 
 def energy_turnover(record: Record) -> float:

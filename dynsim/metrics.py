@@ -185,7 +185,7 @@ def summarise(
         ],
     }
     if counts.unilateral is not None:
-        summary["joint_stops"] = touched_stops(counts.stops, counts.unilateral, duration)
+        summary["joint_stops"] = touched_stops(record, robot, counts.stops, counts.unilateral, duration)
     if counts.stepping is not None:
         summary["time_stepping"] = counts.stepping
     summary["warnings"] = _warnings(record, scenario, contacts, robot, counts, summary) + _sunk(record, sunk)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -95,8 +96,8 @@ def print_summary(console: Console, summary: Summary) -> None:
     for contact in summary.get("contacts", ()):
         for heading, cells in _contact_rows(contact["name"], [contact]):
             table.add_row(heading, *cells)
-    for heading, value in _stop_rows(summary):
-        table.add_row(heading, value)
+    for heading, cells in _stop_rows([summary], [summary]):
+        table.add_row(heading, *cells)
     console.print(table)
     _print_warnings(console, {"": summary})
 
@@ -132,6 +133,8 @@ def _print_columns(console: Console, summaries: Mapping[str, Summary], names: Se
         by_variant = [next((c for c in s["contacts"] if c["name"] == contact), None) for s in shown]
         for heading, cells in _contact_rows(contact, by_variant):
             table.add_row(heading, *cells)
+    for heading, cells in _stop_rows(list(summaries.values()), shown):
+        table.add_row(heading, *cells)
     console.print(table)
 
 
@@ -206,11 +209,29 @@ def _contact_rows(name: str, contacts: Sequence[Summary | None]) -> Iterator[tup
             yield escaped_line(_of(name, heading)), cells
 
 
-def _stop_rows(summary: Summary) -> Iterator[tuple[str, str]]:
-    """Joint stops that were touched."""
-    for stop in summary.get("joint_stops", ()):
-        yield escaped_line(f"{stop['joint']}: hits of its stop"), str(stop["hits"])
-        yield "  impact loss [J]", _number(stop["impact_loss_J"], digits=3)
+# Heading, and how to show it, of a joint stop.
+_STOP_ROWS: tuple[tuple[str, Callable[[Summary], str]], ...] = (
+    ("hits", lambda s: str(s["hits"])),
+    ("  force, max [{force_unit}]", lambda s: _number(s["force_max"], digits=3)),
+    ("  closed [% of time]", _percent("closed_fraction")),
+    ("  impact loss [J]", lambda s: _number(s["impact_loss_J"], digits=3)),
+)
+
+
+def _stop_rows(summaries: Sequence[Summary], shown: Sequence[Summary]) -> Iterator[tuple[str, list[str]]]:
+    """Rows of the joint stops that any run has touched, a cell for each run that is shown."""
+    stops = {_stop(one): one for summary in summaries for one in summary.get("joint_stops", ())}
+    for key, stop in stops.items():
+        cells = [{_stop(one): one for one in summary.get("joint_stops", ())}.get(key) for summary in shown]
+        joint, limit = key
+        place = f"{math.degrees(limit):.4g}°" if stop["unit"] == "rad" else f"{limit:.4g} {stop['unit']}"
+        for heading, show in _STOP_ROWS:
+            text = _of(f"{joint}, stop at {place}", heading.format(**stop))
+            yield escaped_line(text), ["–" if one is None else show(one) for one in cells]
+
+
+def _stop(stop: Summary) -> tuple[str, float]:
+    return stop["joint"], stop["limit"]
 
 
 def _of(contact: str, heading: str) -> str:

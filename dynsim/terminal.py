@@ -9,10 +9,12 @@ from __future__ import annotations
 import unicodedata
 from typing import Any
 
-from rich.console import Console
+from rich.console import Console, ConsoleDimensions
 from rich.markup import escape
 from rich.text import Text
 
+# Columns where nobody looks at a screen: a table in a file or a pipe is as wide as it needs to be.
+UNBOUNDED = 10_000
 # Control characters, invisible and direction-changing ones, halves of surrogate pairs, line and paragraph separators.
 _UNFIT = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 
@@ -43,6 +45,17 @@ class Terminal(Console):
 
     Markup is read where the console is made to: :func:`escaped` is for what is put between.
     """
+
+    @property
+    def size(self) -> ConsoleDimensions:
+        """That of the terminal or of COLUMNS; without either lines end where they end."""
+        if self.is_terminal or self._width is not None:
+            return super().size
+        return ConsoleDimensions(UNBOUNDED, super().size.height)
+
+    @size.setter
+    def size(self, new_size: tuple[int, int]) -> None:
+        self._width, self._height = new_size
 
     def render_str(self, text: str, **options: Any) -> Text:
         """Cells, titles and prints all come by here."""

@@ -304,7 +304,7 @@ def bench(
     stops = joint_stops(robot) if real else []
     size = n + ka.row_limit(c, len(robot.couplings) + len(stops)) + circuits
     system = System(
-        layout=state_layout(robot.nq, n, circuits, c, len(loads or ()), LOSSES if real else 0),
+        layout=state_layout(robot.nq, n, circuits, c, len(loads or ()), LOSSES if real else 0, 1),
         model=compile_model(robot),
         drives=compile_drives(robot, k_p=[k_p] * na, k_d=[k_d] * na),
         reference=held_reference(np.zeros(na) if held is None else held),

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from dynsim.errors import ModelError
-from dynsim.model.bracing import MIN_N, Brace
+from dynsim.kernels.constraint.bracing import BRACE_SIZE
+from dynsim.model.bracing import MIN_N, BracePlanner, brace_rows
 from dynsim.model.description import Contact
 from dynsim.model.drives import Motor
 from dynsim.model.model import Model
@@ -23,6 +24,8 @@ Array = NDArray[np.float64]
 
 # Slip of the references [m/s] over which planned friction grows to its value: a jump would make the voltages ring.
 SLIP_SCALE = 5e-3
+# Slower than this it has no direction [m/s].
+SLIP_MIN = 1e-9
 # Further off its surface than this, by the references, a brace carries nothing [m].
 GAP_MAX = 2e-3
 
@@ -57,28 +60,16 @@ def planned_voltages(
     q = np.tile(robot.initial, (len(times), 1))
     for name, values in positions.items():
         q[:, model.joint_names.index(name)] = values
-    for name, (contact, _) in braces.items():
-        _check_brace(model, name, contact, times, q)
     spline = make_interp_spline(times, q, k=5)
     v, vdot = spline(times, 1), spline(times, 2)
-    rest = np.zeros(model.n)
-    torques = np.zeros((len(times), model.n))
-    for k in range(len(times)):
-        if not whole:
-            torques[k] = model.bias_forces(q[k], rest)
-            continue
-        at = {name: _brace(model, contact, force, min_N, q[k], v[k]) for name, (contact, force) in braces.items()}
-        found = model.brace_statics(q[k], v[k], vdot[k], at)
-        if not found.feasible:
-            raise ModelError(
-                f"controller.brace: at t = {times[k]:.3f} s no forces of {', '.join(braces)} carry the motion within "
-                "the limits of the motors",
-                keys=("controller", "brace"),
-            )
-        torques[k] = found.torques
+    if whole:
+        torques = _pressing_torques(model, times, q, v, vdot, braces, min_N)
+    else:
+        rest = np.zeros(model.n)
+        torques = np.array([model.bias_forces(row, rest) for row in q])
     columns = [model.joint_names.index(joint) for joint in driven]
     motors = [motor for motor in robot.motors if isinstance(motor, Motor)]
-    constant = np.array([motor.torque_constant * motor.gear_ratio for motor in motors])
+    constant = np.array([motor.joint_constant for motor in motors])
     resistance, inductance = (np.array([getattr(m, key) for m in motors]) for key in ("resistance", "inductance"))
     current = torques[:, columns] / constant
     if not whole:
@@ -87,39 +78,55 @@ def planned_voltages(
     return np.asarray(resistance * current + inductance * rate + constant * v[:, columns])
 
 
-def _check_brace(model: Model, name: str, contact: Contact, times: Array, q: Array) -> None:
-    """Refuse a brace that nothing can press against."""
-    keys = ("controller", "brace")
-    if contact.radius > 0.0 or contact.tip is not None:
+def _pressing_torques(
+    model: Model,
+    times: Array,
+    q: Array,
+    v: Array,
+    vdot: Array,
+    braces: Mapping[str, tuple[Contact, float | None]],
+    min_N: float,
+) -> Array:
+    """Torques of the motors along the references, (T, n), with braces that press."""
+    attached = []
+    for name, (contact, _) in braces.items():
+        if contact.radius > 0.0 or contact.tip is not None:
+            raise ModelError(
+                f"controller.brace: {name} is no point but has a radius; name points of contacts.points that are to "
+                "press",
+                keys=("controller", "brace"),
+            )
+        attached.append(model.robot.attach(contact.body, contact.point))
+    planner = BracePlanner(model.robot, model.arrays, [link for link, _ in attached])
+    points = np.array([point for _, point in attached]).reshape(-1, 3)
+    positions, velocities = planner.motion(points, q, v)
+    tables = np.zeros((len(times), len(braces), BRACE_SIZE))
+    for k, (name, (contact, force)) in enumerate(braces.items()):
+        _check_gaps(name, contact, times, contact.surface.gaps(positions[:, k]))
+        normals = contact.surface.normals(positions[:, k])
+        slip = velocities[:, k] - np.sum(velocities[:, k] * normals, axis=1, keepdims=True) * normals
+        speed = np.linalg.norm(slip, axis=1)
+        slip[speed <= SLIP_MIN] = 0.0
+        # A point at rest along the surface is planned without friction: what holds it then, its history decides.
+        friction = np.where(speed > SLIP_MIN, contact.friction * speed / np.hypot(speed, SLIP_SCALE), 0.0)
+        tables[:, k] = brace_rows(points[k], normals, friction, min_N, np.nan if force is None else force, slip)
+    torques, solved = planner.torques(q, v, vdot, tables)
+    if solved < len(times):
         raise ModelError(
-            f"controller.brace: {name} is no point but has a radius; name points of contacts.points that are to press",
-            keys=keys,
+            f"controller.brace: at t = {times[solved]:.3f} s no forces of {', '.join(braces)} carry the motion within "
+            "the limits of the motors",
+            keys=("controller", "brace"),
         )
-    gaps = np.array([contact.surface.gap(model.point_position(contact.body, contact.point, row)) for row in q])
+    return torques
+
+
+def _check_gaps(name: str, contact: Contact, times: Array, gaps: Array) -> None:
+    """Refuse a brace that the references take off its surface: nothing would carry what is planned for it."""
     k = int(np.abs(gaps).argmax())
     if abs(gaps[k]) > GAP_MAX:
         raise ModelError(
             f"controller.brace: the references take {name} {gaps[k]:+.4g} m off surface {contact.surface_name!r} at "
             f"t = {times[k]:.3f} s (limit {GAP_MAX:g} m); let controller.hand.braces keep it there, or take "
             "initial.on_surface",
-            keys=keys,
+            keys=("controller", "brace"),
         )
-
-
-def _brace(model: Model, contact: Contact, force: float | None, min_N: float, q: Array, v: Array) -> Brace:
-    """The brace that a contact is at a point of the references."""
-    position, jacobian = model.point_position_and_jacobian(contact.body, contact.point, q)
-    normal = contact.surface.normal(position)
-    slip = jacobian @ v
-    slip -= (slip @ normal) * normal
-    speed = float(np.linalg.norm(slip))
-    sliding = speed > 1e-9
-    return Brace(
-        body=contact.body,
-        point=contact.point,
-        normal=normal,
-        friction=contact.friction * speed / float(np.hypot(speed, SLIP_SCALE)) if sliding else 0.0,
-        min_N=min_N,
-        normal_force=force,
-        sliding=slip if sliding else None,
-    )

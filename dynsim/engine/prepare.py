@@ -83,9 +83,9 @@ def prepare(
     ScenarioError
         The record would be larger than ``record.size_limit_GB``, or the explicit method would need too many steps.
     """
-    described = build.robot(scenario)
+    described, contacts = build.robot_and_contacts(scenario)
     model = Model(described if motors is None else replace(described, motors=tuple(motors)))
-    robot, contacts = model.robot, build.contacts(scenario, model.robot)
+    robot = model.robot
     build.check_start(scenario, model, contacts)
     loads = build.loads(scenario, robot)
     if pushable:
@@ -93,12 +93,13 @@ def prepare(
     n, na, c = model.n, len(robot.motors), len(contacts)
     real = scenario.config.contacts.law == "unilateral"
     stops = joint_stops(robot) if real else []
-    layout = state_layout(model.nq, n, robot.circuits, c, len(loads), LOSSES if real else 0)
+    stepped = scenario.integrator.method == "time_stepping"
+    layout = state_layout(model.nq, n, robot.circuits, c, len(loads), LOSSES if real else 0, 1 if stepped else 0)
     columns = output_layout(n, na, c, OUTPUTS if robot.base else 0, len(stops))
     if times is None:
         times = sample_times(scenario, layout, columns, n)
     _check_coordinates(scenario, robot)
-    if scenario.integrator.method == "time_stepping":
+    if stepped:
         if robot.base is not None:
             raise ScenarioError("integrator.method: time_stepping locates no events, such as a mobile base that tips")
         if contacts and not real:
@@ -111,7 +112,7 @@ def prepare(
     _check_stiffness(scenario, robot)
     joint_rows = len(robot.couplings) + len(stops)
     _check_work(scenario, n, c + joint_rows)
-    control = _control(scenario, model, progress)
+    control = _control(scenario, model, contacts, progress)
     if not real:
         _check_references(scenario, robot, contacts, control)
     options, size = scenario.integrator, n + ka.row_limit(c, joint_rows) + robot.circuits
@@ -269,12 +270,14 @@ def _check_work(scenario: Scenario, n: int, p: int) -> None:
         )
 
 
-def _control(scenario: Scenario, model: Model, progress: Progress | None) -> JointControl:
+def _control(scenario: Scenario, model: Model, contacts: Sequence[Contact], progress: Progress | None) -> JointControl:
     if scenario.controller is None:
         return JointControl.absent(model.robot)
     log.info("%s: planning references over %g s", scenario.title, scenario.duration_s)
     started = clock.perf_counter()
-    control = build.controller(scenario, model, None if progress is None else partial(progress, stage=REFERENCES))
+    control = build.controller(
+        scenario, model, None if progress is None else partial(progress, stage=REFERENCES), contacts
+    )
     log.info("%s: planned references in %.3f s", scenario.title, clock.perf_counter() - started)
     if not isinstance(control, JointControl):
         raise ModelError(f"controller {scenario.controller.type!r} cannot drive a {scenario.plant.type!r}")

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from dynsim import metrics
+from dynsim.contact_metrics import beyond_stops
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.provenance import provenance
 from dynsim.engine.uniqueness import motion_spread
@@ -117,6 +118,7 @@ def make_record(
         stepping=None if run.stepping is None else _stepping(run.stepping.found),
     )
     record.summary = metrics.summarise(record, scenario, contacts, robot, counts)
+    record.summary["warnings"] += beyond_stops(robot, prepared.stops, prepared.control)
     return record
 
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.uniqueness import paradox
 from dynsim.errors import SimulationStopped
 from dynsim.kernels import arrays as ka
+from dynsim.kernels.constraint import unilateral as ku
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.state import block
 from dynsim.scenario import Scenario
@@ -33,6 +35,14 @@ def stopped(scenario: Scenario, prepared: Prepared) -> SimulationStopped:
 def last_state(prepared: Prepared, y: np.ndarray) -> dict[str, Sequence[float]]:
     """Positions, rates and currents by name, for a message."""
     return {name: y[block(prepared.system.layout, name)].tolist() for name in ("q", "v", "current")}
+
+
+def _listed(prepared: Prepared, *choices: NDArray[np.bool_]) -> str:
+    """Names of the contacts of the first choice, (c,) or more, that is not empty; else of all."""
+    for chosen in choices:
+        if chosen[: len(prepared.contacts)].any():
+            return ", ".join(c.name for c, here in zip(prepared.contacts, chosen, strict=False) if here)
+    return ", ".join(contact.name for contact in prepared.contacts)
 
 
 def _reason(scenario: Scenario, prepared: Prepared) -> str:
@@ -63,15 +73,17 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
             "caster or make it heavier, or take on_overturn: warn to go on as if it were held down"
         )
     if status == ki.NO_CONTACT_FORCES:
-        names = ", ".join(contact.name for contact in prepared.contacts)
+        names = _listed(prepared, prepared.workspace.active[:, ka.MODE] != ka.OPEN)
         return (
             f"{where}: no forces at {names} agree with Coulomb's law (Painlevé's paradox, or rows that contradict each "
             "other); lower contacts.friction, or take another posture"
         )
     if status == ki.CHATTER:
+        law = prepared.system.unilateral
+        names = _listed(prepared, law.tally[:, ku.CHATTERED] > 0.0, law.mode[:, ku.BEFORE] != law.mode[:, ku.WANTED])
         return (
-            f"{where}: contacts open and close without end; take integrator.method: time_stepping, or a larger "
-            "integrator.atol"
+            f"{where}: the contact at {names} opens and closes, or slips and sticks, without end; take "
+            "integrator.method: time_stepping, which goes on through it, or a larger integrator.atol"
         )
     ws = prepared.workspace
     gaps = ws.rows[: ws.counts[ka.ROWS], ka.ROW_GAP]

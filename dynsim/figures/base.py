@@ -67,18 +67,20 @@ def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
         return None
     some = list(shown.values())
     figure = style.new_figure(
-        3.4 + len(shown) * style.LEGEND_ROW / 72.0,
+        3.4 + len(shown) * style.LEGEND_ROW / 72.0 + events.height_of_variants(shown),
         style.comparison_title(some, "tip margin (1: safest place, 0: tips over)"),
     )
     series = [(record.time, np.maximum(record[MARGIN], MARGIN_LOW)) for record in some]
     (panels,) = style.time_rows(figure, [series], max(map(style.settle_time, some)))
     styles = style.variant_styles(list(records))
+    colours = {name: str(look["color"]) for name, look in styles.items()}
     for axes in panels:
         for name, record in shown.items():
             style.line(axes, record.time, record[MARGIN], label=_margin_label(name, record), **styles[name])
         _frame_margin(axes)
-        _mark_tipping(axes, some, [str(styles[name]["color"]) for name in shown])
+        _mark_tipping(axes, some, [colours[name] for name in shown])
     panels[0].set_ylabel("tip margin")
+    events.explain(panels[-1], events.mark_variants([panels], shown, colours))
     handles, labels = panels[-1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=1)
     return figure

@@ -67,8 +67,9 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
     shown = {name: record for name, record in records.items() if has_motors(record)}
     if not shown:
         return None
+    height = 5.0 + 2.0 * events.height_of_variants(shown)
     figure = style.new_figure(
-        5.0, style.comparison_title(list(shown.values()), "electrical energy and mechanical work")
+        height, style.comparison_title(list(shown.values()), "electrical energy and mechanical work")
     )
     grid = figure.add_gridspec(2, 2, width_ratios=[1.6, 1.0])
     over_time, total = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[:, 1])
@@ -87,6 +88,8 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
     work.axhline(0.0, color=style.GREY, linewidth=0.6)
     work.set_ylabel("mechanical work [J]")
     work.set_xlabel("time [s]")
+    colours = {name: str(look["color"]) for name, look in styles.items()}
+    events.explain(work, events.mark_variants([(over_time,), (work,)], shown, colours))
     _bars(total, list(shown), finals, [styles[name]["color"] for name in shown])
     figure.legend(*over_time.get_legend_handles_labels(), loc="outside lower center", ncols=min(len(shown), 5))
     return figure

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -26,8 +26,8 @@ MARKS: dict[str, tuple[str, str, str]] = {
 COLOUR = "#555555"
 # Lines of more events than this would hide the curves; their marks stay.
 LINES = 40
-# Marks lie so far below the upper edge [point].
-BELOW = 4.0
+# Marks lie so far below the upper edge, and rows of them so far from each other [point].
+BELOW, ROW = 4.0, 6.0
 
 
 def marked(record: Record, names: Iterable[str] | None = None) -> list[Event]:
@@ -36,11 +36,14 @@ def marked(record: Record, names: Iterable[str] | None = None) -> list[Event]:
     return [event for event in record.events if event.kind in MARKS and (chosen is None or event.name in chosen)]
 
 
-def mark(axes: Axes, events: Sequence[Event], colour: str = COLOUR, *, row: int = 0) -> None:
-    """Draw events that lie within the axes: a faint line each and its mark, in a row from the upper edge down."""
+def mark(axes: Axes, events: Sequence[Event], colour: str = COLOUR, *, row: int = 0, lines: bool = True) -> None:
+    """Draw events that lie within the axes: a faint line each and its mark, in a row from the upper edge down.
+
+    Negative rows lie above the edge.
+    """
     low, high = axes.get_xlim()
     inside = [event for event in events if low <= event.time <= high]
-    down = ScaledTranslation(0.0, -BELOW * (1.0 + 1.5 * row) / 72.0, axes.figure.dpi_scale_trans)
+    down = ScaledTranslation(0.0, -(BELOW + ROW * row) / 72.0, axes.figure.dpi_scale_trans)
     place = axes.get_xaxis_transform() + down
     look: dict[str, Any] = {"color": colour, "markersize": 3.2, "markeredgewidth": 0.0, "zorder": 6, "clip_on": False}
     for kind, (marker, _, _) in MARKS.items():
@@ -48,9 +51,9 @@ def mark(axes: Axes, events: Sequence[Event], colour: str = COLOUR, *, row: int 
         if not times:
             continue
         axes.plot(times, [1.0] * len(times), marker, transform=place, label="_event", **look)
-        if len(inside) <= LINES:
+        if lines and len(inside) <= LINES:
             for time in times:
-                axes.axvline(time, color=colour, linewidth=0.5, alpha=0.35, zorder=0.5)
+                axes.axvline(time, color=colour, linewidth=0.5, alpha=0.35 if row >= 0 else 0.2, zorder=0.5)
     axes.set_xlim(low, high)
 
 
@@ -63,6 +66,31 @@ def mark_all(rows: Iterable[Sequence[Axes]], record: Record) -> None:
         for axes in panels:
             mark(axes, found)
     explain(rows[-1][-1], found)
+
+
+def height_of_variants(records: Mapping[str, Record]) -> float:
+    """Room over a panel for the rows of :func:`mark_variants` [inch]."""
+    return ROW * sum(bool(marked(record)) for record in records.values()) / 72.0
+
+
+def mark_variants(
+    rows: Iterable[Sequence[Axes]], records: Mapping[str, Record], colours: Mapping[str, str]
+) -> list[Event]:
+    """Mark the events of several runs over every panel, a row in its colour for each that has some; returns them.
+
+    Inside they would lie on the curves of the other variants.
+    """
+    having = {name: found for name, record in records.items() if (found := marked(record))}
+    everything = [event for found in having.values() for event in found]
+    if not everything:
+        return []
+    for panels in rows:
+        for axes in panels:
+            for row, (name, found) in enumerate(having.items()):
+                mark(axes, found, colours[name], row=-1 - row, lines=len(everything) <= LINES)
+            # The empty title keeps the room.
+            axes.set_title(" ", fontsize=1.0, pad=ROW * len(having))
+    return everything
 
 
 def explain(axes: Axes, events: Sequence[Event]) -> None:

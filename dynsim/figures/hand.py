@@ -88,7 +88,8 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
     shown = {name: record for name, record in records.items() if hand_target(record) is not None}
     if not shown:
         return None
-    figure = style.new_figure(4.4, style.comparison_title(list(shown.values()), "tracking error"))
+    height = 4.4 + 2.0 * events.height_of_variants(shown)
+    figure = style.new_figure(height, style.comparison_title(list(shown.values()), "tracking error"))
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[1.3, 1.0])
     styles = style.variant_styles(list(records))
     for name, record in shown.items():
@@ -102,6 +103,8 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
     bottom.set_ylabel("vertical error $e_z$ [mm]")
     bottom.set_xlabel("time [s]")
     _mark_settle((top, bottom), next(iter(shown.values())))
+    colours = {name: str(look["color"]) for name, look in styles.items()}
+    events.explain(bottom, events.mark_variants([(top,), (bottom,)], shown, colours))
     figure.legend(loc="outside lower center", ncols=2)
     return figure
 

@@ -57,15 +57,9 @@ from dynsim.kernels.tree.sweep import body_inertia
 
 
 @inlined_kernel
-def ledger_rates(model: ModelArrays, drives: DriveArrays, ws: Workspace, out, layout):
-    """Rates of all integrals, into the blocks ledger and contact of ``out`` [W; N, m/s], and the normal forces.
-
-    Electrical Σ u i; drawn Σ max(u i, 0), a supply for each motor; supply max(Σ u i, 0), one for all; Joule Σ R i²;
-    gear Σ D_m v² and the drag of servos; joint Σ D v²; friction −Σ f_n (d − n)·v of what slides, d the force direction;
-    constraint Σ f J v of all rows (zero on the constraint); mechanical Σ tau v with tau = K_m i − J_m vdot − D_m v −
-    drag ([WM] eq 25).
-    """
-    joints, motors, motor, state = ws.joints, ws.motors, drives.motor, ws.contacts
+def drive_powers(drives: DriveArrays, ws: Workspace):
+    """Electrical, drawn, Joule and mechanical power of all drives, and that of their drag [W]; see `ledger_rates`."""
+    joints, motors, motor = ws.joints, ws.motors, drives.motor
     electrical, drawn, joule, mechanical, drag = 0.0, 0.0, 0.0, 0.0, 0.0
     for a in range(motors.shape[0]):
         i = drives.table[a, DRIVEN]
@@ -77,6 +71,20 @@ def ledger_rates(model: ModelArrays, drives: DriveArrays, ws: Workspace, out, la
         shaft = motor[a, K_M] * current - motor[a, J_M] * joints[i, QDD] - motor[a, D_M] * v - motors[a, DRAG]
         mechanical += shaft * v
         drag += motors[a, DRAG] * v
+    return electrical, drawn, joule, mechanical, drag
+
+
+@inlined_kernel
+def ledger_rates(model: ModelArrays, drives: DriveArrays, ws: Workspace, out, layout):
+    """Rates of all integrals, into the blocks ledger and contact of ``out`` [W; N, m/s], and the normal forces.
+
+    Electrical Σ u i; drawn Σ max(u i, 0), a supply for each motor; supply max(Σ u i, 0), one for all; Joule Σ R i²;
+    gear Σ D_m v² and the drag of servos; joint Σ D v²; friction −Σ f_n (d − n)·v of what slides, d the force direction;
+    constraint Σ f J v of all rows (zero on the constraint); mechanical Σ tau v with tau = K_m i − J_m vdot − D_m v −
+    drag ([WM] eq 25).
+    """
+    joints, state = ws.joints, ws.contacts
+    electrical, drawn, joule, mechanical, drag = drive_powers(drives, ws)
     gear, joint = 0.0, 0.0
     for i in range(joints.shape[0]):
         square = joints[i, QD] * joints[i, QD]

@@ -9,6 +9,7 @@ State y, all in one vector, blocks in this order:
     contact  (2 c,) impulse of the normal force [N s] and slip [m] of each contact point
     load     (l,)   work of each external wrench [J]
     loss     (2,)   what impacts of contacts and of joint stops take [J]; only under the unilateral law
+    scheme   (1,)   what time steps take of the energy [J], see dynsim.kernels.integrate.balance; only of time stepping
 
 The first three are what error control looks at; the rest are integrals that nothing depends on.
 """
@@ -40,18 +41,32 @@ class StateLayout(NamedTuple):
     contact: int
     load: int
     loss: int
+    scheme: int
     size: int
     tracked: int  # how many entries, from the first on, error control looks at: all that derivatives depend on
     extra: int  # nq − n
     circuits: int  # currents among the states
 
 
-def state_layout(nq: int, n: int, circuits: int, contacts: int, loads: int = 0, losses: int = 0) -> StateLayout:
-    """The layout for nq positions, n rates, and so many circuits, contact points, external wrenches and losses."""
-    starts = np.cumsum([0, nq, n, circuits, LEDGER_SIZE, CONTACT_SIZE * contacts, loads, losses])
-    q, v, current, ledger, contact, load, loss, size = (int(start) for start in starts)
+def state_layout(
+    nq: int, n: int, circuits: int, contacts: int, loads: int = 0, losses: int = 0, scheme: int = 0
+) -> StateLayout:
+    """The layout for nq positions, n rates, and so many of circuits, contact points, wrenches, losses, schemes."""
+    starts = np.cumsum([0, nq, n, circuits, LEDGER_SIZE, CONTACT_SIZE * contacts, loads, losses, scheme])
+    q, v, current, ledger, contact, load, loss, scheme_start, size = (int(start) for start in starts)
     return StateLayout(
-        q, v, current, ledger, contact, load, loss, size, tracked=ledger, extra=nq - n, circuits=circuits
+        q,
+        v,
+        current,
+        ledger,
+        contact,
+        load,
+        loss,
+        scheme_start,
+        size,
+        tracked=ledger,
+        extra=nq - n,
+        circuits=circuits,
     )
 
 

@@ -150,8 +150,8 @@ def compile_drives(
 
 
 def _dc_motor(m: Motor, k_p: float, k_d: float) -> np.ndarray:
-    row, k = np.zeros(ka.MOTOR_SIZE), m.gear_ratio
-    row[ka.K_M] = m.torque_constant * k
+    row = np.zeros(ka.MOTOR_SIZE)
+    row[ka.K_M] = m.joint_constant
     row[ka.RESISTANCE], row[ka.INDUCTANCE] = m.resistance, m.inductance
     row[ka.J_M], row[ka.D_M] = m.armature, m.reflected_damping
     row[ka.K_P], row[ka.K_D] = k_p, k_d

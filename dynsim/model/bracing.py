@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from dynsim.errors import ModelError
+from dynsim.errors import ModelError, shown
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.constraint import bracing as kb
 from dynsim.kernels.jit import integers, reals
@@ -19,7 +20,7 @@ MIN_N = 0.5
 
 @dataclass(frozen=True)
 class Brace:
-    """A point of a body that leans on a surface.
+    """A point of a body that leans on a surface; its arrays are copies that cannot be written to.
 
     Attributes
     ----------
@@ -30,6 +31,11 @@ class Brace:
     min_N : least normal force [N]
     normal_force : [N], commanded; None: whatever gives the least heat
     sliding : (3,) velocity along the surface, of which the direction counts: f_t = μ f_n against it; None: it is held
+
+    Raises
+    ------
+    ModelError
+        No three finite numbers, no direction, a negative friction or least force, or a commanded one that pulls.
     """
 
     body: str
@@ -39,6 +45,43 @@ class Brace:
     min_N: float = MIN_N
     normal_force: float | None = None
     sliding: Array | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("point", "normal", "sliding"):
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, _vector(name, value))
+        if not self.normal.any():
+            raise ModelError(f"brace on {self.body}: normal {self.normal.tolist()} has no direction")
+        if not 0.0 <= self.friction < np.inf:
+            raise ModelError(f"brace on {self.body}: friction {self.friction} must be zero or positive")
+        if not 0.0 <= self.min_N < np.inf:
+            raise ModelError(f"brace on {self.body}: min_N {self.min_N} must be zero or positive [N]")
+        if self.normal_force is not None and not 0.0 < self.normal_force < np.inf:
+            raise ModelError(
+                f"brace on {self.body}: normal_force {self.normal_force} must be positive [N]; a brace cannot pull"
+            )
+        if self.sliding is not None and not _is_along(self.sliding, self.normal):
+            raise ModelError(
+                f"brace on {self.body}: sliding {self.sliding.tolist()} has no direction along the surface"
+            )
+
+
+def _is_along(sliding: Array, normal: Array) -> bool:
+    """Whether a velocity has a part along the surface that is more than rounding."""
+    across = np.linalg.norm(np.cross(normal, sliding))
+    return bool(across > 1e-12 * np.linalg.norm(normal) * np.linalg.norm(sliding))
+
+
+def _vector(name: str, value: ArrayLike) -> Array:
+    """Three finite numbers, not to be written to."""
+    try:
+        vector = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"brace: {name} must be three numbers, not {shown(value)}") from error
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise ModelError(f"brace: {name} must be three finite numbers, not {shown(value)}")
+    vector.flags.writeable = False
+    return vector
 
 
 @dataclass(frozen=True)
@@ -68,89 +111,121 @@ class BraceStatics:
 
 
 class BracePlanner:
-    """Room for one robot with one set of braces, whose points, normals and forces may change from call to call."""
+    """Braces of a robot as the tables of the kernels, and room for them.
 
-    def __init__(self, robot: Robot, model: ka.ModelArrays, braces: Mapping[str, Brace]) -> None:
+    Parameters
+    ----------
+    robot, model : the description and its arrays
+    links : (c,) int, the body of each brace
+    """
+
+    def __init__(self, robot: Robot, model: ka.ModelArrays, links: Sequence[int]) -> None:
         if robot.couplings:
             raise ModelError("brace_statics: not for robots with coupled joints, which share a motor")
-        self._robot, self._model, self.names = robot, model, tuple(braces)
-        self._drives = {motor.joint: motor for motor in robot.motors}
-        motors = reals(np.zeros((len(robot.links), kb.MOTOR_LIMITS)))
-        for j, joint in enumerate(robot.joint_names):
-            motor = self._drives.get(joint)
-            if motor is not None and not isinstance(motor, TorqueSource):
-                motors[j, kb.HEAT] = motor.resistance / _constant(motor) ** 2
-        link = integers([robot.attach(brace.body, brace.point)[0] for brace in braces.values()])
-        self._arrays = kb.brace_arrays(link, reals(np.zeros((len(braces), kb.BRACE_SIZE))), motors)
+        self._model, self._ws = model, ka.workspace(len(robot.links), 0, 0)
+        drives = {motor.joint: motor for motor in robot.motors}
+        motors = np.array([_motor_row(drives.get(joint)) for joint in robot.joint_names])
+        self.arrays = kb.brace_arrays(integers(links), reals(motors))
 
-    def solve(self, ws: ka.Workspace, v: Array, braces: Mapping[str, Brace]) -> BraceStatics:
-        """For the q, v and vdot in ``ws.joints`` and these braces, of the names and bodies of the planner."""
-        arrays, joints = self._arrays, self._robot.joint_names
-        for k, (name, brace) in enumerate(braces.items()):
-            arrays.table[k] = _brace_row(self._robot, name, brace)
-        for j, joint in enumerate(joints):
-            arrays.motors[j, kb.LOWER], arrays.motors[j, kb.UPPER] = _torque_limits(self._drives.get(joint), v[j])
-        feasible = bool(kb.brace_statics(self._model, ws, arrays))
-        found, heat = arrays.found.copy(), arrays.motors[:, kb.HEAT]
-        axes = arrays.table[:, kb.AXES : kb.AXES + 9].reshape(-1, 3, 3)
+    def motion(self, points: Array, q: Array, v: Array) -> tuple[Array, Array]:
+        """Positions and velocities of points of the braces' bodies, (c, 3) [m], along a motion, both (T, c, 3)."""
+        positions, velocities = np.zeros((2, len(q), len(points), 3))
+        self.arrays.table[:, kb.POINT : kb.POINT + 3] = points
+        kb.brace_motion(self._model, self._ws, self.arrays, reals(q), reals(v), positions, velocities)
+        return positions, velocities
+
+    def torques(self, q: Array, v: Array, vdot: Array, tables: Array) -> tuple[Array, int]:
+        """Torques of least heat along a motion, (T, n) [N m], and at how many instants there are some.
+
+        ``tables`` : (T, c, BRACE_SIZE) of :func:`brace_rows`
+        """
+        torques = np.zeros(v.shape)
+        solved = kb.brace_statics(
+            self._model, self._ws, self.arrays, reals(q), reals(v), reals(vdot), tables, torques, False
+        )
+        return torques, int(solved)
+
+
+class PreparedBraces:
+    """Some braces of a robot with all that does not change from one state to the next."""
+
+    def __init__(self, robot: Robot, model: ka.ModelArrays, braces: Mapping[str, Brace]) -> None:
+        self.names, self.braces = tuple(braces), tuple(braces.values())
+        attached = [robot.attach(brace.body, brace.point) for brace in self.braces]
+        self._arrays = BracePlanner(robot, model, [link for link, _ in attached]).arrays
+        self._model, self._ws = model, ka.workspace(len(robot.links), 0, 0)
+        self._tables = np.zeros((1, len(braces), kb.BRACE_SIZE))
+        for k, (brace, (_, point)) in enumerate(zip(self.braces, attached, strict=True)):
+            sliding = np.zeros(3) if brace.sliding is None else brace.sliding
+            forces = brace.min_N, np.nan if brace.normal_force is None else brace.normal_force
+            self._tables[0, k] = brace_rows(
+                point, brace.normal[None], np.array([brace.friction]), *forces, sliding[None]
+            )
+        n = len(robot.links)
+        self._q, self._v, self._vdot = np.zeros((1, robot.nq)), np.zeros((1, n)), np.zeros((1, n))
+        self._torques = np.zeros((1, n))
+
+    def are(self, braces: Mapping[str, Brace]) -> bool:
+        """Whether these are the same objects under the same names, so that nothing of them can have changed."""
+        return self.names == tuple(braces) and all(a is b for a, b in zip(self.braces, braces.values(), strict=True))
+
+    def solve(self, q: Array, v: Array, vdot: Array) -> BraceStatics:
+        """For one state."""
+        arrays = self._arrays
+        self._q[0], self._v[0], self._vdot[0] = q, v, vdot
+        solved = kb.brace_statics(
+            self._model, self._ws, arrays, self._q, self._v, self._vdot, self._tables, self._torques, True
+        )
+        feasible = solved == 1
+        torques, found, forces = self._torques[0].copy(), arrays.found, arrays.forces.copy()
         if not feasible:
-            found[:] = np.nan
-        torques = arrays.torques.copy() if feasible else np.full(len(joints), np.nan)
+            torques[:], found[:], forces[:] = np.nan, np.nan, np.nan
+        numbers = found.tolist()
         return BraceStatics(
             feasible=feasible,
             torques=torques,
-            heat=float(heat @ torques**2),
-            forces={name: found[k, :3] @ axes[k] for k, name in enumerate(self.names)},
-            normal_forces={name: float(found[k, 0]) for k, name in enumerate(self.names)},
-            intervals={name: (float(found[k, kb.LOW]), float(found[k, kb.HIGH])) for k, name in enumerate(self.names)},
+            heat=float(arrays.motors[:, kb.HEAT] @ torques**2),
+            forces=dict(zip(self.names, forces, strict=True)),
+            normal_forces={name: row[kb.FORCES] for name, row in zip(self.names, numbers, strict=True)},
+            intervals={name: (row[kb.LOW], row[kb.HIGH]) for name, row in zip(self.names, numbers, strict=True)},
             certificate=None if feasible else arrays.certificate.copy(),
         )
 
 
-def _brace_row(robot: Robot, name: str, brace: Brace) -> Array:
-    """A row of the table of the kernels."""
-    row = np.zeros(kb.BRACE_SIZE)
-    normal, force = np.asarray(brace.normal, dtype=np.float64), brace.normal_force
-    length = float(np.linalg.norm(normal)) if normal.shape == (3,) else np.nan
-    if not (np.isfinite(length) and length > 0.0):
-        raise ModelError(f"brace {name}: normal {brace.normal} must be a direction in the world, (3,)")
-    if not (np.isfinite(brace.friction) and brace.friction >= 0.0):
-        raise ModelError(f"brace {name}: friction {brace.friction} must be zero or positive")
-    if not (np.isfinite(brace.min_N) and brace.min_N >= 0.0):
-        raise ModelError(f"brace {name}: min_N {brace.min_N} must be zero or positive [N]")
-    if force is not None and not (np.isfinite(force) and force > 0.0):
-        raise ModelError(f"brace {name}: normal_force {force} must be positive [N]; a brace cannot pull")
-    normal = normal / length
-    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    first /= np.linalg.norm(first)
-    tangents = np.array([first, np.cross(normal, first)])
-    row[kb.POINT : kb.POINT + 3] = robot.attach(brace.body, np.asarray(brace.point, dtype=np.float64))[1]
-    row[kb.AXES : kb.AXES + 9] = np.concatenate([normal, tangents.ravel()])
-    row[kb.FRICTION], row[kb.LEAST] = brace.friction, brace.min_N
-    row[kb.COMMANDED] = np.nan if force is None else force
-    if brace.sliding is not None:
-        slip = tangents @ np.asarray(brace.sliding, dtype=np.float64)
-        speed = float(np.linalg.norm(slip))
-        if not (np.isfinite(speed) and speed > 0.0):
-            raise ModelError(f"brace {name}: sliding {brace.sliding} has no direction along the surface")
-        row[kb.SLIP : kb.SLIP + 2] = slip / speed
-    return row
+def brace_rows(point: Array, normals: Array, friction: Array, least: float, commanded: float, sliding: Array) -> Array:
+    """Rows of the table of the kernels for one brace along a motion, (T, BRACE_SIZE).
+
+    Parameters
+    ----------
+    point : (3,) on its link [m]
+    normals : (T, 3) of any length
+    friction : (T,)
+    least, commanded : [N], NaN for no commanded force
+    sliding : (T, 3), zero where it is held
+    """
+    rows = np.zeros((len(normals), kb.BRACE_SIZE))
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    tangents = np.stack([first, np.cross(normals, first)], axis=1)
+    slip = np.einsum("tij,tj->ti", tangents, sliding)
+    speed = np.linalg.norm(slip, axis=1, keepdims=True)
+    rows[:, kb.POINT : kb.POINT + 3] = point
+    rows[:, kb.AXES : kb.AXES + 3], rows[:, kb.AXES + 3 : kb.AXES + 9] = normals, tangents.reshape(-1, 6)
+    rows[:, kb.SLIP : kb.SLIP + 2] = np.divide(slip, speed, out=np.zeros_like(slip), where=speed > 0.0)
+    rows[:, kb.FRICTION], rows[:, kb.LEAST], rows[:, kb.COMMANDED] = friction, least, commanded
+    return rows
 
 
-def _constant(motor: Motor | Servo) -> float:
-    """K_m [N m/A] at the joint."""
-    return motor.torque_constant * (motor.gear_ratio if isinstance(motor, Motor) else 1.0)
-
-
-def _torque_limits(motor: Motor | Servo | TorqueSource | None, v: float) -> tuple[float, float]:
-    """Least and largest torque of a motor at a steady current and a rate v: |R i + K_m v| ≤ U, |i| ≤ I."""
-    if motor is None:
-        return 0.0, 0.0
+def _motor_row(motor: Motor | Servo | TorqueSource | None) -> Array:
+    """A row of the table of motors of the kernels; the limits follow from the rate."""
+    row = np.zeros(kb.MOTOR_SIZE)
+    row[kb.CONSTANT] = 1.0
     if isinstance(motor, TorqueSource):
-        return -motor.torque_limit, motor.torque_limit
-    constant = _constant(motor)
-    current = motor.greatest_current if isinstance(motor, Servo) else np.inf
-    low = max(-current, (-motor.voltage_limit - constant * v) / motor.resistance)
-    high = min(current, (motor.voltage_limit - constant * v) / motor.resistance)
-    # A motor that is driven faster than its voltage allows brakes with all it has.
-    return constant * min(low, current), constant * max(high, -current)
+        row[kb.CURRENT_LIMIT] = motor.torque_limit
+    elif motor is not None:
+        row[kb.CONSTANT], row[kb.RESISTANCE] = motor.joint_constant, motor.resistance
+        row[kb.HEAT] = motor.resistance / motor.joint_constant**2
+        row[kb.VOLTAGE_LIMIT] = motor.voltage_limit
+        row[kb.CURRENT_LIMIT] = motor.greatest_current if isinstance(motor, Servo) else np.inf
+    return row

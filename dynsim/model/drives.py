@@ -38,6 +38,11 @@ class Motor:
     mass_point: Array | None = None
 
     @property
+    def joint_constant(self) -> float:
+        """K_m = K k [N m/A = V s/rad] at the joint."""
+        return self.torque_constant * self.gear_ratio
+
+    @property
     def armature(self) -> float:
         """J_m = I_m k² [kg m², or kg at a prismatic joint]."""
         return self.rotor_inertia * self.gear_ratio**2
@@ -83,6 +88,11 @@ class Servo:
     free_drag: float = 0.0
     mass: float = 0.0
     mass_point: Array | None = None
+
+    @property
+    def joint_constant(self) -> float:
+        """K_m [N m/A = V s/rad] at the joint."""
+        return self.torque_constant
 
     @property
     def greatest_current(self) -> float:

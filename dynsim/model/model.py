@@ -15,7 +15,7 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels import ledger
 from dynsim.kernels.tree import articulated, joints, points, sweep
 from dynsim.model.arrays import compile_model
-from dynsim.model.bracing import Brace, BracePlanner, BraceStatics
+from dynsim.model.bracing import Brace, BraceStatics, PreparedBraces
 from dynsim.model.description import Array, Robot
 from dynsim.problems import listed
 
@@ -53,6 +53,7 @@ class Model:
         self.n, self.nq = len(robot.links), robot.nq
         self._workspace = ka.workspace(self.n, 0, 0)
         self._q = np.zeros(self.nq)
+        self._braces: PreparedBraces | None = None  # those of the last call of brace_statics
         self._position_names = robot.position_names  # computed from every link's kind
         # forward_dynamics and mass_matrix are those of the bodies alone: no rotor inertia.
         self._bodies = self.arrays._replace(body=self.arrays.body.copy())
@@ -156,9 +157,12 @@ class Model:
         ModelError
             A brace on no body, without a direction, or with a force that pulls; a robot with coupled joints.
         """
-        self._set(q, v)
-        self._workspace.joints[:, ka.QDD] = self._vector(vdot, "vdot", self.joint_names)
-        return BracePlanner(self.robot, self.arrays, braces).solve(self._workspace, np.asarray(v, float), braces)
+        names = self.joint_names
+        positions, rates = self._vector(q, "q", self._position_names), self._vector(v, "v", names)
+        accelerations = self._vector(vdot, "vdot", names)
+        if self._braces is None or not self._braces.are(braces):
+            self._braces = PreparedBraces(self.robot, self.arrays, braces)
+        return self._braces.solve(positions, rates, accelerations)
 
     def point_position(self, body: str | int, point: ArrayLike, q: ArrayLike) -> Array:
         """World position of a point fixed on a body, or in a frame of one by its name, (3,) [m]."""

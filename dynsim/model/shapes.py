@@ -10,6 +10,7 @@ from dynsim.errors import ModelError
 from dynsim.kernels.constraint import distance as kd
 from dynsim.kernels.jit import integers, reals
 from dynsim.model.description import Contact, Robot
+from dynsim.model.model import Model
 from dynsim.model.surfaces import Array, Box, HeightField, Quadric, Surface
 
 _SIMPLE = {"plane": kd.PLANE, "sphere": kd.SPHERE, "cylinder": kd.CYLINDER}
@@ -94,6 +95,12 @@ def shape_arrays(entries: Sequence[tuple[Surface | None, float, Array, bool]]) -
         else:
             raise ModelError(f"a {type(surface).__name__} is no surface that the kernels know")
     return kd.ShapeArrays(kind=integers(kind), data=reals(data), fields=reals(np.concatenate(fields)))
+
+
+def gap_at(model: Model, contact: Contact, q: Array) -> float:
+    """Gap [m] of a contact at a configuration, (nq,); ModelError for a body that the model does not have."""
+    ends = [model.point_position(contact.body, end, q) for end in (contact.point, contact.tip) if end is not None]
+    return contact_gap(contact, *ends)
 
 
 def contact_gap(contact: Contact, start: Array, end: Array | None = None) -> float:

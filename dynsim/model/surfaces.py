@@ -29,6 +29,9 @@ class Surface(Protocol):
     def normal(self, position: Array) -> Array:
         """Unit normal at a point, (3,), to the free side."""
 
+    def normals(self, positions: Array) -> Array:
+        """:meth:`normal` at many points, (T, 3) → (T, 3)."""
+
 
 @dataclass(frozen=True)
 class Quadric:
@@ -75,6 +78,12 @@ class Quadric:
         slope = float(np.linalg.norm(gradient))
         return np.asarray(gradient / slope) if slope > 0.0 else np.zeros(3)
 
+    def normals(self, positions: Array) -> Array:
+        """:meth:`normal` at many points, (T, 3) → (T, 3)."""
+        gradients = positions @ self.Q + self.b
+        slopes = np.linalg.norm(gradients, axis=1, keepdims=True)
+        return np.divide(gradients, slopes, out=np.zeros_like(gradients), where=slopes > 0.0)
+
     @cached_property
     def drawn(self) -> Drawn:
         """The surface with the parameters of the simple kind that it is of, if any; without a name."""
@@ -102,6 +111,10 @@ class _Shaped:
     def normal(self, position: Array) -> Array:
         """Unit normal at a point, (3,), to the free side."""
         return np.asarray(self._distances(np.asarray(position)[None])[1][0])
+
+    def normals(self, positions: Array) -> Array:
+        """:meth:`normal` at many points, (T, 3) → (T, 3)."""
+        return self._distances(positions)[1]
 
     def _distances(self, positions: Array) -> tuple[Array, Array]:
         from dynsim.kernels.constraint.distance import surface_distances

@@ -32,6 +32,11 @@ class JointStop:
     position: float
 
 
+def told(value: float, unit: str) -> str:
+    """A joint coordinate for a line of text; an angle in degrees too, which scenarios are written in."""
+    return f"{value:.5g} {unit}" if unit != "rad" else f"{np.degrees(value):.5g}° ({value:.4g} rad)"
+
+
 def compile_unilateral(
     robot: Robot, contacts: Sequence[Contact], stops: Sequence[JointStop], slow: float
 ) -> UnilateralArrays:
@@ -101,7 +106,8 @@ def joint_stops(robot: Robot) -> list[JointStop]:
                 beyond = side * (limit - robot.initial[k])
                 if beyond > START_TOLERANCE:
                     raise ModelError(
-                        f"{link.joint}: starts at {robot.initial[k]:.6g} {link.units[0]}, beyond its stop {limit:.6g}; "
+                        f"{link.joint}: starts at {told(robot.initial[k], link.units[0])}, beyond its stop at "
+                        f"{told(limit, link.units[0])}; "
                         "contacts.law: unilateral enforces it: change its initial position or its limit"
                     )
                 found.append(JointStop(link.joint, side, float(limit)))

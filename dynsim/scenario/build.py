@@ -17,7 +17,7 @@ from dynsim.model.description import Array, Contact, Inertia, Load, Robot
 from dynsim.model.model import Model
 from dynsim.model.posture import on_surfaces
 from dynsim.model.protocols import BuildContext
-from dynsim.model.shapes import contact_gap
+from dynsim.model.shapes import gap_at
 from dynsim.model.surfaces import SURFACES, Surface
 from dynsim.problems import dotted, suggest
 from dynsim.scenario.candidates import candidates
@@ -42,13 +42,27 @@ def machine(scenario: Scenario) -> Robot | SnakeDescription:
 
 
 def robot(scenario: Scenario) -> Robot:
-    """The tree of bodies with its motors and payloads.
+    """The tree of bodies with its motors and payloads, in its initial posture.
 
     Raises
     ------
     ModelError
-        The plant is none or cannot be built, or a payload is on a body that it does not have.
+        The plant is none or cannot be built, a payload is on a body that it does not have, or contact points do not
+        reach the surfaces that ``initial`` puts them on.
     """
+    built = _loaded(scenario)
+    return built if scenario.config.initial is None else _posed(scenario, built, contacts(scenario, built))
+
+
+def robot_and_contacts(scenario: Scenario) -> tuple[Robot, list[Contact]]:
+    """:func:`robot` and all enabled contacts, each built once."""
+    built = _loaded(scenario)
+    touching = contacts(scenario, built)
+    return _posed(scenario, built, touching), touching
+
+
+def _loaded(scenario: Scenario) -> Robot:
+    """The tree of bodies as its plant says, with payloads."""
     if scenario.engine == "kinematic":
         raise ModelError(f"plant {scenario.plant.type!r} is kinematic: it has no rigid-body model")
     bare = families.build("plant", scenario.plant, BuildContext(scenario.duration_s), Robot)
@@ -60,11 +74,15 @@ def robot(scenario: Scenario) -> Robot:
     links = list(bare.links)
     for body, parts in inertias.items():
         links[body] = replace(links[body], inertia=Inertia.merged(parts))
-    built = replace(bare, links=tuple(links)) if inertias else bare
+    return replace(bare, links=tuple(links)) if inertias else bare
+
+
+def _posed(scenario: Scenario, built: Robot, touching: Sequence[Contact]) -> Robot:
+    """The robot in the posture that ``initial`` asks for."""
     initial = scenario.config.initial
     if initial is None:
         return built
-    points = {contact.name: contact for contact in contacts(scenario, built)}
+    points = {contact.name: contact for contact in touching}
     try:
         return replace(built, q0=on_surfaces(Model(built), points, initial.on_surface, initial.keep))
     except ModelError as error:
@@ -86,15 +104,28 @@ def build_model(scenario: Scenario) -> Model:
 
 
 @overload
-def controller(scenario: Scenario, machine: Model, progress: Callable[[float], None] | None = None) -> JointControl: ...
+def controller(
+    scenario: Scenario,
+    machine: Model,
+    progress: Callable[[float], None] | None = None,
+    touching: Sequence[Contact] | None = None,
+) -> JointControl: ...
 @overload
 def controller(
     scenario: Scenario, machine: SnakeDescription, progress: Callable[[float], None] | None = None
 ) -> TaskSpaceController: ...
 def controller(
-    scenario: Scenario, machine: Model | SnakeDescription, progress: Callable[[float], None] | None = None
+    scenario: Scenario,
+    machine: Model | SnakeDescription,
+    progress: Callable[[float], None] | None = None,
+    touching: Sequence[Contact] | None = None,
 ) -> JointControl | TaskSpaceController:
-    """The controller for a machine; ``progress`` is called with the time [s] that its references have come to.
+    """The controller for a machine.
+
+    Parameters
+    ----------
+    progress : called with the time [s] that the references have come to
+    touching : the contacts of the scenario, when they are built already
 
     Raises
     ------
@@ -108,7 +139,9 @@ def controller(
         raise ModelError("the scenario has no controller; its motors are short-circuited")
     if scenario.engine != families.member("controller", config.type).ENGINE:
         raise ModelError(f"controller {config.type!r} cannot drive a {scenario.plant.type!r}")
-    points = {c.name: c for c in contacts(scenario)} if isinstance(machine, Model) else {}
+    if touching is None:
+        touching = contacts(scenario, machine.robot) if isinstance(machine, Model) else ()
+    points = {contact.name: contact for contact in touching}
     context = BuildContext(scenario.duration_s, machine, progress=progress, contacts=points)
     if isinstance(machine, Model):
         control = families.build("controller", config, context, JointControl)
@@ -244,14 +277,13 @@ def check_start(
         declared = contact.name in scenario.config.contacts.points
         keys = ("contacts", "points", contact.name) if declared else ("contacts", "candidates")
         try:
-            position = model.point_position(contact.body, contact.point, q)
+            gap = gap_at(model, contact, q)
         except ModelError as error:
             raise ModelError(f"{dotted((*keys, 'body'))}: {error}", keys=(*keys, "body")) from error
-        end = None if contact.tip is None else model.point_position(contact.body, contact.tip, q)
-        gap = contact_gap(contact, position, end)
         if scenario.config.contacts.law == "unilateral" and gap > 0.0:
             continue
         if not abs(gap) <= START_TOLERANCE:
+            position = model.point_position(contact.body, contact.point, q)
             raise ModelError(
                 f"{dotted(keys)}: {'its point' if declared else contact.name} starts {gap:+.4g} m "
                 f"from surface {contact.surface_name!r} "

@@ -435,6 +435,30 @@ def test_every_time_figure_marks_the_events_of_contacts(real: Record, braced: Re
             assert "_event" not in [line.get_label() for line in axes.get_lines()]
 
 
+def test_comparisons_mark_the_events_of_every_run_in_its_colour(real: Record, braced: Record) -> None:
+    other = copy.copy(real)
+    other.events = real.events[:1]
+    records = {"glued": braced, "real": real, "other": other}
+    colours = {name: look["color"] for name, look in style.variant_styles(list(records)).items()}
+    for draw, panels in ((hand.error_comparison, (0, 1)), (energy.energy_comparison, (0, 2))):
+        figure = drawn(draw(records))
+        for axes in (figure.axes[k] for k in panels):
+            marks = [line for line in axes.get_lines() if line.get_label() == "_event"]
+            shown = {name: [l for l in marks if l.get_color() == colour] for name, colour in colours.items()}
+            assert shown["glued"] == []
+            for name in ("real", "other"):
+                assert sum(len(line.get_xdata()) for line in shown[name]) == len(records[name].events)
+            # Rows that do not cover each other, over the panel: no curve lies there.
+            bottom = axes.get_window_extent().y1
+            rows = [{line.get_window_extent().y0 for line in shown[name]} for name in ("real", "other")]
+            assert all(len(row) == 1 for row in rows)
+            (one,), (next_one,) = rows
+            assert bottom < one < next_one
+        explained = " ".join(axes.get_xlabel() for axes in figure.axes)
+        landings = sum(event.kind == "landing" for record in records.values() for event in record.events)
+        assert f"landing ({landings})" in explained or landings < 2
+
+
 def test_many_events_are_marks_without_lines(pendulum: Record) -> None:
     record = copy.copy(pendulum)
     record.events = []

@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 
 import dynsim
 from dynsim.errors import ModelError
-from dynsim.model.bracing import Brace, BraceStatics
+from dynsim.model.bracing import Brace, BracePlanner, BraceStatics, brace_rows
 from dynsim.model.model import Model
 
 seeds = st.integers(0, 2**32 - 1)
@@ -227,6 +227,60 @@ def test_one_brace_by_hand():
     assert np.isfinite(position).all()
 
 
+def test_prepared_braces_are_those_of_the_call(arm):
+    """What is kept from one call to the next is kept for the same objects alone, and these cannot change."""
+    q, rest = arm.robot.initial, np.zeros(arm.n)
+    braces = elbows()
+    first = arm.brace_statics(q, rest, rest, braces)
+    braces["elbow_7"] = replace(braces["elbow_7"], normal_force=20.0)
+    assert arm.brace_statics(q, rest, rest, braces).normal_forces["elbow_7"] == pytest.approx(20.0, abs=1e-12)
+    fewer = arm.brace_statics(q, rest, rest, {"elbow_4": braces["elbow_4"]})
+    assert list(fewer.forces) == ["elbow_4"]
+    again = arm.brace_statics(q, rest, rest, elbows())
+    assert np.array_equal(again.torques, first.torques)
+    assert first.heat < fewer.heat
+    with pytest.raises(ValueError, match="read-only"):
+        braces["elbow_4"].normal[2] = -1.0
+
+
+@settings(max_examples=20)
+@given(seeds)
+def test_a_motion_in_one_call_is_its_instants(arm, seed):
+    """The compiled loop of planned voltages gives the torques of single states, and ends where there are none."""
+    rng = np.random.default_rng(seed)
+    model, _, _, _, braces = random_case(rng, arm, limited=True)
+    q, v, vdot = rng.uniform(-2, 2, size=(6, model.n)), rng.normal(size=(6, model.n)), rng.normal(size=(6, model.n))
+    attached = [model.robot.attach(brace.body, brace.point) for brace in braces.values()]
+    planner = BracePlanner(model.robot, model.arrays, [link for link, _ in attached])
+    points = np.array([point for _, point in attached])
+    positions, velocities = planner.motion(points, q, v)
+    for k, brace in enumerate(braces.values()):
+        for t in range(6):
+            place, jacobian = model.point_position_and_jacobian(brace.body, brace.point, q[t])
+            assert positions[t, k] == pytest.approx(place, abs=1e-12)
+            assert velocities[t, k] == pytest.approx(jacobian @ v[t], abs=1e-12)
+    tables = np.stack(
+        [
+            brace_rows(
+                points[k],
+                np.tile(brace.normal, (6, 1)),
+                np.full(6, brace.friction),
+                brace.min_N,
+                math.nan if brace.normal_force is None else brace.normal_force,
+                np.tile(np.zeros(3) if brace.sliding is None else brace.sliding, (6, 1)),
+            )
+            for k, brace in enumerate(braces.values())
+        ],
+        axis=1,
+    )
+    torques, solved = planner.torques(q, v, vdot, tables)
+    single = [model.brace_statics(q[t], v[t], vdot[t], braces) for t in range(6)]
+    feasible = [found.feasible for found in single]
+    assert solved == (feasible.index(False) if False in feasible else 6)
+    for t in range(solved):
+        assert torques[t] == pytest.approx(single[t].torques, rel=1e-12, abs=1e-12)
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
@@ -236,9 +290,13 @@ def test_one_brace_by_hand():
         ({"min_N": math.nan}, "min_N"),
         ({"sliding": UP}, "no direction along"),
         ({"body": "link_99"}, "no body"),
+        ({"point": np.zeros(2)}, "point must be three finite numbers"),
     ],
 )
 def test_refused(arm, changes, said):
-    braces = {"elbow": replace(elbows()["elbow_4"], **changes)}
+    def ask():
+        braces = {"elbow": replace(elbows()["elbow_4"], **changes)}
+        return arm.brace_statics(arm.robot.initial, np.zeros(10), np.zeros(10), braces)
+
     with pytest.raises(ModelError, match=said):
-        arm.brace_statics(arm.robot.initial, np.zeros(10), np.zeros(10), braces)
+        ask()

@@ -319,7 +319,10 @@ def test_joint_stops_of_a_scenario(tmp_path):
 @pytest.mark.parametrize(
     ("lines", "words"),
     [
-        (("limit_deg: [0, 90]", "initial_deg: -20"), "joint_1: starts at -0.349"),
+        (
+            ("limit_deg: [0, 90]", "initial_deg: -20"),
+            r"joint_1: starts at -20° \(-0\.3491 rad\), beyond its stop",
+        ),
         (("limit_deg: [90, 0]",), "the lower limit 90 is not below"),
         (("limit_m: [0, 1]",), "has limit_deg instead"),
     ],

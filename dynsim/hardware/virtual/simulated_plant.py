@@ -26,7 +26,6 @@ from dynsim.hardware.virtual.servo_plant import Drive, MotorLaw
 
 if TYPE_CHECKING:
     from dynsim import Scenario
-    from dynsim.model.description import Contact
     from dynsim.model.model import Model
 
 Array = NDArray[np.float64]
@@ -146,18 +145,14 @@ def possible(scenario: Scenario, model: Model, posture: Array) -> Array:
     gaps are rounding; what is moved is logged. A posture that would have to change by more than START_CHANGE is
     returned as it is: the simulation refuses it by name.
     """
-    from dynsim.model.shapes import contact_gap
+    from dynsim.model.shapes import gap_at
     from dynsim.scenario import build
 
     contacts = build.contacts(scenario, model.robot)
     links = model.robot.links
 
-    def gap(contact: Contact, q: Array) -> float:
-        ends = [model.point_position(contact.body, end, q) for end in (contact.point, contact.tip) if end is not None]
-        return contact_gap(contact, *ends)
-
     def gaps(q: Array) -> Array:
-        return np.array([gap(contact, q) for contact in contacts])
+        return np.array([gap_at(model, contact, q) for contact in contacts])
 
     q = np.clip(posture, [link.lower for link in links], [link.upper for link in links])
     below = np.zeros(len(contacts), dtype=bool)

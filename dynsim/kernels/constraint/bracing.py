@@ -4,7 +4,9 @@
 
 with f = (f_n, f_1, f_2) of each brace and the rows of B the velocities of its point along n and two tangents;
 subject to lower ≤ tau ≤ upper (zero where there is no motor), |f_t| ≤ μ f_n and f_n ≥ min_N. A brace that slides has
-f_t = −μ f_n d instead, one whose normal force is commanded has f_n = that.
+f_t = −μ f_n d instead, one whose normal force is commanded has f_n = that. The unknowns are what is left then: three
+forces of a brace that is held, f_n alone of one that slides or has no friction, and no normal force where that is
+commanded.
 """
 
 from __future__ import annotations
@@ -14,11 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.arrays import ARMATURE, BIAS, DAMPING, GEAR_DAMPING, MOST_ROWS, QD, QDD, ModelArrays, Workspace
+from dynsim.kernels.arrays import ARMATURE, BIAS, DAMPING, GEAR_DAMPING, MOST_ROWS, QD, QDD, ModelArrays, Q, Workspace
 from dynsim.kernels.constraint.cone_program import ConeProgram, cone_program, solve_cone_program
-from dynsim.kernels.jit import internal_kernel, kernel, reals
+from dynsim.kernels.jit import integers, internal_kernel, kernel, reals
+from dynsim.kernels.tree.joints import read_positions
 from dynsim.kernels.tree.points import point_jacobian, point_position
-from dynsim.kernels.tree.sweep import newton_euler
+from dynsim.kernels.tree.sweep import kinematics, newton_euler
 
 # BraceArrays.table
 POINT = 0  # 3: in the body's frame [m]
@@ -28,11 +31,12 @@ FRICTION = 14
 LEAST = 15  # min_N
 COMMANDED = 16  # [N], NaN for none
 BRACE_SIZE = 17
-# BraceArrays.motors
+# BraceArrays.motors: a torque source has K_m = 1 and no resistance, a joint without a motor K_m = 1 and no current
 HEAT = 0  # w = R / K_m² [W/(N m)²]
-LOWER = 1  # torque limits [N m], infinite for none; both zero without a motor
+LOWER = 1  # torque limits at the rate of the moment [N m], infinite for none; both zero without a motor
 UPPER = 2
-MOTOR_LIMITS = 3
+CONSTANT, RESISTANCE, VOLTAGE_LIMIT, CURRENT_LIMIT = 3, 4, 5, 6  # K_m [N m/A], R [Ω], U [V], I [A]
+MOTOR_SIZE = 7
 # BraceArrays.found: normal and tangential forces, then the ends of the interval of the normal force
 FORCES, LOW, HIGH = 0, 3, 4
 FOUND_SIZE = 5
@@ -40,6 +44,8 @@ FOUND_SIZE = 5
 # How far forces violate the constraints, and how far apart the ends of an interval may be [1]: beyond it there is no
 # solution, and below it nothing but one.
 SLACK = 1e-9
+# Torques that are this part of the force scale within their limits need no program that looks for more room.
+AMPLE = 1e-6
 # Intervals are open where forces this many times their scale are still possible.
 FAR = 1e4
 # Weight of the forces beside the heat: keeps those finite that no motor feels.
@@ -51,101 +57,228 @@ class BraceArrays(NamedTuple):
 
     link: np.ndarray  # (c,) int
     table: np.ndarray  # (c, BRACE_SIZE)
-    motors: np.ndarray  # (n, MOTOR_LIMITS)
-    free: np.ndarray  # (n,) torques without braces [N m]
+    motors: np.ndarray  # (n, MOTOR_SIZE)
+    first: np.ndarray  # (c + 1,) int: the first unknown of each brace, and their number
+    free: np.ndarray  # (n,) torques without the unknown forces [N m]
     torques: np.ndarray  # (n,) [N m]
     found: np.ndarray  # (c, FOUND_SIZE) [N]
+    forces: np.ndarray  # (c, 3) on the arm in W [N]
     certificate: np.ndarray  # (n,) see brace_statics
-    B: np.ndarray  # (3 c, n)
-    start: np.ndarray  # (3 c,) scratch
+    B: np.ndarray  # (3 c, n) a row for each unknown
+    inside: np.ndarray  # (3 c,) scratch
     position: np.ndarray  # (3,) scratch
     jacobian: np.ndarray  # (3, n) scratch
     program: ConeProgram
 
 
-def brace_arrays(link: np.ndarray, table: np.ndarray, motors: np.ndarray) -> BraceArrays:
-    """Allocate a :class:`BraceArrays` for these braces and motors."""
+def brace_arrays(link: np.ndarray, motors: np.ndarray) -> BraceArrays:
+    """Allocate a :class:`BraceArrays` for braces on these links and for these motors."""
     c, n = len(link), len(motors)
-    forces, cones, limits = MOST_ROWS * c, 2 * c + 2 * n + 1, 2 * n
+    forces = MOST_ROWS * c
     return BraceArrays(
         link=link,
-        table=table,
+        table=reals(np.zeros((c, BRACE_SIZE))),
         motors=motors,
+        first=integers(np.zeros(c + 1)),
         free=reals(np.zeros(n)),
         torques=reals(np.zeros(n)),
         found=reals(np.zeros((c, FOUND_SIZE))),
+        forces=reals(np.zeros((c, 3))),
         certificate=reals(np.zeros(n)),
         B=reals(np.zeros((forces, n))),
-        start=reals(np.zeros(forces)),
+        inside=reals(np.zeros(forces)),
         position=reals(np.zeros(3)),
         jacobian=reals(np.zeros((3, n))),
-        program=cone_program(forces + 1, n + forces, cones, 4 * c + limits + 1),
+        program=cone_program(forces + 1, n, 2 * c + 2 * n + 1, 4 * c + 2 * n + 1),
     )
 
 
 @kernel
-def brace_statics(model: ModelArrays, ws: Workspace, braces: BraceArrays):
-    """Least-heat forces at the q, v and vdot in ``ws.joints``; torques and forces into ``braces``.
+def brace_motion(model: ModelArrays, ws: Workspace, braces: BraceArrays, q, v, positions, velocities):
+    """Positions and velocities of the points of braces along a motion.
 
-    Returns 1.0, or 0.0 where nothing fulfils all constraints. Then ``certificate`` is a vector ω (n,) of joint rates
-    that shows it: for all torques within their limits and all forces of the braces, ω·(tau + Bᵀ f) < ω·free, which
-    would have to be equal.
+    Parameters
+    ----------
+    q, v : (T, nq), (T, n)
+    positions, velocities : (T, c, 3) [m, m/s], overwritten; points are those of ``braces.table``
     """
-    program, found, table, n = braces.program, braces.found, braces.table, braces.free.shape[0]
-    c = braces.link.shape[0]
-    scale, unknowns, x = brace_rows(model, ws, braces), MOST_ROWS * c, program.x
+    jacobian, n = braces.jacobian, braces.free.shape[0]
+    for t in range(q.shape[0]):
+        set_motion(model, ws, q[t], v[t], v[t])
+        kinematics(model, ws)
+        for k in range(braces.link.shape[0]):
+            point_position(ws, braces.link[k], braces.table[k], positions[t, k])
+            point_jacobian(model, ws, braces.link[k], positions[t, k], jacobian)
+            for e in range(3):
+                rate = 0.0
+                for j in range(n):
+                    rate += jacobian[e, j] * v[t, j]
+                velocities[t, k, e] = rate
+
+
+@kernel
+def brace_statics(model: ModelArrays, ws: Workspace, braces: BraceArrays, q, v, vdot, tables, torques, intervals):
+    """Least-heat forces along a motion; the last instant's forces, and intervals if they are wanted, into ``braces``.
+
+    Returns the number of instants with a solution: it ends where nothing fulfils all constraints. Then ``certificate``
+    is a vector ω (n,) of joint rates that shows it: for all torques within their limits and all forces of the braces,
+    ω·(tau + Bᵀ f) < ω·free, which would have to be equal.
+
+    Parameters
+    ----------
+    q, v, vdot : (T, nq), (T, n), (T, n)
+    tables : (T, c, BRACE_SIZE), the braces at each instant
+    torques : (T, n) of the motors [N m], overwritten
+    """
+    for t in range(q.shape[0]):
+        for k in range(braces.link.shape[0]):
+            for e in range(BRACE_SIZE):
+                braces.table[k, e] = tables[t, k, e]
+        set_motion(model, ws, q[t], v[t], vdot[t])
+        torque_limits(braces, ws)
+        if not least_heat_forces(model, ws, braces, intervals):
+            return t
+        for j in range(torques.shape[1]):
+            torques[t, j] = braces.torques[j]
+    return q.shape[0]
+
+
+@internal_kernel
+def set_motion(model: ModelArrays, ws: Workspace, q, v, vdot):
+    """Coordinates, rates and accelerations into the workspace."""
+    if model.compound is None:  # known to the compiler
+        for j in range(v.shape[0]):
+            ws.joints[j, Q] = q[j]
+    else:
+        read_positions(model.compound, model, q, 0, ws)
+    for j in range(v.shape[0]):
+        ws.joints[j, QD], ws.joints[j, QDD] = v[j], vdot[j]
+
+
+@internal_kernel
+def torque_limits(braces: BraceArrays, ws: Workspace):
+    """Least and largest torque of each motor at a steady current: |R i + K_m v| ≤ U, |i| ≤ I.
+
+    A motor that is driven faster than its voltage allows brakes with all it has.
+    """
+    motors = braces.motors
+    for j in range(motors.shape[0]):
+        constant, resistance, current = motors[j, CONSTANT], motors[j, RESISTANCE], motors[j, CURRENT_LIMIT]
+        low, high = -current, current
+        if resistance > 0.0:
+            induced = constant * ws.joints[j, QD]
+            low = min(max(low, (-motors[j, VOLTAGE_LIMIT] - induced) / resistance), current)
+            high = max(min(high, (motors[j, VOLTAGE_LIMIT] - induced) / resistance), -current)
+        motors[j, LOWER], motors[j, UPPER] = constant * low, constant * high
+
+
+@internal_kernel
+def least_heat_forces(model: ModelArrays, ws: Workspace, braces: BraceArrays, intervals):
+    """Torques, forces and intervals of one instant into ``braces``; False, and a certificate, where there are none."""
+    found, table, motors = braces.found, braces.table, braces.motors
+    c, n, first, x = braces.link.shape[0], braces.free.shape[0], braces.first, braces.program.x
+    scale = brace_rows(model, ws, braces)
+    unknowns = first[c]
     passive, limited = 0, False
     for j in range(n):
-        passive += braces.motors[j, LOWER] == braces.motors[j, UPPER]
-        limited |= not (math.isinf(braces.motors[j, LOWER]) and math.isinf(braces.motors[j, UPPER]))
-    # Equations that contradict each other have no margin: first with torques of passive joints that may be off.
-    if passive > 0:
-        equations, cones = constraints(braces, scale, True)
-        if largest_margin(braces, equations, cones, scale) < -SLACK:
-            contradiction(braces, equations, cones, True)
-            return 0.0
-    equations, cones = constraints(braces, scale, False)
-    inside = 1.0
-    if limited:
+        passive += motors[j, LOWER] == motors[j, UPPER]
+        limited |= not (math.isinf(motors[j, LOWER]) and math.isinf(motors[j, UPPER]))
+    best = False
+    if passive == 0:
+        # The optimum without limits is that within them where it keeps them: mostly.
+        equations, cones = constraints(braces, scale, False, False)
+        middle_forces(braces, scale)
+        least_heat(braces, unknowns, equations, cones, scale)
+        keep(braces, scale)
+        best = not limited or ample(braces, scale)
+    if limited and (intervals or not best):
+        # Equations that contradict each other have no margin: first with torques of passive joints that may be off.
+        if passive > 0:
+            equations, cones = constraints(braces, scale, True, True)
+            if largest_margin(braces, equations, cones, scale) < -SLACK:
+                contradiction(braces, equations, cones, True)
+                return False
+        equations, cones = constraints(braces, scale, True, False)
         inside = largest_margin(braces, equations, cones, scale)
         if inside < -SLACK:
             contradiction(braces, equations, cones, False)
-            return 0.0
-    else:
-        middle_forces(braces, scale)
-    for j in range(c):
-        found[j, LOW], found[j, HIGH] = table[j, LEAST], math.inf
-        if table[j, COMMANDED] == table[j, COMMANDED]:
-            found[j, LOW], found[j, HIGH] = table[j, COMMANDED], table[j, COMMANDED]
-        elif limited:
-            for end in range(2):
-                found[j, LOW + end] = extreme_force(braces, unknowns, equations, cones, inside, j, end, scale)
-    if inside > SLACK:
-        least_heat(braces, unknowns, equations, cones, scale)
-    for j in range(n):
-        braces.torques[j] = braces.free[j]
+            return False
         for k in range(unknowns):
-            braces.torques[j] -= braces.B[k, j] * scale * x[k]
-    for j in range(c):
+            braces.inside[k] = x[k]
+        if not best:
+            if inside > SLACK:
+                least_heat(braces, unknowns, equations, cones, scale)
+            keep(braces, scale)
+        for k in range(c):
+            for end in range(2):
+                if table[k, COMMANDED] == table[k, COMMANDED]:
+                    found[k, LOW + end] = table[k, COMMANDED]
+                elif inside <= SLACK:
+                    found[k, LOW + end] = found[k, FORCES]
+                elif intervals:
+                    found[k, LOW + end] = extreme_force(braces, unknowns, equations, cones, k, end, scale)
+        return True
+    for k in range(c):
+        commanded = table[k, COMMANDED] == table[k, COMMANDED]
+        found[k, LOW] = table[k, COMMANDED] if commanded else table[k, LEAST]
+        found[k, HIGH] = table[k, COMMANDED] if commanded else math.inf
+    return True
+
+
+@internal_kernel
+def keep(braces: BraceArrays, scale):
+    """Torques and forces of the unknowns x into ``braces``."""
+    for j in range(braces.free.shape[0]):
+        torque = braces.free[j]
+        for k in range(braces.first[braces.link.shape[0]]):
+            torque -= braces.B[k, j] * scale * braces.program.x[k]
+        braces.torques[j] = torque
+    for k in range(braces.link.shape[0]):
+        brace_forces(braces, k, scale)
+
+
+@internal_kernel
+def brace_forces(braces: BraceArrays, k, scale):
+    """The force of brace k from the unknowns, along its axes and in the world."""
+    table, found, x, at = braces.table, braces.found, braces.program.x, braces.first[k]
+    normal = table[k, COMMANDED]
+    if normal != normal:
+        normal, at = scale * x[at], at + 1
+    found[k, FORCES] = normal
+    for e in range(2):
+        directed = at == braces.first[k + 1]
+        found[k, FORCES + 1 + e] = -table[k, FRICTION] * normal * table[k, SLIP + e] if directed else scale * x[at + e]
+    for i in range(3):
+        braces.forces[k, i] = 0.0
         for e in range(MOST_ROWS):
-            found[j, FORCES + e] = scale * x[MOST_ROWS * j + e]
-    return 1.0
+            braces.forces[k, i] += found[k, FORCES + e] * table[k, AXES + 3 * e + i]
+
+
+@internal_kernel
+def ample(braces: BraceArrays, scale):
+    """Whether all torques keep their limits and there is room for more."""
+    for j in range(braces.free.shape[0]):
+        torque, room = braces.torques[j], AMPLE * scale
+        if torque - braces.motors[j, LOWER] < room or braces.motors[j, UPPER] - torque < room:
+            return False
+    return True
 
 
 @internal_kernel
 def middle_forces(braces: BraceArrays, scale):
     """Forces to start from, along the normals: inside the cones of all braces."""
-    table, x = braces.table, braces.program.x
-    for j in range(braces.link.shape[0]):
-        commanded = table[j, COMMANDED]
-        x[MOST_ROWS * j] = (1.0 + 2.0 * table[j, LEAST] / scale) if math.isnan(commanded) else commanded / scale
-        x[MOST_ROWS * j + 1], x[MOST_ROWS * j + 2] = 0.0, 0.0
+    table, x, first = braces.table, braces.program.x, braces.first
+    for k in range(braces.link.shape[0]):
+        for i in range(first[k], first[k + 1]):
+            x[i] = 0.0
+        if table[k, COMMANDED] != table[k, COMMANDED]:
+            x[first[k]] = 1.0 + 2.0 * table[k, LEAST] / scale
 
 
 @internal_kernel
 def largest_margin(braces: BraceArrays, equations, cones, scale):
     """A point x inside all constraints; returns the worst margin there, the largest possible, at most 1."""
-    program, unknowns = braces.program, MOST_ROWS * braces.link.shape[0]
+    program, unknowns = braces.program, braces.first[braces.link.shape[0]]
     x, rows = program.x, program.first[cones]
     clear_objective(program, unknowns + 1)
     program.g[unknowns], program.H[unknowns, unknowns] = -1.0, 0.0
@@ -160,61 +293,78 @@ def largest_margin(braces: BraceArrays, equations, cones, scale):
 
 @internal_kernel
 def brace_rows(model: ModelArrays, ws: Workspace, braces: BraceArrays):
-    """Torques without braces, and B; returns a scale of the forces [N]."""
+    """Torques without the unknown forces, and the rows B of those; returns a scale of the forces [N]."""
     newton_euler(model, ws, 1.0, 1.0, 1.0)
-    table, B, jacobian, n = braces.table, braces.B, braces.jacobian, braces.free.shape[0]
+    table, B, jacobian, first, n = braces.table, braces.B, braces.jacobian, braces.first, braces.free.shape[0]
     torque, lever, scale = 0.0, 0.0, 1e-3
     for j in range(n):
         losses = model.body[j, DAMPING] + model.body[j, GEAR_DAMPING]
         braces.free[j] = ws.joints[j, BIAS] + model.body[j, ARMATURE] * ws.joints[j, QDD] + losses * ws.joints[j, QD]
         torque = max(torque, abs(braces.free[j]))
+    first[0] = 0
     for k in range(braces.link.shape[0]):
         point_position(ws, braces.link[k], table[k], braces.position)
         point_jacobian(model, ws, braces.link[k], braces.position, jacobian)
         scale = max(scale, table[k, LEAST])
-        for e in range(MOST_ROWS):
-            x, y, z = table[k, AXES + 3 * e], table[k, AXES + 3 * e + 1], table[k, AXES + 3 * e + 2]
-            for j in range(n):
-                rate = x * jacobian[0, j] + y * jacobian[1, j] + z * jacobian[2, j]
-                B[MOST_ROWS * k + e, j] = rate
-                lever = max(lever, abs(rate))
+        commanded, mu, at = table[k, COMMANDED] == table[k, COMMANDED], table[k, FRICTION], first[k]
+        directed = mu == 0.0 or table[k, SLIP] != 0.0 or table[k, SLIP + 1] != 0.0
+        tangents = at + (0 if commanded else 1)
+        first[k + 1] = tangents + (0 if directed else 2)
+        for j in range(n):
+            rate = along(table, jacobian, k, j, 0)
+            one, other = along(table, jacobian, k, j, 1), along(table, jacobian, k, j, 2)
+            lever = max(lever, abs(rate), abs(one), abs(other))
+            if directed:
+                rate -= mu * (table[k, SLIP] * one + table[k, SLIP + 1] * other)
+            else:
+                B[tangents, j], B[tangents + 1, j] = one, other
+            if commanded:
+                braces.free[j] -= table[k, COMMANDED] * rate
+            else:
+                B[at, j] = rate
     return max(scale, torque / lever) if lever > 0.0 else scale
 
 
 @internal_kernel
-def constraints(braces: BraceArrays, scale, relaxed):
-    """Equations and cones in the forces over ``scale``; their numbers. ``relaxed``: passive joints are in cones."""
+def along(table, jacobian, k, j, e):
+    """Velocity of the point of brace k along its axis e for each unit of rate j."""
+    at = AXES + 3 * e
+    return table[k, at] * jacobian[0, j] + table[k, at + 1] * jacobian[1, j] + table[k, at + 2] * jacobian[2, j]
+
+
+@internal_kernel
+def constraints(braces: BraceArrays, scale, limits, relaxed):
+    """Equations and cones in the forces over ``scale``; their numbers.
+
+    ``limits`` : those of the torques are among them; ``relaxed`` : passive joints are in cones, not in equations
+    """
     program, table, B, motors = braces.program, braces.table, braces.B, braces.motors
     A, b, G, h, first = program.A, program.b, program.G, program.h, program.first
     c, n = braces.link.shape[0], braces.free.shape[0]
-    unknowns, equations, cones, rows = MOST_ROWS * c, 0, 0, 0
+    unknowns, equations, cones, rows = braces.first[c], 0, 0, 0
     for e in range(A.shape[0]):
+        A[e, unknowns] = 0.0
+    for i in range(4 * c):
         for k in range(unknowns + 1):
-            A[e, k] = 0.0
-    for i in range(G.shape[0]):
-        for k in range(unknowns):
             G[i, k] = 0.0
         h[i] = 0.0
     for j in range(c):
-        k, mu = MOST_ROWS * j, table[j, FRICTION]
-        if table[j, COMMANDED] == table[j, COMMANDED]:
-            A[equations, k], b[equations] = 1.0, table[j, COMMANDED] / scale
-            equations += 1
-        else:
+        k, mu, commanded = braces.first[j], table[j, FRICTION], table[j, COMMANDED] == table[j, COMMANDED]
+        tangents = k + (0 if commanded else 1)
+        if not commanded:
             G[rows, k], h[rows], first[cones] = 1.0, -table[j, LEAST] / scale, rows
             G[rows, unknowns] = -1.0
             rows, cones = rows + 1, cones + 1
-        if mu == 0.0 or table[j, SLIP] != 0.0 or table[j, SLIP + 1] != 0.0:
-            for e in range(2):
-                A[equations, k + 1 + e], A[equations, k], b[equations] = 1.0, mu * table[j, SLIP + e], 0.0
-                equations += 1
-        else:
+        if tangents < braces.first[j + 1]:
             first[cones] = rows
-            G[rows, k], G[rows + 1, k + 1], G[rows + 2, k + 2] = mu, 1.0, 1.0
-            G[rows, unknowns], G[rows + 1, unknowns], G[rows + 2, unknowns] = -1.0, 0.0, 0.0
+            if commanded:
+                h[rows] = mu * table[j, COMMANDED] / scale
+            else:
+                G[rows, k] = mu
+            G[rows + 1, tangents], G[rows + 2, tangents + 1], G[rows, unknowns] = 1.0, 1.0, -1.0
             rows, cones = rows + 3, cones + 1
     # Torques in units of the force scale.
-    for j in range(n):
+    for j in range(n if limits else 0):
         low, high = motors[j, LOWER], motors[j, UPPER]
         if low == high and not relaxed:
             for k in range(unknowns):
@@ -284,25 +434,36 @@ def contradiction(braces: BraceArrays, equations, cones, relaxed):
 
 
 @internal_kernel
-def extreme_force(braces: BraceArrays, unknowns, equations, cones, inside, j, end, scale):
-    """The least (end 0) or largest (end 1) normal force of brace j within all constraints [N], from the point x."""
-    program, k = braces.program, MOST_ROWS * j
-    x = program.x
-    if inside <= SLACK:
-        return scale * x[k]
+def extreme_force(braces: BraceArrays, unknowns, equations, cones, j, end, scale):
+    """The least (end 0) or largest (end 1) normal force of brace j within all constraints [N], from a point inside."""
+    program, k, x = braces.program, braces.first[j], braces.program.x
+    if end == 0 and equations == 0 and holds_with_least(braces, j):
+        return braces.table[j, LEAST]
     rows, first = program.first[cones], program.first
     clear_objective(program, unknowns)
     sign = 1.0 if end == 0 else -1.0
     program.g[k] = sign
     for m in range(unknowns):
         program.G[rows, m] = 0.0
-        braces.start[m] = x[m]
+        x[m] = braces.inside[m]
     program.G[rows, k], program.h[rows], first[cones + 1] = sign, FAR, rows + 1
     solve_cone_program(program, unknowns, equations, cones + 1)
-    force = x[k]
-    for m in range(unknowns):
-        x[m] = braces.start[m]
-    return math.inf if end == 1 and force > 0.999 * FAR else scale * force
+    return math.inf if end == 1 and x[k] > 0.999 * FAR else scale * x[k]
+
+
+@internal_kernel
+def holds_with_least(braces: BraceArrays, j):
+    """Whether the forces found stay possible when that of brace j is shortened to the least that it may be."""
+    found, k, least = braces.found, braces.first[j], braces.table[j, LEAST]
+    shorter = found[j, FORCES] - least
+    share = shorter / found[j, FORCES] if shorter > 0.0 else 0.0
+    for i in range(braces.free.shape[0]):
+        torque = braces.torques[i] + shorter * braces.B[k, i]
+        for e in range(k + 1, braces.first[j + 1]):
+            torque += share * found[j, FORCES + e - k] * braces.B[e, i]
+        if not braces.motors[i, LOWER] <= torque <= braces.motors[i, UPPER]:
+            return False
+    return True
 
 
 @internal_kernel

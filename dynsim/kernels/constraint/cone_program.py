@@ -204,24 +204,38 @@ def start(program: ConeProgram, n, m, cones):
             z[i] = s[i] / square * (1.0 if i == first[c] else -1.0)
 
 
+@inlined_kernel
+def slope(program: ConeProgram, n, m, k):
+    """(H x + g + Aᵀ y)_k."""
+    total = program.g[k]
+    for j in range(n):
+        total += program.H[k, j] * program.x[j]
+    for e in range(m):
+        total += program.A[e, k] * program.y[e]
+    return total
+
+
+@inlined_kernel
+def equation(program: ConeProgram, n, e):
+    """(A x − b)_e."""
+    total = -program.b[e]
+    for k in range(n):
+        total += program.A[e, k] * program.x[k]
+    return total
+
+
 @internal_kernel
 def conditions(program: ConeProgram, n, m, cones):
     """What is left of the conditions of optimality, the largest; that of the slacks into ``work``."""
-    x, y, s, z, rows = program.x, program.y, program.s, program.z, program.first[cones]
+    x, s, z, rows = program.x, program.s, program.z, program.first[cones]
     worst, gap = 0.0, 0.0
     for k in range(n):
-        left = program.g[k]
-        for j in range(n):
-            left += program.H[k, j] * x[j]
-        for e in range(m):
-            left += program.A[e, k] * y[e]
+        left = slope(program, n, m, k)
         for i in range(rows):
             left -= program.G[i, k] * z[i]
         worst = max(worst, abs(left))
     for e in range(m):
-        left = -program.b[e]
-        for k in range(n):
-            left += program.A[e, k] * x[k]
+        left = equation(program, n, e)
         worst = max(worst, abs(left))
     for i in range(rows):
         left = program.h[i] - s[i]
@@ -327,7 +341,7 @@ def factor_kkt(program: ConeProgram, n, m, rows, cones):
 def newton_step(program: ConeProgram, n, m, cones):
     """Step of all unknowns for λ ∘ (W dz + W⁻¹ ds) = TARGET, which is overwritten."""
     work, kkt, step, first = program.work, program.kkt, program.step, program.first
-    x, y, z, rows = program.x, program.y, program.z, first[cones]
+    z, rows = program.z, first[cones]
     target, ds, dz = work[TARGET], work[DS], work[DZ]
     scaled_ds, scaled_dz = work[SCALED_DS], work[SCALED_DZ]
     for i in range(rows):
@@ -336,18 +350,12 @@ def newton_step(program: ConeProgram, n, m, cones):
         divide(work, LAMBDA, TARGET, first[c], first[c + 1])
         unscale(program, c, scaled_ds)
     for k in range(n):
-        left = program.g[k]
-        for j in range(n):
-            left += program.H[k, j] * x[j]
-        for e in range(m):
-            left += program.A[e, k] * y[e]
+        left = slope(program, n, m, k)
         for i in range(rows):
             left -= program.G[i, k] * z[i] + program.scaled[i, k] * (target[i] - scaled_ds[i])
         step[k] = -left
     for e in range(m):
-        left = -program.b[e]
-        for k in range(n):
-            left += program.A[e, k] * x[k]
+        left = equation(program, n, e)
         step[n + e] = -left
         for k in range(n):
             step[k] -= program.A[e, k] * left

@@ -71,7 +71,7 @@ from dynsim.kernels.constraint.unilateral import (
     STOP_ROW,
     UnilateralArrays,
 )
-from dynsim.kernels.jit import apart_kernel, internal_kernel
+from dynsim.kernels.jit import apart_kernel, inlined_kernel, internal_kernel
 
 
 @internal_kernel
@@ -185,6 +185,13 @@ def tangents(ws: Workspace, k):
     state[k, SECOND_TANGENT + 2] = x * ty - y * tx
 
 
+@inlined_kernel
+def point_row(rows, r, x, y, z, dx, dy, dz):
+    """Motion of a body's point at (x, y, z) along (dx, dy, dz), as row r."""
+    rows[r, ROW], rows[r, ROW + 1], rows[r, ROW + 2] = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
+    rows[r, ROW + 3], rows[r, ROW + 4], rows[r, ROW + 5] = dx, dy, dz
+
+
 @apart_kernel
 def sticking_rows(model: ModelArrays, ws: Workspace, k, i):
     """Rows of candidate k, on link i, that sticks; the first one is there already.
@@ -207,8 +214,7 @@ def sticking_rows(model: ModelArrays, ws: Workspace, k, i):
         r = first + m
         d = NORMAL if m == 0 else FIRST_TANGENT if m == 1 else SECOND_TANGENT
         dx, dy, dz = state[k, d], state[k, d + 1], state[k, d + 2]
-        rows[r, ROW], rows[r, ROW + 1], rows[r, ROW + 2] = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
-        rows[r, ROW + 3], rows[r, ROW + 4], rows[r, ROW + 5] = dx, dy, dz
+        point_row(rows, r, x, y, z, dx, dy, dz)
         for s in range(6):
             rows[r, DIRECTION + s] = rows[r, ROW + s]
         if m > 0:

@@ -41,7 +41,7 @@ from dynsim.kernels.arrays import (
     Workspace,
 )
 from dynsim.kernels.constraint.distance import AS_POINT, MOVES, RADIUS, SURFACE, D, ShapeArrays, distance, nearest
-from dynsim.kernels.constraint.rows import sticking_rows, tangents
+from dynsim.kernels.constraint.rows import point_row, sticking_rows, tangents
 from dynsim.kernels.constraint.surface import signed_friction, unit_force
 from dynsim.kernels.constraint.unilateral import UnilateralArrays, slide_direction
 from dynsim.kernels.jit import internal_kernel
@@ -136,8 +136,7 @@ def shaped_row(
     state[k, NORMAL], state[k, NORMAL + 1], state[k, NORMAL + 2] = nx, ny, nz
     state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2] = tx, ty, tz
     state[k, TANGENT], state[k, TANGENT + 1], state[k, TANGENT + 2] = gx, gy, gz
-    rows[m, ROW], rows[m, ROW + 1], rows[m, ROW + 2] = cy * nz - cz * ny, cz * nx - cx * nz, cx * ny - cy * nx
-    rows[m, ROW + 3], rows[m, ROW + 4], rows[m, ROW + 5] = nx, ny, nz
+    point_row(rows, m, cx, cy, cz, nx, ny, nz)
     unit_force(rows, m, signed_friction(ws, m), cx, cy, cz, nx, ny, nz, gx, gy, gz)
     if ws.active[k, MODE] != STICKING:
         return

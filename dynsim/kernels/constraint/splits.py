@@ -18,10 +18,8 @@ from dynsim.kernels.constraint.unilateral import (
     SPLIT,
     SPLIT_MATRIX,
     STATIC,
-    STOP_CLOSED,
-    STOP_FORCE,
-    STOP_ROW,
     UnilateralArrays,
+    note_stop_forces,
 )
 from dynsim.kernels.jit import apart_kernel, inlined_kernel, internal_kernel
 
@@ -53,10 +51,7 @@ def admissible_forces(unilateral: UnilateralArrays | None, ws: Workspace):
 @apart_kernel
 def look_at_forces(unilateral: UnilateralArrays, ws: Workspace):
     """:func:`admissible_forces` where there are dependent rows or stops."""
-    table, stop = unilateral.stop_table, unilateral.stop
-    for k in range(table.shape[0]):
-        if table[k, STOP_CLOSED] == 1:
-            stop[k, STOP_FORCE] = ws.rows[table[k, STOP_ROW], FORCE]
+    note_stop_forces(unilateral, ws)
     unilateral.number[SPLIT] = 0.0
     if unilateral.number[REDUNDANT] == 1.0:
         for k in range(ws.contacts.shape[0]):

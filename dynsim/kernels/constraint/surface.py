@@ -22,7 +22,6 @@ from dynsim.kernels.arrays import (
     POINT,
     POSITION,
     QUADRIC,
-    ROW,
     ROW_MU,
     ROWS,
     SIGN,
@@ -39,7 +38,7 @@ from dynsim.kernels.arrays import (
     V,
     Workspace,
 )
-from dynsim.kernels.constraint.rows import sticking_rows
+from dynsim.kernels.constraint.rows import point_row, sticking_rows
 from dynsim.kernels.constraint.unilateral import UnilateralArrays, slide_direction
 from dynsim.kernels.jit import exact_kernel, inlined_kernel, kernel
 
@@ -133,8 +132,7 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: Unilat
         state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2] = tx, ty, tz
         # From here on nothing is read back: stores to one table keep the compiler from trusting the other.
         state[k, TANGENT], state[k, TANGENT + 1], state[k, TANGENT + 2] = sx, sy, sz
-        rows[m, ROW], rows[m, ROW + 1], rows[m, ROW + 2] = ry * nz - rz * ny, rz * nx - rx * nz, rx * ny - ry * nx
-        rows[m, ROW + 3], rows[m, ROW + 4], rows[m, ROW + 5] = nx, ny, nz
+        point_row(rows, m, rx, ry, rz, nx, ny, nz)
         unit_force(rows, m, mu, rx, ry, rz, nx, ny, nz, sx, sy, sz)
     if ws.counts[HELD] == 0:
         return

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.arrays import MU, ContactArrays
+from dynsim.kernels.arrays import FORCE, MU, ContactArrays, Q, Workspace
 from dynsim.kernels.constraint.cone import CONE_ROOM
 from dynsim.kernels.jit import inlined_kernel
 
@@ -59,7 +59,8 @@ CLOSED_TIME = 5  # [s]
 STOP_SIZE = 6
 # UnilateralArrays.mode, int: columns
 WANTED, BEFORE, TOUCHING, STRUCK = 0, 1, 2, 3
-MODE_SIZE = 4
+GIVES_WAY = 4  # 1: it has come to its static cone, and the kinetic coefficient holds from now on
+MODE_SIZE = 5
 # UnilateralArrays.vector: three of the splits of forces, then those of the problem that chooses modes
 OFFSET, SOLUTION, CONE_FRICTION, FIRST_PART, SECOND_PART = 3, 4, 5, 6, 7
 VECTORS = 8
@@ -113,6 +114,22 @@ def slide_direction(unilateral: UnilateralArrays, contacts: ContactArrays, k, x,
         a, b, c = x * scale, y * scale, z * scale
         speed = size if along >= 0.0 else -size
     return a, b, c, sliding_friction(law, k, contacts.point[k, MU], speed)
+
+
+@inlined_kernel
+def stop_gap(unilateral: UnilateralArrays, ws: Workspace, k):
+    """What joint stop k leaves its joint to go, ≥ 0 [rad or m]."""
+    stop = unilateral.stop
+    return stop[k, SIDE] * ws.joints[unilateral.stop_table[k, STOP_JOINT], Q] - stop[k, LIMIT]
+
+
+@inlined_kernel
+def note_stop_forces(unilateral: UnilateralArrays, ws: Workspace):
+    """Forces of the joint stops from their rows; none where they are open."""
+    table = unilateral.stop_table
+    for k in range(table.shape[0]):
+        closed = table[k, STOP_CLOSED] == 1
+        unilateral.stop[k, STOP_FORCE] = ws.rows[table[k, STOP_ROW], FORCE] if closed else 0.0
 
 
 @inlined_kernel

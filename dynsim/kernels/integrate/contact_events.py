@@ -25,7 +25,6 @@ from dynsim.kernels.arrays import (
     SLIDING,
     SLIP_VELOCITY,
     STICKING,
-    Q,
     Workspace,
 )
 from dynsim.kernels.constraint.rows import set_modes
@@ -41,18 +40,17 @@ from dynsim.kernels.constraint.unilateral import (
     DEEPEST,
     DEPTH,
     FROZEN,
+    GIVES_WAY,
     HEADWAY,
     HITS,
     LANDINGS,
     LANDS_AT,
     LAST_CHANGE,
     LIFT_OFFS,
-    LIMIT,
     NEXT,
     NEXT_SPEED,
     REFERENCE,
     SETTLE,
-    SIDE,
     SLIP_STARTS,
     SLOW,
     SPEED,
@@ -61,15 +59,15 @@ from dynsim.kernels.constraint.unilateral import (
     STOP_BEFORE,
     STOP_CLOSED,
     STOP_FORCE,
-    STOP_JOINT,
     STRUCK,
     TIME_OPEN,
     WANTED,
     WINDOW_COUNT,
     WINDOW_START,
     UnilateralArrays,
+    stop_gap,
 )
-from dynsim.kernels.integrate.contact_modes import begin_slip, resolve
+from dynsim.kernels.integrate.contact_modes import begin_slip, drops, resolve, slip_on
 from dynsim.kernels.integrate.impacts import evaluate, slip_speed
 from dynsim.kernels.integrate.run import (
     CHATTER,
@@ -77,15 +75,13 @@ from dynsim.kernels.integrate.run import (
     EVENT_INDEX,
     EVENT_KIND,
     LOGGED,
+    SIDE,
     STARTED,
     STATUS,
     STOP_LOG,
     TIME,
     VALUE,
     Run,
-)
-from dynsim.kernels.integrate.run import (
-    SIDE as GUARD_SIDE,
 )
 from dynsim.kernels.jit import apart_kernel, internal_kernel
 from dynsim.kernels.system import System
@@ -118,10 +114,9 @@ def contact_guard(unilateral: UnilateralArrays | None, ws: Workspace, kind, k):
     if unilateral is None:  # known to the compiler
         return 1.0
     if kind == STOP_GUARD:
-        stop, j = unilateral.stop, unilateral.stop_table[k, STOP_JOINT]
         if unilateral.stop_table[k, STOP_CLOSED] == 1:
-            return stop[k, STOP_FORCE]
-        return stop[k, SIDE] * ws.joints[j, Q] - stop[k, LIMIT] + DEPTH
+            return unilateral.stop[k, STOP_FORCE]
+        return stop_gap(unilateral, ws, k) + DEPTH
     mode = ws.active[k, MODE]
     if kind == NORMAL_GUARD:
         return ws.contacts[k, GAP] + unilateral.slide[k, LANDS_AT] if mode == OPEN else ws.contacts[k, NORMAL_FORCE]
@@ -284,7 +279,7 @@ def rearm(run: Run):
     """All guards of the unilateral law are on their positive side."""
     for e in range(run.event.shape[0]):
         if run.event_table[e, EVENT_KIND] >= NORMAL_GUARD:
-            run.event[e, GUARD_SIDE], run.event[e, VALUE] = 1.0, 1.0
+            run.event[e, SIDE], run.event[e, VALUE] = 1.0, 1.0
 
 
 @internal_kernel
@@ -398,17 +393,16 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
                 mode[k, WANTED] = OPEN
                 tell(system, run, k, LIFT_OFF)
                 continue
+            if drops(system, k):
+                # Forces jump, and with them the direction of slip.
+                mode[k, GIVES_WAY], by_hand = 1, False
+                continue
             begin_slip(system, ws, k, ws.rows[r + 1, FORCE], ws.rows[r + 2, FORCE])
             mode[k, WANTED] = SLIDING
             tell(system, run, k, SLIP_START)
         elif mode[k, WANTED] == SLIDING:
-            if slip_speed(ws, k) > 10.0 * unilateral.number[SLOW]:
-                # Slip has only turned.
-                for s in range(3):
-                    unilateral.slide[k, REFERENCE + s] = ws.contacts[k, SLIP_VELOCITY + s] / slip_speed(ws, k)
-                unilateral.slide[k, FROZEN] = 0.0
-            else:
-                by_hand = False
+            # Either slip has only turned, or all is to be looked at.
+            by_hand = slip_on(unilateral, ws, k, 10.0 * unilateral.number[SLOW]) and by_hand
     if by_hand:
         set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
         rearm(run)

@@ -29,22 +29,24 @@ from dynsim.kernels.arrays import (
     STICKING,
     Workspace,
 )
-from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, ONE_WAY, TANGENT, solve_cones
+from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, ONE_WAY, TANGENT
 from dynsim.kernels.constraint.rows import set_modes
 from dynsim.kernels.constraint.unilateral import (
     BEFORE,
     CONE_FRICTION,
+    DEPTH,
     FIRST_PART,
     FROZEN,
+    GIVES_WAY,
     HEADWAY,
     KINDS,
+    LANDS_AT,
     NEXT,
     NEXT_SPEED,
     OFFSET,
     PROBLEM,
     REDUNDANT,
     REFERENCE,
-    SCRATCH,
     SECOND_PART,
     SLOW,
     SOLUTION,
@@ -62,15 +64,14 @@ from dynsim.kernels.constraint.unilateral import (
     slide_direction,
 )
 from dynsim.kernels.integrate.impacts import (
-    CONE_TOLERANCE,
     FORCE_TOLERANCE,
-    IMMOBILE,
     evaluate,
     find_touching,
     gather,
     impact,
     keep_touching,
     slip_speed,
+    solve_problem,
 )
 from dynsim.kernels.integrate.project import project_level
 from dynsim.kernels.integrate.run import (
@@ -81,7 +82,7 @@ from dynsim.kernels.integrate.run import (
     TIME,
     Run,
 )
-from dynsim.kernels.jit import internal_kernel
+from dynsim.kernels.jit import inlined_kernel, internal_kernel
 from dynsim.kernels.state import IMPACT_LOSS
 from dynsim.kernels.system import System
 
@@ -117,7 +118,7 @@ def resolve(system: System, ws: Workspace, run: Run, touch):
 def choose(system: System, ws: Workspace, run: Run):
     """Modes by the accelerations of all that touches; the rates of what is closed are brought to zero."""
     unilateral = system.unilateral
-    mode, vector = unilateral.mode, unilateral.vector
+    mode = unilateral.mode
     p = gather(system, ws, run)
     largest = 0.0
     for r in range(p):
@@ -125,30 +126,24 @@ def choose(system: System, ws: Workspace, run: Run):
     for k in range(mode.shape[0]):
         if mode[k, TOUCHING] == 1:
             mode[k, WANTED] = SLIDING if begins_sliding(system, ws, k) else STICKING
+            mode[k, GIVES_WAY] = 1 if mode[k, GIVES_WAY] == 1 and drops(system, k) else 0
     solved = False
     # Where static friction gives way to a smaller kinetic one, the others' forces change.
     for _ in range(1 + mode.shape[0]):
         size = reduce_rows(system, ws, run, p)
         if run.count[STATUS] == FORCES_REVERSED:
-            return
-        residual = solve_cones(
-            unilateral.room[PROBLEM],
-            vector[OFFSET],
-            unilateral.place[KINDS],
-            vector[CONE_FRICTION],
-            size,
-            vector[SOLUTION],
-            unilateral.room[SCRATCH:],
-            1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE),
-        )
-        if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
-            run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
-            return
-        if not give_way(system, ws, size, largest):
-            solved = True
             break
+        solved = solve_problem(unilateral, unilateral.room[PROBLEM], size, largest)
+        if not solved or not give_way(system, ws, size, largest):
+            break
+        solved = False
     if not solved:
-        run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
+        if run.count[STATUS] != FORCES_REVERSED:
+            run.count[STATUS] = NO_CONTACT_FORCES
+        run.clock[NOT_UNIQUE] = run.clock[TIME]
+        # Whoever looks for the cause finds the rows that contradict the law.
+        set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
+        evaluate(system, ws, run)
         return
     take_solution(system, ws, size, largest)
     # What is left of rates after an impact that was let settle, and of points that were solved for as if at rest: those
@@ -169,6 +164,7 @@ def choose(system: System, ws: Workspace, run: Run):
     evaluate(system, ws, run)
     unilateral.number[REDUNDANT] = 1.0 if ws.counts[DEPENDENT] > before else 0.0
     for k in range(mode.shape[0]):
+        mode[k, GIVES_WAY] = 0
         starts = mode[k, WANTED] == SLIDING and mode[k, TOUCHING] == STICKING
         unilateral.slide[k, HEADWAY] = max(0.0, -unilateral.slide[k, SPEED]) if starts else 0.0
 
@@ -177,18 +173,24 @@ def choose(system: System, ws: Workspace, run: Run):
 def begins_sliding(system: System, ws: Workspace, k):
     """True for a candidate that slides already, or has no friction to stick with; sets its direction."""
     unilateral = system.unilateral
-    slide, state = unilateral.slide, ws.contacts
-    speed = slip_speed(ws, k)
-    if speed > 2.0 * unilateral.number[SLOW]:
-        # An impact may have turned it.
-        slide[k, FROZEN] = 0.0
-        for s in range(3):
-            slide[k, REFERENCE + s] = state[k, SLIP_VELOCITY + s] / speed
+    # An impact may have turned it.
+    if slip_on(unilateral, ws, k, 2.0 * unilateral.number[SLOW]):
         return True
     if unilateral.law[k, STATIC] == 0.0:
-        slide[k, FROZEN] = 0.0
+        unilateral.slide[k, FROZEN] = 0.0
         return True
     return False
+
+
+@internal_kernel
+def slip_on(unilateral: UnilateralArrays, ws: Workspace, k, least):
+    """Let candidate k slide along its own slip, v_t/|v_t|, where that is faster than ``least`` [m/s]; True if it is."""
+    slide, speed = unilateral.slide, slip_speed(ws, k)
+    if speed > least:
+        slide[k, FROZEN] = 0.0
+        for s in range(3):
+            slide[k, REFERENCE + s] = ws.contacts[k, SLIP_VELOCITY + s] / speed
+    return speed > least
 
 
 @internal_kernel
@@ -221,7 +223,7 @@ def reduce_rows(system: System, ws: Workspace, run: Run, p):
             place[KINDS, size] = ONE_WAY
             size += 1
         else:
-            vector[CONE_FRICTION, size] = unilateral.law[k, STATIC]
+            vector[CONE_FRICTION, size] = friction_at_rest(system, k)
             for s in range(3):
                 place[KINDS, size] = CONE if s == 0 else TANGENT
                 place[TABLE_ROW, size], vector[FIRST_PART, size], vector[SECOND_PART, size] = r + s, 0.0, 0.0
@@ -236,7 +238,7 @@ def reduce_rows(system: System, ws: Workspace, run: Run, p):
                 value += vector[FIRST_PART, j] * W[a, b + 1] + vector[SECOND_PART, j] * W[a, b + 2]
             unilateral.room[PROBLEM, i, j] = value
         if place[KINDS, i] == ONE_WAY and W[a, a] > 0.0 and unilateral.room[PROBLEM, i, i] <= 1e-12 * W[a, a]:
-            run.count[STATUS], run.clock[NOT_UNIQUE] = FORCES_REVERSED, run.clock[TIME]
+            run.count[STATUS] = FORCES_REVERSED
     return size
 
 
@@ -273,21 +275,38 @@ def begin_slip(system: System, ws: Workspace, k, fx, fy):
     slide[k, NEXT_SPEED] = 0.0
 
 
+@inlined_kernel
+def drops(system: System, k):
+    """True for a candidate whose friction falls from a static coefficient to a smaller kinetic one when it slips."""
+    law = system.unilateral.law
+    return law[k, STRIBECK] == 0.0 and law[k, STATIC] > system.contacts.point[k, MU]
+
+
+@inlined_kernel
+def friction_at_rest(system: System, k):
+    """Coefficient of the cone of candidate k, which is at rest along its surface."""
+    gives_way = system.unilateral.mode[k, GIVES_WAY] == 1
+    return system.contacts.point[k, MU] if gives_way else system.unilateral.law[k, STATIC]
+
+
 @internal_kernel
 def give_way(system: System, ws: Workspace, size, largest):
-    """Let what slips over a static coefficient that is larger than the kinetic one slide; True if something does."""
+    """Give what slips over a static coefficient the smaller kinetic one; True if something does.
+
+    It stays a cone: the direction in which it begins to slip is not that of the larger force, unless its mobility is
+    the same in all directions.
+    """
     unilateral = system.unilateral
-    place, mode, law, f = unilateral.place, unilateral.mode, unilateral.law, unilateral.vector[SOLUTION]
+    place, mode, f = unilateral.place, unilateral.mode, unilateral.vector[SOLUTION]
     changed, i = False, 0
     for k in range(mode.shape[0]):
         if mode[k, TOUCHING] == 0:
             continue
         while place[TABLE_ROW, i] != ws.active[k, FIRST_ROW]:
             i += 1
-        drops = law[k, STRIBECK] == 0.0 and law[k, STATIC] > system.contacts.point[k, MU] and f[i] > 0.0
-        if mode[k, WANTED] == STICKING and drops and slips(system, i, size, largest, law[k, STATIC]):
-            begin_slip(system, ws, k, f[i + 1], f[i + 2])
-            mode[k, WANTED] = SLIDING
+        holds = mode[k, WANTED] == STICKING and mode[k, GIVES_WAY] == 0 and f[i] > 0.0
+        if holds and drops(system, k) and slips(system, i, size, largest, unilateral.law[k, STATIC]):
+            mode[k, GIVES_WAY] = 1
             changed = True
     return changed
 
@@ -312,7 +331,8 @@ def take_solution(system: System, ws: Workspace, size, largest):
         while place[TABLE_ROW, i] != ws.active[k, FIRST_ROW]:
             i += 1
         if not f[i] > FORCE_TOLERANCE * strongest:
-            mode[k, WANTED] = OPEN
-        elif mode[k, WANTED] == STICKING and slips(system, i, size, largest, unilateral.law[k, STATIC]):
+            # It touches without a force, maybe a little below its surface: only if it goes on does it land.
+            mode[k, WANTED], unilateral.slide[k, LANDS_AT] = OPEN, DEPTH
+        elif mode[k, WANTED] == STICKING and slips(system, i, size, largest, friction_at_rest(system, k)):
             begin_slip(system, ws, k, f[i + 1], f[i + 2])
             mode[k, WANTED] = SLIDING

@@ -40,9 +40,7 @@ from dynsim.kernels.integrate.rosenbrock import step_rodas4
 from dynsim.kernels.integrate.run import (
     AT_START,
     DOPRI5,
-    END,
     ERROR,
-    FINISHED,
     FIRED,
     HOLD,
     MODES_DUE,
@@ -67,7 +65,7 @@ from dynsim.kernels.integrate.run import (
     TRIMMED,
     Run,
 )
-from dynsim.kernels.integrate.steps import choose_step, finite, first_step, next_step, rejected
+from dynsim.kernels.integrate.steps import choose_step, finished, finite, first_step, next_step, rejected
 from dynsim.kernels.integrate.watch import forces_unique, watch
 from dynsim.kernels.jit import internal_kernel, kernel, merged_kernel
 from dynsim.kernels.system import System
@@ -130,15 +128,6 @@ def accept(system: System, ws: Workspace, run: Run):
         run.stage[0, j] = run.stage[6, j]
     run.clock[TIME] = t + h
     run.count[STEPS] += 1
-
-
-@merged_kernel
-def finished(run: Run):
-    """True when the run has ended, for whatever reason; sets STATUS at END."""
-    end = run.clock[END]
-    if run.count[STATUS] == RUNNING and end - run.clock[TIME] <= 1e-12 * max(1.0, end):
-        run.count[STATUS] = FINISHED
-    return run.count[STATUS] != RUNNING
 
 
 @merged_kernel

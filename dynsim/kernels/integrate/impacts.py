@@ -23,16 +23,15 @@ from dynsim.kernels.arrays import (
     SLIDING,
     SLIP_VELOCITY,
     STICKING,
-    Q,
     Workspace,
 )
 from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, ONE_WAY, TANGENT, solve_cones
 from dynsim.kernels.constraint.rows import row_errors, set_modes
 from dynsim.kernels.constraint.unilateral import (
     BEFORE,
+    CHANGES,
     CONE_FRICTION,
     KINDS,
-    LIMIT,
     LOSS,
     OFFSET,
     RESTITUTION,
@@ -47,6 +46,7 @@ from dynsim.kernels.constraint.unilateral import (
     TOUCHING,
     WANTED,
     UnilateralArrays,
+    stop_gap,
 )
 from dynsim.kernels.integrate.project import PROJECTION_LIMIT, RATE_TOLERANCE, project_level
 from dynsim.kernels.integrate.run import (
@@ -64,6 +64,8 @@ from dynsim.kernels.tree.articulated import accelerate
 
 # A point that approaches faster than this many tolerances of projected rates strikes.
 STRIKE = 3.0
+# Impacts at one instant, of which each is the cause of the next, before restitution is none.
+MOST_BOUNCES = 30.0
 # What begins to touch is brought this close to its surface [m].
 FOOT_TOLERANCE = 1e-13
 # Of a solution of the cones: residual by the largest entry, and what of the largest force is none.
@@ -104,10 +106,9 @@ def find_touching(unilateral: UnilateralArrays, ws: Workspace, touch):
         # What lands ever so slowly is stopped too: nothing else would, should it stay open.
         strikes = strikes or (near and state[k, GAP_RATE] < (-limit if closed else 0.0))
     for k in range(table.shape[0]):
-        j = table[k, STOP_JOINT]
-        gap, rate = stop[k, SIDE] * ws.joints[j, Q] - stop[k, LIMIT], stop[k, SIDE] * ws.joints[j, QD]
+        rate = stop[k, SIDE] * ws.joints[table[k, STOP_JOINT], QD]
         limit = STRIKE * RATE_TOLERANCE
-        near = table[k, STOP_CLOSED] == 1 or (gap <= touch and rate <= limit)
+        near = table[k, STOP_CLOSED] == 1 or (stop_gap(unilateral, ws, k) <= touch and rate <= limit)
         table[k, STOP_CLOSED] = 1 if near else 0
         strikes = strikes or (near and rate < -limit)
     return strikes
@@ -175,6 +176,26 @@ def gather(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
+def solve_problem(unilateral: UnilateralArrays, W, size, largest):
+    """Solve the contact problem of ``unilateral.vector`` and W, (size, size), into SOLUTION; False when that fails.
+
+    ``largest``: of the rates or accelerations that it is to bring to zero.
+    """
+    vector = unilateral.vector
+    residual = solve_cones(
+        W,
+        vector[OFFSET],
+        unilateral.place[KINDS],
+        vector[CONE_FRICTION],
+        size,
+        vector[SOLUTION],
+        unilateral.room[SCRATCH:],
+        1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE),
+    )
+    return 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest)
+
+
+@internal_kernel
 def impulses(system: System, ws: Workspace, p, largest, share):
     """Solve for the impulses of :func:`impact` with so much of the restitutions; the loss of each row into FORCE [J].
 
@@ -192,17 +213,7 @@ def impulses(system: System, ws: Workspace, p, largest, share):
             falls = mode[k, STRUCK] == 1 and mode[k, BEFORE] == OPEN
             if falls and -rows[r, ROW_RATE] > unilateral.tally[k, SETTLE]:
                 vector[OFFSET, r] *= 1.0 + share * unilateral.law[k, RESTITUTION]
-    residual = solve_cones(
-        ws.small[0],
-        vector[OFFSET],
-        unilateral.place[KINDS],
-        vector[CONE_FRICTION],
-        p,
-        vector[SOLUTION],
-        unilateral.room[SCRATCH:],
-        1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE),
-    )
-    if not 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest):
+    if not solve_problem(unilateral, ws.small[0], p, largest):
         return False
     f, total, turnover = vector[SOLUTION], 0.0, 0.0
     for r in range(p):
@@ -229,8 +240,10 @@ def impact(system: System, ws: Workspace, run: Run):
     for r in range(p):
         largest = max(largest, abs(rows[r, ROW_RATE]))
     # Newton's restitution may contradict friction: a point that is wedged cannot leave, and some would gain energy.
-    # Those impacts are without restitution, which always has a solution, and a loss.
-    if not impulses(system, ws, p, largest, 1.0) and not impulses(system, ws, p, largest, 0.0):
+    # Those impacts are without restitution, which always has a solution, and a loss. So are those of points that throw
+    # each other back and forth at one instant: what accumulates ends in contact.
+    bouncing = unilateral.number[CHANGES] <= MOST_BOUNCES and impulses(system, ws, p, largest, 1.0)
+    if not bouncing and not impulses(system, ws, p, largest, 0.0):
         run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
         return
     f = vector[SOLUTION]

@@ -5,27 +5,20 @@ from __future__ import annotations
 from dynsim.kernels.arrays import (
     APPLIED,
     CIRCUIT,
-    CURRENT,
-    D_M,
     DAMPING,
-    DRAG,
     DRIVEN,
     FIRST_ROW,
     FORCE,
     GAP,
     GEAR_DAMPING,
-    J_M,
-    K_M,
     MODE,
     NORMAL_FORCE,
     OPEN,
     QD,
     QDD,
-    RESISTANCE,
     ROWS,
     SLIDING,
     STICKING,
-    VOLTAGE,
     ModelArrays,
     Q,
     Workspace,
@@ -33,57 +26,86 @@ from dynsim.kernels.arrays import (
 from dynsim.kernels.constraint.unilateral import (
     CLOSED_TIME,
     DEEPEST,
+    HITS,
+    LANDINGS,
+    LIFT_OFFS,
     LOSS,
     SLIP_STARTS,
+    STOP_BEFORE,
     STOP_CLOSED,
     STOP_LOSS,
     STOP_ROW,
     UnilateralArrays,
 )
 from dynsim.kernels.drive.law import drive, take_commands
+from dynsim.kernels.integrate.balance import begin_energy, drive_work, midpoint_work, stored_energy
+from dynsim.kernels.integrate.contact_events import (
+    LANDING,
+    LIFT_OFF,
+    LOG_KINDS,
+    SLIP_START,
+    SLIP_STOP,
+    STOP_HIT,
+    STOP_LEFT,
+    log,
+)
 from dynsim.kernels.integrate.events import take_ticks
 from dynsim.kernels.integrate.output import write_output
 from dynsim.kernels.integrate.run import (
+    CONTACT_LOG,
     END,
     EVALUATIONS,
-    FINISHED,
     HOLD,
+    LOGGED,
     NOT_FINITE,
     PENDING,
     PROPOSED,
-    RUNNING,
     SAMPLE,
     STARTED,
     STATUS,
     STEP,
     STEPS,
+    STOP_LOG,
     TAKE_COMMANDS,
     TICKED,
     TIME,
     Run,
 )
-from dynsim.kernels.integrate.steps import choose_step, finite
+from dynsim.kernels.integrate.steps import choose_step, finished, finite
 from dynsim.kernels.integrate.time_stepping import (
+    ACCELERATION,
+    APPLIED_THEN,
     BAD,
+    FREE,
+    MAGNETIC,
     PENETRATION,
+    PER,
+    START,
+    STOP,
+    V_BIAS,
+    V_START,
+    SteppingArrays,
     close_contacts,
+    constraint_rates,
     geometry,
     implicit_drives,
     moved,
     place_joints,
-    row_rates,
-    slip_speed,
+    slip_of_rates,
     solve_contacts,
     stop_forces,
     tangent_rows,
 )
+from dynsim.kernels.integrate.time_stepping import MECHANICAL as ENERGY
 from dynsim.kernels.integrate.watch import watch
 from dynsim.kernels.jit import internal_kernel, kernel
+from dynsim.kernels.ledger import drive_powers
 from dynsim.kernels.state import (
     CONSTRAINT,
     CONTACT_SIZE,
     DRAWN,
     ELECTRICAL,
+    ENERGIES,
     FRICTION,
     GEAR,
     IMPACT_LOSS,
@@ -98,6 +120,7 @@ from dynsim.kernels.state import (
     SUPPLY,
 )
 from dynsim.kernels.system import System
+from dynsim.kernels.tree.angles import sine_cosine
 from dynsim.kernels.tree.articulated import accelerate, add_row_forces, factor, row_system
 from dynsim.kernels.tree.joints import normalise
 from dynsim.kernels.tree.loads import add_loads
@@ -109,8 +132,11 @@ def step_moreau(system: System, ws: Workspace, run: Run):
     s, t, h, y, y_new, layout = run.stepping, run.clock[TIME], run.clock[STEP], run.y, run.y_new, system.layout
     joints, theta, n = ws.joints, s.theta, ws.joints.shape[0]
     model = ModelArrays(system.model.tree, s.body, system.model.gravity, system.model.compound)
-    v0, v_bias, last = s.before[0], s.before[1], s.before[2]
+    v0, v_bias, last, applied = s.before[V_START], s.before[V_BIAS], s.before[ACCELERATION], s.before[APPLIED_THEN]
+    begin_energy(system, ws, run)
     place_joints(system, ws, y)
+    if layout.extra > 0:  # rolling bases move along their heading, whatever was swept last
+        sine_cosine(joints, ws.trig)
     for i in range(n):
         v0[i] = y[layout.v + i]
         v_bias[i] = v0[i] + theta * h * last[i]
@@ -119,6 +145,8 @@ def step_moreau(system: System, ws: Workspace, run: Run):
         joints[i, APPLIED] = -(model.body[i, DAMPING] + model.body[i, GEAR_DAMPING]) * v0[i]
     drive(system.drives, system.reference, t + theta * h, y, layout, ws)
     implicit_drives(system, s, ws, h)
+    for i in range(n):
+        applied[i] = joints[i, APPLIED]
 
     moved(system, ws, y, 0.5 * h, y_new)
     place_joints(system, ws, y_new)
@@ -134,7 +162,7 @@ def step_moreau(system: System, ws: Workspace, run: Run):
         add_loads(model, system.loads, t + theta * h, ws, run.stage[1], layout.load)
     tangent_rows(system, s, ws)
     factor(model, ws)
-    row_rates(model, ws, y, layout.v, s.rate[0])
+    constraint_rates(model, ws, y, layout.v, s.rate[0])
     if ws.counts[ROWS] > 0:
         row_system(model, ws)
         solve_contacts(system.unilateral, s, ws, h)
@@ -150,11 +178,13 @@ def step_moreau(system: System, ws: Workspace, run: Run):
     for i in range(n):
         y_new[layout.v + i] = v0[i] + h * last[i]
         joints[i, QDD] = last[i]
-    row_rates(model, ws, y_new, layout.v, s.rate[1])
+    constraint_rates(model, ws, y_new, layout.v, s.rate[1])
     for a in range(ws.motors.shape[0]):
         k, j = system.drives.table[a, CIRCUIT], system.drives.table[a, DRIVEN]
         if k >= 0:
-            y_new[layout.current + k] = y[layout.current + k] + s.eliminated[a, 0] + s.eliminated[a, 1] * h * last[j]
+            y_new[layout.current + k] = (
+                y[layout.current + k] + s.eliminated[a, FREE] + s.eliminated[a, PER] * h * last[j]
+            )
     book(system, ws, run)
 
 
@@ -162,11 +192,16 @@ def step_moreau(system: System, ws: Workspace, run: Run):
 def book(system: System, ws: Workspace, run: Run):
     """The ledger of the step into y_new: power at x_θ, and what contacts and couplings have done."""
     s, t, h, y, y_new, layout = run.stepping, run.clock[TIME], run.clock[STEP], run.y, run.y_new, system.layout
-    joints, motors, motor, theta, n = ws.joints, ws.motors, system.drives.motor, s.theta, ws.joints.shape[0]
+    joints, theta, n = ws.joints, s.theta, ws.joints.shape[0]
     between, body = run.stage[2], system.model.body
+    # Of the sweep at the midpoint, before others overwrite it.
+    stored = -midpoint_work(system.model, ws, s.before[V_START], s.before[ACCELERATION], h)
+    if system.loads.table.shape[0] > 0:
+        # Once more, for their powers at the mean velocities that are in the links now.
+        add_loads(system.model, system.loads, t + theta * h, ws, run.stage[1], layout.load)
     for j in range(y.shape[0]):
         between[j] = y[j] + theta * (y_new[j] - y[j])
-    gear, joint, mechanical = 0.0, 0.0, 0.0
+    gear, joint = 0.0, 0.0
     place_joints(system, ws, y)
     for i in range(n):
         v = between[layout.v + i]
@@ -175,17 +210,8 @@ def book(system: System, ws: Workspace, run: Run):
         gear += body[i, GEAR_DAMPING] * v * v
         joint += body[i, DAMPING] * v * v
     drive(system.drives, system.reference, t + theta * h, between, layout, ws)
-    electrical, drawn, joule = 0.0, 0.0, 0.0
-    for a in range(motors.shape[0]):
-        i = system.drives.table[a, DRIVEN]
-        current, v = motors[a, CURRENT], joints[i, QD]
-        power = motors[a, VOLTAGE] * current
-        electrical += power
-        drawn += max(power, 0.0)
-        joule += motor[a, RESISTANCE] * current * current
-        shaft = motor[a, K_M] * current - motor[a, J_M] * joints[i, QDD] - motor[a, D_M] * v - motors[a, DRAG]
-        mechanical += shaft * v
-        gear += motors[a, DRAG] * v
+    electrical, drawn, joule, mechanical, drag = drive_powers(system.drives, ws)
+    stored += drive_work(system, ws, run)
     held, friction, first = 0.0, 0.0, layout.contact
     for r in range(ws.counts[ROWS]):
         held += 0.5 * ws.rows[r, FORCE] * (s.rate[0, r] + s.rate[1, r])
@@ -199,18 +225,16 @@ def book(system: System, ws: Workspace, run: Run):
             held -= power
             ws.contacts[k, NORMAL_FORCE] = ws.rows[r, FORCE]
             s.found[PENETRATION] = max(s.found[PENETRATION], -ws.contacts[k, GAP])
-            y_new[first + SLIP] += h * slip_speed(s, k, x, z)
+            y_new[first + SLIP] += h * slip_of_rates(s, k, x, z)
             y_new[first + IMPULSE] += h * ws.rows[r, FORCE]
-            motion = SLIDING if slip_speed(s, k, s.rate[1, r + 1], s.rate[1, r + 2]) > BAD else STICKING
-            if motion == SLIDING and s.motion[k] == STICKING:
-                count_slip_start(system.unilateral, k)
+            motion = SLIDING if slip_of_rates(s, k, s.rate[1, r + 1], s.rate[1, r + 2]) > BAD else STICKING
         s.motion[k] = motion
         first += CONTACT_SIZE
     start = layout.ledger
     y_new[start + ELECTRICAL] += h * electrical
     y_new[start + DRAWN] += h * drawn
     y_new[start + JOULE] += h * joule
-    y_new[start + GEAR] += h * gear
+    y_new[start + GEAR] += h * (gear + drag)
     y_new[start + JOINT] += h * joint
     y_new[start + FRICTION] += h * friction
     y_new[start + CONSTRAINT] += h * held
@@ -219,13 +243,43 @@ def book(system: System, ws: Workspace, run: Run):
     y_new[start + SUPPLY] += h * max(electrical, 0.0)
     for k in range(system.loads.table.shape[0]):
         y_new[layout.load + k] += h * run.stage[1, layout.load + k]
+    stored_energy(system, ws, y_new, s.energy[STOP])
+    y_new[layout.scheme] -= stored + (s.energy[STOP, ENERGY] - s.energy[START, ENERGY])
 
 
 @internal_kernel
-def count_slip_start(unilateral: UnilateralArrays | None, k):
-    """Candidate k has stuck at the start of the step, and slides at its end."""
-    if unilateral is not None:
-        unilateral.tally[k, SLIP_STARTS] += 1.0
+def tell_changes(unilateral: UnilateralArrays | None, s: SteppingArrays, run: Run):
+    """Log and count what the accepted step has changed, at its end; True when the caller is to empty the log.
+
+    What a contact begins with is no event.
+    """
+    if unilateral is None:  # known to the compiler
+        return False
+    tally, table, stop = unilateral.tally, unilateral.stop_table, unilateral.stop
+    for k in range(s.told.shape[0]):
+        before, now = s.told[k], s.motion[k]
+        s.told[k] = now
+        if before < 0 or before == now:
+            continue
+        if now == OPEN:
+            kind = LIFT_OFF
+            tally[k, LIFT_OFFS] += 1.0
+        elif before == OPEN:
+            kind = LANDING
+            tally[k, LANDINGS] += 1.0
+        elif now == SLIDING:
+            kind = SLIP_START
+            tally[k, SLIP_STARTS] += 1.0
+        else:
+            kind = SLIP_STOP
+        log(run, CONTACT_LOG + LOG_KINDS * k + kind)
+    for k in range(table.shape[0]):
+        closed = table[k, STOP_CLOSED] == 1
+        if run.count[STEPS] > 1 and table[k, STOP_CLOSED] != table[k, STOP_BEFORE]:
+            stop[k, HITS] += 1.0 if closed else 0.0
+            log(run, STOP_LOG + LOG_KINDS * k + (STOP_HIT if closed else STOP_LEFT))
+        table[k, STOP_BEFORE] = table[k, STOP_CLOSED]
+    return run.count[LOGGED] + s.told.shape[0] + table.shape[0] > run.log_time.shape[0]
 
 
 @internal_kernel
@@ -258,6 +312,7 @@ def book_losses(unilateral: UnilateralArrays | None, system: System, s, ws: Work
 def sample_moreau(system: System, ws: Workspace, run: Run):
     """Record every sample time within the step, the state linear in between; forces are the means of the step."""
     t, h, last, clock = run.clock[TIME], run.clock[STEP], run.count[SAMPLE], run.clock
+    s = run.stepping
     until = t + h + 1e-12 * max(1.0, clock[END])
     while last < run.sample_time.shape[0] and run.sample_time[last] <= until:
         x = min(max((run.sample_time[last] - t) / h, 0.0), 1.0)
@@ -270,11 +325,17 @@ def sample_moreau(system: System, ws: Workspace, run: Run):
         for i in range(ws.joints.shape[0]):
             ws.joints[i, QD], ws.joints[i, APPLIED] = row[system.layout.v + i], 0.0
         drive(system.drives, system.reference, run.sample_time[last], row, system.layout, ws)
-        geometry(system, system.model, run.stepping, ws)
+        geometry(system, system.model, s, ws)
         write_output(system, ws, run, last)
+        # What lies between the ends of a step is linear, energy is not.
+        between = -(1.0 - x) * (s.energy[START, ENERGY] + s.energy[START, MAGNETIC])
+        between -= x * (s.energy[STOP, ENERGY] + s.energy[STOP, MAGNETIC])
+        for k in range(ENERGIES):
+            between += run.output[last, run.columns.energy + k]
+        row[system.layout.scheme] -= between
         for k in range(ws.contacts.shape[0]):
             # The rows are those of sticking even where it slides.
-            run.output[last, run.columns.contact + k * OUTPUTS_PER_CONTACT + OUT_MODE] = run.stepping.motion[k]
+            run.output[last, run.columns.contact + k * OUTPUTS_PER_CONTACT + OUT_MODE] = s.motion[k]
         last += 1
     run.count[SAMPLE] = last
 
@@ -292,7 +353,7 @@ def commands_due(system: System, ws: Workspace, run: Run):
     if run.count[STARTED] == 0:
         run.count[STARTED] = 1
         for i in range(ws.joints.shape[0]):
-            run.stepping.before[2, i] = 0.0
+            run.stepping.before[ACCELERATION, i] = 0.0
     return run.count[TICKED] != 0
 
 
@@ -301,9 +362,7 @@ def advance_moreau(system: System, ws: Workspace, run: Run, limit):
     """``advance`` of time stepping."""
     clock, count, taken = run.clock, run.count, 0
     while not commands_due(system, ws, run):
-        if count[STATUS] == RUNNING and clock[END] - clock[TIME] <= 1e-12 * max(1.0, clock[END]):
-            count[STATUS] = FINISHED
-        if taken >= limit or count[STATUS] != RUNNING:
+        if finished(run) or taken >= limit:
             return
         taken += 1
         if count[PENDING] == 0:
@@ -324,3 +383,5 @@ def advance_moreau(system: System, ws: Workspace, run: Run, limit):
         clock[TIME] += clock[STEP]
         clock[STEP] = clock[PROPOSED]
         count[STEPS] += 1
+        if tell_changes(system.unilateral, run.stepping, run):
+            return

@@ -135,8 +135,16 @@ def new_run(
     support: SupportArrays | None = None,
     stepping: SteppingArrays | None = None,
 ) -> Run:
-    """Allocate a :class:`Run` from t = 0 at state y, (layout.size,)."""
+    """Allocate a :class:`Run` from t = 0 at state y, (layout.size,).
+
+    Raises
+    ------
+    ValueError
+        For time stepping without the block ``scheme`` of the state.
+    """
     m, p, rodas = len(y), row_limit(c, couplings), method == RODAS4
+    if method == TIME_STEPPING and layout.size == layout.scheme:
+        raise ValueError("the state has no room for the scheme's energy, see dynsim.kernels.state")
     clock = np.zeros(CLOCK_SIZE)
     clock[[STEP, LAST_ERROR, END, RTOL, ATOL, STEP_MAX]] = step, 1e-4, end, rtol, atol, step_max
     clock[HOLD] = np.inf

@@ -9,6 +9,7 @@ from dynsim.kernels.integrate.events import next_tick
 from dynsim.kernels.integrate.run import (
     ATOL,
     END,
+    FINISHED,
     FIXED_STEP,
     LAST_ERROR,
     NO_FORCES,
@@ -25,7 +26,7 @@ from dynsim.kernels.integrate.run import (
     TRIMMED,
     Run,
 )
-from dynsim.kernels.jit import internal_kernel, kernel
+from dynsim.kernels.jit import internal_kernel, kernel, merged_kernel
 from dynsim.kernels.system import System
 from dynsim.kernels.tree.joints import position_error
 
@@ -58,6 +59,15 @@ def finite(values):
     for j in range(values.shape[0]):
         total += values[j] * 0.0
     return total == 0.0
+
+
+@merged_kernel
+def finished(run: Run):
+    """True when the run has ended, for whatever reason; sets STATUS at END."""
+    end = run.clock[END]
+    if run.count[STATUS] == RUNNING and end - run.clock[TIME] <= 1e-12 * max(1.0, end):
+        run.count[STATUS] = FINISHED
+    return run.count[STATUS] != RUNNING
 
 
 @internal_kernel

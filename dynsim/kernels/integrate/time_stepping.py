@@ -50,7 +50,6 @@ from dynsim.kernels.arrays import (
     OPEN,
     PARENT,
     POSITION,
-    QD,
     QDD,
     RATE_I,
     RATE_Q,
@@ -73,24 +72,18 @@ from dynsim.kernels.arrays import (
     row_limit,
 )
 from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, CONE_ROOM, ONE_WAY, TANGENT, approach
-from dynsim.kernels.constraint.rows import set_modes
+from dynsim.kernels.constraint.rows import point_row, set_modes
 from dynsim.kernels.constraint.shapes import shaped_rows
 from dynsim.kernels.constraint.surface import contact_rows
+from dynsim.kernels.constraint.unilateral import RESTITUTION as LAW_RESTITUTION
 from dynsim.kernels.constraint.unilateral import (
-    HITS,
-    LANDINGS,
-    LIFT_OFFS,
-    LIMIT,
-    SIDE,
     STATIC,
     STOP_CLOSED,
-    STOP_FORCE,
-    STOP_JOINT,
-    STOP_ROW,
     UnilateralArrays,
+    note_stop_forces,
     sliding_friction,
+    stop_gap,
 )
-from dynsim.kernels.constraint.unilateral import RESTITUTION as LAW_RESTITUTION
 from dynsim.kernels.drive.law import drive_block
 from dynsim.kernels.jit import integers, internal_kernel, reals
 from dynsim.kernels.tree.joints import displace, normalise, read_positions
@@ -108,6 +101,14 @@ LAW_SIZE = 6
 # more than the quick rounds.
 WORST, CAPPED, PENETRATION, SOLVES, LONG_SOLVES = 0, 1, 2, 3, 4
 FOUND_SIZE = 5
+# SteppingArrays.before: rates at the start; rates of the velocity products; acceleration of the last step, and then of
+# this one; what is applied at the start, without loads.
+V_START, V_BIAS, ACCELERATION, APPLIED_THEN = 0, 1, 2, 3
+# SteppingArrays.eliminated
+FREE, PER, DIDT_THEN = 0, 1, 2
+# SteppingArrays.energy
+START, STOP = 0, 1
+MECHANICAL, MAGNETIC = 0, 1
 
 
 class SteppingArrays(NamedTuple):
@@ -117,8 +118,9 @@ class SteppingArrays(NamedTuple):
     law: np.ndarray  # (c, LAW_SIZE) friction, restitution, and friction along GRIP_AXIS per that across (1: isotropic)
     body: np.ndarray  # (n, BODY_SIZE) as that of the model, its ARMATURE with what is implicit
     linear: np.ndarray  # (na, BLOCK_SIZE)
-    eliminated: np.ndarray  # (na, 2) i' − i at v' = v, and what v' − v adds to it
-    before: np.ndarray  # (3, n) v at the start; v of the velocity products; acceleration of the last step
+    eliminated: np.ndarray  # (na, 3) i' − i at v' = v, what v' − v adds to it; di/dt at the start
+    before: np.ndarray  # (4, n) see V_START and what follows it
+    energy: np.ndarray  # (2, 2) at START and STOP of the step: MECHANICAL and MAGNETIC [J]
     rate: np.ndarray  # (2, p) row rates at the start and the end
     impulse: np.ndarray  # (p,) of the rows of candidate k at 3 k, then couplings: the next start
     f: np.ndarray  # (p,)
@@ -127,6 +129,7 @@ class SteppingArrays(NamedTuple):
     kind: np.ndarray  # (p,) int
     modes: np.ndarray  # (c,) int: OPEN, or STICKING for three rows
     motion: np.ndarray  # (c,) int: OPEN, SLIDING or STICKING at the end of the step
+    told: np.ndarray  # (c,) int: that of the last accepted step; −1 before the first
     room: np.ndarray  # (CONE_ROOM, p, p)
     found: np.ndarray  # (FOUND_SIZE,)
 
@@ -151,8 +154,9 @@ def stepping_arrays(
         law=law,
         body=reals(model.body),
         linear=np.zeros((na, BLOCK_SIZE)),
-        eliminated=np.zeros((na, 2)),
-        before=np.zeros((3, n)),
+        eliminated=np.zeros((na, 3)),
+        before=np.zeros((4, n)),
+        energy=np.full((2, 2), np.nan),
         rate=np.zeros((2, p)),
         impulse=np.zeros(p),
         f=np.zeros(p),
@@ -161,6 +165,7 @@ def stepping_arrays(
         kind=integers(np.zeros(p)),
         modes=integers(np.full(c, -1)),
         motion=integers(np.full(c, OPEN)),
+        told=integers(np.full(c, -1)),
         room=np.zeros((CONE_ROOM, p, p)),
         found=np.zeros(FOUND_SIZE),
     )
@@ -227,7 +232,6 @@ def close_contacts(system, s: SteppingArrays, ws: Workspace):
         mode = STICKING if ws.contacts[k, GAP] <= MARGIN else OPEN
         if mode != s.modes[k]:
             changed = True
-            count_change(system.unilateral, k, s.modes[k], mode)
         s.modes[k] = mode
     if changed:
         set_modes(system.contacts, system.couplings, system.unilateral, ws, s.modes)
@@ -239,22 +243,12 @@ def close_stops(unilateral: UnilateralArrays | None, ws: Workspace):
     """Close the joint stops whose gap is not open, open the others; True when one has changed."""
     if unilateral is None:  # known to the compiler
         return False
-    table, stop, changed = unilateral.stop_table, unilateral.stop, False
+    table, changed = unilateral.stop_table, False
     for k in range(table.shape[0]):
-        joint = ws.joints[table[k, STOP_JOINT]]
-        closed = 1 if stop[k, SIDE] * joint[Q] - stop[k, LIMIT] <= MARGIN else 0
-        if closed > table[k, STOP_CLOSED] and stop[k, SIDE] * joint[QD] < -BAD:
-            stop[k, HITS] += 1.0
+        closed = 1 if stop_gap(unilateral, ws, k) <= MARGIN else 0
         changed = changed or closed != table[k, STOP_CLOSED]
         table[k, STOP_CLOSED] = closed
     return changed
-
-
-@internal_kernel
-def count_change(unilateral: UnilateralArrays | None, k, before, mode):
-    """A landing or a lift-off of candidate k; what it begins with is neither."""
-    if unilateral is not None and before >= 0:
-        unilateral.tally[k, LANDINGS if mode == STICKING else LIFT_OFFS] += 1.0
 
 
 @internal_kernel
@@ -262,9 +256,7 @@ def stop_forces(unilateral: UnilateralArrays | None, ws: Workspace):
     """Forces of the joint stops, after the contact problem."""
     if unilateral is None:  # known to the compiler
         return
-    for k in range(unilateral.stop.shape[0]):
-        closed = unilateral.stop_table[k, STOP_CLOSED] == 1
-        unilateral.stop[k, STOP_FORCE] = ws.rows[unilateral.stop_table[k, STOP_ROW], FORCE] if closed else 0.0
+    note_stop_forces(unilateral, ws)
 
 
 @internal_kernel
@@ -288,8 +280,7 @@ def tangent_rows(system, s: SteppingArrays, ws: Workspace):
             r, d = first + m, NORMAL if m == 0 else FIRST_TANGENT if m == 1 else SECOND_TANGENT
             scale = s.law[k, GRIP] if m == 1 else 1.0
             dx, dy, dz = scale * state[k, d], scale * state[k, d + 1], scale * state[k, d + 2]
-            rows[r, ROW], rows[r, ROW + 1], rows[r, ROW + 2] = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
-            rows[r, ROW + 3], rows[r, ROW + 4], rows[r, ROW + 5] = dx, dy, dz
+            point_row(rows, r, x, y, z, dx, dy, dz)
             rows[r, TARGET] = 0.0
             for j in range(6):
                 rows[r, DIRECTION + j] = rows[r, ROW + j]
@@ -297,7 +288,7 @@ def tangent_rows(system, s: SteppingArrays, ws: Workspace):
 
 
 @internal_kernel
-def row_rates(model: ModelArrays, ws: Workspace, y, first, out):
+def constraint_rates(model: ModelArrays, ws: Workspace, y, first, out):
     """J v of all rows, v from ``first`` on in y. A row's rate climbs from its link to the world."""
     rows, links, active = ws.rows, ws.links, ws.active
     for r in range(ws.counts[ROWS]):
@@ -334,7 +325,7 @@ def implicit_drives(system, s: SteppingArrays, ws: Workspace, h):
             scale = h / (1.0 - h * theta * linear[RATE_I])
             free = scale * motors[a, DIDT]
             per = scale * (linear[RATE_Q] * h * theta * theta + linear[RATE_V] * theta)
-        s.eliminated[a, 0], s.eliminated[a, 1] = free, per
+        s.eliminated[a, FREE], s.eliminated[a, PER], s.eliminated[a, DIDT_THEN] = free, per, motors[a, DIDT]
         joints[j, APPLIED] += linear[TORQUE_I] * theta * free
         slope = linear[TORQUE_Q] * h * theta * theta + linear[TORQUE_V] * theta + linear[TORQUE_I] * theta * per
         s.body[j, ARMATURE] -= h * slope
@@ -350,7 +341,7 @@ def friction_of(unilateral: UnilateralArrays | None, s: SteppingArrays, k, speed
 
 
 @internal_kernel
-def slip_speed(s: SteppingArrays, k, x, y):
+def slip_of_rates(s: SteppingArrays, k, x, y):
     """Slip of candidate k from the rates x, y of its tangents [m/s]."""
     x = x / s.law[k, GRIP] if s.law[k, GRIP] > 0.0 else 0.0
     return math.sqrt(x * x + y * y)
@@ -369,7 +360,7 @@ def solve_contacts(unilateral: UnilateralArrays | None, s: SteppingArrays, ws: W
         if ws.active[k, MODE] == STICKING:
             r = ws.active[k, FIRST_ROW]
             s.b[r] += s.law[k, RESTITUTION] * min(s.rate[0, r], 0.0)
-            s.mu[r] = friction_of(unilateral, s, k, slip_speed(s, k, s.rate[0, r + 1], s.rate[0, r + 2]))
+            s.mu[r] = friction_of(unilateral, s, k, slip_of_rates(s, k, s.rate[0, r + 1], s.rate[0, r + 2]))
             for m in range(MOST_ROWS):
                 s.f[r + m] = s.impulse[3 * k + m]
     residual = approach(ws.small[0], s.b, s.kind, s.mu, p, s.f, s.room, GOOD, QUICK_ROUNDS)

@@ -42,7 +42,7 @@ class RotorModel:
         if len(motors) < len(robot.motors):
             raise ModelError(f"{robot.name}: only DC motors have rotors here")
         of = [(motor.gear_ratio, motor) for motor in motors]
-        self.torque_constant = np.array([k * motor.torque_constant for k, motor in of])
+        self.torque_constant = np.array([motor.joint_constant for motor in motors])
         self.resistance = np.array([motor.resistance for _, motor in of])
         self.inductance = np.array([motor.inductance for _, motor in of])
         self.loss = np.array([link.damping for link in robot.links])

@@ -1,0 +1,97 @@
+"""Tables of summaries: whole in files and pipes, and with joint stops; warnings of references beyond these."""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+
+import pytest
+
+import dynsim
+from dynsim.record import Record
+from dynsim.tables import print_comparison, print_summary
+from dynsim.terminal import Terminal
+
+ARM = """\
+duration_s: 1.0
+metrics: {settle_s: 0.2}
+plant:
+  type: serial_arm
+  chain:
+    - {axis: y, mass_kg: 0.8, length_m: 0.5, limit_deg: [-30, 40], initial_deg: 20, motor: {type: wang_minami}}
+controller:
+  type: joint_pd
+  joints: {joint_1: {times_s: [0, 0.8], angles_deg: [20, GOAL]}}
+contacts: {law: unilateral}
+"""
+
+
+def reached(folder: Path, goal: float) -> Record:
+    path = folder / f"to_{goal:g}.yaml"
+    path.write_text(ARM.replace("GOAL", str(goal)))
+    return dynsim.simulate(dynsim.load_scenario(path))
+
+
+@pytest.fixture(scope="module")
+def beyond(tmp_path_factory: pytest.TempPathFactory) -> Record:
+    return reached(tmp_path_factory.mktemp("stops"), 52.0)
+
+
+def shown(summaries: dict[str, dict], width: int | None = None, monkeypatch: pytest.MonkeyPatch | None = None) -> str:
+    output = io.StringIO()
+    terminal = Terminal(file=output, width=width, emoji=False)
+    if len(summaries) == 1:
+        print_summary(terminal, next(iter(summaries.values())))
+    else:
+        print_comparison(terminal, summaries)
+    return output.getvalue()
+
+
+def test_a_reference_beyond_a_stop_is_told(beyond: Record, tmp_path: Path) -> None:
+    (warning,) = [text for text in beyond.summary["warnings"] if "reference" in text]
+    # The spline of the references swings over by thousandths of a degree.
+    assert re.match(
+        r"joint_1: its reference goes beyond its stop at 40° \(0.6981 rad\) by up to 12(\.00\d)?° ", warning
+    )
+    (hit,) = [event for event in beyond.events if event.kind == "stop_hit"]
+    first = float(warning.partition("first at t = ")[2].partition(" s")[0])
+    # The joint is close behind its reference.
+    assert first == pytest.approx(hit.time, abs=0.1)
+    within = reached(tmp_path, 39.0)
+    assert not any("reference" in text for text in within.summary["warnings"])
+
+
+def test_joint_stops_have_rows(beyond: Record, tmp_path: Path) -> None:
+    (stop,) = beyond.summary["joint_stops"]
+    assert stop["force_max"] == pytest.approx(-beyond["stop_force"].min(), rel=1e-12)
+    assert stop["force_max"] > 0.0
+    lines = shown({"": beyond.summary}).splitlines()
+    k = next(k for k, line in enumerate(lines) if "joint_1, stop at 40°: hits" in line)
+    assert [line.split()[-1] for line in lines[k : k + 4]] == [
+        str(stop["hits"]),
+        f"{stop['force_max']:.3g}",
+        f"{100 * stop['closed_fraction']:.1f}",
+        f"{stop['impact_loss_J']:.3g}",
+    ]
+    assert "force, max [N m]" in lines[k + 1]
+    both = shown({"within": reached(tmp_path, 39.0).summary, "beyond": beyond.summary}).splitlines()
+    row = next(line for line in both if "joint_1, stop at 40°: hits" in line)
+    assert row.split()[-2:] == ["–", str(stop["hits"])]
+
+
+def test_tables_that_nobody_looks_at_are_whole(beyond: Record, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a pipe all variants are in one table, no name is cut off and no warning broken; COLUMNS is heeded."""
+    monkeypatch.delenv("COLUMNS", raising=False)
+    names = [f"a_variant_with_quite_a_long_name_{k}" for k in range(9)]
+    text = shown(dict.fromkeys(names, beyond.summary))
+    assert text.count("electrical energy [J]") == 1
+    header = next(line for line in text.splitlines() if names[0] in line)
+    assert header.split() == names
+    assert "…" not in text
+    for warning in beyond.summary["warnings"]:
+        assert f"warning: {names[0]}: {warning}" in text.splitlines()
+    monkeypatch.setenv("COLUMNS", "100")
+    narrow = shown(dict.fromkeys(names, beyond.summary))
+    assert narrow.count("electrical energy [J]") > 1
+    assert max(map(len, narrow.splitlines())) <= 100
