@@ -6,8 +6,8 @@ from dynsim.kernels.arrays import Workspace
 from dynsim.kernels.integrate.newton import NewtonArrays
 from dynsim.kernels.integrate.output import write_output
 from dynsim.kernels.integrate.project import settle
-from dynsim.kernels.integrate.run import DOPRI5, END, RADAU5, RODAS4, SAMPLE, STEP, TIME, TIME_STEPPING, Run
-from dynsim.kernels.integrate.tableaux import D_RODAS, NODE_RADAU
+from dynsim.kernels.integrate.run import DOPRI5, END, RADAU5, SAMPLE, STEP, TIME, TIME_STEPPING, Run
+from dynsim.kernels.integrate.tableaux import NODE_RADAU
 from dynsim.kernels.jit import internal_kernel, kernel, merged_kernel
 from dynsim.kernels.system import System
 from dynsim.kernels.tree.joints import normalise
@@ -35,11 +35,6 @@ def fill_dense(run: Run):
             d[1, j], d[2, j] = 0.0, 0.0
         elif run.method == RADAU5:
             d[1, j], d[2, j] = collocated(run.newton, j, d[0, j])
-        elif run.method == RODAS4:
-            d[1, j], d[2, j] = 0.0, 0.0
-            for s in range(5):
-                d[1, j] += D_RODAS[0, s] * k[1 + s, j]
-                d[2, j] += D_RODAS[1, s] * k[1 + s, j]
         else:
             d[1, j] = h * k[0, j] - d[0, j]
             d[2, j] = d[0, j] - h * k[6, j] - d[1, j]

@@ -8,8 +8,8 @@ Methods, all with dense output (so that records do not force steps):
 - ``DOPRI5``: Dormand–Prince 5(4), adaptive, six evaluations a step; dense output of order 4 (Hairer, Nørsett, Wanner:
   Solving Ordinary Differential Equations I, II.5–II.6). Better where accuracy sets the step;
 - ``RK4``: the classical method at a fixed step; cubic Hermite dense output;
-- ``RODAS4``: a linearly implicit (Rosenbrock) method of order 4(3), stiffly accurate, which keeps its order when the
-  inductance goes to zero (Hairer, Wanner: Solving Ordinary Differential Equations II, IV.7 and VI.4); adaptive;
+- ``RADAU5``: implicit, three stages of order 5 (order 3 in themselves), error estimate of order 3, adaptive: steps as
+  long as accuracy allows, however fast the motors are, see ``radau``; dense output of order 3;
 - ``TIME_STEPPING``: contacts that open and close within fixed steps, see ``time_stepping``; linear between their ends.
 
 After each accepted step q and v are projected onto the active rows when they have left them by more than
@@ -36,7 +36,6 @@ from dynsim.kernels.integrate.moreau import advance_moreau
 from dynsim.kernels.integrate.newton import forget
 from dynsim.kernels.integrate.project import off_surface, settle
 from dynsim.kernels.integrate.radau import after_step, step_radau5
-from dynsim.kernels.integrate.rosenbrock import step_rodas4
 from dynsim.kernels.integrate.run import (
     AT_START,
     DOPRI5,
@@ -49,9 +48,8 @@ from dynsim.kernels.integrate.run import (
     NOT_PROJECTED,
     PENDING,
     PROPOSED,
-    RK4,
     RADAU5,
-    RODAS4,
+    RK4,
     RUNNING,
     SEARCHING,
     STARTED,
@@ -223,21 +221,6 @@ def advance_explicit(system: System, ws: Workspace, run: Run, limit):
 
 
 @kernel
-def advance_rodas4(system: System, ws: Workspace, run: Run, limit):
-    """:func:`advance` of RODAS4."""
-    taken, error = 0, 0.0
-    while waiting(system, ws, run):
-        if taken >= limit or finished(run):
-            return
-        taken += 1
-        if run.count[PENDING] == 0:
-            propose(run)
-            error = step_rodas4(system, ws, run)
-        if conclude(system, ws, run, error, 4.0):
-            return
-
-
-@kernel
 def advance_radau5(system: System, ws: Workspace, run: Run, limit):
     """:func:`advance` of RADAU5."""
     taken, error = 0, 0.0
@@ -264,5 +247,5 @@ def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:
 
     Three compiled functions behind one name, so that each is only compiled when it is used.
     """
-    methods = {RODAS4: advance_rodas4, RADAU5: advance_radau5, TIME_STEPPING: advance_moreau}
+    methods = {RADAU5: advance_radau5, TIME_STEPPING: advance_moreau}
     methods.get(run.method, advance_explicit)(system, ws, run, limit)

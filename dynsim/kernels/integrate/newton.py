@@ -10,9 +10,11 @@ from dynsim.kernels.arrays import BLOCK_SIZE
 from dynsim.kernels.jit import internal_kernel
 
 # NewtonArrays.clock: step that the factors are of, that the stages are of, that the extrapolation is of [s];
-# contraction of Newton's method, and what it says of the error of the last iterate.
-FACTORED, TRIED, KEPT, CONTRACTION, LEVER = 0, 1, 2, 3, 4
-NEWTON_CLOCK_SIZE = 5
+# contraction of Newton's method, and what it says of the error of the last iterate; the error
+# that the last one may have, per tolerance.
+FACTORED, TRIED, KEPT, CONTRACTION, LEVER, CLOSE = 0, 1, 2, 3, 4, 5
+NEWTON_CLOCK_SIZE = 6
+CLOSE_ENOUGH = 0.03
 # NewtonArrays.count, int: the Jacobian must be made anew; accepted steps when it was made, and when the stages were
 # kept for extrapolation; there are such; Jacobians, factorisations, Newton iterations, steps in which they diverged.
 STALE, MADE_AT, SEEN, EXTRAPOLATES, JACOBIANS, FACTORS, ITERATIONS, DIVERGED = 0, 1, 2, 3, 4, 5, 6, 7
@@ -44,6 +46,8 @@ def newton_arrays(n: int, na: int, circuits: int, tracked: int, m: int) -> Newto
     """Allocate :class:`NewtonArrays`."""
     count = np.zeros(NEWTON_COUNT_SIZE, dtype=np.int64)
     count[STALE] = 1
+    clock = np.zeros(NEWTON_CLOCK_SIZE)
+    clock[CLOSE] = CLOSE_ENOUGH
     return NewtonArrays(
         along=np.zeros((2 * n + circuits, n)),
         linear=np.zeros((na, BLOCK_SIZE)),
@@ -59,7 +63,7 @@ def newton_arrays(n: int, na: int, circuits: int, tracked: int, m: int) -> Newto
         two=np.zeros(tracked, dtype=np.complex128),
         room_one=np.zeros((2, tracked)),
         room_two=np.zeros((2, tracked), dtype=np.complex128),
-        clock=np.zeros(NEWTON_CLOCK_SIZE),
+        clock=clock,
         count=count,
     )
 

@@ -21,6 +21,7 @@ import math
 from dynsim.kernels.arrays import CIRCUIT, DRIVEN, QDD, RATE_I, RATE_Q, RATE_V, Workspace
 from dynsim.kernels.drive.law import drive_block
 from dynsim.kernels.integrate.newton import (
+    CLOSE,
     CONTRACTION,
     DIVERGED,
     EXTRAPOLATES,
@@ -52,8 +53,8 @@ from dynsim.kernels.jit import internal_kernel, merged_kernel
 from dynsim.kernels.system import System, derivative
 from dynsim.kernels.tree.joints import displace, positions_along, rates_across
 
-# Newton's method: error of the last iterate per tolerance, most iterations, contraction below which the Jacobian stays.
-CLOSE_ENOUGH, MOST_ITERATIONS, GOOD_CONTRACTION = 0.03, 8, 0.05
+# Newton's method: most iterations, and the contraction below which the Jacobian stays.
+MOST_ITERATIONS, GOOD_CONTRACTION = 8, 0.05
 # What a step whose Newton's method diverges is said to be in error by: half of it is tried next.
 NO_STAGES = 10.5
 
@@ -207,7 +208,7 @@ def solve_stages(system: System, ws: Workspace, run: Run, h):
     tracked, before, contraction = r.kept.shape[1], 0.0, 0.0
     g, c = GAMMA_RADAU / h, complex(ALPHA_RADAU / h, BETA_RADAU / h)
     guess_stages(run, h)
-    lever = max(r.clock[LEVER], 1e-16) ** 0.8
+    lever, least = max(r.clock[LEVER], 1e-16) ** 0.8, 1 - r.count[EXTRAPOLATES]
     for k in range(MOST_ITERATIONS):
         for s in range(3):
             for j in range(tracked):
@@ -238,7 +239,7 @@ def solve_stages(system: System, ws: Workspace, run: Run, h):
             if contraction >= 0.99:
                 return False
             lever = contraction / (1.0 - contraction)
-            if lever * change * contraction ** (MOST_ITERATIONS - 2 - k) >= CLOSE_ENOUGH:
+            if lever * change * contraction ** (MOST_ITERATIONS - 2 - k) >= r.clock[CLOSE]:
                 return False
             r.clock[CONTRACTION] = contraction
         before = max(change, 1e-16)
@@ -248,7 +249,8 @@ def solve_stages(system: System, ws: Workspace, run: Run, h):
             r.w[2, j] += r.two[j].imag
             for s in range(3):
                 r.z[s, j] = T_RADAU[s, 0] * r.w[0, j] + T_RADAU[s, 1] * r.w[1, j] + T_RADAU[s, 2] * r.w[2, j]
-        if lever * change <= CLOSE_ENOUGH:
+        # The ledger adds up the derivatives of the last iterate but one: where nothing was known before, one more.
+        if lever * change <= r.clock[CLOSE] and k >= least:
             r.clock[LEVER] = lever
             return True
     return False
@@ -259,9 +261,7 @@ def estimate(system: System, ws: Workspace, run: Run, h, slope):
     """Norm of the error (γ/h − J)⁻¹ (f + Σ e_s Z_s / h), of order 3, into stage[7]; f is ``slope``."""
     r, error = run.newton, run.stage[7]
     for j in range(r.one.shape[0]):
-        r.one[j] = slope[j] + (
-            ERROR_RADAU[0] * r.z[0, j] + ERROR_RADAU[1] * r.z[1, j] + ERROR_RADAU[2] * r.z[2, j]
-        ) / h
+        r.one[j] = slope[j] + (ERROR_RADAU[0] * r.z[0, j] + ERROR_RADAU[1] * r.z[1, j] + ERROR_RADAU[2] * r.z[2, j]) / h
     solve_newton(system, ws, run.y, r, GAMMA_RADAU / h, r.real, r.pivot[0], r.one, r.room_one)
     for j in range(error.shape[0]):
         error[j] = r.one[j] if j < r.one.shape[0] else 0.0
