@@ -20,7 +20,7 @@ from __future__ import annotations
 import errno
 import select
 import termios
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -29,13 +29,15 @@ import serial
 from dynamixel_sdk import COMM_RX_TIMEOUT, COMM_SUCCESS, PortHandler, Protocol2PacketHandler
 
 from dynsim.hardware.bus.control_table import BROADCAST_ID, Field
-from dynsim.hardware.bus.packet import ALERT, HEADER, STATUS, Decoder, StatusError
+from dynsim.hardware.bus.packet import ALERT, HEADER, STATUS, Decoder, Packet, StatusError
 from dynsim.hardware.bus.protocol import BlockRead, NoAnswer, RequestRefused, ServoReply
 from dynsim.hardware.errors import PortError
 
 WRITE_TIMEOUT = 0.25
 READ_WAIT = 5e-4
 """Longest wait for a byte before time-outs are looked at [s]."""
+MARKS = 16
+"""Sync reads of one block after which an answer that was missed is not expected any more."""
 RETRIES = 2
 """Further attempts of a single read or write; the timed loop makes none."""
 TORQUE_ENABLE = 64
@@ -110,6 +112,31 @@ def latency_timer(port_name: str) -> int | None:
         return None
 
 
+class Marks:
+    """By how many bytes the next request for a block is longer, so that answers to earlier ones have a wrong length.
+
+    A status says whose it is, not what it answers: a servo that is two periods late would pass for one that is up to
+    date. Where all have answered nothing can come late, and nothing is longer; a request that somebody missed keeps its
+    length to itself for the next MARKS - 1 requests.
+    """
+
+    def __init__(self) -> None:
+        self._number = 0
+        self._missed: dict[int, int] = {}  # number of the request by its bytes more
+
+    def choose(self) -> int:
+        """For a request to be sent now."""
+        self._number += 1
+        if not self._missed:
+            return 0
+        self._missed = {extra: number for extra, number in self._missed.items() if self._number - number < MARKS}
+        return next(extra for extra in range(MARKS) if extra not in self._missed)
+
+    def miss(self, extra: int) -> None:
+        """Somebody has not answered the request sent last, which was ``extra`` bytes longer."""
+        self._missed[extra] = self._number
+
+
 class DynamixelBus:
     """Servos on one port.
 
@@ -128,6 +155,7 @@ class DynamixelBus:
         self.latency = latency
         self.return_delay = return_delay
         self._library = Protocol2PacketHandler()
+        self._marks: dict[int, Marks] = {}
 
     @property
     def name(self) -> str:
@@ -173,32 +201,41 @@ class DynamixelBus:
             raise PortError(f"{self.name}: {self._library.getTxRxResult(result)}")
 
     def sync_read(self, ids: Sequence[int], address: int, length: int) -> BlockRead:
+        marks = self._marks.setdefault(address, Marks())
+        extra = marks.choose()
+        asked = length + extra
         with self._transaction():
             stray = self.port.getBytesAvailable()
-            result = self._library.syncReadTx(self.port, address, length, list(ids), len(ids), False)
+            result = self._library.syncReadTx(self.port, address, asked, list(ids), len(ids), False)
             if result != COMM_SUCCESS:
                 raise PortError(f"{self.name}: {self._library.getTxRxResult(result)}")
-            answer_bytes = len(ids) * (11 + length)
+            answer_bytes = len(ids) * (11 + asked)
             milliseconds = self.port.tx_time_per_byte * (answer_bytes + 14 + len(ids))
             milliseconds += 1e3 * (len(ids) * (self.return_delay + 50e-6) + self.latency)
             self.port.setPacketTimeoutMillis(milliseconds)
             replies: dict[int, ServoReply] = {}
-            decoder = Decoder()
+            outdated: set[int] = set()
+            decoder, asked_of = Decoder(), frozenset(ids)
+
+            def sort_in(packets: Iterable[Packet]) -> None:
+                for packet in packets:
+                    # Requests echoed by the adapter are no status.
+                    if packet.instruction == STATUS and packet.id in asked_of:
+                        if len(packet.parameters) == asked:
+                            replies[packet.id] = ServoReply(packet.parameters[:length], bool(packet.error & ALERT))
+                        elif length <= len(packet.parameters) < length + MARKS:
+                            outdated.add(packet.id)
+
             while len(replies) < len(ids) and not self.port.isPacketTimeout():
-                for packet in decoder.feed(self.port.readPort(answer_bytes)):
-                    self._sort_in(packet, ids, length, replies)
+                sort_in(decoder.feed(self.port.readPort(answer_bytes)))
             # What came while this process was not running is here, however late it is.
             late = self.port.getBytesAvailable()
-            arrived = [*decoder.feed(self.port.readPort(late))] if late else []
-            for packet in [*arrived, *decoder.flush()]:
-                self._sort_in(packet, ids, length, replies)
-        return BlockRead(replies, stray + decoder.garbage)
-
-    @staticmethod
-    def _sort_in(packet: Any, ids: Sequence[int], length: int, replies: dict[int, ServoReply]) -> None:
-        # Requests echoed by the adapter are no status; a wrong length is a stale answer to another request.
-        if packet.instruction == STATUS and packet.id in ids and len(packet.parameters) == length:
-            replies[packet.id] = ServoReply(packet.parameters, bool(packet.error & ALERT))
+            if late:
+                sort_in(decoder.feed(self.port.readPort(late)))
+            sort_in(decoder.flush())
+        if len(replies) < len(ids):
+            marks.miss(extra)
+        return BlockRead(replies, stray + decoder.garbage, frozenset(outdated))
 
     def torque_off_all(self) -> None:
         for _ in range(3):

@@ -84,6 +84,7 @@ class Loop:
         self._cycles = 0
         self._sent: dict[int, int] = {}
         self._sent_at = math.nan
+        self._heard_at = math.inf
 
     def take_over(self, index: int, register: int, angle: float) -> None:
         """A servo was armed where it is: at the goal ``register``, at a joint angle [rad]."""
@@ -91,7 +92,21 @@ class Loop:
         self.goal[index] = self.measured[index] = angle
 
     def all_taken_over(self) -> None:
-        self._sent_at = self._clock.now()
+        """All are armed; from now on silence makes their watchdogs trip."""
+        self._sent_at = self._heard_at = self._clock.now()
+
+    def stall(self) -> Fault | None:
+        """The fault of having been silent for longer than the servos' watchdogs allow, until now."""
+        silence = self._clock.now() - self._heard_at
+        return self.rules.stall(silence) if self.rules.stalled(silence) else None
+
+    def now(self) -> float:
+        """[s]."""
+        return self._clock.now()
+
+    def pause(self, duration: float) -> None:
+        """Let a time pass [s]."""
+        self._clock.sleep_until(self._clock.now() + duration)
 
     def begin(self) -> None:
         """Deadlines count from now."""
@@ -135,11 +150,15 @@ class Loop:
         self.exchange(lateness, skipped, write=False)
 
     def _cycle(self, position: Array, velocity: Array, lateness: float, skipped: int) -> Cycle:
+        stall = self.stall()
+        if stall:
+            # Servos that stopped by themselves must not be sent to where they would be by now.
+            raise Stopped(stall)
         self.goal, self.goal_rate = position, velocity
         cycle = self.exchange(lateness, skipped, write=True)
-        fault = self.rules.examine(cycle)
-        if fault:
-            raise Stopped(fault)
+        faults = self.rules.examine(cycle)
+        if faults:
+            raise Stopped(*faults)
         return cycle
 
     def exchange(self, lateness: float, skipped: int, *, write: bool) -> Cycle:
@@ -169,6 +188,7 @@ class Loop:
             cycle.velocity[index] = servo.to_velocity(int.from_bytes(data[2:6], "little", signed=True))
             cycle.position[index] = servo.to_angle(int.from_bytes(data[6:10], "little", signed=True))
             cycle.alert[index] = reply.alert
+        cycle.outdated = tuple(block.outdated)
         self.measured = np.where(cycle.missed, self.measured, cycle.position)
         self._cycles += 1
         if self._cycles % self._health_every == 0:
@@ -177,9 +197,15 @@ class Loop:
             answer = self.bus.sync_read((servo.id,), *HEALTH_BLOCK).replies.get(servo.id)
             if answer is not None:
                 cycle.health[servo.id] = decode_health(servo, answer.data)
-        self._recorder.add(
+        now = self._clock.now()
+        if self._heard_at < math.inf:
+            cycle.silence, self._heard_at = max(began - self._heard_at, now - began), now
+        self._journal.guard(
+            "record",
+            self._recorder.add,
             time=began,
             path_time=self.following_time if self.path_started is not None else math.nan,
+            origin=math.nan if self.path_started is None else self.path_started,
             state=int(self._journal.state),
             exchange=exchange,
             stray=block.stray_bytes,
