@@ -362,6 +362,8 @@ def log_changes(system: System, ws: Workspace, run: Run):
             if now != OPEN:
                 tell(system, run, k, LANDING)
             elif unilateral.mode[k, STRUCK] == 1:
+                # It flies off from where it has landed, below its surface: there it is not to land again at once.
+                unilateral.slide[k, LANDS_AT] = AT_ROOT + max(0.0, -ws.contacts[k, GAP])
                 tell(system, run, k, BOUNCE)
         elif now == OPEN:
             tell(system, run, k, LIFT_OFF)
