@@ -344,12 +344,14 @@ def stop_servos(
 
         servo_map = load_servo_map(map_file) if map_file else None
         bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else survey.STOP_BAUD_RATES
-        torque = survey.stop_all(port, bauds, servo_map.ids if servo_map else ())
-    on = [id_ for id_, still_on in torque.items() if still_on]
-    if on or not torque:
-        who = f"ID {', '.join(map(str, on))}" if on else "any servo"
-        raise VerificationFailed(f"torque off was sent, but NOT confirmed by {who}: cut the power")
-    console.print(f"torque off, confirmed by {len(torque)} servos")
+        asked = survey.stop_all(port, bauds, servo_map.ids if servo_map else ())
+    on = [id_ for id_, still_on in asked.torque.items() if still_on]
+    # With a map everybody is known; without one those at a bit rate at which the port failed are not.
+    if on or not asked.torque or (asked.trouble and not servo_map):
+        who = f"ID {', '.join(map(str, on))}" if on else "everybody" if asked.torque else "any servo"
+        why = f" ({'; '.join(asked.trouble)})" if asked.trouble else ""
+        raise VerificationFailed(f"torque off was sent, but NOT confirmed by {who}: cut the power{why}")
+    console.print(f"torque off, confirmed by {len(asked.torque)} servos")
 
 
 @hw.command(epilog="Example: dynsim hw schema > servo_map.schema.json")

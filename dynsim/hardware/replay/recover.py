@@ -26,8 +26,8 @@ def recover(folder: Path) -> Record:
     """Make ``measured.h5`` and ``summary.json`` of a ``measured.part`` that was left over, and remove that.
 
     The record is marked incomplete. A summary that is there is of the same replay, which ended, and could not write its
-    record: what it says of the end is kept. A measured record that is already there is of the same replay (what an earlier one
-    left is moved away before), and whole: it stays.
+    record: what it says of the end is kept. A measured record that is already there is of the same replay too (what an
+    earlier one left is moved away before), and whole: it stays.
 
     Raises
     ------

@@ -30,7 +30,8 @@ def stop_on_signals(stop: StopRequest) -> Iterator[None]:
     """Signals only count up ``stop``: an exception out of a handler would tear a bus transaction in two.
 
     Ctrl-C counts every time; SIGTERM, SIGHUP, SIGQUIT (Ctrl-\\), SIGTSTP (Ctrl-Z, which would leave a moving robot
-    without goals) and all others by which a process ends ask for the controlled stop only. A SIGHUP that is ignored (``nohup``) stays so.
+    without goals) and all others by which a process ends ask for the controlled stop only. A SIGHUP
+    that is ignored (``nohup``) stays so.
     """
 
     def ask_once(*_: Any) -> None:
