@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from enum import StrEnum
@@ -176,7 +177,7 @@ def replay(
         from dynsim.hardware.errors import ServoMapError
         from dynsim.hardware.ports import VIRTUAL, bus_on
         from dynsim.hardware.replay.display import displayed
-        from dynsim.hardware.replay.session import run_replay
+        from dynsim.hardware.replay.session import run_replay, shown_by
         from dynsim.hardware.replay.signals import stop_on_signals
         from dynsim.hardware.replay.states import StopRequest
         from dynsim.hardware.virtual.faults import load_fault_script
@@ -193,28 +194,28 @@ def replay(
         if live and port != VIRTUAL:
             confirm_replay(console, servo_map, motion, port, asked=not yes)
         stop = StopRequest()
-        with stop_on_signals(stop), nullcontext() if quiet else displayed(console) as observer:
-            result = run_replay(
-                motion,
-                servo_map,
-                bus_on(port, servo_map, script=script, plant=robot),
-                folder,
-                policy=policy.value if policy else None,
-                live=moves,
-                write_eeprom=configure,
-                stop=stop,
-                observer=observer,
-                provenance={"port": port, "record": str(record), "simulated": simulated.provenance},
-            )
-    _print_timing(result)
-    if not moves:
-        print_limits(console, result.limits)
-        console.print("dry run: servos verified and the bus timed, nothing was moved; --live moves")
-        return
-    console.print(
-        f"replayed; torque {'ON, holding' if result.end_state == 'holding' else 'off'}; {folder / 'measured.h5'}"
-    )
-    console.print(f"compare: dynsim hw compare {record} {folder / 'measured.h5'}")
+        with shown_by({"standard output": sys.stdout}, folder) as lost:
+            with stop_on_signals(stop), nullcontext() if quiet else displayed(console, lost) as observer:
+                result = run_replay(
+                    motion,
+                    servo_map,
+                    bus_on(port, servo_map, script=script, plant=robot),
+                    folder,
+                    policy=policy.value if policy else None,
+                    live=moves,
+                    write_eeprom=configure,
+                    stop=stop,
+                    observer=observer,
+                    provenance={"port": port, "record": str(record), "simulated": simulated.provenance},
+                )
+            _print_timing(result)
+            if not moves:
+                print_limits(console, result.limits)
+                console.print("dry run: servos verified and the bus timed, nothing was moved; --live moves")
+                return
+            left = "ON, holding" if result.end_state == "holding" else "off"
+            console.print(f"replayed; torque {left}; {folder / 'measured.h5'}")
+            console.print(f"compare: dynsim hw compare {record} {folder / 'measured.h5'}")
 
 
 def _plant(scenario: str, variant: str | None, servo_map: Any, motion: Any) -> Any:

@@ -1,4 +1,4 @@
-"""`dynsim hw stop`: what goes wrong once torque off was sent is told as not confirmed, and stops nothing from being sent."""
+"""`dynsim hw stop`: what goes wrong once torque off was sent is told as not confirmed, and holds nothing up."""
 
 from __future__ import annotations
 
