@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import threading
+from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from dynsim.errors import RecordError
-from dynsim.hardware.errors import PortError
+from dynsim.hardware.errors import PortError, ReplayAborted
 from dynsim.hardware.replay import session
 from dynsim.hardware.replay.folder import move_away
 from dynsim.hardware.replay.loop import Loop
@@ -27,8 +28,8 @@ from dynsim.record import Record
 from .conftest import Rig
 
 
-def replay(rig: Rig, folder: Path, **options) -> ReplayResult:
-    run = rig.prepare(**options)
+def replay(rig: Rig, folder: Path, faults: Sequence[dict] = (), **options) -> ReplayResult:
+    run = rig.prepare(*faults, **options)
     motion = rig.motion()
     return run_replay(motion, rig.map, nullcontext((run.replay.bus, run.clock)), folder, live=True)
 
@@ -195,3 +196,30 @@ def test_a_killed_process_leaves_all_but_the_last_interval(rig: Rig, tmp_path: P
     recovered = recover(tmp_path / "killed")
     assert len(recovered) >= 150
     np.testing.assert_array_equal(recovered["q_goal"], result.record["q_goal"][: len(recovered)])
+
+
+def test_the_end_that_a_replay_has_told_is_kept(rig: Rig, tmp_path: Path, monkeypatch) -> None:
+    """Its record could not be written; its summary could."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(session, "replace_together", refuse)
+        with pytest.raises(ReplayAborted, match="measured record failed"):
+            replay(rig, tmp_path, faults=[{"kind": "overload", "id": 2, "at": 1.7}])
+    told = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    recovered = recover(tmp_path)
+    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    assert summary["end_state"] == "mixed: 2 holding; elbow limp: overload"
+    assert told["outputs_failed"].keys() == {"measured record"}
+    assert {name: summary[name] for name in told} == told
+    assert summary["recovered"]
+    assert summary["timing"]["cycles"] == len(recovered)
+    assert Record.load(tmp_path / "measured.h5").summary["servos"] == told["servos"]
+
+
+def test_a_summary_that_was_cut_off_says_nothing(streamed, tmp_path: Path) -> None:
+    (tmp_path / PART).write_bytes(streamed[1])
+    (tmp_path / "summary.json").write_text('{"end_state": "hol', encoding="utf-8")
+    assert recover(tmp_path).summary["end_state"] == "not known: the program died"
