@@ -76,6 +76,9 @@ class Limits(StrictModel):
     jerk : float
         Highest change of acceleration, averaged in magnitude over 0.1 s [rad/s³]
         (:meth:`dynsim.hardware.replay.trajectory.Path.jerk`). The default refuses a zigzag of 2 mrad every 5 ms.
+    shaking : float
+        Highest velocity that is gained and lost again within 0.3 s, or lost and gained [rad/s]
+        (:meth:`dynsim.hardware.replay.trajectory.Path.shaking`).
     """
 
     position_deg: tuple[Finite, Finite] | None = None
@@ -83,6 +86,7 @@ class Limits(StrictModel):
     torque: Positive
     acceleration: Positive = 2000.0
     jerk: Positive = 60_000.0
+    shaking: Positive = 3.0
 
 
 # For editors; what loading says about it is in _position_limits_fit_the_mode.
