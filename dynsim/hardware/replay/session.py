@@ -18,7 +18,8 @@ from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.run_log import RunLog
 from dynsim.hardware.replay.states import Progress, ReplayResult, StopRequest
 from dynsim.hardware.replay.stream import INTERVAL, PART, Background, RowStream
-from dynsim.hardware.servo_map import FaultPolicy, ServoMap
+from dynsim.hardware.safety import FaultPolicy
+from dynsim.hardware.servo_map import ServoMap
 
 Failures = dict[str, BaseException]
 
