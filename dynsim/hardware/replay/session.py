@@ -105,11 +105,15 @@ def _open_log(folder: Path) -> tuple[RunLog, Path | None]:
 
 
 def _stream(replay: Replay, log: RunLog, folder: Path) -> Background:
+    stream = None
     try:
         stream = RowStream(folder / PART, replay.recorder.rows, replay.layout, replay.motion.scene)
         background = Background([log, stream], INTERVAL)
     except (OSError, RuntimeError) as error:
-        log.close()
+        # What holds nothing would pass for a replay that died.
+        for outlet in (log, stream):
+            if outlet is not None:
+                outlet.discard()
         raise PortError(f"{folder}: cannot be written ({error}); nothing was moved") from error
     log.wake = background.wake
     return background
