@@ -31,7 +31,7 @@ from .conftest import MAP, Rig, swing
 F = MX_106.fields
 # A busy machine may not run the servos for a while: patience where a real robot would abort.
 PATIENT = MAP.replace("{baud: 1000000, rate: 100}", "{baud: 1000000, rate: 50, latency: 0.2}").replace(
-    "safety: {", "safety: {watchdog: 2.0, missed_cycles: 50, late_cycles: 1000, following_cycles: 50, "
+    "safety: {", "safety: {watchdog: 2.0, missed_cycles: 25, late_cycles: 25, following_cycles: 25, "
 )
 
 

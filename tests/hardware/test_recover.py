@@ -15,7 +15,7 @@ import pytest
 
 from dynsim.errors import RecordError
 from dynsim.hardware.errors import PortError, ReplayAborted
-from dynsim.hardware.replay import session
+from dynsim.hardware.replay import session, stream
 from dynsim.hardware.replay.folder import move_away
 from dynsim.hardware.replay.loop import Loop
 from dynsim.hardware.replay.recover import recover
@@ -89,7 +89,7 @@ def test_a_stream_cut_anywhere_keeps_its_whole_rows(streamed, rig: Rig, tmp_path
         if started:
             same(record, recovered, cut // size)
         (tmp_path / "measured.h5").unlink()
-    for cut in (0, 1, head // 2, head - 2):
+    for cut in (1, head // 2, head - 2):
         (tmp_path / PART).write_bytes(stream[:cut])
         with pytest.raises(RecordError, match="is no streamed record of a replay"):
             recover(tmp_path)
@@ -116,6 +116,37 @@ def test_a_record_that_is_whole_stays(streamed, tmp_path: Path) -> None:
 def test_nothing_to_recover(tmp_path: Path) -> None:
     with pytest.raises(RecordError, match="nothing to recover"):
         recover(tmp_path)
+
+
+def test_an_empty_stream_is_said_to_be_empty(tmp_path: Path) -> None:
+    (tmp_path / PART).touch()
+    with pytest.raises(
+        RecordError, match=r"measured\.part: is empty, the replay died before its first cycle: nothing to"
+    ):
+        recover(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [PART]
+
+
+def no_room(*_: object, **__: object) -> None:
+    raise OSError(28, "No space left on device")
+
+
+def no_thread(*_: object) -> None:
+    raise RuntimeError("can't start new thread")
+
+
+@pytest.mark.parametrize(
+    ("owner", "method", "fault"),
+    [(GrowingFile, "append", no_room), (threading.Thread, "start", no_thread), (stream, "lock", no_room)],
+)
+def test_a_refused_start_leaves_no_empty_files(rig: Rig, tmp_path: Path, monkeypatch, owner, method, fault) -> None:
+    run = rig.prepare()
+    (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
+    monkeypatch.setattr(owner, method, fault)
+    with pytest.raises(PortError, match="nothing was moved"):
+        run_replay(rig.motion(), rig.map, nullcontext((run.replay.bus, run.clock)), tmp_path, live=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    assert not run.sent
 
 
 def test_a_stream_of_another_version_is_refused(streamed, tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from dynsim.hardware.replay.journal import Journal
 from dynsim.hardware.replay.loop import FIELDS, Array, Loop
 from dynsim.hardware.replay.rules import Cause, Cycle, Fault
 from dynsim.hardware.replay.states import NOT_ARMED, UNARMED, ReplayResult, State
-from dynsim.hardware.servo_map import FaultPolicy
+from dynsim.hardware.safety import FaultPolicy
 
 REST_TIME = 1.0
 """Longest wait for the servos to stand still, and for silent ones to come back (a restart takes 0.3 s) [s]."""

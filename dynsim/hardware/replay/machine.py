@@ -35,7 +35,8 @@ from dynsim.hardware.replay.run_log import Recorder, RunLog
 from dynsim.hardware.replay.states import UNARMED, Progress, ReplayResult, State, Stopped, StopRequest
 from dynsim.hardware.replay.trajectory import Path
 from dynsim.hardware.replay.verify import Registers, all_registers, configure, verify
-from dynsim.hardware.servo_map import FaultPolicy, Servo, ServoMap
+from dynsim.hardware.safety import FaultPolicy
+from dynsim.hardware.servo_map import Servo, ServoMap
 
 APPROACH_ACCELERATION = 10.0
 """Profile acceleration the firmware is given for the move to the start [rad/s²]."""

@@ -32,7 +32,8 @@ def recover(folder: Path) -> Record:
     Raises
     ------
     RecordError
-        There is no streamed record, its replay is still running, or it cannot be read; or the record cannot be written.
+        There is no streamed record, it is empty, its replay is still running, or it cannot be read; or the record cannot
+        be written.
     """
     part = folder / PART
     try:
@@ -68,7 +69,10 @@ def _summary(path: Path) -> dict[str, Any]:
 
 
 def _read(part: Path) -> Record:
-    line, _, data = part.read_bytes().partition(b"\n")
+    content = part.read_bytes()
+    if not content:
+        raise RecordError(f"{part}: is empty, the replay died before its first cycle: nothing to recover, remove it")
+    line, _, data = content.partition(b"\n")
     try:
         header: dict[str, Any] = json.loads(line)
         layout = Layout(**header["layout"])

@@ -22,7 +22,8 @@ from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.run_log import RunLog
 from dynsim.hardware.replay.states import Progress, ReplayResult, StopRequest
 from dynsim.hardware.replay.stream import INTERVAL, PART, Background, RowStream
-from dynsim.hardware.servo_map import FaultPolicy, ServoMap
+from dynsim.hardware.safety import FaultPolicy
+from dynsim.hardware.servo_map import ServoMap
 
 Failures = dict[str, BaseException]
 
@@ -154,11 +155,15 @@ def _open_log(folder: Path) -> tuple[RunLog, Path | None]:
 
 
 def _stream(replay: Replay, log: RunLog, folder: Path) -> Background:
+    stream = None
     try:
         stream = RowStream(folder / PART, replay.recorder.rows, replay.layout, replay.motion.scene)
         background = Background([log, stream], INTERVAL)
     except (OSError, RuntimeError) as error:
-        log.close()
+        # What holds nothing would pass for a replay that died.
+        for outlet in (log, stream):
+            if outlet is not None:
+                outlet.discard()
         raise PortError(f"{folder}: cannot be written ({error}); nothing was moved") from error
     log.wake = background.wake
     return background
