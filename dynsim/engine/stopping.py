@@ -80,7 +80,7 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
             "other); lower contacts.friction, or take another posture"
         )
     if status == ki.CHATTER and (law := prepared.system.unilateral) is not None:
-        names = _listed(
+        at = _listed(
             prepared,
             law.tally[:, ku.CHATTERED] > 0.0,
             law.mode[:, ku.BEFORE] != law.mode[:, ku.WANTED],
@@ -89,8 +89,8 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
         # A mobile base cannot be stepped over: see prepare.
         stepping = "integrator.method: time_stepping, which goes on through it, or "
         return (
-            f"{where}: {'the' if names else 'a'} contact{names} opens and closes, or slips and sticks, without end; take "
-            f"{stepping if prepared.model.robot.base is None else ''}a larger integrator.atol"
+            f"{where}: {'the' if at else 'a'} contact{at} opens and closes, or slips and sticks, without end; "
+            f"take {stepping if prepared.model.robot.base is None else ''}a larger integrator.atol"
         )
     ws = prepared.workspace
     gaps = ws.rows[: ws.counts[ka.ROWS], ka.ROW_GAP]
