@@ -32,7 +32,7 @@ def recover(folder: Path) -> Record:
     Raises
     ------
     RecordError
-        There is no streamed record, it is empty, its replay is still running, or it cannot be read; or the record cannot
+        There is no streamed record, it is empty or cannot be read, or its replay is still running; or the record cannot
         be written.
     """
     part = folder / PART
