@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim._version import __version__
-from dynsim.contact_metrics import capped, chattered, modes, touched_stops
+from dynsim.contact_metrics import capped, chattered, coarse, modes, touched_stops
 from dynsim.kernels.constraint.unilateral import UnilateralArrays
 from dynsim.kernels.integrate.run import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, LOCAL_SINCE, PULLING
 from dynsim.measures import (
@@ -46,6 +46,8 @@ INTEGRALS = {
 
 # Those that runs under the unilateral law have beside them.
 LOSSES = {"loss_impact": "energy that impacts of contacts take", "loss_stop": "energy that impacts at joint stops take"}
+
+SCHEME = "energy that the steps of time stepping take; negative: that they make"
 
 DRIFT_LIMIT_M = 1e-9
 # Friction heat below zero by no more than this share of the turnover is rounding.
@@ -173,6 +175,7 @@ def summarise(
         "joint_loss_J": final("loss_joint"),
         "friction_heat_J": final("heat_friction"),
         **({} if counts.unilateral is None else {f"{key}_J": final(name) for key, name in _LOSS_KEYS.items()}),
+        **({} if counts.stepping is None else {"scheme_loss_J": final("loss_scheme")}),
         **_loads(record),
         "energy_turnover_J": turnover,
         "energy_residual_relative": residual / denominator if denominator > 0.0 else 0.0,
@@ -286,6 +289,7 @@ def _warnings(
         )
     if counts.stepping is not None:
         found.extend(capped(counts.stepping))
+        found.extend(coarse(counts.stepping, summary["energy_turnover_J"]))
     elif summary["constraint_drift_max_m"] > DRIFT_LIMIT_M:
         found.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
     if counts.deficient and counts.unilateral is None:

@@ -70,6 +70,8 @@ def make_record(
     if prepared.system.unilateral is not None:
         for integral, (name, text) in zip(run.states("loss").T, metrics.LOSSES.items(), strict=True):
             record.add(name, integral, "J", description=text)
+    if run.stepping is not None:
+        record.add("loss_scheme", run.states("scheme")[:, 0], "J", description=metrics.SCHEME)
     others = 0 if pushed is None else len(robot.bodies)
     shown = [*range(len(prepared.loads) - others), *(pushed or ())]
     if shown:
@@ -115,20 +117,24 @@ def make_record(
         support=np.zeros(0) if run.support is None else run.support.least,
         unilateral=prepared.system.unilateral,
         stops=tuple(prepared.stops),
-        stepping=None if run.stepping is None else _stepping(run.stepping.found),
+        stepping=None if run.stepping is None else _stepping(run),
     )
     record.summary = metrics.summarise(record, scenario, contacts, robot, counts)
     record.summary["warnings"] += beyond_stops(robot, prepared.stops, prepared.control)
     return record
 
 
-def _stepping(found: np.ndarray) -> dict[str, Any]:
+def _stepping(run: ki.Run) -> dict[str, Any]:
     """How well time stepping has solved its contact problems, and how deep points came to lie."""
+    assert run.stepping is not None
+    found = run.stepping.found
     return {
+        "step_s": float(run.clock[ki.STEP]),
         "contact_solves": int(found[time_stepping.SOLVES]),
         "long_solves": int(found[time_stepping.LONG_SOLVES]),
         "capped_solves": int(found[time_stepping.CAPPED]),
         "residual_max_m_s": float(found[time_stepping.WORST]),
+        "scheme_loss_worst_J": float(found[time_stepping.TAKEN]),
         "penetration_max_m": float(found[time_stepping.PENETRATION]),
     }
 

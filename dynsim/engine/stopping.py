@@ -78,8 +78,7 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
             f"{where}: no forces at {names} agree with Coulomb's law (Painlevé's paradox, or rows that contradict each "
             "other); lower contacts.friction, or take another posture"
         )
-    if status == ki.CHATTER:
-        law = prepared.system.unilateral
+    if status == ki.CHATTER and (law := prepared.system.unilateral) is not None:
         names = _listed(prepared, law.tally[:, ku.CHATTERED] > 0.0, law.mode[:, ku.BEFORE] != law.mode[:, ku.WANTED])
         return (
             f"{where}: the contact at {names} opens and closes, or slips and sticks, without end; take "

@@ -172,6 +172,7 @@ def replay(
     Ctrl-C once: controlled stop. Twice: torque off.
     """
     with _client_library():
+        from dynsim.hardware.dialog import confirm_replay, print_limits
         from dynsim.hardware.errors import ServoMapError
         from dynsim.hardware.ports import VIRTUAL, bus_on
         from dynsim.hardware.replay.display import displayed
@@ -189,8 +190,8 @@ def replay(
         for warning in motion.warnings:
             console.print(f"warning: {warning}")
         moves = live or port == VIRTUAL
-        if live and port != VIRTUAL and not yes:
-            _confirm(servo_map, motion)
+        if live and port != VIRTUAL:
+            confirm_replay(console, servo_map, motion, port, asked=not yes)
         stop = StopRequest()
         with stop_on_signals(stop), nullcontext() if quiet else displayed(console) as observer:
             result = run_replay(
@@ -207,6 +208,7 @@ def replay(
             )
     _print_timing(result)
     if not moves:
+        print_limits(console, result.limits)
         console.print("dry run: servos verified and the bus timed, nothing was moved; --live moves")
         return
     console.print(
@@ -220,22 +222,6 @@ def _plant(scenario: str, variant: str | None, servo_map: Any, motion: Any) -> A
 
     posture = dict(zip((servo.label for servo in servo_map.servos), motion.path.position[0], strict=True))
     return simulated_arm(scenario, variant, servo_map, posture)
-
-
-def _confirm(servo_map: Any, motion: Any) -> None:
-    from dynsim.hardware.errors import ReplayInterrupted
-
-    duration = (motion.path.end - motion.path.start) / motion.speed
-    console.print(
-        f"{servo_map.robot}: {len(servo_map.servos)} servos will move for {duration:.1f} s plus the way to the start."
-    )
-    console.print("Is everybody clear of the robot, and the power cut within reach?")
-    try:
-        agreed = typer.confirm("move?")
-    except typer.Abort:
-        agreed = False
-    if not agreed:
-        raise ReplayInterrupted("not confirmed; nothing was moved")
 
 
 def _print_timing(result: Any) -> None:
@@ -269,7 +255,7 @@ def compare(
     gate: Annotated[Path | None, typer.Option("--gate", help="YAML with bounds; exit code 5 beyond them")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="folder [that of MEASURED]")] = None,
 ) -> None:
-    """Delay, rms and largest error between a simulated and a measured run, with a figure."""
+    """Delay, rms and largest error between a simulated and a measured run, joints and wheels, with a figure."""
     from dynsim.hardware.replay.compare import check_gate, compare_records, draw_comparison, load_gate
     from dynsim.record import Record
 
@@ -286,6 +272,21 @@ def compare(
             "-" if joint.delay != joint.delay else f"{joint.delay * 1e3:.1f}",
         )
     console.print(table)
+    if comparison.wheels:
+        wheels = Table(
+            "wheel", "rate: rms [rad/s]", "max [rad/s]", "at [s]", "turned [rad]", "error: max [rad]", "at end"
+        )
+        for wheel in comparison.wheels:
+            wheels.add_row(
+                wheel.wheel,
+                f"{wheel.rate_rms:.4f}",
+                f"{wheel.rate_max:.4f}",
+                f"{wheel.time_of_max:.3f}",
+                f"{wheel.turned:.3f}",
+                f"{wheel.angle_max:.4f}",
+                f"{wheel.angle_end:+.4f}",
+            )
+        console.print(wheels)
     console.print(f"delay {comparison.delay * 1e3:.1f} ms, worst joint {comparison.worst.joint}")
     folder = out or measured.parent
     write_json(folder / "comparison.json", comparison.summary())
@@ -365,25 +366,45 @@ def calibrate(
     port: Port,
     joint: Annotated[list[str] | None, typer.Option("--joint", help="only this joint; may be repeated")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="write here instead of into the map")] = None,
+    nudge: Annotated[bool, typer.Option("--nudge", help="turn each joint 3° and back, to see its sense")] = False,
+    live: Annotated[bool, typer.Option("--live", help="really move (--nudge)")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="ask nothing, only report (--nudge)")] = False,
+    write: Annotated[bool, typer.Option("--write", help="write wrong senses into the map (--nudge)")] = False,
 ) -> None:
-    """Write the zero ticks: put the robot into its zero posture by hand (torque off), then run this."""
+    """Write the zero ticks: put the robot into its zero posture by hand (torque off), then run this.
+
+    With --nudge: find swapped senses instead, joint by joint.
+    """
     with _client_library():
-        from dynsim.hardware.calibrate import read_zero_ticks, write_zero_ticks
-        from dynsim.hardware.errors import ServoMapError
+        from dynsim.hardware.calibrate import read_zero_ticks, write_into_map
+        from dynsim.hardware.dialog import find_senses, may_write
+        from dynsim.hardware.errors import ServoMapError, VerificationFailed
         from dynsim.hardware.ports import bus_on
         from dynsim.hardware.servo_map import SHIPPED, load_servo_map
 
         servo_map = load_servo_map(map_file)
         target = out or servo_map.path
-        if target.resolve().parent == SHIPPED:
+        shipped = target.resolve().parent == SHIPPED
+        if shipped and (write or not nudge):
             raise ServoMapError(f"{target} comes with dynsim; write your own map with --out")
         unknown = [name for name in joint or () if name not in servo_map.joints]
         if unknown:
             raise ServoMapError(f"{map_file} has no joint {', '.join(unknown)}; it has {', '.join(servo_map.joints)}")
+        if nudge:
+            chosen = [servo for servo in servo_map.servos if servo.joint in (joint or servo_map.joints)]
+            signs, blocked = find_senses(console, servo_map, chosen, port, live=live, asked=not yes)
+            if signs and (write or (not shipped and may_write(console, list(signs), target))):
+                write_into_map(servo_map, "sign", signs, target)
+                console.print(f"written to {target}")
+            if blocked:
+                raise VerificationFailed(f"{', '.join(blocked)}: did not turn as told; is something in the way?")
+            return
+        if live or yes or write:
+            raise ServoMapError("--live, --yes and --write are for --nudge: zero ticks are read with the torque off")
         chosen = [servo for servo in servo_map.servos if (servo.joint in joint if joint else servo.in_position_mode)]
         with bus_on(port, servo_map) as (bus, _):
             ticks = read_zero_ticks(bus, chosen)
-        write_zero_ticks(servo_map, ticks, target)
+        write_into_map(servo_map, "zero_tick", ticks, target)
     table = Table("joint", "ID", "old zero", "new zero")
     for servo in chosen:
         table.add_row(servo.joint, str(servo.id), str(servo.zero_tick), str(ticks[servo.joint]))

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
-from dynsim.config import error_at, forbid_conversion
+from dynsim.config import error_at
 from dynsim.errors import shown
 from dynsim.hardware.bus.control_table import (
     BAUD_RATES,
@@ -27,9 +27,10 @@ from dynsim.hardware.bus.control_table import (
     OperatingMode,
     ServoModel,
 )
+from dynsim.hardware.data_sheet import objections_to_limits, objections_to_safety
 from dynsim.hardware.errors import ServoMapError
-from dynsim.inputs import is_file, parse_yaml, read_text
-from dynsim.problems import Origin, explain, unknown_keys
+from dynsim.hardware.strict_yaml import Finite, Positive, StrictModel, read_yaml
+from dynsim.inputs import is_file
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent / "scenarios" / "hardware"
@@ -37,20 +38,6 @@ SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else _PACKAGE / "shipped_scenarios" / 
 """Folder of the servo maps that come with dynsim."""
 
 FaultPolicy = Literal["hold", "decelerate", "off"]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-
-
-class StrictModel(BaseModel):
-    """Unknown keys are errors, and numbers neither texts nor true."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    @classmethod
-    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> Any:
-        schema = handler(source)
-        forbid_conversion(schema)
-        return schema
 
 
 class Follows(StrictModel):
@@ -83,11 +70,19 @@ class Limits(StrictModel):
         Highest joint speed [rad/s].
     torque : float
         Joint torque at which the replay aborts [N·m].
+    acceleration : float
+        Highest acceleration of the path, between samples too [rad/s²]. The default lets the start of the published
+        arm's record pass, which jumps to 2.6 rad/s within 5 ms; a joint that turns a load wants less.
+    jerk : float
+        Highest change of acceleration, averaged in magnitude over 0.1 s [rad/s³]
+        (:meth:`dynsim.hardware.replay.trajectory.Path.jerk`). The default refuses a zigzag of 2 mrad every 5 ms.
     """
 
     position_deg: tuple[Finite, Finite] | None = None
     velocity: Positive
     torque: Positive
+    acceleration: Positive = 2000.0
+    jerk: Positive = 60_000.0
 
 
 # For editors; what loading says about it is in _position_limits_fit_the_mode.
@@ -134,6 +129,16 @@ class Kind(StrictModel):
             raise error_at("limits", "a servo in position mode needs limits.position_deg: [lowest, highest]")
         if limits is not None and not limits[0] < limits[1]:
             raise error_at("limits.position_deg", f"{limits[0]} is not below {limits[1]}")
+        for key, text in objections_to_limits(
+            MODELS[self.model],
+            self.gear,
+            turns_to_angle=self.mode == "position",
+            position_deg=limits,
+            velocity=self.limits.velocity,
+            torque=self.limits.torque,
+            following_error=self.following_error,
+        ):
+            raise error_at(key, text)
         return self
 
 
@@ -199,6 +204,8 @@ class Safety(StrictModel):
         Acceleration of the stretch added where a record begins or ends in motion [rad/s²].
     approach_velocity : float
         Top speed of the move to the start posture [rad/s].
+    start_distance : float
+        A joint further than this from the start posture is asked about once more [rad].
     watchdog : float
         Servos stop by themselves when the bus is silent for this long [s].
     missed_cycles, late_cycles, following_cycles, torque_cycles : int
@@ -211,17 +218,44 @@ class Safety(StrictModel):
     """
 
     policy: FaultPolicy = "decelerate"
-    stop_time: Positive = 0.3
+    stop_time: Annotated[float, Field(gt=0, le=3.0)] = 0.3
     run_up: Positive = 2.0
     approach_velocity: Positive = 0.3
+    start_distance: Positive = 0.5
     watchdog: Annotated[float, Field(ge=0.02, le=2.54)] = 0.2
-    missed_cycles: Annotated[int, Field(ge=1)] = 3
-    late_cycles: Annotated[int, Field(ge=1)] = 5
-    following_cycles: Annotated[int, Field(ge=1)] = 5
-    torque_cycles: Annotated[int, Field(ge=1)] = 10
+    missed_cycles: Annotated[int, Field(ge=1, le=100)] = 3
+    late_cycles: Annotated[int, Field(ge=1, le=1000)] = 5
+    following_cycles: Annotated[int, Field(ge=1, le=100)] = 5
+    torque_cycles: Annotated[int, Field(ge=1, le=100)] = 10
     temperature_max: Positive = 65.0
     supply: Supply = Supply()
     at_end: Literal["off", "hold"] = "off"
+
+
+class Lifts(StrictModel):
+    """How wheel pairs that the record lifts are lifted.
+
+    Attributes
+    ----------
+    signal : str
+        Signal of the record with 1 where a wheel pair is on the ground, 0 where it is lifted.
+    joints : tuple of str
+        The pitch joints on the axles of the first, second, ... pair: every pair but the last has one. Lifting is added
+        to what they do otherwise; the first, on the axle that carries the head, follows the record and keeps the head
+        where it is.
+    clearance_mm : float
+        Height of the lower wheel of a lifted pair above the floor.
+    blend_s : float
+        Time to lift a pair, and to put it down [s of record time].
+    tilt_mm : float
+        A record is refused where one wheel of a grounded pair would be further above the floor: a bent base twists.
+    """
+
+    signal: str = "grounded"
+    joints: Annotated[tuple[str, ...], Field(min_length=1)]
+    clearance_mm: Positive = 5.0
+    blend_s: Positive = 0.3
+    tilt_mm: Positive = 2.5
 
 
 class _MapFile(StrictModel):
@@ -232,6 +266,7 @@ class _MapFile(StrictModel):
     robot: str
     bus: Bus = Bus()
     safety: Safety = Safety()
+    lifts: Lifts | None = None
     kinds: dict[str, Kind]
     servos: Annotated[dict[str, ServoEntry], Field(json_schema_extra={"minProperties": 1})]
 
@@ -240,12 +275,43 @@ class _MapFile(StrictModel):
         if not self.servos:
             raise error_at("servos", "the map names none")
         owner: dict[int, str] = {}
+        follower: dict[tuple[str, str], str] = {}
         for joint, entry in self.servos.items():
             if entry.kind not in self.kinds:
                 raise error_at(f"servos.{joint}.kind", f"is not one of {', '.join(self.kinds)}")
             if entry.id in owner:
                 raise error_at(f"servos.{joint}.id", f"is also the ID of {owner[entry.id]}")
             owner[entry.id] = joint
+            column = (self.kinds[entry.kind].follows.position, entry.label or joint)
+            if entry.hold_at_deg is None and (other := follower.setdefault(column, joint)) != joint:
+                raise error_at(f"servos.{joint}.label", f"{other} already follows {column[1]!r} of {column[0]!r}")
+        for joint in self.lifts.joints if self.lifts else ():
+            if joint not in self.servos:
+                raise error_at("lifts.joints", f"{joint} is none of the servos")
+            if self.kinds[self.servos[joint].kind].mode != "position" or self.servos[joint].hold_at_deg not in (
+                None,
+                0,
+            ):
+                raise error_at(
+                    "lifts.joints", f"{joint} must be in position mode and follow the record or be held at 0"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _safety_fits_the_servos(self) -> _MapFile:
+        safety, supply = self.safety, self.safety.supply
+        used = {name: self.kinds[name] for name in dict.fromkeys(entry.kind for entry in self.servos.values())}
+        models = [MODELS[kind.model] for kind in used.values()]
+        for key, text in objections_to_safety(models, safety.temperature_max, (supply.lowest, supply.highest)):
+            raise error_at(f"safety.{key}", text)
+        if self.bus.latency >= safety.watchdog:
+            raise error_at("bus.latency", "is not below safety.watchdog: one lost answer would trip the watchdogs")
+        for name, kind in used.items():
+            limits = kind.limits
+            if kind.mode == "position" and safety.approach_velocity > limits.velocity:
+                raise error_at("safety.approach_velocity", f"is above kinds.{name}.limits.velocity")
+            if (needed := limits.velocity / safety.stop_time) > limits.acceleration:
+                raise error_at("safety.stop_time", f"stops kinds.{name} with {needed:.4g} rad/s², above its limit")
         return self
 
 
@@ -323,6 +389,7 @@ class ServoMap:
     path : Path
     bus : Bus
     safety : Safety
+    lifts : Lifts or None
     servos : tuple of Servo
     """
 
@@ -331,6 +398,7 @@ class ServoMap:
         self.robot = content.robot
         self.bus = content.bus
         self.safety = content.safety
+        self.lifts = content.lifts
         self.servos = tuple(Servo(joint, entry, content.kinds[entry.kind]) for joint, entry in content.servos.items())
 
     @property
@@ -340,6 +408,14 @@ class ServoMap:
     @property
     def joints(self) -> tuple[str, ...]:
         return tuple(servo.joint for servo in self.servos)
+
+    @property
+    def lifting(self) -> dict[str, Any]:
+        """The entry ``lifts``, if there is one, with the columns of a record instead of the joints: for provenance."""
+        if self.lifts is None:
+            return {}
+        label = {servo.joint: servo.label for servo in self.servos}
+        return {"lifts": self.lifts.model_dump() | {"joints": [label[joint] for joint in self.lifts.joints]}}
 
 
 def load_servo_map(path: str | Path) -> ServoMap:
@@ -369,24 +445,3 @@ def json_schema() -> dict[str, Any]:
     limit is below the upper one. Loading checks these.
     """
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **_MapFile.model_json_schema()}
-
-
-_Schema = TypeVar("_Schema", bound=BaseModel)
-
-
-def read_yaml(path: Path, schema: type[_Schema], context: dict[str, Any] | None = None) -> _Schema:
-    """Read YAML into a pydantic model, whose validators are given ``context``.
-
-    Raises
-    ------
-    ServoMapError
-        Missing file, bad YAML or bad entry; the message holds file, line and key.
-    """
-    data = parse_yaml(read_text(path, ServoMapError), ServoMapError, str(path))
-    if not isinstance(data, dict):
-        raise ServoMapError(f"{path}: expected a mapping with the keys {', '.join(schema.model_fields)}")
-    try:
-        return schema.model_validate(data, context=context)
-    except ValidationError as error:
-        origin = Origin(path, (data,))
-        raise ServoMapError(explain(error, data, origin, unknown_keys(error, data, origin, schema))) from None

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynsim.errors import ModelError
 from dynsim.kernels import arrays as ka
@@ -91,6 +92,15 @@ def compile_unilateral(
     )
 
 
+def compile_grips(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float64]:
+    """Friction along an axis per that across, and the axis in the link's frame, (c, 4); 1 where it is isotropic."""
+    grips = np.ones((len(contacts), 4))
+    for row, contact in zip(grips, contacts, strict=True):
+        if contact.grip_axis is not None:
+            row[0], row[1:] = contact.grip, robot.attached_axes(contact.body) @ contact.grip_axis
+    return grips
+
+
 def joint_stops(robot: Robot) -> list[JointStop]:
     """The stops of a robot's joints: their finite limits, the lower one first.
 
@@ -108,7 +118,8 @@ def joint_stops(robot: Robot) -> list[JointStop]:
                     raise ModelError(
                         f"{link.joint}: starts at {told(robot.initial[k], link.units[0])}, beyond its stop at "
                         f"{told(limit, link.units[0])}; "
-                        "contacts.law: unilateral enforces it: change its initial position or its limit"
+                        "contacts.law: unilateral enforces it: change its initial position or its limit",
+                        keys=("plant",),
                     )
                 found.append(JointStop(link.joint, side, float(limit)))
     return found

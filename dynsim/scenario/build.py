@@ -217,6 +217,7 @@ def _unilateral(options: Contacts, point: ContactPoint) -> dict[str, Any]:
         "stribeck": options.stribeck_m_s or 0.0,
         "viscous_friction": options.viscous_friction_s_per_m,
         "restitution": options.restitution if point.restitution is None else point.restitution,
+        **({} if point.grip is None else {"grip": point.grip.ratio, "grip_axis": np.array(point.grip.axis)}),
     }
 
 

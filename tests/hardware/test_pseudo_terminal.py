@@ -8,8 +8,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from processes import Child, started, wait_for
 
 from dynsim.hardware.bus.control_table import MX_106
 from dynsim.hardware.bus.dynamixel_bus import DynamixelBus, open_serial_port
+from dynsim.hardware.bus.protocol import NoAnswer
 from dynsim.hardware.errors import PortError
 from dynsim.hardware.replay.states import State
 from dynsim.record import Record
@@ -81,9 +82,18 @@ class Servos:
 
     def torque(self) -> list[int]:
         bus = DynamixelBus(open_serial_port(str(self.device), 1_000_000, exclusive=False), latency=0.2)
-        values = [bus.read(id_, F["torque_enable"]) for id_ in (1, 2, 7)]
-        bus.close()
-        return values
+        try:
+            return [self._patiently(lambda id_=id_: bus.read(id_, F["torque_enable"])) for id_ in (1, 2, 7)]
+        finally:
+            bus.close()
+
+    @staticmethod
+    def _patiently(read: Callable[[], int]) -> int:
+        """A computer with too much to do may not run the servos for longer than a client waits."""
+        for _ in range(20):
+            with suppress(NoAnswer):
+                return read()
+        raise AssertionError("no answer, twenty times")
 
     def end(self) -> int:
         """Exit code after one Ctrl-C."""

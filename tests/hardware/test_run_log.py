@@ -1,5 +1,9 @@
 """The log of a replay must not keep the robot from being stopped."""
 
+import threading
+
+import pytest
+
 from dynsim.hardware.replay.run_log import RunLog
 from dynsim.hardware.replay.stream import Background
 
@@ -33,3 +37,45 @@ def test_a_full_disk_ends_the_file_and_not_the_run(tmp_path, monkeypatch):
     assert background.close() == {"log": log.failure}
     assert len(asked) == 1
     assert len(log.lines) == 2
+
+
+class Stuck:
+    """An outlet that never comes back, as a disk that is gone or a terminal that is held."""
+
+    name = "stuck"
+    failure: Exception | None = None
+
+    def __init__(self) -> None:
+        self.entered, self.freed = threading.Event(), threading.Event()
+
+    def pump(self) -> None:
+        self.entered.set()
+        self.freed.wait(60.0)
+
+    def close(self) -> None:
+        self.freed.wait(60.0)
+
+
+def test_an_outlet_that_does_not_come_back_is_named_and_not_waited_for(tmp_path):
+    stuck, log = Stuck(), RunLog(tmp_path / "replay.log")
+    background = Background([log, stuck], interval=0.001)
+    log.wake = background.wake
+    assert stuck.entered.wait(60.0)
+    log.write(1.0, "REPLAY", "one")  # waits for nobody
+    failures = background.close(patience=0.01)
+    assert set(failures) == {"stuck"}
+    assert isinstance(failures["stuck"], TimeoutError)
+    stuck.freed.set()
+    background._thread.join(60.0)
+    assert (tmp_path / "replay.log").read_text(encoding="utf-8").splitlines() == log.lines
+
+
+def test_where_the_system_gives_no_thread_the_outlets_are_closed(tmp_path, monkeypatch):
+    def none_left(_):
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", none_left)
+    log = RunLog(tmp_path / "replay.log")
+    with pytest.raises(RuntimeError):
+        Background([log], interval=0.001)
+    assert log._file._stream.closed

@@ -149,7 +149,7 @@ kinds:
     mode: {"velocity" if mode == "velocity" else "position"}
     gear: 2.0
     follows: {{position: q, velocity: v}}
-    limits: {{position_deg: [-40, 40], velocity: 4.0, torque: 6.0}}
+    limits: {{position_deg: [-40, 40], velocity: 3.5, torque: 6.0}}
     following_error: 0.25
 servos:
   joint_1: {{kind: swing, id: 1, sign: -1, zero_tick: 2048}}

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from processes import wait_for
 
-from dynsim.hardware.replay.recover import recover
 from dynsim.hardware.replay.states import State
 from dynsim.hardware.replay.stream import PART
 from dynsim.record import Record
@@ -159,7 +158,13 @@ def test_a_killed_replay_keeps_its_cycles(servos: Servos) -> None:
     plot = subprocess.run(command("plot", folder / "measured.h5"), capture_output=True, text=True, check=False)
     assert plot.returncode == 2
     assert f"dynsim hw recover {folder}" in " ".join(plot.stderr.split())
-    recovered = recover(folder)
+    recovery = subprocess.run(command("hw", "recover", folder), capture_output=True, text=True, check=False)
+    assert recovery.returncode == 0, recovery.stderr
+    assert ", incomplete: " in recovery.stdout
+    recovered = Record.load(folder / "measured.h5")
+    again = subprocess.run(command("hw", "recover", folder), capture_output=True, text=True, check=False)
+    assert again.returncode == 2
+    assert "nothing to recover" in again.stderr
     assert not recovered.complete
     assert recovered["state"][-1] == State.REPLAY
     assert np.isfinite(recovered["record_time"][-1])

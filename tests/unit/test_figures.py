@@ -230,7 +230,7 @@ def test_ledger_stack_adds_up_to_the_electrical_energy(braced: Record) -> None:
     total = max(y.max() for y in at_end) + min(y.min() for y in at_end)
     expected = braced["energy_electrical"] + braced["work_constraint"] - braced["energy_residual"]
     assert total == pytest.approx(expected[-1], rel=1e-12)
-    assert set(energy.TERMS) == {*measures.SINKS, *measures.IMPACT_SINKS, *metrics.STORES}
+    assert set(energy.TERMS) == {*measures.SINKS, *measures.MORE_SINKS, *metrics.STORES}
 
 
 def test_hand_path_panels_have_one_scale_and_all_points(braced: Record) -> None:

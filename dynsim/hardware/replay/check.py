@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 
 from dynsim.hardware.bus.control_table import HEALTH_BLOCK, STATE_BLOCK, TICKS_PER_TURN
 from dynsim.hardware.errors import CheckRefused
-from dynsim.hardware.replay.trajectory import Path, column_of, path_of_record
+from dynsim.hardware.replay.trajectory import JERK_WINDOW, LONG, Path, column_of, long_steps, path_of_record
 from dynsim.hardware.servo_map import Servo, ServoMap
 from dynsim.record import Record
 from dynsim.record.scene import Scene
@@ -24,10 +24,24 @@ TURNAROUND = 50e-6
 """Planned time per status beyond its bytes and return delay [s] (unverified; servos and adapter both contribute)."""
 USB_TRANSACTION = 1e-3
 """Planned cost of waiting for an answer through a USB adapter with its latency timer at 1 ms [s]."""
+WATCHDOG_CYCLES = 3
+"""The servos' watchdogs must outlast so many cycles."""
 BUS_SHARE = 0.97
 """Largest part of the period the bus may be busy."""
 
+Quantity = Literal["position", "velocity", "acceleration", "jerk", "torque"]
+UNITS: dict[Quantity, str] = {
+    "position": "rad",
+    "velocity": "rad/s",
+    "acceleration": "rad/s²",
+    "jerk": "rad/s³",
+    "torque": "N m",
+}
+SLOWED: dict[Quantity, int] = {"velocity": 1, "acceleration": 2, "jerk": 2}
+"""Power of the speed with which a quantity falls, or falls at least: the window over which a jerk is averaged holds
+less of a path that is run through more slowly."""
 
+SLOWEST_OFFERED = 0.01
 ROUNDING = 1e-9
 """A joint of a record that rests at its very limit may be off by rounding of this size; a tick is 1.5e-3 rad."""
 
@@ -38,7 +52,7 @@ class Margin:
 
     Attributes
     ----------
-    quantity : "position", "velocity" or "torque"
+    quantity : "position", "velocity", "acceleration", "jerk" or "torque"
     value, limit, margin : float
         SI; a negative margin is a violation.
     time : float
@@ -46,7 +60,7 @@ class Margin:
     """
 
     joint: str
-    quantity: Literal["position", "velocity", "torque"]
+    quantity: Quantity
     value: float
     limit: float
     margin: float
@@ -54,7 +68,7 @@ class Margin:
 
     @property
     def unit(self) -> str:
-        return {"position": "rad", "velocity": "rad/s", "torque": "N m"}[self.quantity]
+        return UNITS[self.quantity]
 
     def __str__(self) -> str:
         unit = self.unit
@@ -135,14 +149,20 @@ def check_motion(
     plan = plan_cycle(servo_map, rate if rate is not None else servo_map.bus.rate)
     path = path_of_record(record, servo_map)
     margins = _motion_margins(path, servo_map, speed) + _torque_margins(record, servo_map)
-    violations = [margin for margin in margins if margin.margin < -ROUNDING]
+    # What overflows to no number at all is no motion either.
+    violations = [margin for margin in margins if not margin.margin >= -ROUNDING]
     if violations:
         lines = [f"{len(violations)} limit(s) violated, nothing was sent:", *(f"  {entry}" for entry in violations)]
-        if all(entry.quantity == "velocity" for entry in violations):
-            slower = speed * min(entry.limit / abs(entry.value) for entry in violations)
-            lines.append(f"  --speed {math.floor(100 * slower) / 100:g} would pass")
+        if all(entry.quantity in SLOWED for entry in violations):
+            slower = speed * min(
+                (entry.limit / abs(entry.value)) ** (1 / SLOWED[entry.quantity]) for entry in violations
+            )
+            if slower >= SLOWEST_OFFERED:
+                lines.append(f"  --speed {math.floor(100 * slower) / 100:g} would pass")
         raise CheckRefused("\n".join(lines))
     warnings = [] if record.complete else ["the record is marked incomplete: it ends before its scenario does"]
+    if missing := long_steps(record, LONG):
+        warnings.append(f"{len(missing)} sample(s) of the record may be missing: {missing[0]}")
     return CheckedMotion(path, speed, plan, tuple(margins), tuple(warnings), record.scene)
 
 
@@ -156,6 +176,11 @@ def plan_cycle(servo_map: ServoMap, rate: float) -> CyclePlan:
     """
     if not (math.isfinite(rate) and rate > 0):
         raise CheckRefused(f"--rate must be positive, not {rate}")
+    if rate * servo_map.safety.watchdog < WATCHDOG_CYCLES:
+        raise CheckRefused(
+            f"at {rate:g} Hz the servos' watchdogs of {servo_map.safety.watchdog:g} s would trip within "
+            f"{WATCHDOG_CYCLES} cycles. Use --rate {math.ceil(WATCHDOG_CYCLES / servo_map.safety.watchdog)} or more"
+        )
     count = len(servo_map.servos)
     groups = [sum(servo.in_position_mode is mode for servo in servo_map.servos) for mode in (True, False)]
     written = sum(14 + 5 * members for members in groups if members)
@@ -176,6 +201,12 @@ def plan_cycle(servo_map: ServoMap, rate: float) -> CyclePlan:
 
 def _motion_margins(path: Path, servo_map: ServoMap, speed: float) -> list[Margin]:
     extremes = path.extremes()
+    # The window is one of the robot's time, of which `speed` seconds of the path pass in a second.
+    jerk, jerk_time = path.jerk(JERK_WINDOW * speed)
+    with np.errstate(over="ignore"):
+        velocity = speed * extremes.velocity
+        acceleration = speed * (speed * extremes.acceleration)
+        jerk = speed * (speed * (speed * jerk))
     margins = []
     for column, servo in enumerate(servo_map.servos):
         if servo.in_position_mode:
@@ -186,19 +217,22 @@ def _motion_margins(path: Path, servo_map: ServoMap, speed: float) -> list[Margi
                 margins.append(_margin(servo, "position", position[below], low, position[below] - low, at[below]))
             else:
                 margins.append(_margin(servo, "position", position[above], high, high - position[above], at[above]))
-        velocity = extremes.velocity[..., column].ravel() * speed
-        at = extremes.velocity_time[..., column].ravel()
-        fastest = int(np.abs(velocity).argmax())
-        limit = velocity_limit(servo)
-        margins.append(
-            _margin(servo, "velocity", velocity[fastest], limit, limit - abs(velocity[fastest]), at[fastest])
-        )
+        limits = servo.kind.limits
+        for quantity, values, times, limit in (
+            ("velocity", velocity, extremes.velocity_time, velocity_limit(servo)),
+            ("acceleration", acceleration, extremes.acceleration_time, limits.acceleration),
+            ("jerk", jerk, jerk_time, limits.jerk),
+        ):
+            of_joint, at = values[..., column].ravel(), times[..., column].ravel()
+            worst = int(np.abs(of_joint).argmax())
+            value = of_joint[worst]
+            margins.append(_margin(servo, cast(Quantity, quantity), value, limit, limit - abs(value), at[worst]))
     return margins
 
 
 def _margin(
     servo: Servo,
-    quantity: Literal["position", "velocity", "torque"],
+    quantity: Quantity,
     value: float,
     limit: float,
     margin: float,

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -238,17 +237,23 @@ class Ending:
         """Watchdogs off, so that the robot keeps holding when this program has gone. Raises PortError."""
         loop = self._loop
         health = read_health(loop.bus, self._servos)
+        unconfirmed = []
         for index, servo in enumerate(self._servos):
             if loop.stop.for_release:
                 return self._release()
-            # One that does not take it will be read to be silent, or to have been stopped by its watchdog.
-            with suppress(NoAnswer, RequestRefused):
+            try:
                 loop.bus.write(servo.id, FIELDS["bus_watchdog"], 0)
+            except (NoAnswer, RequestRefused) as error:
+                unconfirmed.append(f"{servo.joint}: {error}")
             registers = health.get(servo.id)
             if registers and registers["bus_watchdog"] == -1:
                 # It stopped by itself, and took no goal until now.
                 loop.measured[index] = servo.to_angle(registers["present_position"])
                 self._hold_measured([index])
+        if unconfirmed:
+            self._journal.say(
+                f"watchdogs not confirmed to be off, they may stop these servos: {'; '.join(unconfirmed)}"
+            )
         return self._journal.say("servos that are on stay ON; `dynsim hw stop` releases them")
 
     def _release(self) -> None:

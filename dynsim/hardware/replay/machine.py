@@ -27,7 +27,8 @@ from dynsim.hardware.replay.folder import REGISTERS, REGISTERS_AFTER_FAULT
 from dynsim.hardware.replay.journal import Journal
 from dynsim.hardware.replay.loop import FIELDS, Loop
 from dynsim.hardware.replay.measured import describe
-from dynsim.hardware.replay.motion import Approach
+from dynsim.hardware.replay.motion import QUINTIC_PEAK, Approach
+from dynsim.hardware.replay.registers import difference_lines
 from dynsim.hardware.replay.rows import Layout, measured_record, timing_of
 from dynsim.hardware.replay.rules import Cause, Fault, watchdog_units
 from dynsim.hardware.replay.run_log import Recorder, RunLog
@@ -104,7 +105,7 @@ class Replay:
         self.stop = stop or StopRequest()
         self._dump_folder = dump_folder
         self._provenance = {"robot": servo_map.robot, "speed": motion.speed, "rate_Hz": motion.plan.rate}
-        self._provenance |= provenance or {}
+        self._provenance |= servo_map.lifting | (provenance or {})
         self._servos = servo_map.servos
         self._found_holding = False
         self.recorder = Recorder(servo_map)
@@ -150,7 +151,10 @@ class Replay:
         self.journal.enter(State.VERIFY)
         if self.write_eeprom:
             configure(self.bus, self.map, self.journal.say)
-        problems = verify(self.bus, self.map, self.motion, poll=self.stop.check)
+        problems, limits = verify(self.bus, self.map, self.motion, poll=self.stop.check)
+        self.result.limits = tuple(limits)
+        for line in difference_lines(limits):
+            self.journal.say(line)
         self._dump(self._read_registers(), REGISTERS)
         if problems:
             raise Stopped(Fault(Cause.VERIFICATION, "\n  ".join([f"{len(problems)} problem(s):", *problems])))
@@ -193,7 +197,7 @@ class Replay:
         in_position_mode = np.array([servo.in_position_mode for servo in self._servos])
         goal = np.where(in_position_mode, self.motion.path.position[0], here)
         distance = float(np.abs(goal - here).max())
-        duration = max(1.875 * distance / self.map.safety.approach_velocity, self.loop.period)
+        duration = max(QUINTIC_PEAK * distance / self.map.safety.approach_velocity, self.loop.period)
         self.journal.enter(State.MOVE_TO_START)
         self.journal.say(f"{distance:.3f} rad in {duration:.1f} s")
         self.loop.begin()

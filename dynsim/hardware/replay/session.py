@@ -159,11 +159,9 @@ def raise_for(result: ReplayResult, folder: Path, failures: Failures) -> None:
         unconfirmed = f"; torque off NOT confirmed by ID {', '.join(map(str, result.torque_still_on))}"
     left = f"robot left {result.end_state}{unconfirmed}; see {folder / LOG}{'; ' + lost if lost else ''}"
     if fault.cause == Cause.INTERRUPTED:
-        others = "".join(f"{other.cause}: {other.text}; " for other in result.faults[1:])
-        raise ReplayInterrupted(f"interrupted in {state.name}; {others}{left}", result=result)
+        raise ReplayInterrupted(f"{result.fault_text}; {left}", result=result)
     if fault.cause == Cause.VERIFICATION:
         raise VerificationFailed(fault.text)
     if fault.cause == Cause.PORT and result.end_state == "not armed":
         raise PortError(fault.text)
-    others = "".join(f"; {other.cause}: {other.text}" for other in result.faults[1:])
-    raise ReplayAborted(f"{fault.cause} in {state.name}: {fault.text}{others}; {left}", result=result)
+    raise ReplayAborted(f"{result.fault_text}; {left}", result=result)

@@ -8,6 +8,7 @@ from enum import IntEnum
 from typing import Any
 
 from dynsim.hardware.replay.end_state import ServoEnd
+from dynsim.hardware.replay.registers import LimitRow
 from dynsim.hardware.replay.rows import TimingStatistics
 from dynsim.hardware.replay.rules import Cause, Fault
 from dynsim.record import Record
@@ -96,6 +97,8 @@ class ReplayResult:
     timing : TimingStatistics | None
     torque_still_on : tuple of int
         IDs that did not confirm torque off.
+    limits : tuple of LimitRow
+        Limits that the servos have stored, beside the map's.
     """
 
     end_state: str = NOT_ARMED
@@ -107,6 +110,7 @@ class ReplayResult:
     record: Record = field(default_factory=lambda: Record([]))
     timing: TimingStatistics | None = None
     torque_still_on: tuple[int, ...] = ()
+    limits: tuple[LimitRow, ...] = ()
 
     @property
     def fault(self) -> Fault | None:
@@ -115,8 +119,10 @@ class ReplayResult:
 
     @property
     def fault_text(self) -> str:
-        """All causes and what is known of them, the first one first; empty without a fault."""
-        return "; ".join(f"{fault.cause}: {fault.text}" for fault in self.faults)
+        """All faults in words, the first one with the state it struck in; empty without one."""
+        first = f" in {self.fault_state.name}" if self.fault_state is not None else ""
+        texts = [f"{fault.cause}{'' if number else first}: {fault.text}" for number, fault in enumerate(self.faults)]
+        return "; ".join(texts)
 
     def summary(self) -> dict[str, Any]:
         """How it ended, for ``summary.json``."""

@@ -37,7 +37,11 @@ class GrowingFile:
     def __init__(self, path: Path) -> None:
         # Not buffered: what a buffer still holds would be tried again, and fail again, when it is closed.
         self._stream = path.open("xb", buffering=0)
-        lock(self._stream.fileno(), wait=False)
+        try:
+            lock(self._stream.fileno(), wait=False)
+        except OSError:
+            self._stream.close()
+            raise
 
     def append(self, data: bytes) -> None:
         """Raises OSError."""

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dynsim.hardware.bus.control_table import MAX_ID
 from dynsim.hardware.virtual.registers import ServoRegisters
 
@@ -19,13 +22,13 @@ class Hearing:
         By the ID they have now; more than one where they share it.
     by_shadow : dict of int to list of int
         By their secondary ID: they obey what is written to it, and do not answer.
-    members : list of int
+    members : int array
         Their places in the order of the line.
     """
 
     by_id: dict[int, list[int]] = field(default_factory=dict)
     by_shadow: dict[int, list[int]] = field(default_factory=dict)
-    members: list[int] = field(default_factory=list)
+    members: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
 class Addresses:
@@ -38,16 +41,19 @@ class Addresses:
     def sort(self) -> None:
         """Take over what the registers say now."""
         self._hearing: dict[tuple[int, int], Hearing] = {}
+        self._protocols: dict[int, tuple[int, ...]] = {}
         for place, (first_id, registers) in enumerate(self._servos.items()):
-            hearing = self._hearing.setdefault((registers.baud, registers["protocol"]), Hearing())
-            hearing.members.append(place)
+            baud, protocol = registers.baud, registers["protocol"]
+            hearing = self._hearing.setdefault((baud, protocol), Hearing())
+            hearing.members = np.append(hearing.members, place)
+            self._protocols[baud] = tuple({*self._protocols.get(baud, ()), protocol})
             hearing.by_id.setdefault(registers["id"], []).append(first_id)
             if registers["shadow_id"] <= MAX_ID and registers["shadow_id"] != registers["id"]:
                 hearing.by_shadow.setdefault(registers["shadow_id"], []).append(first_id)
 
-    def protocols(self, baud: int) -> list[int]:
+    def protocols(self, baud: int) -> tuple[int, ...]:
         """Protocols of the servos that are set to a bit rate [bit/s]; none where nobody is."""
-        return [protocol for rate, protocol in self._hearing if rate == baud]
+        return self._protocols.get(baud, ())
 
     def hearing(self, baud: int, protocol: int) -> Hearing:
         """Those who understand a packet."""

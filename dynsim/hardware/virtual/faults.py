@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationInfo, model_validator
 
 from dynsim.config import error_at
-from dynsim.hardware.servo_map import StrictModel, read_yaml
+from dynsim.hardware.strict_yaml import StrictModel, read_yaml
 
 Probability = Annotated[float, Field(ge=0, le=1)]
 

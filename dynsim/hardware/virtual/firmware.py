@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from dynsim.hardware.bus.control_table import BROADCAST_ID, EEPROM_END, RAD_S_PER_UNIT
@@ -36,16 +36,16 @@ class Answer(NamedTuple):
     chained: bool = False
 
 
-def together(frames: Mapping[int, bytes]) -> Answer:
-    """Several servos answer at once: both drive the line, and a zero bit wins (unverified)."""
+def together(frames: Sequence[tuple[int, bytes]]) -> Answer:
+    """Servos that answer at once, each with its frame: all drive the line, and a zero bit wins (unverified)."""
     if len(frames) == 1:
-        ((servo, frame),) = frames.items()
+        servo, frame = frames[0]
         return Answer((servo,), frame)
-    line = bytearray(max(frames.values(), key=len))
-    for frame in frames.values():
+    line = bytearray(max((frame for _, frame in frames), key=len))
+    for _, frame in frames:
         for k, byte in enumerate(frame):
             line[k] &= byte
-    return Answer(tuple(frames), bytes(line))
+    return Answer(tuple(servo for servo, _ in frames), bytes(line))
 
 
 class Firmware:
@@ -60,11 +60,11 @@ class Firmware:
 
     def awake(self, hearing: Hearing, id_: int) -> list[int]:
         """Servos that have an ID and are not dead, off or starting."""
-        return [servo for servo in hearing.by_id.get(id_, ()) if self.servos.listens(servo)]
+        return list(filter(self.servos.listens, hearing.by_id.get(id_, ())))
 
     def shadows(self, hearing: Hearing, id_: int) -> list[int]:
         """Servos of which it is the secondary ID."""
-        return [servo for servo in hearing.by_shadow.get(id_, ()) if self.servos.listens(servo)]
+        return list(filter(self.servos.listens, hearing.by_shadow.get(id_, ())))
 
     def write(self, servo: int, address: int, data: bytes) -> StatusError:
         return self.servos.write(servo, address, data)
@@ -131,9 +131,11 @@ class Protocol2:
                 yield from self._answers_of_each(packet, hearing)
 
     def _write_silently(self, id_: int, address: int, data: bytes, hearing: Hearing) -> None:
-        shadows = self._firmware.shadows(hearing, id_) if address >= EEPROM_END else []
-        for servo in [*self._firmware.awake(hearing, id_), *shadows]:
-            self._firmware.write(servo, address, data)
+        for servo in self._firmware.awake(hearing, id_):
+            self._servos.write(servo, address, data)
+        if hearing.by_shadow and address >= EEPROM_END:
+            for servo in self._firmware.shadows(hearing, id_):
+                self._servos.write(servo, address, data)
 
     def _answers_of_each(self, packet: Packet, hearing: Hearing) -> Iterator[Answer]:
         broadcast = packet.id == BROADCAST_ID
@@ -142,11 +144,11 @@ class Protocol2:
                 self._reply(servo, packet.id, packet)
         # A list: the instruction may give a servo another ID.
         for id_ in sorted(hearing.by_id) if broadcast else [packet.id]:
-            frames = {}
+            frames = []
             for servo in self._firmware.awake(hearing, id_):
                 reply = self._reply(servo, id_, packet)
                 if reply and (not broadcast or packet.instruction == Instruction.PING):
-                    frames[servo] = encode(reply)
+                    frames.append((servo, encode(reply)))
             if frames:
                 yield together(frames)
 
@@ -185,8 +187,8 @@ class Protocol2:
 
     def _read_many(self, entries: Sequence[tuple[int, int, int]], hearing: Hearing) -> Iterator[Answer]:
         for id_, address, length in entries:
-            replies = {servo: self._read(servo, id_, address, length) for servo in self._firmware.awake(hearing, id_)}
-            if frames := {servo: encode(reply) for servo, reply in replies.items() if reply}:
+            replies = [(servo, self._read(servo, id_, address, length)) for servo in self._firmware.awake(hearing, id_)]
+            if frames := [(servo, encode(reply)) for servo, reply in replies if reply]:
                 yield together(frames)
 
     def _fast_read(self, entries: Sequence[tuple[int, int, int]], hearing: Hearing) -> Iterator[Answer]:

@@ -83,11 +83,11 @@ class Protocol1:
             return
         broadcast = packet.id == BROADCAST_ID
         for id_ in sorted(hearing.by_id) if broadcast else [packet.id]:
-            frames = {}
+            frames = []
             for servo in self._firmware.awake(hearing, id_):
                 frame = self._reply(servo, id_, packet)
                 if frame and (not broadcast or packet.instruction == Instruction.PING):
-                    frames[servo] = frame
+                    frames.append((servo, frame))
             if frames:
                 yield together(frames)
 

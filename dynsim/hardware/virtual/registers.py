@@ -87,18 +87,20 @@ class ServoRegisters:
         """Write consecutive items, all or none."""
         if not data or address + len(data) > TABLE_SIZE:
             return StatusError.ACCESS
-        targets = [self._resolve(a) for a in range(address, address + len(data))]
+        end = address + len(data)
+        direct = end <= INDIRECT_BLOCKS[0][0]
+        targets = range(address, end) if direct else [self._resolve(a) for a in range(address, end)]
         pending: list[tuple[str, int]] = []
         position = 0
         while position < len(targets):
             start = targets[position]
-            if self._is_pointer(start):
+            if not direct and self._is_pointer(start):
                 if self["torque_enable"]:
                     return StatusError.ACCESS
                 self._table[start] = data[position]
                 position += 1
                 continue
-            if start == address + position and self._is_indirect_data(start):
+            if not direct and start == address + position and self._is_indirect_data(start):
                 self._table[start] = data[position]
                 position += 1
                 continue
@@ -106,7 +108,7 @@ class ServoRegisters:
             if name is None:
                 return StatusError.ACCESS
             field = self.model.fields[name]
-            if targets[position : position + field.size] != list(range(start, start + field.size)):
+            if [*targets[position : position + field.size]] != [*range(start, start + field.size)]:
                 return StatusError.DATA_LENGTH
             value = field.decode(data[position : position + field.size])
             error = self._objection(name, field, value)
