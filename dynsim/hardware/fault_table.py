@@ -11,10 +11,13 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import random
+import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -32,6 +35,7 @@ from dynsim.hardware.replay.end_state import SILENT
 from dynsim.hardware.replay.machine import Replay
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.states import Progress, ReplayResult, State, StopRequest
+from dynsim.hardware.replay.trajectory import path_of_record
 from dynsim.hardware.servo_map import FaultPolicy, ServoMap, load_servo_map
 from dynsim.hardware.virtual.faults import FaultScript
 from dynsim.hardware.virtual.line import VirtualLine, line_for_map
@@ -224,7 +228,9 @@ def rig() -> Rig:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "rig.yaml")
         path.write_text(MAP, encoding="utf-8")
-        return Rig(load_servo_map(path), swing(0.6), {"shoulder": 0.05, "elbow": 0.25})
+        servo_map, record = load_servo_map(path), swing(0.3)
+    start = path_of_record(record, servo_map).position[0]
+    return Rig(servo_map, record, {"shoulder": float(start[0]) + 0.04, "elbow": float(start[1]) - 0.03})
 
 
 @dataclass(frozen=True)
@@ -365,12 +371,17 @@ class Cell:
 
 
 def cells(runs: int, cases: Iterable[Case] = CASES, first: int = 0) -> Iterator[Cell]:
-    """All cells of these faults, with so many runs each."""
+    """All cells of these faults, with so many runs each, of the seeds from ``first`` on."""
     for case in cases:
         for state in STATES if case.scripted_onset else (State.VERIFY.name,):
             for policy in POLICIES:
                 outcomes = [strike(case, state, policy, seed) for seed in range(first, first + runs)]
                 yield Cell(case.name, state, policy, outcomes)
+
+
+def _cells_of(job: tuple[Case, int]) -> list[dict[str, Any]]:
+    case, runs = job
+    return [cell.as_dict() for cell in cells(runs, [case])]
 
 
 def markdown(table: list[dict[str, Any]]) -> str:
@@ -386,10 +397,11 @@ def markdown(table: list[dict[str, Any]]) -> str:
             every = [cell for row in rows for cell in row]
             cycles = [cell["cycles_max"] for cell in every if cell["cycles_max"] is not None]
             states = ", ".join(row[0]["state"] for row in rows)
+            text = next((cell["text"] for cell in every if f"in {State.REPLAY.name}" in cell["text"]), every[0]["text"])
             goals = "/".join(str(max(row[k]["goal_packets_max"] for row in rows)) for k in range(len(POLICIES)))
             lines.append(
                 f"| `{case}` | {states} | {' | '.join(ends)} | {max(cycles) if cycles else '–'} | {goals} | "
-                f"{every[0]['text'].splitlines()[0]} |"
+                f"{text.splitlines()[0]} |"
             )
     return "\n".join(lines)
 
@@ -406,12 +418,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=100, help="of each cell [100]")
     parser.add_argument("--out", type=Path, help="keep the numbers there (JSON)")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes [all processors]")
     arguments = parser.parse_args()
     table = []
-    for cell in cells(arguments.runs):
-        table.append(cell.as_dict())
-        for text in table[-1]["broken"]:
-            print(f"BROKEN: {cell.case} in {cell.state}, {cell.policy}: {text}")
+    with ProcessPoolExecutor(arguments.jobs) as pool:
+        jobs = [(case, arguments.runs) for case in CASES]
+        for done, found in enumerate(pool.map(_cells_of, jobs), start=1):
+            table += found
+            print(f"{done} of {len(CASES)} faults: {CASES[done - 1].name}", file=sys.stderr, flush=True)
+            for cell in found:
+                for text in cell["broken"]:
+                    print(f"BROKEN: {cell['fault']} in {cell['state']}, {cell['policy']}: {text}")
     if arguments.out:
         write_json(arguments.out, {"version": __version__, "runs": arguments.runs, "cells": table})
     print(markdown(table))
