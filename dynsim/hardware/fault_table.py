@@ -70,7 +70,7 @@ GOAL_ADDRESSES = (104, 116)
 TORQUE_ADDRESS = 64
 STOPPING = "stopping"
 """While the robot slows down after a Ctrl-C."""
-STATES = (State.MOVE_TO_START.name, State.SETTLE.name, State.REPLAY.name, STOPPING)
+STATES = (State.MOVE_TO_START.name, State.REPLAY.name, STOPPING)
 POLICIES: tuple[FaultPolicy, ...] = get_args(FaultPolicy)
 
 
@@ -266,11 +266,9 @@ def spans() -> dict[str, tuple[float, float]]:
     since = run.result.record.time + run.started() - run.line.servos.torque_since
     states = run.result.record["state"]
     found = {}
-    for name in STATES[:3]:
+    for name in (State.MOVE_TO_START.name, State.REPLAY.name):
         times = since[states == State[name]]
-        # There are two of SETTLE: the way to the start ends with the first.
-        ends = np.flatnonzero(np.diff(times) > 2.0 / rig().map.bus.rate)
-        found[name] = float(times[0]), float(times[ends[0] if ends.size else -1])
+        found[name] = float(times[0]), float(times[-1])
     return found
 
 
