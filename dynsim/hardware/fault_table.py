@@ -36,7 +36,8 @@ from dynsim.hardware.replay.machine import Replay
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.states import Progress, ReplayResult, State, StopRequest
 from dynsim.hardware.replay.trajectory import path_of_record
-from dynsim.hardware.servo_map import FaultPolicy, ServoMap, load_servo_map
+from dynsim.hardware.safety import FaultPolicy
+from dynsim.hardware.servo_map import ServoMap, load_servo_map
 from dynsim.hardware.virtual.faults import FaultScript
 from dynsim.hardware.virtual.line import VirtualLine, line_for_map
 from dynsim.hardware.virtual.port import VirtualPort
