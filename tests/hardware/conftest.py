@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from dynsim.hardware.fault_table import GOAL_ADDRESSES, MAP, Rig, Run, goals_in, swing
+from dynsim.hardware.fault_table import GOAL_ADDRESSES, MAP, TORQUE_ADDRESS, Rig, Run, goals_in, swing
 from dynsim.hardware.replay.check import velocity_limit
 from dynsim.hardware.servo_map import load_servo_map
 
-__all__ = ["GOAL_ADDRESSES", "MAP", "Rig", "Run", "goals_in", "swing"]
+__all__ = ["GOAL_ADDRESSES", "MAP", "TORQUE_ADDRESS", "Rig", "Run", "goals_in", "swing"]
 
 
 def check_goals_within_limits(run: Run) -> None:
