@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.errors import ModelError
-from dynsim.kernels.constraint.bracing import BRACE_SIZE
+from dynsim.kernels.constraint.brace_arrays import BRACE_SIZE
 from dynsim.model.bracing import MIN_N, BracePlanner, brace_rows
 from dynsim.model.description import Contact
 from dynsim.model.drives import Motor
