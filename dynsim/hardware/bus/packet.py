@@ -61,7 +61,9 @@ def _crc_table() -> array[int]:
     """Checksum of every two bytes."""
     value = np.arange(0x10000, dtype=np.uint16)
     for _ in range(16):
-        value = value << 1 ^ (value >> 15) * np.uint16(0x8005)
+        top = value >> 15
+        value <<= 1
+        value ^= top * np.uint16(0x8005)
     return array("H", value.tobytes())
 
 
