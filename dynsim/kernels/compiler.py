@@ -148,8 +148,9 @@ def register_part(function: F, compiler: type[Compiler], options: Mapping[str, A
     what is not said here (``forceinline``).
     """
 
-    def implementation(*_: Any, **__: Any) -> F:
-        return function
+    def implementation(*kinds: Any, **__: Any) -> Any:
+        form, where = _LANE_FORMS.get(function, (function, None))
+        return form if _have_lanes(kinds if where is None else kinds[where : where + 1]) else function
 
     every = {"nopython": True, "pipeline_class": compiler, "forceinline": False, **options, **_NO_ENTRY}
     template = make_overload_template(function, implementation, every, strict=False, inline="never")
@@ -157,6 +158,29 @@ def register_part(function: F, compiler: type[Compiler], options: Mapping[str, A
     infer(template)
     infer_global(function, types.Function(template))
     return function
+
+
+# Kernels with a form for lanes, and which of their arguments must have lanes; None: any.
+_LANE_FORMS: dict[Callable[..., Any], tuple[Callable[..., Any], int | None]] = {}
+
+
+def lane_form(function: Callable[..., Any], where: int | None = None) -> Callable[[F], F]:
+    """The decorated function stands in for a registered part where it is compiled for lanes (dynsim.kernels.lanes)."""
+
+    def put(form: F) -> F:
+        _LANE_FORMS[function] = form, where
+        return form
+
+    return put
+
+
+def _have_lanes(kinds: Any) -> bool:
+    return any(
+        hasattr(kind, "lanes")
+        or (isinstance(kind, types.Array) and hasattr(kind.dtype, "lanes"))
+        or (isinstance(kind, types.BaseTuple) and _have_lanes(kind))
+        for kind in kinds
+    )
 
 
 def _implementation(template: Any, args: Any, kws: Any) -> Any:

@@ -1,0 +1,101 @@
+"""The right-hand side on lanes: several states, times and sets of parameters at once, by the kernels of one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba.core import config
+
+from dynsim.kernels.arrays import Workspace
+from dynsim.kernels.jit import internal_kernel, kernel
+from dynsim.kernels.lanes import forms  # noqa: F401
+from dynsim.kernels.lanes.tables import (
+    as_lanes,
+    lane,
+    lane_count,
+    lane_tables,
+    spread_tables,
+    tables_as_lanes,
+)
+from dynsim.kernels.system import System, derivative
+
+# What says how wide lanes are: a tuple of so many zeros. Eight pay where states are many, four for three stages.
+FOUR, EIGHT = (0.0,) * 4, (0.0,) * 8
+
+
+def lane_workspace(ws: Workspace, width: tuple) -> Workspace:
+    """A workspace of lanes, all of which are what ``ws`` is; rows and modes are the same for all.
+
+    Sines are computed a lane at a time, so ``trig`` needs no padding.
+    """
+    found: Workspace = spread_tables(ws._replace(trig=ws.trig[:, : len(ws.joints)]), len(width))
+    return found._replace(active=ws.active.copy(), counts=ws.counts.copy())
+
+
+@internal_kernel
+def derivative_lanes(dense, unilateral, shapes, system: System, t, y, ws: Workspace, dy):
+    """``derivative`` of all lanes; t one time or lanes. What has no form for lanes is evaluated lane by lane.
+
+    The first three are those of the system: apart from it they are known to the compiler.
+    """
+    if dense is None:
+        if unilateral is None:
+            if shapes is None:
+                derivative(system, t, y, ws, dy)
+                return
+    for k in range(lane_count(y)):
+        derivative(lane(system, k), lane(t, k), lane(y, k), lane(ws, k), lane(dy, k))
+
+
+@kernel
+def evaluate_lanes(width, system: System, t, y, ws: Workspace, dy):
+    """:func:`derivative_lanes` of float tables whose last axis is the lanes; t a number."""
+    lanes = tables_as_lanes(system, width)
+    derivative_lanes(
+        system.dense,
+        system.unilateral,
+        system.shapes,
+        lanes,
+        t,
+        as_lanes(y, width),
+        tables_as_lanes(ws, width),
+        as_lanes(dy, width),
+    )
+
+
+@kernel
+def evaluate_lanes_at(width, system: System, t, y, ws: Workspace, dy):
+    """The same at times of their own, t (N,)."""
+    lanes = tables_as_lanes(system, width)
+    derivative_lanes(
+        system.dense,
+        system.unilateral,
+        system.shapes,
+        lanes,
+        as_lanes(t, width)[()],
+        as_lanes(y, width),
+        tables_as_lanes(ws, width),
+        as_lanes(dy, width),
+    )
+
+
+def derivatives(system: System, t: Any, y: np.ndarray, ws: Workspace, dy: np.ndarray) -> None:
+    """dy/dt of N states at once, N = 4 or 8.
+
+    Parameters
+    ----------
+    system : tables of :data:`~dynsim.kernels.lanes.tables.AXES` may have a last axis of N sets of parameters
+    t : time, or (N,) times [s]
+    y, dy : (layout.size, N)
+    ws : of :func:`lane_workspace`
+    """
+    width = (0.0,) * y.shape[-1]
+    if config.DISABLE_JIT:
+        for k in range(len(width)):
+            at = t[k] if isinstance(t, np.ndarray) else t
+            derivative(lane_tables(system, k), at, y[:, k], lane_tables(ws, k), dy[:, k])
+    elif isinstance(t, np.ndarray):
+        evaluate_lanes_at(width, system, t, y, ws, dy)
+    else:
+        evaluate_lanes(width, system, t, y, ws, dy)
