@@ -149,8 +149,8 @@ def register_part(function: F, compiler: type[Compiler], options: Mapping[str, A
     """
 
     def implementation(*kinds: Any, **__: Any) -> Any:
-        form, where = _LANE_FORMS.get(function, (function, None))
-        return form if _have_lanes(kinds if where is None else kinds[where : where + 1]) else function
+        form, when = _FORMS.get(function, (None, None))
+        return form if when and when(*kinds) else function
 
     every = {"nopython": True, "pipeline_class": compiler, "forceinline": False, **options, **_NO_ENTRY}
     template = make_overload_template(function, implementation, every, strict=False, inline="never")
@@ -160,27 +160,18 @@ def register_part(function: F, compiler: type[Compiler], options: Mapping[str, A
     return function
 
 
-# Kernels with a form for lanes, and which of their arguments must have lanes; None: any.
-_LANE_FORMS: dict[Callable[..., Any], tuple[Callable[..., Any], int | None]] = {}
+# Parts with another form, and for which types of arguments it stands in.
+_FORMS: dict[Callable[..., Any], tuple[Callable[..., Any], Callable[..., bool]]] = {}
 
 
-def lane_form(function: Callable[..., Any], where: int | None = None) -> Callable[[F], F]:
-    """The decorated function stands in for a registered part where it is compiled for lanes (dynsim.kernels.lanes)."""
+def form_of(function: Callable[..., Any], when: Callable[..., bool]) -> Callable[[F], F]:
+    """The decorated function stands in for a registered part where ``when(*types of its arguments)`` is true."""
 
     def put(form: F) -> F:
-        _LANE_FORMS[function] = form, where
+        _FORMS[function] = form, when
         return form
 
     return put
-
-
-def _have_lanes(kinds: Any) -> bool:
-    return any(
-        hasattr(kind, "lanes")
-        or (isinstance(kind, types.Array) and hasattr(kind.dtype, "lanes"))
-        or (isinstance(kind, types.BaseTuple) and _have_lanes(kind))
-        for kind in kinds
-    )
 
 
 def _implementation(template: Any, args: Any, kws: Any) -> Any:

@@ -25,7 +25,7 @@ from numba.core import config, serialize
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
 
-from dynsim.kernels.compiler import ApartCompiler, KernelCompiler, PartCompiler, as_part, lane_form, register_part
+from dynsim.kernels.compiler import ApartCompiler, KernelCompiler, PartCompiler, as_part, register_part
 
 # Packs the scalar formulas of 3-vectors and wrenches into vector instructions (numba leaves it off): a right-hand side
 # takes 8 % less time. Global, and read when numba compiles its first function in the process.

@@ -25,19 +25,29 @@ from dynsim.kernels.constraint.surface import sign_changed, surface_distance
 from dynsim.kernels.drive.law import evaluate_reference, fed_forward
 from dynsim.kernels.drive.limit import clipped
 from dynsim.kernels.drive.servo import servo_circuit
-from dynsim.kernels.jit import lane_form
-from dynsim.kernels.lanes.number import every, select
+from dynsim.kernels.compiler import form_of
+from dynsim.kernels.lanes.number import every, lanes_of, select
 from dynsim.kernels.lanes.tables import lane, lane_count, with_lane
 from dynsim.kernels.tree.loads import add_loads
 
 
-@lane_form(clipped)
+def any_lanes(*kinds):
+    """Where any argument has lanes."""
+    return lanes_of(*kinds) > 0
+
+
+def times(*kinds):
+    """Where lanes have times of their own: t is the third argument."""
+    return lanes_of(kinds[2]) > 0
+
+
+@form_of(clipped, any_lanes)
 def clipped_lanes(x, limit):
     """A lane within its limits; NaN stays NaN."""
     return select(x > limit, limit, select(x < -limit, -limit, x))
 
 
-@lane_form(servo_circuit)
+@form_of(servo_circuit, any_lanes)
 def servo_circuit_lanes(motor, a, mode, command, v):
     """Voltage and current; lanes at the limit of current have another voltage."""
     if mode == OFF:
@@ -48,14 +58,14 @@ def servo_circuit_lanes(motor, a, mode, command, v):
     return select(i != wanted, motor[a, RESISTANCE] * i + motor[a, K_M] * v, u), i
 
 
-@lane_form(surface_distance)
+@form_of(surface_distance, any_lanes)
 def surface_distance_lanes(value, slope, curvature):
     """Lanes without a root along the normal take the distance of first order."""
     inner = 1.0 - 2.0 * curvature * value / (slope * slope)
     return select(inner <= 0.0, value / slope, 2.0 * value / (slope * (1.0 + math.sqrt(inner))))
 
 
-@lane_form(solve_small, 0)
+@form_of(solve_small, any_lanes)
 def solve_small_lanes(small, state, active, p):
     """The closed forms where they hold for all lanes; else the kernel's choice for each of them, added up."""
     if p == 1 and every(small[0, 0, 0] != 0.0):
@@ -74,7 +84,7 @@ def solve_small_lanes(small, state, active, p):
     return dependent
 
 
-@lane_form(sign_changed, 0)
+@form_of(sign_changed, any_lanes)
 def sign_changed_lanes(ws, passes):
     """True when any lane's signs have changed. The others keep theirs: once they agree they go on agreeing."""
     one_way = False
@@ -89,14 +99,14 @@ def sign_changed_lanes(ws, passes):
     return changed
 
 
-@lane_form(evaluate_reference, 2)
+@form_of(evaluate_reference, times)
 def evaluate_reference_lanes(drives, reference, t, ws):
     """At times of their own, which may lie in different segments."""
     for k in range(lane_count(t)):
         evaluate_reference(lane(drives, k), lane(reference, k), lane(t, k), lane(ws, k))
 
 
-@lane_form(fed_forward, 2)
+@form_of(fed_forward, times)
 def fed_forward_lanes(voltage, grid, t, a, asked):
     """The same of planned voltages."""
     if voltage is None:  # known to the compiler
@@ -106,7 +116,7 @@ def fed_forward_lanes(voltage, grid, t, a, asked):
     return asked
 
 
-@lane_form(add_loads, 2)
+@form_of(add_loads, times)
 def add_loads_lanes(model, loads, t, ws, power, start):
     """The same of external wrenches."""
     for k in range(lane_count(t)):

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba.core import config
+from numba.core import config, types
 
 from dynsim.kernels.arrays import Workspace
+from dynsim.kernels.compiler import form_of
 from dynsim.kernels.jit import internal_kernel, kernel
 from dynsim.kernels.lanes import forms  # noqa: F401
 from dynsim.kernels.lanes.tables import (
@@ -34,29 +35,29 @@ def lane_workspace(ws: Workspace, width: tuple) -> Workspace:
 
 
 @internal_kernel
-def derivative_lanes(dense, unilateral, shapes, system: System, t, y, ws: Workspace, dy):
-    """``derivative`` of all lanes; t one time or lanes. What has no form for lanes is evaluated lane by lane.
-
-    The first three are those of the system: apart from it they are known to the compiler.
-    """
-    if dense is None:
-        if unilateral is None:
-            if shapes is None:
-                derivative(system, t, y, ws, dy)
-                return
+def derivative_lanes(system: System, t, y, ws: Workspace, dy):
+    """``derivative`` of all lanes, one by one; t one time or lanes. Systems that have a form for lanes take that."""
     for k in range(lane_count(y)):
         derivative(lane(system, k), lane(t, k), lane(y, k), lane(ws, k), lane(dy, k))
+
+
+def _have_forms(*kinds: Any) -> bool:
+    """The bilateral law on points, by the articulated solve."""
+    parts = dict(zip(System._fields, kinds[0], strict=True))
+    return all(parts[name] == types.none for name in ("dense", "unilateral", "shapes"))
+
+
+@form_of(derivative_lanes, _have_forms)
+def derivative_at_once(system: System, t, y, ws: Workspace, dy):
+    """``derivative`` itself, compiled for lanes."""
+    derivative(system, t, y, ws, dy)
 
 
 @kernel
 def evaluate_lanes(width, system: System, t, y, ws: Workspace, dy):
     """:func:`derivative_lanes` of float tables whose last axis is the lanes; t a number."""
-    lanes = tables_as_lanes(system, width)
     derivative_lanes(
-        system.dense,
-        system.unilateral,
-        system.shapes,
-        lanes,
+        tables_as_lanes(system, width),
         t,
         as_lanes(y, width),
         tables_as_lanes(ws, width),
@@ -67,12 +68,8 @@ def evaluate_lanes(width, system: System, t, y, ws: Workspace, dy):
 @kernel
 def evaluate_lanes_at(width, system: System, t, y, ws: Workspace, dy):
     """The same at times of their own, t (N,)."""
-    lanes = tables_as_lanes(system, width)
     derivative_lanes(
-        system.dense,
-        system.unilateral,
-        system.shapes,
-        lanes,
+        tables_as_lanes(system, width),
         as_lanes(t, width)[()],
         as_lanes(y, width),
         tables_as_lanes(ws, width),
