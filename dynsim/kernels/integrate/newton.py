@@ -6,8 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.arrays import BLOCK_SIZE
+from dynsim.kernels.arrays import BLOCK_SIZE, Workspace
 from dynsim.kernels.jit import internal_kernel
+from dynsim.kernels.lanes.system import FOUR, lane_workspace
+from dynsim.kernels.lanes.tables import aligned
 
 # NewtonArrays.clock: step that the factors are of, that the stages are of, that the extrapolation is of [s];
 # contraction of Newton's method, and what it says of the error of the last iterate; the error
@@ -19,6 +21,21 @@ CLOSE_ENOUGH = 0.03
 # kept for extrapolation; there are such; Jacobians, factorisations, Newton iterations, steps in which they diverged.
 STALE, MADE_AT, SEEN, EXTRAPOLATES, JACOBIANS, FACTORS, ITERATIONS, DIVERGED = 0, 1, 2, 3, 4, 5, 6, 7
 NEWTON_COUNT_SIZE = 8
+
+
+class StageLanes(NamedTuple):
+    """Room for right-hand sides that are evaluated four at a time."""
+
+    ws: Workspace
+    t: np.ndarray  # (4,)
+    y: np.ndarray  # (m, 4)
+    f: np.ndarray  # (m, 4)
+    delta: np.ndarray  # (4,)
+
+
+def stage_lanes(ws: Workspace, m: int) -> StageLanes:
+    """Allocate :class:`StageLanes` beside a workspace, whose rows are taken whenever the Jacobian is made anew."""
+    return StageLanes(lane_workspace(ws, FOUR), aligned(4), aligned(m, 4), aligned(m, 4), aligned(4))
 
 
 class NewtonArrays(NamedTuple):
@@ -40,6 +57,7 @@ class NewtonArrays(NamedTuple):
     room_two: np.ndarray  # (2, s) complex
     clock: np.ndarray  # (NEWTON_CLOCK_SIZE,)
     count: np.ndarray  # (NEWTON_COUNT_SIZE,) int
+    lanes: StageLanes | None = None  # None: right-hand sides one by one
 
 
 def newton_arrays(n: int, na: int, circuits: int, tracked: int, m: int) -> NewtonArrays:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import CIRCUIT, DRIVEN, QDD, RATE_I, RATE_Q, RATE_V, Workspace
+from dynsim.kernels.arrays import CIRCUIT, DRIVEN, RATE_I, RATE_Q, RATE_V, Workspace
 from dynsim.kernels.drive.law import drive_block
 from dynsim.kernels.integrate.newton import (
     CLOSE,
@@ -39,6 +39,7 @@ from dynsim.kernels.integrate.newton import (
 )
 from dynsim.kernels.integrate.run import ATOL, EVALUATIONS, RTOL, STEP, STEPS, TIME, Run
 from dynsim.kernels.integrate.steps import error_norm
+from dynsim.kernels.integrate.stages import columns, evaluate_stages
 from dynsim.kernels.integrate.tableaux import (
     A_RADAU,
     ALPHA_RADAU,
@@ -51,7 +52,7 @@ from dynsim.kernels.integrate.tableaux import (
 )
 from dynsim.kernels.jit import internal_kernel, merged_kernel
 from dynsim.kernels.system import System, derivative
-from dynsim.kernels.tree.joints import displace, positions_along, rates_across
+from dynsim.kernels.tree.joints import positions_along, rates_across
 
 # Newton's method: most iterations, and the contraction below which the Jacobian stays.
 MOST_ITERATIONS, GOOD_CONTRACTION = 8, 0.05
@@ -66,27 +67,11 @@ def differentiate(system: System, ws: Workspace, run: Run):
     The stiff electrical rows are not taken from here but are the drives' own; v̇ is linear in the currents.
     """
     t, y, x, base, r = run.clock[TIME], run.y, run.stage[6], run.stage[7], run.newton
-    n, v, joints = ws.joints.shape[0], system.layout.v, ws.joints
     # The workspace may still hold a sample or a rejected step.
     derivative(system, t, y, ws, base)
     for a in range(ws.motors.shape[0]):
         drive_block(system.drives, ws, a, r.linear[a])
-    for s in range(r.along.shape[0]):
-        for j in range(y.shape[0]):
-            x[j] = y[j]
-        if s < n and system.layout.extra > 0:
-            delta = 1e-7
-            for i in range(n):
-                joints[i, QDD] = delta if i == s else 0.0
-            displace(system.model.compound, system.model, ws, x, system.layout.q)
-        else:
-            j = system.layout.q + s if s < n else v + s - n if s < 2 * n else system.layout.current + s - 2 * n
-            delta = 1e-3 if s >= 2 * n else 1e-8 * max(abs(y[j]), 0.1) if s >= n else 1e-7 * max(abs(y[j]), 1.0)
-            x[j] = y[j] + delta
-            delta = x[j] - y[j]
-        derivative(system, t, x, ws, r.f[0])
-        for i in range(n):
-            r.along[s, i] = (r.f[0, v + i] - base[v + i]) / delta
+    columns(r.lanes, system, ws, t, y, x, base, r)
     run.count[EVALUATIONS] += r.along.shape[0] + 1
     r.count[JACOBIANS] += 1
     r.count[STALE], r.count[MADE_AT], r.clock[FACTORED] = 0, run.count[STEPS], 0.0
@@ -210,10 +195,7 @@ def solve_stages(system: System, ws: Workspace, run: Run, h):
     guess_stages(run, h)
     lever, least = max(r.clock[LEVER], 1e-16) ** 0.8, 1 - r.count[EXTRAPOLATES]
     for k in range(MOST_ITERATIONS):
-        for s in range(3):
-            for j in range(tracked):
-                x[j] = y[j] + r.z[s, j]
-            derivative(system, t + NODE_RADAU[s] * h, x, ws, r.f[s])
+        evaluate_stages(r.lanes, system, ws, t, h, y, x, r)
         run.count[EVALUATIONS] += 3
         r.count[ITERATIONS] += 1
         for j in range(tracked):

@@ -20,12 +20,12 @@ from dynsim.kernels.arrays import (
     ROWS,
     U_MAX,
 )
+from dynsim.kernels.compiler import form_of
 from dynsim.kernels.constraint.delassus import solve_small
 from dynsim.kernels.constraint.surface import sign_changed, surface_distance
 from dynsim.kernels.drive.law import evaluate_reference, fed_forward
 from dynsim.kernels.drive.limit import clipped
 from dynsim.kernels.drive.servo import servo_circuit
-from dynsim.kernels.compiler import form_of
 from dynsim.kernels.lanes.number import every, lanes_of, select
 from dynsim.kernels.lanes.tables import lane, lane_count, with_lane
 from dynsim.kernels.tree.loads import add_loads

@@ -41,10 +41,19 @@ def derivative_lanes(system: System, t, y, ws: Workspace, dy):
         derivative(lane(system, k), lane(t, k), lane(y, k), lane(ws, k), lane(dy, k))
 
 
-def _have_forms(*kinds: Any) -> bool:
-    """The bilateral law on points, by the articulated solve."""
-    parts = dict(zip(System._fields, kinds[0], strict=True))
-    return all(parts[name] == types.none for name in ("dense", "unilateral", "shapes"))
+# Parts of a system whose kernels have no forms for lanes.
+_WITHOUT_FORMS = ("dense", "unilateral", "shapes")
+
+
+def has_forms(system: System) -> bool:
+    """True of the bilateral law on points, by the articulated solve; other systems go lane by lane."""
+    return all(getattr(system, name) is None for name in _WITHOUT_FORMS)
+
+
+def _have_forms(system: Any, *_: Any) -> bool:
+    """The same by types."""
+    parts = dict(zip(System._fields, system, strict=True))
+    return all(parts[name] == types.none for name in _WITHOUT_FORMS)
 
 
 @form_of(derivative_lanes, _have_forms)
