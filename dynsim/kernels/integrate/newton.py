@@ -55,6 +55,12 @@ class NewtonArrays(NamedTuple):
     two: np.ndarray  # (s,) complex
     room_one: np.ndarray  # (2, s)
     room_two: np.ndarray  # (2, s) complex
+    direct: np.ndarray  # (n, n, 4) inverses of both matrices, see dynsim.kernels.integrate.reduced
+    crossed: np.ndarray  # (n, n, 4)
+    over: np.ndarray  # (2, 4) 1/g
+    circuit: np.ndarray  # (na, 2, 4) and 1/(g − ∂(di/dt)/∂i)
+    x: np.ndarray  # (s, 4)
+    room: np.ndarray  # (3, s, 4)
     clock: np.ndarray  # (NEWTON_CLOCK_SIZE,)
     count: np.ndarray  # (NEWTON_COUNT_SIZE,) int
     lanes: StageLanes | None = None  # None: right-hand sides one by one
@@ -81,6 +87,12 @@ def newton_arrays(n: int, na: int, circuits: int, tracked: int, m: int) -> Newto
         two=np.zeros(tracked, dtype=np.complex128),
         room_one=np.zeros((2, tracked)),
         room_two=np.zeros((2, tracked), dtype=np.complex128),
+        direct=aligned(n, n, 4),
+        crossed=aligned(n, n, 4),
+        over=aligned(2, 4),
+        circuit=aligned(na, 2, 4),
+        x=aligned(tracked, 4),
+        room=aligned(3, tracked, 4),
         clock=clock,
         count=count,
     )
