@@ -1,4 +1,4 @@
-"""Right-hand sides that RADAU5 needs together: its three stages, and the columns of its Jacobian; on lanes if it has any.
+"""Right-hand sides that RADAU5 needs together, on lanes if it has any: three stages, and columns of the Jacobian.
 
 Four lanes do for both: a second width would be a second program to compile.
 """

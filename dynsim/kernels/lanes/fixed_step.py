@@ -77,7 +77,7 @@ def settle_lanes(system: System, t, y, ws: Workspace, dy):
         if not moved:
             return True
         derivative_lanes(system, t, y, ws, dy)
+    met = True
     for k in range(lane_count(y)):
-        if off_surface(lane(ws, k)):
-            return False
-    return True
+        met = met and not off_surface(lane(ws, k))
+    return met

@@ -83,7 +83,7 @@ def _cast(context: Any, builder: Any, kind: Any, to: Lanes, value: Any) -> Any:
 
 
 def lanes_of(*kinds: Any) -> int:
-    """How many lanes there are in the first of these types that has any; tuples and arrays have those of their parts."""
+    """How many lanes the first of these types has that has any; tuples and arrays have those of their parts."""
     for kind in kinds:
         found = getattr(kind, "lanes", 0)
         if not found and isinstance(kind, types.Array):
@@ -202,3 +202,28 @@ def every(typingctx: Any, mask: Any) -> Any:
         return builder.icmp_unsigned("==", bits, ir.Constant(ir.IntType(mask.lanes), 2**mask.lanes - 1))
 
     return types.boolean(mask), codegen
+
+
+@intrinsic
+def four(typingctx: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+    """Four numbers as lanes."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        value = ir.Constant(_vector(4), ir.Undefined)
+        for k, x in enumerate(args):
+            number = context.cast(builder, x, sig.args[k], types.float64)
+            value = builder.insert_element(value, number, ir.Constant(INT32, k))
+        return value
+
+    return signature(Lanes(4), *(types.unliteral(x) for x in (a, b, c, d))), codegen
+
+
+@intrinsic
+def turned(typingctx: Any, value: Any) -> Any:
+    """Four lanes with the two in the middle exchanged."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        order = ir.Constant(ir.VectorType(INT32, 4), [0, 2, 1, 3])
+        return builder.shuffle_vector(args[0], args[0], order)
+
+    return value(value), codegen
