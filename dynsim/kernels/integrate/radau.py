@@ -38,8 +38,8 @@ from dynsim.kernels.integrate.newton import (
     NewtonArrays,
 )
 from dynsim.kernels.integrate.run import ATOL, EVALUATIONS, RTOL, STEP, STEPS, TIME, Run
-from dynsim.kernels.integrate.steps import error_norm
 from dynsim.kernels.integrate.stages import columns, evaluate_stages
+from dynsim.kernels.integrate.steps import error_norm
 from dynsim.kernels.integrate.tableaux import (
     A_RADAU,
     ALPHA_RADAU,
