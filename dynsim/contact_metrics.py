@@ -16,6 +16,10 @@ from dynsim.model.description import Contact, Robot
 from dynsim.model.unilateral import START_TOLERANCE, JointStop, told
 from dynsim.record import Record
 
+# Time stepping: what its steps may take or make of the turnover, and how deep points may sink, without a warning.
+SCHEME_LIMIT = 1e-2
+PENETRATION_LIMIT_M = 1e-3
+
 
 def modes(unilateral: UnilateralArrays, k: int, duration: float) -> dict[str, Any]:
     """What a candidate has done under the unilateral law."""
@@ -96,6 +100,35 @@ def chattered(contacts: Sequence[Contact], unilateral: UnilateralArrays) -> list
                 f"slowly than {tally[ku.SETTLE]:.0e} m/s was kept on the surface"
             )
     return found
+
+
+def coarse(stepping: dict[str, Any], turnover: float) -> list[str]:
+    """Steps so long that they take or make energy, or let points sink in, and the step that would not.
+
+    turnover : [J]
+    """
+    found, step, worst = [], stepping["step_s"], stepping["scheme_loss_worst_J"]
+    if abs(worst) > SCHEME_LIMIT * turnover:
+        shorter = _shorter(step * SCHEME_LIMIT * turnover / abs(worst))
+        found.append(
+            f"time stepping: the steps themselves {'took' if worst > 0.0 else 'made'} up to {abs(worst):.3g} J, "
+            f"{100 * abs(worst) / turnover:.2g} % of the turnover (limit {100 * SCHEME_LIMIT:g} %); "
+            f"integrator.step_s is {step:g}: take {shorter:g}"
+        )
+    deepest = stepping["penetration_max_m"]
+    if deepest > PENETRATION_LIMIT_M:
+        found.append(
+            f"time stepping: points sink up to {1e3 * deepest:.3g} mm into their surfaces as they land (limit "
+            f"{1e3 * PENETRATION_LIMIT_M:g} mm); integrator.step_s is {step:g}: take "
+            f"{_shorter(step * PENETRATION_LIMIT_M / deepest):g}"
+        )
+    return found
+
+
+def _shorter(step: float) -> float:
+    """The step with one digit, rounded down."""
+    power = 10.0 ** np.floor(np.log10(step))
+    return float(np.floor(step / power) * power)
 
 
 def capped(stepping: dict[str, Any]) -> list[str]:

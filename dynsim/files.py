@@ -226,7 +226,7 @@ class _Draft:
         flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
         descriptor = os.open(temporary, flags, 0o666)
         self._temporary, self._stream = temporary, os.fdopen(descriptor, "w+b")
-        _lock(descriptor, wait=False)
+        lock(descriptor, wait=False)
         if existing is not None and hasattr(os, "fchmod"):
             with suppress(OSError):  # only root may give files away; then they are ours, as after any replacement
                 if (existing.st_uid, existing.st_gid) != (os.geteuid(), os.getegid()):
@@ -305,7 +305,7 @@ def _write_through(path: Path, descriptor: int | None, content: memoryview) -> N
         stream.write(content)
 
 
-def _lock(descriptor: int, *, wait: bool) -> bool:
+def lock(descriptor: int, *, wait: bool) -> bool:
     """Hold a file until it is closed; False if somebody else does."""
     if fcntl is None:
         return True
@@ -331,7 +331,7 @@ def _remove_left_behind(folder: Path) -> None:
                     continue
                 descriptor = os.open(entry.path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
                 try:
-                    if _lock(descriptor, wait=False):
+                    if lock(descriptor, wait=False):
                         os.unlink(entry.path)
                 finally:
                     os.close(descriptor)
@@ -386,7 +386,7 @@ def _open_mark(mark: Path) -> tuple[BinaryIO, set[str]]:
     while True:
         stream = os.fdopen(os.open(mark, flags | getattr(os, "O_NONBLOCK", 0), 0o666), "r+b", buffering=0)
         try:
-            _lock(stream.fileno(), wait=True)
+            lock(stream.fileno(), wait=True)
             status = os.fstat(stream.fileno())
             if not stat.S_ISREG(status.st_mode):
                 raise OSError(0, "is in the way; it is no file")

@@ -109,6 +109,15 @@ def explain(error: ValidationError, data: Any, origin: Origin, unknown: Sequence
         found = False
     elif kind in ("model_type", "dict_type", "model_attributes_type"):
         text = "must be a mapping of keys to values"
+    elif kind in ("too_short", "too_long"):
+        limits = problem["ctx"]
+        most = "at least" if kind == "too_short" else "at most"
+        needed = limits["min_length" if kind == "too_short" else "max_length"]
+        text = f"has {limits['actual_length']} entries; it must have {most} {needed}"
+    elif kind == "list_type":
+        text = "must be a list, such as [a, b]"
+    elif message.startswith("Input should be "):
+        text = "must be " + message.removeprefix("Input should be ")
     else:
         text = " ".join((message[0].lower() + message[1:]).splitlines())
     given = f" = {value_text(value)}" if found and not isinstance(value, (Mapping, list)) else ""

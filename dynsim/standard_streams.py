@@ -63,9 +63,23 @@ class LenientStream:
         return getattr(self._stream, name)
 
 
+def hold_descriptors() -> None:
+    """Let the descriptors of closed standard streams lead nowhere.
+
+    The next files opened would get them: what a library prints would go to a record, or to the servos.
+    """
+    for descriptor in (0, 1, 2):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            # The system gives the lowest that is free.
+            os.open(os.devnull, os.O_RDWR)
+
+
 @contextmanager
 def lenient_streams() -> Iterator[LenientStream | None]:
     """Within the block standard output and error are lenient; gives standard output, None where it is closed."""
+    hold_descriptors()
     before = sys.stdout, sys.stderr
     with _encodable(sys.stdout), _encodable(sys.stderr):
         output = LenientStream(sys.stdout) if sys.stdout is not None else None

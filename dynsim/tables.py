@@ -56,6 +56,7 @@ _ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = 
     ("friction heat [J]", lambda s: s.get("friction_heat_J"), _number),
     ("impact loss [J]", lambda s: s.get("impact_loss_J"), _number),
     ("stop loss [J]", lambda s: s.get("stop_loss_J") or None, _number),
+    ("taken by time steps [J]", lambda s: s.get("scheme_loss_J"), _number),
     ("hand error, rms [mm]", lambda s: s.get("hand_error_rms_m"), lambda v: _number(v, 1e3)),
     ("  max [mm]", lambda s: s.get("hand_error_max_m"), lambda v: _number(v, 1e3)),
     ("  vertical, rms [mm]", lambda s: s.get("hand_error_z_rms_m"), lambda v: _number(v, 1e3)),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from dynsim.errors import ModelError
-from dynsim.kernels.constraint.bracing import BRACE_SIZE
+from dynsim.kernels.constraint.brace_arrays import BRACE_SIZE
 from dynsim.model.bracing import MIN_N, BracePlanner, brace_rows
 from dynsim.model.description import Contact
 from dynsim.model.drives import Motor
@@ -114,7 +114,7 @@ def _pressing_torques(
     if solved < len(times):
         raise ModelError(
             f"controller.brace: at t = {times[solved]:.3f} s no forces of {', '.join(braces)} carry the motion within "
-            "the limits of the motors",
+            "the limits of the motors; ask for other forces, go slower, or raise voltage_limit_V",
             keys=("controller", "brace"),
         )
     return torques

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 from scipy.interpolate import CubicSpline
 
 from dynsim import families
-from dynsim.config import NonNegative, Positive, StrictConfig, check_waypoints
+from dynsim.config import NonNegative, Positive, StrictConfig, check_waypoints, error_at
 from dynsim.control.feed_forward import planned_voltages
 from dynsim.control.inverse_kinematics import follow
 from dynsim.errors import ModelError
@@ -99,15 +100,29 @@ class Config(StrictConfig):
     )
     knot_spacing_s: Positive = Field(default=0.02, description="distance of the knots of the reference splines")
 
+    @field_validator("brace", mode="before")
+    @classmethod
+    def _check_brace(cls, value: Any) -> Any:
+        """One message for what is neither of the two, and one that names the force that is none."""
+        if isinstance(value, Mapping) and value:
+            for name, force in value.items():
+                if isinstance(force, bool) or not isinstance(force, int | float) or not 0.0 < force < np.inf:
+                    raise error_at(
+                        str(name), "must be a normal force above 0 N; leave out a contact that shall not press"
+                    )
+        elif value not in (None, "optimal"):
+            raise ValueError("must be `optimal`, or normal forces [N] by contact, such as {elbow_4: 3.0}")
+        return value
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         both = [name for name in self.joints if self.hand is not None and name in self.hand.joints]
         if both:
             raise ValueError(f"{both[0]} cannot follow both the hand path and waypoints of its own")
         if self.brace is not None and self.feed_forward != "none":
-            raise ValueError("brace plans the whole dynamics; leave feed_forward away")
+            raise error_at("feed_forward", "brace plans the whole dynamics; leave feed_forward away")
         if self.min_N != MIN_N and self.brace != "optimal":
-            raise ValueError("min_N is for brace: optimal")
+            raise error_at("min_N", "min_N is for brace: optimal; commanded forces are what they are; remove it")
         return self
 
 
@@ -164,7 +179,7 @@ def _planned(
     """Voltages of the motors along the references, (T, na)."""
     if config.brace is None:
         return planned_voltages(context.model, times, positions, {}, whole=config.feed_forward == "dynamics")
-    forces = dict.fromkeys(context.contacts) if config.brace == "optimal" else dict(config.brace)
+    forces = dict.fromkeys(context.declared) if config.brace == "optimal" else dict(config.brace)
     braces = {name: (_contact(context, name, "brace"), force) for name, force in forces.items()}
     return planned_voltages(context.model, times, positions, braces, config.min_N)
 

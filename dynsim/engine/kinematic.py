@@ -9,7 +9,7 @@ import numpy as np
 
 from dynsim import interruption
 from dynsim.engine import Progress, Start
-from dynsim.engine.kinematic_record import make_record
+from dynsim.engine.kinematic_record import COORDINATES, make_record
 from dynsim.engine.kinematic_run import Run
 from dynsim.engine.mode_switching import ModeSwitcher
 from dynsim.engine.outcome import check_size, kernels_logged, raise_stopped
@@ -31,7 +31,7 @@ from dynsim.record import Record
 from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, build
 from dynsim.snake.kinematics import pose_of_point
-from dynsim.snake.state import MODE, PLACE, TICKS, State, new_rig, new_state, new_trace
+from dynsim.snake.state import DONE, MODE, PLACE, TICKS, State, new_rig, new_state, new_trace
 from dynsim.snake.ticks import record_row, run_ticks
 
 log = logging.getLogger(__name__)
@@ -170,6 +170,13 @@ def _read_commands(run: Run, waiting: bool) -> None:
 
     Velocities that had to wait in the block before this one and were not carried out there are dropped: a script is
     one block and loses none, a joystick says anew what it wants.
+
+    Raises
+    ------
+    SimulationStopped
+        The source failed, or gave what is no command, after the run had begun: there is something to keep.
+    ModelError
+        The same before the first period.
     """
     state, period, first = run.state, run.controller.schedule.period, int(run.state.counts[TICKS])
     w = np.zeros(6)
@@ -183,20 +190,39 @@ def _read_commands(run: Run, waiting: bool) -> None:
         mode=run.controller.modes.numbers[state.counts[MODE]],
         waiting=waiting,
     )
-    block = run.source.read(first, run.ticks - first, period, feedback)
+    try:
+        block = _checked(run, run.source.read(first, run.ticks - first, period, feedback), run.ticks - first)
+    except (SimulationStopped, ScenarioError):
+        raise
+    except Exception as error:
+        # What is no fault of the source's code is said as it is.
+        what = str(error) if isinstance(error, ModelError) else f"{type(run.source).__name__} failed: {error!r}"
+        text = f"command source at t = {feedback.time:g} s: {what}"
+        if first == 0:
+            raise ModelError(text) from error
+        raise SimulationStopped(text, time=feedback.time, state=_named(state)) from error
+    run.block, run.block_start = block, first
+    run.gripper[first : first + len(block.request)] = block.gripper
+    state.counts[PLACE], state.progress[DONE] = 0, 0.0
+
+
+def _checked(run: Run, block: CommandBlock, left: int) -> CommandBlock:
+    """The commands as arrays; raises ModelError for what the controller cannot be asked."""
     block = CommandBlock(reals(block.velocity), integers(block.request), integers(block.gripper))
     known = len(block.request)
-    if not 1 <= known <= run.ticks - first or block.velocity.shape != (known, 6) or block.gripper.shape != (known,):
+    if not 1 <= known <= left or block.velocity.shape != (known, 6) or block.gripper.shape != (known,):
         raise ModelError(
-            f"command source at t = {feedback.time:g} s: velocity {block.velocity.shape}, request "
-            f"{block.request.shape}, gripper {block.gripper.shape}; give (T, 6), (T,), (T,) with T from 1 to "
-            f"{run.ticks - first}"
+            f"velocity {block.velocity.shape}, request {block.request.shape}, gripper {block.gripper.shape}; give "
+            f"(T, 6), (T,), (T,) with T from 1 to {left}"
+        )
+    if not np.isfinite(block.velocity).all():
+        row, column = np.argwhere(~np.isfinite(block.velocity))[0]
+        raise ModelError(
+            f"the velocity of {COORDINATES[column]} in period {row} of {known} is {block.velocity[row, column]}"
         )
     for number in set(block.request.tolist()) - {NO_REQUEST, SWITCHING, FIXING}:
         run.controller.modes.row(number, "controller.commands: mode")
-    run.block, run.block_start = block, first
-    run.gripper[first : first + known] = block.gripper
-    state.counts[PLACE] = 0
+    return block
 
 
 def _advance(run: Run, switcher: ModeSwitcher, progress: Progress | None) -> None:
@@ -262,7 +288,7 @@ def _predict(run: Run, row: int) -> tuple[float, float]:
     trial, trace = _copy(run.state), new_trace(run.model, ticks + 1)
     place = min(int(trial.counts[PLACE]), len(run.block.velocity) - 1)
     held = np.tile(run.block.velocity[place], (ticks, 1))
-    trial.counts[MODE], trial.counts[TICKS], trial.counts[PLACE] = row, 0, 0
+    trial.counts[MODE], trial.counts[TICKS], trial.counts[PLACE], trial.progress[DONE] = row, 0, 0, 0.0
     done, _ = run_ticks(run.model, law, schedule, trial, held, ticks, 1, 1, 1, run.rig, trace)
     if done < 0:
         return np.inf, -np.inf  # no longer finite: no mode to take

@@ -17,12 +17,26 @@ from dynsim.record import Record
 from dynsim.record.poses import add_body_poses
 from dynsim.scenario import Scenario
 from dynsim.snake.kinematics import new_chain, posture_points
-from dynsim.snake.state import CLAMPED, NULL_REDUCED, SLOWED, TICKS, WAITED, WAITED_FOR, Trace
+from dynsim.snake.state import (
+    CLAMPED,
+    LATE,
+    NULL_REDUCED,
+    PATH_SLOWED,
+    SLOWED,
+    STILL,
+    STILL_FOR,
+    TICKS,
+    WAITED,
+    WAITED_FOR,
+    Trace,
+)
 from dynsim.snake.ticks import record_row
 
 # Why the target waited, in the order of the counters of dynsim.snake.state.State; the last is the rest: after
 # an obstacle, until switching has brought the joints below switching.release_fraction of their limits.
 OBSTACLES = ("joint limit", "rate limit", "singular posture", "attitude at beta = 90 deg", "release of the joints")
+OUT_OF_REACH = 1.0
+"""A target that waits for so long at the end of a run [s] is called out of reach."""
 COORDINATES = ("x", "y", "z", "alpha", "beta", "gamma")
 
 
@@ -117,9 +131,17 @@ def make_record(
 
 def _waiting_for(counts: NDArray[np.int64], period: float) -> dict[str, float]:
     """Why the target waited, and how long [s]; reasons that did not occur are left out."""
-    known = counts[WAITED_FOR + 1 :]
+    known = counts[WAITED_FOR + 1 : PATH_SLOWED]
     ticks = [*known, counts[WAITED] - known.sum()]
     return {name: float(count * period) for name, count in zip(OBSTACLES, ticks, strict=True) if count}
+
+
+def _out_of_reach(counts: NDArray[np.int64], period: float, duration: float) -> dict[str, Any] | None:
+    """Since when a target has waited that waits at the end of the run, and for what; None where it does not."""
+    still = float(counts[STILL] * period)
+    if still < OUT_OF_REACH:
+        return None
+    return {"since_s": duration - still, "reason": OBSTACLES[counts[STILL_FOR] - 1]}
 
 
 def _summary(run: Run, scenario: Scenario, switcher: ModeSwitcher, record: Record, wall: float) -> dict[str, Any]:
@@ -148,6 +170,9 @@ def _summary(run: Run, scenario: Scenario, switcher: ModeSwitcher, record: Recor
         "joints_taken_out": [description.joint_names[j] for j in np.flatnonzero((at_limit == 1).any(axis=0))],
         "waiting_s": float(counts[WAITED] * period),
         "waiting_for_s": _waiting_for(counts, period),
+        "path_slowed_s": float(counts[PATH_SLOWED] * period),
+        "path_late_s": float(run.state.progress[LATE] * period),
+        "out_of_reach": _out_of_reach(counts, period, duration),
         "slowed_s": float(counts[SLOWED] * period),
         "null_space_reduced_s": float(counts[NULL_REDUCED] * period),
         "clamped_joint_ticks": int(counts[CLAMPED]),
@@ -188,6 +213,18 @@ def _warnings(run: Run, record: Record, summary: dict[str, Any]) -> list[str]:
         share = 100.0 * summary["waiting_s"] / max(summary["duration_s"], 1e-9)
         why = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in summary["waiting_for_s"].items())
         found.append(f"the target waited for {summary['waiting_s']:.2f} s ({share:.0f} % of the run): {why}")
+    if (gone := summary["out_of_reach"]) is not None:
+        place = ", ".join(f"{value:.3f}" for value in record["w_target"][-1])
+        found.append(
+            f"the path is out of reach from t = {gone['since_s']:.2f} s on ({gone['reason']}): the target waited there "
+            f"to the end of the run, at ({', '.join(COORDINATES)}) = ({place})"
+        )
+    if summary["path_slowed_s"] > 0.0:
+        found.append(
+            f"the path is too fast for the joints: the target was slower than commanded for "
+            f"{summary['path_slowed_s']:.2f} s and came {summary['path_late_s']:.2f} s late "
+            "(controller.rate_limit_rad_s)"
+        )
     if summary["slowed_s"] > 0.0:
         found.append(
             f"feedback and shape points were slowed down for {summary['slowed_s']:.2f} s: they asked for more than the "

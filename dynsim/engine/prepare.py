@@ -17,7 +17,7 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.contact_events import NORMAL_GUARD, SLIP_GUARD, STOP_GUARD
 from dynsim.kernels.integrate.events import TIP_MARGIN
-from dynsim.kernels.integrate.time_stepping import stepping_arrays
+from dynsim.kernels.integrate.time_stepping import GRIP, GRIP_AXIS, stepping_arrays
 from dynsim.kernels.lanes.system import has_forms
 from dynsim.kernels.state import LOSSES, OutputLayout, StateLayout, block, output_layout, state_layout
 from dynsim.kernels.system import System, new_workspace
@@ -35,7 +35,7 @@ from dynsim.model.description import Array, Contact, Load, Robot
 from dynsim.model.drives import Drive, Motor
 from dynsim.model.model import Model
 from dynsim.model.shapes import compile_shapes
-from dynsim.model.unilateral import JointStop, compile_unilateral, joint_stops
+from dynsim.model.unilateral import JointStop, compile_grips, compile_unilateral, joint_stops
 from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, build
 
@@ -99,16 +99,12 @@ def prepare(
     columns = output_layout(n, na, c, OUTPUTS if robot.base else 0, len(stops))
     if times is None:
         times = sample_times(scenario, layout, columns, n)
-    if stepped:
-        if robot.base is not None:
-            raise ScenarioError("integrator.method: time_stepping locates no events, such as a mobile base that tips")
-        if contacts and not real:
-            raise ScenarioError("integrator.method: time_stepping needs `contacts: {law: unilateral}`")
-        if scenario.integrator.solver != "articulated":
-            raise ScenarioError(
-                f"integrator.solver: {scenario.integrator.solver} is not of integrator.method: time_stepping, which "
-                "solves with articulated sweeps; remove it"
-            )
+    if stepped and robot.base is not None:
+        raise ModelError(
+            "integrator.method = 'time_stepping': it locates no events, so a mobile base would tip unseen; "
+            "take rk43, or radau5 with motors, or a plant without mobile base",
+            keys=("integrator", "method"),
+        )
     _check_stiffness(scenario, robot)
     joint_rows = len(robot.couplings) + len(stops)
     _check_work(scenario, n, c + joint_rows)
@@ -135,6 +131,7 @@ def prepare(
     stepping = None
     if method == ki.TIME_STEPPING:
         stepping = stepping_arrays(model.arrays, system.contacts, na, joint_rows, options.theta, system.unilateral)
+        stepping.law[:, GRIP : GRIP_AXIS + 3] = compile_grips(robot, contacts)
     y = np.zeros(layout.size)
     y[block(layout, "q")] = robot.initial
     run = ki.new_run(

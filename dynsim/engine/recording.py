@@ -11,6 +11,7 @@ from dynsim import metrics
 from dynsim.contact_metrics import beyond_stops
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.provenance import provenance
+from dynsim.engine.sharing import sharing
 from dynsim.engine.uniqueness import motion_spread
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import run as ki
@@ -70,6 +71,8 @@ def make_record(
     if prepared.system.unilateral is not None:
         for integral, (name, text) in zip(run.states("loss").T, metrics.LOSSES.items(), strict=True):
             record.add(name, integral, "J", description=text)
+    if run.stepping is not None:
+        record.add("loss_scheme", run.states("scheme")[:, 0], "J", description=metrics.SCHEME)
     others = 0 if pushed is None else len(robot.bodies)
     shown = [*range(len(prepared.loads) - others), *(pushed or ())]
     if shown:
@@ -94,6 +97,9 @@ def make_record(
     record.scene = robot_scene(robot, contacts, build.surfaces(scenario))
     add_body_poses(record)
     deficient, spread = int(prepared.workspace.counts[ka.DEPENDENT]), None
+    shared: list[str] = []
+    if prepared.system.unilateral is not None and deficient and rows:
+        shared = sharing(prepared.model, contacts, record["q"], record["contact_mode"])
     # Under the unilateral law rows of what sticks depend on each other, which leaves no motion open.
     if (
         prepared.system.unilateral is None
@@ -112,23 +118,28 @@ def make_record(
         deficient=deficient,
         extremes=run.extremes,
         spread=spread,
+        shared=tuple(shared),
         support=np.zeros(0) if run.support is None else run.support.least,
         unilateral=prepared.system.unilateral,
         stops=tuple(prepared.stops),
-        stepping=None if run.stepping is None else _stepping(run.stepping.found),
+        stepping=None if run.stepping is None else _stepping(run),
     )
     record.summary = metrics.summarise(record, scenario, contacts, robot, counts)
     record.summary["warnings"] += beyond_stops(robot, prepared.stops, prepared.control)
     return record
 
 
-def _stepping(found: np.ndarray) -> dict[str, Any]:
+def _stepping(run: ki.Run) -> dict[str, Any]:
     """How well time stepping has solved its contact problems, and how deep points came to lie."""
+    assert run.stepping is not None
+    found = run.stepping.found
     return {
+        "step_s": float(run.clock[ki.STEP]),
         "contact_solves": int(found[time_stepping.SOLVES]),
         "long_solves": int(found[time_stepping.LONG_SOLVES]),
         "capped_solves": int(found[time_stepping.CAPPED]),
         "residual_max_m_s": float(found[time_stepping.WORST]),
+        "scheme_loss_worst_J": float(found[time_stepping.TAKEN]),
         "penetration_max_m": float(found[time_stepping.PENETRATION]),
     }
 

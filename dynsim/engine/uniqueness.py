@@ -222,8 +222,8 @@ def paradox(
         )
     else:
         what = (
-            f"Painlevé's paradox at {names}: {'every' if turned.all() else 'its'} diagonal entry of J M⁻¹F is negative, "
-            "so that each of these points moves against a force that pushes it"
+            f"Painlevé's paradox at {names}: {'every' if turned.all() else 'its'} diagonal entry of J M⁻¹F is "
+            "negative, so that each of these points moves against a force that pushes it"
         )
     factor = matrices.critical_friction()
     below = ""

@@ -22,6 +22,7 @@ TERMS = {
     "heat_friction": ("contact friction", "#882255"),
     "loss_impact": ("impacts of contacts", "#8C6D31"),
     "loss_stop": ("impacts at joint stops", "#F0E442"),
+    "loss_scheme": ("taken by time steps", "#999933"),
     "energy_kinetic": ("Δ kinetic energy", "#009E73"),
     "energy_potential": ("Δ potential energy", "#CC79A7"),
     "energy_magnetic": ("Δ magnetic energy", "#7F7F7F"),

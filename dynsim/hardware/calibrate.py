@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Literal
 
 import numpy as np
 from ruamel.yaml import YAML
@@ -13,10 +14,11 @@ from ruamel.yaml import YAML
 from dynsim.errors import RecordError
 from dynsim.files import write_text
 from dynsim.hardware.bus.control_table import MX_106, STATE_BLOCK
-from dynsim.hardware.bus.protocol import Bus
+from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused
 from dynsim.hardware.errors import ServoMapError, VerificationFailed
 from dynsim.hardware.servo_map import Servo, ServoMap, load_servo_map
 
+Key = Literal["zero_tick", "sign"]
 READS = 20
 STILL = 3
 """Spread over the reads that still counts as standing still [ticks]."""
@@ -29,13 +31,9 @@ def read_zero_ticks(bus: Bus, servos: Iterable[Servo]) -> dict[str, int]:
     ------
     VerificationFailed
         Torque is on, a servo does not answer, or moves.
-    NoAnswer, RequestRefused
-        While asking for torque.
     """
     chosen = list(servos)
-    for servo in chosen:
-        if bus.read(servo.id, MX_106.fields["torque_enable"]):
-            raise VerificationFailed(f"{servo.joint} (ID {servo.id}): torque is on; `dynsim hw stop` releases it")
+    refuse_torque(bus, chosen)
     ticks: dict[str, list[int]] = {servo.joint: [] for servo in chosen}
     for _ in range(READS):
         replies = bus.sync_read([servo.id for servo in chosen], *STATE_BLOCK).replies
@@ -51,21 +49,32 @@ def read_zero_ticks(bus: Bus, servos: Iterable[Servo]) -> dict[str, int]:
     return {joint: int(np.median(seen)) for joint, seen in ticks.items()}
 
 
-def write_zero_ticks(servo_map: ServoMap, ticks: dict[str, int], path: Path) -> None:
-    """Write the map with new zero ticks to ``path``; everything else, comments too, stays as it is.
+def refuse_torque(bus: Bus, servos: Iterable[Servo]) -> None:
+    """Raises VerificationFailed where a servo has its torque on, or does not answer."""
+    for servo in servos:
+        try:
+            torque = bus.read(servo.id, MX_106.fields["torque_enable"])
+        except (NoAnswer, RequestRefused) as error:
+            raise VerificationFailed(f"{servo.joint}: {error}; check power, cable, ID and baud rate") from error
+        if torque:
+            raise VerificationFailed(f"{servo.joint} (ID {servo.id}): torque is on; `dynsim hw stop` releases it")
+
+
+def write_into_map(servo_map: ServoMap, key: Key, values: Mapping[str, int], path: Path) -> None:
+    """Write the map with new zero ticks or senses, by joint, to ``path``; all else, comments too, stays as it is.
 
     Raises
     ------
     ServoMapError
-        With the new zero a joint's limits would leave the single turn position mode knows, or the file cannot be
+        With the new value a joint's limits would leave the single turn position mode knows, or the file cannot be
         written.
     """
     yaml = YAML(typ="rt")
     yaml.preserve_quotes = True
     yaml.width = 200
     data = yaml.load(servo_map.path.read_text(encoding="utf-8"))
-    for joint, tick in ticks.items():
-        data["servos"][joint]["zero_tick"] = tick
+    for joint, value in values.items():
+        data["servos"][joint][key] = value
     text = io.StringIO()
     yaml.dump(data, text)
     with TemporaryDirectory() as folder:
@@ -75,10 +84,10 @@ def write_zero_ticks(servo_map: ServoMap, ticks: dict[str, int], path: Path) -> 
             ends = (
                 sorted(servo.to_ticks(angle) for angle in servo.position_limits) if servo.in_position_mode else [0, 0]
             )
-            if servo.joint in ticks and (ends[0] < 0 or ends[1] > 4095):
+            if servo.joint in values and (ends[0] < 0 or ends[1] > 4095):
                 raise ServoMapError(
-                    f"{servo.joint}: with zero at tick {servo.zero_tick} its limits reach ticks {ends[0]} to "
-                    f"{ends[1]}, position mode ends at 0 and 4095; turn the horn or narrow the limits"
+                    f"{servo.joint}: with sign {servo.sign} and zero at tick {servo.zero_tick} its limits reach ticks "
+                    f"{ends[0]} to {ends[1]}, position mode ends at 0 and 4095; turn the horn or narrow the limits"
                 )
     try:
         write_text(path, text.getvalue())

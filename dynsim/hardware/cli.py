@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -172,45 +173,49 @@ def replay(
     Ctrl-C once: controlled stop. Twice: torque off.
     """
     with _client_library():
+        from dynsim.hardware.dialog import confirm_replay, print_limits
         from dynsim.hardware.errors import ServoMapError
         from dynsim.hardware.ports import VIRTUAL, bus_on
-        from dynsim.hardware.replay.session import run_replay, stop_on_signals
+        from dynsim.hardware.replay.display import displayed
+        from dynsim.hardware.replay.session import run_replay, shown_by
+        from dynsim.hardware.replay.signals import stop_on_signals
         from dynsim.hardware.replay.states import StopRequest
         from dynsim.hardware.virtual.faults import load_fault_script
 
         if (faults or plant) and port != VIRTUAL:
             raise ServoMapError("--faults and --plant are for virtual servos: --port virtual")
         simulated, servo_map, motion = _checked(record, map_file, rate, speed)
-        script = load_fault_script(faults) if faults else None
+        script = load_fault_script(faults, servo_map.ids) if faults else None
         robot = _plant(plant, variant, servo_map, motion) if plant else None
         folder = out or Path("results") / file_name(f"{servo_map.robot}_replay")
         for warning in motion.warnings:
             console.print(f"warning: {warning}")
         moves = live or port == VIRTUAL
-        if live and port != VIRTUAL and not yes:
-            _confirm(servo_map, motion)
+        if live and port != VIRTUAL:
+            confirm_replay(console, servo_map, motion, port, asked=not yes)
         stop = StopRequest()
-        with stop_on_signals(stop), _progress(enabled=not quiet) as observer:
-            result = run_replay(
-                motion,
-                servo_map,
-                bus_on(port, servo_map, script=script, plant=robot),
-                folder,
-                policy=policy.value if policy else None,
-                live=moves,
-                write_eeprom=configure,
-                stop=stop,
-                observer=observer,
-                provenance={"port": port, "record": str(record), "simulated": simulated.provenance},
-            )
-    _print_timing(result)
-    if not moves:
-        console.print("dry run: servos verified and the bus timed, nothing was moved; --live moves")
-        return
-    console.print(
-        f"replayed; torque {'ON, holding' if result.end_state == 'holding' else 'off'}; {folder / 'measured.h5'}"
-    )
-    console.print(f"compare: dynsim hw compare {record} {folder / 'measured.h5'}")
+        with shown_by({"standard output": sys.stdout}, folder) as lost:
+            with stop_on_signals(stop), nullcontext() if quiet else displayed(console, lost) as observer:
+                result = run_replay(
+                    motion,
+                    servo_map,
+                    bus_on(port, servo_map, script=script, plant=robot),
+                    folder,
+                    policy=policy.value if policy else None,
+                    live=moves,
+                    write_eeprom=configure,
+                    stop=stop,
+                    observer=observer,
+                    provenance={"port": port, "record": str(record), "simulated": simulated.provenance},
+                )
+            _print_timing(result)
+            if not moves:
+                print_limits(console, result.limits)
+                console.print("dry run: servos verified and the bus timed, nothing was moved; --live moves")
+                return
+            left = "ON, holding" if result.end_state == "holding" else "off"
+            console.print(f"replayed; torque {left}; {folder / 'measured.h5'}")
+            console.print(f"compare: dynsim hw compare {record} {folder / 'measured.h5'}")
 
 
 def _plant(scenario: str, variant: str | None, servo_map: Any, motion: Any) -> Any:
@@ -218,54 +223,6 @@ def _plant(scenario: str, variant: str | None, servo_map: Any, motion: Any) -> A
 
     posture = dict(zip((servo.label for servo in servo_map.servos), motion.path.position[0], strict=True))
     return simulated_arm(scenario, variant, servo_map, posture)
-
-
-def _confirm(servo_map: Any, motion: Any) -> None:
-    from dynsim.hardware.errors import ReplayInterrupted
-
-    duration = (motion.path.end - motion.path.start) / motion.speed
-    console.print(
-        f"{servo_map.robot}: {len(servo_map.servos)} servos will move for {duration:.1f} s plus the way to the start."
-    )
-    console.print("Is everybody clear of the robot, and the power cut within reach?")
-    try:
-        agreed = typer.confirm("move?")
-    except typer.Abort:
-        agreed = False
-    if not agreed:
-        raise ReplayInterrupted("not confirmed; nothing was moved")
-
-
-@contextmanager
-def _progress(*, enabled: bool) -> Iterator[Any]:
-    """A bar with state, following error and temperature; gives the observer that feeds it."""
-    if not enabled:
-        yield None
-        return
-    from rich.progress import BarColumn, TextColumn
-    from rich.progress import Progress as Bar
-
-    columns = (
-        TextColumn("{task.description:<13}"),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f} %"),
-        TextColumn("following error {task.fields[error]:6.4f} rad"),
-        TextColumn("hottest {task.fields[temperature]}"),
-    )
-    with Bar(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("", total=1.0, error=0.0, temperature="-")
-
-        def observe(progress: Any) -> None:
-            known = progress.temperature == progress.temperature
-            bar.update(
-                task,
-                description=progress.state.name,
-                completed=progress.fraction,
-                error=progress.following_error,
-                temperature=f"{progress.temperature:.0f} °C" if known else "-",
-            )
-
-        yield observe
 
 
 def _print_timing(result: Any) -> None:
@@ -279,6 +236,17 @@ def _print_timing(result: Any) -> None:
     )
 
 
+@hw.command(epilog="Example: dynsim hw recover results/arm_replay")
+def recover(folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="of a replay whose process died")]) -> None:
+    """Make a measured record, marked incomplete, of the cycles that a replay had written when it died."""
+    from dynsim.hardware.replay import recover as recovery
+    from dynsim.hardware.replay.folder import MEASURED
+
+    record = recovery.recover(folder)
+    span = f", {record.time[0]:.2f} to {record.time[-1]:.2f} s" if len(record) else ""
+    console.print(f"{len(record)} cycles{span}{'' if record.complete else ', incomplete'}: {folder / MEASURED}")
+
+
 @hw.command(
     epilog="Example: dynsim hw compare results/elbow_comparison/two_elbows/record.h5 results/arm_replay/measured.h5"
 )
@@ -288,7 +256,7 @@ def compare(
     gate: Annotated[Path | None, typer.Option("--gate", help="YAML with bounds; exit code 5 beyond them")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="folder [that of MEASURED]")] = None,
 ) -> None:
-    """Delay, rms and largest error between a simulated and a measured run, with a figure."""
+    """Delay, rms and largest error between a simulated and a measured run, joints and wheels, with a figure."""
     from dynsim.hardware.replay.compare import check_gate, compare_records, draw_comparison, load_gate
     from dynsim.record import Record
 
@@ -305,6 +273,21 @@ def compare(
             "-" if joint.delay != joint.delay else f"{joint.delay * 1e3:.1f}",
         )
     console.print(table)
+    if comparison.wheels:
+        wheels = Table(
+            "wheel", "rate: rms [rad/s]", "max [rad/s]", "at [s]", "turned [rad]", "error: max [rad]", "at end"
+        )
+        for wheel in comparison.wheels:
+            wheels.add_row(
+                wheel.wheel,
+                f"{wheel.rate_rms:.4f}",
+                f"{wheel.rate_max:.4f}",
+                f"{wheel.time_of_max:.3f}",
+                f"{wheel.turned:.3f}",
+                f"{wheel.angle_max:.4f}",
+                f"{wheel.angle_end:+.4f}",
+            )
+        console.print(wheels)
     console.print(f"delay {comparison.delay * 1e3:.1f} ms, worst joint {comparison.worst.joint}")
     folder = out or measured.parent
     write_json(folder / "comparison.json", comparison.summary())
@@ -318,19 +301,23 @@ def virtual(
     map_file: MapFile,
     faults: Annotated[Path | None, typer.Option("--faults", help="fault script")] = None,
     link: Annotated[Path | None, typer.Option("--link", help="name the device by this symbolic link")] = None,
+    plant: Annotated[str | None, typer.Option("--plant", help="scenario whose robot the servos move")] = None,
+    variant: Annotated[str | None, typer.Option("--variant", help="variant of that scenario")] = None,
 ) -> None:
     """Virtual servos behind a pseudo-terminal, for any Dynamixel tool. Ctrl-C ends it."""
     with _client_library():
-        from dynsim.hardware.replay.session import stop_on_signals
+        from dynsim.hardware.replay.signals import stop_on_signals
         from dynsim.hardware.replay.states import StopRequest
         from dynsim.hardware.servo_map import load_servo_map
         from dynsim.hardware.virtual.faults import load_fault_script
         from dynsim.hardware.virtual.line import line_for_map
         from dynsim.hardware.virtual.pseudo_terminal import PseudoTerminal
+        from dynsim.hardware.virtual.simulated_plant import simulated_arm
 
         servo_map = load_servo_map(map_file)
-        script = load_fault_script(faults) if faults else None
-        terminal = PseudoTerminal(line_for_map(servo_map, script=script), link)
+        script = load_fault_script(faults, servo_map.ids) if faults else None
+        robot = simulated_arm(plant, variant, servo_map, {}) if plant else None
+        terminal = PseudoTerminal(line_for_map(servo_map, script=script, plant=robot), link)
         stop = StopRequest()
         # A plain line: other programs wait for it.
         print(
@@ -358,12 +345,14 @@ def stop_servos(
 
         servo_map = load_servo_map(map_file) if map_file else None
         bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else survey.STOP_BAUD_RATES
-        torque = survey.stop_all(port, bauds, servo_map.ids if servo_map else ())
-    on = [id_ for id_, still_on in torque.items() if still_on]
-    if on or not torque:
-        who = f"ID {', '.join(map(str, on))}" if on else "any servo"
-        raise VerificationFailed(f"torque off was sent, but NOT confirmed by {who}: cut the power")
-    console.print(f"torque off, confirmed by {len(torque)} servos")
+        asked = survey.stop_all(port, bauds, servo_map.ids if servo_map else ())
+    on = [id_ for id_, still_on in asked.torque.items() if still_on]
+    # With a map everybody is known; without one those at a bit rate at which the port failed are not.
+    if on or not asked.torque or (asked.trouble and not servo_map):
+        who = f"ID {', '.join(map(str, on))}" if on else "everybody" if asked.torque else "any servo"
+        why = f" ({'; '.join(asked.trouble)})" if asked.trouble else ""
+        raise VerificationFailed(f"torque off was sent, but NOT confirmed by {who}: cut the power{why}")
+    console.print(f"torque off, confirmed by {len(asked.torque)} servos")
 
 
 @hw.command(epilog="Example: dynsim hw schema > servo_map.schema.json")
@@ -380,25 +369,45 @@ def calibrate(
     port: Port,
     joint: Annotated[list[str] | None, typer.Option("--joint", help="only this joint; may be repeated")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="write here instead of into the map")] = None,
+    nudge: Annotated[bool, typer.Option("--nudge", help="turn each joint 3° and back, to see its sense")] = False,
+    live: Annotated[bool, typer.Option("--live", help="really move (--nudge)")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="ask nothing, only report (--nudge)")] = False,
+    write: Annotated[bool, typer.Option("--write", help="write wrong senses into the map (--nudge)")] = False,
 ) -> None:
-    """Write the zero ticks: put the robot into its zero posture by hand (torque off), then run this."""
+    """Write the zero ticks: put the robot into its zero posture by hand (torque off), then run this.
+
+    With --nudge: find swapped senses instead, joint by joint.
+    """
     with _client_library():
-        from dynsim.hardware.calibrate import read_zero_ticks, write_zero_ticks
-        from dynsim.hardware.errors import ServoMapError
+        from dynsim.hardware.calibrate import read_zero_ticks, write_into_map
+        from dynsim.hardware.dialog import find_senses, may_write
+        from dynsim.hardware.errors import ServoMapError, VerificationFailed
         from dynsim.hardware.ports import bus_on
         from dynsim.hardware.servo_map import SHIPPED, load_servo_map
 
         servo_map = load_servo_map(map_file)
         target = out or servo_map.path
-        if target.resolve().parent == SHIPPED:
+        shipped = target.resolve().parent == SHIPPED
+        if shipped and (write or not nudge):
             raise ServoMapError(f"{target} comes with dynsim; write your own map with --out")
         unknown = [name for name in joint or () if name not in servo_map.joints]
         if unknown:
             raise ServoMapError(f"{map_file} has no joint {', '.join(unknown)}; it has {', '.join(servo_map.joints)}")
+        if nudge:
+            chosen = [servo for servo in servo_map.servos if servo.joint in (joint or servo_map.joints)]
+            signs, blocked = find_senses(console, servo_map, chosen, port, live=live, asked=not yes)
+            if signs and (write or (not shipped and may_write(console, list(signs), target))):
+                write_into_map(servo_map, "sign", signs, target)
+                console.print(f"written to {target}")
+            if blocked:
+                raise VerificationFailed(f"{', '.join(blocked)}: did not turn as told; is something in the way?")
+            return
+        if live or yes or write:
+            raise ServoMapError("--live, --yes and --write are for --nudge: zero ticks are read with the torque off")
         chosen = [servo for servo in servo_map.servos if (servo.joint in joint if joint else servo.in_position_mode)]
         with bus_on(port, servo_map) as (bus, _):
             ticks = read_zero_ticks(bus, chosen)
-        write_zero_ticks(servo_map, ticks, target)
+        write_into_map(servo_map, "zero_tick", ticks, target)
     table = Table("joint", "ID", "old zero", "new zero")
     for servo in chosen:
         table.add_row(servo.joint, str(servo.id), str(servo.zero_tick), str(ticks[servo.joint]))

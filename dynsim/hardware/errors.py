@@ -49,6 +49,12 @@ class ReplayInterrupted(ReplayAborted):
     exit_code: ClassVar[int] = 130
 
 
+class OutputsFailed(DynsimError):
+    """The motion went well, but the log, the record or what else tells of it could not be written."""
+
+    exit_code: ClassVar[int] = 1
+
+
 class ComparisonGateFailed(DynsimError):
     """The measured run is further from the simulated one than the gate file allows."""
 

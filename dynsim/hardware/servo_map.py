@@ -10,15 +10,16 @@ Joint angle and servo position are tied by
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
-from dynsim.config import error_at, forbid_conversion
+from dynsim.config import error_at
 from dynsim.errors import shown
+from dynsim.files import file_name
 from dynsim.hardware.bus.control_table import (
-    BAUD_RATES,
     MAX_ID,
     MODELS,
     RAD_PER_TICK,
@@ -27,30 +28,19 @@ from dynsim.hardware.bus.control_table import (
     OperatingMode,
     ServoModel,
 )
+from dynsim.hardware.data_sheet import Objection, objections_to_limits, objections_to_safety, rounded_up
 from dynsim.hardware.errors import ServoMapError
-from dynsim.inputs import is_file, parse_yaml, read_text
-from dynsim.problems import Origin, explain, unknown_keys
+from dynsim.hardware.safety import Bus, Safety, objections_to_times
+from dynsim.hardware.strict_yaml import Finite, Positive, StrictModel, Within, read_yaml
+from dynsim.inputs import is_file
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent / "scenarios" / "hardware"
 SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else _PACKAGE / "shipped_scenarios" / "hardware"
 """Folder of the servo maps that come with dynsim."""
 
-FaultPolicy = Literal["hold", "decelerate", "off"]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
 
-
-class StrictModel(BaseModel):
-    """Unknown keys are errors, and numbers neither texts nor true."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    @classmethod
-    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> Any:
-        schema = handler(source)
-        forbid_conversion(schema)
-        return schema
+_NO_LIMIT = "bounds nothing that a servo can do, or lets nothing pass"
 
 
 class Follows(StrictModel):
@@ -83,11 +73,23 @@ class Limits(StrictModel):
         Highest joint speed [rad/s].
     torque : float
         Joint torque at which the replay aborts [N·m].
+    acceleration : float
+        Highest acceleration of the path, between samples too [rad/s²]. The default lets the start of the published
+        arm's record pass, which jumps to 2.6 rad/s within 5 ms; a joint that turns a load wants less.
+    jerk : float
+        Highest change of acceleration, averaged in magnitude over 0.1 s [rad/s³]
+        (:meth:`dynsim.hardware.replay.trajectory.Path.jerk`). The default refuses a zigzag of 2 mrad every 5 ms.
+    shaking : float
+        Highest velocity that is gained and lost again within 0.3 s, or lost and gained [rad/s]
+        (:meth:`dynsim.hardware.replay.trajectory.Path.shaking`).
     """
 
     position_deg: tuple[Finite, Finite] | None = None
     velocity: Positive
     torque: Positive
+    acceleration: Annotated[Positive, Within(0.01, 1e5, "rad/s²", _NO_LIMIT)] = 2000.0
+    jerk: Annotated[Positive, Within(0.01, 1e7, "rad/s³", _NO_LIMIT)] = 60_000.0
+    shaking: Annotated[Positive, Within(0.01, 100.0, "rad/s", _NO_LIMIT)] = 3.0
 
 
 # For editors; what loading says about it is in _position_limits_fit_the_mode.
@@ -105,7 +107,7 @@ class Kind(StrictModel):
     Attributes
     ----------
     model : str
-        "MX-106" or "MX-28".
+        A name of :data:`dynsim.hardware.bus.control_table.MODELS`.
     mode : "position" or "velocity"
     firmware_min : int
         Oldest firmware accepted.
@@ -117,7 +119,7 @@ class Kind(StrictModel):
         Servo turns per joint turn.
     """
 
-    model: Literal["MX-106", "MX-28"]
+    model: Literal["MX-106", "MX-28", "XL430-W250", "XM430-W210", "XM430-W350", "XH540-W150", "XH540-W270"]
     mode: Literal["position", "velocity"]
     firmware_min: int = 41
     follows: Follows
@@ -134,6 +136,16 @@ class Kind(StrictModel):
             raise error_at("limits", "a servo in position mode needs limits.position_deg: [lowest, highest]")
         if limits is not None and not limits[0] < limits[1]:
             raise error_at("limits.position_deg", f"{limits[0]} is not below {limits[1]}")
+        for key, text in objections_to_limits(
+            MODELS[self.model],
+            self.gear,
+            turns_to_angle=self.mode == "position",
+            position_deg=limits,
+            velocity=self.limits.velocity,
+            torque=self.limits.torque,
+            following_error=self.following_error,
+        ):
+            raise error_at(key, text)
         return self
 
 
@@ -148,80 +160,38 @@ class ServoEntry(StrictModel):
     hold_at_deg: Finite | None = None
 
 
-# 4.5 Mbit/s is the servos' but not the client library's.
-_BAUD_CHOICES = [rate for rate in BAUD_RATES if rate <= 4_000_000]
-
-
-class Bus(StrictModel):
-    """The serial line.
+class Lifts(StrictModel):
+    """How wheel pairs that the record lifts are lifted.
 
     Attributes
     ----------
-    baud : int
-        [bit/s].
-    rate : float
-        Goal and state cycles per second [Hz].
-    latency : float
-        What adapter and operating system may add to an answer [s].
-    return_delay : float
-        Longest return delay a servo may have stored [s].
+    signal : str
+        Signal of the record with 1 where a wheel pair is on the ground, 0 where it is lifted.
+    joints : tuple of str
+        The pitch joints on the axles of the first, second, ... pair: every pair but the last has one. Lifting is added
+        to what they do otherwise; the first, on the axle that carries the head, follows the record and keeps the head
+        where it is.
+    clearance_mm : float
+        Height of the lower wheel of a lifted pair above the floor.
+    blend_s : float
+        Time to lift a pair, and to put it down [s of record time].
+    tilt_mm : float
+        A record is refused where one wheel of a grounded pair would be further above the floor: a bent base twists.
     """
 
-    baud: Annotated[int, Field(json_schema_extra={"enum": _BAUD_CHOICES})] = 3_000_000
-    rate: Positive = 200.0
-    latency: Positive = 2e-3
-    return_delay: Annotated[float, Field(ge=0, le=508e-6)] = 0.0
-
-    @model_validator(mode="after")
-    def _baud_is_one_of_the_servos(self) -> Bus:
-        if self.baud not in _BAUD_CHOICES:
-            raise error_at("baud", f"is not one of {', '.join(map(str, _BAUD_CHOICES))}")
-        return self
+    signal: str = "grounded"
+    joints: Annotated[tuple[str, ...], Field(min_length=1)]
+    clearance_mm: Positive = 5.0
+    blend_s: Positive = 0.3
+    tilt_mm: Positive = 2.5
 
 
-class Supply(StrictModel):
-    """Voltage range in which the robot may move [V]."""
-
-    lowest: Positive = 10.0
-    highest: Positive = 14.8
-
-
-class Safety(StrictModel):
-    """When to abort, and how to stop.
-
-    Attributes
-    ----------
-    policy : "hold", "decelerate" or "off"
-        What to do on a fault: freeze where the robot is; slow down along the path and hold; release torque.
-    stop_time : float
-        Time in which `decelerate` comes to rest [s].
-    run_up : float
-        Acceleration of the stretch added where a record begins or ends in motion [rad/s²].
-    approach_velocity : float
-        Top speed of the move to the start posture [rad/s].
-    watchdog : float
-        Servos stop by themselves when the bus is silent for this long [s].
-    missed_cycles, late_cycles, following_cycles, torque_cycles : int
-        Consecutive cycles of one servo without a status, of late deadlines, of following error and of too much torque
-        that abort.
-    temperature_max : float
-        [°C].
-    at_end : "off" or "hold"
-        Torque after a run that went well. A robot that falls when limp holds.
-    """
-
-    policy: FaultPolicy = "decelerate"
-    stop_time: Positive = 0.3
-    run_up: Positive = 2.0
-    approach_velocity: Positive = 0.3
-    watchdog: Annotated[float, Field(ge=0.02, le=2.54)] = 0.2
-    missed_cycles: Annotated[int, Field(ge=1)] = 3
-    late_cycles: Annotated[int, Field(ge=1)] = 5
-    following_cycles: Annotated[int, Field(ge=1)] = 5
-    torque_cycles: Annotated[int, Field(ge=1)] = 10
-    temperature_max: Positive = 65.0
-    supply: Supply = Supply()
-    at_end: Literal["off", "hold"] = "off"
+def _is_a_file_name(robot: str) -> str:
+    if file_name(robot) != robot:
+        raise ValueError(
+            f"names the folder of results; use a name without / and the like, such as {file_name(robot)!r}"
+        )
+    return robot
 
 
 class _MapFile(StrictModel):
@@ -229,9 +199,10 @@ class _MapFile(StrictModel):
 
     model_config = ConfigDict(title="ServoMap")
 
-    robot: str
+    robot: Annotated[str, AfterValidator(_is_a_file_name)]
     bus: Bus = Bus()
     safety: Safety = Safety()
+    lifts: Lifts | None = None
     kinds: dict[str, Kind]
     servos: Annotated[dict[str, ServoEntry], Field(json_schema_extra={"minProperties": 1})]
 
@@ -240,12 +211,37 @@ class _MapFile(StrictModel):
         if not self.servos:
             raise error_at("servos", "the map names none")
         owner: dict[int, str] = {}
+        follower: dict[tuple[str, str], str] = {}
         for joint, entry in self.servos.items():
             if entry.kind not in self.kinds:
                 raise error_at(f"servos.{joint}.kind", f"is not one of {', '.join(self.kinds)}")
             if entry.id in owner:
                 raise error_at(f"servos.{joint}.id", f"is also the ID of {owner[entry.id]}")
             owner[entry.id] = joint
+            column = (self.kinds[entry.kind].follows.position, entry.label or joint)
+            if entry.hold_at_deg is None and (other := follower.setdefault(column, joint)) != joint:
+                raise error_at(f"servos.{joint}.label", f"{other} already follows {column[1]!r} of {column[0]!r}")
+        for joint in self.lifts.joints if self.lifts else ():
+            if joint not in self.servos:
+                raise error_at("lifts.joints", f"{joint} is none of the servos")
+            if self.kinds[self.servos[joint].kind].mode != "position" or self.servos[joint].hold_at_deg not in (
+                None,
+                0,
+            ):
+                raise error_at(
+                    "lifts.joints", f"{joint} must be in position mode and follow the record or be held at 0"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _entries_fit_each_other(self) -> _MapFile:
+        used = {name: self.kinds[name] for name in dict.fromkeys(entry.kind for entry in self.servos.values())}
+        for key, text in (*_objections_to_kinds(self.safety, used), *objections_to_times(self.bus, self.safety)):
+            raise error_at(key, text)
+        for joint, entry in self.servos.items():
+            kind = self.kinds[entry.kind]
+            for key, text in _objections_to_servo(entry, kind):
+                raise error_at(f"servos.{joint}.{key}", text)
         return self
 
 
@@ -323,6 +319,7 @@ class ServoMap:
     path : Path
     bus : Bus
     safety : Safety
+    lifts : Lifts or None
     servos : tuple of Servo
     """
 
@@ -331,6 +328,7 @@ class ServoMap:
         self.robot = content.robot
         self.bus = content.bus
         self.safety = content.safety
+        self.lifts = content.lifts
         self.servos = tuple(Servo(joint, entry, content.kinds[entry.kind]) for joint, entry in content.servos.items())
 
     @property
@@ -340,6 +338,53 @@ class ServoMap:
     @property
     def joints(self) -> tuple[str, ...]:
         return tuple(servo.joint for servo in self.servos)
+
+    @property
+    def lifting(self) -> dict[str, Any]:
+        """The entry ``lifts``, if there is one, with the columns of a record instead of the joints: for provenance."""
+        if self.lifts is None:
+            return {}
+        label = {servo.joint: servo.label for servo in self.servos}
+        return {"lifts": self.lifts.model_dump() | {"joints": [label[joint] for joint in self.lifts.joints]}}
+
+
+def _objections_to_kinds(safety: Safety, kinds: dict[str, Kind]) -> Iterable[Objection]:
+    """What the kinds that are used, or their servos' models, cannot do of what ``safety`` asks for."""
+    supply = safety.supply
+    models = [MODELS[kind.model] for kind in kinds.values()]
+    for key, text in objections_to_safety(models, safety.temperature_max, (supply.lowest, supply.highest)):
+        yield f"safety.{key}", text
+    for name, kind in kinds.items():
+        limits = kind.limits
+        if kind.mode == "position" and safety.approach_velocity > limits.velocity:
+            yield "safety.approach_velocity", f"is above kinds.{name}.limits.velocity; use {limits.velocity:g} or less"
+        if (needed := limits.velocity / safety.stop_time) > limits.acceleration:
+            least = limits.velocity / limits.acceleration
+            yield (
+                "safety.stop_time",
+                f"stops kinds.{name} with {needed:.4g} rad/s², above its limit; use {rounded_up(least):g} or more",
+            )
+        if safety.run_up > limits.acceleration:
+            yield (
+                "safety.run_up",
+                f"is above kinds.{name}.limits.acceleration, {limits.acceleration:g} rad/s²; use that or less",
+            )
+
+
+def _objections_to_servo(entry: ServoEntry, kind: Kind) -> Iterable[Objection]:
+    """A servo in position mode that is to be held where it must not be, or has nowhere to go."""
+    limits = kind.limits.position_deg
+    if kind.mode != "position" or limits is None:
+        return
+    if entry.hold_at_deg is not None and not limits[0] <= entry.hold_at_deg <= limits[1]:
+        yield "hold_at_deg", f"is beyond limits.position_deg; use {limits[0]:g} to {limits[1]:g}"
+    lowest, highest = Servo("", entry, kind).tick_limits
+    if lowest > highest:
+        yield (
+            "zero_tick",
+            f"leaves no tick of 0 to {TICKS_PER_TURN - 1}, the turn of position mode, within limits.position_deg; "
+            "use that of the zero posture (`dynsim hw calibrate`)",
+        )
 
 
 def load_servo_map(path: str | Path) -> ServoMap:
@@ -369,24 +414,3 @@ def json_schema() -> dict[str, Any]:
     limit is below the upper one. Loading checks these.
     """
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **_MapFile.model_json_schema()}
-
-
-_Schema = TypeVar("_Schema", bound=BaseModel)
-
-
-def read_yaml(path: Path, schema: type[_Schema]) -> _Schema:
-    """Read YAML into a pydantic model.
-
-    Raises
-    ------
-    ServoMapError
-        Missing file, bad YAML or bad entry; the message holds file, line and key.
-    """
-    data = parse_yaml(read_text(path, ServoMapError), ServoMapError, str(path))
-    if not isinstance(data, dict):
-        raise ServoMapError(f"{path}: expected a mapping with the keys {', '.join(schema.model_fields)}")
-    try:
-        return schema.model_validate(data)
-    except ValidationError as error:
-        origin = Origin(path, (data,))
-        raise ServoMapError(explain(error, data, origin, unknown_keys(error, data, origin, schema))) from None

@@ -218,6 +218,7 @@ class Contact:
     stribeck : speed [m/s] of μ + (μ_s − μ) exp(−(v/v_s)²); 0: μ from the first slip on
     viscous_friction : what each m/s adds to the coefficient [s/m]
     restitution : share of the normal speed that is left after an impact, with its sign turned
+    grip_axis : (3,) in the body's frame, or None: friction along it is ``grip`` times that across; time stepping only
     radius : of sphere or capsule [m]
     tip : (3,) or None
         The other end of a capsule's axis, in the same frame [m]. Where the surface bends away from the free side the
@@ -236,6 +237,8 @@ class Contact:
     stribeck: float = 0.0
     viscous_friction: float = 0.0
     restitution: float = 0.0
+    grip: float = 1.0
+    grip_axis: Array | None = None
     radius: float = 0.0
     tip: Array | None = None
 

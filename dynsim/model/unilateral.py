@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynsim.errors import ModelError
 from dynsim.kernels import arrays as ka
@@ -32,9 +33,11 @@ class JointStop:
     position: float
 
 
-def told(value: float, unit: str) -> str:
-    """A joint coordinate for a line of text; an angle in degrees too, which scenarios are written in."""
-    return f"{value:.5g} {unit}" if unit != "rad" else f"{np.degrees(value):.5g}° ({value:.4g} rad)"
+def told(value: float, unit: str, digits: int = 5) -> str:
+    """A joint coordinate for a line of text; an angle in degrees first, which scenarios are written in."""
+    if unit != "rad":
+        return f"{value:.{digits}g} {unit}"
+    return f"{np.degrees(value):.{digits}g}° ({value:.{min(digits, 4)}g} rad)"
 
 
 def compile_unilateral(
@@ -91,6 +94,15 @@ def compile_unilateral(
     )
 
 
+def compile_grips(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float64]:
+    """Friction along an axis per that across, and the axis in the link's frame, (c, 4); 1 where it is isotropic."""
+    grips = np.ones((len(contacts), 4))
+    for row, contact in zip(grips, contacts, strict=True):
+        if contact.grip_axis is not None:
+            row[0], row[1:] = contact.grip, robot.attached_axes(contact.body) @ contact.grip_axis
+    return grips
+
+
 def joint_stops(robot: Robot) -> list[JointStop]:
     """The stops of a robot's joints: their finite limits, the lower one first.
 
@@ -108,7 +120,8 @@ def joint_stops(robot: Robot) -> list[JointStop]:
                     raise ModelError(
                         f"{link.joint}: starts at {told(robot.initial[k], link.units[0])}, beyond its stop at "
                         f"{told(limit, link.units[0])}; "
-                        "contacts.law: unilateral enforces it: change its initial position or its limit"
+                        "contacts.law: unilateral enforces it: change its initial position or its limit",
+                        keys=("plant",),
                     )
                 found.append(JointStop(link.joint, side, float(limit)))
     return found

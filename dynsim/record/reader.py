@@ -65,7 +65,9 @@ def read(path: Path) -> Content:
     """
     try:
         if not is_file(path, RecordError):
-            raise RecordError(f"{path}: no such record")
+            part = path.with_suffix(".part")
+            hint = f"; the replay that made {part} died: dynsim hw recover {path.parent}" if part.is_file() else ""
+            raise RecordError(f"{path}: no such record{hint}")
         check_complete(path)
         with path.open("rb") as stream:
             verified = _verified(path, stream)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig, error_at
+from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig, Vector3, error_at
 from dynsim.families import member, union
 from dynsim.problems import Origin, listed
 from dynsim.scenario.loads import LoadConfig
@@ -20,8 +20,24 @@ NAME_LIMIT = 255
 
 # Keys that only one law reads.
 BILATERAL_KEYS = ("slip_smoothing_m_s", "pulling_friction")
-UNILATERAL_KEYS = ("static_friction", "stribeck_m_s", "viscous_friction_s_per_m", "restitution")
+UNILATERAL_KEYS = ("static_friction", "stribeck_m_s", "viscous_friction_s_per_m", "restitution", "grip")
+# The trapezoidal rule of time stepping.
+THETA = 0.5
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
+
+
+class Grip(StrictConfig):
+    """Friction that differs along and across an axis of the body, as that of a wheel."""
+
+    axis: Vector3 = Field(description="in the axes of the body or frame: along it, as far as it lies in the surface")
+    ratio: Share = Field(description="friction along the axis as a fraction of that across; 0: it rolls freely")
+
+    @field_validator("axis")
+    @classmethod
+    def _check_axis(cls, value: list[float]) -> list[float]:
+        if not any(value):
+            raise ValueError("has no direction")
+        return value
 
 
 class ContactPoint(BodyPoint):
@@ -31,6 +47,7 @@ class ContactPoint(BodyPoint):
     friction: NonNegative | None = Field(default=None, description="kinetic coefficient; default: that of contacts")
     static_friction: NonNegative | None = Field(default=None, description="default: that of contacts; unilateral law")
     restitution: Share | None = Field(default=None, description="default: that of contacts; unilateral law")
+    grip: Grip | None = Field(default=None, description="anisotropic friction; only of integrator.method time_stepping")
     enabled: bool = True
 
 
@@ -76,24 +93,30 @@ class Contacts(StrictConfig):
     @model_validator(mode="after")
     def _check_law(self) -> Self:
         """Keys of the other law would be read by nobody."""
-        set_here = [key for key in self.other_keys if key in self.model_fields_set]
-        if set_here:
-            raise ValueError(f"{listed(set_here)} {'is' if len(set_here) == 1 else 'are'} not of law {self.law}")
+        other = "unilateral" if self.law == "bilateral" else "bilateral"
+        fix = f"is read under law: {other} only, this is law: {self.law}; remove it, or change the law"
+        for key in self.other_keys:
+            if key in self.model_fields_set:
+                raise error_at(key, fix)
         if self.law == "bilateral" and self.candidates != "points":
             raise error_at(
                 "candidates", f"{self.candidates!r} would glue all of them to their surfaces; it needs law: unilateral"
             )
         static = self.friction if self.static_friction is None else self.static_friction
         if static < self.friction:
-            raise ValueError(f"static_friction {static:g} is less than friction {self.friction:g}")
+            raise error_at("static_friction", f"is less than friction {self.friction:g}; it must hold as much or more")
         for name, point in self.points.items():
-            if self.law == "bilateral" and point.model_fields_set & set(UNILATERAL_KEYS):
-                keys = listed(sorted(point.model_fields_set & set(UNILATERAL_KEYS)))
-                raise ValueError(f"points.{name}: {keys} not of law bilateral")
+            given = sorted(point.model_fields_set & set(UNILATERAL_KEYS))
+            if self.law == "bilateral" and given:
+                raise error_at(f"points.{name}.{given[0]}", fix)
             kinetic = self.friction if point.friction is None else point.friction
             holds = point.static_friction if point.static_friction is not None else self.static_friction
             if holds is not None and holds < kinetic:
-                raise ValueError(f"points.{name}: static_friction {holds:g} is less than friction {kinetic:g}")
+                key = "friction" if point.static_friction is None else "static_friction"
+                raise error_at(
+                    f"points.{name}.{key}",
+                    f"static_friction {holds:g} is less than friction {kinetic:g}; it must hold as much or more",
+                )
         return self
 
 
@@ -119,7 +142,7 @@ class Integrator(StrictConfig):
         default=None, description="fixed step of rk4 and time_stepping (default 0.001), else the first step"
     )
     theta: float = Field(
-        default=0.5, ge=0.5, le=1.0, description="time_stepping: 0.5 is second order between events, 1 damps"
+        default=THETA, ge=0.5, le=1.0, description="time_stepping: 0.5 is second order between events, 1 damps"
     )
     step_max_s: Positive | None = None
     time_limit_h: Positive = Field(default=24.0, description="runs estimated to integrate for longer are refused [h]")
@@ -130,6 +153,17 @@ class Integrator(StrictConfig):
         if value == "rodas4":
             raise ValueError("is no longer there; radau5 does what it did, at any inductance, and takes longer steps")
         return value
+
+    @model_validator(mode="after")
+    def _check_method(self) -> Self:
+        stepping = self.method == "time_stepping"
+        if stepping and self.solver != "articulated":
+            raise error_at(
+                "solver", "is not of integrator.method: time_stepping, which solves with articulated sweeps; remove it"
+            )
+        if self.theta != THETA and not stepping:
+            raise error_at("theta", f"is of method: time_stepping only, this is method: {self.method}; remove it")
+        return self
 
 
 class RecordOptions(StrictConfig):
@@ -161,6 +195,25 @@ class ScenarioConfig(StrictConfig):
     integrator: Integrator = Integrator()
     record: RecordOptions = RecordOptions()
     metrics: Metrics = Metrics()
+
+    @model_validator(mode="after")
+    def _check_stepped_contacts(self) -> Self:
+        glued = self.contacts.law == "bilateral" and any(point.enabled for point in self.contacts.points.values())
+        if glued and self.integrator.method == "time_stepping":
+            raise error_at("integrator.method", "needs `contacts: {law: unilateral}`")
+        return self
+
+    @model_validator(mode="after")
+    def _check_grips(self) -> Self:
+        """The event-driven methods know round cones only."""
+        for name, point in self.contacts.points.items():
+            if point.grip is not None and self.integrator.method != "time_stepping":
+                raise error_at(
+                    f"contacts.points.{name}.grip",
+                    f"needs integrator.method: time_stepping; {self.integrator.method} finds begin and end of slip by "
+                    "one coefficient for all directions",
+                )
+        return self
 
     @field_validator("name", "variant")
     @classmethod

@@ -25,7 +25,13 @@ WAITED = 4  # ticks in which the command could not be carried out and the target
 SLOWED = 5  # ticks slowed down
 NULL_REDUCED = 6  # ticks with less null-space motion
 WAITED_FOR = 6  # + JOINT_LIMIT … ATTITUDE: ticks that waited for it
-COUNTS_SIZE = WAITED_FOR + ATTITUDE + 1
+PATH_SLOWED = WAITED_FOR + ATTITUDE + 1  # ticks in which the target moved slower than commanded
+STILL = PATH_SLOWED + 1  # ticks for which the target has now waited without a break
+STILL_FOR = STILL + 1  # what it waited for last
+COUNTS_SIZE = STILL_FOR + 1
+# State.progress
+DONE = 0  # part of the present row of commands that is carried out, 0 to 1
+LATE = 1  # control periods that a slower target has lost
 
 
 class Schedule(NamedTuple):
@@ -48,6 +54,7 @@ class State(NamedTuple):
     w_hat: np.ndarray  # (6,) what the controller believes of w
     phi_hat: np.ndarray  # (n_phi,) what the controller believes of phi
     counts: np.ndarray  # (COUNTS_SIZE,) int
+    progress: np.ndarray  # (2,)
 
 
 class Rig(NamedTuple):
@@ -65,7 +72,6 @@ class Rig(NamedTuple):
     target: np.ndarray  # (6,)
     rate: np.ndarray  # (6,) rate of the target that is carried out
     origin: np.ndarray  # (3,)
-    command: np.ndarray  # (6,) rate of the target that is asked for
 
 
 class Trace(NamedTuple):
@@ -99,6 +105,7 @@ def new_state(model: SnakeModel) -> State:
         w_hat=np.zeros(6),
         phi_hat=np.zeros(joints),
         counts=np.zeros(COUNTS_SIZE, dtype=np.int64),
+        progress=np.zeros(2),
     )
 
 
@@ -118,7 +125,6 @@ def new_rig(model: SnakeModel) -> Rig:
         target=np.zeros(6),
         rate=np.zeros(6),
         origin=np.zeros(3),
-        command=np.zeros(6),
     )
 
 

@@ -17,16 +17,21 @@ from dynsim.snake.plant import advance_plant
 from dynsim.snake.state import (
     ATTITUDE,
     CLAMPED,
+    DONE,
     FEEDFORWARD,
     JOINT_LIMIT,
+    LATE,
     MEASURED,
     MODE,
     NO_OBSTACLE,
     NULL_REDUCED,
+    PATH_SLOWED,
     PLACE,
     RATE_LIMIT,
     SINGULAR,
     SLOWED,
+    STILL,
+    STILL_FOR,
     TICKS,
     WAITED,
     WAITED_FOR,
@@ -39,6 +44,15 @@ WITHHELD = 1e-5
 BETA_LIMIT = 0.5 * math.pi - 0.02
 # Steps in which a null-space motion that is too fast is reduced, the last of them to nothing.
 NULL_REDUCTIONS = 4
+# Tries to find a speed of the target that keeps the limits: each takes ROOM of what the last one leaves, but not less
+# than LEAST_PART of its speed, because the predicted middle of a period that is much too fast says little.
+SLOW_DOWNS = 8
+ROOM = 0.98
+LEAST_PART = 0.25
+# A target that would have to be slower than this part of its commanded speed waits.
+LEAST_SPEED = 0.01
+# A joint that is nearer to its limit than this [rad] is at it; one further off that is in the way was too fast.
+AT_LIMIT = 0.05
 
 
 @internal_kernel
@@ -93,17 +107,65 @@ def slow_down(model, law, u, phi):
 
 
 @internal_kernel
-def tick(model, law, schedule, state, velocity, rig):
+def is_too_fast(model, law, work, found, phi):
+    """A slower target would pass: joints are too fast, and what comes too fast to a limit is not at it yet."""
+    for j in range(phi.shape[0]):
+        if work.at_limit[j] == 2:
+            left = model.upper[j] - phi[j] if work.u[j] > 0.0 else phi[j] - model.lower[j]
+            if left < AT_LIMIT and abs(work.u[j]) <= law.rate_limit:
+                return False
+    return found in (RATE_LIMIT, JOINT_LIMIT)
+
+
+@internal_kernel
+def fitting_part(model, law, work, phi):
+    """Part of the rates ``work.u`` that keeps the rate limit and comes to no limit too fast, by a step at a time."""
+    part = 1.0
+    for j in range(phi.shape[0]):
+        allowed, rate = law.rate_limit, abs(work.u[j])
+        if work.at_limit[j] == 2:
+            left = model.upper[j] - phi[j] if work.u[j] > 0.0 else phi[j] - model.lower[j]
+            allowed = min(allowed, law.limit_rate * max(left, 0.0))
+        if rate > allowed:
+            part = min(part, allowed / rate)
+    return max(ROOM * part, LEAST_PART)
+
+
+@internal_kernel
+def commanded_rate(velocity, place, done, speed, rate):
+    """Mean rate of the target in a period in which ``speed`` rows of the commands are carried out, 0 to 1.
+
+    The first ``done`` of row ``place`` is carried out already; after the last row the rate is zero. The path is that of
+    the rows, whatever the speeds: every row is carried out as a whole, in one period or in several.
+    """
+    rows = velocity.shape[0]
+    first = min(speed, 1.0 - done)
+    second = speed - first
+    for i in range(6):
+        rate[i] = first * velocity[place, i] if place < rows else 0.0
+        if second > 0.0 and place + 1 < rows:
+            rate[i] += second * velocity[place + 1, i]
+
+
+@internal_kernel
+def tick(model, law, schedule, state, velocity, moving, slows, rig):
     """One control period: evaluate the controller, hold its rates, move the plant and the controller's beliefs.
 
     Rates of the beginning of the period, held, miss the constraints by O(period) at its end and leave a head error of
     that order. Those of its predicted middle (``schedule.midpoint``) make it O(period^2). The prediction is the closed
     loop itself, w~' = w~_d' - K (w~ - w~_d) ([T] eq 15).
 
-    With the allocating limit policy a command is carried out only as a whole, every joint within its limits and rate;
-    a null-space motion that is too fast is reduced. Otherwise the target waits where it is, and what is left to do
-    (errors, shape points) is slowed down until it fits. A target that would turn over beta = +-90 deg, where the rates
-    of alpha and gamma have no bound, waits too.
+    With the allocating limit policy a command is carried out with all six coordinates in step, every joint within its
+    limits and rate. When a joint would be too fast, first the null-space motion is reduced, then (``slows``) the target
+    goes along its path with less speed. Otherwise the target waits where it is, and what is left to do (errors, shape
+    points) is slowed down until it fits. A target that would turn over beta = +-90 deg, where the rates of alpha and
+    gamma have no bound, waits too.
+
+    Parameters
+    ----------
+    velocity : (T, 6) see :func:`run_ticks`.
+    moving : int, 0: the target waits, whatever the commands.
+    slows : int, 1: the target may be slower than commanded.
 
     Returns
     -------
@@ -120,10 +182,17 @@ def tick(model, law, schedule, state, velocity, rig):
     null_gain = full_gain
     allocate = law.limit_policy == LIMITS_ALLOCATE
     believe(model, schedule, state, rig)
-    copy(velocity, rate)
     reason, waits, reductions, slowed = NO_OBSTACLE, False, 0, False
+    place, done, speed, tries = state.counts[PLACE], state.progress[DONE], 1.0, 0
+    commanded = False
+    for i in range(6):
+        rate[i] = 0.0
+    if moving:
+        commanded_rate(velocity, place, done, speed, rate)
+    for i in range(6):
+        commanded = commanded or rate[i] != 0.0
     beta = wrap_angle(w_target[4])
-    if allocate and abs(beta) > BETA_LIMIT and beta * velocity[4] > 0.0:
+    if allocate and abs(beta) > BETA_LIMIT and beta * rate[4] > 0.0:
         reason, waits = ATTITUDE, True
         for i in range(6):
             rate[i] = 0.0
@@ -144,12 +213,19 @@ def tick(model, law, schedule, state, velocity, rig):
         found = obstacle(law, work, joints)
         if found == NO_OBSTACLE:
             break
+        fastest = 0.0
+        for j in range(joints):
+            fastest = max(fastest, abs(u[j]))
         if found == RATE_LIMIT and reductions < NULL_REDUCTIONS and null_gain != 0.0:
-            fastest = 0.0
-            for j in range(joints):
-                fastest = max(fastest, abs(u[j]))
             reductions += 1
             null_gain *= 0.0 if reductions == NULL_REDUCTIONS else 0.9 * law.rate_limit / fastest
+        elif slows and commanded and tries < SLOW_DOWNS and not waits and is_too_fast(model, law, work, found, phi):
+            tries += 1
+            speed *= fitting_part(model, law, work, phi)
+            if speed < LEAST_SPEED:
+                tries = SLOW_DOWNS
+            else:
+                commanded_rate(velocity, place, done, speed, rate)
         elif not waits:
             reason, waits, null_gain, reductions = found, True, full_gain, 0
             for i in range(6):
@@ -177,12 +253,23 @@ def tick(model, law, schedule, state, velocity, rig):
         w_target[i] += period * rate[i]
         w_hat[i] += period * rate[i]  # x, y, gamma of the estimated state; the rest is overwritten
     state.counts[TICKS] += 1
-    commanded = False
-    for i in range(6):
-        commanded = commanded or velocity[i] != 0.0
-    if waits and commanded:
+    blocked = waits and commanded
+    if blocked:
         state.counts[WAITED_FOR + reason] += 1
-    return slip, waits and commanded
+        state.counts[STILL] += 1
+        state.counts[STILL_FOR] = reason
+    elif moving:
+        state.counts[STILL] = 0
+        state.counts[PATH_SLOWED] += int(speed < 1.0)
+        state.progress[LATE] += 1.0 - speed
+        done += speed
+        if done >= 1.0 - 1e-12:
+            state.counts[PLACE] += 1
+            done = max(done - 1.0, 0.0)
+        state.progress[DONE] = done
+    if blocked or not moving:
+        state.counts[WAITED] += 1
+    return slip, blocked
 
 
 @kernel
@@ -214,10 +301,11 @@ def run_ticks(model, law, schedule, state, velocity, count, moving, stop, stride
     Parameters
     ----------
     velocity : (T, 6) commanded rates of the target, a block of one row per period; zero after its end. The next row is
-        taken only when the last one was carried out (``state.counts[PLACE]`` is the place).
+        taken only when the last one was carried out (``state.counts[PLACE]`` is the place, ``state.progress[DONE]``
+        the part of that row that is carried out already).
     count : int, control periods to run.
     moving : int, 1: follow the script; 0: the target waits.
-    stop : int, 1: return after a period that was blocked.
+    stop : int, 1: return after a period that was blocked; 0: a target that is too fast is slowed down instead.
     stride : int, ticks 0, stride, 2 stride, ... of the run are recorded.
 
     Returns
@@ -228,16 +316,13 @@ def run_ticks(model, law, schedule, state, velocity, count, moving, stop, stride
         The last period was blocked.
     """
     base, phi, counts, at_limit = state.base, state.phi, state.counts, rig.work.at_limit
-    command, blocked = rig.command, False
+    blocked, slows = False, 0 if stop else 1
     for k in range(count):
-        now, place = counts[TICKS], counts[PLACE]
+        now = counts[TICKS]
         r = now // stride if now % stride == 0 else -1
         if r >= 0:
             record_row(model, law, state, rig, r, trace)
-        for i in range(6):
-            command[i] = velocity[place, i] if moving and place < velocity.shape[0] else 0.0
-        slip, blocked = tick(model, law, schedule, state, command, rig)
-        counts[PLACE if moving and not blocked else WAITED] += 1
+        slip, blocked = tick(model, law, schedule, state, velocity, moving, slows, rig)
         if r >= 0:
             trace.slip[r] = slip
             copy(rig.work.u, trace.u[r])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.errors import CheckRefused
 from dynsim.hardware.replay.check import check_motion, plan_cycle, velocity_limit
-from dynsim.hardware.replay.trajectory import path_of_record
+from dynsim.hardware.replay.trajectory import Path, path_of_record
 from dynsim.hardware.servo_map import load_servo_map
 from dynsim.record import Record
 
@@ -95,6 +96,9 @@ def test_a_record_in_motion_gets_a_run_up_and_a_run_out_at_rest(rig) -> None:
         (lambda record: record.signals.pop("v"), "shoulder follows the signal 'v'; the record has q, rho, rho_dot"),
         (lambda record: record["q"].__setitem__((3, 1), math.nan), "elbow: 'q' is nan at t = 0.015 s"),
         (lambda record: record.time.__setitem__(4, 0.0), "time does not increase at sample 4"),
+        (lambda record: record.time.__setitem__(-1, math.inf), "time is inf at sample 239, of 240 samples"),
+        (lambda record: record.time.__setitem__(-1, math.nan), "time is nan at sample 239, of 240 samples"),
+        (lambda record: record.time.__setitem__(0, -math.inf), "time is -inf at sample 0, of 240 samples"),
     ],
 )
 def test_unusable_records_are_refused(rig, change, message: str) -> None:
@@ -132,9 +136,197 @@ def test_torque_of_the_record_is_checked_where_the_map_names_it(write_map) -> No
         check_motion(record, servo_map)
 
 
+def quintics(knots: np.ndarray, seed: int) -> Path:
+    """A path whose interpolant is known as polynomials: random angles and rates at the knots."""
+    random = np.random.default_rng(seed)
+    rates = random.normal(size=(len(knots), 2))
+    return Path(knots, random.normal(size=(len(knots), 2)), rates[:-1], rates[1:], float(knots[-1]))
+
+
+def test_extremes_of_the_acceleration_are_those_of_the_interpolant() -> None:
+    """Against the slope of the rates that the path gives between its knots."""
+    path = quintics(np.array([0.0, 0.3, 0.4, 1.0]), seed=3)
+    extremes = path.extremes()
+    for interval in range(3):
+        left, right = path.time[interval], path.time[interval + 1]
+        times = np.linspace(left + 1e-9, right - 1e-9, 401)
+        rates = np.array([path.at(t)[1] for t in times])
+        accelerations = np.diff(rates, axis=0) / np.diff(times)[:, None]
+        found = extremes.acceleration[:2, interval]
+        # Differences lie half a step inside the interval.
+        inside = 1 / 400 * np.abs(found[1] - found[0])
+        assert np.all(np.abs(found.max(axis=0) - accelerations.max(axis=0)) <= inside)
+        assert np.all(np.abs(found.min(axis=0) - accelerations.min(axis=0)) <= inside)
+
+
+def test_a_held_rate_that_steps_is_an_acceleration_over_the_time_it_stands_for() -> None:
+    """From 1 rad/s held for 0.1 s to 2 rad/s held for 0.3 s: 1 rad/s in 0.2 s, and nothing between the knots."""
+    rates = np.array([[1.0], [2.0]])
+    path = Path(np.array([0.0, 0.1, 0.4]), np.array([[0.0], [0.1], [0.7]]), rates, rates, 0.4)
+    acceleration = path.extremes().acceleration[..., 0]
+    assert acceleration[2] == pytest.approx([0.0, 5.0])
+    assert acceleration[:2] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_the_jerk_of_a_smooth_path_is_the_mean_of_its_third_derivative() -> None:
+    """q = sin ωt: |d³q/dt³| = ω³ |cos ωt|, whose mean over a window of half a period is 2ω³/π wherever it begins."""
+    omega, time = 7.0, np.linspace(0.0, 2.0, 2001)
+    rates = omega * np.cos(omega * time)[:, None]
+    path = Path(time, np.sin(omega * time)[:, None], rates[:-1], rates[1:], 2.0)
+    jerk, _ = path.jerk(math.pi / omega)
+    assert jerk[0] == pytest.approx(2 * omega**3 / math.pi, rel=1e-3)
+
+
+def zigzag(size: float, step: float, rates: str = "none") -> Record:
+    time = step * np.arange(60)
+    angle = size * (np.arange(60) % 2)
+    return record_of(time, angle, np.zeros(60) if rates == "none" else np.gradient(angle, time))
+
+
+HELD = ("{position: q, velocity: v}", "{position: q, velocity: v, rates: held}")
+
+
+@pytest.mark.parametrize("replaced", [(), (HELD,)])
+@pytest.mark.parametrize("rates", ["none", "gradient"])
+def test_a_zigzag_of_12_mrad_every_5_ms_is_refused(write_map, replaced, rates: str) -> None:
+    """Its speed is within the limit of 3 rad/s (2.4 held): what no servo can follow is the acceleration."""
+    servo_map = load_servo_map(write_map(("velocity: 3.0", "velocity: 4.0"), *replaced))
+    with pytest.raises(CheckRefused, match=r"shoulder: jerk \d+\.\d+ rad/s³") as refusal:
+        check_motion(zigzag(0.012, 0.005, rates), servo_map)
+    assert "velocity" not in str(refusal.value)
+    # The same way in steps of 100 ms is one that anybody may go.
+    check_motion(zigzag(0.012, 0.1, rates), servo_map)
+
+
+def test_the_jerk_of_a_zigzag_does_not_depend_on_the_window() -> None:
+    """Held rates ±d/h: the acceleration at the knots is ±2d/h², and changes by 4d/h² in every step."""
+    time, angle = 0.005 * np.arange(200), 0.012 * (np.arange(200) % 2)
+    rates = (np.diff(angle) / 0.005)[:, None]
+    path = Path(time, angle[:, None], rates, rates, float(time[-1]))
+    for window in (0.02, 0.05, 0.1):
+        assert path.jerk(window)[0][0] == pytest.approx(4 * 0.012 / 0.005**3, rel=1e-9)
+
+
+def test_what_is_no_number_any_more_is_refused_and_no_speed_offered(rig) -> None:
+    tiny = record_of(np.array([0.0, 1e-200, 2e-200]), np.array([0.0, 0.1, 0.2]), np.zeros(3))
+    with pytest.raises(CheckRefused, match="shoulder: acceleration inf") as refusal:
+        check_motion(tiny, rig.map)
+    assert "would pass" not in str(refusal.value)
+
+
+def triangles(tooth: float, every: float, step: float, count: int = 30) -> Record:
+    """Straight to and fro by ``tooth`` [rad], a turn every so many seconds, sampled evenly; rates are those behind."""
+    time = step * np.arange(round(count * every / step) + 1)
+    angle = np.interp(time, every * np.arange(count + 1), tooth * (np.arange(count + 1) % 2))
+    return record_of(time, angle, np.diff(angle, prepend=angle[:1]) / step)
+
+
+SHAKES = [(0.02, 0.02, 0.02), (0.02, 0.02, 0.005), (0.04, 0.02, 0.01), (0.2, 0.1, 0.01), (0.25, 0.1, 0.025)]
+SHAKES += [(0.005, 0.02, 0.02), (0.16, 0.1, 0.1)]  # about the least that is refused
+
+
+@pytest.mark.parametrize("replaced", [(), (HELD,)])
+@pytest.mark.parametrize("shake", SHAKES)
+def test_shaking_is_refused_with_its_joint_and_time(write_map, replaced, shake) -> None:
+    """Within all other limits that are set wide: it is what goes to and fro that is refused."""
+    wide = ("velocity: 3.0", "velocity: 4.5, acceleration: 90000, jerk: 9000000")
+    with pytest.raises(CheckRefused) as refusal:
+        check_motion(triangles(*shake), load_servo_map(write_map(wide, *replaced)))
+    lines = str(refusal.value).splitlines()
+    assert re.match(r"  shoulder: shaking \d+\.\d+ rad/s at t = \d+\.\d+ s, limit 3\.0000 rad/s", lines[1])
+    assert [line for line in lines[1:] if "shaking" not in line and "would pass" not in line] == []
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.9])
+def test_a_spike_is_refused_on_a_joint_that_moves_too(write_map, drift: float) -> None:
+    """20 mrad in one sample of 10 ms: 2 rad/s gained, 4 lost, 2 gained, whatever the joint does besides."""
+    servo_map = load_servo_map(write_map(("velocity: 3.0", "velocity: 4.0"), HELD))
+    time = 0.01 * np.arange(100)
+    spike = 0.02 * (np.arange(100) == 50)
+    check_motion(record_of(time, drift * (time - 0.5), np.full(100, drift)), servo_map)
+    with pytest.raises(CheckRefused, match=r"1 limit\(s\) .*\n  shoulder: shaking 4\.0000 rad/s at t = 0\.[5-8]\d\d s"):
+        check_motion(record_of(time, drift * (time - 0.5) + spike, np.full(100, drift)), servo_map)
+
+
+def test_shaking_of_a_smooth_path_is_the_velocity_it_gains_and_loses() -> None:
+    """A sine of 2 rad/s and period T: within T/2 about a peak of the rate it gains and loses 2 rad/s, within T 4."""
+    time = np.linspace(0.0, 4.0, 2001)
+    rate = 2 * np.cos(2 * math.pi * time)
+    angle = 2 * np.sin(2 * math.pi * time) / (2 * math.pi)
+    path = Path(time, angle[:, None], rate[:-1, None], rate[1:, None], 4.0)
+    for window, expected in ((0.5, 2.0), (1.0, 4.0), (0.248, 2 * (1 - math.cos(2 * math.pi * 0.124)))):
+        assert path.shaking(window)[0][0] == pytest.approx(expected, rel=1e-4)
+    # The cubic between three knots turns on the way: v = 1 − 3s + 3s², so 1 to ¼ and back to 1 within an interval.
+    one = Path(np.array([0.0, 1.0]), np.array([[0.0], [0.5]]), np.array([[1.0]]), np.array([[1.0]]), 1.0)
+    assert one.shaking(1.0)[0][0] == pytest.approx(0.75)
+
+
+def test_a_single_jump_of_the_rate_is_bounded_by_the_acceleration(write_map) -> None:
+    """As the published arm's record begins: 2.5 rad/s within one sample of 5 ms, at a constant rate from there."""
+    time = 0.005 * np.arange(40)
+    rate = np.where(time > 0, 2.5, 0.0)
+    angle = np.concatenate([[0.0], np.cumsum(0.005 * 0.5 * (rate[1:] + rate[:-1]))])
+    record = record_of(time, angle, rate)
+    check_motion(record, load_servo_map(write_map()))
+    stricter = load_servo_map(write_map(("[-60, 60], velocity: 3.0", "[-60, 60], acceleration: 400, velocity: 3.0")))
+    with pytest.raises(CheckRefused, match=r"shoulder: acceleration 500\.0000 rad/s² at t = 0\.000 s, limit 400"):
+        check_motion(record, stricter)
+
+
+@pytest.mark.parametrize("quantity", ["acceleration: 9.0", "jerk: 35.0"])
+def test_a_slower_replay_that_is_offered_passes(write_map, quantity: str) -> None:
+    limits = ("[-60, 60], velocity", f"[-60, 60], {quantity}, velocity")
+    servo_map = load_servo_map(write_map(limits, ("run_up: 20", "run_up: 5, stop_time: 0.5")))
+    with pytest.raises(CheckRefused, match=r"--speed 0\.\d+ would pass") as refusal:
+        check_motion(swing(), servo_map)
+    slower = float(str(refusal.value).split("--speed ")[1].split()[0])
+    motion = check_motion(swing(), servo_map, speed=slower)
+    name, limit = quantity.split(": ")
+    value = max(abs(margin.value) for margin in motion.margins if margin.quantity == name and margin.joint != "wheel")
+    assert 0.7 * float(limit) < value <= float(limit)
+
+
+def test_holes_in_the_record_are_refused_and_a_missing_sample_is_told(rig) -> None:
+    whole = swing()
+
+    def without(*samples: int) -> Record:
+        kept = [k for k in range(len(whole)) if k not in samples]
+        record = Record(whole.time[kept])
+        for name in whole:
+            record.add(name, whole[name][kept], whole.units[name], labels=whole.labels[name])
+        return record
+
+    assert rig.motion().warnings == ()
+    warning = check_motion(without(100), rig.map).warnings[0]
+    assert "1 of 238 steps are long, samples of the record may be missing: no sample between t = 0.495 and" in warning
+    # The median of every third sample missing, and of steps of 5 and 10 ms in turn, is not the usual step.
+    every_third = check_motion(without(*range(2, 240, 3)), rig.map).warnings[0]
+    assert "79 of 159 steps are long" in every_third
+    assert "2 of the usual steps of 5 ms" in every_third
+    with pytest.raises(CheckRefused, match=r"2 hole\(s\): no sample between t = 0\.195 and 0\.215 s, 4 of the usual"):
+        check_motion(without(40, 41, 42, 100, 101), rig.map)
+
+
+@pytest.mark.parametrize("speed", [1e-300, 0.0099, 10.1, 1e300])
+def test_speeds_beyond_all_measure_are_refused(rig, speed: float) -> None:
+    at_rest = record_of(0.01 * np.arange(5), np.zeros(5), np.zeros(5))
+    with pytest.raises(CheckRefused, match=r"--speed must be from 0\.01 to 10, not"):
+        check_motion(at_rest, rig.map, speed=speed)
+    for possible in (0.01, 10.0):
+        assert check_motion(at_rest, rig.map, speed=possible).speed == possible
+
+
+@pytest.mark.parametrize(("step", "speed"), [(1e300, 1.0), (30_000.0, 1.0), (1000.0, 0.03)])
+def test_a_motion_of_more_than_a_day_is_refused(rig, step: float, speed: float) -> None:
+    at_rest = record_of(step * np.arange(4), np.zeros(4), np.zeros(4))
+    with pytest.raises(CheckRefused, match=r"would take .* s at --speed .*, more than 24 h\. Is the record's time"):
+        check_motion(at_rest, rig.map, speed=speed)
+    check_motion(record_of(28_000.0 * np.arange(4), np.zeros(4), np.zeros(4)), rig.map)
+
+
 @pytest.mark.parametrize("speed", [0.0, -1.0, math.nan, math.inf])
 def test_nonsense_speeds_and_rates_are_refused(rig, speed: float) -> None:
-    with pytest.raises(CheckRefused, match="--speed must be positive"):
+    with pytest.raises(CheckRefused, match=r"--speed must be from 0\.01 to 10"):
         check_motion(rig.record, rig.map, speed=speed)
     with pytest.raises(CheckRefused, match="--rate must be positive"):
         check_motion(rig.record, rig.map, rate=speed)
@@ -145,6 +337,12 @@ def test_a_rate_the_bus_cannot_carry_is_refused_with_one_it_can(rig) -> None:
         plan_cycle(rig.map, 2000)
     possible = int(str(refusal.value).split("--rate ")[1].split()[0])
     assert plan_cycle(rig.map, possible).health_every <= 10
+
+
+def test_a_rate_at_which_the_watchdogs_would_trip_is_refused(rig) -> None:
+    with pytest.raises(CheckRefused, match=r"watchdogs of 0.2 s would trip within 3 cycles. Use --rate 15 or more"):
+        plan_cycle(rig.map, 14)
+    plan_cycle(rig.map, 15)
 
 
 @pytest.mark.parametrize(("baud", "rate"), [(1_000_000, 142), (3_000_000, 277)])

@@ -79,7 +79,7 @@ def test_exit_codes_of_refusal_verification_and_abort(call, files: Path) -> None
     code, _, error = call("hw", "replay", record, *options)
     assert code == 4
     assert "missed status" in error
-    assert "robot left holding" in error
+    assert "robot left mixed: 2 holding; elbow does not answer" in error
     summary = json.loads((files / "out" / "summary.json").read_text(encoding="utf-8"))
     assert summary["fault"] == "missed status"
     assert not Record.load(files / "out" / "measured.h5").complete
@@ -144,6 +144,9 @@ def test_both_robots_replay_at_200_hz_on_the_virtual_bus(call, tmp_path: Path, r
         amplitude = np.linspace(0.1, 0.2, len(labels))
         record.add(position, np.outer(1 - np.cos(3 * time), amplitude), "rad", labels=tuple(labels))
         record.add(velocity, np.outer(3 * np.sin(3 * time), amplitude), "rad/s", labels=tuple(labels))
+    if servo_map.lifts:
+        pairs = tuple(f"pair{k}" for k in range(1, 8))
+        record.add(servo_map.lifts.signal, np.ones((len(time), 7)), "1", labels=pairs)
     record.save(tmp_path / "record.h5")
     code, out, error = call(
         "hw", "replay", tmp_path / "record.h5", "--map", SHIPPED / f"{robot}.yaml", "--port", "virtual", "--quiet",

@@ -178,3 +178,66 @@ def test_no_wall_clock_enters_a_virtual_replay(rig, clean_run, monkeypatch) -> N
         monkeypatch.setattr(time, name, looked_at)
     second = rig.run().result.record
     assert np.array_equal(first["q"], second["q"])
+
+
+def turning(drift: float, start: float, speed: float = 1.0) -> tuple[Record, Record]:
+    """A wheel at 2 rad/s + sin, and what was measured of it: another start, too fast by ``drift`` [rad/s]."""
+    t = np.linspace(0, 4, 801)
+    simulated, measured = Record(t), Record(t / speed, provenance={"speed": speed})
+    simulated.add("q", np.sin(t)[:, None], "rad", labels=("a",))
+    measured.add("q", np.sin(t)[:, None], "rad", labels=("a",))
+    measured.add("record_time", t, "s")
+    simulated.add("rho", (2 * t - np.cos(t))[:, None], "rad", labels=("rho1",))
+    simulated.add("rho_dot", (2 + np.sin(t))[:, None], "rad/s", labels=("rho1",))
+    measured.add("rho", (start + 2 * t - np.cos(t) + drift * t / speed)[:, None], "rad", labels=("rho1",))
+    measured.add("rho_dot", (speed * (2 + np.sin(t)) + drift)[:, None], "rad/s", labels=("rho1",))
+    return simulated, measured
+
+
+@pytest.mark.parametrize("speed", [1.0, 0.5])
+def test_wheels_are_compared_in_rate_and_in_how_far_they_turned(speed: float) -> None:
+    """Where a wheel stood at the start has no part in it; rates are those of the replay's own speed."""
+    comparison = compare_records(*turning(0.01, start=37.0, speed=speed))
+    (wheel,) = comparison.wheels
+    assert wheel.wheel == "rho1"
+    assert (wheel.rate_rms, wheel.rate_max) == pytest.approx((0.01, 0.01))
+    assert wheel.turned == pytest.approx(8 - np.cos(4) + 1, abs=1e-6)
+    assert (wheel.angle_max, wheel.angle_end) == pytest.approx((0.04 / speed, 0.04 / speed), abs=1e-6)
+    assert [joint.joint for joint in comparison.joints] == ["a"]
+    found = comparison.summary()
+    assert found["wheels"]["rho1"]["angle_end_rad"] == wheel.angle_end
+    assert found["wheel_rate_rms_rad_s"] == wheel.rate_rms
+
+
+def test_missed_answers_of_a_wheel_are_left_out() -> None:
+    simulated, measured = turning(0.0, start=5.0)
+    for name in ("rho", "rho_dot"):
+        measured[name][:3] = measured[name][-2:] = measured[name][100] = np.nan
+    (wheel,) = compare_records(simulated, measured).wheels
+    assert wheel.rate_max < 1e-9
+    assert wheel.angle_max < 1e-9
+
+
+def test_the_gate_knows_wheels() -> None:
+    comparison = compare_records(*turning(0.01, start=0.0))
+    check_gate(comparison, Gate(wheel_rate_rms_rad_s=0.02, wheel_angle_max_rad=0.05))
+    with pytest.raises(
+        ComparisonGateFailed, match=r"wheel_rate_rms_rad_s 0\.01 > 0\.009, wheel_angle_max_rad 0\.04 > 0"
+    ):
+        check_gate(comparison, Gate(wheel_rate_rms_rad_s=0.009, wheel_angle_max_rad=0.03))
+
+
+def test_a_gate_for_wheels_fails_where_there_are_none() -> None:
+    t = np.linspace(0, 1, 101)
+    record = Record(t)
+    record.add("q", np.sin(t)[:, None], "rad", labels=("a",))
+    with pytest.raises(ComparisonGateFailed, match="wheel_angle_max_rad: no wheels to compare"):
+        check_gate(compare_records(record, record), Gate(wheel_angle_max_rad=1.0))
+
+
+def test_the_wheel_of_a_replay_follows_its_rate(rig, clean_run) -> None:
+    """At up to 3 rad/s; it lags by a cycle and the motor's own time, and ends where the path led."""
+    (wheel,) = compare_records(rig.record, clean_run.result.record).wheels
+    assert 0 < wheel.rate_rms < 0.5
+    assert wheel.angle_max < 0.25
+    assert wheel.turned == pytest.approx(rig.record["rho"][-1, 0] - rig.record["rho"][0, 0], abs=0.05)

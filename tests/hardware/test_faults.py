@@ -19,6 +19,10 @@ from dynsim.hardware.virtual.servos import PHYSICS_STEP
 from .conftest import check_goals_within_limits
 
 POLICIES = ("hold", "decelerate", "off")
+SILENCING = ("lost_status", "late_status", "truncated_status", "bad_crc", "drop_off")
+"""Who suffers from these cannot say what it does."""
+DISABLING = ("reboot", "overload", "overheat", "temperature_ramp")
+"""These take the torque from their victim, at once or by and by."""
 JOINTS, ANY = (1, 2), (1, 2, 7)
 
 
@@ -38,6 +42,7 @@ CASES = [
     Case("lost_status, now and then", {"kind": "lost_status", "probability": 0.01}, ANY),
     Case("lost_status, for good", {"kind": "lost_status"}, ANY, (Cause.MISSED_STATUS,)),
     Case("late_status", {"kind": "late_status", "delay": 0.005}, ANY, (Cause.MISSED_STATUS,)),
+    Case("late_status, by two periods", {"kind": "late_status", "delay": 0.02}, ANY, (Cause.MISSED_STATUS,)),
     Case("truncated_status", {"kind": "truncated_status"}, ANY, (Cause.MISSED_STATUS,)),
     Case("bad_crc", {"kind": "bad_crc"}, ANY, (Cause.MISSED_STATUS,)),
     Case("noise", {"kind": "noise"}),
@@ -57,6 +62,7 @@ CASES = [
     Case("backlash", {"kind": "backlash", "angle": 0.02}, JOINTS),
     Case("offset_jump", {"kind": "offset_jump", "angle": 0.5}, JOINTS, (Cause.FOLLOWING_ERROR,)),
     Case("voltage_sag", {"kind": "voltage_sag", "drop": 2.0}, (), (Cause.VOLTAGE,)),
+    Case("supply_loss", {"kind": "supply_loss"}, (), (Cause.MISSED_STATUS,)),
     Case(
         "temperature_ramp", {"kind": "temperature_ramp", "heating_rate": 200.0}, ANY, (Cause.TEMPERATURE,), True, 0.1825
     ),
@@ -73,7 +79,7 @@ def check_case(rig, case: Case, seed: int) -> None:
         entry["at"] = onset
     run = rig.run(entry, seed=seed, policy=policy)
     result = run.result
-    what = f"{case.name}, seed {seed}, {policy}: {result.fault}, {result.end_state}"
+    what = f"{case.name}, seed {seed}, {policy}: {result.fault_text}, {result.end_state}"
     check_goals_within_limits(run)
     if not case.causes:
         assert result.fault is None, what
@@ -96,19 +102,18 @@ def check_nothing_but_the_policy_after(run) -> None:
     # What was declared last may not have reached the wire when the port died under it.
     assert on_the_wire == declared[: len(on_the_wire)]
     assert not [value for time, _, value in run.writes_of(64) if time > result.fault_time and value == 1]
-    if result.end_state in ("off", "not armed") and result.fault_state != State.REPLAY and run.replay.policy == "off":
-        assert not on_the_wire
-    if run.replay.policy == "hold" and result.end_state == "holding":
+    if run.replay.policy == "hold" and result.fault.cause != Cause.WATCHDOG:
         assert len({id_ for id_, _ in on_the_wire}) == len(on_the_wire), "hold speaks once to every servo"
     if run.replay.policy == "off":
         assert not on_the_wire
-    if run.replay.policy == "decelerate" and result.end_state == "holding":
+    everybody = set(result.fault.ids) == set(run.map.ids)  # nobody is left to slow down along the path
+    if run.replay.policy == "decelerate" and result.end_state not in ("not armed", "unreachable") and not everybody:
         check_comes_to_rest(run)
 
 
 def check_comes_to_rest(run) -> None:
     """Steps of the decelerating goals never grow beyond rounding, and the last one is zero or a tick."""
-    troubled = run.result.fault.ids
+    troubled = {id_ for fault in run.result.faults for id_ in fault.ids}
     assert len(run.result.policy_goals) > len(run.map.servos)
     for servo in run.map.servos:
         values = [value for _, id_, value in run.result.policy_goals if id_ == servo.id]
@@ -120,7 +125,7 @@ def check_comes_to_rest(run) -> None:
             assert abs(values[-1] - values[-2]) <= 1
         else:
             assert values[-1] == 0
-    last = run.result.policy_goals[-1][0]
+    last = max(time for time, id_, _ in run.result.policy_goals if id_ not in troubled)
     assert last - run.result.fault_time <= run.map.safety.stop_time + 10 / run.map.bus.rate
 
 
@@ -138,18 +143,53 @@ def check_end_state(run, policy: str, entry: dict[str, Any], what: str) -> None:
         assert all(servo["bus_watchdog"] == -1 for servo in line.servos.registers.values())
         assert np.abs(line.servos.plant.velocity).max() < 1e-3
         return
-    assert end == ("off" if policy == "off" else "holding"), what
-    if end == "off":
+    silent = {entry["id"]} if entry["kind"] in SILENCING else set()
+    asked = "limp: off" if policy == "off" or entry["kind"] == "supply_loss" else "holding"
+    check_what_was_read(run, silent, what)
+    for servo in run.result.servos:
+        if servo.id != entry.get("id"):
+            assert servo.doing == asked, what
+        elif silent:
+            assert servo.doing == "does not answer", what
+        elif entry["kind"] not in DISABLING:
+            assert servo.doing == asked, what
+    doings = {servo.doing for servo in run.result.servos}
+    assert end == ({"holding": "holding", "limp: off": "off"}[asked] if doings == {asked} else end), what
+    assert end.startswith("mixed: 2 ") == (len(doings) > 1), what
+    if asked == "limp: off":
         alive = [id_ for id_ in line.servos.ids if line.servos.registers[id_]["torque_enable"]]
+        # The torque was taken from those too who cannot say so.
         assert not alive, what
+        assert set(run.result.torque_still_on) == silent, what
         return
     line.advance(line.time + 2.0)
     assert np.abs(line.servos.plant.velocity).max() < 1e-2, what
     for id_, servo in line.servos.registers.items():
-        if id_ == entry.get("id"):
+        if id_ == entry.get("id") and entry["kind"] in (*DISABLING, "drop_off"):
             continue
         assert servo["torque_enable"], what
         assert servo["bus_watchdog"] == 0, what
+
+
+def check_what_was_read(run, silent: set[int], what: str) -> None:
+    """The servos reported are the servos there are."""
+    servos = run.line.servos
+    for servo, end in zip(run.map.servos, run.result.servos, strict=True):
+        assert (end.joint, end.id) == (servo.joint, servo.id)
+        if servo.id in silent:
+            assert (end.torque, end.error, end.position, end.doing) == (None, None, None, "does not answer"), what
+            continue
+        registers, index = servos.registers[servo.id], servos.ids.index(servo.id)
+        assert (end.torque, end.error) == (bool(registers["torque_enable"]), registers["hardware_error"]), what
+        assert end.torque == (end.doing in ("holding", "moving", "watchdog tripped")), what
+        speed = servo.sign * servos.plant.velocity[index]
+        # Who is limp coasts to a halt while it is asked.
+        assert not end.torque or abs(end.velocity - speed) < 0.05, what
+        if end.doing == "holding":
+            assert abs(speed) < 0.15, what
+        if end.error and not end.torque:
+            names = {1: "input voltage", 4: "overheating", 32: "overload"}
+            assert end.doing == f"limp: {names[end.error]}", what
 
 
 def check_reaction(run, onset: float, case: Case, what: str) -> None:
@@ -231,7 +271,7 @@ def test_torque_taken_away_by_another_program_is_noticed_in_turn(rig) -> None:
     run.replay.journal.observer = take_away
     result = run.replay.run()
     assert result.fault.cause in (Cause.TORQUE_LOST, Cause.FOLLOWING_ERROR)
-    assert result.end_state == "holding"
+    assert result.end_state == "mixed: 2 holding; elbow limp: off"
     assert not run.line.servos.registers[2]["torque_enable"], "nobody may switch it on again"
 
 

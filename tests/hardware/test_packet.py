@@ -14,7 +14,7 @@ from dynsim.hardware.bus.packet import HEADER, STATUS, Decoder, Packet, crc16, e
 
 bodies = st.lists(st.sampled_from([0xFF, 0xFD, 0x00, 0x55, 0x12]), max_size=40).map(bytes) | st.binary(max_size=40)
 packets = st.builds(Packet, st.integers(0, 252), st.just(STATUS), bodies, st.integers(0, 255)) | st.builds(
-    Packet, st.integers(0, 254), st.sampled_from([1, 2, 3, 8, 0x82, 0x83]), bodies
+    Packet, st.integers(0, 254), st.sampled_from([1, 2, 3, 8, 0x82, 0x83]), bodies, st.just(0)
 )
 
 

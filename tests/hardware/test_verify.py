@@ -8,7 +8,6 @@ import pytest
 
 from dynsim.hardware.bus.control_table import OperatingMode
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.virtual.registers import ServoRegisters
 
 
 @pytest.mark.parametrize(
@@ -44,9 +43,8 @@ def test_a_robot_outside_of_its_limits_is_not_armed(rig) -> None:
 
 def test_an_unknown_servo_on_the_bus_is_reported(rig) -> None:
     run = rig.prepare()
-    stranger = ServoRegisters(run.line.servos.registers[1].model, 9, 3)
-    run.line.servos.registers[9] = stranger
-    run.line.servos.ids.append(9)
+    field = run.map.servos[0].model.fields["id"]
+    run.line.servos.write(1, field.address, field.encode(9))
     result = run.replay.run()
     assert "ID 9: MX-106 (firmware 45) is on the bus but not in the map" in result.fault.text
 

@@ -10,6 +10,7 @@ from dynsim.hardware.bus.clock import VirtualClock
 from dynsim.hardware.bus.control_table import MX_28, MX_106, RAD_PER_TICK, OperatingMode, describe_hardware_error
 from dynsim.hardware.bus.dynamixel_bus import DynamixelBus
 from dynsim.hardware.bus.packet import StatusError
+from dynsim.hardware.virtual.faults import FaultScript
 from dynsim.hardware.virtual.line import VirtualLine
 from dynsim.hardware.virtual.port import VirtualPort
 from dynsim.hardware.virtual.registers import ServoRegisters
@@ -73,7 +74,7 @@ def test_the_watchdog_stops_the_servo_and_makes_goals_read_only(line) -> None:
     write(line, 1, "torque_enable", 1)
     write(line, 1, "bus_watchdog", 5)
     write(line, 1, "goal_position", 3000)
-    line.servos.heard = line.time
+    line.servos.heard[:] = line.time
     line.advance(line.time + 0.11)
     stopped_at = line.servos.registers[1]["goal_position"]
     line.advance(line.time + 1.0)
@@ -211,3 +212,66 @@ def test_a_packet_may_come_in_pieces_but_not_for_ever(line) -> None:
     assert len(line.transmit(ping[6:], 0.001, 1_000_000)) == 1
     assert line.transmit(ping[:6], 0.002, 1_000_000) == []
     assert len(line.transmit(ping, 0.1, 1_000_000)) == 1, "half a packet from long ago does not spoil the next"
+
+
+def scripted_line(*faults: dict) -> VirtualLine:
+    servos = {1: ServoRegisters(MX_106, 1, BAUD_CODE), 2: ServoRegisters(MX_28, 2, BAUD_CODE)}
+    script = FaultScript.model_validate({"faults": list(faults)})
+    return VirtualLine(servos, positions=[2048 * RAD_PER_TICK, 0.0], script=script)
+
+
+def test_a_loss_of_the_supply_leaves_servos_limp_and_started_anew() -> None:
+    line = scripted_line({"kind": "supply_loss", "at": 0.5})
+    bus = DynamixelBus(VirtualPort(line, VirtualClock(), baud=1_000_000))
+    bus.write(1, F["return_delay"], 10)
+    bus.write(1, F["torque_enable"], 1)
+    bus.write(1, F["profile_velocity"], 40)
+    bus.write(1, F["bus_watchdog"], 100)
+    line.servos.raise_error(1, 1 << 2)
+    lost = line.servos.torque_since + 0.5
+
+    def answers(after: float) -> bool:
+        bus.port.clock.sleep_until(lost + after)
+        return set(bus.sync_read((1, 2), 126, 10).replies) == {1, 2}
+
+    assert answers(-0.01)
+    assert not answers(0.01)
+    assert line.servos.registers[1]["torque_enable"] == 0
+    assert not answers(0.29)
+    assert not answers(0.3 + BOOT_TIME - 0.02)
+    assert answers(0.3 + BOOT_TIME + 0.01)
+    assert [bus.read(1, F[name]) for name in ("torque_enable", "profile_velocity", "bus_watchdog")] == [0, 0, 0]
+    assert bus.read(2, F["hardware_error"]) == 0
+    assert bus.read(1, F["return_delay"]) == 10, "EEPROM stays"
+    assert bus.read(1, F["present_voltage"]) == 120
+
+
+def test_a_fault_in_a_long_silence_is_not_slept_over() -> None:
+    """With torque off nothing moves and time passes in one step, but not past a loss of the supply."""
+    line = scripted_line({"kind": "supply_loss", "at": 1.0})
+    write(line, 1, "torque_enable", 1)
+    write(line, 1, "torque_enable", 0)
+    write(line, 1, "profile_velocity", 40)
+    line.advance(60.0)
+    assert line.servos.registers[1]["profile_velocity"] == 0
+    assert line.servos.listens(1)
+
+
+@pytest.mark.parametrize("periods", [1, 2, 3])
+def test_a_late_status_is_the_answer_to_an_earlier_request(periods: int) -> None:
+    """A servo ``periods`` late tells cycle k + periods where it was in cycle k."""
+    line = scripted_line({"kind": "late_status", "id": 2, "delay": periods * 0.01})
+    write(line, 2, "operating_mode", OperatingMode.VELOCITY)
+    write(line, 2, "torque_enable", 1)
+    write(line, 2, "goal_velocity", 100)
+    line.advance(0.5)
+    port = VirtualPort(line, VirtualClock(), baud=1_000_000)
+    told, true = [], []
+    for cycle in range(10):
+        port.clock.sleep_until(1.0 + 0.01 * cycle)
+        # One that has missed no answer: after that it knows those to earlier requests.
+        reply = DynamixelBus(port).sync_read((1, 2), 132, 4).replies.get(2)
+        told.append(reply and F["present_position"].decode(reply.data))
+        true.append(line.servos.registers[2]["present_position"])
+    assert told[:periods] == [None] * periods
+    assert told[periods:] == true[:-periods]

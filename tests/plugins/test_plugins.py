@@ -131,8 +131,8 @@ def test_list_and_schema_know_the_parts_from_outside(installed: Path) -> None:
 MISTAKES = [
     ("type: cart_pole", "type: cart_polo", ":2: plant.type: unknown type 'cart_polo'; did you mean 'cart_pole'?"),
     ("motor: {", "pole_kgs: 1, motor: {", ":2: plant.pole_kgs: unknown key; did you mean 'pole_kg'?"),
-    ("motor: {", "pole_kg: -1, motor: {", ":2: plant.pole_kg = -1: input should be greater than 0"),
-    ("motor: {", "pole_kg: true, motor: {", ":2: plant.pole_kg = True: input should be a valid number"),
+    ("motor: {", "pole_kg: -1, motor: {", ":2: plant.pole_kg = -1: must be greater than 0"),
+    ("motor: {", "pole_kg: true, motor: {", ":2: plant.pole_kg = True: must be a valid number"),
     ("small_servo}", "small_servo, ratio: 1}", ":2: plant.motor.ratio: unknown key; did you mean 'gear_ratio'?"),
     (", motor: {type: small_servo}", "", "plant.motor: is missing; add it"),
     ("{slide: 0.1}", "{wheel: 0.1}", "'wheel' is no joint with a motor; those are: slide"),

@@ -100,10 +100,10 @@ def test_events_cannot_be_watched(falling: Path):
 
 def test_what_it_does_not_do_is_refused(falling: Path):
     for more, message in (
-        ({"integrator.solver": "m_star"}, "integrator.solver: m_star is not of integrator.method: time_stepping"),
+        ({"integrator.solver": "m_star"}, "integrator.solver = 'm_star': is not of integrator.method: time_stepping"),
         ({"contacts.law": "bilateral", "contacts.candidates": "points", "contacts.points.hand.body": "link_2",
           "surfaces.floor.point_m": [0, 0, 0.15]},
-         "time_stepping needs `contacts: {law: unilateral}`"),
+         "integrator.method = 'time_stepping': needs `contacts: {law: unilateral}`"),
     ):  # fmt: skip
         with pytest.raises(ScenarioError, match=re.escape(message)):
             dynsim.simulate(dynsim.load_scenario(falling, overrides=stepping(1e-3, 0.5) | more))

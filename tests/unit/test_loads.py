@@ -157,7 +157,7 @@ def test_several_payloads_on_a_link_add_up(tmp_path: Path) -> None:
         ),
         ("{type: csv, body: link_1, file: steep.csv}", "steep.csv: numbers too large, or samples too close in time"),
         ("{type: payload, body: link_1}", "loads.push.mass_kg: is missing"),
-        ("{type: payload, body: link_1, mass_kg: 0}", "loads.push.mass_kg = 0: input should be greater than 0"),
+        ("{type: payload, body: link_1, mass_kg: 0}", "loads.push.mass_kg = 0: must be greater than 0"),
         (
             "{type: payload, body: link_1, mass_kg: 1, radius_m: 1, inertia_kg_m2: [1, 1, 1]}",
             "loads.push.inertia_kg_m2: cannot be given together with radius_m",

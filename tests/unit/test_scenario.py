@@ -98,7 +98,7 @@ def test_null_removes_a_key(tmp_path: Path):
         (MINIMAL + "variants:\n  ..: {}\n", ["variant = '..': names a folder"]),
         (SHARED.replace("mass_kg", "mas_kg"), ["case.yaml:4: plant.link.mas_kg: unknown key; did you mean 'mass_kg'?"]),
         (SHARED.replace("0.2", "heavy"), ["case.yaml:4: plant.link.mass_kg = 'heavy'", "number"]),
-        (SHARED.replace("[{axis: y}]", "[]"), ["case.yaml:5: plant.chain: list should have at least 1 item"]),
+        (SHARED.replace("[{axis: y}]", "[]"), ["case.yaml:5: plant.chain: has 0 entries; it must have at least 1"]),
         (SHARED.replace("{mass_kg: 0.2}", "3"), ["case.yaml:4: plant.link = 3: must be a mapping"]),
         (
             SHARED.replace("mass_kg: 0.2", "motor: {type: wang_minami, inductance_H: 0}"),
@@ -106,7 +106,7 @@ def test_null_removes_a_key(tmp_path: Path):
         ),
         (
             SHARED.replace("mass_kg: 0.2", "motor: {type: wang_minami, inductance_H: -1}"),
-            ["case.yaml:4: plant.link.motor.inductance_H = -1: input should be greater than 0"],
+            ["case.yaml:4: plant.link.motor.inductance_H = -1: must be greater than 0"],
         ),
         (
             SHARED.replace("axis: y", "mass_kg: 1"),
@@ -294,7 +294,7 @@ KNOWN = "known: switching, fixing, 1, 2, 3, 4, 5, 6"
         ({"mode": "swithcing"}, "mode = 'swithcing': no such mode; did you mean 'switching'?; known: switching"),
         ({"velocity": [0.1, 0, 0, 0, 0]}, "velocity: has 5 entries, 6 are needed"),
         ({"velocity": [0.1, 0]}, "velocity: has 2 entries, 6 are needed"),
-        ({"velocity": [0, 0, 0, 0, 0, 0, 0]}, "at most 6 items"),
+        ({"velocity": [0, 0, 0, 0, 0, 0, 0]}, "at most 6"),
     ],
 )
 def test_commands_that_no_snake_can_carry_out(command, expected):
@@ -314,7 +314,7 @@ def test_an_unknown_mode_in_a_file_is_named_with_its_line(tmp_path: Path):
 
 @pytest.mark.parametrize("key", ["controller.fixing_mode", "controller.switching.order.0"])
 def test_true_is_no_mode_number(key):
-    with pytest.raises(ScenarioError, match=f"{key} = True: input should be a valid integer"):
+    with pytest.raises(ScenarioError, match=f"{key} = True: must be a valid integer"):
         load_scenario("snake_operator", overrides={"controller.switching.order": [2], key: True})
 
 

@@ -213,6 +213,51 @@ def test_published_posture_against_slsqp(arm):
     assert arm.brace_statics(q, rest, rest, commanded).heat > found.heat
 
 
+@pytest.mark.parametrize("joint", ["joint_2", "joint_4", "joint_6"])
+def test_limits_that_hold_and_limits_that_bind(arm, joint):
+    """Wide limits change nothing but give intervals; one that binds gives SLSQP's optimum, and costs heat."""
+    q, rest = arm.robot.initial, np.zeros(arm.n)
+    free_of_limits = arm.brace_statics(q, rest, rest, elbows())
+    j = arm.joint_names.index(joint)
+    J = np.vstack([arm.point_jacobian(f"link_{k}", np.zeros(3), q) for k in (4, 7)])
+    free, weights = free_torques(arm, q, rest, rest), heat_weights(arm)
+
+    def limited(at_joint: float) -> Model:
+        """Voltages that allow 50 N m, and less at one joint."""
+        motors = []
+        for motor in arm.robot.motors:
+            torque = at_joint if motor.joint == joint else 50.0
+            motors.append(replace(motor, voltage_limit=torque * motor.resistance / motor.joint_constant))
+        return Model(replace(arm.robot, motors=tuple(motors)))
+
+    wide = limited(50.0).brace_statics(q, rest, rest, elbows())
+    assert np.array_equal(wide.torques, free_of_limits.torques)
+    assert all(low == 0.5 and 0.5 < high < math.inf for low, high in wide.intervals.values())
+    bound = 0.95 * abs(free_of_limits.torques[j])
+    found = limited(bound).brace_statics(q, rest, rest, elbows())
+    assert found.feasible
+    assert abs(found.torques[j]) == pytest.approx(bound, rel=1e-8)
+    result = minimize(
+        lambda f: weights @ (free - J.T @ f) ** 2,
+        np.concatenate([found.forces["elbow_4"], found.forces["elbow_7"]]) + 0.1,
+        jac=lambda f: -2.0 * J @ (weights * (free - J.T @ f)),
+        constraints=[
+            {
+                "type": "ineq",
+                "fun": lambda f: np.array(
+                    [f[2] - 0.5, f[5] - 0.5]
+                    + [0.1 * f[k + 2] - math.sqrt(f[k] ** 2 + f[k + 1] ** 2 + 1e-30) for k in (0, 3)]
+                    + [bound - (free - J.T @ f)[j], bound + (free - J.T @ f)[j]]
+                ),
+            }
+        ],
+        method="SLSQP",
+        options={"ftol": 1e-16, "maxiter": 500},
+    )
+    assert found.heat == pytest.approx(result.fun, rel=1e-8)
+    assert found.heat > free_of_limits.heat
+
+
 def test_one_brace_by_hand():
     """A level beam of two links, massless but for a tip: one support without friction takes what makes least heat."""
     arm = dynsim.build_model(dynsim.load_scenario("single_pendulum"))

@@ -19,6 +19,7 @@ from random_robots import Bench, bench, random_contacts, random_positions, rando
 
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate.driver import advance
+from dynsim.kernels.integrate.run import PROJECTIONS
 from dynsim.kernels.jit import reals
 from dynsim.kernels.lanes.fixed_step import advance_rk4, stages
 from dynsim.kernels.lanes.system import EIGHT, derivatives, lane_workspace
@@ -53,9 +54,8 @@ def compare(b: Bench, y: np.ndarray, t: float | np.ndarray, tolerance: float) ->
         np.testing.assert_array_equal(np.isnan(dy[:, k]), np.isnan(expected))
         assert np.nanmax(np.abs(dy[:, k] - expected)) <= tolerance * np.nanmax(np.abs(expected))
         forces, forces_alone = ws.rows[:, ka.FORCE, k], room.rows[:, ka.FORCE]
-        np.testing.assert_allclose(
-            forces, forces_alone, rtol=0.0, atol=max(FORCES, tolerance) * np.nanmax(np.abs(forces_alone), initial=1e-300)
-        )
+        largest = np.nanmax(np.abs(forces_alone), initial=1e-300)
+        np.testing.assert_allclose(forces, forces_alone, rtol=0.0, atol=max(FORCES, tolerance) * largest)
         np.testing.assert_array_equal(ws.rows[:, ka.SIGN, k], room.rows[:, ka.SIGN])
     return ws
 
@@ -125,11 +125,11 @@ def of_lane(tables: System, k: int) -> System:
 
 
 def braced(seed: int = 3) -> tuple[Bench, np.ndarray]:
-    """A tree with motors and two points on their surfaces at rest."""
+    """A tree with gentle motors and two points on their surfaces: what is fast and chatters amplifies rounding."""
     rng = np.random.default_rng(seed)
     robot = random_robot(rng, 7)
     q = random_positions(rng, robot)
-    return bench(robot, random_contacts(rng, robot, q, 2), held=np.zeros(len(robot.motors))), q
+    return bench(robot, random_contacts(rng, robot, q, 2), k_p=0.3, k_d=0.01), q
 
 
 def test_runs_of_their_own_parameters():
@@ -137,7 +137,7 @@ def test_runs_of_their_own_parameters():
     (b, q), rng = braced(), np.random.default_rng(5)
     tables = varied(b.system, 8, rng)
     y0 = b.state(q, np.zeros(len(b.robot.links)))
-    y, ws, h, steps = aligned(len(y0), 8), lane_workspace(b.ws, EIGHT), 1e-4, 200
+    y, ws, h, steps = aligned(len(y0), 8), lane_workspace(b.ws, EIGHT), 1e-3, 100
     y[:] = y0[:, None]
     assert advance_rk4(EIGHT, tables, 0.0, h, steps, y, ws, stages(len(y0), 8)) == 0
     for k in range(8):
@@ -145,7 +145,8 @@ def test_runs_of_their_own_parameters():
         run = single.new_run(y0, np.array([0.0, h * steps]), "rk4", step=h)
         advance(single.system, single.ws, run, 10**6)
         scale = np.abs(run.y).max()
-        assert np.abs(y[:, k] - run.y).max() <= 1e-11 * scale
+        assert run.count[PROJECTIONS] > 0
+        assert np.abs(y[:, k] - run.y).max() <= 1e-13 * scale
     assert np.ptp(y, axis=1).max() > 1e-4
 
 

@@ -1,26 +1,27 @@
-"""Control tables of the MX-106(2.0) and MX-28(2.0), Protocol 2.0, as data.
+"""Control tables of MX(2.0), XL430, XM430 and XH540 servos, Protocol 2.0, as data.
 
-Source: ROBOTIS e-Manual, "MX-106(2.0)" and "MX-28(2.0)", chapter Control Table. Limits stored in a servo changed
-between firmware versions: the replay reads them from the servo and never assumes the defaults given here, which only
-fill the virtual servos.
+Source: ROBOTIS e-Manual, the page of each model, chapters Specifications and Control Table. Limits stored in a servo
+changed between firmware versions: the replay reads them from the servo and never assumes the defaults given here,
+which only fill the virtual servos.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 TICKS_PER_TURN = 4096
 RAD_PER_TICK = 2 * math.pi / TICKS_PER_TURN
 RAD_S_PER_UNIT = 0.229 * 2 * math.pi / 60  # 0.229 rpm, present, goal and profile velocity
 RAD_S2_PER_UNIT = 214.577 / 60**2 * 2 * math.pi  # 214.577 rev/min², profile acceleration
-AMPERE_PER_UNIT = 3.36e-3  # present and goal current of the MX-106
 VOLT_PER_UNIT = 0.1
 WATCHDOG_SECONDS_PER_UNIT = 0.020
 RETURN_DELAY_SECONDS_PER_UNIT = 2e-6
 BROADCAST_ID = 254
 MAX_ID = 252
+EEPROM_END = 64
+"""What stands at lower addresses is kept without power."""
 
 BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
 """Bits per second by the code stored at address 8. The Python client library refuses 4.5 Mbit/s."""
@@ -73,7 +74,7 @@ class Field:
     @property
     def in_eeprom(self) -> bool:
         """Kept without power, and writable only with torque off."""
-        return self.address < 64
+        return self.address < EEPROM_END
 
     def decode(self, data: bytes) -> int:
         """Integer in ``data``, with the field's own sign (the client library's getData knows only unsigned ones)."""
@@ -96,6 +97,8 @@ class ServoModel:
         At 12 V [rad/s].
     stall_torque, stall_current : float
         At 12 V [N·m], [A].
+    ampere_per_unit : float
+        Of present and goal current, where there are such registers [A].
     fields : dict[str, Field]
         Control table by name.
     """
@@ -106,6 +109,7 @@ class ServoModel:
     stall_torque: float
     stall_current: float
     fields: dict[str, Field] = field(repr=False)
+    ampere_per_unit: float = 3.36e-3
 
     @property
     def measures_current(self) -> bool:
@@ -120,13 +124,13 @@ class ServoModel:
     def torque(self, effort: int) -> float:
         """Estimated output torque [N·m] from the signed register at address 126."""
         if self.measures_current:
-            return effort * AMPERE_PER_UNIT * self.torque_constant
+            return effort * self.ampere_per_unit * self.torque_constant
         return effort * 1e-3 * self.stall_torque
 
     def effort(self, torque: float) -> int:
         """Register at address 126 for an output torque [N·m]."""
         if self.measures_current:
-            return round(torque / self.torque_constant / AMPERE_PER_UNIT)
+            return round(torque / self.torque_constant / self.ampere_per_unit)
         return round(torque / self.stall_torque * 1e3)
 
 
@@ -147,7 +151,6 @@ _COMMON = {
     "max_voltage": Field(32, 2, 160, 95, 160),
     "min_voltage": Field(34, 2, 95, 95, 160),
     "pwm_limit": Field(36, 2, 885, 0, 885),
-    "acceleration_limit": Field(40, 4, 32767, 0, 32767),
     "velocity_limit": Field(44, 4, 230, 0, 1023),
     "max_position": Field(48, 4, 4095, 0, 4095),
     "min_position": Field(52, 4, 0, 0, 4095),
@@ -182,28 +185,100 @@ _COMMON = {
     "present_temperature": Field(146, 1, writable=False),
 }
 
+_LOAD = {"present_load": Field(126, 2, writable=False, signed=True)}
+_ACCELERATION_LIMIT = {"acceleration_limit": Field(40, 4, 32767, 0, 32767)}
+_BACKUP = {"startup_configuration": Field(60, 1, 0, 0, 3), "backup_ready": Field(147, 1, writable=False)}
+_EXTERNAL_PORTS = {f"external_port_mode_{k}": Field(55 + k, 1, 3, 0, 3) for k in (1, 2, 3)} | {
+    f"external_port_data_{k}": Field(150 + 2 * k, 2) for k in (1, 2, 3)
+}
+_RAD_S_PER_RPM = 2 * math.pi / 60
+
+
+def _current(limit: int) -> dict[str, Field]:
+    """Registers of a servo with a current sensor; ``limit`` is the factory's current limit, and the highest one."""
+    return {
+        "current_limit": Field(38, 2, limit, 0, limit),
+        "goal_current": Field(102, 2, 0, signed=True),
+        "present_current": Field(126, 2, writable=False, signed=True),
+    }
+
+
+def _delivered(fields: dict[str, Field], **defaults: int) -> dict[str, Field]:
+    """The same registers, some with other factory values."""
+    return fields | {name: replace(fields[name], default=value) for name, value in defaults.items()}
+
+
 MX_106 = ServoModel(
     name="MX-106",
     number=321,
-    no_load_speed=45 * 2 * math.pi / 60,
+    no_load_speed=45 * _RAD_S_PER_RPM,
     stall_torque=8.4,
     stall_current=5.2,
-    fields=_COMMON
-    | {
-        "current_limit": Field(38, 2, 2047, 0, 2047),
-        "goal_current": Field(102, 2, 0, signed=True),
-        "present_current": Field(126, 2, writable=False, signed=True),
-    },
+    fields=_delivered(_COMMON, velocity_limit=210) | _ACCELERATION_LIMIT | _current(2047),
 )
 MX_28 = ServoModel(
     name="MX-28",
     number=30,
-    no_load_speed=55 * 2 * math.pi / 60,
+    no_load_speed=55 * _RAD_S_PER_RPM,
     stall_torque=2.5,
     stall_current=1.4,
-    fields=_COMMON | {"present_load": Field(126, 2, writable=False, signed=True)},
+    fields=_COMMON | _ACCELERATION_LIMIT | _LOAD,
 )
-MODELS = {model.name: model for model in (MX_106, MX_28)}
+_X = _delivered(_COMMON, position_p_gain=800) | _BACKUP
+XL430_W250 = ServoModel(
+    name="XL430-W250",
+    number=1060,
+    no_load_speed=61 * _RAD_S_PER_RPM,
+    stall_torque=1.5,
+    stall_current=1.4,
+    fields=_delivered(
+        _X,
+        temperature_limit=72,
+        velocity_limit=265,
+        velocity_i_gain=1000,
+        position_d_gain=4000,
+        position_p_gain=640,
+    )
+    | {"max_voltage": Field(32, 2, 140, 60, 140), "min_voltage": Field(34, 2, 60, 60, 140)}
+    | _LOAD,
+)
+XM430_W210 = ServoModel(
+    name="XM430-W210",
+    number=1030,
+    no_load_speed=77 * _RAD_S_PER_RPM,
+    stall_torque=3.0,
+    stall_current=2.3,
+    fields=_delivered(_X, velocity_limit=330) | _current(1193),
+    ampere_per_unit=2.69e-3,
+)
+XM430_W350 = ServoModel(
+    name="XM430-W350",
+    number=1020,
+    no_load_speed=46 * _RAD_S_PER_RPM,
+    stall_torque=4.1,
+    stall_current=2.3,
+    fields=_delivered(_X, velocity_limit=200) | _current(1193),
+    ampere_per_unit=2.69e-3,
+)
+XH540_W150 = ServoModel(
+    name="XH540-W150",
+    number=1110,
+    no_load_speed=70 * _RAD_S_PER_RPM,
+    stall_torque=7.1,
+    stall_current=4.9,
+    fields=_delivered(_X, velocity_limit=300) | _EXTERNAL_PORTS | _current(2047),
+    ampere_per_unit=2.69e-3,
+)
+XH540_W270 = ServoModel(
+    name="XH540-W270",
+    number=1100,
+    no_load_speed=39 * _RAD_S_PER_RPM,
+    stall_torque=9.9,
+    stall_current=4.9,
+    fields=_delivered(_X, velocity_limit=167) | _EXTERNAL_PORTS | _current(2047),
+    ampere_per_unit=2.69e-3,
+)
+MODELS = {model.name: model for model in (MX_106, MX_28, XL430_W250, XM430_W210, XM430_W350, XH540_W150, XH540_W270)}
 MODEL_BY_NUMBER = {model.number: model for model in MODELS.values()}
 
 INDIRECT_BLOCKS = ((168, 224, 28), (578, 634, 28))

@@ -6,9 +6,11 @@ checksum. Wherever FF FF FD turns up between the length and the checksum the sen
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from enum import IntEnum
+from typing import NamedTuple
+
+from dynsim.hardware.bus.control_table import BROADCAST_ID
 
 HEADER = b"\xff\xff\xfd"
 STATUS = 0x55
@@ -29,8 +31,10 @@ class Instruction(IntEnum):
     CLEAR = 0x10
     SYNC_READ = 0x82
     SYNC_WRITE = 0x83
+    FAST_SYNC_READ = 0x8A
     BULK_READ = 0x92
     BULK_WRITE = 0x93
+    FAST_BULK_READ = 0x9A
 
 
 class StatusError(IntEnum):
@@ -88,8 +92,7 @@ def unstuff(body: bytes) -> bytes:
     return body.replace(HEADER + b"\xfd", HEADER)
 
 
-@dataclass(frozen=True)
-class Packet:
+class Packet(NamedTuple):
     """One packet of either direction.
 
     Attributes
@@ -115,6 +118,24 @@ def encode(packet: Packet) -> bytes:
     body = stuff(first + packet.parameters)
     frame = HEADER + b"\0" + bytes([packet.id]) + (len(body) + 2).to_bytes(2, "little") + body
     return frame + crc16(frame).to_bytes(2, "little")
+
+
+def encode_fast(replies: Sequence[Packet], sizes: Sequence[int]) -> list[bytes]:
+    """What each servo puts on the wire in answer to a fast read: together one status packet of the broadcast ID.
+
+    Every part is error, ID, data and the checksum of all bytes so far; header and length, which counts the bytes of
+    all that were asked for (``sizes``), come with the first. There is no byte stuffing in it.
+    """
+    bodies = [bytes([reply.error, reply.id]) + reply.parameters for reply in replies]
+    length = 1 + sum(size + 4 for size in sizes)
+    head = HEADER + b"\0" + bytes([BROADCAST_ID]) + length.to_bytes(2, "little") + bytes([STATUS])
+    frame, parts = b"", []
+    for body in bodies:
+        part = (head if not frame else b"") + body
+        part += crc16(frame + part).to_bytes(2, "little")
+        frame += part
+        parts.append(part)
+    return parts
 
 
 class Decoder:

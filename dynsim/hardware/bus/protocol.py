@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from dynsim.hardware.bus.control_table import Field
 
 
-@dataclass(frozen=True)
-class ServoReply:
+class ServoReply(NamedTuple):
     """Contents of one status packet.
 
     Attributes
@@ -34,10 +33,13 @@ class BlockRead:
         By ID; a servo that did not answer in time is absent.
     stray_bytes : int
         Bytes that were already waiting before the request, and garbage between the answers.
+    outdated : frozenset of int
+        Who answered an earlier request while the answer to this one was awaited.
     """
 
     replies: dict[int, ServoReply]
     stray_bytes: int
+    outdated: frozenset[int] = frozenset()
 
 
 class NoAnswer(Exception):
@@ -89,7 +91,7 @@ class Bus(Protocol):
         ...
 
     def sync_read(self, ids: Sequence[int], address: int, length: int) -> BlockRead:
-        """Read the same bytes of many servos; whoever does not answer in time is absent."""
+        """Read the same bytes of many servos; whoever does not answer this very request in time is absent."""
         ...
 
     def torque_off_all(self) -> None:

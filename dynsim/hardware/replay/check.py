@@ -8,13 +8,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 
 from dynsim.hardware.bus.control_table import HEALTH_BLOCK, STATE_BLOCK, TICKS_PER_TURN
 from dynsim.hardware.errors import CheckRefused
-from dynsim.hardware.replay.trajectory import Path, column_of, path_of_record
+from dynsim.hardware.replay.trajectory import (
+    COMMON,
+    JERK_WINDOW,
+    LONG,
+    SHAKING_WINDOW,
+    Path,
+    column_of,
+    long_steps,
+    path_of_record,
+)
 from dynsim.hardware.servo_map import Servo, ServoMap
 from dynsim.record import Record
 from dynsim.record.scene import Scene
@@ -24,10 +33,28 @@ TURNAROUND = 50e-6
 """Planned time per status beyond its bytes and return delay [s] (unverified; servos and adapter both contribute)."""
 USB_TRANSACTION = 1e-3
 """Planned cost of waiting for an answer through a USB adapter with its latency timer at 1 ms [s]."""
+WATCHDOG_CYCLES = 3
+"""The servos' watchdogs must outlast so many cycles."""
 BUS_SHARE = 0.97
 """Largest part of the period the bus may be busy."""
 
+Quantity = Literal["position", "velocity", "acceleration", "jerk", "shaking", "torque"]
+UNITS: dict[Quantity, str] = {
+    "position": "rad",
+    "velocity": "rad/s",
+    "acceleration": "rad/s²",
+    "jerk": "rad/s³",
+    "shaking": "rad/s",
+    "torque": "N m",
+}
+SLOWED: dict[Quantity, int] = {"velocity": 1, "acceleration": 2, "jerk": 2, "shaking": 1}
+"""Power of the speed with which a quantity falls, or falls at least: the window of jerk and shaking holds less of a
+path that is run through more slowly."""
 
+SLOWEST, FASTEST = 0.01, 10.0
+"""Path seconds per second that may be asked for."""
+LONGEST = 24 * 3600.0
+"""Motion [s]; beyond that its time is a mistake."""
 ROUNDING = 1e-9
 """A joint of a record that rests at its very limit may be off by rounding of this size; a tick is 1.5e-3 rad."""
 
@@ -38,7 +65,7 @@ class Margin:
 
     Attributes
     ----------
-    quantity : "position", "velocity" or "torque"
+    quantity : "position", "velocity", "acceleration", "jerk", "shaking" or "torque"
     value, limit, margin : float
         SI; a negative margin is a violation.
     time : float
@@ -46,7 +73,7 @@ class Margin:
     """
 
     joint: str
-    quantity: Literal["position", "velocity", "torque"]
+    quantity: Quantity
     value: float
     limit: float
     margin: float
@@ -54,7 +81,7 @@ class Margin:
 
     @property
     def unit(self) -> str:
-        return {"position": "rad", "velocity": "rad/s", "torque": "N m"}[self.quantity]
+        return UNITS[self.quantity]
 
     def __str__(self) -> str:
         unit = self.unit
@@ -130,20 +157,40 @@ def check_motion(
     CheckRefused
         With every violated limit: joint, value, time and margin.
     """
-    if not (math.isfinite(speed) and speed > 0):
-        raise CheckRefused(f"--speed must be positive, not {speed}")
+    if not SLOWEST <= speed <= FASTEST:
+        raise CheckRefused(f"--speed must be from {SLOWEST:g} to {FASTEST:g}, not {speed:g}")
     plan = plan_cycle(servo_map, rate if rate is not None else servo_map.bus.rate)
+    _check_duration(record, speed)
     path = path_of_record(record, servo_map)
     margins = _motion_margins(path, servo_map, speed) + _torque_margins(record, servo_map)
-    violations = [margin for margin in margins if margin.margin < -ROUNDING]
+    # What overflows to no number at all is no motion either.
+    violations = [margin for margin in margins if not margin.margin >= -ROUNDING]
     if violations:
         lines = [f"{len(violations)} limit(s) violated, nothing was sent:", *(f"  {entry}" for entry in violations)]
-        if all(entry.quantity == "velocity" for entry in violations):
-            slower = speed * min(entry.limit / abs(entry.value) for entry in violations)
-            lines.append(f"  --speed {math.floor(100 * slower) / 100:g} would pass")
+        if all(entry.quantity in SLOWED for entry in violations):
+            slower = speed * min(
+                (entry.limit / abs(entry.value)) ** (1 / SLOWED[entry.quantity]) for entry in violations
+            )
+            if slower >= SLOWEST:
+                lines.append(f"  --speed {math.floor(100 * slower) / 100:g} would pass")
         raise CheckRefused("\n".join(lines))
     warnings = [] if record.complete else ["the record is marked incomplete: it ends before its scenario does"]
+    if missing := long_steps(record, LONG, COMMON):
+        warnings.append(
+            f"{len(missing)} of {len(record) - 1} steps are long, samples of the record may be missing: {missing[0]}"
+        )
     return CheckedMotion(path, speed, plan, tuple(margins), tuple(warnings), record.scene)
+
+
+def _check_duration(record: Record, speed: float) -> None:
+    with np.errstate(over="ignore", invalid="ignore"):
+        duration = np.ptp(record.time) / speed if len(record) else 0.0
+    # Times that are no number at all are refused by their sample.
+    if LONGEST < duration < math.inf:
+        raise CheckRefused(
+            f"the motion would take {duration:.3g} s at --speed {speed:g}, more than {LONGEST / 3600:g} h. "
+            "Is the record's time in seconds? Cut the record, or replay it faster"
+        )
 
 
 def plan_cycle(servo_map: ServoMap, rate: float) -> CyclePlan:
@@ -156,6 +203,11 @@ def plan_cycle(servo_map: ServoMap, rate: float) -> CyclePlan:
     """
     if not (math.isfinite(rate) and rate > 0):
         raise CheckRefused(f"--rate must be positive, not {rate}")
+    if rate * servo_map.safety.watchdog < WATCHDOG_CYCLES:
+        raise CheckRefused(
+            f"at {rate:g} Hz the servos' watchdogs of {servo_map.safety.watchdog:g} s would trip within "
+            f"{WATCHDOG_CYCLES} cycles. Use --rate {math.ceil(WATCHDOG_CYCLES / servo_map.safety.watchdog)} or more"
+        )
     count = len(servo_map.servos)
     groups = [sum(servo.in_position_mode is mode for servo in servo_map.servos) for mode in (True, False)]
     written = sum(14 + 5 * members for members in groups if members)
@@ -176,6 +228,13 @@ def plan_cycle(servo_map: ServoMap, rate: float) -> CyclePlan:
 
 def _motion_margins(path: Path, servo_map: ServoMap, speed: float) -> list[Margin]:
     extremes = path.extremes()
+    # The windows are of the robot's time, of which `speed` seconds of the path pass in a second.
+    jerk, jerk_time = path.jerk(JERK_WINDOW * speed)
+    shaking, shaking_time = path.shaking(SHAKING_WINDOW * speed)
+    with np.errstate(over="ignore"):
+        velocity = speed * extremes.velocity
+        acceleration = speed * (speed * extremes.acceleration)
+        jerk = speed * (speed * (speed * jerk))
     margins = []
     for column, servo in enumerate(servo_map.servos):
         if servo.in_position_mode:
@@ -186,19 +245,23 @@ def _motion_margins(path: Path, servo_map: ServoMap, speed: float) -> list[Margi
                 margins.append(_margin(servo, "position", position[below], low, position[below] - low, at[below]))
             else:
                 margins.append(_margin(servo, "position", position[above], high, high - position[above], at[above]))
-        velocity = extremes.velocity[..., column].ravel() * speed
-        at = extremes.velocity_time[..., column].ravel()
-        fastest = int(np.abs(velocity).argmax())
-        limit = velocity_limit(servo)
-        margins.append(
-            _margin(servo, "velocity", velocity[fastest], limit, limit - abs(velocity[fastest]), at[fastest])
-        )
+        limits = servo.kind.limits
+        for quantity, values, times, limit in (
+            ("velocity", velocity, extremes.velocity_time, velocity_limit(servo)),
+            ("acceleration", acceleration, extremes.acceleration_time, limits.acceleration),
+            ("jerk", jerk, jerk_time, limits.jerk),
+            ("shaking", speed * shaking, shaking_time, limits.shaking),
+        ):
+            of_joint, at = values[..., column].ravel(), times[..., column].ravel()
+            worst = int(np.abs(of_joint).argmax())
+            value = of_joint[worst]
+            margins.append(_margin(servo, cast(Quantity, quantity), value, limit, limit - abs(value), at[worst]))
     return margins
 
 
 def _margin(
     servo: Servo,
-    quantity: Literal["position", "velocity", "torque"],
+    quantity: Quantity,
     value: float,
     limit: float,
     margin: float,

@@ -8,14 +8,16 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, ValidationError
 from scipy.optimize import minimize_scalar
 
 from dynsim.errors import RecordError, shown
 from dynsim.files import replacing
 from dynsim.hardware.errors import ComparisonGateFailed
+from dynsim.hardware.replay.lifting import lifted
 from dynsim.hardware.replay.states import State
-from dynsim.hardware.servo_map import StrictModel, read_yaml
+from dynsim.hardware.servo_map import Lifts
+from dynsim.hardware.strict_yaml import StrictModel, read_yaml
 from dynsim.record import Record
 
 Array = NDArray[np.float64]
@@ -23,6 +25,8 @@ MAX_DELAY = 0.5
 """Longest delay looked for [s]."""
 MOVING = 1e-3
 """A joint that moves less than this [rad] says nothing about delay."""
+WHEEL_ANGLE, WHEEL_RATE = "rho", "rho_dot"
+"""Signals of what turns on and on: where it stands says nothing, how far it has turned and how fast it turns does."""
 Bound = Annotated[float, Field(gt=0)]
 
 
@@ -36,12 +40,16 @@ class Gate(StrictModel):
     rms_delay_removed_rad : float or None
         The same with the common delay taken out [rad].
     delay_s : float or None
+    wheel_rate_rms_rad_s, wheel_angle_max_rad : float or None
+        Rate, and angle turned since the start, of the worst wheel; a comparison without wheels fails.
     """
 
     rms_rad: Bound | None = None
     max_rad: Bound | None = None
     rms_delay_removed_rad: Bound | None = None
     delay_s: Bound | None = None
+    wheel_rate_rms_rad_s: Bound | None = None
+    wheel_angle_max_rad: Bound | None = None
 
 
 @dataclass(frozen=True)
@@ -57,6 +65,32 @@ class JointError:
 
 
 @dataclass(frozen=True)
+class WheelError:
+    """Measured minus simulated motion of one wheel.
+
+    Attributes
+    ----------
+    wheel : str
+    rate_rms, rate_max : float
+        Of its rate [rad/s].
+    time_of_max : float
+        Of ``rate_max`` [s of record time].
+    turned : float
+        How far it turned in the simulation, first to last sample compared [rad].
+    angle_max, angle_end : float
+        Of the angle turned since the start of the motion: the largest, and that at its end with its sign [rad].
+    """
+
+    wheel: str
+    rate_rms: float
+    rate_max: float
+    time_of_max: float
+    turned: float
+    angle_max: float
+    angle_end: float
+
+
+@dataclass(frozen=True)
 class Comparison:
     """Simulated and measured angles on the measured run's times.
 
@@ -65,6 +99,8 @@ class Comparison:
     delay : float
         By which the measured run lags, common to all joints [s]; 0 where no delay explains the error.
     joints : tuple of JointError
+    wheels : tuple of WheelError
+        Empty where the records share none.
     time : array, shape (T,)
         Record time [s].
     simulated, measured : array, shape (T, N)
@@ -73,6 +109,7 @@ class Comparison:
 
     delay: float
     joints: tuple[JointError, ...]
+    wheels: tuple[WheelError, ...]
     time: Array
     simulated: Array
     measured: Array
@@ -93,26 +130,42 @@ class Comparison:
             }
             for joint in self.joints
         }
+        wheels = {
+            wheel.wheel: {
+                "rate_rms_rad_s": wheel.rate_rms,
+                "rate_max_rad_s": wheel.rate_max,
+                "turned_rad": wheel.turned,
+                "angle_max_rad": wheel.angle_max,
+                "angle_end_rad": wheel.angle_end,
+            }
+            for wheel in self.wheels
+        }
         return {
             "delay_s": self.delay,
             "rms_rad": self.worst.rms,
             "max_rad": max(joint.max for joint in self.joints),
             "rms_delay_removed_rad": max(joint.rms_delay_removed for joint in self.joints),
             "worst_joint": self.worst.joint,
+            "wheel_rate_rms_rad_s": max((wheel.rate_rms for wheel in self.wheels), default=None),
+            "wheel_angle_max_rad": max((wheel.angle_max for wheel in self.wheels), default=None),
             "joints": joints,
+            "wheels": wheels,
         }
 
 
 def compare_records(simulated: Record, measured: Record) -> Comparison:
     """Compare every joint angle the two records share.
 
-    ``measured`` may be a measured run (its ``record_time`` ties it to the simulated one) or any other record. Wheels
-    are left out: where they stand after a run says nothing about the replay.
+    ``measured`` may be a measured run (its ``record_time`` ties it to the simulated one) or any other record. What
+    lifts wheels is compared with the angles that the record's lifted pairs ask for. Of wheels the rates are compared,
+    and how far they turned since the start of the motion.
 
     Raises
     ------
     RecordError
         No common angles, no sample of the replayed motion, or a measured run that is not as a replay makes them.
+    CheckRefused
+        The measured run lifted wheels, and the simulated record is none of which they can be lifted.
     """
     for name in ("state", "record_time"):
         if name in measured and measured[name].shape != measured.time.shape:
@@ -158,23 +211,78 @@ def compare_records(simulated: Record, measured: Record) -> Comparison:
                 delay=_delay(at, time, actual, only) / speed,
             )
         )
-    return Comparison(delay / speed, tuple(joints), time, at(time), actual)
+    wheels = _wheel_errors(simulated, measured, rows, time, speed)
+    return Comparison(delay / speed, tuple(joints), wheels, time, at(time), actual)
+
+
+def _wheel_errors(
+    simulated: Record, measured: Record, rows: NDArray[np.bool_], time: Array, speed: float
+) -> tuple[WheelError, ...]:
+    angles = {label: (ours, theirs) for label, ours, theirs in _columns(simulated, measured, WHEEL_ANGLE)}
+    own_time = simulated.time - simulated.time[0]
+    found = []
+    for label, ours, theirs in _columns(simulated, measured, WHEEL_RATE):
+        if label not in angles:
+            continue
+        rate = theirs[rows] - speed * np.interp(time, own_time, ours)
+        asked = np.interp(time, own_time, angles[label][0])
+        turned = angles[label][1][rows]
+        seen = np.flatnonzero(np.isfinite(turned))  # not NaN, as where an answer was missed
+        angle = (turned - turned[seen[0]]) - (asked - asked[seen[0]])
+        worst = int(np.nanargmax(np.abs(rate)))
+        found.append(
+            WheelError(
+                wheel=label,
+                rate_rms=float(np.sqrt(np.nanmean(rate**2))),
+                rate_max=float(abs(rate[worst])),
+                time_of_max=float(time[worst]),
+                turned=float(asked[seen[-1]] - asked[seen[0]]),
+                angle_max=float(np.nanmax(np.abs(angle))),
+                angle_end=float(angle[seen[-1]]),
+            )
+        )
+    return tuple(found)
+
+
+def _columns(simulated: Record, measured: Record, name: str) -> list[tuple[str, Array, Array]]:
+    """Label, simulated and measured column of all that the records share of a signal with columns."""
+    if name not in simulated or name not in measured or simulated[name].ndim != 2 or measured[name].ndim != 2:
+        return []
+    ours, theirs = simulated.labels[name], measured.labels[name]
+    found = []
+    for label in (label for label in ours if label in theirs):
+        data = np.asarray(measured[name][:, theirs.index(label)], dtype=np.float64)
+        if np.isfinite(data).any():
+            found.append((label, np.asarray(simulated[name][:, ours.index(label)], dtype=np.float64), data))
+    return found
 
 
 def _common_angles(simulated: Record, measured: Record) -> list[tuple[str, Array, Array]]:
+    """All angles but those of wheels; what lifts wheels follows the record and the lifting, or the lifting alone."""
+    offsets = _lifting(simulated, measured)
     pairs = []
     for name, signal in simulated.signals.items():
-        if signal.unit != "rad" or name not in measured or name == "rho":
+        if signal.unit != "rad" or name not in measured or name == WHEEL_ANGLE:
             continue
-        if signal.data.ndim != 2 or measured[name].ndim != 2:
-            continue
-        theirs = measured.labels[name]
-        for column, label in enumerate(signal.labels):
-            if label in theirs:
-                data = np.asarray(measured[name][:, theirs.index(label)], dtype=np.float64)
-                if np.isfinite(data).any():
-                    pairs.append((label, np.asarray(signal.data[:, column], dtype=np.float64), data))
+        shared = _columns(simulated, measured, name)
+        pairs += [(label, ours + offsets.pop(label, 0.0), theirs) for label, ours, theirs in shared]
+        for label in [label for label in offsets if label in measured.labels[name]]:
+            data = np.asarray(measured[name][:, measured.labels[name].index(label)], dtype=np.float64)
+            if np.isfinite(data).any():
+                pairs.append((label, offsets.pop(label), data))
     return pairs
+
+
+def _lifting(simulated: Record, measured: Record) -> dict[str, Array]:
+    """What the measured run's servo map added to joints for lifting wheels, by column [rad]."""
+    entry = measured.provenance.get("lifts")
+    if entry is None:
+        return {}
+    try:
+        lifts = Lifts.model_validate(entry)
+    except ValidationError:
+        raise RecordError(f"the provenance of the measured run says lifts {shown(entry)}") from None
+    return dict(zip(lifts.joints, lifted(simulated, lifts).hinge.T, strict=True))
 
 
 def _delay(at: Any, time: Array, actual: Array, columns: NDArray[np.bool_]) -> float:
@@ -220,10 +328,12 @@ def check_gate(comparison: Comparison, gate: Gate) -> None:
         With every bound exceeded.
     """
     found = comparison.summary()
-    exceeded = [
+    bounds = {name: bound for name, bound in gate.model_dump().items() if bound is not None}
+    exceeded = [f"{name}: no wheels to compare" for name in bounds if found[name] is None]
+    exceeded += [
         f"{name} {found[name]:.4g} > {bound:.4g}"
-        for name, bound in gate.model_dump().items()
-        if bound is not None and found[name] > bound
+        for name, bound in bounds.items()
+        if found[name] is not None and found[name] > bound
     ]
     if exceeded:
         raise ComparisonGateFailed(f"gate failed (worst joint {comparison.worst.joint}): {', '.join(exceeded)}")

@@ -1,15 +1,29 @@
-"""How a replay leaves the robot: at rest and holding, or without torque; after a fault nothing else is sent."""
+"""How a replay leaves the robot: at rest and holding, or without torque; after a fault nothing else is sent.
+
+Nothing here writes to a log, a terminal or a file; nothing that goes wrong on the way keeps the rest from being done,
+and what the servos do in the end is read from them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import replace
+
+import numpy as np
 
 from dynsim.hardware.bus.protocol import NoAnswer, RequestRefused
+from dynsim.hardware.errors import PortError
+from dynsim.hardware.replay.end_state import AT_REST, ServoEnd, of_the_whole, read_back, read_health
 from dynsim.hardware.replay.journal import Journal
-from dynsim.hardware.replay.loop import FIELDS, Loop
-from dynsim.hardware.replay.rules import Cause, Fault
-from dynsim.hardware.replay.states import UNARMED, EndState, ReplayResult, State
-from dynsim.hardware.servo_map import FaultPolicy
+from dynsim.hardware.replay.loop import FIELDS, Array, Loop
+from dynsim.hardware.replay.rules import Cause, Cycle, Fault
+from dynsim.hardware.replay.states import NOT_ARMED, UNARMED, ReplayResult, State
+from dynsim.hardware.safety import FaultPolicy
+
+REST_TIME = 1.0
+"""Longest wait for the servos to stand still, and for silent ones to come back (a restart takes 0.3 s) [s]."""
+REST_CYCLES = 10
 
 
 class Ending:
@@ -20,7 +34,7 @@ class Ending:
     loop : Loop
     journal : Journal
     result : ReplayResult
-        Gets the IDs that did not confirm torque off.
+        Gets further faults, what every servo does in the end, and the IDs that did not confirm torque off.
     policy : "hold", "decelerate" or "off"
     """
 
@@ -30,13 +44,19 @@ class Ending:
         self._result = result
         self._policy = policy
         self._servos = loop.map.servos
+        self._troubled: set[int] = set()
+        self._held = self._released = False
+        self._at_rest = False
 
-    def regular(self) -> EndState:
-        """What the map says about the end of a motion."""
-        return self.leave_holding() if self._loop.map.safety.at_end == "hold" else self.release()
+    def regular(self) -> None:
+        """What the map says about the end of a motion. Raises PortError."""
+        if self._loop.map.safety.at_end == "hold":
+            self._leave_holding()
+        else:
+            self._release()
 
-    def after_fault(self, fault: Fault, struck: State, *, found_holding: bool) -> EndState:
-        """Carry out the fault policy.
+    def after_fault(self, struck: State, *, found_holding: bool) -> None:
+        """Carry out the fault policy for the faults of the result; raises nothing.
 
         Parameters
         ----------
@@ -45,97 +65,209 @@ class Ending:
         found_holding : bool
             Torque was on before the robot was armed.
         """
-        stop = self._loop.stop
-        if stop.for_release:
-            return self.release()
-        if struck in UNARMED:
-            return "not armed"
-        if struck == State.DISARM:
-            return self.regular()
-        if struck == State.ARM:
-            # Nothing has moved yet: back to how the robot was found.
-            return self.leave_holding() if found_holding else self.release()
-        # A dead port needs no policy, but the attempt costs nothing and finds out whether it is really dead.
-        if self._policy == "off" and fault.cause != Cause.INTERRUPTED:
-            return self.release()
-        if self._policy == "hold" and fault.cause != Cause.INTERRUPTED:
-            self._hold_measured(range(len(self._servos)))
+        self._at_rest = struck == State.SETTLE
+        interrupted = self._result.faults[0].cause == Cause.INTERRUPTED
+        if self._loop.stop.for_release:
+            self._try(self._release)
+        elif struck in UNARMED:
+            return
+        elif struck == State.DISARM:
+            self._try(self.regular)
+        elif struck == State.ARM:
+            # Nothing has moved yet: back to how the robot was found, unless somebody else took its torque meanwhile.
+            taken = any(fault.cause == Cause.TORQUE_LOST for fault in self._result.faults)
+            self._try(self._leave_holding if found_holding and not taken else self._release)
+        elif self._policy == "off" and not interrupted:
+            self._try(self._release)
         else:
-            self._decelerate(fault, struck)
-        if stop.for_release or self._policy == "off":
-            return self.release()
-        return self.leave_holding()
+            # A dead port needs no policy, but the attempt costs nothing and finds out whether it is really dead.
+            if not self._try(self._hold if self._policy == "hold" and not interrupted else self._decelerate):
+                self._try(self._hold)
+            self._try(self._come_to_rest)
+            self._try(self._release if self._policy == "off" else self._leave_holding)
+
+    def release_at_last(self) -> bool:
+        """Torque off if the user has asked for it since the policy was carried out; raises nothing."""
+        if self._released or not self._loop.stop.for_release:
+            return False
+        self._try(self._release)
+        self.read_back(armed=True)
+        return True
+
+    def read_back(self, *, armed: bool) -> None:
+        """Ask every servo what it does, and derive from it what the robot does; raises nothing."""
+        self._result.servos = tuple(ServoEnd(servo.joint, servo.id) for servo in self._servos)
+        self._try(self._ask)
+        self._result.end_state = of_the_whole(self._result.servos) if armed else NOT_ARMED
+
+    def _ask(self) -> None:
+        self._result.servos = read_back(self._loop.bus, self._servos)
+
+    # -- what goes wrong on the way -----------------------------------------------------------------------------------
+
+    def _try(self, step: Callable[[], None]) -> bool:
+        """Whether a step went through; why not becomes a fault of the result."""
+        try:
+            step()
+        except PortError as error:
+            if all(fault.cause != Cause.PORT for fault in self._result.faults):
+                self._declare(Fault(Cause.PORT, f"{error}; armed servos stop by their bus watchdog"))
+        except Exception as error:
+            self._declare(Fault(Cause.PROGRAM, repr(error)))
+        except BaseException as error:
+            # Somebody wants out, and gets out when the robot has been seen to.
+            self._loop.stop()
+            self._declare(Fault(Cause.PROGRAM, repr(error)))
+        else:
+            return True
+        return False
+
+    def _declare(self, fault: Fault) -> None:
+        self._result.declare(replace(fault, time=self._loop.now()))
+        self._journal.say(f"{fault.cause}: {fault.text}")
+
+    def _watch(self, lateness: float, skipped: int) -> Cycle:
+        """Read; the rules go on, and who gets into trouble stops where it is."""
+        loop = self._loop
+        cycle = loop.exchange(lateness, skipped, write=False)
+        # The goals that follow do not depend on when they are sent.
+        for fault in loop.rules.examine(cycle):
+            if fault.cause != Cause.DEADLINE:
+                self._declare(fault)
+                self._stop_where_they_are(fault)
+        return cycle
+
+    def _stop_where_they_are(self, fault: Fault) -> None:
+        if self._held:
+            return
+        if fault.cause == Cause.STALL:
+            self._hold()
+        else:
+            self._hold_measured(self._known_as(fault.ids))
+
+    def _known_as(self, ids: Collection[int]) -> list[int]:
+        """Numbers of servos in the map, of which none was in trouble before."""
+        found = [index for index, servo in enumerate(self._servos) if servo.id in ids and index not in self._troubled]
+        self._troubled.update(found)
+        return found
+
+    # -- ways of stopping ---------------------------------------------------------------------------------------------
+
+    def _hold(self) -> None:
+        """Goals of all servos := where they are."""
+        self._held = True
+        if any(fault.cause == Cause.STALL for fault in self._result.faults):
+            # What was read last is from before.
+            self._loop.exchange(0.0, 0, write=False)
+        self._hold_measured(range(len(self._servos)))
 
     def _hold_measured(self, indices: Iterable[int]) -> None:
         """Goals of the given servos := where they are."""
+        loop = self._loop
         goals: dict[str, dict[int, int]] = {"goal_position": {}, "goal_velocity": {}}
         for index in indices:
             servo = self._servos[index]
+            loop.goal_rate[index] = 0.0
             if not servo.in_position_mode:
                 goals["goal_velocity"][servo.id] = 0
                 continue
-            ticks = servo.to_ticks(float(self._loop.measured[index]))
+            ticks = servo.to_ticks(float(loop.measured[index]))
             low, high = servo.tick_limits
             if low <= ticks <= high:
                 goals["goal_position"][servo.id] = ticks
+                loop.goal[index] = loop.measured[index]
             # A reading outside of the joint's limits is not to be trusted: that servo keeps its last goal.
-        self._loop.write_goals(goals)
+        loop.write_goals(goals)
 
-    def _decelerate(self, fault: Fault, struck: State) -> None:
+    def _decelerate(self) -> None:
         """Slow down along the path to rest, so that all joints keep step; servos in trouble stop where they are."""
-        loop = self._loop
-        troubled = [index for index, servo in enumerate(self._servos) if servo.id in fault.ids]
-        self._hold_measured(troubled)
+        loop, faults = self._loop, self._result.faults
+        if any(fault.cause == Cause.STALL for fault in faults):
+            # They have stopped by themselves, and take no goals.
+            return self._hold()
+        self._hold_measured(self._known_as([id_ for fault in faults for id_ in fault.ids]))
         if loop.following is None:
-            return
+            return None
         start, end, speed = loop.following_time, loop.following_end, loop.following_speed
-        if struck == State.SETTLE:
+        if self._at_rest:
             speed = 0.0
         stop_time = loop.map.safety.stop_time
-        healthy = [index for index in range(len(self._servos)) if index not in troubled]
-        first = loop.tick
-        while (elapsed := (loop.tick - first) * loop.period) < stop_time and not loop.stop.for_release:
-            loop.wait_for_deadline()
-            elapsed = min(stop_time, (loop.tick - first) * loop.period)
+        elapsed, goals = 0.0, 0
+        while elapsed < stop_time and not loop.stop.for_release and not self._held:
+            lateness, skipped = loop.wait_for_deadline()
+            stall = loop.stall()
+            if stall:
+                self._declare(stall)
+                return self._hold()
+            goals += 1
+            elapsed = min(stop_time, goals * loop.period)
             loop.following_time = min(end, start + speed * (elapsed - elapsed**2 / (2 * stop_time)))
             position, rate = loop.following.at(loop.following_time)
             velocity = rate * speed * (1 - elapsed / stop_time)
-            goals: dict[str, dict[int, int]] = {"goal_position": {}, "goal_velocity": {}}
-            for index in healthy:
-                servo = self._servos[index]
-                name = "goal_position" if servo.in_position_mode else "goal_velocity"
-                units = servo.to_velocity_units(float(velocity[index]))
-                goals[name][servo.id] = servo.to_ticks(float(position[index])) if servo.in_position_mode else units
-                loop.goal[index], loop.goal_rate[index] = position[index], velocity[index]
-            loop.write_goals(goals)
-            loop.exchange(0.0, 0, write=False)
+            self._send(position, velocity)
+            self._watch(lateness, skipped)
+        return None
 
-    def leave_holding(self) -> EndState:
-        """Watchdogs off, so that the robot keeps holding when this program has gone."""
-        silent = []
-        for servo in self._servos:
+    def _send(self, position: Array, velocity: Array) -> None:
+        """Goals [rad], [rad/s] of the servos that are not in trouble."""
+        loop = self._loop
+        goals: dict[str, dict[int, int]] = {"goal_position": {}, "goal_velocity": {}}
+        for index, servo in enumerate(self._servos):
+            if index in self._troubled:
+                continue
+            if servo.in_position_mode:
+                goals["goal_position"][servo.id] = servo.to_ticks(float(position[index]))
+            else:
+                goals["goal_velocity"][servo.id] = servo.to_velocity_units(float(velocity[index]))
+            loop.goal[index], loop.goal_rate[index] = position[index], velocity[index]
+        loop.write_goals(goals)
+
+    def _come_to_rest(self) -> None:
+        """Wait until everybody answers and stands still, for REST_TIME at most."""
+        quiet = 0
+        for _ in range(math.ceil(REST_TIME / self._loop.period)):
             if self._loop.stop.for_release:
-                return self.release()
-            try:
-                self._loop.bus.write(servo.id, FIELDS["bus_watchdog"], 0)
-            except (NoAnswer, RequestRefused):
-                silent.append(servo.joint)
-        if silent:
-            self._journal.say(f"no answer from {', '.join(silent)}: whether they hold is not known")
-        self._journal.say("torque stays ON, the robot holds; `dynsim hw stop` releases it")
-        return "holding"
+                return
+            cycle = self._watch(*self._loop.wait_for_deadline())
+            # A servo that is silent is not at rest: it may be restarting.
+            quiet = quiet + 1 if np.all(np.abs(cycle.velocity) < AT_REST) else 0
+            if quiet == REST_CYCLES:
+                return
 
-    def release(self) -> EndState:
-        """Torque off by broadcast, then ask every servo."""
-        self._loop.bus.torque_off_all()
-        still_on = []
-        for servo in self._servos:
+    def _leave_holding(self) -> None:
+        """Watchdogs off, so that the robot keeps holding when this program has gone. Raises PortError."""
+        loop = self._loop
+        health = read_health(loop.bus, self._servos)
+        unconfirmed = []
+        for index, servo in enumerate(self._servos):
+            if loop.stop.for_release:
+                return self._release()
             try:
-                if self._loop.bus.read(servo.id, FIELDS["torque_enable"]):
-                    still_on.append(servo.id)
-            except (NoAnswer, RequestRefused):
-                still_on.append(servo.id)
-        self._result.torque_still_on = tuple(still_on)
+                loop.bus.write(servo.id, FIELDS["bus_watchdog"], 0)
+            except (NoAnswer, RequestRefused) as error:
+                unconfirmed.append(f"{servo.joint}: {error}")
+            registers = health.get(servo.id)
+            if registers and registers["bus_watchdog"] == -1:
+                # It stopped by itself, and took no goal until now.
+                loop.measured[index] = servo.to_angle(registers["present_position"])
+                self._hold_measured([index])
+        if unconfirmed:
+            self._journal.say(
+                f"watchdogs not confirmed to be off, they may stop these servos: {'; '.join(unconfirmed)}"
+            )
+        return self._journal.say("servos that are on stay ON; `dynsim hw stop` releases them")
+
+    def _release(self) -> None:
+        """Torque off by broadcast, until every servo confirms or REST_TIME is over. Raises PortError."""
+        loop, until = self._loop, self._loop.now() + REST_TIME
+        self._released = True
+        while True:
+            loop.bus.torque_off_all()
+            health = read_health(loop.bus, self._servos)
+            still_on = [id_ for id_ in loop.map.ids if id_ not in health or health[id_]["torque_enable"]]
+            self._result.torque_still_on = tuple(still_on)
+            if not still_on or loop.now() >= until:
+                break
+            loop.pause(REST_TIME / 10)
         confirmed = f"; NOT confirmed by ID {', '.join(map(str, still_on))}" if still_on else ""
         self._journal.say(f"torque off{confirmed}")
-        return "off"

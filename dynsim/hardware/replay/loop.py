@@ -1,6 +1,6 @@
 """The cycle of a replay: at every deadline all goals are written and all states read, recorded and examined.
 
-Cycles start at absolute deadlines; one that is more than a period late is skipped, never made up for.
+Cycles start at absolute deadlines; one that is more than a period late is skipped, never made up for: the path waits.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Loop:
         self._health_every = motion.plan.health_every
         self._cycles = 0
         self._sent: dict[int, int] = {}
-        self._sent_at = math.nan
+        self._heard_at = math.inf
 
     def take_over(self, index: int, register: int, angle: float) -> None:
         """A servo was armed where it is: at the goal ``register``, at a joint angle [rad]."""
@@ -91,7 +91,21 @@ class Loop:
         self.goal[index] = self.measured[index] = angle
 
     def all_taken_over(self) -> None:
-        self._sent_at = self._clock.now()
+        """All are armed; from now on silence makes their watchdogs trip."""
+        self._heard_at = self._clock.now()
+
+    def stall(self) -> Fault | None:
+        """The fault of having been silent for longer than the servos' watchdogs allow, until now."""
+        silence = self._clock.now() - self._heard_at
+        return self.rules.stall(silence) if self.rules.stalled(silence) else None
+
+    def now(self) -> float:
+        """[s]."""
+        return self._clock.now()
+
+    def pause(self, duration: float) -> None:
+        """Let a time pass [s]."""
+        self._clock.sleep_until(self._clock.now() + duration)
 
     def begin(self) -> None:
         """Deadlines count from now."""
@@ -110,16 +124,21 @@ class Loop:
         return self._clock.now() - self.deadline_of(self.tick) + skipped * self.period, skipped
 
     def follow(self, motion: Motion, start: float, end: float, *, speed: float) -> None:
-        """Run along a motion from its time ``start`` to ``end`` [s], ``speed`` of it per second."""
-        first = self.tick + 1
+        """Run along a motion from its time ``start`` to ``end`` [s], ``speed`` of it per second.
+
+        From goal to goal one period of it passes, also where cycles in between were skipped: made up for at once they
+        would be one great step.
+        """
+        goals = 0
         self.following, self.following_end, self.following_speed = motion, end, speed
         self.following_time = start
         while self.following_time < end:
             lateness, skipped = self.wait_for_deadline()
-            # Scheduled, not actual time: jitter of the loop must not enter the goals.
-            self.following_time = min(end, start + speed * self.period * (self.tick - first + 1))
-            position, rate = motion.at(self.following_time)
             self.stop.check()
+            goals += 1
+            # Scheduled, not actual time: jitter of the loop must not enter the goals.
+            self.following_time = min(end, start + speed * self.period * goals)
+            position, rate = motion.at(self.following_time)
             self._cycle(position, speed * rate, lateness, skipped)
 
     def stay(self, position: Array) -> Cycle:
@@ -135,11 +154,15 @@ class Loop:
         self.exchange(lateness, skipped, write=False)
 
     def _cycle(self, position: Array, velocity: Array, lateness: float, skipped: int) -> Cycle:
+        stall = self.stall()
+        if stall:
+            # Servos that stopped by themselves must not be sent to where they would be by now.
+            raise Stopped(stall)
         self.goal, self.goal_rate = position, velocity
         cycle = self.exchange(lateness, skipped, write=True)
-        fault = self.rules.examine(cycle)
-        if fault:
-            raise Stopped(fault)
+        faults = self.rules.examine(cycle)
+        if faults:
+            raise Stopped(*faults)
         return cycle
 
     def exchange(self, lateness: float, skipped: int, *, write: bool) -> Cycle:
@@ -169,6 +192,7 @@ class Loop:
             cycle.velocity[index] = servo.to_velocity(int.from_bytes(data[2:6], "little", signed=True))
             cycle.position[index] = servo.to_angle(int.from_bytes(data[6:10], "little", signed=True))
             cycle.alert[index] = reply.alert
+        cycle.outdated = tuple(block.outdated)
         self.measured = np.where(cycle.missed, self.measured, cycle.position)
         self._cycles += 1
         if self._cycles % self._health_every == 0:
@@ -177,9 +201,15 @@ class Loop:
             answer = self.bus.sync_read((servo.id,), *HEALTH_BLOCK).replies.get(servo.id)
             if answer is not None:
                 cycle.health[servo.id] = decode_health(servo, answer.data)
-        self._recorder.add(
+        now = self._clock.now()
+        if self._heard_at < math.inf:
+            cycle.silence, self._heard_at = max(began - self._heard_at, now - began), now
+        self._journal.guard(
+            "record",
+            self._recorder.add,
             time=began,
             path_time=self.following_time if self.path_started is not None else math.nan,
+            origin=math.nan if self.path_started is None else self.path_started,
             state=int(self._journal.state),
             exchange=exchange,
             stray=block.stray_bytes,
@@ -197,14 +227,12 @@ class Loop:
 
     def _send(self, position: Array, velocity: Array) -> None:
         """The only place goals of a motion leave through. Refuses what no checked motion can ask for."""
-        now = self._clock.now()
-        elapsed = max(now - self._sent_at, 0.0) + self.period
         goals: dict[str, dict[int, int]] = {"goal_position": {}, "goal_velocity": {}}
         for index, servo in enumerate(self.map.servos):
             ticks, units = servo.to_ticks(float(position[index])), servo.to_velocity_units(float(velocity[index]))
             if servo.in_position_mode:
                 low, high = servo.tick_limits
-                step = velocity_limit(servo) * servo.gear * elapsed / RAD_PER_TICK + 2
+                step = velocity_limit(servo) * servo.gear * 2 * self.period / RAD_PER_TICK + 2
                 if not low <= ticks <= high or abs(ticks - self._sent[servo.id]) > step:
                     raise Stopped(Fault(Cause.GOAL_GUARD, f"{servo.joint}: goal {ticks} was not sent", (servo.id,)))
                 goals["goal_position"][servo.id] = ticks
@@ -224,4 +252,3 @@ class Loop:
             if self._journal.state == State.FAULT:
                 now = self._clock.now()
                 self.policy_goals += [(now, id_, value) for id_, value in values.items()]
-        self._sent_at = self._clock.now()

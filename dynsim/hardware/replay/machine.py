@@ -8,37 +8,43 @@ policy says.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 
-from dynsim.errors import RecordError
+from dynsim.files import write_json
 from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.bus.control_table import RAD_S2_PER_UNIT, RAD_S_PER_UNIT, WATCHDOG_SECONDS_PER_UNIT
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused
 from dynsim.hardware.errors import PortError
 from dynsim.hardware.replay.check import CheckedMotion, velocity_limit
+from dynsim.hardware.replay.end_state import AT_REST, read_health
 from dynsim.hardware.replay.ending import Ending
+from dynsim.hardware.replay.folder import REGISTERS, REGISTERS_AFTER_FAULT
 from dynsim.hardware.replay.journal import Journal
 from dynsim.hardware.replay.loop import FIELDS, Loop
 from dynsim.hardware.replay.measured import describe
-from dynsim.hardware.replay.motion import Approach
-from dynsim.hardware.replay.rules import Cause, Fault
+from dynsim.hardware.replay.motion import QUINTIC_PEAK, Approach
+from dynsim.hardware.replay.registers import difference_lines
+from dynsim.hardware.replay.rows import Layout, measured_record, timing_of
+from dynsim.hardware.replay.rules import Cause, Fault, watchdog_units
 from dynsim.hardware.replay.run_log import Recorder, RunLog
 from dynsim.hardware.replay.states import UNARMED, Progress, ReplayResult, State, Stopped, StopRequest
 from dynsim.hardware.replay.trajectory import Path
-from dynsim.hardware.replay.verify import configure, dump_registers, verify
-from dynsim.hardware.servo_map import FaultPolicy, Servo, ServoMap
+from dynsim.hardware.replay.verify import Registers, all_registers, configure, verify
+from dynsim.hardware.safety import FaultPolicy
+from dynsim.hardware.servo_map import Servo, ServoMap
 
 APPROACH_ACCELERATION = 10.0
 """Profile acceleration the firmware is given for the move to the start [rad/s²]."""
 SETTLE_CYCLES = 10
 SETTLE_TIME = 3.0
 """Longest wait for the servos to come to rest [s]."""
-SETTLE_VELOCITY = 0.1
-"""[rad/s], a few units of the velocity register."""
+RECORD = "measured record"
+"""Name of that output among those that failed."""
 DRY_RUN_TIME = 1.0
 """Reading without moving, to time the bus [s]."""
 
@@ -66,6 +72,12 @@ class Replay:
         Called with a Progress after every cycle and on every change of state.
     provenance : dict
         Kept in the measured record.
+
+    Attributes
+    ----------
+    recorder : Recorder
+    layout : Layout
+        Of the record made of its rows.
     """
 
     def __init__(
@@ -94,20 +106,21 @@ class Replay:
         self.stop = stop or StopRequest()
         self._dump_folder = dump_folder
         self._provenance = {"robot": servo_map.robot, "speed": motion.speed, "rate_Hz": motion.plan.rate}
-        self._provenance |= provenance or {}
+        self._provenance |= servo_map.lifting | (provenance or {})
         self._servos = servo_map.servos
         self._found_holding = False
-        self._recorder = Recorder(servo_map)
-        self.journal = Journal(clock, self._recorder, log or RunLog(None), observer)
-        self.loop = Loop(motion, servo_map, bus, clock, self.stop, self._recorder, self.journal)
+        self.recorder = Recorder(servo_map)
+        self.layout = Layout.of(servo_map, self._provenance)
+        self.journal = Journal(clock, self.recorder, log or RunLog(None), observer, self.stop)
+        self.loop = Loop(motion, servo_map, bus, clock, self.stop, self.recorder, self.journal)
         self.result = ReplayResult(policy_goals=self.loop.policy_goals)
         self._ending = Ending(self.loop, self.journal, self.result, self.policy)
 
     def run(self) -> ReplayResult:
-        """Carry the replay through, to its end or to a fault; never raises for trouble on the bus.
+        """Carry the replay through, to its end or to a fault; never raises for trouble on the bus or with outputs.
 
-        An exception of another kind (of the observer, a KeyboardInterrupt without :class:`StopRequest`) is raised again
-        after the fault policy was carried out.
+        An exception of another kind (a KeyboardInterrupt without :class:`StopRequest`) is raised again after the fault
+        policy was carried out.
         """
         try:
             self._verify()
@@ -119,7 +132,7 @@ class Replay:
             else:
                 self._dry_run()
         except Stopped as stopped:
-            self._fault(stopped.fault)
+            self._fault(*stopped.faults)
         except PortError as error:
             self._fault(Fault(Cause.PORT, str(error)))
         except (NoAnswer, RequestRefused) as error:
@@ -128,6 +141,7 @@ class Replay:
         except BaseException as error:
             # A robot with its torque on must not be left to itself, whatever went wrong.
             self._fault(Fault(Cause.PROGRAM, repr(error)))
+            self._finish()
             raise
         self._finish()
         return self.result
@@ -138,9 +152,11 @@ class Replay:
         self.journal.enter(State.VERIFY)
         if self.write_eeprom:
             configure(self.bus, self.map, self.journal.say)
-        problems = verify(self.bus, self.map, self.motion, poll=self.stop.check)
-        if self._dump_folder:
-            dump_registers(self.bus, self.map, self._dump_folder / "registers.json")
+        problems, limits = verify(self.bus, self.map, self.motion, poll=self.stop.check)
+        self.result.limits = tuple(limits)
+        for line in difference_lines(limits):
+            self.journal.say(line)
+        self._dump(self._read_registers(), REGISTERS)
         if problems:
             raise Stopped(Fault(Cause.VERIFICATION, "\n  ".join([f"{len(problems)} problem(s):", *problems])))
         self.journal.say(f"{len(self._servos)} servos as the map says")
@@ -155,7 +171,8 @@ class Replay:
 
     def _arm(self) -> None:
         self.journal.enter(State.ARM)
-        self._found_holding = any(self.bus.read(servo.id, FIELDS["torque_enable"]) for servo in self._servos)
+        on = {servo.id for servo in self._servos if self.bus.read(servo.id, FIELDS["torque_enable"])}
+        self._found_holding = bool(on)
         for index, servo in enumerate(self._servos):
             self.stop.check()
             # A watchdog that tripped in an earlier run keeps goals read-only until it is cleared.
@@ -167,22 +184,38 @@ class Replay:
             self.bus.write(servo.id, FIELDS[name], goal)
             if self.bus.read(servo.id, FIELDS[name]) != goal:
                 raise Stopped(Fault(Cause.ARMING, f"{servo.joint} (ID {servo.id}) did not take its goal", (servo.id,)))
+            if servo.id in on:
+                self._check_still_on([servo])
             self.bus.write(servo.id, FIELDS["torque_enable"], 1)
             if not self.bus.read(servo.id, FIELDS["torque_enable"]):
                 raise Stopped(Fault(Cause.ARMING, f"{servo.joint} (ID {servo.id}): torque stays off", (servo.id,)))
             self.loop.take_over(index, goal, servo.to_angle(present))
-        units = math.ceil(self.map.safety.watchdog / WATCHDOG_SECONDS_PER_UNIT)
+        # Who stopped the robot meanwhile has not reached the servos that were armed after that.
+        self._check_still_on(self._servos)
+        units = watchdog_units(self.map.safety)
+        self.loop.all_taken_over()
         for servo in self._servos:
             self.bus.write(servo.id, FIELDS["bus_watchdog"], units)
-        self.loop.all_taken_over()
         self.journal.say(f"torque on, bus watchdogs at {units * WATCHDOG_SECONDS_PER_UNIT * 1e3:.0f} ms")
+
+    def _check_still_on(self, servos: Sequence[Servo]) -> None:
+        """Raises Stopped where one has lost its torque, NoAnswer where one is silent."""
+        health = read_health(self.bus, servos)
+        for servo in servos:
+            if servo.id not in health:
+                raise NoAnswer(servo.id, garbled=False)
+        lost = [servo for servo in servos if not health[servo.id]["torque_enable"]]
+        if lost:
+            names = ", ".join(f"{servo.joint} (ID {servo.id})" for servo in lost)
+            text = f"{names}: torque is off again (switched off by another program, or restarted)"
+            raise Stopped(Fault(Cause.TORQUE_LOST, text, tuple(servo.id for servo in lost)))
 
     def _move_to_start(self) -> None:
         here = self.loop.goal.copy()
         in_position_mode = np.array([servo.in_position_mode for servo in self._servos])
         goal = np.where(in_position_mode, self.motion.path.position[0], here)
         distance = float(np.abs(goal - here).max())
-        duration = max(1.875 * distance / self.map.safety.approach_velocity, self.loop.period)
+        duration = max(QUINTIC_PEAK * distance / self.map.safety.approach_velocity, self.loop.period)
         self.journal.enter(State.MOVE_TO_START)
         self.journal.say(f"{distance:.3f} rad in {duration:.1f} s")
         self.loop.begin()
@@ -197,7 +230,7 @@ class Replay:
             cycle = loop.stay(goal)
             error = np.abs(loop.rules.following_error(cycle))
             limit = np.array([servo.kind.following_error for servo in self._servos])
-            still = (error < limit) & (np.abs(cycle.velocity) < SETTLE_VELOCITY)
+            still = (error < limit) & (np.abs(cycle.velocity) < AT_REST)
             quiet = quiet + 1 if np.all(still | cycle.missed) else 0
             cycles += 1
             if cycles * loop.period > SETTLE_TIME:
@@ -219,6 +252,12 @@ class Replay:
     def _disarm(self) -> None:
         self.journal.enter(State.DISARM)
         self._ending.regular()
+        self._ending.read_back(armed=True)
+        asked = "holding" if self.map.safety.at_end == "hold" else "off"
+        if self.result.end_state != asked:
+            cause = Cause.INTERRUPTED if self.stop.for_release else Cause.END_STATE
+            raise Stopped(Fault(cause, f"should be {asked}, but is {self.result.end_state}"))
+        self._tell_end()
 
     def _profile(self, servo: Servo, *, approaching: bool) -> dict[str, int]:
         """The firmware's own limits: slow towards the start, the joint's speed limit during the replay.
@@ -234,42 +273,59 @@ class Replay:
             "profile_acceleration": math.ceil(acceleration * servo.gear / RAD_S2_PER_UNIT),
         }
 
-    def _fault(self, fault: Fault) -> None:
-        struck = self.journal.state
-        self.result.fault, self.result.fault_state, self.result.fault_time = fault, struck, self.clock.now()
-        self.journal.enter(State.FAULT)
-        self.journal.say(f"in {struck.name}: {fault.cause}: {fault.text}")
-        try:
-            self.result.end_state = self._ending.after_fault(fault, struck, found_holding=self._found_holding)
-        except PortError as error:
-            self.result.end_state = "not armed" if struck in UNARMED else "unreachable"
-            self.journal.say(f"{error}; armed servos stop by their bus watchdog")
-        self.journal.say(f"end state: {self.result.end_state}")
-        self._dump_after_fault()
+    def _fault(self, *faults: Fault) -> None:
+        struck, result = self.journal.state, self.result
+        # The robot first: whatever writes, is told afterwards.
+        with self.journal.held_back():
+            result.fault_state, result.fault_time = struck, self.clock.now()
+            self.journal.enter(State.FAULT)
+            for fault in faults:
+                result.declare(replace(fault, time=result.fault_time))
+                self.journal.say(f"in {struck.name}: {fault.cause}: {fault.text}")
+            self._ending.after_fault(struck, found_holding=self._found_holding)
+            armed = struck not in UNARMED or self.stop.for_release
+            if armed or faults[0].cause != Cause.PORT:
+                self._ending.read_back(armed=armed)
+        self._tell_end()
+        if armed and result.end_state != "unreachable":
+            registers = self._read_registers()
+            if self._ending.release_at_last():
+                self._tell_end()
+            self._dump(registers, REGISTERS_AFTER_FAULT)
 
-    def _dump_after_fault(self) -> None:
-        if not self._dump_folder or self.result.end_state in ("not armed", "unreachable"):
-            return
+    def _tell_end(self) -> None:
+        self.journal.say(f"end state: {self.result.end_state}")
+        for servo in self.result.servos:
+            self.journal.say(str(servo))
+
+    def _read_registers(self) -> dict[str, Registers | str] | None:
+        """Of all servos, for a dump; None where the port died after a fault."""
         try:
-            dump_registers(self.bus, self.map, self._dump_folder / "registers_after_fault.json")
-        except (PortError, RecordError) as error:
+            return all_registers(self.bus, self.map)
+        except PortError as error:
+            if self.result.fault is None:
+                raise
             self.journal.say(f"no register dump: {error}")
+            return None
+
+    def _dump(self, registers: dict[str, Registers | str] | None, name: str) -> None:
+        if self._dump_folder and registers is not None:
+            self.journal.guard(name, write_json, self._dump_folder / name, registers)
 
     def _finish(self) -> None:
-        result = self.result
-        if result.fault is None:
-            held = self.map.safety.at_end == "hold"
-            result.end_state = "not armed" if not self.live else "holding" if held else "off"
+        self.journal.guard(RECORD, self._sum_up)
+        timing = self.result.timing
+        if timing:
+            self.journal.say(f"timing: {', '.join(f'{name} {value:.6g}' for name, value in timing.as_dict().items())}")
+
+    def _sum_up(self) -> None:
+        """Record and timing of the run."""
+        result, rows = self.result, self.recorder.rows.all()
+        result.timing = timing_of(rows, self.layout)
         started = self.loop.path_started if self.loop.path_started is not None else self.loop.origin
-        result.record = describe(self._recorder.record(started, self._provenance), self.motion.scene, State)
-        result.record.complete = result.fault is None
-        result.timing = self._recorder.timing()
-        summary: dict[str, Any] = {"end_state": result.end_state}
-        if result.fault is not None:
-            fault = result.fault
-            result.record.add_event(result.fault_time - started, "fault", fault.cause.value, description=fault.text)
-            summary |= {"fault": fault.cause.value, "fault_text": fault.text}
-        result.record.summary |= summary
-        if result.timing:
-            timing = ", ".join(f"{name} {value:.6g}" for name, value in result.timing.as_dict().items())
-            self.journal.say(f"timing: {timing}")
+        record = describe(measured_record(rows, self.layout, started), self.motion.scene, State)
+        record.complete = result.fault is None
+        for fault in result.faults:
+            record.add_event(fault.time - started, "fault", fault.cause.value, description=fault.text)
+        record.summary |= result.summary()
+        result.record = record

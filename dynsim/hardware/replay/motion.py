@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+QUINTIC_PEAK = 1.875
+"""Top speed of :func:`quintic`, times its duration."""
+
 
 class Motion(Protocol):
     """Something to follow, over its own time."""

@@ -6,14 +6,21 @@ the cycle in which the fault is declared; :func:`reaction_bound` gives it.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.hardware.bus.control_table import HEALTH_BLOCK, VOLT_PER_UNIT, describe_hardware_error
+from dynsim.hardware.bus.control_table import (
+    HEALTH_BLOCK,
+    VOLT_PER_UNIT,
+    WATCHDOG_SECONDS_PER_UNIT,
+    describe_hardware_error,
+)
 from dynsim.hardware.replay.check import CyclePlan
+from dynsim.hardware.safety import Safety
 from dynsim.hardware.servo_map import Servo, ServoMap
 
 
@@ -33,8 +40,10 @@ class Cause(StrEnum):
     VOLTAGE = "voltage"
     TEMPERATURE = "temperature"
     DEADLINE = "deadline"
+    STALL = "stall"
     NOT_SETTLED = "not settled"
     GOAL_GUARD = "goal guard"
+    END_STATE = "end state"
     PROGRAM = "program error"
 
 
@@ -49,11 +58,14 @@ class Fault:
         For the log and the user.
     ids : tuple of int
         Servos that are in trouble; empty when none is singled out.
+    time : float
+        When it was declared, on the replay's clock [s].
     """
 
     cause: Cause
     text: str
     ids: tuple[int, ...] = ()
+    time: float = math.nan
 
 
 @dataclass
@@ -69,6 +81,10 @@ class Cycle:
     alert : bool array
     lateness : float
         Start after the deadline [s].
+    silence : float
+        Longest time in which the servos heard nothing, from the cycle before to the end of this one [s].
+    outdated : tuple of int
+        Servos that answered an earlier request instead of this one.
     health : dict
         Registers of the servo whose health was read, by ID; empty when none was.
     """
@@ -80,6 +96,8 @@ class Cycle:
     torque: NDArray[np.float64]
     alert: NDArray[np.bool_]
     lateness: float
+    silence: float = 0.0
+    outdated: tuple[int, ...] = ()
     health: dict[int, dict[str, int]] = field(default_factory=dict)
 
     @property
@@ -104,13 +122,23 @@ def reaction_bound(cause: Cause, servo_map: ServoMap, plan: CyclePlan) -> int:
     }.get(cause, 1)
 
 
+def watchdog_units(safety: Safety) -> int:
+    """The map's watchdog time in units of the servos' register (20 ms), rounded up."""
+    return math.ceil(safety.watchdog / WATCHDOG_SECONDS_PER_UNIT)
+
+
 class AbortRules:
-    """Watches a replay cycle by cycle."""
+    """Watches a replay cycle by cycle, from arming to the end of the fault policy.
+
+    A fault is declared once for every servo; what follows from a servo's earlier fault is none.
+    """
 
     def __init__(self, servo_map: ServoMap, plan: CyclePlan) -> None:
         count = len(servo_map.servos)
         self._servos = servo_map.servos
+        self._by_id = {servo.id: servo for servo in servo_map.servos}
         self._safety = servo_map.safety
+        self._watchdog = watchdog_units(servo_map.safety) * WATCHDOG_SECONDS_PER_UNIT
         self._late_after = 1.0 / plan.rate
         self._in_position_mode = np.array([servo.in_position_mode for servo in self._servos])
         self._following_limit = np.array([servo.kind.following_error for servo in self._servos])
@@ -119,6 +147,7 @@ class AbortRules:
         self._following = np.zeros(count, dtype=int)
         self._torque = np.zeros(count, dtype=int)
         self._late = 0
+        self._declared: set[tuple[Cause, int | None]] = set()
 
     def following_error(self, cycle: Cycle) -> NDArray[np.float64]:
         """Commanded minus measured, shape (N,): [rad] in position mode, [rad/s] in velocity mode."""
@@ -126,8 +155,8 @@ class AbortRules:
             self._in_position_mode, cycle.goal_position - cycle.position, cycle.goal_velocity - cycle.velocity
         )
 
-    def examine(self, cycle: Cycle) -> Fault | None:
-        """The gravest fault this cycle shows, or None."""
+    def examine(self, cycle: Cycle) -> list[Fault]:
+        """The faults this cycle shows for the first time, the gravest first."""
         missed = cycle.missed
         error = np.abs(self.following_error(cycle))
         self._missed = np.where(missed, self._missed + 1, 0)
@@ -135,72 +164,112 @@ class AbortRules:
         self._following = _count(self._following, error > self._following_limit, missed)
         self._torque = _count(self._torque, np.abs(cycle.torque) > self._torque_limit, missed)
         self._late = self._late + 1 if cycle.lateness > self._late_after else 0
-        return (
-            self._alert(cycle)
-            or self._health(cycle)
-            or self._repeated(Cause.MISSED_STATUS, self._missed, self._safety.missed_cycles, "no status")
-            or self._repeated(
-                Cause.FOLLOWING_ERROR, self._following, self._safety.following_cycles, "off its goal", error
-            )
-            or self._repeated(Cause.TORQUE, self._torque, self._safety.torque_cycles, "too much torque", cycle.torque)
-            or self._deadline(cycle)
-        )
+        safety = self._safety
+        return [
+            *self._stall(cycle.silence),
+            *(self._alert(cycle) if cycle.alert.any() else ()),
+            *(fault for id_, registers in cycle.health.items() for fault in self._health(self._by_id[id_], registers)),
+            *self._silent(np.flatnonzero(self._missed >= safety.missed_cycles), cycle),
+            *self._beyond(
+                Cause.FOLLOWING_ERROR, self._following >= safety.following_cycles, error,
+                f"off its goal for {safety.following_cycles} cycles",
+            ),
+            *self._beyond(
+                Cause.TORQUE, self._torque >= safety.torque_cycles, cycle.torque,
+                f"too much torque for {safety.torque_cycles} cycles",
+            ),
+            *self._deadline(cycle),
+        ]  # fmt: skip
 
-    def _alert(self, cycle: Cycle) -> Fault | None:
-        hit = [servo for servo, alert in zip(self._servos, cycle.alert, strict=True) if alert]
+    def stalled(self, silence: float) -> bool:
+        """True where the servos heard nothing for so long [s] that their watchdogs have tripped."""
+        return silence > self._watchdog
+
+    def _stall(self, silence: float) -> list[Fault]:
+        return [self.stall(silence)] if self.stalled(silence) else []
+
+    def stall(self, silence: float) -> Fault:
+        """Nobody spoke to the servos for ``silence`` [s]."""
+        self._new(Cause.STALL)
+        text = f"stalled for {silence:.2f} s: the servos' bus watchdogs ({self._watchdog:.2f} s) have tripped"
+        return Fault(Cause.STALL, text)
+
+    def _new(self, cause: Cause, id_: int | None = None) -> bool:
+        """Whether this was not declared before; from now on it was."""
+        known = (cause, id_) in self._declared
+        self._declared.add((cause, id_))
+        return not known
+
+    def _in_trouble(self, id_: int) -> bool:
+        return any(who == id_ for _, who in self._declared)
+
+    def _alert(self, cycle: Cycle) -> list[Fault]:
+        hit = [
+            servo
+            for servo, alert in zip(self._servos, cycle.alert, strict=True)
+            if alert and self._new(Cause.ALERT, servo.id)
+        ]
         if not hit:
-            return None
-        names = ", ".join(f"{servo.joint} (ID {servo.id})" for servo in hit)
-        return Fault(Cause.ALERT, f"hardware alert of {names}", tuple(servo.id for servo in hit))
+            return []
+        return [Fault(Cause.ALERT, f"hardware error reported by {_names(hit)}", tuple(servo.id for servo in hit))]
 
-    def _health(self, cycle: Cycle) -> Fault | None:
-        for id_, registers in cycle.health.items():
-            servo = next(servo for servo in self._servos if servo.id == id_)
-            fault = self._unfit(servo, registers)
-            if fault:
-                return fault
-        return None
+    def _health(self, servo: Servo, registers: dict[str, int]) -> list[Fault]:
+        who, found = f"{servo.joint} (ID {servo.id})", []
 
-    def _unfit(self, servo: Servo, registers: dict[str, int]) -> Fault | None:
-        who, ids = f"{servo.joint} (ID {servo.id})", (servo.id,)
-        volts = registers["present_voltage"] * VOLT_PER_UNIT
-        celsius = registers["present_temperature"]
-        supply = self._safety.supply
+        def add(cause: Cause, text: str) -> None:
+            if self._new(cause, servo.id):
+                found.append(Fault(cause, f"{who}: {text}", (servo.id,)))
+
         if registers["hardware_error"]:
-            return Fault(Cause.ALERT, f"{who}: {describe_hardware_error(registers['hardware_error'])}", ids)
-        if registers["bus_watchdog"] == -1:
-            return Fault(Cause.WATCHDOG, f"{who}: its bus watchdog has tripped, it ignores goals", ids)
-        if not registers["torque_enable"]:
-            return Fault(Cause.TORQUE_LOST, f"{who}: torque is off (restarted?)", ids)
+            add(Cause.ALERT, describe_hardware_error(registers["hardware_error"]))
+        elif registers["bus_watchdog"] == -1 and (Cause.STALL, None) not in self._declared:
+            add(Cause.WATCHDOG, "its bus watchdog has tripped, it ignores goals")
+        elif not registers["torque_enable"]:
+            add(Cause.TORQUE_LOST, "torque is off (restarted, or switched off by another program)")
+        celsius, volts = registers["present_temperature"], registers["present_voltage"] * VOLT_PER_UNIT
         if celsius > self._safety.temperature_max:
-            return Fault(Cause.TEMPERATURE, f"{who}: {celsius} °C, limit {self._safety.temperature_max:g} °C", ids)
-        if not supply.lowest <= volts <= supply.highest:
-            return Fault(Cause.VOLTAGE, f"{who}: {volts:.1f} V, allowed {supply.lowest:g} to {supply.highest:g} V", ids)
-        return None
+            add(Cause.TEMPERATURE, f"{celsius} °C, limit {self._safety.temperature_max:g} °C")
+        supply = self._safety.supply
+        if not supply.lowest <= volts <= supply.highest and self._new(Cause.VOLTAGE):
+            # One supply feeds all: no servo is singled out, they keep step.
+            text = f"{who}: {volts:.1f} V, allowed {supply.lowest:g} to {supply.highest:g} V"
+            found.append(Fault(Cause.VOLTAGE, text))
+        return found
 
-    def _repeated(
-        self,
-        cause: Cause,
-        counters: NDArray[np.int64],
-        allowed: int,
-        what: str,
-        values: NDArray[np.float64] | None = None,
-    ) -> Fault | None:
-        hit = np.flatnonzero(counters >= allowed)
-        if not hit.size:
-            return None
-        names = ", ".join(
-            f"{self._servos[k].joint} (ID {self._servos[k].id}{'' if values is None else f', {values[k]:.3f}'})"
-            for k in hit
-        )
-        return Fault(cause, f"{what} for {allowed} cycles: {names}", tuple(self._servos[k].id for k in hit))
+    def _silent(self, indices: NDArray[np.intp], cycle: Cycle) -> list[Fault]:
+        hit = [self._servos[k] for k in indices if self._new(Cause.MISSED_STATUS, self._servos[k].id)]
+        if not hit:
+            return []
+        text = f"no status for {self._safety.missed_cycles} cycles: {_names(hit)}"
+        outdated = [servo for servo in hit if servo.id in cycle.outdated]
+        if outdated:
+            text += f"; answers to earlier requests come from {_names(outdated)}"
+        if len(indices) == len(self._servos) > 1:
+            text += "; nobody answers: is the supply or the line lost?"
+        return [Fault(Cause.MISSED_STATUS, text, tuple(servo.id for servo in hit))]
 
-    def _deadline(self, cycle: Cycle) -> Fault | None:
-        if self._late < self._safety.late_cycles:
-            return None
-        return Fault(
-            Cause.DEADLINE, f"{self._late} cycles in a row started late, the last by {cycle.lateness * 1e3:.1f} ms"
-        )
+    def _beyond(self, cause: Cause, over: NDArray[np.bool_], values: NDArray[np.float64], what: str) -> list[Fault]:
+        if not over.any():
+            return []
+        # A servo that is limp or silent is off its goal too: that is no news.
+        hit = [k for k in np.flatnonzero(over) if not self._in_trouble(self._servos[k].id)]
+        if not hit:
+            return []
+        ids = tuple(self._servos[k].id for k in hit)
+        for id_ in ids:
+            self._new(cause, id_)
+        names = ", ".join(f"{self._servos[k].joint} (ID {self._servos[k].id}, {values[k]:.3f})" for k in hit)
+        return [Fault(cause, f"{what}: {names}", ids)]
+
+    def _deadline(self, cycle: Cycle) -> list[Fault]:
+        if self._late < self._safety.late_cycles or not self._new(Cause.DEADLINE):
+            return []
+        text = f"{self._late} cycles in a row started late, the last by {cycle.lateness * 1e3:.1f} ms"
+        return [Fault(Cause.DEADLINE, text)]
+
+
+def _names(servos: list[Servo]) -> str:
+    return ", ".join(f"{servo.joint} (ID {servo.id})" for servo in servos)
 
 
 def _count(counters: NDArray[np.int64], hit: NDArray[np.bool_], unknown: NDArray[np.bool_]) -> NDArray[np.int64]:

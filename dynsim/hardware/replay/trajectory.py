@@ -14,11 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.hardware.errors import CheckRefused
+from dynsim.hardware.replay.lifting import wheel_offsets
 from dynsim.hardware.servo_map import Servo, ServoMap
 from dynsim.record import TIME, Record
 
 REST = 1e-6
 """Joint speed [rad/s] below which a record counts as at rest."""
+HOLE, LONG = 2.5, 1.5
+"""Steps of so many times the median step: a motion that is not known in between. Of so many times the step that a tenth
+of all steps does not exceed: samples missing. The median itself is a long one where every third sample is missing."""
+COMMON = 0.1
+JERK_WINDOW = 0.1
+"""Over which the change of acceleration is averaged [s]: twice the lag of these servos (43.5 ms). A single jump in the
+velocity of a record is a knock, and bounded by the acceleration; jumps one after the other wear the gears."""
+SHAKING_WINDOW = 0.3
+"""In which velocity that is gained and lost again counts as shaking [s]."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +76,11 @@ class Path:
         return q0 + s * (m0 + s * (b + s * a)), (m0 + s * (2 * b + 3 * s * a)) / h
 
     def extremes(self) -> Extremes:
-        """Every interval's extreme positions and velocities, between the knots too."""
+        """Every interval's extreme positions, velocities and accelerations, between the knots too.
+
+        Acceleration q'' = (2b + 6a s)/h² is straight within an interval of length h, s = (t − t_k)/h: its extremes are
+        the two ends. Where the rate itself steps, the step over the time it stands for is the third candidate.
+        """
         h = np.diff(self.time)[:, None]
         q0, q1 = self.position[:-1], self.position[1:]
         m0, m1 = h * self.rate_after, h * self.rate_before
@@ -82,7 +96,99 @@ class Path:
         position = q0 + at_position * (m0 + at_position * (b + at_position * a))
         velocity = (m0 + at_velocity * (2 * b + 3 * at_velocity * a)) / h
         left = self.time[:-1, None]
-        return Extremes(left + h * at_position, position, left + h * at_velocity, velocity)
+        ends = np.stack([left, left + h, left]) + np.zeros_like(a)
+        with np.errstate(over="ignore"):  # an infinite one is beyond any limit
+            acceleration = np.stack([2 * b / h / h, (2 * b + 6 * a) / h / h, self._steps()])
+        return Extremes(left + h * at_position, position, left + h * at_velocity, velocity, ends, acceleration)
+
+    def _steps(self) -> NDArray[np.float64]:
+        """Acceleration for the step in rate at the beginning of every interval [rad/s²], shape (T-1, N).
+
+        A rate that is held from sample to sample stands for the middle of its interval, so that the step between two
+        of them takes half the one interval and half the other. There is none before the first interval.
+        """
+        h = np.diff(self.time)[:, None]
+        steps = np.zeros_like(self.rate_after)
+        steps[1:] = (self.rate_after[1:] - self.rate_before[:-1]) / (0.5 * (h[1:] + h[:-1]))
+        return steps
+
+    def jerk(self, window: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Change of acceleration per time, averaged in magnitude over ``window`` [s] of path time.
+
+        j(t) = (1/window) Σ |a_{k+1} − a_k| over the knots between t − window and t, in which a_k is the mean of what
+        the interpolant has on both sides of knot k, plus the step in rate there. It is the mean of |d³q/dt³| for a
+        smooth path, 4 |a| f for one that is thrown to and fro f times a second, whatever the window, and Δa/window for
+        a single jump. Between knots a is taken as straight.
+
+        Returns
+        -------
+        jerk : array, shape (N,)
+            Largest of each joint [rad/s³].
+        time : array, shape (N,)
+            Where the window of that value ends [s].
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            first, last = self._accelerations()
+            at_knots = np.concatenate([first[:1], 0.5 * (last[:-1] + first[1:]) + self._steps()[1:], last[-1:]])
+            variation = np.cumsum(np.abs(np.diff(at_knots, axis=0)), axis=0)
+        variation = np.concatenate([np.zeros_like(first[:1]), variation])
+        jerk, where = np.empty(self.position.shape[1]), np.empty(self.position.shape[1])
+        for joint in range(len(jerk)):
+            ends, within = self._within(variation[:, joint], window)
+            worst = int(within.argmax())
+            jerk[joint], where[joint] = within[worst] / window, min(ends[worst], self.end)
+        return jerk, where
+
+    def shaking(self, window: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Velocity that is gained and lost again, or lost and gained again, within ``window`` [s] of path time.
+
+        min(P, N), in which P = ∫ max(q'', 0) dt and N = ∫ max(−q'', 0) dt over the window, steps in rate included. It
+        does not depend on a velocity the joint has besides. A zigzag of d every h has d · window/h² where the window
+        holds many teeth, a spike of d within 2h (out in h, back in h) 2d/h with held rates; a move that goes one way
+        gains and loses its top speed once, which counts where it takes no longer than the window.
+
+        Returns
+        -------
+        shaking : array, shape (N,)
+            Largest of each joint [rad/s].
+        time : array, shape (N,)
+            Where the window of that value ends [s].
+        """
+        h = np.diff(self.time)[:, None]
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            first, last = self._accelerations()
+            # q'' is straight in an interval: where it changes sign the rate turns on the way.
+            turning = self.rate_after + 0.5 * h * first * (first / (first - last))
+            turning = np.where(first * last < 0, turning, self.rate_before)
+            changes = np.stack([turning - self.rate_after, self.rate_before - turning])
+            changes = np.concatenate([changes, np.zeros_like(changes[:1])])
+            changes[2, :-1] = self.rate_after[1:] - self.rate_before[:-1]
+            gained, lost = (
+                np.concatenate([np.zeros_like(first[:1]), np.cumsum(np.maximum(part, 0.0).sum(axis=0), axis=0)])
+                for part in (changes, -changes)
+            )
+        shaking, where = np.empty(self.position.shape[1]), np.empty(self.position.shape[1])
+        for joint in range(len(shaking)):
+            ends, up = self._within(gained[:, joint], window)
+            both = np.minimum(up, self._within(lost[:, joint], window)[1])
+            worst = int(both.argmax())
+            shaking[joint], where[joint] = both[worst], min(ends[worst], self.end)
+        return shaking, where
+
+    def _accelerations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Acceleration of the interpolant at the beginning and the end of every interval [rad/s²], shape (T-1, N)."""
+        h = np.diff(self.time)[:, None]
+        m0, m1, rise = h * self.rate_after, h * self.rate_before, np.diff(self.position, axis=0)
+        return (6 * rise - 4 * m0 - 2 * m1) / h / h, (-6 * rise + 2 * m0 + 4 * m1) / h / h
+
+    def _within(self, total: NDArray[np.float64], window: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What ``total``, a running sum at the knots, grows by within windows: their ends [s], and the growth.
+
+        The growth is straight between windows that begin or end at a knot.
+        """
+        ends = np.concatenate([self.time, self.time + window])
+        with np.errstate(over="ignore", invalid="ignore"):
+            return ends, np.interp(ends, self.time, total) - np.interp(ends - window, self.time, total)
 
 
 @dataclass(frozen=True)
@@ -93,6 +199,8 @@ class Extremes:
     position: NDArray[np.float64]
     velocity_time: NDArray[np.float64]
     velocity: NDArray[np.float64]
+    acceleration_time: NDArray[np.float64]
+    acceleration: NDArray[np.float64]
 
 
 def path_of_record(record: Record, servo_map: ServoMap) -> Path:
@@ -101,16 +209,10 @@ def path_of_record(record: Record, servo_map: ServoMap) -> Path:
     Raises
     ------
     CheckRefused
-        A signal or column is missing, time does not increase, a value is not finite, or the record is too short.
+        A signal or column is missing, time does not increase or has holes, a value is not finite, or the record is too
+        short.
     """
-    if len(record) < 2:
-        raise CheckRefused(f"the record has {len(record)} samples; a motion needs two")
-    with np.errstate(invalid="ignore"):
-        steps = np.diff(record.time)
-    later = np.isfinite(steps) & (steps > 0)
-    if not later.all():
-        bad = int(np.flatnonzero(~later)[0]) + 1
-        raise CheckRefused(f"the record's time does not increase at sample {bad} (t = {record.time[bad]:g} s)")
+    _check_time(record)
     time = record.time - record.time[0]
     position = np.empty((len(record), len(servo_map.servos)))
     rate_after, rate_before = np.empty_like(position[1:]), np.empty_like(position[1:])
@@ -125,9 +227,48 @@ def path_of_record(record: Record, servo_map: ServoMap) -> Path:
             rate_after[:, column] = rate_before[:, column] = np.diff(position[:, column]) / np.diff(time)
         else:
             rate_after[:, column], rate_before[:, column] = velocity[:-1], velocity[1:]
+    for joint, offset in wheel_offsets(record, servo_map).items():
+        column, rate = servo_map.joints.index(joint), np.gradient(offset, time)
+        position[:, column] += offset
+        rate_after[:, column] += rate[:-1]
+        rate_before[:, column] += rate[1:]
     return _at_rest_at_both_ends(
         Path(time, position, rate_after, rate_before, float(time[-1])), servo_map.safety.run_up
     )
+
+
+def _check_time(record: Record) -> None:
+    if len(record) < 2:
+        raise CheckRefused(f"the record has {len(record)} samples; a motion needs two")
+    known = np.isfinite(record.time)
+    if not known.all():
+        bad = int(np.flatnonzero(~known)[0])
+        raise CheckRefused(f"the record's time is {record.time[bad]} at sample {bad}, of {len(record)} samples")
+    with np.errstate(over="ignore"):
+        steps = np.diff(record.time)
+    later = np.isfinite(steps) & (steps > 0)
+    if not later.all():
+        bad = int(np.flatnonzero(~later)[0]) + 1
+        raise CheckRefused(f"the record's time does not increase at sample {bad} (t = {record.time[bad]:g} s)")
+    if holes := long_steps(record, HOLE, 0.5):
+        raise CheckRefused(
+            f"the record has {len(holes)} hole(s): {holes[0]}; what the robot did there is not known. "
+            "Simulate with an even step, or cut the record"
+        )
+
+
+def long_steps(record: Record, factor: float, share: float) -> list[str]:
+    """Steps of the record's time longer than ``factor`` times the usual one, each in words.
+
+    The usual step is the one that ``share`` of all steps do not exceed: 0.5 for their median.
+    """
+    steps = np.diff(record.time)
+    usual = float(np.quantile(steps, share, method="lower"))
+    return [
+        f"no sample between t = {record.time[k]:g} and {record.time[k + 1]:g} s, {steps[k] / usual:.3g} of the usual "
+        f"steps of {usual * 1e3:g} ms"
+        for k in np.flatnonzero(steps > factor * usual)
+    ]
 
 
 def column_of(record: Record, signal: str, servo: Servo, unit: str) -> NDArray[np.float64]:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path as FilePath
 
-from dynsim.files import write_json
 from dynsim.hardware.bus.control_table import (
     HEALTH_BLOCK,
     MODEL_BY_NUMBER,
-    RAD_S_PER_UNIT,
     RETURN_DELAY_SECONDS_PER_UNIT,
     STATE_BLOCK,
     VOLT_PER_UNIT,
@@ -18,6 +15,7 @@ from dynsim.hardware.bus.control_table import (
 )
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused
 from dynsim.hardware.replay.check import CheckedMotion
+from dynsim.hardware.replay.registers import LimitRow, compare_limits, needs_of
 from dynsim.hardware.servo_map import Servo, ServoMap
 
 EEPROM_BLOCK = (0, 64)
@@ -45,15 +43,15 @@ def snapshot(bus: Bus, servo: Servo) -> Registers:
     }
 
 
-def dump_registers(bus: Bus, servo_map: ServoMap, path: FilePath) -> None:
-    """Write the registers of every servo that answers as JSON."""
+def all_registers(bus: Bus, servo_map: ServoMap) -> dict[str, Registers | str]:
+    """Registers of every servo by joint, or why it did not answer. Raises PortError."""
     contents: dict[str, Registers | str] = {}
     for servo in servo_map.servos:
         try:
             contents[servo.joint] = snapshot(bus, servo)
         except (NoAnswer, RequestRefused) as error:
             contents[servo.joint] = str(error)
-    write_json(path, contents)
+    return contents
 
 
 def configure(bus: Bus, servo_map: ServoMap, report: Callable[[str], None]) -> None:
@@ -80,8 +78,12 @@ def _wanted_eeprom(servo: Servo, servo_map: ServoMap) -> Registers:
     }
 
 
-def verify(bus: Bus, servo_map: ServoMap, motion: CheckedMotion, *, poll: Callable[[], None]) -> list[str]:
+def verify(
+    bus: Bus, servo_map: ServoMap, motion: CheckedMotion, *, poll: Callable[[], None]
+) -> tuple[list[str], list[LimitRow]]:
     """Everything that is wrong with the servos on the bus, one line each; empty when the robot may move.
+
+    With it the limits that the servos have stored, beside the map's.
 
     Parameters
     ----------
@@ -89,13 +91,14 @@ def verify(bus: Bus, servo_map: ServoMap, motion: CheckedMotion, *, poll: Callab
         Called between servos; may raise to break off.
     """
     problems: list[str] = []
+    rows: list[LimitRow] = []
     present = bus.ping_all()
     poll()
     for id_, (model, firmware) in present.items():
         if id_ not in servo_map.ids:
             name = MODEL_BY_NUMBER[model].name if model in MODEL_BY_NUMBER else f"model {model}"
             problems.append(f"ID {id_}: {name} (firmware {firmware}) is on the bus but not in the map")
-    for column, servo in enumerate(servo_map.servos):
+    for servo, needs in zip(servo_map.servos, needs_of(motion), strict=True):
         poll()
         try:
             registers = snapshot(bus, servo)
@@ -106,14 +109,14 @@ def verify(bus: Bus, servo_map: ServoMap, motion: CheckedMotion, *, poll: Callab
         except RequestRefused as refused:
             problems.append(f"{servo.joint}: {refused}")
             continue
-        problems += [f"{servo.joint} (ID {servo.id}): {text}" for text in _unfit(servo, registers, servo_map)]
-        if servo.in_position_mode and registers["model_number"] == servo.model.number:
-            problems += [
-                f"{servo.joint} (ID {servo.id}): {text}" for text in _unreachable(servo, column, registers, motion)
-            ]
+        found = _unfit(servo, registers, servo_map)
+        if registers["model_number"] == servo.model.number:
+            rows.append(compare_limits(servo, registers, servo_map.safety, needs))
+            found += [*rows[-1].refused, *_out_of_place(servo, registers)]
+        problems += [f"{servo.joint} (ID {servo.id}): {text}" for text in found]
     if not problems:
         problems += _trial_reads(bus, servo_map, poll)
-    return problems
+    return problems, rows
 
 
 def _unfit(servo: Servo, registers: Registers, servo_map: ServoMap) -> list[str]:
@@ -149,31 +152,19 @@ def _unfit(servo: Servo, registers: Registers, servo_map: ServoMap) -> list[str]
         found.append(f"supply is {volts:.1f} V, allowed {supply.lowest:g} to {supply.highest:g} V")
     if registers["present_temperature"] > servo_map.safety.temperature_max:
         found.append(f"{registers['present_temperature']} °C is above {servo_map.safety.temperature_max:g} °C")
-    fastest = abs(servo.to_velocity_units(servo.kind.limits.velocity))
-    if not servo.in_position_mode and registers["velocity_limit"] < fastest:
-        found.append(
-            f"its velocity limit is {registers['velocity_limit'] * RAD_S_PER_UNIT:.2f} rad/s, below the map's; "
-            "faster goals would be ignored silently"
-        )
     return found
 
 
-def _unreachable(servo: Servo, column: int, registers: Registers, motion: CheckedMotion) -> list[str]:
-    """Goals the servo itself would ignore, and a posture the robot must not start from."""
-    found = []
-    angles = motion.path.extremes().position[..., column]
-    goals = sorted((servo.to_ticks(float(angles.min())), servo.to_ticks(float(angles.max()))))
-    low, high = registers["min_position"], registers["max_position"]
-    if goals[0] < low or goals[1] > high:
-        found.append(f"the motion needs ticks {goals[0]} to {goals[1]}, its own limits are {low} to {high}")
+def _out_of_place(servo: Servo, registers: Registers) -> list[str]:
+    """A posture the robot must not start from."""
     tick = registers["present_position"]
-    allowed = servo.tick_limits
-    if not allowed[0] <= tick <= allowed[1]:
-        found.append(
-            f"stands at {servo.to_angle(tick):.3f} rad (tick {tick}), outside of its limits "
-            f"{servo.position_limits[0]:.3f} to {servo.position_limits[1]:.3f} rad; move it by hand"
-        )
-    return found
+    low, high = servo.tick_limits
+    if not servo.in_position_mode or low <= tick <= high:
+        return []
+    return [
+        f"stands at {servo.to_angle(tick):.3f} rad (tick {tick}), outside of its limits "
+        f"{servo.position_limits[0]:.3f} to {servo.position_limits[1]:.3f} rad; move it by hand"
+    ]
 
 
 def _trial_reads(bus: Bus, servo_map: ServoMap, poll: Callable[[], None]) -> list[str]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, ValidationInfo, model_validator
 
-from dynsim.hardware.servo_map import StrictModel, read_yaml
+from dynsim.config import error_at
+from dynsim.hardware.strict_yaml import StrictModel, read_yaml
 
 Probability = Annotated[float, Field(ge=0, le=1)]
 
@@ -21,9 +23,15 @@ class _Timed(StrictModel):
 
     def active(self, since_torque: float) -> bool:
         """True at ``since_torque`` [s] after the first torque enable (−∞ before it)."""
+        start, end = self.span
+        return start <= since_torque < end
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """When it begins and ends [s after the first torque enable]; −∞ and ∞ for one that is always there."""
         if self.at is None:
-            return True
-        return self.at <= since_torque < self.at + (self.duration or math.inf)
+            return -math.inf, math.inf
+        return self.at, self.at + (self.duration or math.inf)
 
 
 class LineFault(_Timed):
@@ -35,7 +43,7 @@ class LineFault(_Timed):
 
 
 class LateStatus(_Timed):
-    """Status packets come later by ``delay`` [s]."""
+    """Status packets come later by ``delay`` [s]: by n periods, and cycle k + n gets the answer of cycle k."""
 
     kind: Literal["late_status"]
     id: int | None = None
@@ -79,6 +87,14 @@ class VoltageSag(_Timed):
     drop: Annotated[float, Field(gt=0)]
 
 
+class SupplyLoss(_Timed):
+    """No volts for ``duration`` [s]: every servo is limp and silent, then starts anew with what its EEPROM holds."""
+
+    kind: Literal["supply_loss"]
+    at: Annotated[float, Field(ge=0)]
+    duration: Annotated[float, Field(gt=0)] = 0.3
+
+
 class TemperatureRamp(_Timed):
     """A servo warms by ``heating_rate`` [K/s] on top of its own losses."""
 
@@ -88,7 +104,15 @@ class TemperatureRamp(_Timed):
 
 
 Fault = Annotated[
-    LineFault | LateStatus | PortFault | ServoFault | WrongRegister | AngleFault | VoltageSag | TemperatureRamp,
+    LineFault
+    | LateStatus
+    | PortFault
+    | ServoFault
+    | WrongRegister
+    | AngleFault
+    | VoltageSag
+    | SupplyLoss
+    | TemperatureRamp,
     Field(discriminator="kind"),
 ]
 
@@ -106,13 +130,24 @@ class FaultScript(StrictModel):
     seed: int = 0
     faults: list[Fault] = Field(default_factory=list)
 
+    @model_validator(mode="after")
+    def _servos_are_there(self, info: ValidationInfo) -> FaultScript:
+        """Validated with the context ``{"ids": ...}`` a fault of a servo that is not among them is an error."""
+        ids = info.context["ids"] if info.context else None
+        for number, fault in enumerate(self.faults):
+            id_ = getattr(fault, "id", None)
+            if ids is not None and id_ is not None and id_ not in ids:
+                there = ", ".join(map(str, sorted(ids)))
+                raise error_at(f"faults.{number}.id", f"no servo has this ID; there are {there}")
+        return self
 
-def load_fault_script(path: str | Path) -> FaultScript:
-    """Read a fault script.
+
+def load_fault_script(path: str | Path, ids: Collection[int] | None = None) -> FaultScript:
+    """Read a fault script for servos with these IDs, of which it may name no others (any if not given).
 
     Raises
     ------
     ServoMapError
         Missing file, bad YAML or bad entry, with file and line.
     """
-    return read_yaml(Path(path), FaultScript)
+    return read_yaml(Path(path), FaultScript, {"ids": ids})

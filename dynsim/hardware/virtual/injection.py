@@ -34,6 +34,7 @@ class Injection:
     def apply(self) -> None:
         """Faults that change a servo: once when they become active, the jam at every step."""
         servos = self._servos
+        servos.set_power(on=not any(fault.kind == "supply_loss" for fault in servos.active_faults()))
         for number, fault in enumerate(self._script.faults):
             if not fault.active(servos.time - servos.torque_since):
                 continue

@@ -11,16 +11,13 @@ from typing import Any
 
 import serial
 
-from dynsim.hardware.bus.control_table import (
-    BAUD_RATES,
-    BROADCAST_ID,
-    RAD_PER_TICK,
-    RETURN_DELAY_SECONDS_PER_UNIT,
-)
-from dynsim.hardware.bus.packet import ALERT, STATUS, Decoder, Instruction, Packet, StatusError, encode
+from dynsim.hardware.bus.control_table import BAUD_RATES, RAD_PER_TICK, RETURN_DELAY_SECONDS_PER_UNIT
+from dynsim.hardware.bus.packet import STATUS, Decoder, Packet
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.hardware.virtual.faults import FaultScript
+from dynsim.hardware.virtual.firmware import Firmware, Protocol2
 from dynsim.hardware.virtual.injection import Injection
+from dynsim.hardware.virtual.protocol1 import Decoder1, Protocol1
 from dynsim.hardware.virtual.registers import ServoRegisters
 from dynsim.hardware.virtual.servo_plant import ServoPlant
 from dynsim.hardware.virtual.servos import PHYSICS_STEP, VirtualServos
@@ -50,7 +47,7 @@ class VirtualLine:
     supply : float
         Voltage of the supply without load [V].
     listener : callable, optional
-        Called with (time, packet) for every valid instruction packet on the line.
+        Called with (time, packet) for every valid packet of Protocol 2.0 that a servo can hear.
     """
 
     def __init__(
@@ -67,9 +64,10 @@ class VirtualLine:
         self.servos = VirtualServos(servos, positions=positions, plant=plant, script=script, supply=supply)
         self.listener = listener
         self._faults = Injection(self.servos, script)
-        self._decoder = Decoder()
+        firmware = Firmware(self.servos)
+        self._protocols: dict[int, Protocol1 | Protocol2] = {1: Protocol1(firmware), 2: Protocol2(firmware)}
+        self._decoders: dict[tuple[int, int], Decoder | Decoder1] = {}
         self._heard = 0.0
-        self._registered: dict[int, tuple[int, bytes]] = {}
         self._faults.apply()
 
     @property
@@ -90,8 +88,8 @@ class VirtualLine:
 
     @property
     def baud(self) -> int:
-        """What the servos are set to [bit/s]."""
-        return BAUD_RATES[next(iter(self.servos.registers.values()))["baud"]]
+        """What the first servo is set to [bit/s]."""
+        return next(iter(self.servos.registers.values())).baud
 
     def transmit(self, data: bytes, start: float, baud: int) -> list[tuple[float, bytes]]:
         """Put bytes on the line at ``start`` [s]; the answers, each with the time its last byte reaches the reader.
@@ -108,107 +106,31 @@ class VirtualLine:
         arrivals: list[tuple[float, bytes]] = []
         if self._faults.echo:
             arrivals.append((end + ADAPTER_LATENCY, data))
-        # Another bit rate is noise to the servos; a packet that stopped half-way is given up after a while.
-        packets = [*self._decoder.flush()] if start - self._heard > BYTE_TIMEOUT else []
+        # A packet that stopped half-way is given up after a while.
+        given_up = start - self._heard > BYTE_TIMEOUT
         self._heard = end
-        if baud == self.baud:
-            for packet in [*packets, *self._decoder.feed(data)]:
-                arrivals += self._execute(packet, end, baud)
+        # To servos at another bit rate this is noise.
+        for protocol in self.servos.addresses.protocols(baud):
+            decoder = self._decoders.setdefault((baud, protocol), Decoder() if protocol == 2 else Decoder1())
+            packets = [*decoder.flush()] if given_up else []
+            for packet in [*packets, *decoder.feed(data)]:
+                if packet.instruction != STATUS and protocol in self.servos.addresses.protocols(baud):
+                    arrivals += self._execute(packet, protocol, end, baud)
         return arrivals
 
-    def _execute(self, packet: Packet, now: float, baud: int) -> list[tuple[float, bytes]]:
-        if packet.instruction == STATUS:
-            return []
-        self.servos.heard = now
-        if self.listener:
+    def _execute(self, packet: Packet, protocol: int, now: float, baud: int) -> list[tuple[float, bytes]]:
+        hearing = self.servos.addresses.hearing(baud, protocol)
+        self.servos.hear(hearing, now)
+        if self.listener and protocol == 2:
             self.listener(now, packet)
         arrivals: list[tuple[float, bytes]] = []
-        for id_, reply in self._replies(packet):
-            registers = self.servos.registers[id_]
-            now += registers["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT + TURNAROUND
-            frame = encode(reply)
-            now += len(frame) * 10 / baud
-            arrivals += self._faults.disturb(id_, frame, now + ADAPTER_LATENCY)
+        for answer in self._protocols[protocol].answers(packet, hearing):
+            first = answer.servos[0]
+            if not answer.chained:
+                now += self.servos.registers[first]["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT + TURNAROUND
+            now += len(answer.frame) * 10 / baud
+            arrivals += self._faults.disturb(first, answer.frame, now + ADAPTER_LATENCY)
         return arrivals
-
-    def _replies(self, packet: Packet) -> Iterable[tuple[int, Packet]]:
-        p = packet.parameters
-        if packet.instruction == Instruction.SYNC_READ and len(p) >= 5:
-            address, length = int.from_bytes(p[0:2], "little"), int.from_bytes(p[2:4], "little")
-            return [reply for id_ in p[4:] if self.servos.listens(id_) for reply in self._read(id_, address, length)]
-        if packet.instruction == Instruction.BULK_READ:
-            entries = [p[k : k + 5] for k in range(0, len(p) - 4, 5)]
-            return [
-                reply
-                for entry in entries
-                if self.servos.listens(entry[0])
-                for reply in self._read(
-                    entry[0], int.from_bytes(entry[1:3], "little"), int.from_bytes(entry[3:5], "little")
-                )
-            ]
-        if packet.instruction == Instruction.SYNC_WRITE and len(p) >= 4:
-            address, length = int.from_bytes(p[0:2], "little"), int.from_bytes(p[2:4], "little")
-            for k in range(4, len(p) - length, length + 1):
-                if self.servos.listens(p[k]):
-                    # Nobody answers a sync write: a refused goal goes unnoticed, as on real servos.
-                    self.servos.write(p[k], address, p[k + 1 : k + 1 + length])
-            return []
-        if packet.instruction == Instruction.BULK_WRITE:
-            k = 0
-            while k + 5 <= len(p):
-                length = int.from_bytes(p[k + 3 : k + 5], "little")
-                if self.servos.listens(p[k]):
-                    self.servos.write(p[k], int.from_bytes(p[k + 1 : k + 3], "little"), p[k + 5 : k + 5 + length])
-                k += 5 + length
-            return []
-        targets = self.servos.ids if packet.id == BROADCAST_ID else [packet.id]
-        replies = [reply for id_ in sorted(targets) if self.servos.listens(id_) for reply in self._single(id_, packet)]
-        silent = packet.id == BROADCAST_ID and packet.instruction != Instruction.PING
-        return [] if silent else replies
-
-    def _single(self, id_: int, packet: Packet) -> list[tuple[int, Packet]]:
-        registers, p = self.servos.registers[id_], packet.parameters
-        level = registers["status_return_level"]
-        match packet.instruction:
-            case Instruction.PING:
-                data = registers.read(0, 2) or b""
-                return [(id_, self._status(id_, StatusError.NONE, data + bytes([registers["firmware"]])))]
-            case Instruction.READ if len(p) == 4:
-                return self._read(id_, int.from_bytes(p[0:2], "little"), int.from_bytes(p[2:4], "little"))
-            case Instruction.WRITE if len(p) >= 3:
-                error = self.servos.write(id_, int.from_bytes(p[0:2], "little"), p[2:])
-            case Instruction.REG_WRITE if len(p) >= 3:
-                self._registered[id_] = (int.from_bytes(p[0:2], "little"), p[2:])
-                registers["registered_instruction"] = 1
-                error = StatusError.NONE
-            case Instruction.ACTION:
-                error = StatusError.RESULT_FAIL
-                if id_ in self._registered:
-                    address, data = self._registered.pop(id_)
-                    registers["registered_instruction"] = 0
-                    error = self.servos.write(id_, address, data)
-            case Instruction.REBOOT:
-                answer = [(id_, self._status(id_, StatusError.NONE))] if level == 2 else []
-                self.servos.reboot(id_)
-                return answer
-            case Instruction.CLEAR if p == b"\x01\x44\x58\x4c\x22":
-                self.servos.forget_turns(self.servos.ids.index(id_))
-                error = StatusError.NONE
-            case _:
-                error = StatusError.INSTRUCTION
-        return [(id_, self._status(id_, error))] if level == 2 else []
-
-    def _read(self, id_: int, address: int, length: int) -> list[tuple[int, Packet]]:
-        if self.servos.registers[id_]["status_return_level"] == 0:
-            return []
-        data = self.servos.read(id_, address, length)
-        if data is None:
-            return [(id_, self._status(id_, StatusError.ACCESS))]
-        return [(id_, self._status(id_, StatusError.NONE, data))]
-
-    def _status(self, id_: int, error: StatusError, data: bytes = b"") -> Packet:
-        alert = ALERT if self.servos.registers[id_]["hardware_error"] else 0
-        return Packet(id_, STATUS, data, error | alert)
 
 
 def line_for_map(servo_map: ServoMap, **options: Any) -> VirtualLine:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import select
+import sys
 import termios
 import time
 import tty
@@ -18,6 +20,9 @@ from dynsim.hardware.virtual.line import ADAPTER_LATENCY, VirtualLine
 _BAUD_BY_CODE = {
     getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()
 }
+_TCGETS2 = 0x802C542A
+"""Asks Linux for the settings of a terminal with its bit rate as a number: clients set rates that have no code."""
+_OUTPUT_SPEED = slice(40, 44)
 IDLE = 1e-3
 """Longest wait for bytes before the servos move on [s]; short, for a request to find little motion to catch up with."""
 
@@ -41,7 +46,7 @@ class PseudoTerminal:
         Raises
         ------
         PortError
-            The link exists as something else, or cannot be made.
+            The link exists as something else, leads to a device that is there, or cannot be made.
         """
         self.line = line
         self._master, self._slave = os.openpty()
@@ -53,11 +58,20 @@ class PseudoTerminal:
         if link is not None:
             try:
                 if link.is_symlink():
+                    self._refuse_device_in_use(link)
                     link.unlink()
                 link.symlink_to(self.device)
             except OSError as error:
                 self.close()
                 raise PortError(f"{link}: cannot be made a link to {self.device} ({error.strerror})") from error
+
+    def _refuse_device_in_use(self, link: Path) -> None:
+        """What a process that was killed has left leads nowhere, or by chance to the own device."""
+        if link.exists() and os.readlink(link) != self.device:
+            there = os.readlink(link)
+            self._link = None
+            self.close()
+            raise PortError(f"{link}: leads to {there}, which is in use (other virtual servos?); give another link")
 
     def serve(self, keep_on: Callable[[], bool]) -> None:
         """Answer until ``keep_on`` says no, or the scripted adapter is pulled out."""
@@ -82,9 +96,17 @@ class PseudoTerminal:
 
     def _answer(self, data: bytes, now: float) -> list[tuple[float, bytes]]:
         # The client's own write time has passed already when the bytes are here; the USB adapter's has too.
-        baud = _BAUD_BY_CODE.get(termios.tcgetattr(self._slave)[5], self.line.baud)
+        baud = self.baud
         arrivals = self.line.transmit(data, now - len(data) * 10 / baud, baud)
         return [(arrival - ADAPTER_LATENCY, frame) for arrival, frame in arrivals]
+
+    @property
+    def baud(self) -> int:
+        """What the client has set [bit/s]; what the servos have where the system does not say."""
+        with contextlib.suppress(OSError):
+            settings = fcntl.ioctl(self._slave, _TCGETS2, bytes(44))
+            return int.from_bytes(settings[_OUTPUT_SPEED], sys.byteorder)
+        return _BAUD_BY_CODE.get(termios.tcgetattr(self._slave)[5], self.line.baud)
 
     def _send(self, data: bytes) -> None:
         # A client that does not read loses bytes, as with a real adapter.
@@ -92,8 +114,8 @@ class PseudoTerminal:
             os.write(self._master, data)
 
     def close(self) -> None:
-        """Hang up and remove the link."""
-        if self._link is not None and self._link.is_symlink():
+        """Hang up and remove the link, where it is still the own one."""
+        if self._link is not None and self._link.is_symlink() and os.readlink(self._link) == self.device:
             self._link.unlink()
         for descriptor in (self._master, self._slave):
             with contextlib.suppress(OSError):

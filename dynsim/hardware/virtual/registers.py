@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 from dynsim.hardware.bus.control_table import (
+    BAUD_RATES,
     INDIRECT_BLOCKS,
-    RAD_S_PER_UNIT,
     TABLE_SIZE,
     Field,
     OperatingMode,
@@ -31,21 +33,34 @@ class ServoRegisters:
         self.model = model
         self._table = bytearray(TABLE_SIZE)
         self._field_at = {field.address: name for name, field in model.fields.items()}
-        for name, field in model.fields.items():
-            self[name] = field.default
-        self["model_number"], self["id"], self["baud"] = model.number, id_, baud_code
-        self["velocity_limit"] = round(1.1 * model.no_load_speed / RAD_S_PER_UNIT)
-        self.restart()
+        # Each read of a state asks for a dozen registers: their places are looked up once.
+        self._places = {
+            name: (slice(field.address, field.address + field.size), field.size, field.signed)
+            for name, field in model.fields.items()
+        }
+        self.reset()
+        self["id"], self["baud"] = id_, baud_code
 
     def __getitem__(self, name: str) -> int:
-        field = self.model.fields[name]
-        return int.from_bytes(self._table[field.address : field.address + field.size], "little", signed=field.signed)
+        place, _, signed = self._places[name]
+        return int.from_bytes(self._table[place], "little", signed=signed)
 
     def __setitem__(self, name: str, value: int) -> None:
-        field = self.model.fields[name]
-        self._table[field.address : field.address + field.size] = value.to_bytes(
-            field.size, "little", signed=field.signed
-        )
+        place, size, signed = self._places[name]
+        self._table[place] = value.to_bytes(size, "little", signed=signed)
+
+    @property
+    def baud(self) -> int:
+        """[bit/s]."""
+        return BAUD_RATES[self["baud"]]
+
+    def reset(self, keep: Collection[str] = ()) -> None:
+        """All as delivered, but for the registers named in ``keep``."""
+        kept = {name: self[name] for name in keep}
+        for name, field in self.model.fields.items():
+            self[name] = kept.get(name, field.default)
+        self["model_number"] = self.model.number
+        self.restart()
 
     def restart(self) -> None:
         """RAM as after power-on."""
@@ -72,18 +87,20 @@ class ServoRegisters:
         """Write consecutive items, all or none."""
         if not data or address + len(data) > TABLE_SIZE:
             return StatusError.ACCESS
-        targets = [self._resolve(a) for a in range(address, address + len(data))]
+        end = address + len(data)
+        direct = end <= INDIRECT_BLOCKS[0][0]
+        targets = range(address, end) if direct else [self._resolve(a) for a in range(address, end)]
         pending: list[tuple[str, int]] = []
         position = 0
         while position < len(targets):
             start = targets[position]
-            if self._is_pointer(start):
+            if not direct and self._is_pointer(start):
                 if self["torque_enable"]:
                     return StatusError.ACCESS
                 self._table[start] = data[position]
                 position += 1
                 continue
-            if start == address + position and self._is_indirect_data(start):
+            if not direct and start == address + position and self._is_indirect_data(start):
                 self._table[start] = data[position]
                 position += 1
                 continue
@@ -91,7 +108,7 @@ class ServoRegisters:
             if name is None:
                 return StatusError.ACCESS
             field = self.model.fields[name]
-            if targets[position : position + field.size] != list(range(start, start + field.size)):
+            if [*targets[position : position + field.size]] != [*range(start, start + field.size)]:
                 return StatusError.DATA_LENGTH
             value = field.decode(data[position : position + field.size])
             error = self._objection(name, field, value)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 
@@ -17,11 +17,16 @@ from dynsim.hardware.bus.control_table import (
     OperatingMode,
 )
 from dynsim.hardware.bus.packet import StatusError
+from dynsim.hardware.virtual.addresses import Addresses, Hearing
 from dynsim.hardware.virtual.faults import AngleFault, Fault, FaultScript, TemperatureRamp, VoltageSag
 from dynsim.hardware.virtual.registers import ServoRegisters
 from dynsim.hardware.virtual.servo_plant import Drive, InertialLoad, ServoPlant
 
 PHYSICS_STEP = 2e-3
+COMMUNICATION_END = 14
+"""IDs, bit rate and protocol stand at lower addresses."""
+TRAJECTORY = 136, 144
+"""Where the profile's own speed and position stand; kept up to date only for those who read them."""
 BOOT_TIME = 0.3
 """Silence after a reboot [s] (unverified)."""
 AMBIENT = 25.0  # °C
@@ -39,7 +44,7 @@ class VirtualServos:
     Parameters
     ----------
     registers : mapping of int to ServoRegisters
-        By ID.
+        By ID. A servo that is given another one keeps its place here, and its name in fault scripts.
     positions : iterable of float
         Initial servo angles [rad], 0 at tick 0.
     plant : ServoPlant or None
@@ -52,14 +57,17 @@ class VirtualServos:
     Attributes
     ----------
     registers : dict
-        ServoRegisters by ID.
+        ServoRegisters by the ID that a servo had at first.
     ids : list of int
+        Those IDs.
+    addresses : Addresses
+        Who hears what.
     time : float
         [s].
     torque_since : float
         When torque was first switched on [s]; infinite before.
-    heard : float
-        Time of the last packet, for the watchdogs [s].
+    heard : array, shape (N,)
+        Time of the last packet that each servo could understand, for the watchdogs [s].
     dead : set of int
         IDs without power or cable.
     temperature, play : array, shape (N,)
@@ -77,15 +85,17 @@ class VirtualServos:
     ) -> None:
         self.registers = dict(registers)
         self.ids = list(registers)
+        self.addresses = Addresses(self.registers)
         self._models = [table.model for table in registers.values()]
         self.plant: ServoPlant = plant or InertialLoad(self._models, np.array(list(positions), dtype=np.float64))
         self.supply = supply
         self.time = 0.0
         self.torque_since = math.inf
-        self.heard = 0.0
         self.dead: set[int] = set()
+        self._powered = True
         self._script = script
         count = len(self.ids)
+        self.heard = np.zeros(count)
         self._drive = Drive(
             np.zeros(count, dtype=bool), np.ones(count, dtype=bool), self.plant.position.copy(), np.zeros(count), supply
         )
@@ -98,11 +108,13 @@ class VirtualServos:
         self._overload = np.zeros(count)
         self.play = self.plant.position.copy()
         self._turns = np.zeros(count, dtype=np.int64)
+        self._sense = [1] * count
         self._boot_until: dict[int, float] = {}
         self._overload_torque = OVERLOAD_FRACTION * np.array([model.stall_torque for model in self._models])
         self._resistance = np.array([12.0 / model.stall_current for model in self._models])
         self._ampere_per_newtonmetre = np.array([1 / model.torque_constant for model in self._models])
         for index in range(count):
+            self.reload(index)
             self.hold_here(index)
             self.reload(index)
 
@@ -113,15 +125,31 @@ class VirtualServos:
         since = self.time - self.torque_since
         return [fault for fault in self._script.faults if fault.active(since)]
 
+    def _next_fault(self) -> float:
+        """When the next fault begins or ends [s]."""
+        changes = [self.torque_since + time for fault in self._script.faults for time in fault.span]
+        return min((time for time in changes if time > self.time), default=math.inf)
+
     # -- requests -----------------------------------------------------------------------------------------------------
+
+    def hear(self, hearing: Hearing, now: float) -> None:
+        """Those who understood a packet at ``now`` [s] are content for as long as their watchdogs wait."""
+        self.heard[hearing.members] = now
 
     def listens(self, id_: int) -> bool:
         """Whether a servo hears what is sent."""
-        return id_ in self.registers and id_ not in self.dead and self.time >= self._boot_until.get(id_, 0.0)
+        there = self._powered and id_ in self.registers and id_ not in self.dead
+        return there and self.time >= self._boot_until.get(id_, 0.0)
 
     def read(self, id_: int, address: int, length: int) -> bytes | None:
         """Bytes of a servo's control table as they are now; None outside of it."""
-        self.measure(self.ids.index(id_))
+        index = self.ids.index(id_)
+        self.measure(index)
+        if address < TRAJECTORY[1] and address + length > TRAJECTORY[0]:
+            registers = self.registers[id_]
+            registers["position_trajectory"] = self._present_ticks(index, self._drive.set_position[index])
+            rate = self._set_rate[index] if self._drive.in_position_mode[index] else self._drive.set_velocity[index]
+            registers["velocity_trajectory"] = round(self._sense[index] * float(rate) / RAD_S_PER_UNIT)
         return self.registers[id_].read(address, length)
 
     def write(self, id_: int, address: int, data: bytes) -> StatusError:
@@ -132,13 +160,23 @@ class VirtualServos:
         if error:
             return error
         if registers["operating_mode"] != mode:
+            self.reload(index)
             self.forget_turns(index)
         if registers["torque_enable"] and not torque:
             self.hold_here(index)
             if self.torque_since == math.inf:
                 self.torque_since = self.time
         self.reload(index)
+        if address < COMMUNICATION_END:
+            self.addresses.sort()
         return StatusError.NONE
+
+    def reset(self, id_: int, keep: Collection[str]) -> None:
+        """As delivered but for the registers ``keep``, then a restart."""
+        self.registers[id_].reset(keep)
+        self.reload(self.ids.index(id_))
+        self.addresses.sort()
+        self.reboot(id_)
 
     def reboot(self, id_: int) -> None:
         """Power-on state; the servo is silent for a while."""
@@ -149,9 +187,17 @@ class VirtualServos:
         self._boot_until[id_] = self.time + BOOT_TIME
         self.reload(index)
 
+    def set_power(self, *, on: bool) -> None:
+        """Switch the supply of all servos; they start anew when it comes back."""
+        if on == self._powered:
+            return
+        self._powered = on
+        for id_ in self.ids:
+            self.reboot(id_)
+
     def forget_turns(self, index: int) -> None:
         """Count turns from here."""
-        self._turns[index] = self._sense(index) * round(self.plant.position[index] / RAD_PER_TICK) // TICKS_PER_TURN
+        self._turns[index] = self._sense[index] * round(self.plant.position[index] / RAD_PER_TICK) // TICKS_PER_TURN
 
     # -- motion, heat, supply -----------------------------------------------------------------------------------------
 
@@ -159,7 +205,7 @@ class VirtualServos:
         """One physics step, or when nothing moves all that fit in before ``until`` [s]."""
         if not self._drive.enabled.any() and self.plant.rests:
             # Nothing moves: one long step for the temperatures, so that waiting for pings costs nothing.
-            steps = int((until - self.time) / PHYSICS_STEP)
+            steps = max(1, int((min(until, self._next_fault()) - self.time) / PHYSICS_STEP))
             self.time += steps * PHYSICS_STEP
             self._warm(steps * PHYSICS_STEP)
         else:
@@ -194,7 +240,7 @@ class VirtualServos:
         self.temperature += (target - self.temperature) * -math.expm1(-dt / THERMAL_TIME)
         self._overload = np.where(torque > self._overload_torque, self._overload + dt, 0.0)
         sag = sum(fault.drop for fault in self.active_faults() if isinstance(fault, VoltageSag))
-        self._drive.voltage = self.supply - sag - SUPPLY_RESISTANCE * float(current.sum())
+        self._drive.voltage = (self.supply - sag - SUPPLY_RESISTANCE * float(current.sum())) * self._powered
         for fault in self.active_faults():
             if isinstance(fault, TemperatureRamp) and fault.id in self.registers:
                 self.temperature[self.ids.index(fault.id)] += dt * fault.heating_rate
@@ -233,19 +279,14 @@ class VirtualServos:
 
     # -- registers and motion -----------------------------------------------------------------------------------------
 
-    def _sense(self, index: int) -> int:
-        # Reverse mode turns the shaft's sense, not that of the homing offset.
-        return -1 if self.registers[self.ids[index]]["drive_mode"] & 1 else 1
-
     def _present_ticks(self, index: int, angle: float) -> int:
-        registers = self.registers[self.ids[index]]
-        ticks = self._sense(index) * round(angle / RAD_PER_TICK) - int(self._turns[index]) * TICKS_PER_TURN
-        return ticks + registers["homing_offset"]
+        ticks = self._sense[index] * round(angle / RAD_PER_TICK) - int(self._turns[index]) * TICKS_PER_TURN
+        return ticks + self.registers[self.ids[index]]["homing_offset"]
 
     def _angle(self, index: int, ticks: int) -> float:
         registers = self.registers[self.ids[index]]
         raw = ticks - registers["homing_offset"] + int(self._turns[index]) * TICKS_PER_TURN
-        return self._sense(index) * raw * RAD_PER_TICK
+        return self._sense[index] * raw * RAD_PER_TICK
 
     def hold_here(self, index: int) -> None:
         """Set point and goals := where the shaft is."""
@@ -258,7 +299,9 @@ class VirtualServos:
 
     def reload(self, index: int) -> None:
         """Take over what the motion needs from the registers."""
-        registers, sense = self.registers[self.ids[index]], self._sense(index)
+        registers = self.registers[self.ids[index]]
+        # Reverse mode turns the shaft's sense, not that of the homing offset.
+        self._sense[index] = sense = -1 if registers["drive_mode"] & 1 else 1
         self._drive.enabled[index] = bool(registers["torque_enable"])
         self._drive.in_position_mode[index] = registers["operating_mode"] != OperatingMode.VELOCITY
         self._goal_position[index] = self._angle(index, registers["goal_position"])
@@ -272,7 +315,7 @@ class VirtualServos:
     def measure(self, index: int) -> None:
         """Bring the registers of one servo up to date before they are read."""
         id_ = self.ids[index]
-        registers, sense = self.registers[id_], self._sense(index)
+        registers, sense = self.registers[id_], self._sense[index]
         angle = self.plant.position[index]
         for fault in self.active_faults():
             if isinstance(fault, AngleFault) and fault.id == id_:

@@ -133,7 +133,7 @@ def choose(system: System, ws: Workspace, run: Run):
         size = reduce_rows(system, ws, run, p)
         if run.count[STATUS] == FORCES_REVERSED:
             break
-        solved = solve_problem(unilateral, unilateral.room[PROBLEM], size, largest)
+        solved = solve_problem(unilateral, unilateral.room[PROBLEM], size, largest, 0)
         if not solved or not give_way(system, ws, size, largest):
             break
         solved = False

@@ -25,7 +25,7 @@ from dynsim.kernels.arrays import (
     STICKING,
     Workspace,
 )
-from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, ONE_WAY, TANGENT, solve_cones
+from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, ONE_WAY, TANGENT, approach, solve_cones
 from dynsim.kernels.constraint.rows import row_errors, set_modes
 from dynsim.kernels.constraint.unilateral import (
     BEFORE,
@@ -66,6 +66,8 @@ from dynsim.kernels.tree.articulated import accelerate
 STRIKE = 3.0
 # Impacts at one instant, of which each is the cause of the next, before restitution is none.
 MOST_BOUNCES = 30.0
+# Starts of an impact problem with restitution, which has no solution where that contradicts friction.
+BOUNCE_STARTS = 40
 # What begins to touch is brought this close to its surface [m].
 FOOT_TOLERANCE = 1e-13
 # Of a solution of the cones: residual by the largest entry, and what of the largest force is none.
@@ -176,22 +178,21 @@ def gather(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
-def solve_problem(unilateral: UnilateralArrays, W, size, largest):
+def solve_problem(unilateral: UnilateralArrays, W, size, largest, starts):
     """Solve the contact problem of ``unilateral.vector`` and W, (size, size), into SOLUTION; False when that fails.
 
-    ``largest``: of the rates or accelerations that it is to bring to zero.
+    Parameters
+    ----------
+    largest : of the rates or accelerations that it is to bring to zero
+    starts : of Newton's method, before a problem that may well have no solution is given up; 0: as many as it takes
     """
-    vector = unilateral.vector
-    residual = solve_cones(
-        W,
-        vector[OFFSET],
-        unilateral.place[KINDS],
-        vector[CONE_FRICTION],
-        size,
-        vector[SOLUTION],
-        unilateral.room[SCRATCH:],
-        1e-2 * CONE_TOLERANCE * max(largest, IMMOBILE),
-    )
+    vector, room, kind = unilateral.vector, unilateral.room[SCRATCH:], unilateral.place[KINDS]
+    b, mu, f, good = vector[OFFSET], vector[CONE_FRICTION], vector[SOLUTION], 1e-2 * CONE_TOLERANCE
+    good *= max(largest, IMMOBILE)
+    if starts > 0:
+        residual = approach(W, b, kind, mu, size, f, room, good, starts)
+    else:
+        residual = solve_cones(W, b, kind, mu, size, f, room, good)
     return 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest)
 
 
@@ -213,7 +214,7 @@ def impulses(system: System, ws: Workspace, p, largest, share):
             falls = mode[k, STRUCK] == 1 and mode[k, BEFORE] == OPEN
             if falls and -rows[r, ROW_RATE] > unilateral.tally[k, SETTLE]:
                 vector[OFFSET, r] *= 1.0 + share * unilateral.law[k, RESTITUTION]
-    if not solve_problem(unilateral, ws.small[0], p, largest):
+    if not solve_problem(unilateral, ws.small[0], p, largest, BOUNCE_STARTS if share > 0.0 else 0):
         return False
     f, total, turnover = vector[SOLUTION], 0.0, 0.0
     for r in range(p):

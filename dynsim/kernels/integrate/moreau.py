@@ -82,6 +82,7 @@ from dynsim.kernels.integrate.time_stepping import (
     PER,
     START,
     STOP,
+    TAKEN,
     V_BIAS,
     V_START,
     SteppingArrays,
@@ -245,6 +246,8 @@ def book(system: System, ws: Workspace, run: Run):
         y_new[layout.load + k] += h * run.stage[1, layout.load + k]
     stored_energy(system, ws, y_new, s.energy[STOP])
     y_new[layout.scheme] -= stored + (s.energy[STOP, ENERGY] - s.energy[START, ENERGY])
+    if abs(y_new[layout.scheme]) > abs(s.found[TAKEN]):
+        s.found[TAKEN] = y_new[layout.scheme]
 
 
 @internal_kernel

@@ -1,8 +1,8 @@
 """RADAU5, Radau IIA of order 5 with three stages: one step by simplified Newton, circuits and positions eliminated.
 
 Stages Z_i = h Σ a_ij f(t + c_j h, y + Z_j), and y_new = y + Z_3 (Hairer, Wanner: Solving Ordinary Differential
-Equations II, IV.8). With W = T⁻¹ Z the linear systems of Newton's method fall apart into a real one and a complex one of
-the size of the state, g I − J with g = γ/h or (α + iβ)/h, and these into ones of the size of the rates. Of
+Equations II, IV.8). With W = T⁻¹ Z the linear systems of Newton's method fall apart into a real one and a complex one
+of the size of the state, g I − J with g = γ/h or (α + iβ)/h, and these into ones of the size of the rates. Of
 
     q̇ = N v,    v̇ = f(q, v, i),    di/dt = a q + b v + c i + …
 

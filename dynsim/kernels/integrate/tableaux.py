@@ -31,8 +31,9 @@ NODE_RK4 = np.array([0.0, 0.5, 0.5, 1.0, 1.0])
 WEIGHT_ACCURACY = 1 / 6
 WEIGHT_STABILITY = 0.03
 
-# Radau IIA of order 5, coefficients of Hairer and Wanner (Solving Ordinary Differential Equations II, IV.8). T⁻¹ A⁻¹ T has
-# γ, and [[α, −β], [β, α]], on its diagonal. ERROR_RADAU: weights of the stages in h times the error estimate's right side.
+# Radau IIA of order 5, coefficients of Hairer and Wanner (Solving Ordinary Differential Equations II, IV.8): T⁻¹ A⁻¹ T
+# has γ, and [[α, −β], [β, α]], on its diagonal. ERROR_RADAU: weights of the stages in h times the right side of the
+# error estimate.
 _ROOT = math.sqrt(6.0)
 A_RADAU = np.array(
     [

@@ -98,9 +98,9 @@ MARGIN = 1e-10
 FRICTION_OF, RESTITUTION, GRIP, GRIP_AXIS = 0, 1, 2, 3
 LAW_SIZE = 6
 # SteppingArrays.found: largest residual [m/s], solves above BAD, largest penetration [m]; solves, and those that took
-# more than the quick rounds.
-WORST, CAPPED, PENETRATION, SOLVES, LONG_SOLVES = 0, 1, 2, 3, 4
-FOUND_SIZE = 5
+# more than the quick rounds; most of what steps have taken of the energy, or made (negative), at any time [J].
+WORST, CAPPED, PENETRATION, SOLVES, LONG_SOLVES, TAKEN = 0, 1, 2, 3, 4, 5
+FOUND_SIZE = 6
 # SteppingArrays.before: rates at the start; rates of the velocity products; acceleration of the last step, and then of
 # this one; what is applied at the start, without loads.
 V_START, V_BIAS, ACCELERATION, APPLIED_THEN = 0, 1, 2, 3

@@ -1,0 +1,152 @@
+"""Wheel pairs that a record lifts, as angles of the pitch joints on the axles.
+
+The record says which pairs are on the ground, 0 or 1; the robot needs time for it. A pair's height follows
+
+    eta(t) = clearance s((t - t_up)/blend) s((t_down - t)/blend),   s(u) = 10 u^3 - 15 u^4 + 6 u^5
+
+from the sample t_up on in which it is first lifted, and is zero again at t_down, when it is first grounded: a pair is
+in the air only while the record says so. Pitch angles follow from the heights and the yaw angles of every sample
+(:mod:`dynsim.hardware.replay.base_part`), before anything moves.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.hardware.errors import CheckRefused
+from dynsim.hardware.replay.base_part import Fold, base_part
+from dynsim.hardware.servo_map import Lifts, ServoMap
+from dynsim.record import TIME, Record
+
+Array = NDArray[np.float64]
+SAMPLES_PER_BLEND = 20
+"""Fewer of them, and the path between two samples is no longer at the heights of the samples."""
+SIGNAL = "grounded"
+"""Where dynsim's own records say which wheel pairs are on the ground; looked at when the map has no ``lifts``."""
+
+
+def wheel_offsets(record: Record, servo_map: ServoMap) -> dict[str, Array]:
+    """What lifting adds to the joints that the map names for it, shape (T,) each [rad]; none where nothing is lifted.
+
+    Raises
+    ------
+    CheckRefused
+        The record lifts wheels and the map does not say how, or it lifts what cannot be lifted.
+    """
+    lifts = servo_map.lifts
+    if lifts is None:
+        _refuse_lifted_wheels(record)
+        return {}
+    return dict(zip(lifts.joints, lifted(record, lifts).hinge.T, strict=True))
+
+
+def lifted(record: Record, lifts: Lifts) -> Fold:
+    """How the base part of a record is folded at every sample.
+
+    Raises
+    ------
+    CheckRefused
+        No such signal, or it lifts pairs that cannot be lifted, or not for so short a time; with pair and time.
+    """
+    grounded = _grounded(record, lifts.signal)
+    pairs = record.labels[lifts.signal]
+    if len(lifts.joints) != len(pairs) - 1:
+        raise CheckRefused(
+            f"lifts.joints names {len(lifts.joints)} pitch joints; the record has {len(pairs)} wheel pairs, with one "
+            "on the axle of each but the last"
+        )
+    time = record.time - record.time[0]
+    _refuse_what_cannot_stand(grounded, pairs, time)
+    height = np.column_stack(
+        [_height(column, time, lifts, name) for column, name in zip(grounded.T, pairs, strict=True)]
+    )
+    if not height.any():
+        return Fold(np.zeros_like(height[:, 1:]), height, np.zeros_like(height))
+    if (step := float(np.diff(time).max())) * SAMPLES_PER_BLEND > lifts.blend_s:
+        raise CheckRefused(
+            f"wheels are lifted in blend_s = {lifts.blend_s:g} s, and the record has a sample every {step:g} s: record "
+            f"at {SAMPLES_PER_BLEND / lifts.blend_s:.0f} Hz or more, or lift them slower"
+        )
+    part = base_part(record, pairs)
+    try:
+        fold = part.fold(part.yaw_angles(record), height)
+    except ArithmeticError as lost:
+        row, pair = lost.args
+        raise CheckRefused(
+            f"no pitch angle brings {pairs[pair]} to {1e3 * height[row, pair]:g} mm above the floor at "
+            f"t = {time[row]:.3f} s"
+        ) from None
+    _refuse_twist(np.where(height == 0.0, fold.tilt, 0.0), lifts, pairs, time)
+    return fold
+
+
+def _refuse_lifted_wheels(record: Record) -> None:
+    if SIGNAL not in record:
+        return
+    up = np.flatnonzero((_grounded(record, SIGNAL) == 0).any(axis=0))
+    if len(up):
+        names = ", ".join(record.labels[SIGNAL][k] for k in up)
+        raise CheckRefused(
+            f"the record lifts wheel pairs ({names}) and the servo map does not say how: without it they would drag "
+            "over the floor. Add to the map, for example:\n"
+            "  lifts: {joints: [psi3, psi4, psi5, psi6, psi7, psi8], clearance_mm: 5, blend_s: 0.3}"
+        )
+
+
+def _grounded(record: Record, name: str) -> Array:
+    """1 where a pair is on the ground, shape (T, pairs)."""
+    if name not in record:
+        raise CheckRefused(f"lifts.signal: the record has no {name!r}; it has {', '.join(record)}")
+    data = np.asarray(record[name])
+    if data.ndim != 2 or record.signals[name].axis != TIME or not np.isin(data, (0, 1)).all():
+        raise CheckRefused(f"signal {name!r} must be 0 or 1 for each wheel pair, at the times of the record")
+    return data.astype(np.float64)
+
+
+def _refuse_what_cannot_stand(grounded: Array, pairs: tuple[str, ...], time: Array) -> None:
+    if not (grounded[:, 0] == 1).all():
+        row = int(np.argmin(grounded[:, 0]))
+        raise CheckRefused(
+            f"{pairs[0]} is lifted at t = {time[row]:.3f} s: it carries the raised head, which would move with it"
+        )
+    standing = grounded.sum(axis=1)
+    if standing.min() < 2:
+        row = int(np.argmin(standing))
+        raise CheckRefused(f"only {pairs[0]} is on the ground at t = {time[row]:.3f} s: the robot does not stand on it")
+
+
+def _height(grounded: Array, time: Array, lifts: Lifts, name: str) -> Array:
+    """Height of one pair over time, shape (T,) [m]."""
+    height = np.zeros_like(time)
+    edges = np.flatnonzero(np.diff(grounded, prepend=1.0, append=1.0))
+    for first, end in edges.reshape(-1, 2):
+        up, down = time[first], time[min(end, len(time) - 1)]
+        # What is lifted from the beginning is lifted in the start posture, what is at the end stays so.
+        blends = int(first > 0) + int(end < len(time))
+        if down - up < blends * lifts.blend_s - 1e-9:
+            raise CheckRefused(
+                f"{name} is lifted for {down - up:.3f} s only, from t = {up:.3f} s on; up and down take "
+                f"{blends * lifts.blend_s:g} s (lifts.blend_s)"
+            )
+        since = (time[first:end] - up) / lifts.blend_s if first > 0 else np.ones(end - first)
+        until = (down - time[first:end]) / lifts.blend_s if end < len(time) else np.ones(end - first)
+        height[first:end] = 1e-3 * lifts.clearance_mm * _smooth(since) * _smooth(until)
+    return height
+
+
+def _smooth(u: Array) -> Array:
+    u = np.clip(u, 0.0, 1.0)
+    return u**3 * (10.0 + u * (-15.0 + 6.0 * u))
+
+
+def _refuse_twist(tilt: Array, lifts: Lifts, pairs: tuple[str, ...], time: Array) -> None:
+    """A grounded pair whose other wheel is high in the air does not roll as the record's kinematics has it."""
+    row, pair = np.unravel_index(int(tilt.argmax()), tilt.shape)
+    if tilt[row, pair] > 1e-3 * lifts.tilt_mm:
+        raise CheckRefused(
+            f"{pairs[pair]} would stand on one wheel at t = {time[row]:.3f} s, the other "
+            f"{1e3 * tilt[row, pair]:.1f} mm above the floor (lifts.tilt_mm: {lifts.tilt_mm:g}): the axles before it "
+            "do not meet in one point, so that one between them cannot be lifted without a twist. Less clearance, or a "
+            "base that is bent less"
+        )

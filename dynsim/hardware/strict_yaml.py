@@ -1,0 +1,73 @@
+"""YAML files of the bridge (maps, fault scripts, gates) as pydantic models; errors name file, line and key."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
+from pydantic_core import core_schema
+
+from dynsim.config import forbid_conversion
+from dynsim.hardware.errors import ServoMapError
+from dynsim.inputs import parse_yaml, read_text
+from dynsim.problems import Origin, explain, unknown_keys
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+@dataclass(frozen=True)
+class Within:
+    """Annotation of a number from ``low`` to ``high``; the error says why, and what to write instead."""
+
+    low: float
+    high: float
+    unit: str
+    why: str
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        return core_schema.no_info_after_validator_function(self._checked, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler) -> Any:
+        return handler(schema) | {"minimum": self.low, "maximum": self.high}
+
+    def _checked(self, value: float) -> float:
+        if not self.low <= value <= self.high:
+            bounds = f"{self.low:g} to {self.high:g}{self.unit and ' ' + self.unit}"
+            raise ValueError(f"{self.why}; use {bounds}")
+        return value
+
+
+class StrictModel(BaseModel):
+    """Unknown keys are errors, and numbers neither texts nor true."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> Any:
+        schema = handler(source)
+        forbid_conversion(schema)
+        return schema
+
+
+_Schema = TypeVar("_Schema", bound=BaseModel)
+
+
+def read_yaml(path: Path, schema: type[_Schema], context: dict[str, Any] | None = None) -> _Schema:
+    """Read YAML into a pydantic model, whose validators are given ``context``.
+
+    Raises
+    ------
+    ServoMapError
+        Missing file, bad YAML or bad entry; the message holds file, line and key.
+    """
+    data = parse_yaml(read_text(path, ServoMapError), ServoMapError, str(path))
+    if not isinstance(data, dict):
+        raise ServoMapError(f"{path}: expected a mapping with the keys {', '.join(schema.model_fields)}")
+    try:
+        return schema.model_validate(data, context=context)
+    except ValidationError as error:
+        origin = Origin(path, (data,))
+        raise ServoMapError(explain(error, data, origin, unknown_keys(error, data, origin, schema))) from None

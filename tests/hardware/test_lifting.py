@@ -1,0 +1,449 @@
+"""Wheel pairs that a record lifts, against the whole robot in Pinocchio, from the recorded head to the tail.
+
+The oracle gets the pose of the head that the record holds and the angles that the servos are sent, and nothing of the
+base part: that pair 1 comes to lie on the floor at the recorded place shows that the head is where the record has it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.optimize import linprog
+
+from dynsim.errors import RecordError
+from dynsim.hardware.errors import CheckRefused, ServoMapError
+from dynsim.hardware.ports import bus_on
+from dynsim.hardware.replay.base_part import Fold, base_part
+from dynsim.hardware.replay.check import check_motion
+from dynsim.hardware.replay.compare import compare_records
+from dynsim.hardware.replay.lifting import lifted
+from dynsim.hardware.replay.machine import Replay
+from dynsim.hardware.replay.trajectory import path_of_record
+from dynsim.hardware.servo_map import SHIPPED, Lifts, ServoMap, load_servo_map
+from dynsim.record import Record
+
+LINK, RADIUS, GRIPPER = 0.0905, 0.05, 0.09  # [T] Table I, IV.B
+HALF_TRACK = np.array([0.075, 0.06, 0.075, 0.06, 0.075, 0.06, 0.06])
+CLEARANCE, BLEND = 5e-3, 0.3  # the shipped map's
+JOINTS = [f"{kind}{k}" for k in range(1, 10) for kind in ("theta", "psi")][:-1]  # theta1, psi1 ... psi8, theta9
+PITCH = tuple(f"psi{k}" for k in range(3, 9))
+MODES = {1: (3, 6), 2: (6, 7), 3: (5, 6), 4: (4, 5), 5: (3, 4), 6: (2, 3)}  # [T] Table II
+PASSING = [("snake_operator", None), ("snake_positioning", "x"), ("snake_positioning", "y"), ("snake_door_arc", "push")]
+
+
+class Oracle:
+    """The chain of all 18 joints, a revolute one in each, neighbours one link apart."""
+
+    def __init__(self) -> None:
+        self.model = pin.Model()
+        parent, place = 0, pin.SE3.Identity()
+        for name in JOINTS:
+            kind = pin.JointModelRZ() if name.startswith("theta") else pin.JointModelRY()
+            place = pin.SE3(np.eye(3), np.array([-LINK, 0.0, 0.0]))
+            parent = self.model.addJoint(parent, kind, place, name)
+        self.data = self.model.createData()
+        self.axle = [self.model.getJointId(name) for name in PITCH] + [parent]
+        self.tail = pin.SE3(np.eye(3), np.array([-LINK, 0.0, 0.0]))
+
+    def from_head(self, w: np.ndarray, offset: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Axle middles (7, 3), axle directions (7, 3) and heights of the wheels' lowest points (7, 2) [m]."""
+        head = pin.SE3(pin.rpy.rpyToMatrix(*w[3:]), w[:3]) * pin.SE3(np.eye(3), np.array([-offset, 0.0, 0.0]))
+        return self._seen(head, q)
+
+    def from_pair_1(self, psi_3: float, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same with pair 1 flat on the floor at the origin; ``psi_3`` is the record's angle, without lifting."""
+        pin.forwardKinematics(self.model, self.data, q)
+        lifting = pin.SE3(pin.rpy.rpyToMatrix(0.0, q[JOINTS.index("psi3")] - psi_3, 0.0), np.zeros(3))
+        floor = self.data.oMi[self.axle[0]] * lifting.inverse()
+        return self._seen(pin.SE3(np.eye(3), np.array([0.0, 0.0, RADIUS])) * floor.inverse(), q)
+
+    def _seen(self, head: pin.SE3, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        pin.forwardKinematics(self.model, self.data, q)
+        poses = [head * self.data.oMi[joint] for joint in self.axle]
+        poses[-1] = poses[-1] * self.tail
+        middle = np.array([pose.translation for pose in poses])
+        axle = np.array([pose.rotation[:, 1] for pose in poses])
+        bottom = middle[:, 2] - RADIUS * np.sqrt(1.0 - axle[:, 2] ** 2)
+        beside = HALF_TRACK * axle[:, 2]
+        return middle, axle, np.column_stack([bottom + beside, bottom - beside])
+
+
+@dataclass
+class Posed:
+    """A record on the oracle at all its samples."""
+
+    record: Record
+    middle: np.ndarray  # (T, 7, 3)
+    axle: np.ndarray  # (T, 7, 3)
+    wheel: np.ndarray  # (T, 7, 2)
+
+    @property
+    def grounded(self) -> np.ndarray:
+        return self.record["grounded"] == 1
+
+    @property
+    def lower(self) -> np.ndarray:
+        return self.wheel.min(axis=2)
+
+
+def snake_map() -> ServoMap:
+    return load_servo_map(SHIPPED / "snake.yaml")
+
+
+def head_offset(record: Record) -> float:
+    return record.scene.hand.position[0] - LINK
+
+
+def posed(record: Record, servo_map: ServoMap) -> Posed:
+    oracle, path = Oracle(), path_of_record(record, servo_map)
+    columns = [servo_map.joints.index(name) for name in JOINTS]
+    first = int(np.searchsorted(path.time, 0.0))
+    angles = path.position[first : first + len(record), columns]
+    found = [oracle.from_head(w, head_offset(record), q) for w, q in zip(record["w"], angles, strict=True)]
+    return Posed(record, *(np.array(part) for part in zip(*found, strict=True)))
+
+
+Find = Callable[[str, "str | None"], Posed]
+
+
+@pytest.fixture(scope="module")
+def posed_run(simulated: Callable[[str, str | None], Record]) -> Find:
+    """Record of a scenario and variant, as the shipped map has it replayed."""
+    return cache(lambda scenario, variant: posed(simulated(scenario, variant), snake_map()))
+
+
+@pytest.fixture(scope="module")
+def operator(posed_run: Find) -> Posed:
+    return posed_run("snake_operator", None)
+
+
+def settled(record: Record) -> np.ndarray:
+    """Where a pair has been lifted for the blend time, and stays so for as long."""
+    away, time = record["grounded"] == 0, record.time
+    found = np.zeros_like(away)
+    for pair in range(away.shape[1]):
+        for row in np.flatnonzero(away[:, pair]):
+            near = np.abs(time - time[row]) < BLEND + 1e-9
+            found[row, pair] = away[near, pair].all()
+    return found
+
+
+@pytest.mark.parametrize(("scenario", "variant"), PASSING)
+def test_lifted_wheels_clear_the_floor_and_grounded_pairs_touch_it(posed_run, scenario, variant) -> None:
+    """At every sample of the records, blends and all; both wheels of what is lifted, the lower one of the others."""
+    found = posed_run(scenario, variant)
+    record, up = found.record, settled(found.record)
+    assert (record["grounded"] == 0).any()
+    assert up.sum() > 0.9 * (record["grounded"] == 0).sum()
+    np.testing.assert_allclose(found.lower[up], CLEARANCE, atol=1e-8)
+    assert found.wheel[up].min() > CLEARANCE - 1e-8
+    # Far within the 0.1 mm: nothing is left but rounding, and nothing is pushed into the floor, in no blend either.
+    np.testing.assert_allclose(found.lower[found.grounded], 0.0, atol=1e-8)
+    assert found.wheel.min() > -1e-8
+
+
+def test_the_operator_lifts_in_all_samples_and_every_mode(operator) -> None:
+    assert (operator.grounded.sum(axis=1) == 5).all()
+    lifted_pairs = {tuple(np.flatnonzero(~row) + 1) for row in operator.grounded}
+    assert lifted_pairs == set(MODES.values())
+
+
+@pytest.mark.parametrize(("scenario", "variant"), PASSING)
+def test_the_head_stays_where_the_record_has_it(posed_run, scenario, variant) -> None:
+    """From the recorded head down the chain pair 1 is met at its recorded place, flat on the floor."""
+    found = posed_run(scenario, variant)
+    base = found.record["base_pose"]
+    np.testing.assert_allclose(found.middle[:, 0, :2], base[:, :2], atol=1e-8)
+    np.testing.assert_allclose(found.wheel[:, 0], 0.0, atol=1e-8)
+    left = np.column_stack([-np.sin(base[:, 2]), np.cos(base[:, 2])])
+    np.testing.assert_allclose(found.axle[:, 0, :2], left, atol=1e-8)
+
+
+def test_no_wheel_is_pushed_into_the_floor_between_two_samples(operator) -> None:
+    """The path between samples: yaw angles straight, pitch angles cubic. A few micrometres, in the blends too."""
+    oracle, servo_map, record = Oracle(), snake_map(), operator.record
+    path = path_of_record(record, servo_map)
+    columns = [servo_map.joints.index(name) for name in JOINTS]
+    psi_3 = record["phi"][:, record.labels["phi"].index("psi3")]
+    blending = ~(operator.grounded | settled(record)).all(axis=1)
+    rows = np.flatnonzero(blending[:-1])
+    assert len(rows) > 7 * 2 * 50
+    for row in [*rows, *range(0, len(record) - 1, 100)]:
+        for part in (0.25, 0.5, 0.75):
+            time = (1 - part) * record.time[row] + part * record.time[row + 1]
+            angle = (1 - part) * psi_3[row] + part * psi_3[row + 1]
+            wheel = oracle.from_pair_1(angle, path.at(time)[0][columns])[2]
+            assert wheel.min() > -5e-6
+            still = operator.grounded[row] & operator.grounded[row + 1]
+            np.testing.assert_allclose(wheel[still].min(axis=1), 0.0, atol=5e-6)
+
+
+def test_pairs_are_in_the_air_only_while_the_record_says_so(operator) -> None:
+    """A pair that carries in the record carries on the robot: it lifts after the change and is down before it."""
+    record, lower = operator.record, operator.lower
+    change = int(np.flatnonzero(np.diff(record["grounded"][:, 6]) < 0)[0]) + 1  # pair 7 goes up
+    assert lower[change, 6] == pytest.approx(0.0, abs=1e-9)
+    rising = lower[change : change + 61, 6]
+    assert (np.diff(rising) > 0).all()
+    u = np.linspace(0.0, 1.0, 61)
+    np.testing.assert_allclose(rising, CLEARANCE * (6 * u**5 - 15 * u**4 + 10 * u**3), atol=1e-8)
+    down = int(np.flatnonzero(np.diff(record["grounded"][:, 6]) > 0)[0]) + 1
+    np.testing.assert_allclose(lower[down - 60 : down + 1, 6], rising[::-1], atol=1e-8)
+
+
+def test_rates_and_accelerations_are_those_of_the_blend(operator) -> None:
+    """Base almost straight: no hinge needs more than 4 clearance s''/2l, between neighbours that go the other way."""
+    servo_map = snake_map()
+    path, segment = path_of_record(operator.record, servo_map), 2 * LINK
+    for name in PITCH[1:]:
+        column = servo_map.joints.index(name)
+        before, after = path.rate_before[:-1, column], path.rate_after[1:, column]
+        np.testing.assert_allclose(before, after, atol=1e-12)  # no jump in speed anywhere
+        acceleration = np.diff(path.rate_after[:, column]) / np.diff(path.time[:-1])
+        assert np.abs(path.extremes().velocity[..., column]).max() < 4 * 1.875 * CLEARANCE / BLEND / segment
+        assert np.abs(acceleration).max() < 4 * 5.774 * CLEARANCE / BLEND**2 / segment
+
+
+def test_the_grounded_part_keeps_its_kinematics_to_second_order(operator) -> None:
+    """Axles that are on the ground are where the flat base of the record has them, up to clearance^2."""
+    record = operator.record
+    flat = record["posture"][:, 6::2, :2]  # after the controlled point and five joints
+    grounded = operator.grounded
+    off = np.linalg.norm(operator.middle[..., :2] - flat, axis=2)[grounded].max()
+    assert off < 0.3e-3
+    yaw = np.cumsum(np.column_stack([record["base_pose"][:, 2], record["phi"][:, 6:]]), axis=1)
+    along = np.cos(yaw) * operator.axle[..., 0] + np.sin(yaw) * operator.axle[..., 1]  # sine of the axles' error in yaw
+    assert np.abs(along[grounded]).max() < 0.05e-3
+    lower = posed(record, with_lifts(snake_map(), clearance_mm=2.5))
+    half = np.linalg.norm(lower.middle[..., :2] - flat, axis=2)[grounded].max()
+    assert half == pytest.approx(off / 4, rel=0.05)
+
+
+def with_lifts(servo_map: ServoMap, **changes: object) -> ServoMap:
+    servo_map.lifts = Lifts.model_validate(servo_map.lifts.model_dump() | changes)
+    return servo_map
+
+
+def test_clearance_and_blend_can_be_set(simulated) -> None:
+    record = simulated("snake_positioning", "z")
+    found = posed(record, with_lifts(snake_map(), clearance_mm=12, blend_s=0.5))
+    np.testing.assert_allclose(found.lower[~found.grounded], 12e-3, atol=1e-8)
+    np.testing.assert_allclose(found.lower[found.grounded], 0.0, atol=1e-8)
+
+
+def a_snake(yaw: np.ndarray, grounded: np.ndarray, simulated, rate: float = 200.0) -> Record:
+    """A record with the scene of a real one: yaw angles (T, 6) of the base part, pairs on the ground or not (T, 7)."""
+    real = simulated("snake_positioning", "z")
+    record = Record(np.arange(len(yaw)) / rate)
+    phi = np.repeat(real["phi"][:1], len(yaw), axis=0)
+    phi[:, 6:] = yaw
+    record.add("phi", phi, "rad", labels=real.labels["phi"])
+    record.add("phi_dot", np.gradient(phi, record.time, axis=0), "rad/s", labels=real.labels["phi"])
+    record.add("rho", np.zeros((len(yaw), 7)), "rad", labels=real.labels["rho"])
+    record.add("rho_dot", np.zeros((len(yaw), 7)), "rad/s", labels=real.labels["rho"])
+    record.add("grounded", grounded, "1", labels=real.labels["grounded"])
+    record.scene = real.scene
+    return record
+
+
+def held(yaw: list[float], away: tuple[int, ...], simulated) -> Fold:
+    grounded = np.ones((3, 7))
+    grounded[:, np.array(away) - 1] = 0
+    record = a_snake(np.tile(yaw, (3, 1)), grounded, simulated)
+    return lifted(record, Lifts(joints=PITCH, tilt_mm=100.0))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_straight_base_folds_in_a_plane(mode, simulated) -> None:
+    """Segments between an axle up and one down incline by asin(clearance / 2l), in closed form."""
+    fold = held([0.0] * 6, MODES[mode], simulated)
+    height = np.where(np.isin(np.arange(1, 8), MODES[mode]), CLEARANCE, 0.0)
+    incline = np.arcsin(np.diff(height) / (2 * LINK))
+    np.testing.assert_allclose(fold.hinge[0], np.diff(incline, prepend=0.0), atol=1e-12)
+    np.testing.assert_allclose(fold.tilt, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("away", [(3,), (3, 6), (2, 5)])
+def test_a_base_bent_in_an_arc_folds_without_a_twist(away, simulated) -> None:
+    """All axles meet in the middle of the arc: both wheels of what is grounded stay down. In a zigzag they cannot."""
+    arc, zigzag = held([0.3] * 6, away, simulated), held([0.3, -0.3] * 3, away, simulated)
+    grounded = ~np.isin(np.arange(1, 8), away)
+    assert arc.tilt[0, grounded].max() < 0.02e-3
+    assert zigzag.tilt[0, grounded].max() > 1e-3
+
+
+def best_deviation(yaw: np.ndarray, away: set[int]) -> float:
+    """Smallest possible largest distance of a grounded wheel from the floor [m], to first order, over all pitch angles.
+
+    A linear programme: pitch joint j lifts what is behind it by its distance from axle j; lifted wheels are at the
+    clearance or above, pair 1 is flat.
+    """
+    middle, axle, heading = [np.zeros(2)], [np.array([0.0, 1.0])], 0.0
+    for angle in yaw:
+        ahead = np.array([np.cos(heading), np.sin(heading)])
+        heading += angle
+        behind = np.array([np.cos(heading), np.sin(heading)])
+        middle.append(middle[-1] - LINK * ahead - LINK * behind)
+        axle.append(np.array([-behind[1], behind[0]]))
+    rows, bounds = [], []
+    for i in range(1, 7):
+        for side in (1, -1):
+            wheel = middle[i] + side * HALF_TRACK[i] * axle[i]
+            lift = [(middle[j] - wheel) @ [axle[j][1], -axle[j][0]] if j < i else 0.0 for j in range(6)]
+            if i + 1 in away:
+                rows.append([*(-np.array(lift)), 0.0])
+                bounds.append(-CLEARANCE)
+            else:
+                rows += [[*lift, -1.0], [*(-np.array(lift)), -1.0]]
+                bounds += [0.0, 0.0]
+    found = linprog([*[0.0] * 6, 1.0], A_ub=rows, b_ub=bounds, bounds=[(None, None)] * 6 + [(0.0, None)])
+    return float(found.x[-1])
+
+
+def test_what_stays_of_the_twist_no_pitch_angles_could_remove(operator) -> None:
+    """Mode 1 lifts single pairs between grounded ones. Shared between both wheels, half the tilt is the least."""
+    record = operator.record
+    tilt = np.ptp(operator.wheel, axis=2) * operator.grounded
+    row = int(tilt.max(axis=1).argmax())
+    assert tilt[row].max() < 0.45e-3
+    away = set(np.flatnonzero(~operator.grounded[row]) + 1)
+    assert away == {3, 6}
+    least = best_deviation(record["phi"][row, 6:], away)
+    assert least > 0.1e-3
+    assert tilt[row].max() / 2 == pytest.approx(least, rel=0.02)
+
+
+def blinking(away: dict[int, tuple[float, float]], duration: float = 2.0, rate: float = 200.0) -> np.ndarray:
+    """Pairs off the ground from a time to another, shape (T, 7)."""
+    time = np.arange(0.0, duration, 1 / rate)
+    grounded = np.ones((len(time), 7))
+    for pair, (start, end) in away.items():
+        grounded[(time >= start) & (time < end), pair - 1] = 0
+    return grounded
+
+
+@pytest.mark.parametrize(
+    ("away", "words"),
+    [
+        ({1: (0.5, 1.5)}, ["pair1", "head", "0.5"]),
+        (dict.fromkeys(range(2, 8), (0.5, 1.5)), ["only pair1"]),
+        ({4: (0.5, 0.9)}, ["pair4", "0.4", "0.6 s", "blend_s"]),
+        ({4: (1.8, 9.0)}, ["pair4", "0.3 s"]),
+    ],
+)
+def test_what_cannot_be_lifted_is_refused(away, words, simulated) -> None:
+    grounded = blinking(away)
+    record = a_snake(np.zeros((len(grounded), 6)), grounded, simulated)
+    with pytest.raises(CheckRefused) as refused:
+        check_motion(record, snake_map())
+    assert all(word in str(refused.value) for word in words), refused.value
+
+
+def test_a_twist_beyond_the_bound_is_refused_and_the_bound_can_be_set(simulated) -> None:
+    grounded = blinking({3: (0.0, 9.0)})
+    record = a_snake(np.tile([0.0, 0.6, -0.6, 0.0, 0.0, 0.0], (len(grounded), 1)), grounded, simulated)
+    with pytest.raises(CheckRefused, match=r"would stand on one wheel .*tilt_mm: 2\.5"):
+        check_motion(record, snake_map())
+    assert check_motion(record, with_lifts(snake_map(), tilt_mm=9))
+
+
+def test_a_record_too_coarse_for_the_blend_is_refused(simulated) -> None:
+    grounded = blinking({4: (0.5, 1.5)}, rate=50)
+    record = a_snake(np.zeros((len(grounded), 6)), grounded, simulated, rate=50)
+    with pytest.raises(CheckRefused, match="67 Hz"):
+        check_motion(record, snake_map())
+    assert check_motion(record, with_lifts(snake_map(), blend_s=0.45))
+
+
+def test_without_an_entry_in_the_map_lifted_wheels_are_refused_and_others_pass(simulated) -> None:
+    servo_map = snake_map()
+    servo_map.lifts = None
+    with pytest.raises(CheckRefused, match=r"pair3, pair6.*does not say how"):
+        check_motion(simulated("snake_positioning", "z"), servo_map)
+    flat = a_snake(np.zeros((400, 6)), np.ones((400, 7)), simulated)
+    kept = check_motion(flat, servo_map).path
+    assert np.array_equal(kept.position, check_motion(flat, snake_map()).path.position)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"signal": "ground"}, "no 'ground'"),
+        ({"signal": "phi"}, "0 or 1"),
+        ({"joints": PITCH[1:]}, "names 5 pitch joints; the record has 7 wheel pairs"),
+    ],
+)
+def test_an_entry_that_does_not_fit_the_record_is_refused(change, words, simulated) -> None:
+    with pytest.raises(CheckRefused, match=words):
+        check_motion(simulated("snake_positioning", "z"), with_lifts(snake_map(), **change))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("[psi3, psi4,", "[psi3, psi44,", "psi44 is none of the servos"),
+        ("[psi3, psi4,", "[psi3, wheel1,", "wheel1 must be in position mode"),
+        ("id: 8, sign: 1, zero_tick: 2048, hold_at_deg: 0", "id: 8, hold_at_deg: 3", "psi4 must be in position mode"),
+        ("clearance_mm: 5", "clearance_mm: 0", "clearance_mm"),
+    ],
+)
+def test_an_entry_that_does_not_fit_the_servos_is_refused(old, new, words, tmp_path) -> None:
+    text = (SHIPPED / "snake.yaml").read_text(encoding="utf-8")
+    assert old in text
+    file = tmp_path / "snake.yaml"
+    file.write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(ServoMapError, match=words):
+        load_servo_map(file)
+
+
+def test_a_record_without_a_scene_has_no_lengths(simulated) -> None:
+    record = a_snake(np.zeros((400, 6)), blinking({4: (0.5, 1.5)}), simulated)
+    record.scene = None
+    with pytest.raises(CheckRefused, match="no scene"):
+        check_motion(record, snake_map())
+    with pytest.raises(CheckRefused, match="no wheel pair"):
+        base_part(simulated("snake_positioning", "z"), ("pair1", "pair9"))
+
+
+def test_what_was_lifted_is_no_error_of_the_replay(simulated) -> None:
+    """psi3 with the lifting added, psi4 to psi8 that the record does not have: compared with what they were to do."""
+    record, servo_map = simulated("snake_positioning", "z"), snake_map()
+    fold = lifted(record, servo_map.lifts)
+    measured = Record(record.time, provenance=servo_map.lifting)
+    psi_3 = record["phi"][:, record.labels["phi"].index("psi3")]
+    measured.add("phi", np.column_stack([psi_3, np.zeros((len(record), 5))]) + fold.hinge, "rad", labels=PITCH)
+    comparison = compare_records(record, measured)
+    assert {joint.joint for joint in comparison.joints} == set(PITCH)
+    assert max(joint.max for joint in comparison.joints) < 1e-12
+    measured.provenance = {}
+    (only,) = compare_records(record, measured).joints
+    assert only.joint == "psi3"
+    measured.provenance = {"lifts": {"joints": 3}}
+    with pytest.raises(RecordError, match="says lifts"):
+        compare_records(record, measured)
+
+
+@pytest.mark.slow
+def test_lifting_on_virtual_servos(simulated, tmp_path) -> None:
+    """The goals are the path's, and the servos follow them."""
+    record, servo_map = simulated("snake_positioning", "x"), snake_map()
+    motion = check_motion(record, servo_map)
+    with bus_on("virtual", servo_map) as (bus, clock):
+        result = Replay(motion, servo_map, bus, clock).run()
+    assert result.fault is None
+    comparison = compare_records(record, result.record)
+    of = {joint.joint: joint for joint in comparison.joints}
+    assert set(PITCH) < set(of)
+    assert max(of[name].max for name in PITCH) < 0.01
+    goals = result.record["phi_goal"][:, [result.record.labels["phi_goal"].index(name) for name in PITCH[1:]]]
+    rows = np.isfinite(result.record["record_time"])
+    wanted = np.array([motion.path.at(time)[0] for time in result.record["record_time"][rows]])
+    columns = [servo_map.joints.index(name) for name in PITCH[1:]]
+    np.testing.assert_allclose(goals[rows], wanted[:, columns], atol=1e-12)
+    assert np.abs(goals[rows]).max() > 0.05
+    assert len(comparison.wheels) == 7

@@ -1,0 +1,53 @@
+"""Servo maps name every model that there is a table of, and a replay on such servos is measured in their units."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from dynsim.hardware.bus.control_table import HEALTH_BLOCK, MODELS, STATE_BLOCK
+from dynsim.hardware.servo_map import Kind, load_servo_map
+
+from .conftest import Rig
+
+
+def test_maps_name_every_model_that_there_is_a_table_of() -> None:
+    assert set(get_args(Kind.model_fields["model"].annotation)) == set(MODELS)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_what_the_loop_reads_stands_in_the_same_place_on_all_models(name: str) -> None:
+    fields = MODELS[name].fields
+    effort = fields["present_current" if MODELS[name].measures_current else "present_load"]
+    assert (effort.address, effort.size) == (STATE_BLOCK[0], 2)
+    assert fields["present_velocity"].address == STATE_BLOCK[0] + 2
+    assert fields["present_position"].address + 4 == sum(STATE_BLOCK)
+    assert fields["torque_enable"].address == HEALTH_BLOCK[0]
+    assert fields["present_temperature"].address + 1 == sum(HEALTH_BLOCK)
+
+
+@pytest.mark.parametrize("name", ["XL430-W250", "XM430-W350", "XM430-W210", "XH540-W150", "XH540-W270"])
+def test_a_replay_on_servos_of_another_model(name: str, write_map: Callable[..., Path]) -> None:
+    """The joints lag by d/k of their model's law, and the torque told is the torque that moved them."""
+    stall = MODELS[name].stall_torque
+    servo_map = load_servo_map(
+        write_map(
+            ("model: MX-106", f"model: {name}"),
+            ("velocity: 3.0, torque: 6.0", f"velocity: 3.0, torque: {0.7 * stall}"),
+        )
+    )
+    run = Rig(servo_map).run()
+    assert run.result.fault is None
+    assert run.result.end_state == "off"
+    record = run.result.record
+    lag = (41.0 / 8.4) ** -1 / MODELS[name].no_load_speed  # k per stall torque is that of the MX-106
+    moving = slice(20, -20)
+    expected = lag * record["v"][moving]
+    error = (record["q_goal"] - record["q"])[moving]
+    # One cycle between goal and reading, ticks, and the inertia's own lag at 4 rad/s.
+    assert np.abs(error - expected).max() < 0.02 * np.abs(record["v"]).max()
+    assert 0 < np.abs(record["torque_estimate"][:, :2]).max() < stall

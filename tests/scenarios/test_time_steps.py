@@ -1,0 +1,153 @@
+"""Time stepping in scenarios: events at the times of steps, friction of wheels, what its summary says of the step."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stepping_benches import snake
+
+import dynsim
+from dynsim.contact_metrics import PENETRATION_LIMIT_M, SCHEME_LIMIT, coarse
+from dynsim.errors import ScenarioError
+from dynsim.model.urdf_writer import write_urdf
+
+G, H = 9.81, 1e-3
+STEPS = {"integrator.method": "time_stepping", "integrator.step_s": H}
+SLIDES = {"contacts.friction": 0.5, "duration_s": 0.5}
+
+
+def with_steps(name: str, variant: str | None = None, **more: object) -> dynsim.Record:
+    return dynsim.simulate(dynsim.load_scenario(name, variant, overrides={**STEPS, **more}))
+
+
+def times(record: dynsim.Record, *kinds: str) -> list[float]:
+    return [event.time for event in record.events if event.kind in kinds]
+
+
+def test_a_block_that_is_pulled_starts_to_slip_when_it_should():
+    """On a slope of 2 in 5 across which the pull is 8 N/s: √(T² + (m g sin α)²) = μ_s m g cos α."""
+    record = with_steps("block_on_slope", "pulled")
+    slope, weight = np.arctan(0.4), 3.0 * G
+    starts = np.sqrt((0.5 * weight * np.cos(slope)) ** 2 - (weight * np.sin(slope)) ** 2) / 8.0
+    assert [(event.kind, event.name) for event in record.events] == [("slip_start", "foot")]
+    assert starts <= record.events[0].time <= starts + 2 * H
+    assert record.summary["contacts"][0]["slip_starts"] == 1
+    # Modes of the samples agree with it.
+    slides = record.time[record["contact_mode"][:, 0] == 1]
+    assert abs(slides[0] - record.events[0].time) <= 1.0 / 200.0
+
+
+@pytest.mark.slow  # two programs to compile
+def test_bounces_are_landings_and_lift_offs_when_events_have_them():
+    record = with_steps("bouncing_link", "half")
+    exact = dynsim.simulate(dynsim.load_scenario("bouncing_link", "half"))
+    np.testing.assert_allclose(times(record, "landing")[:3], times(exact, "bounce")[:3], atol=3 * H)
+    contact = record.summary["contacts"][0]
+    assert len(times(record, "landing")) == contact["landings"] > 3
+    assert len(times(record, "lift_off")) == contact["lift_offs"]
+    kinds = [event.kind for event in record.events if "slip" not in event.kind]
+    assert kinds == ["landing", "lift_off"] * (len(kinds) // 2) + ["landing"] * (len(kinds) % 2)
+
+
+def test_a_stop_is_hit_and_left(tmp_path: Path):
+    """A pendulum swings against its stop after a quarter of its period, loses its speed, and is pulled away."""
+    path = tmp_path / "stop.yaml"
+    path.write_text(
+        "duration_s: 1\n"
+        "plant: {type: serial_arm, chain: [{axis: y, length_m: 0.5, mass_kg: 1, limit_deg: [-170, 190], "
+        "initial_deg: 188}]}\n"
+        "contacts: {law: unilateral}\n"
+        "loads: {wind: {type: samples, body: link_1, point_m: [0, 0, 0.5], times_s: [0, 0.5, 0.500001, 1], "
+        "force_N: [[-9, 0, 0], [-9, 0, 0], [9, 0, 0], [9, 0, 0]], interpolation: linear}}\n"
+        "integrator: {method: time_stepping, step_s: 0.001}\n"
+    )
+    stepped = dynsim.simulate(dynsim.load_scenario(path))
+    exact = dynsim.simulate(
+        dynsim.load_scenario(path, overrides={"integrator.method": "rk43", "integrator.step_s": None})
+    )
+    assert exact.events
+    found = [(event.kind, event.name) for event in stepped.events]
+    assert found == [(event.kind, event.name) for event in exact.events]
+    # It is left once the joint is out again of what it sank in, h times the speed of the blow.
+    late = np.subtract([event.time for event in stepped.events], [event.time for event in exact.events])
+    assert (late >= 0.0).all()
+    assert (late <= [2 * H, 10 * H]).all()
+    assert stepped.summary["joint_stops"][0]["hits"] == exact.summary["joint_stops"][0]["hits"] == 1
+    assert stepped.summary["energy_residual_relative"] < 1e-9
+
+
+@pytest.mark.parametrize(("ratio", "axis"), [(0.2, [2.0, 0.0, 0.0]), (0.0, [1.0, 0.0, 0.3]), (0.2, [0.0, 1.0, 0.0])])
+def test_wheels_roll_along_their_axis(ratio, axis):
+    """On the slope, along x: μ ratio acts along the axis; with the axis across, μ holds the block."""
+    grip = {"contacts.points.foot.grip": {"axis": axis, "ratio": ratio}}
+    record = with_steps("block_on_slope", "slides", **SLIDES, **grip)
+    slope = np.arctan(0.4)
+    friction = 0.5 * (ratio if axis[0] else 1.0)
+    acceleration = max(G * (np.sin(slope) - friction * np.cos(slope)), 0.0)
+    moved = np.linalg.norm(record["q"][-1] - record["q"][0])
+    np.testing.assert_allclose(moved, 0.5 * acceleration * 0.5**2, rtol=1e-9, atol=1e-9)
+    # What is written out is read again.
+    assert record.provenance["scenario"]["contacts"]["points"]["foot"]["grip"] == {"axis": axis, "ratio": ratio}
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (
+            {"integrator.method": "rk43", "integrator.step_s": None},
+            "grip: needs .*method: time_stepping; rk43",
+        ),
+        ({"contacts.points.foot.grip.axis": [0, 0, 0]}, "no direction"),
+        ({"contacts.points.foot.grip.ratio": 1.5}, "ratio"),
+    ],
+)
+def test_grips_that_cannot_be(change, says):
+    grip = {"contacts.points.foot.grip": {"axis": [1, 0, 0], "ratio": 0.1}}
+    with pytest.raises(ScenarioError, match=says):
+        dynsim.load_scenario("block_on_slope", "slides", overrides={**STEPS, **grip, **change})
+
+
+@pytest.mark.slow  # a program of its own to compile
+def test_a_snake_on_wheels(tmp_path: Path):
+    """A free root, twelve servos and fourteen wheels, all from a scenario: it sets out along its wheels."""
+    bench, _ = snake()
+    (tmp_path / "snake.urdf").write_text(write_urdf(bench.robot))
+    wheels = "".join(
+        f"    wheel_{k}: {{body: link_{min(k, 12)}, point_m: [{0.05 * (k > 12)}, {0.02 * (-1) ** k}, -0.03], "
+        "grip: {axis: [1, 0, 0], ratio: 0.05}}\n"
+        for k in range(14)
+    )
+    path = tmp_path / "snake.yaml"
+    path.write_text(
+        "duration_s: 0.2\n"
+        "plant:\n  type: urdf_arm\n  file: snake.urdf\n  initial_pose: {root: {position_m: [0, 0, 0.03]}}\n"
+        "  motor: {type: servo, voltage_V: 12, stall_torque_N_m: 6, no_load_speed_rad_per_s: 8, "
+        "k_p_V_per_rad: 60, k_d_V_s_per_rad: 1, rotor_inertia_kg_m2: 0.005, coulomb_friction_N_m: 0.05, "
+        "coulomb_speed_rad_per_s: 0.05}\n"
+        "loads: {pull: {type: constant, body: link_12, force_N: [2, 0, 0]}}\n"
+        "surfaces: {floor: {type: plane}}\n"
+        f"contacts:\n  law: unilateral\n  friction: 0.6\n  points:\n{wheels}"
+        "integrator: {method: time_stepping, step_s: 0.001}\n"
+    )
+    record = dynsim.simulate(dynsim.load_scenario(path))
+    summary = record.summary
+    assert summary["energy_residual_relative"] < 1e-9
+    assert summary["time_stepping"]["capped_solves"] == 0
+    # 13 bodies of 0.3 kg, pulled by 2 N along the wheels against 0.05 · 0.6 of their weight.
+    mass = 13 * 0.3
+    way = 0.5 * (2.0 - 0.03 * mass * G) / mass * 0.2**2
+    np.testing.assert_allclose(record["hand_position"][-1, 0] - record["hand_position"][0, 0], way, rtol=0.02)
+    assert np.abs(record["hand_position"][:, 1]).max() < 1e-6
+
+
+def test_steps_that_are_too_long_are_told():
+    stepping = {"step_s": 1e-3, "scheme_loss_worst_J": -0.05, "penetration_max_m": 3 * PENETRATION_LIMIT_M}
+    scheme, depth = coarse(stepping, 1.0)
+    assert "made up to 0.05 J, 5 % of the turnover" in scheme
+    assert scheme.endswith("take 0.0002")
+    assert "3 mm" in depth
+    assert depth.endswith("take 0.0003")
+    stepping.update(scheme_loss_worst_J=0.5 * SCHEME_LIMIT, penetration_max_m=0.0)
+    assert coarse(stepping, 1.0) == []

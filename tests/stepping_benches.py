@@ -1,0 +1,55 @@
+"""Benches for time stepping: runs with a law of their own, and a scene of the snake's size."""
+
+from __future__ import annotations
+
+import numpy as np
+from random_robots import Bench, bench
+
+from dynsim.kernels.integrate.run import Run
+from dynsim.kernels.integrate.time_stepping import stepping_arrays
+from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
+from dynsim.model.drives import Servo
+from dynsim.model.joints.ball import floating
+
+
+def stepped(b: Bench, y: np.ndarray, times: np.ndarray, step: float, theta: float, law: dict | None = None) -> Run:
+    """A run by time stepping; law: columns of the contacts' law."""
+    stepping = stepping_arrays(b.system.model, b.system.contacts, len(b.robot.motors), len(b.robot.couplings), theta)
+    for column, value in (law or {}).items():
+        stepping.law[:, column] = value
+    return b.simulate(y, times, "time_stepping", step=step, stepping=stepping)
+
+
+def plane(normal: np.ndarray) -> Quadric:
+    return Quadric(np.zeros((3, 3)), normal, 0.0)
+
+
+def snake(joints: int = 12, wheels: int = 14) -> tuple[Bench, np.ndarray]:
+    """A chain of yaw and pitch joints in turn that lies on a plane on wheels, two at each end and one at each joint."""
+    length, inertia = 0.1, Inertia(0.3, np.zeros(3), np.diag([2e-4, 4e-4, 4e-4]))
+    links = list(floating(Link("link_0", "root", None, "floating", np.eye(3)[0], inertia)))
+    for k in range(joints):
+        axis = np.eye(3)[2 if k % 2 == 0 else 1]
+        links.append(
+            Link(f"link_{k + 1}", f"joint_{k}", f"link_{k}", "revolute", axis, inertia, p_PJ=np.array([length, 0, 0]))
+        )
+    motors = [
+        Servo(f"joint_{k}", 1.5, 3.0, 60.0, 1.0, armature=5e-3, coulomb_friction=0.05, coulomb_speed=0.05)
+        for k in range(joints)
+    ]
+    contacts = [
+        Contact(
+            f"wheel_{k}",
+            f"link_{min(k, joints)}",
+            np.array([0.05 * (k > joints), 0.02 * (-1) ** k, -0.03]),
+            plane(np.eye(3)[2]),
+            friction=0.6,
+        )
+        for k in range(wheels)
+    ]
+    robot = Robot("snake", tuple(links), tuple(motors), (f"link_{joints}", np.zeros(3)))
+    held = np.array([0.35 * np.sin(0.8 * k) if k % 2 == 0 else 0.0 for k in range(joints)])
+    b = bench(robot, contacts, held=held)
+    q = np.zeros(robot.nq)
+    q[2], q[3] = 0.03, 1.0
+    return b, b.state(q, np.zeros(len(robot.links)))

@@ -1,0 +1,172 @@
+"""Static friction above the kinetic one: stick–slip in closed form, the direction in which slip begins, named stops."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from random_robots import Bench, bench
+from scipy.optimize import brentq
+from unilateral_checks import events, random_touch, violations
+
+import dynsim
+from dynsim.engine.uniqueness import paradox
+from dynsim.errors import SimulationStopped
+from dynsim.kernels.integrate import contact_events as ce
+from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.state import OUT_VECTOR
+from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot
+from dynsim.model.drives import Servo
+
+G, MASS, CART = 9.81, 2.0, 4.0
+STATIC, KINETIC = 0.6, 0.4
+FLOOR = Quadric(np.zeros((3, 3)), np.array([0.0, 0.0, 1.0]), 0.0)
+
+
+def pull(body: str, wrench: np.ndarray, rate: np.ndarray) -> Load:
+    """Force and moment, (6,), that grow at ``rate``."""
+    powers = np.zeros((1, 6, 4))
+    powers[0, :, 0], powers[0, :, 1] = wrench, rate
+    return Load("pull", body, np.zeros(3), False, np.array([0.0, 20.0]), powers, True)
+
+
+def foot(body: str, point: np.ndarray) -> Contact:
+    return Contact("foot", body, point, FLOOR, friction=KINETIC, static_friction=STATIC, pulling_friction="signed")
+
+
+def sledge(force: np.ndarray, rate: np.ndarray) -> Bench:
+    """A block on the floor under a pull F + F' t; along x it takes a cart with it that runs on rails."""
+    links = tuple(
+        Link(name, f"joint_{name}", "wxyz"[k] if k else None, "prismatic", np.eye(3)[k], Inertia(mass))
+        for k, (name, mass) in enumerate({"x": CART, "y": 0.0, "z": MASS}.items())
+    )
+    none = np.zeros(3)
+    load = pull("z", np.append(force, none), np.append(rate, none))
+    return bench(Robot("sledge", links, (), ("z", none)), [foot("z", none)], loads=[load], real=True)
+
+
+def whisk(stiffness: float, speed: float) -> Bench:
+    """A block on the floor at the end of a bar of 1 m, turned about the vertical through a spring whose end moves."""
+    end = np.array([1.0, 0.0, 0.0])
+    links = (
+        Link("lift", "rail", None, "prismatic", np.array([0.0, 0.0, 1.0]), Inertia(0.0)),
+        Link("bar", "hinge", "lift", "revolute", np.array([0.0, 0.0, 1.0]), Inertia(MASS, end)),
+    )
+    # A servo with next to no back-EMF is a spring to where it starts; the moment is what moving its end does.
+    spring = Servo("hinge", torque_constant=1e-6, resistance=1.0, k_p=1e6 * stiffness)
+    moment = pull("bar", np.zeros(6), np.append(np.zeros(5), stiffness * speed))
+    return bench(Robot("whisk", links, (spring,), ("bar", end)), [foot("bar", end)], loads=[moment], real=True)
+
+
+def test_a_block_dragged_through_a_spring_sticks_and_slips():
+    """Spring k, its end drawn at V: it sticks for 2 A/V and slips for 2 (π − atan(A ω/V))/ω, A = (μ_s − μ_k) N/k."""
+    stiffness, speed = 200.0, 0.1
+    b = whisk(stiffness, speed)
+    omega, swing = np.sqrt(stiffness / MASS), (STATIC - KINETIC) * MASS * G / stiffness
+    stick = 2.0 * swing / speed
+    slip = 2.0 / omega * (np.pi - np.arctan(swing * omega / speed))
+    first = STATIC * MASS * G / (stiffness * speed)
+    run = b.simulate(b.state(np.zeros(2), np.zeros(2)), np.linspace(0.0, 3.6, 3601), rtol=1e-10)
+    found = events(run)
+    assert [kind for _, _, kind in found] == [ce.SLIP_START, ce.SLIP_STOP] * (len(found) // 2)
+    assert len(found) >= 8
+    cycle = np.arange(len(found) // 2)
+    times = np.array([t for t, _, _ in found]).reshape(-1, 2)
+    np.testing.assert_allclose(times[:, 0], first + cycle * (stick + slip), rtol=0.0, atol=1e-7)
+    np.testing.assert_allclose(times[:, 1], times[:, 0] + slip, rtol=0.0, atol=1e-7)
+    # Where it rests the spring is as long as it was about to slip, less 2 A.
+    x = run.states("q")[:, 1]
+    rests = speed * times[:, 1] - (KINETIC * MASS * G / stiffness - swing)
+    for k in range(3):
+        still = (run.sample_time > times[k, 1]) & (run.sample_time < times[k + 1, 0])
+        np.testing.assert_allclose(x[still], rests[k], rtol=0.0, atol=1e-8)
+    stretched = speed * run.sample_time - x
+    amplitude = np.hypot(swing, speed / omega)
+    middle = KINETIC * MASS * G / stiffness
+    later = run.sample_time > times[0, 0]
+    np.testing.assert_allclose(
+        [stretched[later].max(), stretched[later].min()], [middle + amplitude, middle - amplitude], rtol=0.0, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("grows", [False, True])
+def test_slip_begins_in_the_direction_of_kinetic_friction(grows):
+    """Heavier along x than along y: the acceleration (F − μ_k N t)/M is along t, and t is not that of the pull."""
+    way = np.array([np.cos(0.8), np.sin(0.8), 0.0])
+    least = STATIC * MASS * G * way
+    b = sledge(np.zeros(3), 2.0 * least) if grows else sledge(1.2 * least, np.zeros(3))
+    onset = 0.5 if grows else 0.0
+    force, friction = (least if grows else 1.2 * least), KINETIC * MASS * G
+
+    def across(angle: float) -> float:
+        x = (force[0] - friction * np.cos(angle)) / (MASS + CART)
+        y = (force[1] - friction * np.sin(angle)) / MASS
+        return float(x * np.sin(angle) - y * np.cos(angle))
+
+    angle = brentq(across, 0.8, 0.5 * np.pi, xtol=1e-14)
+    times = np.array([0.0, onset + 1e-9, onset + 0.1])
+    run = b.simulate(b.state(np.zeros(3), np.zeros(3)), times, rtol=1e-10)
+    assert angle - 0.8 > 0.1
+    held = run.outputs("contact")[1, 0, OUT_VECTOR : OUT_VECTOR + 2]
+    np.testing.assert_allclose(held, -friction * np.array([np.cos(angle), np.sin(angle)]), rtol=0.0, atol=1e-6)
+    if not grows:
+        x = 0.5 * 0.1**2 * (force[0] - friction * np.cos(angle)) / (MASS + CART)
+        np.testing.assert_allclose(run.states("q")[2, :2], [x, x * np.tan(angle)], rtol=1e-7)
+
+
+@pytest.mark.parametrize("seed", [23, 92, 472, 556])
+def test_what_went_on_without_end_goes_on(seed):
+    """Points that crept in the wrong direction, touched without a force, or threw each other back and forth."""
+    b, y = random_touch(seed)
+    run = b.advance(b.new_run(y, np.linspace(0.0, 1.0, 51), "dopri5", rtol=1e-8), 5_000)
+    assert run.count[ki.STATUS] == ki.FINISHED
+    for rule, size in violations(b, run).items():
+        assert size <= 1e-7, (rule, size)
+
+
+ROD = """
+duration_s: 0.5
+plant:
+  type: serial_arm
+  gravity_m_s2: [-40, 0, -9.81]
+  chain:
+    - {kind: prismatic, axis: x, mass_kg: 0, length_m: 0}
+    - {kind: prismatic, axis: z, mass_kg: 0, length_m: 0, initial_m: 0.41266780745}
+    - {axis: y, mass_kg: 1, length_m: 0, com_m: [0, 0, 0], initial_deg: 34.37746770784939,
+       inertia_kg_m2: [0.0833333, 0, 0, 0.0833333, 0, 0.0833333]}
+surfaces: {floor: {type: plane}}
+contacts:
+  law: unilateral
+  friction: 2
+  points: {tip: {body: link_3, point_m: [0, 0, -0.5]}}
+"""
+
+
+def test_the_paradox_names_contact_time_and_state(tmp_path: Path):
+    """A rod is flung over its foot, which comes to slip where 1 + 3 s (s − μ c) < 0: it would do with less friction."""
+    path = tmp_path / "rod.yaml"
+    path.write_text(ROD)
+    with pytest.raises(SimulationStopped, match="Painlevé's paradox at tip: det J M⁻¹F is negative") as stop:
+        dynsim.simulate(dynsim.load_scenario(str(path)))
+    error = stop.value
+    assert f"stopped at t = {error.time:.6g} s" in str(error)
+    assert error.record.time[-1] <= error.time < error.record.time[-1] + 0.01
+    _, height, lean = error.state["q"]
+    assert height == pytest.approx(0.5 * np.cos(lean), abs=1e-9)
+    critical = (1.0 + 3.0 * np.sin(lean) ** 2) / (3.0 * np.sin(lean) * np.cos(lean))
+    assert critical < 2.0
+    assert f"lower contacts.friction below {critical:.3g}" in str(error)
+    stopped = error.record.provenance["stopped"]
+    assert (stopped["time_s"], stopped["reason"]) == (error.time, str(error))
+    assert stopped["state"] == error.state
+
+
+def test_a_stop_at_an_event_names_the_contacts_that_touch():
+    """A bounce of another point starts the slip of one that has no force to answer to it."""
+    b, y = random_touch(458)
+    run = b.advance(b.new_run(y, np.linspace(0.0, 1.0, 51), "dopri5", rtol=1e-8), 5_000)
+    assert run.count[ki.STATUS] == ki.FORCES_REVERSED
+    t, _, words = paradox(b.system, b.ws, run, b.contacts)
+    assert t == run.clock[ki.TIME]
+    assert words.startswith("Painlevé's paradox at contact_0: ")
