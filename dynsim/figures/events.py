@@ -29,7 +29,7 @@ LINES = 40
 # Marks lie so far below the upper edge, and rows of them so far from each other [point].
 BELOW, ROW = 4.0, 6.0
 # Characters of a line that explains marks: it fits under the narrowest panel over time.
-WIDEST = 66
+WIDEST = 50
 
 
 def marked(record: Record, names: Iterable[str] | None = None) -> list[Event]:

@@ -39,6 +39,7 @@ def factor_newton(system: System, r: NewtonArrays, g, matrix, pivot):
     """The reduced matrix for g, real or complex, LU-factored with partial pivoting."""
     along, block, table = r.along, r.linear, system.drives.table
     n = matrix.shape[0]
+    first = 2 * n  # of the rows of circuits
     for i in range(n):
         for j in range(n):
             matrix[i, j] = -along[n + j, i] - along[j, i] / g
@@ -48,7 +49,7 @@ def factor_newton(system: System, r: NewtonArrays, g, matrix, pivot):
         if k >= 0:
             slope = (block[a, RATE_Q] / g + block[a, RATE_V]) / (g - block[a, RATE_I])
             for i in range(n):
-                matrix[i, j] -= along[2 * n + k, i] * slope
+                matrix[i, j] -= along[first + k, i] * slope
     for k in range(n):
         best, largest = k, 0.0
         for i in range(k, n):
@@ -70,7 +71,7 @@ def solve_newton(system: System, ws: Workspace, y, r: NewtonArrays, g, matrix, p
     """x ← (g I − J)⁻¹ x by the factors of :func:`factor_newton`, x (s,) and room (2, s) real or complex."""
     along, block, table, layout = r.along, r.linear, system.drives.table, system.layout
     n, q, v, current = matrix.shape[0], system.layout.q, system.layout.v, system.layout.current
-    u, angle = room[0], room[1]
+    u, angle, first = room[0], room[1], 2 * n
     if layout.extra > 0:
         rates_across(system.model.compound, system.model, y, q, x, angle)
     for i in range(n):
@@ -84,7 +85,7 @@ def solve_newton(system: System, ws: Workspace, y, r: NewtonArrays, g, matrix, p
         if k >= 0:
             free = (x[current + k] + block[a, RATE_Q] * angle[j]) / (g - block[a, RATE_I])
             for i in range(n):
-                u[i] += along[2 * n + k, i] * free
+                u[i] += along[first + k, i] * free
     for i in range(n):
         p = pivot[i]
         u[i], u[p] = u[p], u[i]
@@ -127,6 +128,7 @@ def invert_on_lanes(system, r, h):
     p, m = as_lanes(r.direct, FOUR), as_lanes(r.crossed, FOUR)
     over, circuit = as_lanes(r.over, FOUR), as_lanes(r.circuit, FOUR)
     n, real, z = p.shape[0], GAMMA_RADAU / h, complex(ALPHA_RADAU / h, BETA_RADAU / h)
+    first = 2 * n
     gp, gm = pair(real, z)
     op, om = pair(1.0 / real, 1.0 / z)
     over[0], over[1] = op, om
@@ -145,8 +147,8 @@ def invert_on_lanes(system, r, h):
             sp, sm = block[a, RATE_Q] * op + block[a, RATE_V], block[a, RATE_Q] * om
             sp, sm = sp * cp - sm * cm, sp * cm + sm * cp
             for i in range(n):
-                p[i, j] -= along[2 * n + k, i] * sp
-                m[i, j] -= along[2 * n + k, i] * sm
+                p[i, j] -= along[first + k, i] * sp
+                m[i, j] -= along[first + k, i] * sm
     for k in range(n):
         best, largest = k, 0.0
         for i in range(k, n):
@@ -186,7 +188,7 @@ def multiply_on_lanes(system, ws, y, r, h):
     p, m, x, room = as_lanes(r.direct, FOUR), as_lanes(r.crossed, FOUR), as_lanes(r.x, FOUR), as_lanes(r.room, FOUR)
     over, circuit = as_lanes(r.over, FOUR), as_lanes(r.circuit, FOUR)
     op, om = over[0], over[1]
-    u, angle, across = room[0], room[1], room[2]
+    u, angle, across, first = room[0], room[1], room[2], 2 * n
     for j in range(x.shape[0]):
         x[j] = four(r.one[j], r.two[j].real, r.two[j].imag, 0.0)
     if layout.extra > 0:
@@ -205,7 +207,7 @@ def multiply_on_lanes(system, ws, y, r, h):
             free = x[current + k] + block[a, RATE_Q] * angle[j]
             free = free * circuit[a, 0] + turned(free) * circuit[a, 1]
             for i in range(n):
-                u[i] += along[2 * n + k, i] * free
+                u[i] += along[first + k, i] * free
     for i in range(n):
         across[i] = turned(u[i])
     for i in range(n):
