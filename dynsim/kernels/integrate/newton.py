@@ -31,11 +31,14 @@ class StageLanes(NamedTuple):
     y: np.ndarray  # (m, 4)
     f: np.ndarray  # (m, 4)
     delta: np.ndarray  # (4,)
+    output: np.ndarray  # (columns.size, 4), see dynsim.kernels.state.OutputLayout
 
 
-def stage_lanes(ws: Workspace, m: int) -> StageLanes:
+def stage_lanes(ws: Workspace, m: int, columns: int) -> StageLanes:
     """Allocate :class:`StageLanes` beside a workspace, whose rows are taken whenever the Jacobian is made anew."""
-    return StageLanes(lane_workspace(ws, FOUR), aligned(4), aligned(m, 4), aligned(m, 4), aligned(4))
+    return StageLanes(
+        lane_workspace(ws, FOUR), aligned(4), aligned(m, 4), aligned(m, 4), aligned(4), aligned(columns, 4)
+    )
 
 
 class NewtonArrays(NamedTuple):

@@ -156,7 +156,7 @@ def new_run(
     count[MODES_DUE] = AT_START
     newton = newton_arrays(n, na, layout.circuits, layout.tracked, m) if method == RADAU5 else None
     if newton is not None and lanes:
-        newton = newton._replace(lanes=stage_lanes(workspace(n, na, c, couplings), m))
+        newton = newton._replace(lanes=stage_lanes(workspace(n, na, c, couplings), m, columns.size))
     return Run(
         method=method,
         layout=layout,
