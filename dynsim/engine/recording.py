@@ -111,6 +111,7 @@ def make_record(
         spread = motion_spread(prepared.system, run.sample_time[:rows], run.sample[:rows], joint_units)
     counts = metrics.Counts(
         wall=wall,
+        choice=prepared.choice,
         steps=int(run.count[ki.STEPS]),
         rejected=int(run.count[ki.REJECTED]),
         evaluations=int(run.count[ki.EVALUATIONS]),
