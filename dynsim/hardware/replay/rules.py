@@ -278,9 +278,4 @@ def _count(counters: NDArray[np.int64], hit: NDArray[np.bool_], unknown: NDArray
 
 def decode_health(servo: Servo, data: bytes) -> dict[str, int]:
     """Registers in a health block, by name."""
-    start, length = HEALTH_BLOCK
-    return {
-        name: item.decode(data[item.address - start : item.address - start + item.size])
-        for name, item in servo.model.fields.items()
-        if start <= item.address and item.address + item.size <= start + length
-    }
+    return servo.model.registers_in(HEALTH_BLOCK[0], data)
