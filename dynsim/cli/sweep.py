@@ -103,7 +103,7 @@ def sweep(
         _draw(rows, plan, folder, quiet, format_)
     if not quiet:
         if not has_parquet():
-            console.print("No Parquet: it needs pyarrow (pip install 'dynsim[tables]').", highlight=False)
+            console.print(escaped("No Parquet: it needs pyarrow (pip install 'dynsim[tables]')."), highlight=False)
         console.print(
             f"{len(rows) - len(failed)} of {len(rows)} runs ended well. Written to {escaped(folder)}",
             highlight=False,

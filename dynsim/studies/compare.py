@@ -126,9 +126,9 @@ def _simulate(scenario: Scenario, look: Progress) -> Record:
 def save_comparison(records: Mapping[str, Record], folder: Path) -> None:
     """Write ``comparison.json`` and ``comparison.csv``."""
     summaries = {name: record.summary for name, record in records.items()}
-    flat = {name: flat(summary) for name, summary in summaries.items()}
+    level = {name: flat(summary) for name, summary in summaries.items()}
     # A number that one variant lacks, another may have.
-    columns = ["variant"] + [key for one in flat.values() for key, value in one.items() if is_scalar(value)]
+    columns = ["variant"] + [key for one in level.values() for key, value in one.items() if is_scalar(value)]
     columns = list(dict.fromkeys(columns))
     contacts = list(dict.fromkeys(c["name"] for s in summaries.values() for c in s.get("contacts", ())))
     # Those of the unilateral law are there if some variant has it.
@@ -139,7 +139,7 @@ def save_comparison(records: Mapping[str, Record], folder: Path) -> None:
     writer.writerow([*columns, *(f"{name}.{key}" for name in contacts for key in contact_keys)])
     for name, summary in summaries.items():
         by_name = {c["name"]: c for c in summary.get("contacts", ())}
-        row = [name if key == "variant" else flat[name].get(key, "") for key in columns]
+        row = [name if key == "variant" else level[name].get(key, "") for key in columns]
         row += [by_name.get(contact, {}).get(key, "") for contact in contacts for key in contact_keys]
         writer.writerow(row)
     table = json_text({"variants": summaries})
