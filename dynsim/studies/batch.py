@@ -111,7 +111,7 @@ def run_one(load: Callable[[], Scenario], keep: Keep, look: Progress | None) -> 
     """
     started = clock.perf_counter()
     try:
-        record = simulate(load(), look)
+        record = simulate(load(), look, pictured=keep != "none")
     except SimulationInterrupted:
         raise
     except SimulationStopped as stop:

@@ -76,7 +76,7 @@ def run_on_cluster(
 
     with client:
         try:
-            queue = as_completed(hand_out())
+            queue = as_completed(hand_out(), loop=client.loop)
             for future in queue:
                 interruption.keep()
                 piece = out.pop(future)

@@ -34,4 +34,4 @@ def numbers(summary: dict[str, Any]) -> dict[str, Any]:
             found |= {f"{key}.{name}": one for name, one in value.items() if is_scalar(one) and not is_text(one)}
     for contact in summary.get("contacts", ()):
         found |= {f"{contact['name']}.{key}": value for key, value in contact.items() if not is_text(value)}
-    return {key: value for key, value in found.items() if key not in _NOT_OF_THE_RUN}
+    return {key: value for key, value in found.items() if value is not None and key not in _NOT_OF_THE_RUN}
