@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from dynsim.errors import ModelError
-from dynsim.kernels.constraint.bracing import BRACE_SIZE
+from dynsim.kernels.constraint.brace_arrays import BRACE_SIZE
 from dynsim.model.bracing import MIN_N, BracePlanner, brace_rows
 from dynsim.model.description import Contact
 from dynsim.model.drives import Motor

@@ -98,7 +98,6 @@ def prepare(
     columns = output_layout(n, na, c, OUTPUTS if robot.base else 0, len(stops))
     if times is None:
         times = sample_times(scenario, layout, columns, n)
-    _check_coordinates(scenario, robot)
     if stepped and robot.base is not None:
         raise ScenarioError("integrator.method: time_stepping locates no events, such as a mobile base that tips")
     _check_stiffness(scenario, robot)
@@ -212,16 +211,6 @@ def sample_times(scenario: Scenario, layout: StateLayout, columns: OutputLayout,
     return times
 
 
-def _check_coordinates(scenario: Scenario, robot: Robot) -> None:
-    """Refuse ``rodas4``, whose Jacobian takes q̇ = v, for joints with more coordinates than rates."""
-    joint = next((link.joint_of_rows for link in robot.links if len(link.row.neutral) != 1), None)
-    if joint is not None and scenario.integrator.method == "rodas4":
-        raise ScenarioError(
-            f"integrator.method: rodas4 cannot integrate joint {joint!r}, which has more coordinates than rates; "
-            "take rk43 or dopri5"
-        )
-
-
 def _check_stiffness(scenario: Scenario, robot: Robot) -> None:
     """Refuse an explicit method where the circuits' own poles R/L already ask for too many steps."""
     method, duration = scenario.integrator.method, scenario.duration_s
@@ -235,7 +224,7 @@ def _check_stiffness(scenario: Scenario, robot: Robot) -> None:
     if steps > STEPS_LIMIT:
         raise ScenarioError(
             f"{motor.joint}: R/L = {pole:.2g} 1/s holds integrator.method {method} to about {steps:.1g} steps for "
-            f"{duration:g} s; take integrator.method: rodas4, or a larger inductance than {motor.inductance:g} H"
+            f"{duration:g} s; take integrator.method: radau5, or a larger inductance than {motor.inductance:g} H"
         )
 
 
@@ -247,11 +236,12 @@ def _check_work(scenario: Scenario, n: int, p: int) -> None:
     seconds = 1e-7 * n + 4e-10 * n * p**2 + (4e-10 if p > n else 2e-10) * p**3
     if options.solver == "m_star":
         seconds += 3e-10 * (n + p) ** 3
-    # A Jacobian by differences, and its factors.
-    per_step = (2 * n + 6) * seconds + 3e-10 * n**3 if options.method == "rodas4" else 4.0 * seconds
-    # Motors and friction hold the step at about a millisecond.
+    # Motors and friction hold the explicit methods' steps at about a millisecond; an implicit one takes steps of some
+    # hundredths of a second, of three iterations, with a Jacobian by differences and its factors now and then.
+    implicit = options.method == "radau5"
+    per_step = (2 * n + 14) * seconds + 3e-9 * n**3 if implicit else 4.0 * seconds
     steps = scenario.duration_s / (
-        options.step_s if options.step_s and ki.METHODS[options.method] in ki.FIXED_STEP else 1e-3
+        options.step_s if options.step_s and ki.METHODS[options.method] in ki.FIXED_STEP else 1e-2 if implicit else 1e-3
     )
     hours = steps * per_step / 3600.0
     if hours > options.time_limit_h:

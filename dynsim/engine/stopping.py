@@ -63,7 +63,7 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
             "lower contacts.friction, or take contacts.pulling_friction: signed"
         )
     if status == ki.STEP_TOO_SMALL:
-        stiff = "try integrator.method rodas4 or a larger rtol" if run.layout.extra == 0 else "try a larger rtol"
+        stiff = "try a larger rtol" if method == "radau5" else "try integrator.method radau5, or a larger rtol"
         if prepared.control.sample_time is not None:
             stiff += "; or a shorter controller.sample_time_s, or smaller gains: commands that are held for long sway"
         return f"{where}: the step size fell to {run.clock[ki.STEP]:.1e} s; {stiff}"

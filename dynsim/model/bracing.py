@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 
 from dynsim.errors import ModelError, shown
 from dynsim.kernels import arrays as ka
-from dynsim.kernels.constraint import bracing as kb
+from dynsim.kernels.constraint import brace_arrays as kb
+from dynsim.kernels.constraint.bracing import brace_motion, brace_statics
 from dynsim.kernels.jit import integers, reals
 from dynsim.model.description import Array, Robot
 from dynsim.model.drives import Motor, Servo, TorqueSource
@@ -131,7 +132,7 @@ class BracePlanner:
         """Positions and velocities of points of the braces' bodies, (c, 3) [m], along a motion, both (T, c, 3)."""
         positions, velocities = np.zeros((2, len(q), len(points), 3))
         self.arrays.table[:, kb.POINT : kb.POINT + 3] = points
-        kb.brace_motion(self._model, self._ws, self.arrays, reals(q), reals(v), positions, velocities)
+        brace_motion(self._model, self._ws, self.arrays, reals(q), reals(v), positions, velocities)
         return positions, velocities
 
     def torques(self, q: Array, v: Array, vdot: Array, tables: Array) -> tuple[Array, int]:
@@ -140,7 +141,7 @@ class BracePlanner:
         ``tables`` : (T, c, BRACE_SIZE) of :func:`brace_rows`
         """
         torques = np.zeros(v.shape)
-        solved = kb.brace_statics(
+        solved = brace_statics(
             self._model, self._ws, self.arrays, reals(q), reals(v), reals(vdot), tables, torques, False
         )
         return torques, int(solved)
@@ -173,7 +174,7 @@ class PreparedBraces:
         """For one state."""
         arrays = self._arrays
         self._q[0], self._v[0], self._vdot[0] = q, v, vdot
-        solved = kb.brace_statics(
+        solved = brace_statics(
             self._model, self._ws, arrays, self._q, self._v, self._vdot, self._tables, self._torques, True
         )
         feasible = solved == 1

@@ -130,10 +130,10 @@ class Initial(StrictConfig):
 class Integrator(StrictConfig):
     """Time integration."""
 
-    method: Literal["rk43", "dopri5", "rk4", "rodas4", "time_stepping"] = Field(
+    method: Literal["rk43", "dopri5", "rk4", "radau5", "time_stepping"] = Field(
         default="rk43",
-        description="adaptive 4(3) or 5(4), fixed step, adaptive linearly implicit for stiff motors, or fixed step "
-        "with contacts that open and close",
+        description="adaptive 4(3) or 5(4), fixed step, adaptive implicit (where motors hold the steps of the others), "
+        "or fixed step with contacts that open and close",
     )
     solver: Literal["articulated", "m_star"] = Field(default="articulated", description="O(n) sweeps or the dense M*")
     rtol: float = Field(default=1e-6, ge=1e-13, le=1e-1)
@@ -146,6 +146,13 @@ class Integrator(StrictConfig):
     )
     step_max_s: Positive | None = None
     time_limit_h: Positive = Field(default=24.0, description="runs estimated to integrate for longer are refused [h]")
+
+    @field_validator("method", mode="before")
+    @classmethod
+    def _replaced(cls, value: object) -> object:
+        if value == "rodas4":
+            raise ValueError("is no longer there; radau5 does what it did, at any inductance, and takes longer steps")
+        return value
 
     @model_validator(mode="after")
     def _check_method(self) -> Self:

@@ -106,7 +106,7 @@ def residuals_by_tolerance() -> dict[str, float]:
         "dopri5, rtol 1e-6, 1 s": {"duration_s": 1, "method": "dopri5"},
         "dopri5, rtol 1e-8, 1 s": {"duration_s": 1, "method": "dopri5", "rtol": 1e-8, "atol": 1e-10},
         "dopri5, rtol 1e-6, 10 s": {"method": "dopri5"},
-        "rodas4, rtol 1e-6, 10 s": {"method": "rodas4"},
+        "radau5, rtol 1e-6, 10 s": {"method": "radau5"},
         "rk4, 1 ms, 1 s": {"duration_s": 1, "method": "rk4", "step_s": 1e-3},
         "rk4, 1 ms, 10 s": {"method": "rk4", "step_s": 1e-3},
         "rk4, 0.5 ms, 10 s": {"method": "rk4", "step_s": 5e-4},
@@ -122,7 +122,7 @@ def differences() -> dict[str, dict[str, float]]:
     cases: dict[str, dict[str, Any]] = {
         "rk43": {},
         "dopri5": {"method": "dopri5"},
-        "rodas4": {"method": "rodas4"},
+        "radau5": {"method": "radau5"},
         "rk4, 1 ms": {"method": "rk4", "step_s": 1e-3},
     }
     for name, case in cases.items():

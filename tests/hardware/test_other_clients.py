@@ -30,6 +30,7 @@ NUMBER_OF = {id_: MODELS[name].number for id_, name in MODEL_OF.items()}
 MAP = """\
 robot: four
 bus: {baud: 1000000, rate: 50}
+safety: {supply: {lowest: 10, highest: 13}}
 kinds:
   mx: &kind
     model: MX-106
@@ -289,7 +290,7 @@ def test_the_robot_of_a_scenario_behind_the_device(tmp_path: Path) -> None:
     arguments = ["--map", "arm", "--link", link, "--plant", "elbow_comparison", "--variant", "two_elbows"]
     command = [sys.executable, "-m", "dynsim", "hw", "virtual", *map(str, arguments)]
     with started(command, tmp_path / "stderr"):
-        wait_for(link.is_symlink)
+        wait_for(link.is_symlink, timeout=500.0)  # kernels may have to be compiled
         read = subprocess.run(
             [sys.executable, "-c", POSTURE, str(link)], capture_output=True, text=True, timeout=120, check=True
         )

@@ -102,7 +102,7 @@ def test_null_removes_a_key(tmp_path: Path):
         (SHARED.replace("{mass_kg: 0.2}", "3"), ["case.yaml:4: plant.link = 3: must be a mapping"]),
         (
             SHARED.replace("mass_kg: 0.2", "motor: {type: wang_minami, inductance_H: 0}"),
-            ["case.yaml:4: plant.link.motor.inductance_H = 0: must be positive", "1e-6", "rodas4"],
+            ["case.yaml:4: plant.link.motor.inductance_H = 0: must be positive", "1e-6", "radau5"],
         ),
         (
             SHARED.replace("mass_kg: 0.2", "motor: {type: wang_minami, inductance_H: -1}"),

@@ -270,16 +270,6 @@ def test_the_record_names_coordinates_and_rates(free: Path):
     assert record["q"][-1, [0, 7]] == pytest.approx([fallen, fallen], abs=1e-8)
 
 
-def test_rodas4_is_refused_where_coordinates_are_more_than_rates(free: Path):
-    message = "integrator.method: rodas4 cannot integrate joint 'root', .* take rk43 or dopri5"
-    with pytest.raises(ScenarioError, match=message):
-        check(load_scenario(free, overrides={"integrator.method": "rodas4"}))
-    (free.parent / "slide.urdf").write_text(FREE.replace("floating", "fixed") % "0 0 1")
-    # Of a planar joint every rate is that of a coordinate.
-    record = run(free, {"integrator.method": "rodas4"})
-    assert record["q"][-1, 0] == pytest.approx(0.5 * 9.81 * 0.5**2, abs=1e-8)
-
-
 def test_limits_behind_a_free_body_are_looked_at_in_their_own_coordinate(free: Path):
     limited = '<axis xyz="0 1 0"/><limit lower="-0.1" upper="0.2" velocity="0.4" effort="50"/></joint></robot>'
     text = (FREE % "0 0 1").replace('"hinge" type="continuous"', '"hinge" type="revolute"')

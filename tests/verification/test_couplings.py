@@ -58,7 +58,7 @@ def gripper(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("integrator", [{}, {"method": "rodas4"}, {"solver": "m_star"}])
+@pytest.mark.parametrize("integrator", [{}, {"method": "radau5"}, {"solver": "m_star"}])
 def test_a_finger_that_mimics_the_other(gripper: Path, integrator: dict[str, str]):
     """It starts and stays where it is led, carries no motor, and takes no energy."""
     overrides = {f"integrator.{key}": value for key, value in integrator.items()}

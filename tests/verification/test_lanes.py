@@ -405,9 +405,14 @@ def test_lanes_that_disagree_are_seen(name, places):
     """At a listed place, not by a wrong number."""
     case = held([ka.STICKING, ka.SLIDING]) if name == "held" else CASES[name]()
     case.spread = 1.0
-    with pytest.raises(Divergent) as raised:
-        run(case, spread(case, np.random.default_rng(99)), case.t)
-    assert raised.value.place in places
+    found = []
+    for seed in range(20):
+        try:
+            run(case, spread(case, np.random.default_rng(seed)), case.t)
+        except Divergent as divergent:
+            found.append(divergent.place)
+    assert found
+    assert {*found} <= {*places}
 
 
 def test_integers_are_apart_from_reals(notes):

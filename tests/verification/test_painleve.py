@@ -23,7 +23,7 @@ from dynsim.scenario import build
 
 X, Y, Z = np.eye(3)
 FLOOR = Quadric(np.zeros((3, 3)), Z, 0.0)
-METHODS = ["rk43", "dopri5", "rk4", "rodas4"]
+METHODS = ["rk43", "dopri5", "rk4", "radau5"]
 HALF, MU = 0.5, 2.0
 # A uniform rod of half length l that leans by θ, its tip sliding along +x: m A_11 = 1 + 3 s (s + μ c), with s = sin θ
 # and c = cos θ, is zero where 5 − 3 cos 2θ + 3 μ sin 2θ = 0. Under a pulling force, or sliding back, μ turns round.

@@ -196,7 +196,7 @@ def test_a_wrench_that_is_set_is_the_load_of_a_scenario(tmp_path):
     assert np.abs(free["q"] - record["q"]).max() > 0.1
 
 
-@pytest.mark.parametrize("method", ["rk43", "dopri5", "rk4", "rodas4"])
+@pytest.mark.parametrize("method", ["rk43", "dopri5", "rk4", "radau5"])
 @pytest.mark.parametrize("length", [1e-3, 0.3])
 def test_a_short_push_is_not_stepped_over(tmp_path, method, length):
     """An impulse of 1 N m s on a rod that nothing else turns, in a run whose steps are otherwise seconds long."""

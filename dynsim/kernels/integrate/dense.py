@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 from dynsim.kernels.arrays import Workspace
+from dynsim.kernels.integrate.newton import NewtonArrays
 from dynsim.kernels.integrate.output import write_output
 from dynsim.kernels.integrate.project import settle
-from dynsim.kernels.integrate.run import DOPRI5, END, RODAS4, SAMPLE, STEP, TIME, TIME_STEPPING, Run
-from dynsim.kernels.integrate.tableaux import D_RODAS
+from dynsim.kernels.integrate.run import DOPRI5, END, RADAU5, SAMPLE, STEP, TIME, TIME_STEPPING, Run
+from dynsim.kernels.integrate.tableaux import NODE_RADAU
 from dynsim.kernels.jit import internal_kernel, kernel, merged_kernel
 from dynsim.kernels.system import System
 from dynsim.kernels.tree.joints import normalise
+
+
+@internal_kernel
+def collocated(newton: NewtonArrays | None, j, whole):
+    """The two bends of entry j, of the cubic through y, the stages and y_new = y + ``whole``."""
+    if newton is None:  # known to the compiler
+        return 0.0, 0.0
+    c0, c1 = NODE_RADAU[0], NODE_RADAU[1]
+    first = (newton.z[0, j] / c0 - whole) / (1.0 - c0)
+    bend = ((newton.z[1, j] / c1 - whole) / (1.0 - c1) - first) / (c1 - c0)
+    return first - c0 * bend, bend
 
 
 @internal_kernel
@@ -21,11 +33,8 @@ def fill_dense(run: Run):
         d[3, j] = 0.0
         if run.method == TIME_STEPPING:
             d[1, j], d[2, j] = 0.0, 0.0
-        elif run.method == RODAS4:
-            d[1, j], d[2, j] = 0.0, 0.0
-            for s in range(5):
-                d[1, j] += D_RODAS[0, s] * k[1 + s, j]
-                d[2, j] += D_RODAS[1, s] * k[1 + s, j]
+        elif run.method == RADAU5:
+            d[1, j], d[2, j] = collocated(run.newton, j, d[0, j])
         else:
             d[1, j] = h * k[0, j] - d[0, j]
             d[2, j] = d[0, j] - h * k[6, j] - d[1, j]

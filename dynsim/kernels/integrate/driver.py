@@ -8,8 +8,8 @@ Methods, all with dense output (so that records do not force steps):
 - ``DOPRI5``: Dormand–Prince 5(4), adaptive, six evaluations a step; dense output of order 4 (Hairer, Nørsett, Wanner:
   Solving Ordinary Differential Equations I, II.5–II.6). Better where accuracy sets the step;
 - ``RK4``: the classical method at a fixed step; cubic Hermite dense output;
-- ``RODAS4``: a linearly implicit (Rosenbrock) method of order 4(3), stiffly accurate, which keeps its order when the
-  inductance goes to zero (Hairer, Wanner: Solving Ordinary Differential Equations II, IV.7 and VI.4); adaptive;
+- ``RADAU5``: implicit, three stages of order 5 (order 3 in themselves), error estimate of order 3, adaptive: steps as
+  long as accuracy allows, however fast the motors are, see ``radau``; dense output of order 3;
 - ``TIME_STEPPING``: contacts that open and close within fixed steps, see ``time_stepping``; linear between their ends.
 
 After each accepted step q and v are projected onto the active rows when they have left them by more than
@@ -33,8 +33,9 @@ from dynsim.kernels.integrate.dense import sample_step
 from dynsim.kernels.integrate.events import arm_events, cut_step, fire_events, take_ticks
 from dynsim.kernels.integrate.explicit import step_explicit
 from dynsim.kernels.integrate.moreau import advance_moreau
+from dynsim.kernels.integrate.newton import forget
 from dynsim.kernels.integrate.project import off_surface, settle
-from dynsim.kernels.integrate.rosenbrock import step_rodas4
+from dynsim.kernels.integrate.radau import after_step, step_radau5
 from dynsim.kernels.integrate.run import (
     AT_START,
     DOPRI5,
@@ -47,8 +48,8 @@ from dynsim.kernels.integrate.run import (
     NOT_PROJECTED,
     PENDING,
     PROPOSED,
+    RADAU5,
     RK4,
-    RODAS4,
     RUNNING,
     SEARCHING,
     STARTED,
@@ -81,6 +82,7 @@ def start(system: System, ws: Workspace, run: Run):
         watch(ws, run, 0.0)
         if run.clock[STEP] <= 0.0:
             first_step(system, ws, run)
+    forget(run.newton, run.count[STEPS])
     run.count[STARTED] = 1
 
 
@@ -219,8 +221,8 @@ def advance_explicit(system: System, ws: Workspace, run: Run, limit):
 
 
 @kernel
-def advance_rodas4(system: System, ws: Workspace, run: Run, limit):
-    """:func:`advance` of RODAS4."""
+def advance_radau5(system: System, ws: Workspace, run: Run, limit):
+    """:func:`advance` of RADAU5."""
     taken, error = 0, 0.0
     while waiting(system, ws, run):
         if taken >= limit or finished(run):
@@ -228,8 +230,12 @@ def advance_rodas4(system: System, ws: Workspace, run: Run, limit):
         taken += 1
         if run.count[PENDING] == 0:
             propose(run)
-            error = step_rodas4(system, ws, run)
-        if conclude(system, ws, run, error, 4.0):
+            error = step_radau5(system, ws, run)
+        steps, h = run.count[STEPS], run.clock[STEP]
+        done = conclude(system, ws, run, error, 4.0)
+        if run.count[STEPS] > steps:
+            after_step(run, h)
+        if done:
             return
 
 
@@ -241,5 +247,5 @@ def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:
 
     Three compiled functions behind one name, so that each is only compiled when it is used.
     """
-    methods = {RODAS4: advance_rodas4, TIME_STEPPING: advance_moreau}
+    methods = {RADAU5: advance_radau5, TIME_STEPPING: advance_moreau}
     methods.get(run.method, advance_explicit)(system, ws, run, limit)

@@ -6,15 +6,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.arrays import BLOCK_SIZE, row_limit
+from dynsim.kernels.arrays import row_limit
 from dynsim.kernels.constraint.uniqueness import ROOM
+from dynsim.kernels.integrate.newton import NewtonArrays, newton_arrays
 from dynsim.kernels.integrate.time_stepping import SteppingArrays
 from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.state import OUTPUTS_PER_CONTACT, OutputLayout, StateLayout, block
 from dynsim.kernels.tree.support import SupportArrays
 
-DOPRI5, RK4, RODAS4, RK43, TIME_STEPPING = 0, 1, 2, 3, 4
-METHODS = {"rk43": RK43, "dopri5": DOPRI5, "rk4": RK4, "rodas4": RODAS4, "time_stepping": TIME_STEPPING}
+DOPRI5, RK4, RADAU5, RK43, TIME_STEPPING = 0, 1, 2, 3, 4
+METHODS = {"rk43": RK43, "dopri5": DOPRI5, "rk4": RK4, "radau5": RADAU5, "time_stepping": TIME_STEPPING}
 # Methods of one step length.
 FIXED_STEP = (RK4, TIME_STEPPING)
 
@@ -72,10 +73,6 @@ class Run(NamedTuple):
     y_new: np.ndarray  # (m,)
     stage: np.ndarray  # (8, m) stage derivatives; stage[0] belongs to y
     dense: np.ndarray  # (4, m) y(θ) = y + θ (d0 + (1−θ)(d1 + θ (d2 + (1−θ) d3)))
-    jacobian: np.ndarray  # (layout.tracked + 1, m) finite differences along q, v, i, t (rodas4)
-    matrix: np.ndarray  # (n, n) factored stage matrix (rodas4)
-    pivot: np.ndarray  # (n,) int (rodas4)
-    linear: np.ndarray  # (na, BLOCK_SIZE) linear blocks of the drives (rodas4)
     clock: np.ndarray  # (CLOCK_SIZE,)
     count: np.ndarray  # (COUNT_SIZE,) int
     extremes: np.ndarray  # (c, EXTREMES_SIZE)
@@ -97,6 +94,7 @@ class Run(NamedTuple):
     columns: OutputLayout
     output: np.ndarray  # (T, columns.size)
     stepping: SteppingArrays | None  # of time stepping alone
+    newton: NewtonArrays | None  # of radau5 alone
 
     def states(self, name: str) -> np.ndarray:
         """A block of the sampled states by its name, see :func:`dynsim.kernels.state.block`."""
@@ -140,7 +138,7 @@ def new_run(
     ValueError
         For time stepping without the block ``scheme`` of the state.
     """
-    m, p, rodas = len(y), row_limit(c, couplings), method == RODAS4
+    m, p = len(y), row_limit(c, couplings)
     if method == TIME_STEPPING and layout.size == layout.scheme:
         raise ValueError("the state has no room for the scheme's energy, see dynsim.kernels.state")
     clock = np.zeros(CLOCK_SIZE)
@@ -159,10 +157,6 @@ def new_run(
         y_new=np.zeros(m),
         stage=np.zeros((8, m)),
         dense=np.zeros((4, m)),
-        jacobian=np.zeros((layout.tracked + 1, m) if rodas else (0, 0)),
-        matrix=np.zeros((n, n) if rodas else (0, 0)),
-        pivot=np.zeros(n if rodas else 0, dtype=np.int64),
-        linear=np.zeros((na, BLOCK_SIZE)),
         clock=clock,
         count=count,
         extremes=extremes,
@@ -184,4 +178,5 @@ def new_run(
         columns=columns,
         output=np.zeros((len(sample_time), columns.size)),
         stepping=stepping,
+        newton=newton_arrays(n, na, layout.circuits, layout.tracked, m) if method == RADAU5 else None,
     )

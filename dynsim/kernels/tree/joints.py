@@ -301,3 +301,54 @@ def position_error(compound, model: ModelArrays, y, y_new, error, start, rtol, a
                 total += e * e
                 count += 1
     return total, count
+
+
+@internal_kernel
+def positions_along(compound, model: ModelArrays, y, start, u, out):
+    """out[start:] ← out[start:] + N(q) u, positions of y[start:], rates u (n,); both may be complex."""
+    if compound is None:  # known to the compiler
+        return
+    tree = model.tree
+    for i in range(tree.shape[0]):
+        k, kind = start + compound[i, POSITION_INDEX], tree[i, KIND]
+        if kind == BALL_X:
+            w, x, y0, z = y[k], y[k + 1], y[k + 2], y[k + 3]
+            a, b, c = 0.5 * u[i], 0.5 * u[i + 1], 0.5 * u[i + 2]
+            out[k] -= x * a + y0 * b + z * c
+            out[k + 1] += w * a + y0 * c - z * b
+            out[k + 2] += w * b + z * a - x * c
+            out[k + 3] += w * c + x * b - y0 * a
+        elif kind == ROLL:
+            s, c = sine_cosine_of(y[start + compound[i + 1, POSITION_INDEX]])
+            out[k] += c * u[i]
+            out[k + 1] += s * u[i]
+        elif kind == LEFT_WHEEL:
+            s, c = sine_cosine_of(model.body[i, PARAMETER] * (y[k + 1] - y[k]))
+            shift = model.body[i + 1, PARAMETER] * (u[i] + u[i + 1])
+            out[k] += u[i]
+            out[k + 1] += u[i + 1]
+            out[k + 2] += shift * c
+            out[k + 3] += shift * s
+        elif kind != BALL_Y and kind != BALL_Z and kind != RIGHT_WHEEL:
+            out[k] += u[i]
+
+
+@internal_kernel
+def rates_across(compound, model: ModelArrays, y, start, d, out):
+    """Rates out (n,) whose positions change as d[start:] does, as far as rates can: N⁺ d; both may be complex."""
+    if compound is None:  # known to the compiler
+        return
+    tree = model.tree
+    for i in range(tree.shape[0]):
+        k, kind = start + compound[i, POSITION_INDEX], tree[i, KIND]
+        if kind == BALL_X:
+            w, x, y0, z = y[k], y[k + 1], y[k + 2], y[k + 3]
+            a, b, c, e = 2.0 * d[k], 2.0 * d[k + 1], 2.0 * d[k + 2], 2.0 * d[k + 3]
+            out[i] = w * b - x * a - y0 * e + z * c
+            out[i + 1] = w * c - y0 * a - z * b + x * e
+            out[i + 2] = w * e - z * a - x * c + y0 * b
+        elif kind == ROLL:
+            s, c = sine_cosine_of(y[start + compound[i + 1, POSITION_INDEX]])
+            out[i] = c * d[k] + s * d[k + 1]
+        elif kind != BALL_Y and kind != BALL_Z:
+            out[i] = d[k]
