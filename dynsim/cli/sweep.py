@@ -75,7 +75,7 @@ def sweep(
     from dynsim.files import check_writable
     from dynsim.scenario import read_scenario
     from dynsim.studies.plan import Axis, Law, Plan
-    from dynsim.studies.sweep import JOURNAL, OK, PLAN, TABLES, has_parquet, run_sweep
+    from dynsim.studies.sweep import JOURNAL, OK, PLAN, STATISTICS, TABLES, has_parquet, run_sweep
 
     if jobs is not None and scheduler is not None:
         raise ScenarioError("--jobs are processes of this machine, --scheduler has its own workers: give one of them")
@@ -83,7 +83,7 @@ def sweep(
     axes, laws = tuple(map(Axis.parse, grid or ())), tuple(map(Law.parse, sample or ()))
     plan = Plan(file, _variants(file.variants, variants), parsed_overrides(overrides), axes, laws, count, seed)
     folder = out or Path("results", file.path.stem, "sweep")
-    check_writable(folder, (PLAN, JOURNAL, *TABLES))
+    check_writable(folder, (PLAN, JOURNAL, *TABLES, STATISTICS))
     with sweep_progress(plan.runs, quiet) as report:
         rows = run_sweep(
             plan,

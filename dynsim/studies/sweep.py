@@ -21,9 +21,11 @@ from dynsim.results import save_run
 from dynsim.studies.batch import Keep, RunResult, run_all, run_one
 from dynsim.studies.columns import numbers
 from dynsim.studies.plan import Plan, Point
+from dynsim.studies.sweep_statistics import statistics
 
 PLAN, JOURNAL = "sweep.json", "runs.jsonl"
 TABLES = ("sweep.csv", "sweep.parquet")
+STATISTICS = "statistics.json"
 OK, FAILED, LOST = "ok", "failed", "lost"
 
 
@@ -72,7 +74,7 @@ def run_sweep(
     scheduler: str | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Row]:
-    """Run what a plan asks for and write plan, journal, records and tables to a folder.
+    """Run what a plan asks for and write plan, journal, records, tables and statistics of samples to a folder.
 
     Parameters
     ----------
@@ -126,6 +128,8 @@ def run_sweep(
         interrupted = run_all(partial(_run, plan, keep_records), left, take, jobs=jobs, scheduler=scheduler)
     done = [rows[run] for run in sorted(rows)]
     write_tables(done, plan, folder)
+    if plan.laws:
+        write_text(folder / STATISTICS, json_text(statistics(done, plan)))
     if interrupted:
         raise SimulationInterrupted(f"interrupted when {len(done)} of {len(points)} runs were done; --resume goes on")
     return done
