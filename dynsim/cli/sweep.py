@@ -88,7 +88,7 @@ def sweep(
         rows = run_sweep(
             plan,
             folder,
-            jobs=min(jobs or len(os.sched_getaffinity(0)), plan.runs),
+            jobs=min(jobs or _cores(), plan.runs),
             keep_records=keep_records.value,
             resume=resume,
             scheduler=scheduler,
@@ -135,3 +135,8 @@ def _draw(rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool, format_: s
     else:
         with console.status(f"drawing {escaped(folder)}"):
             draw(table, folder, format_)
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -27,6 +27,8 @@ ERRORS = {
 }
 # Parameters of a tornado, and bars of a histogram.
 _BARS, _BINS = 12, 40
+# Values whose ratio is larger are of very different size.
+_WIDE = 8.0
 # Height of a panel, of a bar of a tornado, and of what is about them [inch].
 _PANEL, _BAR, _ROOM = 2.1, 0.22, 0.9
 # A label of an axis is not longer [characters].
@@ -109,7 +111,7 @@ def lines(sweep: Sweep) -> Figure | None:
                 )
                 axes.fill_between(at, *limits.T, color=look["color"], alpha=0.15, linewidth=0)
         axes.set_ylabel(label)
-        _from_zero(axes)
+        _scale(axes, "y", scale * _values(sweep.rows, metric))
     _name_places(panels[-1], "x", key, levels)
     if len(sweep.variants) > 1:
         style.legend_above(panels[0], columns=4)
@@ -169,12 +171,19 @@ def pareto(sweep: Sweep) -> Figure | None:
         )
     rows = [row for row in sweep.rows if None not in (row.get(error), row.get(energy))]
     front = best([(scale * row[error], row[energy]) for row in rows])
-    axes.plot(*front.T, color=style.GREY, linewidth=0.9, drawstyle="steps-post", label="no run is better in both")
+    axes.plot(
+        *front.T,
+        color=style.BLACK,
+        linewidth=0.7,
+        marker="o",
+        markersize=5,
+        markerfacecolor="none",
+        label="no run is better in both",
+    )
     axes.margins(0.05)
     axes.set(xlabel=error_label, ylabel=energy_label)
-    low, high = axes.get_ylim()
-    if low > 0.0 and high > 20.0 * low:
-        style.log_axis(axes)
+    _scale(axes, "x", np.array([scale * row[error] for row in rows]))
+    _scale(axes, "y", np.array([row[energy] for row in rows]))
     axes.legend()
     return figure
 
@@ -305,11 +314,14 @@ def _values(rows: Sequence[Mapping[str, Any]] | Iterator[Mapping[str, Any]], met
     return np.array([row[metric] for row in rows if row.get(metric) is not None], dtype=float)
 
 
-def _from_zero(axes: Axes) -> None:
-    """An axis that begins at zero, unless that squeezes what there is to see."""
-    low, high = axes.get_ylim()
-    if 0.0 < low < 0.7 * high:
-        axes.set_ylim(0.0, high)
+def _scale(axes: Axes, which: str, values: Array) -> None:
+    """A logarithmic axis for positive values of very different size; else one from zero, unless that squeezes them."""
+    values = values[np.isfinite(values)]
+    low, high = values.min(initial=np.inf), values.max(initial=-np.inf)
+    if low > 0.0 and high > _WIDE * low:
+        style.log_axis(axes, which)
+    elif 0.0 <= low < 0.7 * high:
+        axes.set(**{f"{which}lim": (0.0, 1.05 * high)})
 
 
 def _short(text: str) -> str:
