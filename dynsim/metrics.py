@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dynsim._version import __version__
 from dynsim.contact_metrics import capped, chattered, coarse, modes, touched_stops
-from dynsim.kernels.constraint.unilateral import UnilateralArrays
+from dynsim.kernels.constraint.unilateral import AT_ROOT, UnilateralArrays
 from dynsim.kernels.integrate.run import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, LOCAL_SINCE, PULLING
 from dynsim.measures import (
     RESIDUAL_LIMIT,
@@ -27,7 +27,7 @@ from dynsim.model.clearance import Sinking, sinking
 from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Drive, Servo, TorqueSource
 from dynsim.model.mobile_base import MobileBase
-from dynsim.model.unilateral import JointStop
+from dynsim.model.unilateral import JointStop, told
 from dynsim.record import Record
 from dynsim.scenario import Scenario, build
 
@@ -54,6 +54,10 @@ DRIFT_LIMIT_M = 1e-9
 FRICTION_ROUNDING = 1e-12
 # Limits in files are rounded: a joint that starts at 1.5707963 = 90° is not beyond it.
 LIMIT_SLACK = 1e-6
+# Heights below this are not resolved by landings [m]: each is found to AT_ROOT, which leaves the weight times that in
+# the ledger, and here ten of them reach the limit of its residual.
+RESOLVED_M = 10.0 * AT_ROOT / RESIDUAL_LIMIT
+NOT_ENFORCED = "no law enforces this limit"
 
 
 _LOSS_KEYS = {"impact_loss": "loss_impact", "stop_loss": "loss_stop"}
@@ -92,6 +96,7 @@ class Counts:
     extremes : (c, 6) over all steps, see dynsim.kernels.integrate: FORCE_MIN, FORCE_MAX, DRIFT_MAX, PULLING,
         LAST_FORCE, LOCAL_SINCE
     spread : motion that dependent rows leave open; None: none
+    shared : contacts that share forces which the motion does not determine; of the unilateral law
     support : (4,) least loads of wheels and caster and least tip margin of a mobile base over all steps, else empty
     unilateral : tables of the unilateral law with what they have counted; None under the other one
     stops : joint stops, in their order there
@@ -106,6 +111,7 @@ class Counts:
     deficient: int
     extremes: NDArray[np.float64]
     spread: MotionSpread | None = None
+    shared: tuple[str, ...] = ()
     support: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     unilateral: UnilateralArrays | None = None
     stops: tuple[JointStop, ...] = ()
@@ -124,21 +130,24 @@ def energy_residual(record: Record) -> NDArray[np.float64]:
     return residual
 
 
-def residual_floor(record: Record, robot: Robot, tolerance: float) -> float:
+def residual_floor(record: Record, robot: Robot, tolerance: float, real: bool = False) -> float:
     """Least denominator of the relative residual [J]: ``tolerance`` times the energy that the arm can have about it.
 
     That is the largest of kinetic energy, magnetic energy, change of potential energy, and gravity's lever: the sum
     over all bodies of weight times the length of the arm from the first joint to their centre of mass. Below it the
-    integration resolves nothing: an arm that hangs at rest would report the ratio of two roundings.
+    integration resolves nothing: an arm that hangs at rest would report the ratio of two roundings. Under the
+    unilateral law (``real``) it is at least the whole weight times :data:`RESOLVED_M`.
     """
     stores = [record[name] - (record[name][:1] if name == "energy_potential" else 0.0) for name in STORES]
     reach: dict[str, float] = {}
-    lever = 0.0
+    lever, mass = 0.0, 0.0
     for link in robot.links:
+        mass += link.inertia.mass
         reach[link.name] = 0.0 if link.parent is None else reach[link.parent] + float(np.linalg.norm(link.p_PJ))
         lever += link.inertia.mass * (reach[link.name] + float(np.linalg.norm(link.inertia.com)))
-    lever *= float(np.linalg.norm(robot.gravity))
-    return tolerance * max(lever, *(float(np.abs(store).max(initial=0.0)) for store in stores))
+    gravity = float(np.linalg.norm(robot.gravity))
+    floor = tolerance * max(lever * gravity, *(float(np.abs(store).max(initial=0.0)) for store in stores))
+    return max(floor, mass * gravity * RESOLVED_M) if real else floor
 
 
 def summarise(
@@ -152,7 +161,7 @@ def summarise(
 
     turnover = energy_turnover(record)
     residual = float(np.abs(record["energy_residual"]).max(initial=0.0))
-    denominator = max(turnover, residual_floor(record, robot, scenario.integrator.rtol))
+    denominator = max(turnover, residual_floor(record, robot, scenario.integrator.rtol, counts.unilateral is not None))
     sunk = sinking(robot, build.surfaces(scenario), record["q"])
     summary: dict[str, Any] = {
         "scenario": scenario.name,
@@ -279,7 +288,7 @@ def _warnings(
                     f"{motor.joint}: {what} at its limit of {limit:g} {unit} for "
                     f"{100 * saturated.mean():.1f} % of the run"
                 )
-    found.extend(_passed_limits(record, robot))
+    found.extend(_passed_limits(record, robot, counts.unilateral is not None))
     if robot.base is not None:
         found.extend(_tipped(record, robot.base, counts.support, scenario.metrics.settle_s))
     if summary["energy_residual_relative"] > RESIDUAL_LIMIT:
@@ -296,9 +305,9 @@ def _warnings(
         found.append(
             f"contact rows depended on each other in {counts.deficient} evaluations: forces are the split of least norm"
         )
-    elif counts.deficient:
+    elif counts.shared:
         found.append(
-            f"points that stick shared forces which the motion does not determine, in {counts.deficient} evaluations: "
+            f"{', '.join(counts.shared)}: shared forces which the motion does not determine, as points that stick do: "
             "they are the split of least norm among those that lie in all friction cones"
         )
     if counts.spread is not None:
@@ -378,8 +387,12 @@ def _sunk(record: Record, sunk: Sequence[Sinking]) -> list[str]:
     return found
 
 
-def _passed_limits(record: Record, robot: Robot) -> list[str]:
-    """Limits of joints that samples of the record lie beyond; the simulation does not enforce them."""
+def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
+    """Limits of joints that samples of the record lie beyond.
+
+    Stops are the only ones that are enforced, and only under the unilateral law (``real``); beyond them lies then what
+    the steps of time stepping let joints go too far.
+    """
     torque = dict(zip(record.labels["torque"], record["torque"].T, strict=True))
     found = []
     for link, k, v in zip(robot.links, robot.position_index, record["v"].T, strict=True):
@@ -387,17 +400,28 @@ def _passed_limits(record: Record, robot: Robot) -> list[str]:
             continue
         q = record["q"][:, k]
         position, velocity, _, force = link.units
-        for what, limit, unit, beyond in (
-            ("lower position", link.lower, position, link.lower - q),
-            ("upper position", link.upper, position, q - link.upper),
-            ("velocity", link.velocity_limit, velocity, np.abs(v) - link.velocity_limit),
-            ("effort", link.effort_limit, force, np.abs(torque.get(link.joint, np.zeros_like(q))) - link.effort_limit),
+        passed = (
+            "the stop holds only at the ends of steps: a shorter integrator.step_s lets it pass less"
+            if real
+            else "stops are enforced under contacts.law: unilateral"
+        )
+        for what, limit, unit, beyond, note in (
+            ("lower position", link.lower, position, link.lower - q, passed),
+            ("upper position", link.upper, position, q - link.upper, passed),
+            ("velocity", link.velocity_limit, velocity, np.abs(v) - link.velocity_limit, NOT_ENFORCED),
+            (
+                "effort",
+                link.effort_limit,
+                force,
+                np.abs(torque.get(link.joint, np.zeros_like(q))) - link.effort_limit,
+                NOT_ENFORCED,
+            ),
         ):
             over = np.flatnonzero(beyond > LIMIT_SLACK)
             if over.size:
                 amount, first = beyond[over].max(), record.time[over[0]]
                 found.append(
-                    f"{link.joint}: passes its {what} limit of {limit:.4g} {unit} by up to {amount:.3g} {unit}, "
-                    f"first at t = {first:.4g} s; limits of joints are enforced under contacts.law: unilateral"
+                    f"{link.joint}: passes its {what} limit of {told(limit, unit, 4)} by up to "
+                    f"{told(amount, unit, 3)}, first at t = {first:.4g} s; {note}"
                 )
     return found

@@ -179,7 +179,7 @@ def _planned(
     """Voltages of the motors along the references, (T, na)."""
     if config.brace is None:
         return planned_voltages(context.model, times, positions, {}, whole=config.feed_forward == "dynamics")
-    forces = dict.fromkeys(context.contacts) if config.brace == "optimal" else dict(config.brace)
+    forces = dict.fromkeys(context.declared) if config.brace == "optimal" else dict(config.brace)
     braces = {name: (_contact(context, name, "brace"), force) for name, force in forces.items()}
     return planned_voltages(context.model, times, positions, braces, config.min_N)
 

@@ -99,7 +99,11 @@ def prepare(
     if times is None:
         times = sample_times(scenario, layout, columns, n)
     if stepped and robot.base is not None:
-        raise ScenarioError("integrator.method: time_stepping locates no events, such as a mobile base that tips")
+        raise ModelError(
+            "integrator.method = 'time_stepping': it locates no events, so a mobile base would tip unseen; "
+            "take rk43, or radau5 with motors, or a plant without mobile base",
+            keys=("integrator", "method"),
+        )
     _check_stiffness(scenario, robot)
     joint_rows = len(robot.couplings) + len(stops)
     _check_work(scenario, n, c + joint_rows)

@@ -11,6 +11,7 @@ from dynsim import metrics
 from dynsim.contact_metrics import beyond_stops
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.provenance import provenance
+from dynsim.engine.sharing import sharing
 from dynsim.engine.uniqueness import motion_spread
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import run as ki
@@ -99,6 +100,9 @@ def make_record(
         record.scene = robot_scene(robot, contacts, build.surfaces(scenario))
         add_body_poses(record)
     deficient, spread = int(prepared.workspace.counts[ka.DEPENDENT]), None
+    shared: list[str] = []
+    if prepared.system.unilateral is not None and deficient and rows:
+        shared = sharing(prepared.model, contacts, record["q"], record["contact_mode"])
     # Under the unilateral law rows of what sticks depend on each other, which leaves no motion open.
     if (
         prepared.system.unilateral is None
@@ -117,6 +121,7 @@ def make_record(
         deficient=deficient,
         extremes=run.extremes,
         spread=spread,
+        shared=tuple(shared),
         support=np.zeros(0) if run.support is None else run.support.least,
         unilateral=prepared.system.unilateral,
         stops=tuple(prepared.stops),

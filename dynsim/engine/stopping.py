@@ -14,6 +14,7 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels.constraint import unilateral as ku
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.state import block
+from dynsim.model.unilateral import START_TOLERANCE
 from dynsim.scenario import Scenario
 
 
@@ -38,11 +39,11 @@ def last_state(prepared: Prepared, y: np.ndarray) -> dict[str, Sequence[float]]:
 
 
 def _listed(prepared: Prepared, *choices: NDArray[np.bool_]) -> str:
-    """Names of the contacts of the first choice, (c,) or more, that is not empty; else of all."""
+    """ " at" and the names of the contacts of the first choice, (c,) or more, that is not empty; "" if all are."""
     for chosen in choices:
         if chosen[: len(prepared.contacts)].any():
-            return ", ".join(c.name for c, here in zip(prepared.contacts, chosen, strict=False) if here)
-    return ", ".join(contact.name for contact in prepared.contacts)
+            return " at " + ", ".join(c.name for c, here in zip(prepared.contacts, chosen, strict=False) if here)
+    return ""
 
 
 def _reason(scenario: Scenario, prepared: Prepared) -> str:
@@ -75,14 +76,21 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
     if status == ki.NO_CONTACT_FORCES:
         names = _listed(prepared, prepared.workspace.active[:, ka.MODE] != ka.OPEN)
         return (
-            f"{where}: no forces at {names} agree with Coulomb's law (Painlevé's paradox, or rows that contradict each "
+            f"{where}: no forces{names} agree with Coulomb's law (Painlevé's paradox, or rows that contradict each "
             "other); lower contacts.friction, or take another posture"
         )
     if status == ki.CHATTER and (law := prepared.system.unilateral) is not None:
-        names = _listed(prepared, law.tally[:, ku.CHATTERED] > 0.0, law.mode[:, ku.BEFORE] != law.mode[:, ku.WANTED])
+        at = _listed(
+            prepared,
+            law.tally[:, ku.CHATTERED] > 0.0,
+            law.mode[:, ku.BEFORE] != law.mode[:, ku.WANTED],
+            np.abs(prepared.workspace.contacts[:, ka.GAP]) < START_TOLERANCE,
+        )
+        # A mobile base cannot be stepped over: see prepare.
+        stepping = "integrator.method: time_stepping, which goes on through it, or "
         return (
-            f"{where}: the contact at {names} opens and closes, or slips and sticks, without end; take "
-            "integrator.method: time_stepping, which goes on through it, or a larger integrator.atol"
+            f"{where}: {'the' if at else 'a'} contact{at} opens and closes, or slips and sticks, without end; "
+            f"take {stepping if prepared.model.robot.base is None else ''}a larger integrator.atol"
         )
     ws = prepared.workspace
     gaps = ws.rows[: ws.counts[ka.ROWS], ka.ROW_GAP]

@@ -6,6 +6,7 @@ there is a mode at each instant instead: bands show when a contact is open, slid
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -21,6 +22,8 @@ from dynsim.record import Record
 ROWS = 8
 # More samples than this are not drawn as dots.
 DOTS = 150
+# A smaller share of a run is rounding of sums of times.
+ROUNDED = 1e-9
 # Modes by their number: what a contact does, the colour of its bands, and what of the summary says for how long.
 MODE = "contact_mode"
 MODES = (
@@ -130,7 +133,10 @@ def _share(record: Record, name: str) -> str:
 
 
 def _percent(share: float) -> str:
-    return f"{100.0 * share:.1f} %"
+    """With one decimal, and more where it takes them to tell it from none or all of the run."""
+    least = min(share, 1.0 - share)
+    decimals = 1 if least < ROUNDED else max(1, -math.floor(math.log10(100.0 * least)))
+    return f"{100.0 * share:.{decimals}f} %"
 
 
 def _within(record: Record, name: str) -> str:

@@ -28,6 +28,8 @@ COLOUR = "#555555"
 LINES = 40
 # Marks lie so far below the upper edge, and rows of them so far from each other [point].
 BELOW, ROW = 4.0, 6.0
+# Characters of a line that explains marks: it fits under the narrowest panel over time.
+WIDEST = 50
 
 
 def marked(record: Record, names: Iterable[str] | None = None) -> list[Event]:
@@ -94,12 +96,14 @@ def mark_variants(
 
 
 def explain(axes: Axes, events: Sequence[Event]) -> None:
-    """A line under the label of the time axis: each mark that is drawn, what it means, and how often."""
+    """Lines under the label of the time axis: each mark that is drawn, what it means, and how often."""
     count = Counter(event.kind for event in events)
-    parts = [
-        f"{sign} {text}" + (f" ({count[kind]})" if count[kind] > 1 else "")
-        for kind, (_, sign, text) in MARKS.items()
-        if count[kind]
-    ]
-    if parts:
-        axes.set_xlabel(f"{axes.get_xlabel()}\n{'   '.join(parts)}")
+    lines = [axes.get_xlabel()]
+    for part in (f"{sign} {text} ({count[kind]})" for kind, (_, sign, text) in MARKS.items() if count[kind]):
+        joined = f"{lines[-1]}   {part}"
+        if len(lines) == 1 or len(joined) > WIDEST:
+            lines.append(part)
+        else:
+            lines[-1] = joined
+    if len(lines) > 1:
+        axes.set_xlabel("\n".join(lines))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from enum import StrEnum
@@ -176,7 +177,7 @@ def replay(
         from dynsim.hardware.errors import ServoMapError
         from dynsim.hardware.ports import VIRTUAL, bus_on
         from dynsim.hardware.replay.display import displayed
-        from dynsim.hardware.replay.session import run_replay
+        from dynsim.hardware.replay.session import run_replay, shown_by
         from dynsim.hardware.replay.signals import stop_on_signals
         from dynsim.hardware.replay.states import StopRequest
         from dynsim.hardware.virtual.faults import load_fault_script
@@ -193,28 +194,28 @@ def replay(
         if live and port != VIRTUAL:
             confirm_replay(console, servo_map, motion, port, asked=not yes)
         stop = StopRequest()
-        with stop_on_signals(stop), nullcontext() if quiet else displayed(console) as observer:
-            result = run_replay(
-                motion,
-                servo_map,
-                bus_on(port, servo_map, script=script, plant=robot),
-                folder,
-                policy=policy.value if policy else None,
-                live=moves,
-                write_eeprom=configure,
-                stop=stop,
-                observer=observer,
-                provenance={"port": port, "record": str(record), "simulated": simulated.provenance},
-            )
-    _print_timing(result)
-    if not moves:
-        print_limits(console, result.limits)
-        console.print("dry run: servos verified and the bus timed, nothing was moved; --live moves")
-        return
-    console.print(
-        f"replayed; torque {'ON, holding' if result.end_state == 'holding' else 'off'}; {folder / 'measured.h5'}"
-    )
-    console.print(f"compare: dynsim hw compare {record} {folder / 'measured.h5'}")
+        with shown_by({"standard output": sys.stdout}, folder) as lost:
+            with stop_on_signals(stop), nullcontext() if quiet else displayed(console, lost) as observer:
+                result = run_replay(
+                    motion,
+                    servo_map,
+                    bus_on(port, servo_map, script=script, plant=robot),
+                    folder,
+                    policy=policy.value if policy else None,
+                    live=moves,
+                    write_eeprom=configure,
+                    stop=stop,
+                    observer=observer,
+                    provenance={"port": port, "record": str(record), "simulated": simulated.provenance},
+                )
+            _print_timing(result)
+            if not moves:
+                print_limits(console, result.limits)
+                console.print("dry run: servos verified and the bus timed, nothing was moved; --live moves")
+                return
+            left = "ON, holding" if result.end_state == "holding" else "off"
+            console.print(f"replayed; torque {left}; {folder / 'measured.h5'}")
+            console.print(f"compare: dynsim hw compare {record} {folder / 'measured.h5'}")
 
 
 def _plant(scenario: str, variant: str | None, servo_map: Any, motion: Any) -> Any:
@@ -344,12 +345,14 @@ def stop_servos(
 
         servo_map = load_servo_map(map_file) if map_file else None
         bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else survey.STOP_BAUD_RATES
-        torque = survey.stop_all(port, bauds, servo_map.ids if servo_map else ())
-    on = [id_ for id_, still_on in torque.items() if still_on]
-    if on or not torque:
-        who = f"ID {', '.join(map(str, on))}" if on else "any servo"
-        raise VerificationFailed(f"torque off was sent, but NOT confirmed by {who}: cut the power")
-    console.print(f"torque off, confirmed by {len(torque)} servos")
+        asked = survey.stop_all(port, bauds, servo_map.ids if servo_map else ())
+    on = [id_ for id_, still_on in asked.torque.items() if still_on]
+    # With a map everybody is known; without one those at a bit rate at which the port failed are not.
+    if on or not asked.torque or (asked.trouble and not servo_map):
+        who = f"ID {', '.join(map(str, on))}" if on else "everybody" if asked.torque else "any servo"
+        why = f" ({'; '.join(asked.trouble)})" if asked.trouble else ""
+        raise VerificationFailed(f"torque off was sent, but NOT confirmed by {who}: cut the power{why}")
+    console.print(f"torque off, confirmed by {len(asked.torque)} servos")
 
 
 @hw.command(epilog="Example: dynsim hw schema > servo_map.schema.json")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
-from dynsim.hardware.bus.control_table import VOLT_PER_UNIT, ServoModel
+from dynsim.hardware.bus.control_table import RAD_PER_TICK, RAD_S_PER_UNIT, VOLT_PER_UNIT, ServoModel
 
 HIGHEST_SUPPLY = 14.8
 """Of the recommended range of the MX series [V]; speed and torque grow with the supply."""
@@ -12,8 +13,16 @@ RATED_SUPPLY = 12.0
 FURTHEST_OFF = 1.0
 """Following error of a position servo beyond which the rule would watch nothing [rad]."""
 
+ROOM = 20.0
+"""Temperature of a room, and so of a servo that has not moved yet [°C]."""
+
 Objection = tuple[str, str]
 """Dotted key of the map within the part that is looked at, and what is wrong with it."""
+
+
+def rounded_up(value: float) -> float:
+    """A short number to offer instead of one that was refused, not below ``value``: to 1e-4."""
+    return math.ceil(value * 1e4) / 1e4
 
 
 def highest_speed(model: ServoModel) -> float:
@@ -52,6 +61,16 @@ def objections_to_limits(
         yield "limits.velocity", f"a {model.name} turns this joint at {speed:.3g} rad/s at most"
     if torque > stall:
         yield "limits.torque", f"a {model.name} stalls at {stall:.3g} N m here: the rule would never fire"
+    if torque < (least := model.torque(1) * gear):
+        yield "limits.torque", f"is below what a {model.name} can tell from none; use {rounded_up(least):g} N m or more"
+    unit, name = (RAD_PER_TICK, "rad") if turns_to_angle else (RAD_S_PER_UNIT, "rad/s")
+    if following_error < unit / gear:
+        yield "following_error", f"is below what the servo can tell; use {rounded_up(unit / gear):g} {name} or more"
+    if not turns_to_angle and position_deg is not None:
+        yield (
+            "limits.position_deg",
+            "a servo in velocity mode is not held to angles; leave it out, or use mode: position",
+        )
     if turns_to_angle and position_deg is not None:
         span = position_deg[1] - position_deg[0]
         if span * gear > 360.0:
@@ -76,6 +95,8 @@ def objections_to_safety(
     """
     if supply[0] >= supply[1]:
         yield "supply.lowest", "is not below supply.highest"
+    if temperature <= ROOM:
+        yield "temperature_max", f"is no more than the {ROOM:g} °C of a room: every run would abort; use 65 or so"
     for model in models:
         hottest = model.fields["temperature_limit"].default
         low, high = model.fields["min_voltage"].low, model.fields["max_voltage"].high

@@ -10,15 +10,16 @@ Joint angle and servo position are tied by
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from dynsim.config import error_at
 from dynsim.errors import shown
+from dynsim.files import file_name
 from dynsim.hardware.bus.control_table import (
-    BAUD_RATES,
     MAX_ID,
     MODELS,
     RAD_PER_TICK,
@@ -27,9 +28,10 @@ from dynsim.hardware.bus.control_table import (
     OperatingMode,
     ServoModel,
 )
-from dynsim.hardware.data_sheet import objections_to_limits, objections_to_safety
+from dynsim.hardware.data_sheet import Objection, objections_to_limits, objections_to_safety, rounded_up
 from dynsim.hardware.errors import ServoMapError
-from dynsim.hardware.strict_yaml import Finite, Positive, StrictModel, read_yaml
+from dynsim.hardware.safety import Bus, Safety, objections_to_times
+from dynsim.hardware.strict_yaml import Finite, Positive, StrictModel, Within, read_yaml
 from dynsim.inputs import is_file
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -37,7 +39,8 @@ _CHECKOUT = _PACKAGE.parent / "scenarios" / "hardware"
 SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else _PACKAGE / "shipped_scenarios" / "hardware"
 """Folder of the servo maps that come with dynsim."""
 
-FaultPolicy = Literal["hold", "decelerate", "off"]
+
+_NO_LIMIT = "bounds nothing that a servo can do, or lets nothing pass"
 
 
 class Follows(StrictModel):
@@ -76,13 +79,17 @@ class Limits(StrictModel):
     jerk : float
         Highest change of acceleration, averaged in magnitude over 0.1 s [rad/s³]
         (:meth:`dynsim.hardware.replay.trajectory.Path.jerk`). The default refuses a zigzag of 2 mrad every 5 ms.
+    shaking : float
+        Highest velocity that is gained and lost again within 0.3 s, or lost and gained [rad/s]
+        (:meth:`dynsim.hardware.replay.trajectory.Path.shaking`).
     """
 
     position_deg: tuple[Finite, Finite] | None = None
     velocity: Positive
     torque: Positive
-    acceleration: Positive = 2000.0
-    jerk: Positive = 60_000.0
+    acceleration: Annotated[Positive, Within(0.01, 1e5, "rad/s²", _NO_LIMIT)] = 2000.0
+    jerk: Annotated[Positive, Within(0.01, 1e7, "rad/s³", _NO_LIMIT)] = 60_000.0
+    shaking: Annotated[Positive, Within(0.01, 100.0, "rad/s", _NO_LIMIT)] = 3.0
 
 
 # For editors; what loading says about it is in _position_limits_fit_the_mode.
@@ -153,85 +160,6 @@ class ServoEntry(StrictModel):
     hold_at_deg: Finite | None = None
 
 
-# 4.5 Mbit/s is the servos' but not the client library's.
-_BAUD_CHOICES = [rate for rate in BAUD_RATES if rate <= 4_000_000]
-
-
-class Bus(StrictModel):
-    """The serial line.
-
-    Attributes
-    ----------
-    baud : int
-        [bit/s].
-    rate : float
-        Goal and state cycles per second [Hz].
-    latency : float
-        What adapter and operating system may add to an answer [s].
-    return_delay : float
-        Longest return delay a servo may have stored [s].
-    """
-
-    baud: Annotated[int, Field(json_schema_extra={"enum": _BAUD_CHOICES})] = 3_000_000
-    rate: Positive = 200.0
-    latency: Positive = 2e-3
-    return_delay: Annotated[float, Field(ge=0, le=508e-6)] = 0.0
-
-    @model_validator(mode="after")
-    def _baud_is_one_of_the_servos(self) -> Bus:
-        if self.baud not in _BAUD_CHOICES:
-            raise error_at("baud", f"is not one of {', '.join(map(str, _BAUD_CHOICES))}")
-        return self
-
-
-class Supply(StrictModel):
-    """Voltage range in which the robot may move [V]."""
-
-    lowest: Positive = 10.0
-    highest: Positive = 14.8
-
-
-class Safety(StrictModel):
-    """When to abort, and how to stop.
-
-    Attributes
-    ----------
-    policy : "hold", "decelerate" or "off"
-        What to do on a fault: freeze where the robot is; slow down along the path and hold; release torque.
-    stop_time : float
-        Time in which `decelerate` comes to rest [s].
-    run_up : float
-        Acceleration of the stretch added where a record begins or ends in motion [rad/s²].
-    approach_velocity : float
-        Top speed of the move to the start posture [rad/s].
-    start_distance : float
-        A joint further than this from the start posture is asked about once more [rad].
-    watchdog : float
-        Servos stop by themselves when the bus is silent for this long [s].
-    missed_cycles, late_cycles, following_cycles, torque_cycles : int
-        Consecutive cycles of one servo without a status, of late deadlines, of following error and of too much torque
-        that abort.
-    temperature_max : float
-        [°C].
-    at_end : "off" or "hold"
-        Torque after a run that went well. A robot that falls when limp holds.
-    """
-
-    policy: FaultPolicy = "decelerate"
-    stop_time: Annotated[float, Field(gt=0, le=3.0)] = 0.3
-    run_up: Positive = 2.0
-    approach_velocity: Positive = 0.3
-    start_distance: Positive = 0.5
-    watchdog: Annotated[float, Field(ge=0.02, le=2.54)] = 0.2
-    missed_cycles: Annotated[int, Field(ge=1, le=100)] = 3
-    late_cycles: Annotated[int, Field(ge=1, le=1000)] = 5
-    following_cycles: Annotated[int, Field(ge=1, le=100)] = 5
-    torque_cycles: Annotated[int, Field(ge=1, le=100)] = 10
-    temperature_max: Positive = 65.0
-    supply: Supply = Supply()
-    at_end: Literal["off", "hold"] = "off"
-
-
 class Lifts(StrictModel):
     """How wheel pairs that the record lifts are lifted.
 
@@ -258,12 +186,20 @@ class Lifts(StrictModel):
     tilt_mm: Positive = 2.5
 
 
+def _is_a_file_name(robot: str) -> str:
+    if file_name(robot) != robot:
+        raise ValueError(
+            f"names the folder of results; use a name without / and the like, such as {file_name(robot)!r}"
+        )
+    return robot
+
+
 class _MapFile(StrictModel):
     """A servo map: which servo follows which column of a record, and what that joint may do."""
 
     model_config = ConfigDict(title="ServoMap")
 
-    robot: str
+    robot: Annotated[str, AfterValidator(_is_a_file_name)]
     bus: Bus = Bus()
     safety: Safety = Safety()
     lifts: Lifts | None = None
@@ -298,20 +234,14 @@ class _MapFile(StrictModel):
         return self
 
     @model_validator(mode="after")
-    def _safety_fits_the_servos(self) -> _MapFile:
-        safety, supply = self.safety, self.safety.supply
+    def _entries_fit_each_other(self) -> _MapFile:
         used = {name: self.kinds[name] for name in dict.fromkeys(entry.kind for entry in self.servos.values())}
-        models = [MODELS[kind.model] for kind in used.values()]
-        for key, text in objections_to_safety(models, safety.temperature_max, (supply.lowest, supply.highest)):
-            raise error_at(f"safety.{key}", text)
-        if self.bus.latency >= safety.watchdog:
-            raise error_at("bus.latency", "is not below safety.watchdog: one lost answer would trip the watchdogs")
-        for name, kind in used.items():
-            limits = kind.limits
-            if kind.mode == "position" and safety.approach_velocity > limits.velocity:
-                raise error_at("safety.approach_velocity", f"is above kinds.{name}.limits.velocity")
-            if (needed := limits.velocity / safety.stop_time) > limits.acceleration:
-                raise error_at("safety.stop_time", f"stops kinds.{name} with {needed:.4g} rad/s², above its limit")
+        for key, text in (*_objections_to_kinds(self.safety, used), *objections_to_times(self.bus, self.safety)):
+            raise error_at(key, text)
+        for joint, entry in self.servos.items():
+            kind = self.kinds[entry.kind]
+            for key, text in _objections_to_servo(entry, kind):
+                raise error_at(f"servos.{joint}.{key}", text)
         return self
 
 
@@ -416,6 +346,45 @@ class ServoMap:
             return {}
         label = {servo.joint: servo.label for servo in self.servos}
         return {"lifts": self.lifts.model_dump() | {"joints": [label[joint] for joint in self.lifts.joints]}}
+
+
+def _objections_to_kinds(safety: Safety, kinds: dict[str, Kind]) -> Iterable[Objection]:
+    """What the kinds that are used, or their servos' models, cannot do of what ``safety`` asks for."""
+    supply = safety.supply
+    models = [MODELS[kind.model] for kind in kinds.values()]
+    for key, text in objections_to_safety(models, safety.temperature_max, (supply.lowest, supply.highest)):
+        yield f"safety.{key}", text
+    for name, kind in kinds.items():
+        limits = kind.limits
+        if kind.mode == "position" and safety.approach_velocity > limits.velocity:
+            yield "safety.approach_velocity", f"is above kinds.{name}.limits.velocity; use {limits.velocity:g} or less"
+        if (needed := limits.velocity / safety.stop_time) > limits.acceleration:
+            least = limits.velocity / limits.acceleration
+            yield (
+                "safety.stop_time",
+                f"stops kinds.{name} with {needed:.4g} rad/s², above its limit; use {rounded_up(least):g} or more",
+            )
+        if safety.run_up > limits.acceleration:
+            yield (
+                "safety.run_up",
+                f"is above kinds.{name}.limits.acceleration, {limits.acceleration:g} rad/s²; use that or less",
+            )
+
+
+def _objections_to_servo(entry: ServoEntry, kind: Kind) -> Iterable[Objection]:
+    """A servo in position mode that is to be held where it must not be, or has nowhere to go."""
+    limits = kind.limits.position_deg
+    if kind.mode != "position" or limits is None:
+        return
+    if entry.hold_at_deg is not None and not limits[0] <= entry.hold_at_deg <= limits[1]:
+        yield "hold_at_deg", f"is beyond limits.position_deg; use {limits[0]:g} to {limits[1]:g}"
+    lowest, highest = Servo("", entry, kind).tick_limits
+    if lowest > highest:
+        yield (
+            "zero_tick",
+            f"leaves no tick of 0 to {TICKS_PER_TURN - 1}, the turn of position mode, within limits.position_deg; "
+            "use that of the zero posture (`dynsim hw calibrate`)",
+        )
 
 
 def load_servo_map(path: str | Path) -> ServoMap:

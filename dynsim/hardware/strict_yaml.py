@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
+from pydantic_core import core_schema
 
 from dynsim.config import forbid_conversion
 from dynsim.hardware.errors import ServoMapError
@@ -14,6 +16,28 @@ from dynsim.problems import Origin, explain, unknown_keys
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+@dataclass(frozen=True)
+class Within:
+    """Annotation of a number from ``low`` to ``high``; the error says why, and what to write instead."""
+
+    low: float
+    high: float
+    unit: str
+    why: str
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        return core_schema.no_info_after_validator_function(self._checked, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler) -> Any:
+        return handler(schema) | {"minimum": self.low, "maximum": self.high}
+
+    def _checked(self, value: float) -> float:
+        if not self.low <= value <= self.high:
+            bounds = f"{self.low:g} to {self.high:g}{self.unit and ' ' + self.unit}"
+            raise ValueError(f"{self.why}; use {bounds}")
+        return value
 
 
 class StrictModel(BaseModel):

@@ -6,7 +6,7 @@ the engines work with.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -31,7 +31,7 @@ class BuildContext:
     duration : simulated time [s]
     machine : what a controller, or the path of a base, is built for; None for the other families
     joint : the joint of a motor, "" for the other families
-    contacts : contact points of the scenario by name
+    contacts : contacts of the scenario by name; declared : those that are points of it, not other candidates
     progress : to be called with the time [s] that references have come to, when they take long; None: nobody listens
     """
 
@@ -40,6 +40,7 @@ class BuildContext:
     joint: str = ""
     progress: Callable[[float], None] | None = None
     contacts: Mapping[str, Contact] = field(default_factory=dict)
+    declared: Sequence[str] = ()
 
     def at_joint(self, joint: str) -> BuildContext:
         """The context of a motor on that joint."""

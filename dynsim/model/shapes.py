@@ -105,10 +105,17 @@ def gap_at(model: Model, contact: Contact, q: Array) -> float:
 
 def contact_gap(contact: Contact, start: Array, end: Array | None = None) -> float:
     """Gap [m] of a contact whose point is at ``start``, (3,), and the other end of whose axis is at ``end``."""
-    if end is None or not moves(contact):
+    if end is None:
         return contact.surface.gap(start) - contact.radius
+    return contact.surface.gap(start + share_of_axis(contact, start, end) * (end - start)) - contact.radius
+
+
+def share_of_axis(contact: Contact, start: Array, end: Array) -> float:
+    """Where on the axis from ``start`` to ``end``, (3,), a capsule is nearest to its surface, 0 to 1."""
+    if not moves(contact):
+        return 0.0
     along = np.asarray(end) - start
     shapes = shape_arrays([(contact.surface, contact.radius, along, True)])
     u = np.zeros(1)
     kd.nearest_points(shapes, np.array(start, dtype=np.float64)[None], along[None].copy(), u)
-    return contact.surface.gap(start + u[0] * along) - contact.radius
+    return float(u[0])

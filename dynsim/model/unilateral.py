@@ -33,9 +33,11 @@ class JointStop:
     position: float
 
 
-def told(value: float, unit: str) -> str:
-    """A joint coordinate for a line of text; an angle in degrees too, which scenarios are written in."""
-    return f"{value:.5g} {unit}" if unit != "rad" else f"{np.degrees(value):.5g}° ({value:.4g} rad)"
+def told(value: float, unit: str, digits: int = 5) -> str:
+    """A joint coordinate for a line of text; an angle in degrees first, which scenarios are written in."""
+    if unit != "rad":
+        return f"{value:.{digits}g} {unit}"
+    return f"{np.degrees(value):.{digits}g}° ({value:.{min(digits, 4)}g} rad)"
 
 
 def compile_unilateral(

@@ -142,7 +142,8 @@ def controller(
     if touching is None:
         touching = contacts(scenario, machine.robot) if isinstance(machine, Model) else ()
     points = {contact.name: contact for contact in touching}
-    context = BuildContext(scenario.duration_s, machine, progress=progress, contacts=points)
+    declared = [name for name in points if name in scenario.config.contacts.points]
+    context = BuildContext(scenario.duration_s, machine, progress=progress, contacts=points, declared=declared)
     if isinstance(machine, Model):
         control = families.build("controller", config, context, JointControl)
         # The kernels would follow the last polynomial on.
@@ -271,9 +272,11 @@ def check_start(
 ) -> None:
     """Raise :class:`ModelError` unless every contact is on a body of the robot and starts on its surface.
 
+    One error for all that do not: about the first, and with the names and gaps of the others.
     ``q`` : coordinates at the start, (nq,) [rad or m]; default: the robot's initial ones
     """
     q = model.robot.initial if q is None else q
+    off: list[tuple[Contact, bool, tuple[str, str] | tuple[str, str, str], float]] = []
     for contact in touching:
         declared = contact.name in scenario.config.contacts.points
         keys = ("contacts", "points", contact.name) if declared else ("contacts", "candidates")
@@ -284,14 +287,18 @@ def check_start(
         if scenario.config.contacts.law == "unilateral" and gap > 0.0:
             continue
         if not abs(gap) <= START_TOLERANCE:
-            position = model.point_position(contact.body, contact.point, q)
-            raise ModelError(
-                f"{dotted(keys)}: {'its point' if declared else contact.name} starts {gap:+.4g} m "
-                f"from surface {contact.surface_name!r} "
-                f"(limit {START_TOLERANCE:g} m), at {position.tolist()}; "
-                "change the initial configuration or the surface, or disable the contact",
-                keys=keys,
-            )
+            off.append((contact, declared, keys, gap))
+    if off:
+        contact, declared, keys, gap = off[0]
+        position = model.point_position(contact.body, contact.point, q)
+        others = ", ".join(f"{other.name} {its:+.4g} m from {other.surface_name!r}" for other, _, _, its in off[1:])
+        raise ModelError(
+            f"{dotted(keys)}: {'its point' if declared else contact.name} starts {gap:+.4g} m "
+            f"from surface {contact.surface_name!r} "
+            f"(limit {START_TOLERANCE:g} m), at {position.tolist()}{f' (also {others})' if others else ''}; "
+            "change the initial configuration or the surface, or disable the contact",
+            keys=keys,
+        )
 
 
 def require_scenario(scenario: object) -> None:

@@ -35,8 +35,9 @@ def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declare
     that neighbours share count once, on the link whose joint it is, with the larger radius. Spheres, cylinders and
     boxes are touched from outside by these, and by the nearest point of the axis; that is :data:`THINNER`.
 
-    Left out are points that are declared or the same as others, and what cannot move along the normal (a log line
-    names it): it would have a row of zeros.
+    Left out are points that are declared or the same as others, spheres about points that are declared (a warning
+    names them), and what cannot move along the normal (a log line names it): it would have a row of zeros. A link
+    without mass and extent, such as a carriage, has no sphere.
     """
     model = Model(robot)
     configurations = _configurations(robot)
@@ -44,6 +45,7 @@ def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declare
     names = {contact.name for contact in declared}
     found: list[Contact] = []
     still: list[str] = []
+    replaced: list[str] = []
     for surface_name, surface in surfaces.items():
         kept: list[tuple[Contact, Array]] = []
         known = [
@@ -54,7 +56,9 @@ def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declare
         for contact in (_joints if kind == "joints" else _links)(robot, surface, surface_name):
             places = _places(model, contact, configurations)
             if contact.tip is None:
-                if any(_same(places, other) and contact.radius == one.radius for one, other in known):
+                twins = [one for one, other in known if _same(places, other)]
+                if twins:
+                    replaced.extend(one.name for one in twins if contact.radius > one.radius)
                     continue
                 twin = next((k for k, (one, other) in enumerate(kept) if one.tip is None and _same(places, other)), -1)
                 if twin >= 0:
@@ -68,6 +72,11 @@ def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declare
                 found.append(replace(contact, name=_unused(name, names)))
             else:
                 still.append(name)
+    if replaced:
+        log.warning(
+            "contacts.candidates: declared at a joint, a point without radius touches there instead of the link: %s",
+            ", ".join(dict.fromkeys(replaced)),
+        )
     if still:
         log.info("contacts.candidates: left out, because nothing moves them along the normal: %s", ", ".join(still))
     return found
@@ -90,7 +99,8 @@ def _links(robot: Robot, surface: Surface, on: str) -> list[Contact]:
     tips, carriers = axis_ends(robot), robot.carriers
     for link in robot.links:
         axes = [tip for tip in tips[link.name] if np.linalg.norm(tip) > SAME]
-        if link.name in carriers:
+        # What has neither extent nor mass, such as a carriage, is no body of its own.
+        if link.name in carriers or not (axes or link.inertia.mass):
             continue
         joint = link.joint_of_rows or link.joint
         starts.append(Contact(joint, link.name, np.zeros(3), surface, on, radius=link.radius))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -207,16 +208,57 @@ def test_the_jerk_of_a_zigzag_does_not_depend_on_the_window() -> None:
 
 
 def test_what_is_no_number_any_more_is_refused_and_no_speed_offered(rig) -> None:
-    """Speeds beyond all measure: 0 stays 0 for joints at rest, and a motion overflows."""
-    time = 0.01 * np.arange(5)
-    at_rest = record_of(time, np.zeros(5), np.zeros(5))
-    assert check_motion(at_rest, rig.map, speed=1e300).speed == 1e300
-    with pytest.raises(CheckRefused, match="shoulder: jerk inf") as refusal:
-        check_motion(swing(), rig.map, speed=1e300)
-    assert "would pass" not in str(refusal.value)
     tiny = record_of(np.array([0.0, 1e-200, 2e-200]), np.array([0.0, 0.1, 0.2]), np.zeros(3))
-    with pytest.raises(CheckRefused, match="shoulder: acceleration"):
+    with pytest.raises(CheckRefused, match="shoulder: acceleration inf") as refusal:
         check_motion(tiny, rig.map)
+    assert "would pass" not in str(refusal.value)
+
+
+def triangles(tooth: float, every: float, step: float, count: int = 30) -> Record:
+    """Straight to and fro by ``tooth`` [rad], a turn every so many seconds, sampled evenly; rates are those behind."""
+    time = step * np.arange(round(count * every / step) + 1)
+    angle = np.interp(time, every * np.arange(count + 1), tooth * (np.arange(count + 1) % 2))
+    return record_of(time, angle, np.diff(angle, prepend=angle[:1]) / step)
+
+
+SHAKES = [(0.02, 0.02, 0.02), (0.02, 0.02, 0.005), (0.04, 0.02, 0.01), (0.2, 0.1, 0.01), (0.25, 0.1, 0.025)]
+SHAKES += [(0.005, 0.02, 0.02), (0.16, 0.1, 0.1)]  # about the least that is refused
+
+
+@pytest.mark.parametrize("replaced", [(), (HELD,)])
+@pytest.mark.parametrize("shake", SHAKES)
+def test_shaking_is_refused_with_its_joint_and_time(write_map, replaced, shake) -> None:
+    """Within all other limits that are set wide: it is what goes to and fro that is refused."""
+    wide = ("velocity: 3.0", "velocity: 4.5, acceleration: 90000, jerk: 9000000")
+    with pytest.raises(CheckRefused) as refusal:
+        check_motion(triangles(*shake), load_servo_map(write_map(wide, *replaced)))
+    lines = str(refusal.value).splitlines()
+    assert re.match(r"  shoulder: shaking \d+\.\d+ rad/s at t = \d+\.\d+ s, limit 3\.0000 rad/s", lines[1])
+    assert [line for line in lines[1:] if "shaking" not in line and "would pass" not in line] == []
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.9])
+def test_a_spike_is_refused_on_a_joint_that_moves_too(write_map, drift: float) -> None:
+    """20 mrad in one sample of 10 ms: 2 rad/s gained, 4 lost, 2 gained, whatever the joint does besides."""
+    servo_map = load_servo_map(write_map(("velocity: 3.0", "velocity: 4.0"), HELD))
+    time = 0.01 * np.arange(100)
+    spike = 0.02 * (np.arange(100) == 50)
+    check_motion(record_of(time, drift * (time - 0.5), np.full(100, drift)), servo_map)
+    with pytest.raises(CheckRefused, match=r"1 limit\(s\) .*\n  shoulder: shaking 4\.0000 rad/s at t = 0\.[5-8]\d\d s"):
+        check_motion(record_of(time, drift * (time - 0.5) + spike, np.full(100, drift)), servo_map)
+
+
+def test_shaking_of_a_smooth_path_is_the_velocity_it_gains_and_loses() -> None:
+    """A sine of 2 rad/s and period T: within T/2 about a peak of the rate it gains and loses 2 rad/s, within T 4."""
+    time = np.linspace(0.0, 4.0, 2001)
+    rate = 2 * np.cos(2 * math.pi * time)
+    angle = 2 * np.sin(2 * math.pi * time) / (2 * math.pi)
+    path = Path(time, angle[:, None], rate[:-1, None], rate[1:, None], 4.0)
+    for window, expected in ((0.5, 2.0), (1.0, 4.0), (0.248, 2 * (1 - math.cos(2 * math.pi * 0.124)))):
+        assert path.shaking(window)[0][0] == pytest.approx(expected, rel=1e-4)
+    # The cubic between three knots turns on the way: v = 1 − 3s + 3s², so 1 to ¼ and back to 1 within an interval.
+    one = Path(np.array([0.0, 1.0]), np.array([[0.0], [0.5]]), np.array([[1.0]]), np.array([[1.0]]), 1.0)
+    assert one.shaking(1.0)[0][0] == pytest.approx(0.75)
 
 
 def test_a_single_jump_of_the_rate_is_bounded_by_the_acceleration(write_map) -> None:
@@ -256,14 +298,35 @@ def test_holes_in_the_record_are_refused_and_a_missing_sample_is_told(rig) -> No
 
     assert rig.motion().warnings == ()
     warning = check_motion(without(100), rig.map).warnings[0]
-    assert "1 sample(s) of the record may be missing: no sample between t = 0.495 and 0.505 s" in warning
+    assert "1 of 238 steps are long, samples of the record may be missing: no sample between t = 0.495 and" in warning
+    # The median of every third sample missing, and of steps of 5 and 10 ms in turn, is not the usual step.
+    every_third = check_motion(without(*range(2, 240, 3)), rig.map).warnings[0]
+    assert "79 of 159 steps are long" in every_third
+    assert "2 of the usual steps of 5 ms" in every_third
     with pytest.raises(CheckRefused, match=r"2 hole\(s\): no sample between t = 0\.195 and 0\.215 s, 4 of the usual"):
         check_motion(without(40, 41, 42, 100, 101), rig.map)
 
 
+@pytest.mark.parametrize("speed", [1e-300, 0.0099, 10.1, 1e300])
+def test_speeds_beyond_all_measure_are_refused(rig, speed: float) -> None:
+    at_rest = record_of(0.01 * np.arange(5), np.zeros(5), np.zeros(5))
+    with pytest.raises(CheckRefused, match=r"--speed must be from 0\.01 to 10, not"):
+        check_motion(at_rest, rig.map, speed=speed)
+    for possible in (0.01, 10.0):
+        assert check_motion(at_rest, rig.map, speed=possible).speed == possible
+
+
+@pytest.mark.parametrize(("step", "speed"), [(1e300, 1.0), (30_000.0, 1.0), (1000.0, 0.03)])
+def test_a_motion_of_more_than_a_day_is_refused(rig, step: float, speed: float) -> None:
+    at_rest = record_of(step * np.arange(4), np.zeros(4), np.zeros(4))
+    with pytest.raises(CheckRefused, match=r"would take .* s at --speed .*, more than 24 h\. Is the record's time"):
+        check_motion(at_rest, rig.map, speed=speed)
+    check_motion(record_of(28_000.0 * np.arange(4), np.zeros(4), np.zeros(4)), rig.map)
+
+
 @pytest.mark.parametrize("speed", [0.0, -1.0, math.nan, math.inf])
 def test_nonsense_speeds_and_rates_are_refused(rig, speed: float) -> None:
-    with pytest.raises(CheckRefused, match="--speed must be positive"):
+    with pytest.raises(CheckRefused, match=r"--speed must be from 0\.01 to 10"):
         check_motion(rig.record, rig.map, speed=speed)
     with pytest.raises(CheckRefused, match="--rate must be positive"):
         check_motion(rig.record, rig.map, rate=speed)

@@ -102,6 +102,72 @@ def test_a_pause_shorter_than_the_watchdogs_is_no_stall(rig) -> None:
     assert result.end_state == "off"
 
 
+def largest_steps(run: Run) -> dict[int, int]:
+    """The largest step from goal to goal of every servo in position mode, by ID [ticks]."""
+    ids = [servo.id for servo in run.map.servos if servo.in_position_mode]
+    return {id_: max(abs(np.diff([value for _, one, value in run.goals() if one == id_]))) for id_ in ids}
+
+
+@pytest.mark.parametrize("pause", [0.05, 0.1, 0.17])
+@pytest.mark.parametrize("state", [State.MOVE_TO_START, State.REPLAY], ids=lambda state: state.name)
+def test_after_a_pause_the_path_waits_and_no_goal_is_far(rig, clean_run: Run, state: State, pause: float) -> None:
+    run = rig.prepare()
+    at_cycle(run, state, 30, stall(run, pause))
+    result = finish(run).result
+    assert result.fault is None
+    # Rounding to ticks: one more than where no cycle was skipped.
+    before = largest_steps(clean_run)
+    assert all(step <= before[id_] + 1 for id_, step in largest_steps(run).items())
+    skipped = result.timing.skipped_cycles * run.replay.loop.period
+    assert skipped >= pause - 2 * run.replay.loop.period
+    assert result.timing.path_late == pytest.approx(skipped if state == State.REPLAY else 0.0)
+    # No place of the path is left out, and it takes so much longer.
+    times, straight = result.record["record_time"], clean_run.result.record["record_time"]
+    on_path, planned = np.isfinite(times), np.isfinite(straight)
+    np.testing.assert_allclose(np.unique(times[on_path]), np.unique(straight[planned]))
+    reached = [record.time[np.flatnonzero(t == np.nanmax(t))[0]] for record, t in
+               ((result.record, times), (clean_run.result.record, straight))]  # fmt: skip
+    assert reached[0] - reached[1] == pytest.approx(result.timing.path_late, abs=1e-3)
+
+
+@pytest.mark.parametrize("number", [1, 5])
+def test_after_a_pause_while_it_slows_down_no_goal_is_far(rig, clean_run: Run, number: int) -> None:
+    run = rig.prepare({"kind": "overload", "id": 1, "at": 1.7}, policy="decelerate")
+    at_cycle(run, State.FAULT, number, stall(run, 0.15))
+    assert finish(run).result.fault.cause == Cause.ALERT
+    assert largest_steps(run)[2] <= largest_steps(clean_run)[2] + 1
+
+
+@pytest.mark.parametrize(("armed", "found_holding"), [(0, True), (1, True), (2, True), (1, False), (2, False)])
+def test_who_is_stopped_by_another_program_while_arming_is_released(rig, armed: int, found_holding: bool) -> None:
+    """`hw stop` after the torque of so many servos was switched on: those that came later had not heard of it."""
+    run = rig.prepare()
+    if found_holding:
+        for id_ in run.map.ids:
+            run.line.servos.write(id_, 64, b"\1")
+    seen = 0
+
+    def listen(time: float, packet: Packet) -> None:
+        nonlocal seen
+        run.sent.append((time, packet))
+        if run.replay.journal.state != State.ARM or packet.instruction != Instruction.WRITE:
+            return
+        address = int.from_bytes(packet.parameters[:2], "little")
+        seen += address == 64
+        if seen == armed and address == 98:  # the watchdog of the next one is cleared
+            for id_ in run.map.ids:
+                run.line.servos.write(id_, 64, b"\0")
+
+    run.line.listener = listen
+    result = finish(run).result
+    assert result.fault.cause == Cause.TORQUE_LOST
+    assert result.fault_state == State.ARM
+    assert "torque is off again" in result.fault.text
+    assert result.end_state == "off"
+    check_against_the_servos(run)
+    assert not [packet for _, packet in run.sent if packet.instruction == Instruction.SYNC_WRITE]
+
+
 SECOND = {
     "drop_off": "does not answer",
     "overload": "limp: overload",

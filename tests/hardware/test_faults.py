@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ import pytest
 
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.bus.packet import Instruction
+from dynsim.hardware.fault_table import CASES, POLICIES, Case
 from dynsim.hardware.replay.check import velocity_limit
 from dynsim.hardware.replay.rules import Cause, reaction_bound
 from dynsim.hardware.replay.states import State
@@ -18,55 +18,10 @@ from dynsim.hardware.virtual.servos import PHYSICS_STEP
 
 from .conftest import check_goals_within_limits
 
-POLICIES = ("hold", "decelerate", "off")
 SILENCING = ("lost_status", "late_status", "truncated_status", "bad_crc", "drop_off")
 """Who suffers from these cannot say what it does."""
 DISABLING = ("reboot", "overload", "overheat", "temperature_ramp")
 """These take the torque from their victim, at once or by and by."""
-JOINTS, ANY = (1, 2), (1, 2, 7)
-
-
-@dataclass(frozen=True)
-class Case:
-    """One fault: its script entry, whom it may strike, and how the run must end (no cause: it goes well)."""
-
-    name: str
-    entry: dict[str, Any]
-    ids: tuple[int, ...] = ()
-    causes: tuple[Cause, ...] = ()
-    scripted_onset: bool = True
-    visible_after: float = 0.0  # s from onset until a rule can see it
-
-
-CASES = [
-    Case("lost_status, now and then", {"kind": "lost_status", "probability": 0.01}, ANY),
-    Case("lost_status, for good", {"kind": "lost_status"}, ANY, (Cause.MISSED_STATUS,)),
-    Case("late_status", {"kind": "late_status", "delay": 0.005}, ANY, (Cause.MISSED_STATUS,)),
-    Case("late_status, by two periods", {"kind": "late_status", "delay": 0.02}, ANY, (Cause.MISSED_STATUS,)),
-    Case("truncated_status", {"kind": "truncated_status"}, ANY, (Cause.MISSED_STATUS,)),
-    Case("bad_crc", {"kind": "bad_crc"}, ANY, (Cause.MISSED_STATUS,)),
-    Case("noise", {"kind": "noise"}),
-    Case("echo", {"kind": "echo"}),
-    Case("duplicate_id", {"kind": "duplicate_id"}, ANY, (Cause.VERIFICATION,), scripted_onset=False),
-    Case("unplug", {"kind": "unplug"}, (), (Cause.PORT,)),
-    Case("drop_off", {"kind": "drop_off"}, ANY, (Cause.MISSED_STATUS,)),
-    Case("reboot", {"kind": "reboot"}, ANY, (Cause.MISSED_STATUS,)),
-    Case("wrong_model", {"kind": "wrong_model", "value": 12}, ANY, (Cause.VERIFICATION,), scripted_onset=False),
-    Case("wrong_firmware", {"kind": "wrong_firmware", "value": 38}, ANY, (Cause.VERIFICATION,), scripted_onset=False),
-    Case("wrong_mode", {"kind": "wrong_mode", "value": 16}, ANY, (Cause.VERIFICATION,), scripted_onset=False),
-    Case("overload", {"kind": "overload"}, ANY, (Cause.ALERT,)),
-    Case("overheat", {"kind": "overheat"}, ANY, (Cause.ALERT,)),
-    Case("watchdog_trip", {"kind": "watchdog_trip"}, ANY, (Cause.WATCHDOG, Cause.FOLLOWING_ERROR)),
-    # A joint that sticks with little error left to grow pushes until its torque rule fires instead.
-    Case("stuck", {"kind": "stuck"}, ANY, (Cause.FOLLOWING_ERROR, Cause.TORQUE)),
-    Case("backlash", {"kind": "backlash", "angle": 0.02}, JOINTS),
-    Case("offset_jump", {"kind": "offset_jump", "angle": 0.5}, JOINTS, (Cause.FOLLOWING_ERROR,)),
-    Case("voltage_sag", {"kind": "voltage_sag", "drop": 2.0}, (), (Cause.VOLTAGE,)),
-    Case("supply_loss", {"kind": "supply_loss"}, (), (Cause.MISSED_STATUS,)),
-    Case(
-        "temperature_ramp", {"kind": "temperature_ramp", "heating_rate": 200.0}, ANY, (Cause.TEMPERATURE,), True, 0.1825
-    ),
-]
 
 
 def check_case(rig, case: Case, seed: int) -> None:

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import random
+
 import numpy as np
 import pytest
 
 from dynsim.hardware.bus.clock import VirtualClock
-from dynsim.hardware.bus.control_table import RAD_PER_TICK, STATE_BLOCK
+from dynsim.hardware.bus.control_table import MX_106, RAD_PER_TICK, STATE_BLOCK
 from dynsim.hardware.bus.dynamixel_bus import MARKS, DynamixelBus
 from dynsim.hardware.bus.packet import Instruction
+from dynsim.hardware.bus.protocol import NoAnswer
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.states import State
 from dynsim.hardware.virtual.faults import FaultScript
 from dynsim.hardware.virtual.line import line_for_map
 from dynsim.hardware.virtual.port import VirtualPort
 
+F = MX_106.fields
 PERIOD = 0.01
 LENGTH = STATE_BLOCK[1]
 
@@ -95,3 +99,26 @@ def test_requests_grow_after_a_miss_and_shrink_again(rig) -> None:
     line.servos.dead.clear()
     # The shortest that nobody owes an answer to.
     assert read(MARKS + 1) == [LENGTH + 1] * (MARKS - 1) + [LENGTH] * 2
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_late_answer_never_passes_for_that_to_another_single_read(rig, seed: int) -> None:
+    """Items of one size, read one after the other from a servo whose answers come up to three time-outs late."""
+    items = {"goal_velocity": 0, "profile_acceleration": 200, "profile_velocity": 300, "goal_position": 1900}
+    line = line_for_map(rig.map)
+    bus = DynamixelBus(VirtualPort(line, VirtualClock(), baud=rig.map.bus.baud), latency=2e-3, return_delay=0.0)
+    for name, value in items.items():
+        line.servos.write(2, F[name].address, F[name].encode(value))
+    draw, transmit = random.Random(seed), line.transmit
+    line.transmit = lambda *sent: [
+        (arrival + (draw.uniform(0, 0.1) if draw.random() < 0.6 else 0.0), frame) for arrival, frame in transmit(*sent)
+    ]
+    heard = 0
+    for _ in range(50):
+        name = draw.choice(list(items))
+        try:
+            assert bus.read(2, F[name]) == items[name]
+            heard += 1
+        except NoAnswer:
+            continue
+    assert heard > 10

@@ -189,7 +189,9 @@ def test_the_makers_easy_library(device: str, monkeypatch: pytest.MonkeyPatch) -
     mixed.addCmd(motors[1].stageIsLEDOn())
     mixed.addCmd(motors[3].stageGetPresentVelocity())
     mixed.executeWrite()
-    assert mixed.executeRead() == [1, 0]
+    lit, velocity = mixed.executeRead()
+    assert lit == 1
+    assert abs(velocity) <= 2  # it may still be coming to rest
 
     motors[3].changeID(30)
     assert motors[3].ping() == NUMBER_OF[3]

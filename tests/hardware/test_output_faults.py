@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import random
+import warnings
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ import pytest
 from dynsim.errors import DynsimError
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted
 from dynsim.hardware.replay.display import displayed
-from dynsim.hardware.replay.session import run_replay
+from dynsim.hardware.replay.session import run_replay, shown_by
 from dynsim.hardware.replay.states import State, StopRequest
 
 from .conftest import TORQUE_ADDRESS, Rig, Run, swing
@@ -55,19 +57,22 @@ class Case:
 
             self.run.clock.sleep_until = sleep_until  # type: ignore[method-assign]
         self.error: BaseException | None = None
+        self.warnings: list[warnings.WarningMessage] = []
         with watched(outputs) as console:
             try:
-                with displayed(console) as observer:
-                    self.result = run_replay(
-                        motion,
-                        short.map,
-                        nullcontext((self.run.replay.bus, self.run.clock)),
-                        folder,
-                        policy=options.get("policy"),
-                        live=True,
-                        stop=stop,
-                        observer=observer,
-                    )
+                with warnings.catch_warnings(record=True) as self.warnings:
+                    warnings.simplefilter("always")
+                    with shown_by({}, folder) as lost, displayed(console, lost) as observer:
+                        self.result = run_replay(
+                            motion,
+                            short.map,
+                            nullcontext((self.run.replay.bus, self.run.clock)),
+                            folder,
+                            policy=options.get("policy"),
+                            live=True,
+                            stop=stop,
+                            observer=observer,
+                        )
             except Exception as error:
                 self.error = error
 
@@ -118,8 +123,12 @@ def check(rig: Rig, ending: str, expected: Case, call: Call, folder: Path) -> No
         assert case.error is None or isinstance(case.error, OutputsFailed), repr(case.error)
     else:
         assert type(case.error) is type(expected.error)
-    if not call.looping and not call.place.startswith("display.py"):
-        assert " failed: " in str(case.error), "told to nobody"
+    if not call.looping:
+        told = " ".join(map(str, [case.error, *case.warnings]))
+        assert " failed: " in told, "told to nobody"
+        if call.place.startswith("display.py"):
+            summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+            assert "progress bar" in summary["outputs_failed"]
     if not (folder / "measured.h5").exists():
         assert "measured record failed" in str(case.error)
         assert (folder / "measured.part").exists()

@@ -22,14 +22,16 @@ from dynsim.hardware.bus.dynamixel_bus import DynamixelBus, open_serial_port
 from dynsim.hardware.bus.protocol import NoAnswer
 from dynsim.hardware.errors import PortError
 from dynsim.hardware.replay.states import State
+from dynsim.hardware.virtual.line import line_for_map
+from dynsim.hardware.virtual.pseudo_terminal import PseudoTerminal
 from dynsim.record import Record
 
-from .conftest import MAP, swing
+from .conftest import MAP, Rig, swing
 
 F = MX_106.fields
 # A busy machine may not run the servos for a while: patience where a real robot would abort.
 PATIENT = MAP.replace("{baud: 1000000, rate: 100}", "{baud: 1000000, rate: 50, latency: 0.2}").replace(
-    "safety: {", "safety: {watchdog: 2.0, missed_cycles: 50, late_cycles: 1000, following_cycles: 50, "
+    "safety: {", "safety: {watchdog: 2.0, missed_cycles: 25, late_cycles: 25, following_cycles: 25, "
 )
 
 
@@ -219,3 +221,25 @@ def test_an_adapter_pulled_out_ends_the_replay(tmp_path: Path) -> None:
         assert "the port died" in live.stderr
         assert "robot left unreachable" in live.stderr
         assert servos.process.wait(timeout=20) == 0
+
+
+def test_the_link_of_running_servos_is_neither_taken_over_nor_removed(rig: Rig, tmp_path: Path) -> None:
+    link = tmp_path / "ttyDXL"
+    first = PseudoTerminal(line_for_map(rig.map), link)
+    with pytest.raises(PortError, match=f"leads to {first.device}, which is in use"):
+        PseudoTerminal(line_for_map(rig.map), link)
+    assert os.readlink(link) == first.device
+    # Somebody else's by the time it ends.
+    link.unlink()
+    link.symlink_to("/dev/null")
+    first.close()
+    assert os.readlink(link) == "/dev/null"
+
+
+def test_a_link_that_leads_nowhere_is_replaced_and_removed(rig: Rig, tmp_path: Path) -> None:
+    link = tmp_path / "ttyDXL"
+    link.symlink_to("/dev/pts/none")
+    terminal = PseudoTerminal(line_for_map(rig.map), link)
+    assert os.readlink(link) == terminal.device
+    terminal.close()
+    assert not link.is_symlink()

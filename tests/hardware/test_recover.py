@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import threading
+from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -13,8 +14,8 @@ import numpy as np
 import pytest
 
 from dynsim.errors import RecordError
-from dynsim.hardware.errors import PortError
-from dynsim.hardware.replay import session
+from dynsim.hardware.errors import PortError, ReplayAborted
+from dynsim.hardware.replay import session, stream
 from dynsim.hardware.replay.folder import move_away
 from dynsim.hardware.replay.loop import Loop
 from dynsim.hardware.replay.recover import recover
@@ -27,8 +28,8 @@ from dynsim.record import Record
 from .conftest import Rig
 
 
-def replay(rig: Rig, folder: Path, **options) -> ReplayResult:
-    run = rig.prepare(**options)
+def replay(rig: Rig, folder: Path, faults: Sequence[dict] = (), **options) -> ReplayResult:
+    run = rig.prepare(*faults, **options)
     motion = rig.motion()
     return run_replay(motion, rig.map, nullcontext((run.replay.bus, run.clock)), folder, live=True)
 
@@ -88,7 +89,7 @@ def test_a_stream_cut_anywhere_keeps_its_whole_rows(streamed, rig: Rig, tmp_path
         if started:
             same(record, recovered, cut // size)
         (tmp_path / "measured.h5").unlink()
-    for cut in (0, 1, head // 2, head - 2):
+    for cut in (1, head // 2, head - 2):
         (tmp_path / PART).write_bytes(stream[:cut])
         with pytest.raises(RecordError, match="is no streamed record of a replay"):
             recover(tmp_path)
@@ -115,6 +116,37 @@ def test_a_record_that_is_whole_stays(streamed, tmp_path: Path) -> None:
 def test_nothing_to_recover(tmp_path: Path) -> None:
     with pytest.raises(RecordError, match="nothing to recover"):
         recover(tmp_path)
+
+
+def test_an_empty_stream_is_said_to_be_empty(tmp_path: Path) -> None:
+    (tmp_path / PART).touch()
+    with pytest.raises(
+        RecordError, match=r"measured\.part: is empty, the replay died before its first cycle: nothing to"
+    ):
+        recover(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [PART]
+
+
+def no_room(*_: object, **__: object) -> None:
+    raise OSError(28, "No space left on device")
+
+
+def no_thread(*_: object) -> None:
+    raise RuntimeError("can't start new thread")
+
+
+@pytest.mark.parametrize(
+    ("owner", "method", "fault"),
+    [(GrowingFile, "append", no_room), (threading.Thread, "start", no_thread), (stream, "lock", no_room)],
+)
+def test_a_refused_start_leaves_no_empty_files(rig: Rig, tmp_path: Path, monkeypatch, owner, method, fault) -> None:
+    run = rig.prepare()
+    (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
+    monkeypatch.setattr(owner, method, fault)
+    with pytest.raises(PortError, match="nothing was moved"):
+        run_replay(rig.motion(), rig.map, nullcontext((run.replay.bus, run.clock)), tmp_path, live=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    assert not run.sent
 
 
 def test_a_stream_of_another_version_is_refused(streamed, tmp_path: Path) -> None:
@@ -195,3 +227,30 @@ def test_a_killed_process_leaves_all_but_the_last_interval(rig: Rig, tmp_path: P
     recovered = recover(tmp_path / "killed")
     assert len(recovered) >= 150
     np.testing.assert_array_equal(recovered["q_goal"], result.record["q_goal"][: len(recovered)])
+
+
+def test_the_end_that_a_replay_has_told_is_kept(rig: Rig, tmp_path: Path, monkeypatch) -> None:
+    """Its record could not be written; its summary could."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(session, "replace_together", refuse)
+        with pytest.raises(ReplayAborted, match="measured record failed"):
+            replay(rig, tmp_path, faults=[{"kind": "overload", "id": 2, "at": 1.7}])
+    told = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    recovered = recover(tmp_path)
+    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    assert summary["end_state"] == "mixed: 2 holding; elbow limp: overload"
+    assert told["outputs_failed"].keys() == {"measured record"}
+    assert {name: summary[name] for name in told} == told
+    assert summary["recovered"]
+    assert summary["timing"]["cycles"] == len(recovered)
+    assert Record.load(tmp_path / "measured.h5").summary["servos"] == told["servos"]
+
+
+def test_a_summary_that_was_cut_off_says_nothing(streamed, tmp_path: Path) -> None:
+    (tmp_path / PART).write_bytes(streamed[1])
+    (tmp_path / "summary.json").write_text('{"end_state": "hol', encoding="utf-8")
+    assert recover(tmp_path).summary["end_state"] == "not known: the program died"

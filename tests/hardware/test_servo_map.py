@@ -77,11 +77,101 @@ MISTAKES = [
     ("run_up: 20", "run_up: 20, watchdog: 60", r"map.yaml:3: safety.watchdog = 60"),
     ("run_up: 20", "run_up: 20, missed_cycles: 100000", r"map.yaml:3: safety.missed_cycles = 100000"),
     ("run_up: 20", "run_up: 20, stop_time: 60", r"map.yaml:3: safety.stop_time = 60"),
+    (
+        "torque: 6.0",
+        "torque: 6.0, acceleration: 1e300",
+        r"limits.acceleration = 1e\+300: .*; use 0.01 to 100000 rad/s²",
+    ),
+    (
+        "torque: 6.0",
+        "torque: 6.0, jerk: 1.0e+8",
+        r"map.yaml:9: kinds.joint.limits.jerk = .*; use 0.01 to 1e\+07 rad/s³",
+    ),
+    (
+        "torque: 6.0",
+        "torque: 6.0, shaking: 1e3",
+        r"map.yaml:9: kinds.joint.limits.shaking = 1000.0: .* 0.01 to 100 rad/s",
+    ),
+    (
+        "run_up: 20",
+        "start_distance: 1e9",
+        r"map.yaml:3: safety.start_distance = 1.* no joint would .* 0.001 to 6.28319 rad",
+    ),
+    ("run_up: 20", "approach_velocity: 50", r"map.yaml:3: safety.approach_velocity = 50: .*; use 0.001 to 1 rad/s"),
+    (
+        "run_up: 20",
+        "run_up: 1e12",
+        r"map.yaml:3: safety.run_up = 1.*: takes minutes, or is a knock; use 0.01 to 100000",
+    ),
+    ("run_up: 20", "run_up: 1e-12", r"map.yaml:3: safety.run_up = 1e-12: takes minutes, .*; use 0.01 to 100000 rad/s²"),
+    ("rate: 100", "rate: 100, latency: 1e-12", r"map.yaml:2: bus.latency = 1e-12: no adapter .*; use 0.0001 to 2.54 s"),
 ]
 # What a data sheet says, or another entry.
 ABSURD = [
     ("id: 2, sign", "id: 2, label: shoulder, sign", r"map.yaml:19: servos.elbow.label.*: shoulder already follows"),
-    ("run_up: 20", "approach_velocity: 50", r"map.yaml:3: safety.approach_velocity = 50: is above kinds.joint.limits"),
+    (
+        "velocity: 3.0",
+        "velocity: 0.2",
+        r"map.yaml:3: safety.approach_velocity: is above kinds.* 0.2",
+    ),
+    ("run_up: 20", "run_up: 3000", r"map.yaml:3: safety.run_up = 3000: is above kinds.joint.limits.acceleration, 2000"),
+    (
+        "run_up: 20",
+        "stop_time: 0.02",
+        r"map.yaml:3: safety.stop_time = 0.02: is less than 3 cycles of 100 Hz; use 0.03",
+    ),
+    (
+        "run_up: 20",
+        "late_cycles: 51",
+        r"map.yaml:3: safety.late_cycles = 51: takes 0.51 s at 100 Hz, .*; use 50 or less",
+    ),
+    ("run_up: 20", "following_cycles: 51", r"safety.following_cycles = 51: takes 0.51 s at 100 Hz.*; use 50 or less"),
+    ("run_up: 20", "torque_cycles: 51", r"map.yaml:3: safety.torque_cycles = 51: takes 0.51 s at 100 Hz.*; use 50 or"),
+    ("run_up: 20", "missed_cycles: 51, watchdog: 1", r"safety.missed_cycles = 51: takes 0.51 s at 100 Hz.*; use 50 or"),
+    (
+        "run_up: 20",
+        "missed_cycles: 20",
+        r"map.yaml:3: safety.missed_cycles = 20: takes 0.2 s .* watchdogs would trip first",
+    ),
+    ("rate: 100", "rate: 1", r"map.yaml:3: safety.missed_cycles: takes 3 s at 1 Hz, .*; use a higher bus.rate"),
+    (
+        "run_up: 20",
+        "temperature_max: 1e-9",
+        r"map.yaml:3: safety.temperature_max = 1e-09: is no more than the 20 °C of a",
+    ),
+    (
+        "torque: 6.0",
+        "torque: 1e-9",
+        r"map.yaml:9: kinds.joint.limits.torque = 1e-09: is below what .*; use 0.0055 N",
+    ),
+    ("error: 0.2", "error: 1e-12", r"kinds.joint.following_error = 1e-12: is below what .*; use 0.0016 rad or more"),
+    ("error: 1.0", "error: 0.02", r"kinds.wheel.following_error = 0.02: is below what .*; use 0.024 rad/s or more"),
+    (
+        "{velocity: 5.0",
+        "{position_deg: [-9, 9], velocity: 5.0",
+        r"map.yaml:15: kinds.wheel.limits.position_deg: .* leave it",
+    ),
+    (
+        "id: 1}",
+        "id: 1, hold_at_deg: 61}",
+        r"map.yaml:18: servos.shoulder.hold_at_deg = 61: is beyond .*; use -60 to 60",
+    ),
+    (
+        "id: 1}",
+        "id: 1, zero_tick: 4779}",
+        r"map.yaml:18: servos.shoulder.zero_tick = 4779: leaves no tick of 0 to 4095",
+    ),
+    (
+        "id: 1}",
+        "id: 1, zero_tick: -684}",
+        r"map.yaml:18: servos.shoulder.zero_tick = -684: leaves .*`dynsim hw",
+    ),
+    (
+        "robot: rig",
+        "robot: ../rig",
+        r"map.yaml:1: robot = '../rig': names the folder of results; use .* such as '_rig'",
+    ),
+    ("robot: rig", "robot: ''", r"map.yaml:1: robot = '': names the folder of results; .* such as 'unnamed'"),
     ("run_up: 20", "temperature_max: 500", r"map.yaml:3: safety.temperature_max = 500: a MX-106 goes limp at 80 °C"),
     ("lowest: 10.5", "lowest: 5.0", r"safety.supply.lowest = 5.0: a MX-106 does not work below 9.5 V"),
     ("highest: 14.0", "highest: 24.0", r"safety.supply.highest = 24.0: a MX-106 does not work above 16 V"),
@@ -98,6 +188,25 @@ ABSURD = [
 MISTAKES += ABSURD
 # What ties entries together, or to a data sheet, is beyond a schema.
 UNSEEN = ("is also the ID of", "is not one of joint, wheel", "is not below", "not YAML", *(row[2] for row in ABSURD))
+
+
+def test_values_just_within_the_bounds_load(write_map) -> None:
+    """The mistakes above, each less by one: what is refused begins where the message says."""
+    fine = [
+        ("run_up: 20", "run_up: 2000, stop_time: 0.03, late_cycles: 50, following_cycles: 50, torque_cycles: 50"),
+        (
+            "run_up: 20",
+            "run_up: 0.01, missed_cycles: 19, start_distance: 6.28, approach_velocity: 1, temperature_max: 21",
+        ),
+        ("torque: 6.0", "torque: 0.0055, acceleration: 1e5, jerk: 1.0e+7, shaking: 100"),
+        ("error: 0.2", "error: 0.0016"),
+        ("error: 1.0", "error: 0.024"),
+        ("id: 1}", "id: 1, zero_tick: 4778, hold_at_deg: -60}"),
+        ("rate: 100", "rate: 20, latency: 1e-4"),
+        ("robot: rig", "robot: rig 2_b"),
+    ]
+    for change in fine:
+        load_servo_map(write_map(change))
 
 
 def test_a_gear_moves_what_a_joint_can_do(write_map) -> None:

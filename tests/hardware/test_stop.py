@@ -82,7 +82,27 @@ def test_first_ctrl_c_is_a_controlled_stop(rig, state: State) -> None:
         assert np.abs(run.line.servos.plant.velocity).max() < 1e-2
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+# Those nobody survives, those of terminals and pipes (below), of jobs that go on, and of broken programs.
+UNHEEDED = {
+    "SIGKILL",
+    "SIGSTOP",
+    "SIGPIPE",
+    "SIGTTIN",
+    "SIGTTOU",
+    "SIGXFSZ",
+    "SIGCHLD",
+    "SIGCONT",
+    "SIGURG",
+    "SIGWINCH",
+}
+BROKEN = {"SIGSEGV", "SIGBUS", "SIGILL", "SIGFPE", "SIGABRT", "SIGTRAP", "SIGSYS"}
+
+
+@pytest.mark.parametrize(
+    "number",
+    [one for one in signal.Signals if one.name not in {"SIGINT", "SIGRTMIN", "SIGRTMAX"} | UNHEEDED | BROKEN],
+    ids=lambda number: number.name,
+)
 def test_other_signals_stop_like_ctrl_c(rig, number: int) -> None:
     run = interrupted(rig, State.REPLAY, [number], after=30)
     assert run.result.fault.cause == Cause.INTERRUPTED

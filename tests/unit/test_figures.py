@@ -15,7 +15,7 @@ import dynsim
 from dynsim import figures, measures, metrics
 from dynsim.errors import RecordError
 from dynsim.figures import arm, contacts, energy, events, hand, motors, posture, skeleton, style
-from dynsim.record import Record
+from dynsim.record import Event, Record
 from dynsim.scenario import load_scenario
 
 SHORT = {"duration_s": 0.3, "metrics.settle_s": 0.1, "integrator.rtol": 1e-4}
@@ -456,7 +456,33 @@ def test_comparisons_mark_the_events_of_every_run_in_its_colour(real: Record, br
             assert bottom < one < next_one
         explained = " ".join(axes.get_xlabel() for axes in figure.axes)
         landings = sum(event.kind == "landing" for record in records.values() for event in record.events)
-        assert f"landing ({landings})" in explained or landings < 2
+        assert f"landing ({landings})" in explained
+
+
+def test_the_marks_are_explained_beside_nothing_else(real: Record) -> None:
+    """All kinds, three digits each: the lines lie within the figure, and not on the names of the bars beside them."""
+    crowded = copy.copy(real)
+    crowded.events = [Event(0.001 * k, kind, "elbow_7") for k in range(100) for kind in events.MARKS]
+    for draw in (energy.energy_comparison, contacts.forces_comparison):
+        figure = drawn(draw({"one": crowded, "other": crowded}))
+        whole = figure.bbox
+        explained = [axes.xaxis.label for axes in figure.axes if "landing (200)" in axes.get_xlabel()]
+        assert len(explained) == 1
+        box = explained[0].get_window_extent()
+        assert whole.x0 <= box.x0
+        assert box.x1 <= whole.x1
+        others = [text for axes in figure.axes for text in [*axes.get_xticklabels(), axes.xaxis.label]]
+        others += [text for legend in figure.legends for text in legend.get_texts()]
+        assert len(others) > 4
+        shown = [text for text in others if text.get_text() and text is not explained[0]]
+        hit = [text.get_text() for text in shown if text.get_visible() and box.overlaps(text.get_window_extent())]
+        assert hit == [], draw
+
+
+def test_shares_near_none_and_all_are_told_from_them() -> None:
+    shares = (0.0, 3e-4, 2e-6, 0.0314, 0.5, 0.9996, 1.0 - 1e-6, 1.0)
+    told = [contacts._percent(share) for share in shares]
+    assert told == ["0.0 %", "0.03 %", "0.0002 %", "3.1 %", "50.0 %", "99.96 %", "99.9999 %", "100.0 %"]
 
 
 def test_many_events_are_marks_without_lines(pendulum: Record) -> None:

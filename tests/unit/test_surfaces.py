@@ -132,18 +132,19 @@ def test_joints_touch_each_surface_but_those_that_cannot_move_along_its_normal(t
     ]
 
 
-def test_declared_points_are_not_candidates_once_more(tmp_path):
+def test_declared_points_are_not_candidates_once_more(tmp_path, caplog):
     declared = "{law: unilateral, candidates: joints, points: {elbow: {body: link_3}}}"
     found = build.contacts(scenario_of(tmp_path, declared))
     assert [one.name for one in found] == ["elbow", "joint_4", "hand"]
-    # As a capsule's end the same place is a sphere, which touches a radius before the point does.
+    assert "instead of the link" not in caplog.text
+    # A sphere about it would start a radius deep where the point starts on the floor.
     found = build.contacts(scenario_of(tmp_path, declared.replace("joints", "links")))
     assert [(one.name, one.radius) for one in found] == [
         ("elbow", 0.0),
-        ("joint_3", 0.02),
         ("joint_4", 0.02),
         ("link_4_end", 0.02),
     ]
+    assert "a point without radius touches there instead of the link: elbow" in caplog.text
 
 
 FLAT = ["joint_3", "joint_4", "link_4_end"]
@@ -217,3 +218,18 @@ def test_links_that_sink_into_a_box_or_a_field_are_found(tmp_path):
     last = robot.hand[0]
     assert found[last, "cube"] >= 0.1 - 1e-9
     assert found[last, "flat"] >= 0.05 - 1e-9
+
+
+def test_a_carriage_without_mass_and_length_is_no_body_of_its_own(tmp_path):
+    """Three joints at one place: only what has mass or extent touches there, with its own radius."""
+    base = "duration_s: 1\nplant:\n  type: serial_arm\n  chain:\n"
+    carriage = "    - {kind: prismatic, axis: z, length_m: 0, mass_kg: MASS, radius_m: 0.3}\n"
+    rod = "    - {axis: y, initial_deg: 90, length_m: 0.4, radius_m: 0.02, mass_kg: 0.5}\n"
+    rest = "surfaces: {floor: {type: plane, point_m: [0, 0, -2]}}\ncontacts: {law: unilateral, candidates: links}\n"
+    file = tmp_path / "s.yaml"
+    for mass, expected in (
+        (0, [("joint_2", 0.02), ("link_2_end", 0.02)]),
+        (1, [("joint_1", 0.3), ("link_2_end", 0.02)]),
+    ):
+        file.write_text(base + carriage.replace("MASS", str(mass)) + rod + rest)
+        assert [(one.name, one.radius) for one in build.contacts(dynsim.load_scenario(file))] == expected

@@ -277,7 +277,8 @@ def test_limits_behind_a_free_body_are_looked_at_in_their_own_coordinate(free: P
     overrides = {"plant.initial_deg": {"hinge": 18}, "plant.initial_pose": {"root": {"position_m": [5, 5, 5]}}}
     warnings = [line for line in run(free, overrides).summary["warnings"] if "limit" in line]
     assert len(warnings) == 1
-    assert warnings[0].startswith("hinge: passes its upper position limit of 0.2 rad by up to 0.114 rad")
+    assert warnings[0].startswith("hinge: passes its upper position limit of 11.46° (0.2 rad) by up to 6.5")
+    assert "° (0.114 rad), first at" in warnings[0]
 
 
 def test_motors_hold_and_the_hand_is_led_behind_a_free_body(free: Path):

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import dynsim
+from dynsim.control import joint_pd
 from dynsim.engine import check
-from dynsim.errors import DynsimError
+from dynsim.errors import DynsimError, ModelError
 
 SCENARIO = """\
 duration_s: 0.05
@@ -104,6 +105,35 @@ def test_points(tmp_path: Path, law: str, point: str, said: str) -> None:
 )
 def test_braces(tmp_path: Path, controller: str, said: str) -> None:
     assert refused(tmp_path, CONTROLLER=f", {controller}").startswith(f"case.yaml:9: controller.{said}")
+
+
+def test_optimal_braces_are_the_declared_points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What could touch as well is no brace: it is in the air, and nothing keeps it on a surface."""
+    pressing: list[str] = []
+
+    def plan(model: object, times: np.ndarray, positions: np.ndarray, braces: dict[str, object], least: float) -> None:
+        pressing.extend(braces)
+        raise ModelError("seen")
+
+    monkeypatch.setattr(joint_pd, "planned_voltages", plan)
+    for candidates in ("joints", "links"):
+        pressing.clear()
+        contacts, controller = f", candidates: {candidates}", ", brace: optimal"
+        assert "seen" in refused(tmp_path, CONTACTS=contacts, CONTROLLER=controller)
+        assert pressing == ["elbow"]
+
+
+def test_all_points_that_start_below_their_surface_are_named_at_once(tmp_path: Path) -> None:
+    """The arm stands upright from z = 0.3 m: joint 3 at 0.8 m, its middle at 0.7 m, and the hand above."""
+    points = "points: {elbow: {body: link_3}, low: {body: link_3, point_m: [0, 0, -0.1]}}"
+    path = written(tmp_path)
+    path.write_text(path.read_text().replace("points: {elbow: {body: link_3}}", f"{points}, candidates: joints"))
+    with pytest.raises(DynsimError) as caught:
+        check(dynsim.load_scenario(path, overrides={"surfaces.floor.point_m": [0.0, 0.0, 0.9]}))
+    said = str(caught.value)
+    assert "contacts.points.elbow: its point starts -0.1 m from surface 'floor'" in said
+    assert "(also low -0.2 m from 'floor'" in said
+    assert "hand" not in said
 
 
 def test_braces_that_the_motors_cannot_press(tmp_path: Path) -> None:

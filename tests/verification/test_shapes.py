@@ -141,6 +141,25 @@ def test_gaps_are_distances_found_by_other_means(kind, shape):
         assert contact_gap(contact, start, end) == pytest.approx(gap, abs=1e-12)
 
 
+def test_capsules_over_edges_of_a_box():
+    """Axes flat over faces and across edges: the nearest point is where a flat stretch of the distance ends."""
+    rng = np.random.default_rng(5)
+    for trial in range(300):
+        box = Box(np.zeros(3), np.eye(3), np.array([0.2, 1.0, 0.2]), rng.choice([0.002, 0.03]))
+        start = np.array([rng.uniform(-0.6, -0.15), rng.uniform(-0.3, 0.3), 0.1 + rng.uniform(0.0, 0.3)])
+        end = np.array([rng.uniform(0.0, 0.6), rng.uniform(-0.3, 0.3), 0.1 + rng.uniform(0.0, 0.3)])
+        if trial % 3 == 0:
+            end[2] = start[2]
+        contact = Contact("c", "b", start, box, radius=0.02, tip=end)
+        u = np.linspace(0.0, 1.0, 20001)
+        points = start + u[:, None] * (end - start)
+        core = 0.5 * box.edges - box.edge_radius
+        nearest = np.linalg.norm(points - np.clip(points, -core, core), axis=1).min() - box.edge_radius - 0.02
+        assert contact_gap(contact, start, end) == pytest.approx(
+            nearest, abs=2e-9 + 1e-4 * (end - start) @ (end - start) / 20
+        )
+
+
 # The row of a point on a round quadric is that of its level set: the gap's own on the surface only.
 SHAPED = [(kind, shape) for kind, shape in CASES if shape != "point" or kind in ("plane", "box", "height_field")]
 

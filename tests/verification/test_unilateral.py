@@ -11,6 +11,7 @@ from dynsim.kernels.integrate import contact_events as ce
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.state import FRICTION, OUT_FORCE, OUT_GAP, OUT_MODE
 from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot, vector
+from dynsim.model.surfaces import Box
 from dynsim.model.unilateral import SETTLE_SPEED
 
 G = 9.81
@@ -126,6 +127,38 @@ def test_a_bouncing_ball():
     assert np.abs(run.states("q")[-1]).max() <= 1e-9
     assert run.states("loss")[-1, 0] == pytest.approx(0.7 * G * height, rel=1e-9)
     assert residual(b, run) < 1e-8
+
+
+@pytest.mark.parametrize("e", [0.2, 0.5])
+def test_two_feet_that_bounce_at_one_instant(e):
+    """A block on two feet, dropped: every impact at the same times as a ball's, one for each foot, to their end."""
+    height, down = 0.3, plane(vector(0, 0, 1))
+    feet = [
+        Contact(f"foot {x}", "z", vector(x, 0, 0), down, restitution=e, pulling_friction="signed") for x in (-0.2, 0.2)
+    ]
+    b = bench(block(0.5), feet, real=True)
+    run = b.simulate(b.state(vector(0, 0, height), np.zeros(3)), np.array([0.0, 2.0]), "rk43")
+    first = np.sqrt(2.0 * height / G)
+    times = np.array([t for t, _, kind in happened(run) if kind == ce.BOUNCE])
+    assert len(times) % 2 == 0
+    flights = 2.0 * first * e ** np.arange(1, len(times) // 2)
+    expected = first + np.concatenate([[0.0], np.cumsum(flights)])
+    np.testing.assert_allclose(times, np.repeat(expected, 2), rtol=0, atol=1e-8)
+    assert [kind for _, _, kind in happened(run)][-2:] == [ce.LANDING] * 2
+    assert run.states("loss")[-1, 0] == pytest.approx(0.5 * G * height, rel=1e-9)
+
+
+@pytest.mark.parametrize("method", ["rk43", "dopri5"])
+@pytest.mark.parametrize("thickness", [0.2, 0.005])
+def test_nothing_falls_through_a_body_within_one_step(method, thickness):
+    """Falling freely steps are as long as the run; a plate's other side is as far from a point as its own."""
+    plate = Box(vector(0, 0, -0.5 * thickness), np.eye(3), np.array([1.0, 1.0, thickness]), 1e-3)
+    b = bench(block(1.0), [Contact("foot", "z", np.zeros(3), plate, pulling_friction="signed")], real=True)
+    run = b.simulate(b.state(vector(0.01, 0.0, 0.3), np.zeros(3)), np.array([0.0, 1.5]), method)
+    ((time, _, kind), *_) = happened(run)
+    assert kind == ce.LANDING
+    assert time == pytest.approx(np.sqrt(0.6 / G), abs=1e-9)
+    assert abs(run.states("q")[-1, 2]) <= 1e-9
 
 
 def test_a_block_thrown_up_a_slope_stops_and_stays_or_comes_back():

@@ -10,6 +10,7 @@ each: when one fails, the library was mended and the detour can go):
 - Group reads drop the error byte: the decoder keeps it.
 - Byte stuffing of requests is lost, some stuffed answers are mangled: a request whose body holds FF FF FD is rejected
   here, answers of a wrong length count as garbled, and Fast Sync Read is never used.
+- Its single read takes any status of the servo for the answer, whatever its length: it is received here too.
 - ``getData`` knows no negative numbers: fields decode themselves.
 - A dead port raises termios.error or OSError beside SerialException; a stalled one blocks: all become PortError, and
   writes have a time-out.
@@ -36,8 +37,10 @@ from dynsim.hardware.errors import PortError
 WRITE_TIMEOUT = 0.25
 READ_WAIT = 5e-4
 """Longest wait for a byte before time-outs are looked at [s]."""
+NOTHING_TO_READ = "returned no data"
+"""What pyserial says of a read that was announced and brought nothing."""
 MARKS = 16
-"""Sync reads of one block after which an answer that was missed is not expected any more."""
+"""Reads after which an answer that was missed is not expected any more."""
 RETRIES = 2
 """Further attempts of a single read or write; the timed loop makes none."""
 TORQUE_ENABLE = 64
@@ -70,7 +73,13 @@ class SerialPort(PortHandler):
     def readPort(self, length: int) -> bytes:
         # A short wait instead of the library's busy loop: it leaves the processor to others.
         select.select([self.ser.fileno()], [], [], READ_WAIT)
-        return self.ser.read(length)
+        try:
+            return self.ser.read(length)
+        except serial.SerialException as error:
+            # Beside another process that took the bytes; on a port of one's own it is the adapter that is gone.
+            if self.exclusive or NOTHING_TO_READ not in str(error):
+                raise
+            return b""
 
 
 def open_serial_port(name: str, baud: int, *, exclusive: bool = True) -> SerialPort:
@@ -113,7 +122,7 @@ def latency_timer(port_name: str) -> int | None:
 
 
 class Marks:
-    """By how many bytes the next request for a block is longer, so that answers to earlier ones have a wrong length.
+    """How many bytes the next read asks for: more than needed, where answers to earlier ones could pass for its own.
 
     A status says whose it is, not what it answers: a servo that is two periods late would pass for one that is up to
     date. Where all have answered nothing can come late, and nothing is longer; a request that somebody missed keeps its
@@ -122,19 +131,19 @@ class Marks:
 
     def __init__(self) -> None:
         self._number = 0
-        self._missed: dict[int, int] = {}  # number of the request by its bytes more
+        self._missed: dict[int, int] = {}  # number of the request by its length
 
-    def choose(self) -> int:
-        """For a request to be sent now."""
+    def choose(self, length: int) -> int:
+        """For a request to be sent now, of which ``length`` bytes are needed."""
         self._number += 1
         if not self._missed:
-            return 0
-        self._missed = {extra: number for extra, number in self._missed.items() if self._number - number < MARKS}
-        return next(extra for extra in range(MARKS) if extra not in self._missed)
+            return length
+        self._missed = {asked: number for asked, number in self._missed.items() if self._number - number < MARKS}
+        return next(asked for asked in range(length, length + MARKS) if asked not in self._missed)
 
-    def miss(self, extra: int) -> None:
-        """Somebody has not answered the request sent last, which was ``extra`` bytes longer."""
-        self._missed[extra] = self._number
+    def miss(self, asked: int) -> None:
+        """Somebody has not answered the request sent last, which was for ``asked`` bytes."""
+        self._missed[asked] = self._number
 
 
 class DynamixelBus:
@@ -155,7 +164,7 @@ class DynamixelBus:
         self.latency = latency
         self.return_delay = return_delay
         self._library = Protocol2PacketHandler()
-        self._marks: dict[int, Marks] = {}
+        self._marks: dict[tuple[str, int], Marks] = {}  # of sync reads by address, of single reads by ID
 
     @property
     def name(self) -> str:
@@ -170,15 +179,22 @@ class DynamixelBus:
         return field.decode(self.read_block(id_, field.address, field.size).data)
 
     def read_block(self, id_: int, address: int, length: int, *, retries: int = RETRIES) -> ServoReply:
+        marks = self._marks.setdefault(("id", id_), Marks())
         for _ in range(retries + 1):
+            asked = marks.choose(length)
             with self._transaction():
-                data, result, error = self._library.readTxRx(self.port, id_, address, length)
-            if result == COMM_SUCCESS and len(data) == length:
-                break
-        else:
-            raise NoAnswer(id_, garbled=result != COMM_RX_TIMEOUT)
-        self._raise_refusal(id_, error)
-        return ServoReply(bytes(data), bool(error & ALERT))
+                result = self._library.readTx(self.port, id_, address, asked)
+                if result != COMM_SUCCESS:
+                    raise PortError(f"{self.name}: {self._library.getTxRxResult(result)}")
+                answers, others, garbage = self._receive((id_,), asked)
+            if id_ in answers:
+                packet = answers[id_]
+                self._raise_refusal(id_, packet.error)
+                return ServoReply(packet.parameters[:length], bool(packet.error & ALERT))
+            if id_ in others and not others[id_].parameters:
+                self._raise_refusal(id_, others[id_].error)
+            marks.miss(asked)
+        raise NoAnswer(id_, garbled=bool(others) or garbage > 0)
 
     def write(self, id_: int, field: Field, value: int) -> None:
         data = list(field.encode(value))
@@ -201,41 +217,48 @@ class DynamixelBus:
             raise PortError(f"{self.name}: {self._library.getTxRxResult(result)}")
 
     def sync_read(self, ids: Sequence[int], address: int, length: int) -> BlockRead:
-        marks = self._marks.setdefault(address, Marks())
-        extra = marks.choose()
-        asked = length + extra
+        marks = self._marks.setdefault(("address", address), Marks())
+        asked = marks.choose(length)
         with self._transaction():
             stray = self.port.getBytesAvailable()
             result = self._library.syncReadTx(self.port, address, asked, list(ids), len(ids), False)
             if result != COMM_SUCCESS:
                 raise PortError(f"{self.name}: {self._library.getTxRxResult(result)}")
-            answer_bytes = len(ids) * (11 + asked)
-            milliseconds = self.port.tx_time_per_byte * (answer_bytes + 14 + len(ids))
+            milliseconds = self.port.tx_time_per_byte * (len(ids) * (11 + asked) + 14 + len(ids))
             milliseconds += 1e3 * (len(ids) * (self.return_delay + 50e-6) + self.latency)
             self.port.setPacketTimeoutMillis(milliseconds)
-            replies: dict[int, ServoReply] = {}
-            outdated: set[int] = set()
-            decoder, asked_of = Decoder(), frozenset(ids)
+            answers, others, garbage = self._receive(ids, asked)
+        if len(answers) < len(ids):
+            marks.miss(asked)
+        replies = {
+            id_: ServoReply(packet.parameters[:length], bool(packet.error & ALERT)) for id_, packet in answers.items()
+        }
+        outdated = (id_ for id_, packet in others.items() if length <= len(packet.parameters) < length + MARKS)
+        return BlockRead(replies, stray + garbage, frozenset(outdated))
 
-            def sort_in(packets: Iterable[Packet]) -> None:
-                for packet in packets:
-                    # Requests echoed by the adapter are no status.
-                    if packet.instruction == STATUS and packet.id in asked_of:
-                        if len(packet.parameters) == asked:
-                            replies[packet.id] = ServoReply(packet.parameters[:length], bool(packet.error & ALERT))
-                        elif length <= len(packet.parameters) < length + MARKS:
-                            outdated.add(packet.id)
+    def _receive(self, ids: Sequence[int], asked: int) -> tuple[dict[int, Packet], dict[int, Packet], int]:
+        """Until all have answered, or the time-out: status packets by ID, and bytes of garbage.
 
-            while len(replies) < len(ids) and not self.port.isPacketTimeout():
-                sort_in(decoder.feed(self.port.readPort(answer_bytes)))
-            # What came while this process was not running is here, however late it is.
-            late = self.port.getBytesAvailable()
-            if late:
-                sort_in(decoder.feed(self.port.readPort(late)))
-            sort_in(decoder.flush())
-        if len(replies) < len(ids):
-            marks.miss(extra)
-        return BlockRead(replies, stray + decoder.garbage, frozenset(outdated))
+        The first ones bring the bytes ``asked`` for; the second ones, the last of every servo, another number of them.
+        """
+        answers: dict[int, Packet] = {}
+        others: dict[int, Packet] = {}
+        decoder, asked_of, total = Decoder(), frozenset(ids), len(ids) * (11 + asked)
+
+        def sort_in(packets: Iterable[Packet]) -> None:
+            for packet in packets:
+                # Requests echoed by the adapter are no status.
+                if packet.instruction == STATUS and packet.id in asked_of:
+                    (answers if len(packet.parameters) == asked else others)[packet.id] = packet
+
+        while len(answers) < len(ids) and not self.port.isPacketTimeout():
+            sort_in(decoder.feed(self.port.readPort(total)))
+        # What came while this process was not running is here, however late it is.
+        late = self.port.getBytesAvailable()
+        if late:
+            sort_in(decoder.feed(self.port.readPort(late)))
+        sort_in(decoder.flush())
+        return answers, others, decoder.garbage
 
     def torque_off_all(self) -> None:
         for _ in range(3):

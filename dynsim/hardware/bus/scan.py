@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import termios
+from contextlib import suppress
 from dataclasses import dataclass
 
 from dynsim.hardware.bus.control_table import MODEL_BY_NUMBER, MX_106, RETURN_DELAY_SECONDS_PER_UNIT, VOLT_PER_UNIT
 from dynsim.hardware.bus.dynamixel_bus import DynamixelBus, open_serial_port
 from dynsim.hardware.bus.protocol import NoAnswer, RequestRefused
+from dynsim.hardware.errors import PortError
 
 SCAN_BAUD_RATES = (57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 STOP_BAUD_RATES = (3_000_000, 1_000_000, 57_600, 115_200, 2_000_000, 4_000_000)
@@ -84,40 +87,52 @@ def _describe(bus: DynamixelBus, id_: int, model: int, firmware: int, baud: int)
     )
 
 
-def stop_all(port: str, bauds: tuple[int, ...] = STOP_BAUD_RATES, ids: tuple[int, ...] = ()) -> dict[int, bool]:
+@dataclass(frozen=True)
+class Asked:
+    """Who obeyed a broadcast torque off.
+
+    Attributes
+    ----------
+    torque : dict
+        Still on, by ID; True also for a servo that does not answer.
+    trouble : tuple of str
+        Where the port failed, so that not everybody may have heard it or been asked.
+    """
+
+    torque: dict[int, bool]
+    trouble: tuple[str, ...]
+
+
+def stop_all(port: str, bauds: tuple[int, ...] = STOP_BAUD_RATES, ids: tuple[int, ...] = ()) -> Asked:
     """Broadcast torque off at every bit rate first, and only then ask who obeyed.
 
-    Works beside a running replay: the port is not locked.
+    Works beside a running replay: the port is not locked. Once it was sent nothing is raised any more.
 
     Parameters
     ----------
     ids : tuple of int
         Whom to ask; everybody who answers a ping if empty.
 
-    Returns
-    -------
-    dict
-        Torque still on, by ID; True also for a servo that does not answer.
-
     Raises
     ------
     PortError
-        The port cannot be opened or died.
+        The port cannot be opened or died, and torque off was not sent.
     """
+    trouble: list[PortError] = []
     for baud in bauds:
-        _torque_off(port, baud)
-    torque: dict[int, bool] = {}
-    for baud in bauds:
-        bus = DynamixelBus(open_serial_port(port, baud, exclusive=False))
         try:
-            for id_ in ids or bus.ping_all():
-                try:
-                    torque[id_] = bool(bus.read(id_, MX_106.fields["torque_enable"]))
-                except (NoAnswer, RequestRefused):
-                    torque.setdefault(id_, True)
-        finally:
-            bus.close()
-    return torque
+            _torque_off(port, baud)
+        except PortError as error:
+            trouble.append(error)
+    if len(trouble) == len(bauds):
+        raise trouble[0]
+    torque = dict.fromkeys(ids, True)
+    for baud in bauds:
+        try:
+            _ask_for_torque(port, baud, ids, torque)
+        except PortError as error:
+            trouble.append(error)
+    return Asked(torque, tuple(dict.fromkeys(map(str, trouble))))
 
 
 def _torque_off(port: str, baud: int) -> None:
@@ -126,5 +141,18 @@ def _torque_off(port: str, baud: int) -> None:
         bus.torque_off_all()
         # Closing throws away what the driver has not sent yet.
         bus.port.ser.flush()
+    except (OSError, termios.error) as error:
+        raise PortError(f"{port}: the port died ({error})") from error
+    finally:
+        bus.close()
+
+
+def _ask_for_torque(port: str, baud: int, ids: tuple[int, ...], torque: dict[int, bool]) -> None:
+    bus = DynamixelBus(open_serial_port(port, baud, exclusive=False))
+    try:
+        for id_ in ids or bus.ping_all():
+            torque.setdefault(id_, True)
+            with suppress(NoAnswer, RequestRefused):
+                torque[id_] = bool(bus.read(id_, MX_106.fields["torque_enable"]))
     finally:
         bus.close()

@@ -14,7 +14,16 @@ import numpy as np
 
 from dynsim.hardware.bus.control_table import HEALTH_BLOCK, STATE_BLOCK, TICKS_PER_TURN
 from dynsim.hardware.errors import CheckRefused
-from dynsim.hardware.replay.trajectory import JERK_WINDOW, LONG, Path, column_of, long_steps, path_of_record
+from dynsim.hardware.replay.trajectory import (
+    COMMON,
+    JERK_WINDOW,
+    LONG,
+    SHAKING_WINDOW,
+    Path,
+    column_of,
+    long_steps,
+    path_of_record,
+)
 from dynsim.hardware.servo_map import Servo, ServoMap
 from dynsim.record import Record
 from dynsim.record.scene import Scene
@@ -29,19 +38,23 @@ WATCHDOG_CYCLES = 3
 BUS_SHARE = 0.97
 """Largest part of the period the bus may be busy."""
 
-Quantity = Literal["position", "velocity", "acceleration", "jerk", "torque"]
+Quantity = Literal["position", "velocity", "acceleration", "jerk", "shaking", "torque"]
 UNITS: dict[Quantity, str] = {
     "position": "rad",
     "velocity": "rad/s",
     "acceleration": "rad/s²",
     "jerk": "rad/s³",
+    "shaking": "rad/s",
     "torque": "N m",
 }
-SLOWED: dict[Quantity, int] = {"velocity": 1, "acceleration": 2, "jerk": 2}
-"""Power of the speed with which a quantity falls, or falls at least: the window over which a jerk is averaged holds
-less of a path that is run through more slowly."""
+SLOWED: dict[Quantity, int] = {"velocity": 1, "acceleration": 2, "jerk": 2, "shaking": 1}
+"""Power of the speed with which a quantity falls, or falls at least: the window of jerk and shaking holds less of a
+path that is run through more slowly."""
 
-SLOWEST_OFFERED = 0.01
+SLOWEST, FASTEST = 0.01, 10.0
+"""Path seconds per second that may be asked for."""
+LONGEST = 24 * 3600.0
+"""Motion [s]; beyond that its time is a mistake."""
 ROUNDING = 1e-9
 """A joint of a record that rests at its very limit may be off by rounding of this size; a tick is 1.5e-3 rad."""
 
@@ -52,7 +65,7 @@ class Margin:
 
     Attributes
     ----------
-    quantity : "position", "velocity", "acceleration", "jerk" or "torque"
+    quantity : "position", "velocity", "acceleration", "jerk", "shaking" or "torque"
     value, limit, margin : float
         SI; a negative margin is a violation.
     time : float
@@ -144,9 +157,10 @@ def check_motion(
     CheckRefused
         With every violated limit: joint, value, time and margin.
     """
-    if not (math.isfinite(speed) and speed > 0):
-        raise CheckRefused(f"--speed must be positive, not {speed}")
+    if not SLOWEST <= speed <= FASTEST:
+        raise CheckRefused(f"--speed must be from {SLOWEST:g} to {FASTEST:g}, not {speed:g}")
     plan = plan_cycle(servo_map, rate if rate is not None else servo_map.bus.rate)
+    _check_duration(record, speed)
     path = path_of_record(record, servo_map)
     margins = _motion_margins(path, servo_map, speed) + _torque_margins(record, servo_map)
     # What overflows to no number at all is no motion either.
@@ -157,13 +171,26 @@ def check_motion(
             slower = speed * min(
                 (entry.limit / abs(entry.value)) ** (1 / SLOWED[entry.quantity]) for entry in violations
             )
-            if slower >= SLOWEST_OFFERED:
+            if slower >= SLOWEST:
                 lines.append(f"  --speed {math.floor(100 * slower) / 100:g} would pass")
         raise CheckRefused("\n".join(lines))
     warnings = [] if record.complete else ["the record is marked incomplete: it ends before its scenario does"]
-    if missing := long_steps(record, LONG):
-        warnings.append(f"{len(missing)} sample(s) of the record may be missing: {missing[0]}")
+    if missing := long_steps(record, LONG, COMMON):
+        warnings.append(
+            f"{len(missing)} of {len(record) - 1} steps are long, samples of the record may be missing: {missing[0]}"
+        )
     return CheckedMotion(path, speed, plan, tuple(margins), tuple(warnings), record.scene)
+
+
+def _check_duration(record: Record, speed: float) -> None:
+    with np.errstate(over="ignore", invalid="ignore"):
+        duration = np.ptp(record.time) / speed if len(record) else 0.0
+    # Times that are no number at all are refused by their sample.
+    if LONGEST < duration < math.inf:
+        raise CheckRefused(
+            f"the motion would take {duration:.3g} s at --speed {speed:g}, more than {LONGEST / 3600:g} h. "
+            "Is the record's time in seconds? Cut the record, or replay it faster"
+        )
 
 
 def plan_cycle(servo_map: ServoMap, rate: float) -> CyclePlan:
@@ -201,8 +228,9 @@ def plan_cycle(servo_map: ServoMap, rate: float) -> CyclePlan:
 
 def _motion_margins(path: Path, servo_map: ServoMap, speed: float) -> list[Margin]:
     extremes = path.extremes()
-    # The window is one of the robot's time, of which `speed` seconds of the path pass in a second.
+    # The windows are of the robot's time, of which `speed` seconds of the path pass in a second.
     jerk, jerk_time = path.jerk(JERK_WINDOW * speed)
+    shaking, shaking_time = path.shaking(SHAKING_WINDOW * speed)
     with np.errstate(over="ignore"):
         velocity = speed * extremes.velocity
         acceleration = speed * (speed * extremes.acceleration)
@@ -222,6 +250,7 @@ def _motion_margins(path: Path, servo_map: ServoMap, speed: float) -> list[Margi
             ("velocity", velocity, extremes.velocity_time, velocity_limit(servo)),
             ("acceleration", acceleration, extremes.acceleration_time, limits.acceleration),
             ("jerk", jerk, jerk_time, limits.jerk),
+            ("shaking", speed * shaking, shaking_time, limits.shaking),
         ):
             of_joint, at = values[..., column].ravel(), times[..., column].ravel()
             worst = int(np.abs(of_joint).argmax())

@@ -70,15 +70,19 @@ class Display:
 
 
 @contextmanager
-def displayed(console: Console) -> Iterator[Display | None]:
-    """A display that draws itself within the block; None where the system gives no thread for it."""
+def displayed(console: Console, failures: dict[str, BaseException]) -> Iterator[Display | None]:
+    """A display that draws itself within the block; None where the system gives no thread for it.
+
+    Why it did not, or did so no more, joins ``failures`` at the end of the block.
+    """
     display = Display(console)
     try:
         background = Background([display], DRAWING_INTERVAL)
-    except RuntimeError:
+    except RuntimeError as error:
+        failures[display.name] = error
         yield None
         return
     try:
         yield display
     finally:
-        background.close(PATIENCE)
+        failures |= background.close(PATIENCE)

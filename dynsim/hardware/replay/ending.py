@@ -19,7 +19,7 @@ from dynsim.hardware.replay.journal import Journal
 from dynsim.hardware.replay.loop import FIELDS, Array, Loop
 from dynsim.hardware.replay.rules import Cause, Cycle, Fault
 from dynsim.hardware.replay.states import NOT_ARMED, UNARMED, ReplayResult, State
-from dynsim.hardware.servo_map import FaultPolicy
+from dynsim.hardware.safety import FaultPolicy
 
 REST_TIME = 1.0
 """Longest wait for the servos to stand still, and for silent ones to come back (a restart takes 0.3 s) [s]."""
@@ -74,8 +74,9 @@ class Ending:
         elif struck == State.DISARM:
             self._try(self.regular)
         elif struck == State.ARM:
-            # Nothing has moved yet: back to how the robot was found.
-            self._try(self._leave_holding if found_holding else self._release)
+            # Nothing has moved yet: back to how the robot was found, unless somebody else took its torque meanwhile.
+            taken = any(fault.cause == Cause.TORQUE_LOST for fault in self._result.faults)
+            self._try(self._leave_holding if found_holding and not taken else self._release)
         elif self._policy == "off" and not interrupted:
             self._try(self._release)
         else:
@@ -191,15 +192,15 @@ class Ending:
         if self._at_rest:
             speed = 0.0
         stop_time = loop.map.safety.stop_time
-        first = loop.tick
-        elapsed = 0.0
+        elapsed, goals = 0.0, 0
         while elapsed < stop_time and not loop.stop.for_release and not self._held:
             lateness, skipped = loop.wait_for_deadline()
             stall = loop.stall()
             if stall:
                 self._declare(stall)
                 return self._hold()
-            elapsed = min(stop_time, (loop.tick - first) * loop.period)
+            goals += 1
+            elapsed = min(stop_time, goals * loop.period)
             loop.following_time = min(end, start + speed * (elapsed - elapsed**2 / (2 * stop_time)))
             position, rate = loop.following.at(loop.following_time)
             velocity = rate * speed * (1 - elapsed / stop_time)

@@ -1,6 +1,6 @@
 """The cycle of a replay: at every deadline all goals are written and all states read, recorded and examined.
 
-Cycles start at absolute deadlines; one that is more than a period late is skipped, never made up for.
+Cycles start at absolute deadlines; one that is more than a period late is skipped, never made up for: the path waits.
 """
 
 from __future__ import annotations
@@ -83,7 +83,6 @@ class Loop:
         self._health_every = motion.plan.health_every
         self._cycles = 0
         self._sent: dict[int, int] = {}
-        self._sent_at = math.nan
         self._heard_at = math.inf
 
     def take_over(self, index: int, register: int, angle: float) -> None:
@@ -93,7 +92,7 @@ class Loop:
 
     def all_taken_over(self) -> None:
         """All are armed; from now on silence makes their watchdogs trip."""
-        self._sent_at = self._heard_at = self._clock.now()
+        self._heard_at = self._clock.now()
 
     def stall(self) -> Fault | None:
         """The fault of having been silent for longer than the servos' watchdogs allow, until now."""
@@ -125,16 +124,21 @@ class Loop:
         return self._clock.now() - self.deadline_of(self.tick) + skipped * self.period, skipped
 
     def follow(self, motion: Motion, start: float, end: float, *, speed: float) -> None:
-        """Run along a motion from its time ``start`` to ``end`` [s], ``speed`` of it per second."""
-        first = self.tick + 1
+        """Run along a motion from its time ``start`` to ``end`` [s], ``speed`` of it per second.
+
+        From goal to goal one period of it passes, also where cycles in between were skipped: made up for at once they
+        would be one great step.
+        """
+        goals = 0
         self.following, self.following_end, self.following_speed = motion, end, speed
         self.following_time = start
         while self.following_time < end:
             lateness, skipped = self.wait_for_deadline()
-            # Scheduled, not actual time: jitter of the loop must not enter the goals.
-            self.following_time = min(end, start + speed * self.period * (self.tick - first + 1))
-            position, rate = motion.at(self.following_time)
             self.stop.check()
+            goals += 1
+            # Scheduled, not actual time: jitter of the loop must not enter the goals.
+            self.following_time = min(end, start + speed * self.period * goals)
+            position, rate = motion.at(self.following_time)
             self._cycle(position, speed * rate, lateness, skipped)
 
     def stay(self, position: Array) -> Cycle:
@@ -223,14 +227,12 @@ class Loop:
 
     def _send(self, position: Array, velocity: Array) -> None:
         """The only place goals of a motion leave through. Refuses what no checked motion can ask for."""
-        now = self._clock.now()
-        elapsed = max(now - self._sent_at, 0.0) + self.period
         goals: dict[str, dict[int, int]] = {"goal_position": {}, "goal_velocity": {}}
         for index, servo in enumerate(self.map.servos):
             ticks, units = servo.to_ticks(float(position[index])), servo.to_velocity_units(float(velocity[index]))
             if servo.in_position_mode:
                 low, high = servo.tick_limits
-                step = velocity_limit(servo) * servo.gear * elapsed / RAD_PER_TICK + 2
+                step = velocity_limit(servo) * servo.gear * 2 * self.period / RAD_PER_TICK + 2
                 if not low <= ticks <= high or abs(ticks - self._sent[servo.id]) > step:
                     raise Stopped(Fault(Cause.GOAL_GUARD, f"{servo.joint}: goal {ticks} was not sent", (servo.id,)))
                 goals["goal_position"][servo.id] = ticks
@@ -250,4 +252,3 @@ class Loop:
             if self._journal.state == State.FAULT:
                 now = self._clock.now()
                 self.policy_goals += [(now, id_, value) for id_, value in values.items()]
-        self._sent_at = self._clock.now()

@@ -8,7 +8,7 @@ policy says.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import Any
@@ -21,7 +21,7 @@ from dynsim.hardware.bus.control_table import RAD_S2_PER_UNIT, RAD_S_PER_UNIT, W
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused
 from dynsim.hardware.errors import PortError
 from dynsim.hardware.replay.check import CheckedMotion, velocity_limit
-from dynsim.hardware.replay.end_state import AT_REST
+from dynsim.hardware.replay.end_state import AT_REST, read_health
 from dynsim.hardware.replay.ending import Ending
 from dynsim.hardware.replay.folder import REGISTERS, REGISTERS_AFTER_FAULT
 from dynsim.hardware.replay.journal import Journal
@@ -35,7 +35,8 @@ from dynsim.hardware.replay.run_log import Recorder, RunLog
 from dynsim.hardware.replay.states import UNARMED, Progress, ReplayResult, State, Stopped, StopRequest
 from dynsim.hardware.replay.trajectory import Path
 from dynsim.hardware.replay.verify import Registers, all_registers, configure, verify
-from dynsim.hardware.servo_map import FaultPolicy, Servo, ServoMap
+from dynsim.hardware.safety import FaultPolicy
+from dynsim.hardware.servo_map import Servo, ServoMap
 
 APPROACH_ACCELERATION = 10.0
 """Profile acceleration the firmware is given for the move to the start [rad/s²]."""
@@ -170,7 +171,8 @@ class Replay:
 
     def _arm(self) -> None:
         self.journal.enter(State.ARM)
-        self._found_holding = any(self.bus.read(servo.id, FIELDS["torque_enable"]) for servo in self._servos)
+        on = {servo.id for servo in self._servos if self.bus.read(servo.id, FIELDS["torque_enable"])}
+        self._found_holding = bool(on)
         for index, servo in enumerate(self._servos):
             self.stop.check()
             # A watchdog that tripped in an earlier run keeps goals read-only until it is cleared.
@@ -182,15 +184,31 @@ class Replay:
             self.bus.write(servo.id, FIELDS[name], goal)
             if self.bus.read(servo.id, FIELDS[name]) != goal:
                 raise Stopped(Fault(Cause.ARMING, f"{servo.joint} (ID {servo.id}) did not take its goal", (servo.id,)))
+            if servo.id in on:
+                self._check_still_on([servo])
             self.bus.write(servo.id, FIELDS["torque_enable"], 1)
             if not self.bus.read(servo.id, FIELDS["torque_enable"]):
                 raise Stopped(Fault(Cause.ARMING, f"{servo.joint} (ID {servo.id}): torque stays off", (servo.id,)))
             self.loop.take_over(index, goal, servo.to_angle(present))
+        # Who stopped the robot meanwhile has not reached the servos that were armed after that.
+        self._check_still_on(self._servos)
         units = watchdog_units(self.map.safety)
         self.loop.all_taken_over()
         for servo in self._servos:
             self.bus.write(servo.id, FIELDS["bus_watchdog"], units)
         self.journal.say(f"torque on, bus watchdogs at {units * WATCHDOG_SECONDS_PER_UNIT * 1e3:.0f} ms")
+
+    def _check_still_on(self, servos: Sequence[Servo]) -> None:
+        """Raises Stopped where one has lost its torque, NoAnswer where one is silent."""
+        health = read_health(self.bus, servos)
+        for servo in servos:
+            if servo.id not in health:
+                raise NoAnswer(servo.id, garbled=False)
+        lost = [servo for servo in servos if not health[servo.id]["torque_enable"]]
+        if lost:
+            names = ", ".join(f"{servo.joint} (ID {servo.id})" for servo in lost)
+            text = f"{names}: torque is off again (switched off by another program, or restarted)"
+            raise Stopped(Fault(Cause.TORQUE_LOST, text, tuple(servo.id for servo in lost)))
 
     def _move_to_start(self) -> None:
         here = self.loop.goal.copy()
@@ -303,7 +321,7 @@ class Replay:
     def _sum_up(self) -> None:
         """Record and timing of the run."""
         result, rows = self.result, self.recorder.rows.all()
-        result.timing = timing_of(rows)
+        result.timing = timing_of(rows, self.layout)
         started = self.loop.path_started if self.loop.path_started is not None else self.loop.origin
         record = describe(measured_record(rows, self.layout, started), self.motion.scene, State)
         record.complete = result.fault is None

@@ -25,13 +25,15 @@ END_STATE = "not known: the program died"
 def recover(folder: Path) -> Record:
     """Make ``measured.h5`` and ``summary.json`` of a ``measured.part`` that was left over, and remove that.
 
-    The record is marked incomplete. A measured record that is already there is of the same replay (what an earlier one
-    left is moved away before), and whole: it stays.
+    The record is marked incomplete. A summary that is there is of the same replay, which ended, and could not write its
+    record: what it says of the end is kept. A measured record that is already there is of the same replay too (what an
+    earlier one left is moved away before), and whole: it stays.
 
     Raises
     ------
     RecordError
-        There is no streamed record, its replay is still running, or it cannot be read; or the record cannot be written.
+        There is no streamed record, it is empty or cannot be read, or its replay is still running; or the record cannot
+        be written.
     """
     part = folder / PART
     try:
@@ -42,6 +44,7 @@ def recover(folder: Path) -> Record:
         record = _kept(folder / MEASURED)
         if record is None:
             record = _read(part)
+            record.summary |= {"end_state": END_STATE} | _summary(folder / SUMMARY) | {"recovered": True}
             summary = json_text(record.summary).encode("utf-8")
             replace_together(folder, {MEASURED: record.to_hdf5(), SUMMARY: summary})
         part.unlink()
@@ -57,8 +60,19 @@ def _kept(measured: Path) -> Record | None:
     return None
 
 
+def _summary(path: Path) -> dict[str, Any]:
+    """What a replay that came to its end has said of it; empty where there is nothing, or nothing whole."""
+    with suppress(FileNotFoundError, ValueError):
+        found = json.loads(path.read_bytes())
+        return found if isinstance(found, dict) else {}
+    return {}
+
+
 def _read(part: Path) -> Record:
-    line, _, data = part.read_bytes().partition(b"\n")
+    content = part.read_bytes()
+    if not content:
+        raise RecordError(f"{part}: is empty, the replay died before its first cycle: nothing to recover, remove it")
+    line, _, data = content.partition(b"\n")
     try:
         header: dict[str, Any] = json.loads(line)
         layout = Layout(**header["layout"])
@@ -74,7 +88,6 @@ def _read(part: Path) -> Record:
     origin = origins[0] if len(origins) else rows["time"][0] if len(rows) else 0.0
     record = describe(measured_record(rows, layout, float(origin)), scene, State)
     record.complete = False
-    record.summary |= {"end_state": END_STATE, "recovered": True}
     return record
 
 

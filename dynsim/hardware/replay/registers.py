@@ -13,7 +13,8 @@ import numpy as np
 
 from dynsim.hardware.bus.control_table import HARDWARE_ERRORS, RAD_S_PER_UNIT, VOLT_PER_UNIT
 from dynsim.hardware.replay.check import CheckedMotion
-from dynsim.hardware.servo_map import Safety, Servo
+from dynsim.hardware.safety import Safety
+from dynsim.hardware.servo_map import Servo
 
 QUANTITIES = ("position °", "velocity rad/s", "torque N m", "temperature °C", "supply V")
 NOT_LIMITED = "-"

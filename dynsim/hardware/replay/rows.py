@@ -70,6 +70,8 @@ class TimingStatistics:
     cycles, skipped_cycles, missed_statuses, stray_bytes : int
     period_mean, period_max, lateness_p50, lateness_p99, lateness_max, exchange_mean, exchange_max : float
         Time between cycle starts, start after the deadline, writing all goals and reading all states [s].
+    path_late : float
+        By how much the path ended later than planned, for the cycles that were skipped on it [s].
     """
 
     cycles: int
@@ -81,6 +83,7 @@ class TimingStatistics:
     lateness_p50: float
     lateness_p99: float
     lateness_max: float
+    path_late: float
     exchange_mean: float
     exchange_max: float
 
@@ -90,10 +93,13 @@ class TimingStatistics:
         return {name: value for name, value in vars(self).items() if isinstance(value, int)} | seconds
 
 
-def timing_of(rows: Rows) -> TimingStatistics | None:
+def timing_of(rows: Rows, layout: Layout) -> TimingStatistics | None:
     """None before the second cycle."""
     if len(rows) < 2:
         return None
+    path_time = rows["path_time"]
+    # Cycles in which the path went on; of the first there is no time before.
+    followed = np.isfinite(path_time) & (np.diff(path_time, prepend=np.nan) != 0)
     periods, lateness, exchange = np.diff(rows["time"]), rows["lateness"], rows["exchange"]
     return TimingStatistics(
         cycles=len(rows),
@@ -105,6 +111,7 @@ def timing_of(rows: Rows) -> TimingStatistics | None:
         lateness_p50=float(np.percentile(lateness, 50)),
         lateness_p99=float(np.percentile(lateness, 99)),
         lateness_max=float(lateness.max()),
+        path_late=float(rows["skipped"][followed].sum() / layout.provenance["rate_Hz"]),
         exchange_mean=float(exchange.mean()),
         exchange_max=float(exchange.max()),
     )
@@ -169,6 +176,6 @@ def measured_record(rows: Rows, layout: Layout, origin: float) -> Record:
     record.add("alert", rows["alert"], "1", labels=joints, description="alert bit of the status")
     record.add("lateness", rows["lateness"], "s", description="cycle start after its deadline")
     record.add("exchange", rows["exchange"], "s", description="duration of the cycle's bus traffic")
-    timing = timing_of(rows)
+    timing = timing_of(rows, layout)
     record.summary["timing"] = timing.as_dict() if timing else {}
     return record

@@ -20,7 +20,8 @@ from dynsim.hardware.bus.control_table import (
     describe_hardware_error,
 )
 from dynsim.hardware.replay.check import CyclePlan
-from dynsim.hardware.servo_map import Safety, Servo, ServoMap
+from dynsim.hardware.safety import Safety
+from dynsim.hardware.servo_map import Servo, ServoMap
 
 
 class Cause(StrEnum):

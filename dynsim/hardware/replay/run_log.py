@@ -60,6 +60,10 @@ class RunLog:
         if self._file:
             self._file.close()
 
+    def discard(self) -> None:
+        if self._file:
+            self._file.discard()
+
 
 class Recorder:
     """Collects the timed cycles of a replay.

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+import errno
+import json
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from dynsim.errors import DynsimError
 from dynsim.files import json_text, replace_together, write_json
 from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.bus.protocol import Bus
@@ -18,7 +22,8 @@ from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.run_log import RunLog
 from dynsim.hardware.replay.states import Progress, ReplayResult, StopRequest
 from dynsim.hardware.replay.stream import INTERVAL, PART, Background, RowStream
-from dynsim.hardware.servo_map import FaultPolicy, ServoMap
+from dynsim.hardware.safety import FaultPolicy
+from dynsim.hardware.servo_map import ServoMap
 
 Failures = dict[str, BaseException]
 
@@ -93,6 +98,52 @@ def run_replay(
     return result
 
 
+@contextmanager
+def shown_by(outputs: Mapping[str, Any], folder: Path) -> Iterator[Failures]:
+    """Within the block a replay is shown; what failed of that is told like the files that could not be written.
+
+    It joins ``outputs_failed`` in the summary, which was written before. The block leaves failures in the dictionary
+    that it is given; those of ``outputs``, streams by name that keep their ``failure``, join them.
+
+    Raises
+    ------
+    OutputsFailed
+        Where nothing else was raised in the block; else it is a warning.
+    """
+    failures: Failures = {}
+    try:
+        yield failures
+    except DynsimError as error:
+        _flush(outputs, failures)
+        if failures:
+            warnings.warn(_lost(failures), stacklevel=3)
+            # With other errors the summary may be that of an earlier replay.
+            if isinstance(error, ReplayAborted | OutputsFailed):
+                _add_to_summary(folder, failures)
+        raise
+    _flush(outputs, failures)
+    if failures:
+        _add_to_summary(folder, failures)
+        raise OutputsFailed(f"the replay went well; {_lost(failures)}; see {folder / LOG}")
+
+
+def _flush(outputs: Mapping[str, Any], failures: Failures) -> None:
+    for name, stream in outputs.items():
+        if stream is not None:
+            stream.flush()
+        failure = getattr(stream, "failure", None)
+        # A reader that wants no more (``| head``) is no failure.
+        if failure is not None and failure.errno != errno.EPIPE:
+            failures[name] = failure
+
+
+def _add_to_summary(folder: Path, failures: Failures) -> None:
+    # Where it cannot be added it is still told on standard error.
+    with suppress(OSError, ValueError, DynsimError):
+        summary = json.loads((folder / SUMMARY).read_bytes())
+        write_json(folder / SUMMARY, summary | {"outputs_failed": summary["outputs_failed"] | _named(failures)})
+
+
 def _open_log(folder: Path) -> tuple[RunLog, Path | None]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -104,11 +155,15 @@ def _open_log(folder: Path) -> tuple[RunLog, Path | None]:
 
 
 def _stream(replay: Replay, log: RunLog, folder: Path) -> Background:
+    stream = None
     try:
         stream = RowStream(folder / PART, replay.recorder.rows, replay.layout, replay.motion.scene)
         background = Background([log, stream], INTERVAL)
     except (OSError, RuntimeError) as error:
-        log.close()
+        # What holds nothing would pass for a replay that died.
+        for outlet in (log, stream):
+            if outlet is not None:
+                outlet.discard()
         raise PortError(f"{folder}: cannot be written ({error}); nothing was moved") from error
     log.wake = background.wake
     return background
@@ -139,6 +194,10 @@ def _named(failures: Failures) -> dict[str, str]:
     return {name: str(error) or type(error).__name__ for name, error in failures.items()}
 
 
+def _lost(failures: Failures) -> str:
+    return "; ".join(f"{name} failed: {text}" for name, text in _named(failures).items())
+
+
 def raise_for(result: ReplayResult, folder: Path, failures: Failures) -> None:
     """Turn a fault, or else a failure of outputs, into the exception that carries its exit code.
 
@@ -146,7 +205,7 @@ def raise_for(result: ReplayResult, folder: Path, failures: Failures) -> None:
     ------
     VerificationFailed, PortError, ReplayInterrupted, ReplayAborted, OutputsFailed
     """
-    lost = "; ".join(f"{name} failed: {text}" for name, text in _named(failures).items())
+    lost = _lost(failures)
     if (folder / PART).exists():
         lost += f"; `dynsim hw recover {folder}` makes a record of what reached the disk"
     fault, state = result.fault, result.fault_state

@@ -16,7 +16,11 @@ def _there(*names: str) -> list[signal.Signals]:
 
 # Of these only the first counts. When a terminal is closed both the system and the shell send SIGHUP, and `timeout`
 # sends SIGTERM to the process and to its group: nobody has asked twice, and a robot that is let go falls.
-_ONCE = _there("SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP")
+# The others would end the process, and leave a moving robot to its watchdogs.
+_ONCE = _there(
+    "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGVTALRM", "SIGPROF", "SIGXCPU",
+    "SIGIO", "SIGPWR", "SIGSTKFLT",
+)  # fmt: skip
 # Of a terminal that the process may not write to or that is gone, and of a disk quota: the write fails, nothing else.
 _PASSED_OVER = _there("SIGTTOU", "SIGTTIN", "SIGPIPE", "SIGXFSZ")
 
@@ -25,8 +29,9 @@ _PASSED_OVER = _there("SIGTTOU", "SIGTTIN", "SIGPIPE", "SIGXFSZ")
 def stop_on_signals(stop: StopRequest) -> Iterator[None]:
     """Signals only count up ``stop``: an exception out of a handler would tear a bus transaction in two.
 
-    Ctrl-C counts every time; SIGTERM, SIGHUP, SIGQUIT (Ctrl-\\) and SIGTSTP (Ctrl-Z, which would leave a moving robot
-    without goals) ask for the controlled stop only. A SIGHUP that is ignored (``nohup``) stays so.
+    Ctrl-C counts every time; SIGTERM, SIGHUP, SIGQUIT (Ctrl-\\), SIGTSTP (Ctrl-Z, which would leave a moving robot
+    without goals) and all others by which a process ends ask for the controlled stop only. A SIGHUP
+    that is ignored (``nohup``) stays so.
     """
 
     def ask_once(*_: Any) -> None:

@@ -9,6 +9,7 @@ import json
 import os
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -28,6 +29,10 @@ PART_FORMAT = 1
 class GrowingFile:
     """A file that can be read while it grows; nobody else's, and held (:func:`dynsim.files.lock`) until it is closed.
 
+    Attributes
+    ----------
+    path : Path
+
     Raises
     ------
     OSError
@@ -36,11 +41,12 @@ class GrowingFile:
 
     def __init__(self, path: Path) -> None:
         # Not buffered: what a buffer still holds would be tried again, and fail again, when it is closed.
+        self.path = path
         self._stream = path.open("xb", buffering=0)
         try:
             lock(self._stream.fileno(), wait=False)
         except OSError:
-            self._stream.close()
+            self.discard()
             raise
 
     def append(self, data: bytes) -> None:
@@ -56,6 +62,13 @@ class GrowingFile:
     def close(self) -> None:
         """Raises OSError."""
         self._stream.close()
+
+    def discard(self) -> None:
+        """Close and remove it: the run that it was made for does not begin."""
+        with suppress(OSError):
+            self._stream.close()
+        with suppress(OSError):
+            self.path.unlink()
 
 
 class RowStream:
@@ -91,8 +104,11 @@ class RowStream:
         try:
             self._file.append(json.dumps(header, default=str).encode("utf-8") + b"\n")
         except BaseException:
-            self._file.close()
+            self._file.discard()
             raise
+
+    def discard(self) -> None:
+        self._file.discard()
 
     def pump(self) -> None:
         rows = self._rows.since(self._written)

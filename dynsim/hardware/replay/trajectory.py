@@ -21,10 +21,14 @@ from dynsim.record import TIME, Record
 REST = 1e-6
 """Joint speed [rad/s] below which a record counts as at rest."""
 HOLE, LONG = 2.5, 1.5
-"""Steps of so many times the median step: a motion that is not known in between; one sample missing."""
+"""Steps of so many times the median step: a motion that is not known in between. Of so many times the step that a tenth
+of all steps does not exceed: samples missing. The median itself is a long one where every third sample is missing."""
+COMMON = 0.1
 JERK_WINDOW = 0.1
 """Over which the change of acceleration is averaged [s]: twice the lag of these servos (43.5 ms). A single jump in the
 velocity of a record is a knock, and bounded by the acceleration; jumps one after the other wear the gears."""
+SHAKING_WINDOW = 0.3
+"""In which velocity that is gained and lost again counts as shaking [s]."""
 
 
 @dataclass(frozen=True)
@@ -123,23 +127,68 @@ class Path:
         time : array, shape (N,)
             Where the window of that value ends [s].
         """
-        h = np.diff(self.time)[:, None]
-        m0, m1, rise = h * self.rate_after, h * self.rate_before, np.diff(self.position, axis=0)
         with np.errstate(over="ignore", invalid="ignore"):
-            first, last = (6 * rise - 4 * m0 - 2 * m1) / h / h, (-6 * rise + 2 * m0 + 4 * m1) / h / h
+            first, last = self._accelerations()
             at_knots = np.concatenate([first[:1], 0.5 * (last[:-1] + first[1:]) + self._steps()[1:], last[-1:]])
             variation = np.cumsum(np.abs(np.diff(at_knots, axis=0)), axis=0)
         variation = np.concatenate([np.zeros_like(first[:1]), variation])
         jerk, where = np.empty(self.position.shape[1]), np.empty(self.position.shape[1])
-        # The variation within a window is straight between those that begin or end at a knot.
-        ends = np.concatenate([self.time, self.time + window])
         for joint in range(len(jerk)):
-            v = variation[:, joint]
-            with np.errstate(over="ignore", invalid="ignore"):
-                within = np.interp(ends, self.time, v) - np.interp(ends - window, self.time, v)
+            ends, within = self._within(variation[:, joint], window)
             worst = int(within.argmax())
             jerk[joint], where[joint] = within[worst] / window, min(ends[worst], self.end)
         return jerk, where
+
+    def shaking(self, window: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Velocity that is gained and lost again, or lost and gained again, within ``window`` [s] of path time.
+
+        min(P, N), in which P = ∫ max(q'', 0) dt and N = ∫ max(−q'', 0) dt over the window, steps in rate included. It
+        does not depend on a velocity the joint has besides. A zigzag of d every h has d · window/h² where the window
+        holds many teeth, a spike of d within 2h (out in h, back in h) 2d/h with held rates; a move that goes one way
+        gains and loses its top speed once, which counts where it takes no longer than the window.
+
+        Returns
+        -------
+        shaking : array, shape (N,)
+            Largest of each joint [rad/s].
+        time : array, shape (N,)
+            Where the window of that value ends [s].
+        """
+        h = np.diff(self.time)[:, None]
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            first, last = self._accelerations()
+            # q'' is straight in an interval: where it changes sign the rate turns on the way.
+            turning = self.rate_after + 0.5 * h * first * (first / (first - last))
+            turning = np.where(first * last < 0, turning, self.rate_before)
+            changes = np.stack([turning - self.rate_after, self.rate_before - turning])
+            changes = np.concatenate([changes, np.zeros_like(changes[:1])])
+            changes[2, :-1] = self.rate_after[1:] - self.rate_before[:-1]
+            gained, lost = (
+                np.concatenate([np.zeros_like(first[:1]), np.cumsum(np.maximum(part, 0.0).sum(axis=0), axis=0)])
+                for part in (changes, -changes)
+            )
+        shaking, where = np.empty(self.position.shape[1]), np.empty(self.position.shape[1])
+        for joint in range(len(shaking)):
+            ends, up = self._within(gained[:, joint], window)
+            both = np.minimum(up, self._within(lost[:, joint], window)[1])
+            worst = int(both.argmax())
+            shaking[joint], where[joint] = both[worst], min(ends[worst], self.end)
+        return shaking, where
+
+    def _accelerations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Acceleration of the interpolant at the beginning and the end of every interval [rad/s²], shape (T-1, N)."""
+        h = np.diff(self.time)[:, None]
+        m0, m1, rise = h * self.rate_after, h * self.rate_before, np.diff(self.position, axis=0)
+        return (6 * rise - 4 * m0 - 2 * m1) / h / h, (-6 * rise + 2 * m0 + 4 * m1) / h / h
+
+    def _within(self, total: NDArray[np.float64], window: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What ``total``, a running sum at the knots, grows by within windows: their ends [s], and the growth.
+
+        The growth is straight between windows that begin or end at a knot.
+        """
+        ends = np.concatenate([self.time, self.time + window])
+        with np.errstate(over="ignore", invalid="ignore"):
+            return ends, np.interp(ends, self.time, total) - np.interp(ends - window, self.time, total)
 
 
 @dataclass(frozen=True)
@@ -201,21 +250,24 @@ def _check_time(record: Record) -> None:
     if not later.all():
         bad = int(np.flatnonzero(~later)[0]) + 1
         raise CheckRefused(f"the record's time does not increase at sample {bad} (t = {record.time[bad]:g} s)")
-    if holes := long_steps(record, HOLE):
+    if holes := long_steps(record, HOLE, 0.5):
         raise CheckRefused(
             f"the record has {len(holes)} hole(s): {holes[0]}; what the robot did there is not known. "
             "Simulate with an even step, or cut the record"
         )
 
 
-def long_steps(record: Record, factor: float) -> list[str]:
-    """Steps of the record's time longer than ``factor`` times their median, each in words."""
+def long_steps(record: Record, factor: float, share: float) -> list[str]:
+    """Steps of the record's time longer than ``factor`` times the usual one, each in words.
+
+    The usual step is the one that ``share`` of all steps do not exceed: 0.5 for their median.
+    """
     steps = np.diff(record.time)
-    median = float(np.median(steps))
+    usual = float(np.quantile(steps, share, method="lower"))
     return [
-        f"no sample between t = {record.time[k]:g} and {record.time[k + 1]:g} s, {steps[k] / median:.3g} of the usual "
-        f"steps of {median * 1e3:g} ms"
-        for k in np.flatnonzero(steps > factor * median)
+        f"no sample between t = {record.time[k]:g} and {record.time[k + 1]:g} s, {steps[k] / usual:.3g} of the usual "
+        f"steps of {usual * 1e3:g} ms"
+        for k in np.flatnonzero(steps > factor * usual)
     ]
 
 

@@ -46,7 +46,7 @@ class PseudoTerminal:
         Raises
         ------
         PortError
-            The link exists as something else, or cannot be made.
+            The link exists as something else, leads to a device that is there, or cannot be made.
         """
         self.line = line
         self._master, self._slave = os.openpty()
@@ -58,11 +58,20 @@ class PseudoTerminal:
         if link is not None:
             try:
                 if link.is_symlink():
+                    self._refuse_device_in_use(link)
                     link.unlink()
                 link.symlink_to(self.device)
             except OSError as error:
                 self.close()
                 raise PortError(f"{link}: cannot be made a link to {self.device} ({error.strerror})") from error
+
+    def _refuse_device_in_use(self, link: Path) -> None:
+        """What a process that was killed has left leads nowhere, or by chance to the own device."""
+        if link.exists() and os.readlink(link) != self.device:
+            there = os.readlink(link)
+            self._link = None
+            self.close()
+            raise PortError(f"{link}: leads to {there}, which is in use (other virtual servos?); give another link")
 
     def serve(self, keep_on: Callable[[], bool]) -> None:
         """Answer until ``keep_on`` says no, or the scripted adapter is pulled out."""
@@ -105,8 +114,8 @@ class PseudoTerminal:
             os.write(self._master, data)
 
     def close(self) -> None:
-        """Hang up and remove the link."""
-        if self._link is not None and self._link.is_symlink():
+        """Hang up and remove the link, where it is still the own one."""
+        if self._link is not None and self._link.is_symlink() and os.readlink(self._link) == self.device:
             self._link.unlink()
         for descriptor in (self._master, self._slave):
             with contextlib.suppress(OSError):

@@ -285,8 +285,8 @@ def nearest_to_box(shapes: ShapeArrays, k, x, y, z, dx, dy, dz):
                 high = u
             bend = dx * (hxx * dx + 2.0 * (hxy * dy + hxz * dz)) + dy * (hyy * dy + 2.0 * hyz * dz) + dz * hzz * dz
             trial = u - slope / bend if bend > 0.0 else low
-            # Newton's step in the limit of rounding moves nothing.
-            if trial == u:
+            # Newton's step in the limit of rounding moves nothing; along a flat face there is none.
+            if bend > 0.0 and trial == u:
                 return u
             u = trial if low < trial < high else 0.5 * (low + high)
             if high - low <= 1e-15:

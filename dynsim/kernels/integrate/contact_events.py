@@ -22,6 +22,7 @@ from dynsim.kernels.arrays import (
     NORMAL,
     NORMAL_FORCE,
     OPEN,
+    POSITION,
     SLIDING,
     SLIP_VELOCITY,
     STICKING,
@@ -137,7 +138,8 @@ def too_long(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
     """The fraction of a step to take instead, where it has passed over something; else 1.
 
     An open candidate may dip below its surface and be out again at the end: the minimum of the cubic through gaps and
-    their rates at both ends, ``gaps``, (c, 2), at the start. Or a frozen direction of slip has stood for too long.
+    their rates at both ends, ``gaps``, (c, GAPS_SIZE), at the start. It may have gone through a body: out at its other
+    side, and as far as both gaps together. Or a frozen direction of slip has stood for too long.
     """
     found = 1.0
     if unilateral is None:  # known to the compiler
@@ -148,6 +150,8 @@ def too_long(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
             speed = slip_speed(ws, k)
             if speed > 2.0 * slow:
                 found = min(found, max(1.5 * slow / speed, 0.01))
+        if passes_through(ws, gaps, k):
+            found = min(found, 0.5)
         if ws.active[k, MODE] != OPEN or gaps[k, 1] >= 0.0 or ws.contacts[k, GAP_RATE] <= 0.0:
             continue
         g0, g1, d0, d1 = gaps[k, 0], ws.contacts[k, GAP], h * gaps[k, 1], h * ws.contacts[k, GAP_RATE]
@@ -163,10 +167,31 @@ def too_long(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
 
 
 @internal_kernel
+def passes_through(ws: Workspace, gaps, k):
+    """True when open candidate k may have gone through a body within the step.
+
+    A distance changes by no more than what the point has gone, so that has to be both gaps at least; a way that bends
+    by half a turn is π/2 as long as it looks.
+    """
+    state = ws.contacts[k]
+    g0, g1 = gaps[k, 0], state[GAP]
+    if ws.active[k, MODE] != OPEN or g0 <= 0.0 or g1 <= 0.0:
+        return False
+    turned, square = 0.0, 0.0
+    for s in range(3):
+        turned += gaps[k, 2 + s] * state[NORMAL + s]
+        way = state[POSITION + s] - gaps[k, 5 + s]
+        square += way * way
+    return turned < 0.0 and 2.5 * square >= (g0 + g1) * (g0 + g1)
+
+
+@internal_kernel
 def note_gaps(ws: Workspace, gaps):
-    """Gaps and their rates at the start of a step, for :func:`too_long`."""
+    """Gaps, their rates, normals and places at the start of a step, for :func:`too_long`."""
     for k in range(gaps.shape[0]):
         gaps[k, 0], gaps[k, 1] = ws.contacts[k, GAP], ws.contacts[k, GAP_RATE]
+        for s in range(3):
+            gaps[k, 2 + s], gaps[k, 5 + s] = ws.contacts[k, NORMAL + s], ws.contacts[k, POSITION + s]
 
 
 @internal_kernel
@@ -337,6 +362,8 @@ def log_changes(system: System, ws: Workspace, run: Run):
             if now != OPEN:
                 tell(system, run, k, LANDING)
             elif unilateral.mode[k, STRUCK] == 1:
+                # It flies off from where it has landed, below its surface: there it is not to land again at once.
+                unilateral.slide[k, LANDS_AT] = AT_ROOT + max(0.0, -ws.contacts[k, GAP])
                 tell(system, run, k, BOUNCE)
         elif now == OPEN:
             tell(system, run, k, LIFT_OFF)

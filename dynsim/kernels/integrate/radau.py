@@ -97,6 +97,7 @@ def factor_newton(system: System, r: NewtonArrays, g, matrix, pivot):
     """The reduced matrix for g, real or complex, LU-factored with partial pivoting."""
     along, block, table = r.along, r.linear, system.drives.table
     n = matrix.shape[0]
+    first = 2 * n  # of the rows of circuits
     for i in range(n):
         for j in range(n):
             matrix[i, j] = -along[n + j, i] - along[j, i] / g
@@ -106,7 +107,7 @@ def factor_newton(system: System, r: NewtonArrays, g, matrix, pivot):
         if k >= 0:
             slope = (block[a, RATE_Q] / g + block[a, RATE_V]) / (g - block[a, RATE_I])
             for i in range(n):
-                matrix[i, j] -= along[2 * n + k, i] * slope
+                matrix[i, j] -= along[first + k, i] * slope
     for k in range(n):
         best, largest = k, 0.0
         for i in range(k, n):
@@ -129,7 +130,7 @@ def solve_newton(system: System, ws: Workspace, y, r: NewtonArrays, g, matrix, p
     """x ← (g I − J)⁻¹ x by the factors of :func:`factor_newton`, x (s,) and room (2, s) real or complex."""
     along, block, table, layout = r.along, r.linear, system.drives.table, system.layout
     n, q, v, current = matrix.shape[0], system.layout.q, system.layout.v, system.layout.current
-    u, angle = room[0], room[1]
+    u, angle, first = room[0], room[1], 2 * n
     if layout.extra > 0:
         rates_across(system.model.compound, system.model, y, q, x, angle)
     for i in range(n):
@@ -143,7 +144,7 @@ def solve_newton(system: System, ws: Workspace, y, r: NewtonArrays, g, matrix, p
         if k >= 0:
             free = (x[current + k] + block[a, RATE_Q] * angle[j]) / (g - block[a, RATE_I])
             for i in range(n):
-                u[i] += along[2 * n + k, i] * free
+                u[i] += along[first + k, i] * free
     for i in range(n):
         p = pivot[i]
         u[i], u[p] = u[p], u[i]

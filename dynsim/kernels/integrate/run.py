@@ -55,6 +55,7 @@ TICK_KIND, TICK_COUNT = 0, 1
 TICK_TABLE_SIZE = 2
 TAKE_COMMANDS, CALLER = 1, 2
 LOG_LENGTH = 1024
+GAPS_SIZE = 8
 # Entries of Run.log_event from these numbers on are of contacts and of joint stops, see contact_events.
 CONTACT_LOG, STOP_LOG = 1 << 20, 1 << 40
 # Run.extremes, per contact
@@ -89,7 +90,7 @@ class Run(NamedTuple):
     log_time: np.ndarray  # (LOG_LENGTH,) of events [s]
     log_event: np.ndarray  # (LOG_LENGTH,) int: which
     hand: np.ndarray  # (3,) room
-    gaps: np.ndarray  # (c, 2) gaps and their rates at the start of the step
+    gaps: np.ndarray  # (c, GAPS_SIZE) gaps, their rates, normals and places at the start of the step
     support: SupportArrays | None
     columns: OutputLayout
     output: np.ndarray  # (T, columns.size)
@@ -173,7 +174,7 @@ def new_run(
         log_time=np.zeros(LOG_LENGTH),
         log_event=np.zeros(LOG_LENGTH, dtype=np.int64),
         hand=np.zeros(3),
-        gaps=np.zeros((c, 2)),
+        gaps=np.zeros((c, GAPS_SIZE)),
         support=support,
         columns=columns,
         output=np.zeros((len(sample_time), columns.size)),

@@ -1,0 +1,59 @@
+"""Contacts that share forces: only several, and only where a force of one can take over from another's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dynsim
+from dynsim.engine.sharing import sharing
+from dynsim.kernels.arrays import OPEN, SLIDING, STICKING
+from dynsim.scenario import build
+
+ARM = """\
+duration_s: 1
+plant:
+  type: serial_arm
+  base: {position_m: [0, 0, 0.3]}
+  chain: [YAW{axis: y, count: COUNT, length_m: 0.3, mass_kg: 1}]
+surfaces: {floor: {type: plane, point_m: [0, 0, -5]}}
+contacts:
+  law: unilateral
+  points: {a: {body: link_FIRST}, b: {body: link_LAST}, tip: {body: link_LAST, point_m: [0, 0, 0.2]}}
+"""
+YAW = "{axis: z, length_m: 0.05, mass_kg: 1}, "
+
+
+def shared(folder: Path, modes: list[int], *, yaw: bool = False, count: int = 6) -> list[str]:
+    """Names of those that share at a generic posture."""
+    last = count + yaw
+    path, text = folder / "case.yaml", ARM.replace("YAW", YAW if yaw else "").replace("COUNT", str(count))
+    path.write_text(text.replace("FIRST", str(last - 2)).replace("LAST", str(last)))
+    scenario = dynsim.load_scenario(path)
+    model = dynsim.build_model(scenario)
+    q = np.random.default_rng(3).uniform(-0.5, 0.5, (1, model.n))
+    return sharing(model, build.contacts(scenario, model.robot), q, np.array([modes], dtype=float))
+
+
+@pytest.mark.parametrize("modes", [[STICKING, OPEN, OPEN], [SLIDING, OPEN, OPEN], [OPEN, OPEN, OPEN]])
+def test_one_contact_shares_with_none(tmp_path: Path, modes: list[int]) -> None:
+    """Not even where its rows are zero (across a planar arm), or depend on each other (two joints before it)."""
+    assert shared(tmp_path, modes) == []
+    assert shared(tmp_path, modes, count=3) == []
+
+
+def test_points_of_two_bodies_of_a_planar_arm_do_not_share(tmp_path: Path) -> None:
+    """Two bodies with two joints between them: the four rows in the plane are independent, those across it are zero."""
+    assert shared(tmp_path, [STICKING, STICKING, OPEN]) == []
+
+
+def test_with_one_yaw_joint_points_share_what_is_across_the_arm(tmp_path: Path) -> None:
+    assert shared(tmp_path, [STICKING, STICKING, OPEN], yaw=True) == ["a", "b"]
+    assert shared(tmp_path, [STICKING, SLIDING, OPEN], yaw=True) == []
+
+
+def test_points_of_one_body_share_what_is_along_it_and_the_third_does_not(tmp_path: Path) -> None:
+    assert shared(tmp_path, [OPEN, STICKING, STICKING]) == ["b", "tip"]
+    assert shared(tmp_path, [STICKING, STICKING, STICKING], count=8) == ["b", "tip"]
