@@ -325,13 +325,16 @@ def done(folder: Path) -> int:
     return journal.read_text().count("\n") if journal.exists() else 0
 
 
-def whole(folder: Path) -> bytes:
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The table of a sweep that nothing ends."""
+    folder = tmp_path_factory.mktemp("whole")
     subprocess.run(command("--out", str(folder), "-q"), check=True, timeout=300)
     return (folder / "sweep.csv").read_bytes()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL], ids=lambda number: number.name)
-def test_whatever_ends_a_sweep_it_goes_on(tmp_path: Path, number: signal.Signals):
+def test_whatever_ends_a_sweep_it_goes_on(tmp_path: Path, number: signal.Signals, whole: bytes):
     out = tmp_path / "out"
     with started(command("--out", str(out), "-q"), tmp_path / "errors", preexec_fn=_hears) as child:
         wait_for(lambda: done(out) >= 2)
@@ -345,16 +348,16 @@ def test_whatever_ends_a_sweep_it_goes_on(tmp_path: Path, number: signal.Signals
         assert (out / "sweep.csv").read_text().count("\n") == kept + 1
     subprocess.run(command("--out", str(out), "--resume", "-q"), check=True, timeout=300)
     assert done(out) == 12
-    assert (out / "sweep.csv").read_bytes() == whole(tmp_path / "whole")
+    assert (out / "sweep.csv").read_bytes() == whole
 
 
-def test_a_killed_worker_costs_nothing_but_time(tmp_path: Path):
+def test_a_killed_worker_costs_nothing_but_time(tmp_path: Path, whole: bytes):
     out = tmp_path / "out"
     with started(command("--out", str(out), "-q"), tmp_path / "errors") as child:
         wait_for(lambda: done(out) >= 2)
         os.kill(workers_of(child.process.pid)[0], signal.SIGKILL)
         assert child.end() == 0, child.stderr
-    assert (out / "sweep.csv").read_bytes() == whole(tmp_path / "whole")
+    assert (out / "sweep.csv").read_bytes() == whole
 
 
 def workers_of(pid: int) -> list[int]:
@@ -368,7 +371,7 @@ def _hears() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-def test_a_cluster_gives_the_same_and_outlives_a_worker(tmp_path: Path):
+def test_a_cluster_gives_the_same_and_outlives_a_worker(tmp_path: Path, whole: bytes):
     pytest.importorskip("distributed")
     file, out = tmp_path / "scheduler.json", tmp_path / "out"
     dask = [sys.executable, "-m"]
@@ -385,4 +388,4 @@ def test_a_cluster_gives_the_same_and_outlives_a_worker(tmp_path: Path):
                 wait_for(lambda: done(out) >= 2)
                 one.process.kill()
                 assert child.end() == 0, child.stderr
-    assert (out / "sweep.csv").read_bytes() == whole(tmp_path / "whole")
+    assert (out / "sweep.csv").read_bytes() == whole
