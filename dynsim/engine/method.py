@@ -34,7 +34,7 @@ TOUCHING = 1e-6
 TIGHT = 1e-8
 """Relative tolerance from which on fewer steps of order five outweigh their cost."""
 
-DENSE = 400
+DENSE = 300
 """Size of matrices up to which all eigenvalues are found at once; of larger ones only the largest."""
 
 
@@ -89,7 +89,7 @@ def fastest_rate(model: Model, contacts: Sequence[Contact], drives: ka.DriveArra
             force[j, [j, n + j]] += servo_block(drives.motor, a, drives.table[a, ka.SERVO_MODE], sampled, 0.0, 0.0)
     if not force.any():
         return 0.0
-    mobility = np.linalg.inv(model.mass_matrix(q))
+    mobility = np.linalg.inv(model.mass_matrix(q) + np.diag(model.armature))
     held = _held(model, contacts, q)
     if len(held):
         through = mobility @ held.T
