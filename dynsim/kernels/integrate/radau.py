@@ -51,6 +51,7 @@ from dynsim.kernels.integrate.tableaux import (
     T_RADAU,
 )
 from dynsim.kernels.jit import internal_kernel, merged_kernel
+from dynsim.kernels.state import ELECTRICAL, JOULE
 from dynsim.kernels.system import System, derivative
 
 # Newton's method: most iterations, and the contraction below which the Jacobian stays.
@@ -172,6 +173,20 @@ def estimate(system: System, ws: Workspace, run: Run, h, slope):
     return error_norm(system, ws, run, error)
 
 
+@internal_kernel
+def energy_error(system: System, run: Run, h):
+    """Norm of the error of the ledger's integrals."""
+    r, first = run.newton, system.layout.ledger
+    largest = 0.0
+    for e in range(2):
+        j = first + (ELECTRICAL if e == 0 else JOULE)
+        error = h * run.stage[0, j] + ERROR_RADAU[0] * r.z[0, j] + ERROR_RADAU[1] * r.z[1, j] + ERROR_RADAU[2] * r.z[2, j]
+        error = abs(error) / GAMMA_RADAU
+        scale = run.clock[ATOL] + run.clock[RTOL] * (abs(run.y_new[j])+abs(r.z[2,j]))
+        largest = max(largest, error / scale)
+    return largest
+
+
 @merged_kernel
 def step_radau5(system: System, ws: Workspace, run: Run):
     """One RADAU5 step; returns the error norm. stage[6] is the derivative at y_new."""
@@ -213,7 +228,7 @@ def step_radau5(system: System, ws: Workspace, run: Run):
         error = estimate(system, ws, run, h, r.f[0])
     derivative(system, t + h, y_new, ws, run.stage[6])
     run.count[EVALUATIONS] += 1
-    return error
+    return max(error, energy_error(system, run, h))
 
 
 @internal_kernel
