@@ -68,7 +68,7 @@ class _KernelCache(_Cache):
         if hashlib.sha256(payload).digest() != digest:
             _warn(f"{path}: damaged machine code; compiling it anew")
             return None
-        needs, reduced = pickle.loads(payload)
+        *reduced, needs = pickle.loads(payload)
         for need in needs:
             provide(need)
         return CompileResult._rebuild(target_context, *reduced)
@@ -77,7 +77,7 @@ class _KernelCache(_Cache):
         if data.library.has_dynamic_globals:  # addresses of this process, which NUMBA_OPT=0 leaves in
             return
         path = self._path(sig, data.codegen)
-        payload = serialize.dumps((data.library.needs, data._reduce()))
+        payload = serialize.dumps((*data._reduce(), data.library.needs))
         try:
             with tempfile.NamedTemporaryFile(
                 dir=path.parent, prefix=f"{path.name}.", suffix=".tmp", delete=False
