@@ -120,6 +120,7 @@ def shareable(prepared: Prepared) -> bool:
     run = prepared.run
     return (
         has_forms(prepared.system)
+        and prepared.system.unilateral is None
         and run.support is None
         and not (len(run.event) or len(run.tick) or len(run.breaks))
         and run.newton is None

@@ -13,14 +13,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lane_cases import CASES, TIMED, Case
+from lane_cases import CASES, TIMED, Case, of, plane
 from lanes import copies
 from random_robots import Bench, bench, random_contacts, random_positions, random_robot
 
 from dynsim.kernels import arrays as ka
+from dynsim.kernels.constraint.rows import set_modes
+from dynsim.kernels.constraint.unilateral import FROZEN, REFERENCE, STATIC, STRIBECK, VISCOUS
 from dynsim.kernels.integrate.driver import advance
 from dynsim.kernels.integrate.run import FINISHED, PROJECTIONS, SAMPLE, STATUS
-from dynsim.kernels.jit import reals
+from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.lanes.fixed_step import advance_lanes, lane_runs
 from dynsim.kernels.lanes.system import EIGHT, derivatives, lane_workspace
 from dynsim.kernels.lanes.tables import AXES, spread_tables
@@ -95,6 +97,25 @@ def test_the_cases_have_lanes_that_differ():
     held = np.abs(ws.motors[:, ka.VOLTAGE]) == 15.0
     assert np.any(held)
     assert not np.all(held)
+
+
+@pytest.mark.parametrize("frozen", [0.0, 1.0])
+def test_real_contact(frozen):
+    """Points that slide either way, stick, and are off their planes; friction that depends on the speed."""
+    rng = np.random.default_rng(12)
+    b = bench(random_robot(rng, 7), [plane(rng, f"body_{6 - k}") for k in range(4)], real=True)
+    case = of(rng, b, 1.0)
+    b.derivative(case.y, 0.0)
+    modes = integers([ka.SLIDING, ka.STICKING, ka.OPEN, ka.SLIDING])
+    set_modes(b.system.contacts, b.system.couplings, b.system.unilateral, b.ws, modes)
+    real = b.system.unilateral
+    real.slide[:, REFERENCE : REFERENCE + 3] = rng.normal(size=(4, 3))
+    real.slide[0, FROZEN] = frozen
+    real.law[:, STATIC], real.law[0, STRIBECK], real.law[3, VISCOUS] = 0.4, 0.5, 0.01
+    y = spread(case, 8, rng)
+    ws = compare(b, y, 0.0, 1e-13)
+    along = np.einsum("csk,cs->ck", ws.contacts[:, ka.SLIP_VELOCITY : ka.SLIP_VELOCITY + 3], real.slide[:, :3])
+    assert {*np.sign(along[3])} == {-1.0, 1.0}
 
 
 def varied(system: System, count: int, rng: np.random.Generator) -> System:
