@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynsim.engine.dynamics import Prepared, prepare
 from dynsim.engine.together import LANES, integrate
@@ -21,16 +22,22 @@ from dynsim.studies.bench.programs import EIGHT_LANES, FOUR_LANES, ONE_STATE, SC
 from dynsim.studies.bench.right_hand_side import repeat_derivative
 from dynsim.studies.bench.timing import Timed, take_turns
 
+Array = NDArray[np.float64]
+
 RIGHT_HAND_SIDE, RUN = "right-hand side, 2 contacts", f"RK4 {1e3 * STEP:g} ms, recorded at 200 Hz"
 
 
 @kernel
-def repeat_lanes(width, system: System, y, ws: Workspace, dy, count):
+def repeat_lanes(width: Any, system: System, y: Array, ws: Workspace, dy: Array, count: int) -> None:
     """``count`` right-hand sides of all lanes."""
-    tables, states = tables_as_lanes(system, width), as_lanes(y, width)
-    room, rates = tables_as_lanes(ws, width), as_lanes(dy, width)
     for k in range(count):
-        derivative_lanes(tables, 1e-3 * (k & 1023), states, room, rates)
+        derivative_lanes(
+            tables_as_lanes(system, width),  # type: ignore[call-arg]
+            1e-3 * (k & 1023),
+            as_lanes(y, width),  # type: ignore[call-arg]
+            tables_as_lanes(ws, width),  # type: ignore[call-arg]
+            as_lanes(dy, width),  # type: ignore[call-arg]
+        )
 
 
 def measure(rounds: int, share: float) -> list[dict[str, Any]]:
