@@ -6,38 +6,19 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynsim.engine.dynamics import Prepared, prepare
 from dynsim.engine.together import LANES, integrate
-from dynsim.kernels.arrays import Workspace
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.driver import advance
-from dynsim.kernels.jit import kernel
-from dynsim.kernels.lanes.system import EIGHT, FOUR, derivative_lanes, lane_workspace
-from dynsim.kernels.lanes.tables import aligned, as_lanes, stack_tables, tables_as_lanes
-from dynsim.kernels.system import System
+from dynsim.kernels.lanes.system import EIGHT, FOUR, lane_workspace
+from dynsim.kernels.lanes.tables import aligned, stack_tables
 from dynsim.scenario import load_scenario
 from dynsim.studies.bench.programs import EIGHT_LANES, FOUR_LANES, ONE_STATE, SCENARIO, STEP
-from dynsim.studies.bench.right_hand_side import repeat_derivative
+from dynsim.studies.bench.right_hand_side import repeat_derivative, repeat_lanes
 from dynsim.studies.bench.timing import Timed, take_turns
 
-Array = NDArray[np.float64]
-
 RIGHT_HAND_SIDE, RUN = "right-hand side, 2 contacts", f"RK4 {1e3 * STEP:g} ms, recorded at 200 Hz"
-
-
-@kernel
-def repeat_lanes(width: Any, system: System, y: Array, ws: Workspace, dy: Array, count: int) -> None:
-    """``count`` right-hand sides of all lanes."""
-    for k in range(count):
-        derivative_lanes(
-            tables_as_lanes(system, width),  # type: ignore[call-arg]
-            1e-3 * (k & 1023),
-            as_lanes(y, width),  # type: ignore[call-arg]
-            tables_as_lanes(ws, width),  # type: ignore[call-arg]
-            as_lanes(dy, width),  # type: ignore[call-arg]
-        )
 
 
 def measure(rounds: int, share: float) -> list[dict[str, Any]]:
