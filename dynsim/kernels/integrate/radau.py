@@ -50,7 +50,7 @@ from dynsim.kernels.integrate.tableaux import (
     T_INVERSE_RADAU,
     T_RADAU,
 )
-from dynsim.kernels.jit import internal_kernel, merged_kernel
+from dynsim.kernels.jit import apart_kernel, internal_kernel
 from dynsim.kernels.system import System, derivative
 
 # Newton's method: most iterations, and the contraction below which the Jacobian stays.
@@ -59,7 +59,7 @@ MOST_ITERATIONS, GOOD_CONTRACTION = 8, 0.05
 NO_STAGES = 10.5
 
 
-@merged_kernel
+@apart_kernel
 def differentiate(system: System, ws: Workspace, run: Run):
     """Finite differences of v̇ along the rates' displacements, the rates and the currents, at (TIME, y).
 
@@ -108,7 +108,7 @@ def guess_stages(run: Run, h):
             )
 
 
-@merged_kernel
+@apart_kernel
 def solve_stages(system: System, ws: Workspace, run: Run, h):
     """Newton's method for the stages of a step of length h; True when it has converged."""
     t, y, x, r = run.clock[TIME], run.y, run.y_new, run.newton
@@ -172,7 +172,7 @@ def estimate(system: System, ws: Workspace, run: Run, h, slope):
     return error_norm(system, ws, run, error)
 
 
-@merged_kernel
+@apart_kernel
 def step_radau5(system: System, ws: Workspace, run: Run):
     """One RADAU5 step; returns the error norm. stage[6] is the derivative at y_new."""
     t, h, y, y_new, r = run.clock[TIME], run.clock[STEP], run.y, run.y_new, run.newton
