@@ -7,13 +7,23 @@ import json
 from collections.abc import Container, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from dynsim import completion, interruption
-from dynsim.cli.app import FigureFormat, FiguresOption, FormatOption, QuietOption, ScenarioArgument, SetOption, app
+from dynsim.cli.app import (
+    FigureFormat,
+    FiguresOption,
+    FormatOption,
+    QuietOption,
+    ScenarioArgument,
+    SetOption,
+    app,
+    parsed_overrides,
+)
 from dynsim.cli.display import console, draw_comparison, draw_run, errors, progress
+from dynsim.cli.sweep import sweep
 from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
 from dynsim.hardware.cli import export, hw
 from dynsim.terminal import escaped
@@ -43,7 +53,7 @@ def run(
     from dynsim.results import RUN_FILES, save_run
     from dynsim.scenario import load_scenario
 
-    loaded = load_scenario(scenario, variant, _overrides(overrides))
+    loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
     folder = out or Path("results", loaded.name, loaded.variant)
     check_writable(folder, RUN_FILES)
     try:
@@ -85,7 +95,7 @@ def compare(
     from dynsim.studies.compare import compare as compare_variants
     from dynsim.studies.compare import save_comparison
 
-    given = _overrides(overrides)
+    given = parsed_overrides(overrides)
     loaded = [load_scenario(scenario, name, given) for name in variant_names(scenario)]
     folder = out or Path("results", loaded[0].name if loaded else "")
     check_writable(folder, COMPARISON_FILES[:2])
@@ -160,7 +170,7 @@ def check(
             starts = {}
             for variant in variants:
                 with console.status(f"checking {escaped(name)} {escaped(variant or '')}"):
-                    starts[variant or ""] = check_scenario(load_scenario(name, variant, _overrides(overrides)))
+                    starts[variant or ""] = check_scenario(load_scenario(name, variant, parsed_overrides(overrides)))
         except SimulationInterrupted:
             raise
         except DynsimError as error:
@@ -237,6 +247,7 @@ def schema() -> None:
     _warn_of_plugins()
 
 
+app.command(epilog="Example: dynsim sweep elbow_comparison --variants all --grid contacts.friction=0:1:5")(sweep)
 # These load serial ports and servos only when called.
 app.add_typer(hw, name="hw")
 app.command(
@@ -250,12 +261,6 @@ def _warn_of_plugins() -> None:
 
     for fault in faults():
         errors.print(f"[yellow]warning:[/] {escaped(fault)}")
-
-
-def _overrides(given: list[str] | None) -> dict[str, Any]:
-    from dynsim.scenario import SetOptions, parse_override
-
-    return SetOptions(parse_override(text) for text in given or ())
 
 
 def _label(path: Path, record: Record, taken: Container[str]) -> str:

@@ -85,3 +85,37 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
                 bars.update(simulating[variant], completed=time)
 
         yield report
+
+
+@contextmanager
+def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None]]:
+    """A bar over all runs of a sweep, with time, time to go and how many failed; yields its report."""
+    if quiet:
+        yield lambda done, failed: None
+        return
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+    from rich.table import Column
+
+    columns = (
+        TextColumn("runs"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[failed]}"),
+        TimeElapsedColumn(table_column=Column(no_wrap=True)),
+        TextColumn("to go"),
+        TimeRemainingColumn(table_column=Column(no_wrap=True)),
+    )
+    with Progress(*columns, console=console, transient=not console.is_terminal) as bar:
+        task = bar.add_task("", total=runs, failed="")
+
+        def report(done: int, failed: int) -> None:
+            bar.update(task, completed=done, failed=f"{failed} failed" if failed else "")
+
+        yield report

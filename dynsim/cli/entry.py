@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import os
 import signal
 import sys
@@ -22,10 +23,14 @@ from dynsim.terminal import escaped
 
 # Of a process that a signal ended: this and the number of the signal.
 _SIGNAL_EXIT = 128
+# New objects after which Python looks for garbage.
+GARBAGE = 200_000
 
 
 def main() -> None:
     """Entry point: errors become one line and an exit code. Ctrl-C where nothing can be saved is typer's: 130."""
+    # What a command imports stays: to look through it for garbage, as often as Python does, takes a tenth of a run.
+    gc.set_threshold(GARBAGE)
     with interruption.heeded() as received, lenient_streams() as output, _plain_warnings():
         code = _exit_code()
         if output is not None:

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import make_interp_spline
 
 from dynsim.errors import ModelError
 from dynsim.kernels.constraint.brace_arrays import BRACE_SIZE
@@ -19,6 +18,7 @@ from dynsim.model.bracing import MIN_N, BracePlanner, brace_rows
 from dynsim.model.description import Contact
 from dynsim.model.drives import Motor
 from dynsim.model.model import Model
+from dynsim.model.splines import quintic_rates
 
 Array = NDArray[np.float64]
 
@@ -60,8 +60,8 @@ def planned_voltages(
     q = np.tile(robot.initial, (len(times), 1))
     for name, values in positions.items():
         q[:, model.joint_names.index(name)] = values
-    spline = make_interp_spline(times, q, k=5)
-    v, vdot = spline(times, 1), spline(times, 2)
+    spacing = float(times[1] - times[0])
+    v, vdot = quintic_rates(spacing, q)
     if whole:
         torques = _pressing_torques(model, times, q, v, vdot, braces, min_N)
     else:
@@ -74,7 +74,7 @@ def planned_voltages(
     current = torques[:, columns] / constant
     if not whole:
         return np.asarray(resistance * current)
-    rate = make_interp_spline(times, current, k=5)(times, 1)
+    rate, _ = quintic_rates(spacing, current)
     return np.asarray(resistance * current + inductance * rate + constant * v[:, columns])
 
 

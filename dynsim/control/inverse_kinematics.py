@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-import math
 import time as clock
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.errors import UnreachableReference
+from dynsim.kernels import inverse_kinematics as ki
+from dynsim.kernels.arrays import workspace
+from dynsim.kernels.jit import integers, reals
+from dynsim.model.arrays import compile_contacts
 from dynsim.model.description import Contact
 from dynsim.model.mobile_base import base_row
 from dynsim.model.model import Model
-from dynsim.model.posture import gaps_and_rates
+from dynsim.model.shapes import compile_shapes
 
 Array = NDArray[np.float64]
 
-ITERATIONS = 200
-STEP_MAX = 0.3  # [rad or m] per iteration, so that the branch of the start is kept
+# Targets between two looks at the clock and at Ctrl-C: some milliseconds.
+PIECE = 256
 # Wall time before the first report of progress, and between two [s]: most paths are done before anyone asks.
 QUIET_S, REPORT_S = 1.0, 0.1
 
@@ -62,43 +66,38 @@ def follow(
         With the first time at which the hand cannot reach its target, and the distance that is left.
     """
     columns = [model.joint_names.index(name) for name in joints]
-    places = [model.robot.position_index[column] for column in columns]
-    body, point = model.body_index(model.robot.hand[0]), model.robot.hand[1]
-    q, rows = q.copy(), 3 + len(braces)
-    identity = np.eye(rows)
-    carried = 0 if base is None else base_row(model.robot)[0]
-    result = np.zeros((len(times), len(columns)))
-    due = clock.perf_counter() + QUIET_S
-    for k, (t, target) in enumerate(zip(times, targets, strict=True)):
+    link, point = model.robot.attach(*model.robot.hand)
+    points = [replace(contact, tip=None) for contact in braces]
+    rows = 3 + len(braces)
+    path = ki.PathArrays(
+        link=link,
+        point=reals(point),
+        braces=compile_contacts(model.robot, points),
+        shapes=compile_shapes(model.robot, points),
+        column=integers(columns),
+        place=integers([model.robot.position_index[column] for column in columns]),
+        jacobian=np.zeros((3, model.n)),
+        rates=np.zeros((rows, len(columns))),
+        system=np.zeros((rows, rows)),
+        error=np.zeros(rows),
+        change=np.zeros(len(columns)),
+        position=np.zeros(3),
+    )
+    ws, result, wanted = workspace(model.n, 0, 0), np.zeros((len(times), len(columns))), reals(targets)
+    carried = np.zeros((len(times), 0)) if base is None else reals(base)
+    first = 0 if base is None else base_row(model.robot)[0]
+    q, k, due = reals(q), 0, clock.perf_counter() + QUIET_S
+    while k < len(times):
         if progress is not None and clock.perf_counter() >= due:
-            progress(float(t))
+            progress(float(times[k]))
             due = clock.perf_counter() + REPORT_S
-        if base is not None:
-            q[carried : carried + 4] = base[k]
-        if k >= 3 and len(columns) <= rows:
-            # The parabola through the last three solutions leaves one iteration to do. Not for redundant joints: what
-            # the hand does not determine would run away along it.
-            q[places] = 3.0 * result[k - 1] - 3.0 * result[k - 2] + result[k - 3]
-        best = np.inf
-        for _ in range(ITERATIONS):
-            position, jacobian = model.point_position_and_jacobian(body, point, q)
-            error = target - position
-            if braces:
-                gaps, rates = gaps_and_rates(model, braces, q)
-                error, jacobian = np.concatenate([error, -gaps]), np.vstack([jacobian, rates])
-            distance = math.sqrt(error @ error)
-            best = min(best, distance)
-            # Two orders below the tolerance: the references shall be smooth, not just close.
-            if distance < 1e-4 * tolerance:
-                break
-            J = jacobian[:, columns]
-            step = J.T @ np.linalg.solve(J @ J.T + (1e-12 + 0.1 * distance**2) * identity, error)
-            q[places] += step * min(1.0, STEP_MAX / max(float(np.abs(step).max()), 1e-300))
-        if best > tolerance:
+        end = min(k + PIECE, len(times))
+        k, left = ki.follow_path(model.arrays, ws, path, wanted, carried, first, k, end, tolerance, q, result)
+        if k < end:
+            target = wanted[k]
             raise UnreachableReference(
-                f"the hand cannot follow its path with {', '.join(joints)}: at t = {t:.3f} s it stays "
-                f"{best:.4g} m from ({target[0]:.4g}, {target[1]:.4g}, {target[2]:.4g}) m; "
+                f"the hand cannot follow its path with {', '.join(joints)}: at t = {times[k]:.3f} s it stays "
+                f"{left:.4g} m from ({target[0]:.4g}, {target[1]:.4g}, {target[2]:.4g}) m; "
                 "move the path, or let more joints follow it"
             )
-        result[k] = q[places]
     return result

@@ -8,7 +8,6 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
-from scipy.interpolate import CubicSpline
 
 from dynsim import families
 from dynsim.config import NonNegative, Positive, StrictConfig, check_waypoints, error_at
@@ -16,13 +15,14 @@ from dynsim.control.feed_forward import planned_voltages
 from dynsim.control.inverse_kinematics import follow
 from dynsim.errors import ModelError
 from dynsim.model.bracing import MIN_N
-from dynsim.model.control import BasePath, HandPath, JointControl, spline_coefficients
+from dynsim.model.control import BasePath, HandPath, JointControl
 from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Motor, Servo, TorqueSource
 from dynsim.model.mobile_base import base_row
 from dynsim.model.model import Model
 from dynsim.model.protocols import BuildContext
 from dynsim.model.rolling import rolled, wheel_angles
+from dynsim.model.splines import clamped_cubic, quintic_coefficients
 
 ENGINE = "dynamics"
 
@@ -148,9 +148,9 @@ def build(config: Config, context: BuildContext) -> JointControl:
     if config.joints or config.torques or path is not None or base_path is not None or planned:
         times = _knots(config.knot_spacing_s, context.duration)
         for name, joint in config.joints.items():
-            positions[name] = _waypoints(joint.times_s, np.deg2rad(joint.angles_deg), times)
+            positions[name] = clamped_cubic(joint.times_s, np.deg2rad(joint.angles_deg), times)
         for name, torque in config.torques.items():
-            positions[name] = _waypoints(torque.times_s, np.array(torque.torques_N_m), times)
+            positions[name] = clamped_cubic(torque.times_s, np.array(torque.torques_N_m), times)
         if base_path is not None:
             positions |= _wheel_angles(robot, base_path, times)
         if config.hand is not None and path is not None:
@@ -279,12 +279,9 @@ def _base_coordinates(
     angles = np.tile(start[:2], (len(times), 1))
     for k, wheel in enumerate(robot.base.wheels):
         angles[:, k] = positions.get(wheel, angles[:, k])
-    ways = rolled(robot.base, start[2:], spline_coefficients(times, angles), float(times[1] - times[0]))
+    spacing = float(times[1] - times[0])
+    ways = rolled(robot.base, start[2:], quintic_coefficients(spacing, angles), spacing)
     return np.hstack([angles, np.vstack([start[2:], ways[:, -1]])])
-
-
-def _waypoints(at: list[float], values: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:
-    return CubicSpline(at, values, bc_type="clamped")(np.clip(times, at[0], at[-1]))
 
 
 _KEYS = {"k_p": "k_p_V_per_rad", "k_d": "k_d_V_s_per_rad"}

@@ -85,6 +85,7 @@ def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "pn
 
 
 def _save(figure: Figure, path: Path) -> Path:
+    figure.set_dpi(plt.rcParams["savefig.dpi"])
     style.write(figure, path)
     plt.close(figure)
     return path

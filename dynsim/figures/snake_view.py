@@ -20,6 +20,7 @@ from matplotlib.patches import Circle, Patch, Polygon
 from matplotlib.ticker import Locator
 from numpy.typing import NDArray
 
+from dynsim.figures.solids import outline
 from dynsim.record import Record
 from dynsim.snake_geometry import snake_geometry
 
@@ -96,14 +97,8 @@ class View:
 
     def support(self) -> NDArray[np.float64]:
         """Corners of the support polygon, (k, 2)."""
-        from scipy.spatial import ConvexHull, QhullError
-
         down = self.grounded
-        feet = np.vstack([self.axles[down, :2] + s * self.across[down] for s in (-1, 1)])
-        try:
-            return feet[ConvexHull(feet).vertices]
-        except (QhullError, ValueError):
-            return feet  # fewer than three contacts: no polygon
+        return outline(np.vstack([self.axles[down, :2] + s * self.across[down] for s in (-1, 1)]))
 
     def draw_top(self, axis: Axes) -> list[Artist]:
         drawn: list[Artist] = [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from dynsim.figures.style import Array
 from dynsim.record import Record
@@ -50,15 +49,28 @@ def surface(shape: Shape) -> Array:
 
 
 def outline(points: Array) -> Array:
-    """Corners of the convex hull of points in a plane, (n, 2) → (m, 2); all of them where they lie on a line."""
-    try:
-        return points[ConvexHull(points).vertices]
-    except (QhullError, ValueError):
-        return points
+    """Corners of the convex hull of points in a plane, (n, 2) → (m, 2), turning to the left; of a line its ends."""
+    ordered = np.unique(points, axis=0).tolist()
+    return np.array(_side(ordered) + _side(ordered[::-1])) if len(ordered) > 1 else points
+
+
+def _side(ordered: list[list[float]]) -> list[list[float]]:
+    """The hull's corners from the first of points in order of x up to the last, which is left out."""
+    kept: list[list[float]] = []
+    for x, y in ordered:
+        while len(kept) > 1:
+            (ax, ay), (bx, by) = kept[-2:]
+            if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0.0:
+                break
+            kept.pop()
+        kept.append([x, y])
+    return kept[:-1]
 
 
 def faces(points: Array) -> Array:
     """Triangles of the convex hull of points, (m, 3, 3), that turn to the left seen from outside."""
+    from scipy.spatial import ConvexHull, QhullError  # takes a third of a second
+
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError):

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import numba
-from llvmlite.binding import Linkage
+from llvmlite.binding import Linkage, parse_assembly
 from numba import _dynfunc
 from numba.core import typed_passes, types, untyped_passes
 from numba.core.codegen import JITCodeLibrary
@@ -46,6 +46,22 @@ class _OwnCallees(JITCodeLibrary):
         # numba runs a cheaper set of passes before, for the sake of reference counting, which kernels do without.
         passes, builder = self._codegen._module_pass_manager()
         passes.run(self._final_module, builder)
+
+    def serialize_using_object_code(self) -> tuple[str, str, tuple[bytes, bytes]]:
+        """For the cache: machine code, and the names by which it is found; not the code to merge into further kernels.
+
+        Parts are for that, see :func:`as_part`; to read it back would take longer than a run of some seconds.
+        """
+        self._ensure_finalized()
+        module, inside = self._final_module, (Linkage.internal, Linkage.private)
+        functions, variables = (
+            [one.name for one in ones if not one.is_declaration and one.linkage not in inside]
+            for ones in (module.functions, module.global_variables)
+        )
+        lines = [f'define void @"{name}"() {{ ret void }}' for name in functions]
+        lines += [f'@"{name}" = common global i8 0' for name in variables]
+        names = parse_assembly("\n".join(lines)).as_bitcode()
+        return self.name, "object", (self._get_compiled_object(), names)
 
 
 class _LeanCompiler(Compiler):
@@ -148,8 +164,9 @@ def register_part(function: F, compiler: type[Compiler], options: Mapping[str, A
     what is not said here (``forceinline``).
     """
 
-    def implementation(*_: Any, **__: Any) -> F:
-        return function
+    def implementation(*kinds: Any, **__: Any) -> Any:
+        form, when = _FORMS.get(function, (None, None))
+        return form if when and when(*kinds) else function
 
     every = {"nopython": True, "pipeline_class": compiler, "forceinline": False, **options, **_NO_ENTRY}
     template = make_overload_template(function, implementation, every, strict=False, inline="never")
@@ -157,6 +174,20 @@ def register_part(function: F, compiler: type[Compiler], options: Mapping[str, A
     infer(template)
     infer_global(function, types.Function(template))
     return function
+
+
+# Parts with another form, and for which types of arguments it stands in.
+_FORMS: dict[Callable[..., Any], tuple[Callable[..., Any], Callable[..., bool]]] = {}
+
+
+def form_of(function: Callable[..., Any], when: Callable[..., bool]) -> Callable[[F], F]:
+    """The decorated function stands in for a registered part where ``when(*types of its arguments)`` is true."""
+
+    def put(form: F) -> F:
+        _FORMS[function] = form, when
+        return form
+
+    return put
 
 
 def _implementation(template: Any, args: Any, kws: Any) -> Any:

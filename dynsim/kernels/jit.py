@@ -43,7 +43,8 @@ class _KernelCache(_Cache):
     """Machine code on disk, a file for each function and signature: SHA-256 of the rest, then numba's own pickle.
 
     A file that is damaged or cannot be written costs a compilation, never the run: LLVM aborts the process on broken
-    machine code, so nothing is handed to it before its digest is right.
+    machine code, so nothing is handed to it before its digest is right. Unlike numba's own cache it loads none of the
+    rules by which code is compiled (0.4 s): machine code needs none, and the compiler loads them when it is asked to.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -54,7 +55,6 @@ class _KernelCache(_Cache):
         return str(cache_folder())
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        target_context.refresh()
         path = self._path(sig, target_context.codegen())
         try:
             content = path.read_bytes()

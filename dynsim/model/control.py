@@ -8,7 +8,6 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import make_interp_spline
 
 from dynsim.errors import ModelError
 from dynsim.kernels.arrays import HELD_POSITION, ReferenceArrays
@@ -17,6 +16,7 @@ from dynsim.model.description import Robot
 from dynsim.model.drives import TorqueSource
 from dynsim.model.mobile_base import base_pose, base_row
 from dynsim.model.rolling import coordinates, rolled
+from dynsim.model.splines import quintic_coefficients
 
 # Samples in a segment of the reference splines, and segments that are looked at together.
 _PER_SEGMENT = 4
@@ -123,16 +123,16 @@ class JointControl:
         spline = np.full(len(driven), HELD_POSITION)
         for k, name in enumerate(positions):
             spline[driven.index(name)] = k
+        spacing = float(grid[1]) - float(grid[0])
         coefficients = np.zeros((len(grid) - 1, 0, 6))
         if columns:
-            coefficients = spline_coefficients(grid, np.stack(columns, axis=1))
-        begin, second = float(grid[0]), float(grid[1])
-        reference = _reference(held, spline, (begin, second - begin), coefficients)
+            coefficients = quintic_coefficients(spacing, np.stack(columns, axis=1))
+        reference = _reference(held, spline, (float(grid[0]), spacing), coefficients)
         if voltages is not None:
             planned = np.asarray(voltages, dtype=np.float64)
             if planned.shape != (len(grid), len(driven)) or not np.isfinite(planned).all():
                 raise ModelError(f"voltages must be finite, one of each of {len(driven)} motors for each time")
-            reference = reference._replace(voltage=reals(spline_coefficients(grid, planned)))
+            reference = reference._replace(voltage=quintic_coefficients(spacing, planned))
         return cls(*gains, reference, path, sample_time)
 
     @property
@@ -226,21 +226,3 @@ def _reference(
         grid=reals(grid),
         coefficients=reals(np.zeros((1, 0, 6)) if coefficients is None else coefficients),
     )
-
-
-def spline_coefficients(times: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Quintic spline through ``values`` at equally spaced ``times`` as (segments, columns, 6) ascending powers.
-
-    Inside a segment the polynomial is the one that the spline's value, slope and curvature at both ends determine.
-    """
-    spline = make_interp_spline(times, values, k=5)
-    h = float(times[1] - times[0])
-    y, s, c = spline(times), spline(times, 1) * h, spline(times, 2) * h**2
-    dy = y[1:] - y[:-1] - s[:-1] - 0.5 * c[:-1]
-    ds = s[1:] - s[:-1] - c[:-1]
-    dc = c[1:] - c[:-1]
-    a3 = 10.0 * dy - 4.0 * ds + 0.5 * dc
-    a4 = -15.0 * dy + 7.0 * ds - dc
-    a5 = 6.0 * dy - 3.0 * ds + 0.5 * dc
-    powers = np.stack([y[:-1], s[:-1], 0.5 * c[:-1], a3, a4, a5], axis=-1)
-    return powers / h ** np.arange(6)

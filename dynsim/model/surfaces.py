@@ -173,16 +173,12 @@ SURFACES = Quadric | Box | HeightField
 
 def _spline(values: Array) -> Array:
     """Coefficients of cubic B-splines along the first axis, (n, m) → (n + 2, m)."""
-    from scipy.linalg import solve_banded
+    from dynsim.kernels.banded import solve_banded
 
-    n = len(values)
-    band = np.zeros((9, n + 2))  # entry (i, j) of the matrix at [4 + i - j, j]
-    inner = np.arange(1, n + 1)
-    for offset, weight in ((-1, 1.0 / 6.0), (0, 2.0 / 3.0), (1, 1.0 / 6.0)):
-        band[4 - offset, inner + offset] = weight
-    for offset, weight in enumerate((1.0, -4.0, 6.0, -4.0, 1.0)):
-        band[4 - offset, offset] = weight
-        band[4 + offset, n + 1 - offset] = weight
-    right = np.zeros((n + 2, values.shape[1]))
+    n, beside = len(values), 4
+    band, right = np.zeros((n + 2, 3 * beside + 1)), np.zeros((n + 2, values.shape[1]))
+    band[1:-1, beside - 1 : beside + 2] = 1.0 / 6.0, 2.0 / 3.0, 1.0 / 6.0
+    band[0, beside : beside + 5] = band[-1, beside - 4 : beside + 1] = 1.0, -4.0, 6.0, -4.0, 1.0
     right[1:-1] = values
-    return np.asarray(solve_banded((4, 4), band, right))
+    solve_banded(band, beside, beside, right)
+    return right

@@ -7,7 +7,6 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
-from scipy.interpolate import CubicSpline
 
 from dynsim.config import BodyPoint, NonNegative, Positive, Vector3, error_at
 from dynsim.csv_rows import read_rows
@@ -74,6 +73,8 @@ class Sampled(WrenchConfig):
 
     def _coefficients(self, knots: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
         if self.interpolation == "spline":
+            from scipy.interpolate import CubicSpline  # takes 0.3 s
+
             return np.ascontiguousarray(CubicSpline(knots, values).c[::-1].transpose(1, 2, 0))
         coefficients = np.zeros((len(knots) - 1, 6, 4))
         coefficients[:, :, 0] = values[:-1]

@@ -21,6 +21,7 @@ def slow_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every knot of a path takes long enough for a report."""
     monkeypatch.setattr(inverse_kinematics, "QUIET_S", 0.0)
     monkeypatch.setattr(inverse_kinematics, "REPORT_S", 0.0)
+    monkeypatch.setattr(inverse_kinematics, "PIECE", 1)
 
 
 def stages() -> list[tuple[str, float]]:

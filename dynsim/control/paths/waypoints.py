@@ -7,11 +7,11 @@ from typing import Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
-from scipy.interpolate import CubicSpline
 
 from dynsim.config import StrictConfig, Vector3, check_waypoints
 from dynsim.model.control import HandPath
 from dynsim.model.protocols import BuildContext
+from dynsim.model.splines import clamped_cubic
 
 
 class Config(StrictConfig):
@@ -28,8 +28,7 @@ class Config(StrictConfig):
 
     def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
         """The spline at times t [s], shape (T, 3) [m]."""
-        spline = CubicSpline(self.times_s, np.array(self.points_m), bc_type="clamped")
-        return spline(np.clip(t, self.times_s[0], self.times_s[-1]))
+        return clamped_cubic(self.times_s, np.array(self.points_m), t)
 
 
 def build(config: Config, context: BuildContext) -> HandPath:

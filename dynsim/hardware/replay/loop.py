@@ -6,6 +6,7 @@ Cycles start at absolute deadlines; one that is more than a period late is skipp
 from __future__ import annotations
 
 import math
+import struct
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,8 @@ Array = NDArray[np.float64]
 
 FIELDS = MX_106.fields
 """Items the two models share have the same address in both."""
+STATE = struct.Struct("<hii")
+"""Effort, velocity and position in a block of :data:`~dynsim.hardware.bus.control_table.STATE_BLOCK`."""
 
 
 class Loop:
@@ -80,6 +83,12 @@ class Loop:
         self._recorder = recorder
         self._journal = journal
         self._in_position_mode = np.array([servo.in_position_mode for servo in servo_map.servos])
+        # What may be sent: lowest and highest tick and the longest step from goal to goal, or the highest speed.
+        self._tick_bounds = [
+            (*servo.tick_limits, velocity_limit(servo) * servo.gear * 2 * self.period / RAD_PER_TICK + 2)
+            for servo in servo_map.servos
+        ]
+        self._unit_bounds = [abs(servo.to_velocity_units(velocity_limit(servo))) for servo in servo_map.servos]
         self._health_every = motion.plan.health_every
         self._cycles = 0
         self._sent: dict[int, int] = {}
@@ -187,10 +196,10 @@ class Loop:
             reply = block.replies.get(servo.id)
             if reply is None:
                 continue
-            data = reply.data
-            cycle.torque[index] = servo.to_torque(int.from_bytes(data[0:2], "little", signed=True))
-            cycle.velocity[index] = servo.to_velocity(int.from_bytes(data[2:6], "little", signed=True))
-            cycle.position[index] = servo.to_angle(int.from_bytes(data[6:10], "little", signed=True))
+            effort, units, ticks = STATE.unpack(reply.data)
+            cycle.torque[index] = servo.to_torque(effort)
+            cycle.velocity[index] = servo.to_velocity(units)
+            cycle.position[index] = servo.to_angle(ticks)
             cycle.alert[index] = reply.alert
         cycle.outdated = tuple(block.outdated)
         self.measured = np.where(cycle.missed, self.measured, cycle.position)
@@ -229,15 +238,15 @@ class Loop:
         """The only place goals of a motion leave through. Refuses what no checked motion can ask for."""
         goals: dict[str, dict[int, int]] = {"goal_position": {}, "goal_velocity": {}}
         for index, servo in enumerate(self.map.servos):
-            ticks, units = servo.to_ticks(float(position[index])), servo.to_velocity_units(float(velocity[index]))
             if servo.in_position_mode:
-                low, high = servo.tick_limits
-                step = velocity_limit(servo) * servo.gear * 2 * self.period / RAD_PER_TICK + 2
+                ticks = servo.to_ticks(float(position[index]))
+                low, high, step = self._tick_bounds[index]
                 if not low <= ticks <= high or abs(ticks - self._sent[servo.id]) > step:
                     raise Stopped(Fault(Cause.GOAL_GUARD, f"{servo.joint}: goal {ticks} was not sent", (servo.id,)))
                 goals["goal_position"][servo.id] = ticks
             else:
-                if abs(units) > abs(servo.to_velocity_units(velocity_limit(servo))):
+                units = servo.to_velocity_units(float(velocity[index]))
+                if abs(units) > self._unit_bounds[index]:
                     raise Stopped(Fault(Cause.GOAL_GUARD, f"{servo.joint}: goal {units} was not sent", (servo.id,)))
                 goals["goal_velocity"][servo.id] = units
         self.write_goals(goals)

@@ -108,7 +108,8 @@ class ServoRegisters:
             if name is None:
                 return StatusError.ACCESS
             field = self.model.fields[name]
-            if [*targets[position : position + field.size]] != [*range(start, start + field.size)]:
+            whole = range(start, start + field.size)
+            if targets[position : position + field.size] != (whole if direct else [*whole]):
                 return StatusError.DATA_LENGTH
             value = field.decode(data[position : position + field.size])
             error = self._objection(name, field, value)

@@ -25,8 +25,12 @@ from dynsim.hardware.virtual.servo_plant import Drive, InertialLoad, ServoPlant
 PHYSICS_STEP = 2e-3
 COMMUNICATION_END = 14
 """IDs, bit rate and protocol stand at lower addresses."""
+GOALS = range(100, 120)
+"""Addresses of goals and profile: a write to nothing else changes neither torque nor mode."""
 TRAJECTORY = 136, 144
 """Where the profile's own speed and position stand; kept up to date only for those who read them."""
+STATE = range(124, 136)
+"""Addresses of load, speed and position, which are read in each cycle, without voltage, temperature and clock."""
 BOOT_TIME = 0.3
 """Silence after a reboot [s] (unverified)."""
 AMBIENT = 25.0  # °C
@@ -144,7 +148,9 @@ class VirtualServos:
     def read(self, id_: int, address: int, length: int) -> bytes | None:
         """Bytes of a servo's control table as they are now; None outside of it."""
         index = self.ids.index(id_)
-        self.measure(index)
+        self._measure_motion(index)
+        if not (STATE.start <= address and address + length <= STATE.stop):
+            self._measure_supply(index)
         if address < TRAJECTORY[1] and address + length > TRAJECTORY[0]:
             registers = self.registers[id_]
             registers["position_trajectory"] = self._present_ticks(index, self._drive.set_position[index])
@@ -155,6 +161,11 @@ class VirtualServos:
     def write(self, id_: int, address: int, data: bytes) -> StatusError:
         """Write to a control table, with all that follows from it."""
         registers, index = self.registers[id_], self.ids.index(id_)
+        if GOALS.start <= address and address + len(data) <= GOALS.stop:
+            error = registers.write(address, data)
+            if not error:
+                self._take_goals(index)
+            return error
         torque, mode = registers["torque_enable"], registers["operating_mode"]
         error = registers.write(address, data)
         if error:
@@ -301,19 +312,28 @@ class VirtualServos:
         """Take over what the motion needs from the registers."""
         registers = self.registers[self.ids[index]]
         # Reverse mode turns the shaft's sense, not that of the homing offset.
-        self._sense[index] = sense = -1 if registers["drive_mode"] & 1 else 1
+        self._sense[index] = -1 if registers["drive_mode"] & 1 else 1
         self._drive.enabled[index] = bool(registers["torque_enable"])
         self._drive.in_position_mode[index] = registers["operating_mode"] != OperatingMode.VELOCITY
-        self._goal_position[index] = self._angle(index, registers["goal_position"])
-        self._goal_velocity[index] = sense * registers["goal_velocity"] * RAD_S_PER_UNIT
-        self._profile_velocity[index] = registers["profile_velocity"] * RAD_S_PER_UNIT
-        self._profile_acceleration[index] = registers["profile_acceleration"] * RAD_S2_PER_UNIT
         self._temperature_limit[index] = registers["temperature_limit"]
         self._min_voltage[index] = registers["min_voltage"] * VOLT_PER_UNIT
         self._watchdog[index] = max(0, registers["bus_watchdog"]) * WATCHDOG_SECONDS_PER_UNIT
+        self._take_goals(index)
+
+    def _take_goals(self, index: int) -> None:
+        """Goals and profile as the registers have them."""
+        registers = self.registers[self.ids[index]]
+        self._goal_position[index] = self._angle(index, registers["goal_position"])
+        self._goal_velocity[index] = self._sense[index] * registers["goal_velocity"] * RAD_S_PER_UNIT
+        self._profile_velocity[index] = registers["profile_velocity"] * RAD_S_PER_UNIT
+        self._profile_acceleration[index] = registers["profile_acceleration"] * RAD_S2_PER_UNIT
 
     def measure(self, index: int) -> None:
-        """Bring the registers of one servo up to date before they are read."""
+        """Bring the registers of one servo up to date."""
+        self._measure_motion(index)
+        self._measure_supply(index)
+
+    def _measure_motion(self, index: int) -> None:
         id_ = self.ids[index]
         registers, sense = self.registers[id_], self._sense[index]
         angle = self.plant.position[index]
@@ -331,7 +351,10 @@ class VirtualServos:
         registers["present_current" if model.measures_current else "present_load"] = effort
         registers["present_velocity"] = velocity
         registers["present_position"] = self._present_ticks(index, float(angle))
+        registers["moving"] = int(abs(velocity) > registers["moving_threshold"])
+
+    def _measure_supply(self, index: int) -> None:
+        registers = self.registers[self.ids[index]]
         registers["present_voltage"] = max(0, round(self._drive.voltage / VOLT_PER_UNIT))
         registers["present_temperature"] = min(255, max(0, round(float(self.temperature[index]))))
         registers["realtime_tick"] = int(self.time * 1e3) % 32768
-        registers["moving"] = int(abs(velocity) > registers["moving_threshold"])
