@@ -60,7 +60,17 @@ def compare(b: Bench, y: np.ndarray, t: float | np.ndarray, tolerance: float) ->
     return ws
 
 
-@pytest.mark.parametrize("name", [*CASES, *TIMED])
+# Programs of their own to compile: M* goes lane by lane, and references are in "times of their own" too.
+SLOW = {name for name in CASES if "M*" in name} | {
+    "no choice of signs",
+    "references and loads",
+    "references and loads at their end",
+}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in (*CASES, *TIMED)]
+)
 def test_every_case_of_branches(name):
     """Lanes far apart, so that they take different branches wherever there are any."""
     case = (CASES | TIMED)[name]()
@@ -175,8 +185,9 @@ compare(case.bench, spread(case, 4, np.random.default_rng(99)), 0.0, 1e-15)
     "environment",
     [
         {"NUMBA_DISABLE_JIT": "1"},
-        {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""},
-        {"NUMBA_CPU_NAME": "haswell"},
+        # Each compiles everything anew.
+        pytest.param({"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}, marks=pytest.mark.slow),
+        pytest.param({"NUMBA_CPU_NAME": "haswell"}, marks=pytest.mark.slow),
     ],
     ids=["python", "no vectors", "AVX2"],
 )
