@@ -62,7 +62,17 @@ def compare(b: Bench, y: np.ndarray, t: float | np.ndarray, tolerance: float) ->
     return ws
 
 
-@pytest.mark.parametrize("name", [*CASES, *TIMED])
+# Programs of their own to compile: M* goes lane by lane, and references are in "times of their own" too.
+SLOW = {name for name in CASES if "M*" in name} | {
+    "no choice of signs",
+    "references and loads",
+    "references and loads at their end",
+}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in (*CASES, *TIMED)]
+)
 def test_every_case_of_branches(name):
     """Lanes far apart, so that they take different branches wherever there are any."""
     case = (CASES | TIMED)[name]()
