@@ -22,7 +22,8 @@ from dynsim.cli.app import (
     app,
     parsed_overrides,
 )
-from dynsim.cli.display import console, draw_comparison, draw_run, errors, progress
+from dynsim.cli.display import console, errors, progress
+from dynsim.cli.drawing import Figures, draw, draw_all
 from dynsim.cli.sweep import sweep
 from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
 from dynsim.hardware.cli import export, hw
@@ -68,7 +69,7 @@ def run(
     interruption.heed()
     interruption.check()
     if not no_figures:
-        draw_run(record, folder / "figures", quiet, format_)
+        draw(Figures({loaded.variant: record}, folder / "figures", format_), quiet)
     if not quiet:
         from dynsim.tables import print_summary
 
@@ -131,9 +132,8 @@ def compare(
         interruption.heed()
         interruption.check()
         if not no_figures:
-            for name, record in records.items():
-                draw_run(record, folder / name / "figures", quiet, format_)
-            draw_comparison(records, folder, quiet, format_)
+            wanted = [Figures({name: one}, folder / name / "figures", format_) for name, one in records.items()]
+            draw_all([*wanted, Figures(records, folder, format_, together=True)], folder, quiet)
         if not quiet:
             from dynsim.tables import print_comparison
 
@@ -213,11 +213,11 @@ def plot(
         labelled[label] = record
         folder = path.parent / "figures" if out is None else out if len(records) == 1 else out / label
         try:
-            draw_run(record, folder, quiet=False, format_=format_)
+            draw(Figures({label: record}, folder, format_), quiet=False)
         except RecordError as error:
             raise RecordError(f"{path}: {error}") from error
     if len(labelled) > 1:
-        draw_comparison(labelled, out or Path("figures"), quiet=False, format_=format_)
+        draw(Figures(labelled, out or Path("figures"), format_, together=True), quiet=False)
 
 
 @app.command(epilog="Example: dynsim bench --quick --json bench.json")

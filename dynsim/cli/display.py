@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from dynsim.terminal import Terminal, escaped
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-    from dynsim.record import Record
     from dynsim.scenario import Scenario
     from dynsim.studies.compare import VariantProgress
 
@@ -24,26 +23,11 @@ errors = Terminal(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 _TITLE_WIDTH = 22
 
 
-def draw_run(record: Record, folder: Path, quiet: bool, format_: str) -> None:
-    """Figures of one record into ``folder``; ``format_`` is that of the files."""
-    from dynsim import figures
-
-    _drawing(lambda: figures.draw(record, folder, format_), folder, quiet)
-
-
-def draw_comparison(records: dict[str, Record], folder: Path, quiet: bool, format_: str) -> None:
-    """Figures of several records over each other into ``folder``; ``format_`` is that of the files."""
-    from dynsim import figures
-
-    _drawing(lambda: figures.draw_comparison(records, folder, format_), folder, quiet)
-
-
-def _drawing(draw: Callable[[], Any], folder: Path, quiet: bool) -> None:
-    if quiet:
-        draw()
-    else:
-        with console.status(f"drawing {escaped(folder)}"):
-            draw()
+@contextmanager
+def drawing(folder: Path, quiet: bool) -> Iterator[None]:
+    """Says that figures are being drawn."""
+    with nullcontext() if quiet else console.status(f"drawing {escaped(folder)}"):
+        yield
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -19,7 +18,7 @@ from dynsim.cli.app import (
     SetOption,
     parsed_overrides,
 )
-from dynsim.cli.display import console, errors, sweep_progress
+from dynsim.cli.display import console, drawing, errors, sweep_progress
 from dynsim.errors import ScenarioError
 from dynsim.terminal import escaped
 
@@ -75,6 +74,7 @@ def sweep(
     from dynsim.files import check_writable
     from dynsim.scenario import read_scenario
     from dynsim.studies.plan import Axis, Law, Plan
+    from dynsim.studies.processes import cores
     from dynsim.studies.sweep import JOURNAL, OK, PLAN, STATISTICS, TABLES, has_parquet, run_sweep
 
     if jobs is not None and scheduler is not None:
@@ -88,7 +88,7 @@ def sweep(
         rows = run_sweep(
             plan,
             folder,
-            jobs=min(jobs or _cores(), plan.runs),
+            jobs=min(jobs or cores(), plan.runs),
             keep_records=keep_records.value,
             resume=resume,
             scheduler=scheduler,
@@ -130,13 +130,5 @@ def _draw(rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool, format_: s
         [axis.key for axis in plan.grid],
         plan.sampled,
     )
-    if quiet:
+    with drawing(folder, quiet):
         draw(table, folder, format_)
-    else:
-        with console.status(f"drawing {escaped(folder)}"):
-            draw(table, folder, format_)
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -104,7 +104,7 @@ def prepare(
     if stepped and robot.base is not None:
         raise ModelError(
             "integrator.method = 'time_stepping': it locates no events, so a mobile base would tip unseen; "
-            "take auto, or a plant without mobile base",
+            "take rk43, or radau5 with motors, or a plant without mobile base",
             keys=("integrator", "method"),
         )
     joint_rows = len(robot.couplings) + len(stops)

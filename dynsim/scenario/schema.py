@@ -131,7 +131,7 @@ class Integrator(StrictConfig):
     """Time integration."""
 
     method: Literal["auto", "rk43", "dopri5", "rk4", "radau5", "time_stepping"] = Field(
-        default="auto",
+        default="rk43",
         description="adaptive 4(3) or 5(4), fixed step, adaptive implicit (where motors hold the steps of the others), "
         "or fixed step with contacts that open and close; auto: one of the adaptive ones, by the system",
     )

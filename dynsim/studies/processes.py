@@ -16,17 +16,24 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing import connection, get_context, parent_process
 from multiprocessing.connection import Connection
-from typing import Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from dynsim import interruption
-from dynsim.engine import SIMULATION, Progress
 from dynsim.interruption import STOP_SIGNALS
+
+if TYPE_CHECKING:
+    from dynsim.engine import Progress  # numba, which not every work needs
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 # Between two looks for a signal that was lost [s].
 _LOOK_S = 0.5
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class WorkerLost(Exception):
@@ -174,7 +181,7 @@ def _serve(work: Callable[[Any, Progress], Any], pipe: Connection, stop: Any, se
     library.setLevel(level)
     library.addHandler(_ToParent(sender))
 
-    def look(time: float, stage: str = SIMULATION) -> None:
+    def look(time: float, stage: str = "") -> None:
         # Where Ctrl-C would have stopped it in the parent, with what there is.
         if stop.value:
             raise KeyboardInterrupt

@@ -20,12 +20,13 @@ def chosen(scenario: Scenario) -> str:
 
 
 def shipped(name: str, variant: str | None = None, **changes: Any) -> Scenario:
-    return load_scenario(name, variant, {"duration_s": 0.01, **changes})
+    return load_scenario(name, variant, {"duration_s": 0.01, "integrator.method": "auto", **changes})
 
 
 def chain(links: int = 2, **more: Any) -> Scenario:
     link = {"axis": "y", "length_m": 0.5, "radius_m": 0.01, "mass_kg": 1.0, "initial_deg": 30}
     joint = more.pop("joint", {})
+    more["integrator"] = {"method": "auto", **more.get("integrator", {})}
     plant = {"type": "serial_arm", "chain": [link | joint for _ in range(links)]}
     return scenario_from_resolved({"name": "chain", "duration_s": 0.01, "plant": plant, **more})
 
