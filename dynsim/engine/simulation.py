@@ -632,10 +632,20 @@ class Simulation:
             ("support", prepared.run.support._asdict() if prepared.run.support else {}),
             ("stepping", prepared.run.stepping._asdict() if prepared.run.stepping else {}),
             ("unilateral", {} if system.unilateral is None else system.unilateral._asdict()),
+            *_newton(prepared.run),
         ):
             found |= {f"{owner}.{name}": array for name, array in part.items() if isinstance(array, np.ndarray)}
         # Closed brakes are seen there.
         return found | {"model.body": system.model.body}
+
+
+def _newton(run: ki.Run) -> list[tuple[str, dict[str, Any]]]:
+    """What RADAU5 keeps from step to step, by owner; nothing of other methods."""
+    kept = run.newton
+    if kept is None:
+        return []
+    found, lanes = [("newton", kept._asdict())], kept.lanes
+    return found if lanes is None else [*found, ("lanes", lanes._asdict()), ("lanes.ws", lanes.ws._asdict())]
 
 
 def _index(choices: dict[str, int], name: str, what: str) -> int:

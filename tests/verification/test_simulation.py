@@ -79,8 +79,10 @@ def test_a_state_between_the_steps_is_that_of_the_record():
         np.testing.assert_allclose(state.current, whole["current"][k], rtol=0.0, atol=1e-6)
 
 
-def test_a_snapshot_has_the_same_future():
-    simulation = dynsim.Simulation(arm())
+@pytest.mark.parametrize("method", ["rk43", "radau5"])
+def test_a_snapshot_has_the_same_future(method):
+    """Of an implicit method also with the Jacobian, factors and stages that it keeps."""
+    simulation = dynsim.Simulation(arm(**{"integrator.method": method}))
     simulation.advance(0.7123)
     snapshot = simulation.snapshot()
     simulation.set_wrench("link_10", force=[0.0, 0.0, 20.0])
@@ -88,7 +90,7 @@ def test_a_snapshot_has_the_same_future():
     other = simulation.advance(1.5)
     simulation.restore(snapshot)
     first = simulation.advance(2.0)
-    untouched = dynsim.simulate(arm())
+    untouched = dynsim.simulate(arm(**{"integrator.method": method}))
     assert np.abs(other.q - untouched["q"][300]).max() > 1e-3
     np.testing.assert_array_equal(first.q, untouched["q"][-1])
     assert same(simulation.record(), untouched) or set(simulation.record()) - set(untouched) == {"work_loads"}
@@ -449,7 +451,10 @@ def elbows(simulation: dynsim.Simulation) -> np.ndarray:
     return np.array([simulation.model.point_position(body, np.zeros(3), q)[2] for body in ("link_4", "link_7")])
 
 
-@pytest.mark.parametrize("integrator", [{}, {"integrator.method": "time_stepping", "integrator.step_s": 1e-3}])
+STEPPING = {"integrator.method": "time_stepping", "integrator.step_s": 1e-3}
+
+
+@pytest.mark.parametrize("integrator", [{}, STEPPING, {"integrator.method": "radau5"}])
 def test_a_snapshot_with_contacts_has_the_same_future(tmp_path, integrator):
     """Taken while points stick, and within a step; in between others land, slip and lift off."""
     simulation = dynsim.Simulation(real_arm(tmp_path, **integrator))
