@@ -16,6 +16,7 @@ from dynsim.kernels.integrate.newton import CLOSE
 from dynsim.kernels.integrate.run import FINISHED, METHODS, STATUS, TIME_STEPPING, Run, new_run
 from dynsim.kernels.integrate.time_stepping import SteppingArrays, stepping_arrays
 from dynsim.kernels.jit import integers, reals
+from dynsim.kernels.lanes.system import has_forms
 from dynsim.kernels.state import LOSSES, block, output_layout, state_layout
 from dynsim.kernels.system import System, derivative, new_workspace
 from dynsim.model.arrays import (
@@ -265,6 +266,7 @@ class Bench:
             end=float(times[-1]),
             step=step,
             stepping=stepping,
+            lanes=has_forms(system),
             step_max=step if fixed else np.inf,
             rtol=rtol,
             # With an absolute tolerance out of reach every step is accepted and the next one is as long as allowed.

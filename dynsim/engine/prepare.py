@@ -18,6 +18,7 @@ from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.contact_events import NORMAL_GUARD, SLIP_GUARD, STOP_GUARD
 from dynsim.kernels.integrate.events import TIP_MARGIN
 from dynsim.kernels.integrate.time_stepping import GRIP, GRIP_AXIS, stepping_arrays
+from dynsim.kernels.lanes.system import has_forms
 from dynsim.kernels.state import LOSSES, OutputLayout, StateLayout, block, output_layout, state_layout
 from dynsim.kernels.system import System, new_workspace
 from dynsim.kernels.tree.support import OUTPUTS
@@ -154,6 +155,7 @@ def prepare(
         events=guards(robot, contacts if real else (), stops),
         support=compile_support(robot),
         stepping=stepping,
+        lanes=has_forms(system),
     )
     return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops)
 

@@ -164,8 +164,9 @@ def register_part(function: F, compiler: type[Compiler], options: Mapping[str, A
     what is not said here (``forceinline``).
     """
 
-    def implementation(*_: Any, **__: Any) -> F:
-        return function
+    def implementation(*kinds: Any, **__: Any) -> Any:
+        form, when = _FORMS.get(function, (None, None))
+        return form if when and when(*kinds) else function
 
     every = {"nopython": True, "pipeline_class": compiler, "forceinline": False, **options, **_NO_ENTRY}
     template = make_overload_template(function, implementation, every, strict=False, inline="never")
@@ -173,6 +174,20 @@ def register_part(function: F, compiler: type[Compiler], options: Mapping[str, A
     infer(template)
     infer_global(function, types.Function(template))
     return function
+
+
+# Parts with another form, and for which types of arguments it stands in.
+_FORMS: dict[Callable[..., Any], tuple[Callable[..., Any], Callable[..., bool]]] = {}
+
+
+def form_of(function: Callable[..., Any], when: Callable[..., bool]) -> Callable[[F], F]:
+    """The decorated function stands in for a registered part where ``when(*types of its arguments)`` is true."""
+
+    def put(form: F) -> F:
+        _FORMS[function] = form, when
+        return form
+
+    return put
 
 
 def _implementation(template: Any, args: Any, kws: Any) -> Any:

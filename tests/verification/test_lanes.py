@@ -6,25 +6,20 @@ what a run of its own gets, to the bit, and every place that asks lanes for one 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
 from typing import Any
 
 import lanes
 import numpy as np
 import pytest
+from lane_cases import CASES, TIMED, Case, held, run
 from lanes import Divergent, Lanes, Notes, Place, select
-from random_robots import Bench, bench, random_positions, random_robot, random_robot_of, random_unit, surface_through
 
 from dynsim.kernels import arrays as ka
 from dynsim.kernels import system
-from dynsim.kernels.constraint.rows import set_modes
 from dynsim.kernels.constraint.shapes import shaped_rows
 from dynsim.kernels.constraint.splits import admissible_forces
 from dynsim.kernels.constraint.unilateral import slide_direction
-from dynsim.kernels.jit import integers, reals
-from dynsim.model.description import Contact, Coupling, Inertia, Link, Load, Quadric, Robot
-from dynsim.model.drives import Motor, Servo, TorqueSource
 
 N = 4
 
@@ -123,222 +118,6 @@ FORMS = {
     "servo_circuit": servo_circuit_lanes,
     "surface_distance": surface_distance_lanes,
 }
-
-
-@dataclass
-class Case:
-    """States of a system about one, at a time."""
-
-    bench: Bench
-    y: np.ndarray
-    spread: float  # of the lanes about y
-    t: float = 0.0
-    t_step: float = 0.0  # of time from lane to lane; 0: one time for all
-
-
-def plane(rng: np.random.Generator, body: str, law: str = "signed", friction: float = 0.2) -> Contact:
-    surface = Quadric(np.zeros((3, 3)), random_unit(rng), rng.normal())
-    name = f"{body} {rng.integers(10**6)}"
-    return Contact(name, body, rng.normal(scale=0.3, size=3), surface, friction=friction, pulling_friction=law)
-
-
-def random_state(rng: np.random.Generator, b: Bench) -> np.ndarray:
-    y = b.state(random_positions(rng, b.robot), rng.normal(size=len(b.robot.links)))
-    current = b.part(y, "current")
-    current[:] = rng.normal(size=current.shape)
-    return y
-
-
-def of(rng: np.random.Generator, b: Bench, spread: float, **keys: Any) -> Case:
-    return Case(b, random_state(rng, b), spread, **keys)
-
-
-def on_planes(
-    n: int,
-    count: int,
-    law: str = "signed",
-    *,
-    seed: int = 0,
-    spread: float = 1.0,
-    friction: float = 0.2,
-    twice: bool = False,
-    m_star: bool = False,
-) -> Case:
-    """A tree with points of its last bodies on planes, the first of them ``twice``."""
-    rng = np.random.default_rng(seed)
-    contacts = [plane(rng, f"body_{n - 1 - k % n}", law, friction) for k in range(count)]
-    if twice:
-        contacts[1] = replace(contacts[0], name="again")
-    return of(rng, bench(random_robot(rng, n), contacts, m_star=m_star), spread)
-
-
-def free(seed: int = 0) -> Case:
-    rng = np.random.default_rng(seed)
-    return of(rng, bench(random_robot(rng, 8)), 1.0)
-
-
-def every_joint() -> Case:
-    rng = np.random.default_rng(1)
-    return of(
-        rng,
-        bench(random_robot_of(rng, ["ball", "rolling", "planar", "floating", "wheeled", "prismatic", "revolute"])),
-        1.0,
-    )
-
-
-def held(modes: list[int]) -> Case:
-    """Points that stick, slide and are off their planes."""
-    case = on_planes(7, len(modes), seed=2, spread=1e-3)
-    stick(case, modes)
-    return case
-
-
-def stick(case: Case, modes: list[int]) -> None:
-    """Give the contacts modes; those that stick do so where they are."""
-    b = case.bench
-    _, b.ws = run(case, [case.y], 0.0)
-    lanes.plain(set_modes)(b.system.contacts, b.system.couplings, None, b.ws, integers(modes))
-
-
-def curved() -> Case:
-    """A sphere, a cylinder, and a level set that is nowhere zero."""
-    rng = np.random.default_rng(3)
-    surfaces = [
-        surface_through(rng, "sphere", rng.normal(size=3)),
-        surface_through(rng, "cylinder", rng.normal(size=3)),
-    ]
-    surfaces.append(Quadric(np.eye(3), np.zeros(3), 0.8))
-    contacts = [
-        replace(plane(rng, f"body_{3 + k}"), surface=surface, name=str(k)) for k, surface in enumerate(surfaces)
-    ]
-    return of(rng, bench(random_robot(rng, 6, branches=False), contacts), 1e-3)
-
-
-def saddle() -> Case:
-    """A surface that bends both ways, of which some lanes are too far for a distance along its normal."""
-    rng = np.random.default_rng(9)
-    contact = replace(plane(rng, "body_5"), surface=Quadric(np.diag([1.0, 0.5, -2.0]), np.zeros(3), -0.5))
-    return of(rng, bench(random_robot(rng, 6, branches=False), [contact]), 1.0)
-
-
-def coupled(m_star: bool = False) -> Case:
-    """Joints that follow others up and down the tree, and a point that sticks to a body that moves."""
-    rng = np.random.default_rng(4)
-    robot = random_robot(rng, 8)
-    couplings = (Coupling("joint_6", "joint_2", 0.7, 0.1), Coupling("joint_1", "joint_7", -1.3))
-    b = bench(replace(robot, couplings=couplings), [plane(rng, "body_5")], m_star=m_star)
-    case = of(rng, b, 1e-3)
-    if not m_star:
-        stick(case, [ka.STICKING])
-    b.ws.active[2:, ka.BODY_B] = 3
-    return case
-
-
-def driven(t: float, t_step: float = 0.0) -> Case:
-    """References by splines, held and rewritten; wrenches that are constant, end, and are held."""
-    rng = np.random.default_rng(5)
-    robot = replace(
-        random_robot(rng, 5, motors=False),
-        motors=tuple(Motor(f"joint_{k}", 0.2, 1.3, 2e-3, 1e-4, 7.0, 1e-3) for k in range(4)),
-    )
-    knots, coefficients = np.array([0.1, 0.4, 0.9, 1.6]), rng.normal(size=(3, 6, 4))
-    loads = [
-        Load("none", "body_4", rng.normal(size=3), False, np.zeros(1), np.zeros((0, 6, 4)), False),
-        Load("ends", "body_3", rng.normal(size=3), True, knots, coefficients, False),
-        Load("held", "body_2", rng.normal(size=3), False, knots, coefficients, True),
-    ]
-    b = bench(robot, loads=loads)
-    reference = ka.ReferenceArrays(
-        integers([0, ka.HELD_POSITION, 1, ka.REWRITTEN]),
-        reals(rng.normal(size=4)),
-        reals([0.0, 0.5]),
-        reals(rng.normal(size=(4, 2, 6))),
-        reals(rng.normal(size=(4, 4, 6))),
-    )
-    b.system = b.system._replace(reference=reference)
-    b.system.drives.input[3, [ka.LINE_START, ka.LINE_RATE, ka.LINE_SINCE]] = rng.normal(size=3)
-    return of(rng, b, 1.0, t=t, t_step=t_step)
-
-
-def limited() -> Case:
-    """Motors of which some lanes are at their limits."""
-    rng = np.random.default_rng(6)
-    robot = random_robot(rng, 6)
-    motors = tuple(replace(motor, voltage_limit=15.0) for motor in robot.motors)
-    return of(rng, bench(replace(robot, motors=motors)), 1.0)
-
-
-def servos() -> Case:
-    """Every kind of drive and mode of a servo."""
-    rng = np.random.default_rng(7)
-    robot = random_robot_of(rng, ["revolute"] * 6)
-    common: dict[str, Any] = {"torque_constant": 1.9, "resistance": 2.3, "coulomb_friction": 0.3, "free_drag": 0.1}
-    motors = (
-        Servo("joint_0", k_p=6.0, k_d=0.2, voltage_limit=8.0, current_limit=2.0, **common),
-        Servo("joint_1", k_p=0.0, k_v=5.0, velocity_mode=True, **common),
-        Servo("joint_2", k_p=40.0, **common),
-        Motor("joint_3", 0.2, 1.3, 2e-3, 1e-4, 7.0, 1e-3),
-        TorqueSource("joint_4", 0.3),
-        Servo("joint_5", k_p=40.0, voltage_limit=0.5, **common),
-    )
-    b = bench(replace(robot, motors=motors), held=rng.normal(size=6))
-    b.system.drives.table[2, ka.SERVO_MODE] = ka.OFF
-    b.system.drives.table[5, ka.SAMPLED] = 1
-    b.system.drives.input[5, ka.COMMAND] = 0.7
-    return of(rng, b, 1.0)
-
-
-def unmoved() -> Case:
-    """A point of a slide along x on a floor: a system of one row that is zero."""
-    x, z = np.eye(3)[0], np.eye(3)[2]
-    robot = Robot("slide", (Link("body", "joint", None, "prismatic", x, Inertia(1.0)),), (), ("body", np.zeros(3)))
-    b = bench(robot, [Contact("foot", "body", np.zeros(3), Quadric(np.zeros((3, 3)), z, 0.0))])
-    return of(np.random.default_rng(8), b, 1.0)
-
-
-# Name → states. Spread widely; by little where lanes must agree; not at all where rounding decides on pivots.
-CASES: dict[str, Callable[[], Case]] = {
-    "free arm": free,
-    "every joint": every_joint,
-    "one brace": lambda: on_planes(5, 1),
-    "two braces": lambda: on_planes(6, 2),
-    "two braces, M*": lambda: on_planes(6, 2, m_star=True),
-    "curved": curved,
-    "saddle": saddle,
-    "references and loads": lambda: driven(0.7),
-    "references and loads at their end": lambda: driven(3.0),
-    "voltage limits": limited,
-    "servos": servos,
-    "held, sliding, off": lambda: held([ka.STICKING, ka.OPEN, ka.SLIDING]),
-    "sliding, held, held": lambda: held([ka.SLIDING, ka.STICKING, ka.STICKING]),
-    "coupled": coupled,
-    "coupled, M*": lambda: coupled(m_star=True),
-    "dissipative": lambda: on_planes(6, 3, "dissipative", seed=1, spread=1e-4),
-    "dissipative, M*": lambda: on_planes(6, 3, "dissipative", seed=1, spread=1e-4, m_star=True),
-    "no choice of signs": lambda: on_planes(6, 3, "dissipative", seed=1, spread=1e-6, friction=3.0, m_star=True),
-    "dependent": lambda: on_planes(3, 5, spread=0.0),
-    "very dependent": lambda: on_planes(2, 6, spread=0.0, twice=True),
-    "twice the same point": lambda: on_planes(5, 9, spread=0.0, twice=True),
-    "unmoved": unmoved,
-}
-TIMED = {
-    "times of their own": lambda: driven(0.7, 0.01),
-    "times of their own, at the end": lambda: driven(3.0, 0.01),
-}
-
-
-def run(case: Case, states: list[np.ndarray], t: Any, **forms: Callable[..., Any]) -> tuple[np.ndarray, ka.Workspace]:
-    """Derivative and workspace of states as lanes, or of one state as it is; kernels replaced by their ``forms``."""
-    b, count = case.bench, len(states)
-    parts, ws, dense = b.system, lanes.copies(b.ws), lanes.copies(b.system.dense)
-    y, dy = states[0], np.zeros_like(states[0])
-    if count > 1:
-        parts, ws, dense = lanes.constants(parts), lanes.in_lanes(ws, count), lanes.in_lanes(dense, count)
-        y, dy = lanes.stacked(states), lanes.stacked([dy] * count)
-    with pytest.MonkeyPatch.context() as patches, np.errstate(all="ignore"):
-        lanes.patch(patches, system.derivative, **forms)
-        lanes.plain(system.derivative)(parts._replace(dense=dense), t, y, ws, dy)
-    return dy, ws
 
 
 def spread(case: Case, rng: np.random.Generator) -> list[np.ndarray]:

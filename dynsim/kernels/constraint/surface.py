@@ -40,7 +40,7 @@ from dynsim.kernels.arrays import (
 )
 from dynsim.kernels.constraint.rows import point_row, sticking_rows
 from dynsim.kernels.constraint.unilateral import UnilateralArrays, slide_direction
-from dynsim.kernels.jit import exact_kernel, inlined_kernel, kernel
+from dynsim.kernels.jit import exact_kernel, inlined_kernel, internal_kernel
 
 # Tries, beyond two per contact, to find signs of dissipative contacts that agree with their forces.
 SIGN_PASSES = 64
@@ -50,7 +50,7 @@ SIGNS_LIMIT = 8
 NO_FORCE = 1e-12
 
 
-@kernel
+@internal_kernel
 def surface_distance(value, slope, curvature):
     """Signed distance along the normal from the level-set value: root of C − |∇C| s + κ s²/2 with κ = nᵀQn.
 

@@ -6,8 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.arrays import BLOCK_SIZE
+from dynsim.kernels.arrays import BLOCK_SIZE, Workspace
 from dynsim.kernels.jit import internal_kernel
+from dynsim.kernels.lanes.system import FOUR, lane_workspace
+from dynsim.kernels.lanes.tables import aligned
 
 # NewtonArrays.clock: step that the factors are of, that the stages are of, that the extrapolation is of [s];
 # contraction of Newton's method, and what it says of the error of the last iterate; the error
@@ -19,6 +21,24 @@ CLOSE_ENOUGH = 0.03
 # kept for extrapolation; there are such; Jacobians, factorisations, Newton iterations, steps in which they diverged.
 STALE, MADE_AT, SEEN, EXTRAPOLATES, JACOBIANS, FACTORS, ITERATIONS, DIVERGED = 0, 1, 2, 3, 4, 5, 6, 7
 NEWTON_COUNT_SIZE = 8
+
+
+class StageLanes(NamedTuple):
+    """Room for right-hand sides that are evaluated four at a time."""
+
+    ws: Workspace
+    t: np.ndarray  # (4,)
+    y: np.ndarray  # (m, 4)
+    f: np.ndarray  # (m, 4)
+    delta: np.ndarray  # (4,)
+    output: np.ndarray  # (columns.size, 4), see dynsim.kernels.state.OutputLayout
+
+
+def stage_lanes(ws: Workspace, m: int, columns: int) -> StageLanes:
+    """Allocate :class:`StageLanes` beside a workspace, whose rows are taken whenever the Jacobian is made anew."""
+    return StageLanes(
+        lane_workspace(ws, FOUR), aligned(4), aligned(m, 4), aligned(m, 4), aligned(4), aligned(columns, 4)
+    )
 
 
 class NewtonArrays(NamedTuple):
@@ -38,8 +58,15 @@ class NewtonArrays(NamedTuple):
     two: np.ndarray  # (s,) complex
     room_one: np.ndarray  # (2, s)
     room_two: np.ndarray  # (2, s) complex
+    direct: np.ndarray  # (n, n, 4) inverses of both matrices, see dynsim.kernels.integrate.reduced
+    crossed: np.ndarray  # (n, n, 4)
+    over: np.ndarray  # (2, 4) 1/g
+    circuit: np.ndarray  # (na, 2, 4) and 1/(g − ∂(di/dt)/∂i)
+    x: np.ndarray  # (s, 4)
+    room: np.ndarray  # (3, s, 4)
     clock: np.ndarray  # (NEWTON_CLOCK_SIZE,)
     count: np.ndarray  # (NEWTON_COUNT_SIZE,) int
+    lanes: StageLanes | None = None  # None: right-hand sides one by one
 
 
 def newton_arrays(n: int, na: int, circuits: int, tracked: int, m: int) -> NewtonArrays:
@@ -63,6 +90,12 @@ def newton_arrays(n: int, na: int, circuits: int, tracked: int, m: int) -> Newto
         two=np.zeros(tracked, dtype=np.complex128),
         room_one=np.zeros((2, tracked)),
         room_two=np.zeros((2, tracked), dtype=np.complex128),
+        direct=aligned(n, n, 4),
+        crossed=aligned(n, n, 4),
+        over=aligned(2, 4),
+        circuit=aligned(na, 2, 4),
+        x=aligned(tracked, 4),
+        room=aligned(3, tracked, 4),
         clock=clock,
         count=count,
     )

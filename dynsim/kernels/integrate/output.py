@@ -33,36 +33,41 @@ from dynsim.kernels.tree.support import OUTPUTS, SupportArrays, ground_reaction
 @internal_kernel
 def write_output(system: System, ws: Workspace, run: Run, row):
     """Everything worth recording that is not a state, after ``derivative``, into the columns of OutputLayout."""
-    out, joints, motors, motor, state = run.output, ws.joints, ws.motors, system.drives.motor, ws.contacts
-    columns = run.columns
+    fill_output(system, ws, run, run.output[row])
+    write_support(system, ws, run, row, run.support)
+
+
+@internal_kernel
+def fill_output(system: System, ws: Workspace, run: Run, out):
+    """The same but for what the ground carries, into out (columns.size,); also of lanes."""
+    joints, motors, motor, state, columns = ws.joints, ws.motors, system.drives.motor, ws.contacts, run.columns
     force_vectors(ws)
     for i in range(joints.shape[0]):
-        out[row, columns.vdot + i] = joints[i, QDD]
+        out[columns.vdot + i] = joints[i, QDD]
     for a in range(motors.shape[0]):
         i = system.drives.table[a, DRIVEN]
-        out[row, columns.current + a] = motors[a, CURRENT]
-        out[row, columns.voltage + a] = motors[a, VOLTAGE]
-        out[row, columns.torque + a] = (
+        out[columns.current + a] = motors[a, CURRENT]
+        out[columns.voltage + a] = motors[a, VOLTAGE]
+        out[columns.torque + a] = (
             motor[a, K_M] * motors[a, CURRENT]
             - motor[a, J_M] * joints[i, QDD]
             - motor[a, D_M] * joints[i, QD]
             - motors[a, DRAG]
         )
-    point_position(ws, run.hand_link, run.hand_point, out[row, columns.hand : columns.hand + 3])
-    out[row, columns.energy] = kinetic_energy(system.model, ws)
-    out[row, columns.energy + 1] = potential_energy(system.model, ws)
-    out[row, columns.energy + 2] = magnetic_energy(system.drives, ws)
+    point_position(ws, run.hand_link, run.hand_point, out[columns.hand : columns.hand + 3])
+    out[columns.energy] = kinetic_energy(system.model, ws)
+    out[columns.energy + 1] = potential_energy(system.model, ws)
+    out[columns.energy + 2] = magnetic_energy(system.drives, ws)
     k = columns.contact
     for c in range(state.shape[0]):
-        out[row, k + OUT_FORCE] = state[c, NORMAL_FORCE]
-        out[row, k + OUT_GAP] = state[c, GAP]
-        out[row, k + OUT_MODE] = ws.active[c, MODE]
+        out[k + OUT_FORCE] = state[c, NORMAL_FORCE]
+        out[k + OUT_GAP] = state[c, GAP]
+        out[k + OUT_MODE] = ws.active[c, MODE]
         for s in range(3):
-            out[row, k + OUT_VECTOR + s] = state[c, FORCE_VECTOR + s]
-            out[row, k + OUT_SLIP + s] = state[c, SLIP_VELOCITY + s]
+            out[k + OUT_VECTOR + s] = state[c, FORCE_VECTOR + s]
+            out[k + OUT_SLIP + s] = state[c, SLIP_VELOCITY + s]
         k += OUTPUTS_PER_CONTACT
-    write_support(system, ws, run, row, run.support)
-    stop_forces(system.unilateral, out[row, columns.stop :])
+    stop_forces(system.unilateral, out[columns.stop :])
 
 
 @internal_kernel

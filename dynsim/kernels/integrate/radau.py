@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import CIRCUIT, DRIVEN, QDD, RATE_I, RATE_Q, RATE_V, Workspace
+from dynsim.kernels.arrays import Workspace
 from dynsim.kernels.drive.law import drive_block
 from dynsim.kernels.integrate.newton import (
     CLOSE,
@@ -35,9 +35,10 @@ from dynsim.kernels.integrate.newton import (
     SEEN,
     STALE,
     TRIED,
-    NewtonArrays,
 )
+from dynsim.kernels.integrate.reduced import factor_both, solve_both
 from dynsim.kernels.integrate.run import ATOL, EVALUATIONS, RTOL, STEP, STEPS, TIME, Run
+from dynsim.kernels.integrate.stages import columns, evaluate_stages
 from dynsim.kernels.integrate.steps import error_norm
 from dynsim.kernels.integrate.tableaux import (
     A_RADAU,
@@ -51,7 +52,6 @@ from dynsim.kernels.integrate.tableaux import (
 )
 from dynsim.kernels.jit import internal_kernel, merged_kernel
 from dynsim.kernels.system import System, derivative
-from dynsim.kernels.tree.joints import displace, positions_along, rates_across
 
 # Newton's method: most iterations, and the contraction below which the Jacobian stays.
 MOST_ITERATIONS, GOOD_CONTRACTION = 8, 0.05
@@ -66,108 +66,14 @@ def differentiate(system: System, ws: Workspace, run: Run):
     The stiff electrical rows are not taken from here but are the drives' own; v̇ is linear in the currents.
     """
     t, y, x, base, r = run.clock[TIME], run.y, run.stage[6], run.stage[7], run.newton
-    n, v, joints = ws.joints.shape[0], system.layout.v, ws.joints
     # The workspace may still hold a sample or a rejected step.
     derivative(system, t, y, ws, base)
     for a in range(ws.motors.shape[0]):
         drive_block(system.drives, ws, a, r.linear[a])
-    for s in range(r.along.shape[0]):
-        for j in range(y.shape[0]):
-            x[j] = y[j]
-        if s < n and system.layout.extra > 0:
-            delta = 1e-7
-            for i in range(n):
-                joints[i, QDD] = delta if i == s else 0.0
-            displace(system.model.compound, system.model, ws, x, system.layout.q)
-        else:
-            j = system.layout.q + s if s < n else v + s - n if s < 2 * n else system.layout.current + s - 2 * n
-            delta = 1e-3 if s >= 2 * n else 1e-8 * max(abs(y[j]), 0.1) if s >= n else 1e-7 * max(abs(y[j]), 1.0)
-            x[j] = y[j] + delta
-            delta = x[j] - y[j]
-        derivative(system, t, x, ws, r.f[0])
-        for i in range(n):
-            r.along[s, i] = (r.f[0, v + i] - base[v + i]) / delta
+    columns(r.lanes, system, ws, t, y, x, base, r)
     run.count[EVALUATIONS] += r.along.shape[0] + 1
     r.count[JACOBIANS] += 1
     r.count[STALE], r.count[MADE_AT], r.clock[FACTORED] = 0, run.count[STEPS], 0.0
-
-
-@internal_kernel
-def factor_newton(system: System, r: NewtonArrays, g, matrix, pivot):
-    """The reduced matrix for g, real or complex, LU-factored with partial pivoting."""
-    along, block, table = r.along, r.linear, system.drives.table
-    n = matrix.shape[0]
-    first = 2 * n  # of the rows of circuits
-    for i in range(n):
-        for j in range(n):
-            matrix[i, j] = -along[n + j, i] - along[j, i] / g
-        matrix[i, i] += g
-    for a in range(table.shape[0]):
-        j, k = table[a, DRIVEN], table[a, CIRCUIT]
-        if k >= 0:
-            slope = (block[a, RATE_Q] / g + block[a, RATE_V]) / (g - block[a, RATE_I])
-            for i in range(n):
-                matrix[i, j] -= along[first + k, i] * slope
-    for k in range(n):
-        best, largest = k, 0.0
-        for i in range(k, n):
-            x = matrix[i, k]
-            size = x.real * x.real + x.imag * x.imag
-            if size > largest:
-                best, largest = i, size
-        pivot[k] = best
-        if best != k:
-            for j in range(n):
-                matrix[k, j], matrix[best, j] = matrix[best, j], matrix[k, j]
-        for i in range(k + 1, n):
-            matrix[i, k] /= matrix[k, k]
-            for j in range(k + 1, n):
-                matrix[i, j] -= matrix[i, k] * matrix[k, j]
-
-
-@internal_kernel
-def solve_newton(system: System, ws: Workspace, y, r: NewtonArrays, g, matrix, pivot, x, room):
-    """x ← (g I − J)⁻¹ x by the factors of :func:`factor_newton`, x (s,) and room (2, s) real or complex."""
-    along, block, table, layout = r.along, r.linear, system.drives.table, system.layout
-    n, q, v, current = matrix.shape[0], system.layout.q, system.layout.v, system.layout.current
-    u, angle, first = room[0], room[1], 2 * n
-    if layout.extra > 0:
-        rates_across(system.model.compound, system.model, y, q, x, angle)
-    for i in range(n):
-        angle[i] = (angle[i] if layout.extra > 0 else x[q + i]) / g
-        u[i] = x[v + i]
-    for j in range(n):
-        for i in range(n):
-            u[i] += along[j, i] * angle[j]
-    for a in range(table.shape[0]):
-        j, k = table[a, DRIVEN], table[a, CIRCUIT]
-        if k >= 0:
-            free = (x[current + k] + block[a, RATE_Q] * angle[j]) / (g - block[a, RATE_I])
-            for i in range(n):
-                u[i] += along[first + k, i] * free
-    for i in range(n):
-        p = pivot[i]
-        u[i], u[p] = u[p], u[i]
-    for i in range(n):
-        for j in range(i):
-            u[i] -= matrix[i, j] * u[j]
-    for i in range(n - 1, -1, -1):
-        for j in range(i + 1, n):
-            u[i] -= matrix[i, j] * u[j]
-        u[i] /= matrix[i, i]
-    for a in range(table.shape[0]):
-        j, k = table[a, DRIVEN], table[a, CIRCUIT]
-        if k >= 0:
-            pull = block[a, RATE_Q] * (angle[j] + u[j] / g) + block[a, RATE_V] * u[j]
-            x[current + k] = (x[current + k] + pull) / (g - block[a, RATE_I])
-    for i in range(n):
-        x[v + i] = u[i]
-        if layout.extra == 0:
-            x[q + i] = angle[i] + u[i] / g
-    if layout.extra > 0:
-        positions_along(system.model.compound, system.model, y, q, u, x)
-        for j in range(q, q + n + layout.extra):
-            x[j] /= g
 
 
 @internal_kernel
@@ -211,10 +117,7 @@ def solve_stages(system: System, ws: Workspace, run: Run, h):
     guess_stages(run, h)
     lever, least = max(r.clock[LEVER], 1e-16) ** 0.8, 1 - r.count[EXTRAPOLATES]
     for k in range(MOST_ITERATIONS):
-        for s in range(3):
-            for j in range(tracked):
-                x[j] = y[j] + r.z[s, j]
-            derivative(system, t + NODE_RADAU[s] * h, x, ws, r.f[s])
+        evaluate_stages(r.lanes, system, ws, t, h, y, x, r)
         run.count[EVALUATIONS] += 3
         r.count[ITERATIONS] += 1
         for j in range(tracked):
@@ -225,8 +128,7 @@ def solve_stages(system: System, ws: Workspace, run: Run, h):
                 T_INVERSE_RADAU[1, 0] * f0 + T_INVERSE_RADAU[1, 1] * f1 + T_INVERSE_RADAU[1, 2] * f2,
                 T_INVERSE_RADAU[2, 0] * f0 + T_INVERSE_RADAU[2, 1] * f1 + T_INVERSE_RADAU[2, 2] * f2,
             ) - c * complex(r.w[1, j], r.w[2, j])
-        solve_newton(system, ws, y, r, g, r.real, r.pivot[0], r.one, r.room_one)
-        solve_newton(system, ws, y, r, c, r.complex, r.pivot[1], r.two, r.room_two)
+        solve_both(system, ws, y, r, h)
         total = 0.0
         for j in range(tracked):
             d0, d1, d2 = r.one[j], r.two[j].real, r.two[j].imag
@@ -263,7 +165,8 @@ def estimate(system: System, ws: Workspace, run: Run, h, slope):
     r, error = run.newton, run.stage[7]
     for j in range(r.one.shape[0]):
         r.one[j] = slope[j] + (ERROR_RADAU[0] * r.z[0, j] + ERROR_RADAU[1] * r.z[1, j] + ERROR_RADAU[2] * r.z[2, j]) / h
-    solve_newton(system, ws, run.y, r, GAMMA_RADAU / h, r.real, r.pivot[0], r.one, r.room_one)
+        r.two[j] = 0.0
+    solve_both(system, ws, run.y, r, h)
     for j in range(error.shape[0]):
         error[j] = r.one[j] if j < r.one.shape[0] else 0.0
     return error_norm(system, ws, run, error)
@@ -282,8 +185,7 @@ def step_radau5(system: System, ws: Workspace, run: Run):
         if r.count[STALE] == 1:
             differentiate(system, ws, run)
         if r.clock[FACTORED] != h:
-            factor_newton(system, r, GAMMA_RADAU / h, r.real, r.pivot[0])
-            factor_newton(system, r, complex(ALPHA_RADAU / h, BETA_RADAU / h), r.complex, r.pivot[1])
+            factor_both(system, r, h)
             r.clock[FACTORED] = h
             r.count[FACTORS] += 1
         if solve_stages(system, ws, run, h):

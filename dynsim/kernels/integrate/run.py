@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.arrays import row_limit
+from dynsim.kernels.arrays import row_limit, workspace
 from dynsim.kernels.constraint.uniqueness import ROOM
-from dynsim.kernels.integrate.newton import NewtonArrays, newton_arrays
+from dynsim.kernels.integrate.newton import NewtonArrays, newton_arrays, stage_lanes
 from dynsim.kernels.integrate.time_stepping import SteppingArrays
 from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.state import OUTPUTS_PER_CONTACT, OutputLayout, StateLayout, block
@@ -131,8 +131,11 @@ def new_run(
     breaks: np.ndarray | None = None,
     support: SupportArrays | None = None,
     stepping: SteppingArrays | None = None,
+    lanes: bool = False,
 ) -> Run:
     """Allocate a :class:`Run` from t = 0 at state y, (layout.size,).
+
+    ``lanes``: RADAU5 evaluates right-hand sides together, see dynsim.kernels.lanes.system.has_forms.
 
     Raises
     ------
@@ -151,6 +154,9 @@ def new_run(
     extremes[:, FORCE_MIN], extremes[:, FORCE_MAX], extremes[:, LOCAL_SINCE] = np.inf, -np.inf, np.inf
     count = np.zeros(COUNT_SIZE, dtype=np.int64)
     count[MODES_DUE] = AT_START
+    newton = newton_arrays(n, na, layout.circuits, layout.tracked, m) if method == RADAU5 else None
+    if newton is not None and lanes:
+        newton = newton._replace(lanes=stage_lanes(workspace(n, na, c, couplings), m, columns.size))
     return Run(
         method=method,
         layout=layout,
@@ -179,5 +185,5 @@ def new_run(
         columns=columns,
         output=np.zeros((len(sample_time), columns.size)),
         stepping=stepping,
-        newton=newton_arrays(n, na, layout.circuits, layout.tracked, m) if method == RADAU5 else None,
+        newton=newton,
     )

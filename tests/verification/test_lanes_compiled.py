@@ -1,0 +1,185 @@
+"""Right-hand sides on lanes, compiled: a lane gets what a run of its own gets, to rounding, whatever the others do.
+
+``test_lanes`` runs the kernels' source on lanes as Python; here is the machine code, with the forms of
+``dynsim.kernels.lanes.forms`` in it.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lane_cases import CASES, TIMED, Case
+from lanes import copies
+from random_robots import Bench, bench, random_contacts, random_positions, random_robot
+
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.integrate.driver import advance
+from dynsim.kernels.integrate.run import PROJECTIONS
+from dynsim.kernels.jit import reals
+from dynsim.kernels.lanes.fixed_step import advance_rk4, stages
+from dynsim.kernels.lanes.system import EIGHT, derivatives, lane_workspace
+from dynsim.kernels.lanes.tables import AXES, aligned, spread_tables
+from dynsim.kernels.system import System, derivative
+
+# Of cases whose matrices are ill-conditioned, where one rounding more or less is seen by as much.
+ROUNDING, FORCES = 1e-15, 1e-11
+AMPLIFIED = {"every joint": 1e-11, "sliding, held, held": 1e-9}
+
+
+def spread(case: Case, count: int, rng: np.random.Generator) -> np.ndarray:
+    """States about that of the case, (m, count)."""
+    scale = np.where(np.arange(len(case.y)) < case.bench.system.layout.tracked, 1.0, 0.0)
+    return np.array([case.y + scale * rng.normal(size=len(case.y)) for _ in range(count)]).T.copy()
+
+
+def alone(b: Bench, system: System, t: float, y: np.ndarray, kept: ka.Workspace) -> tuple[np.ndarray, ka.Workspace]:
+    """The derivative by a workspace of its own."""
+    ws, dy = copies(kept), np.zeros(len(y))
+    derivative(system, t, reals(y), ws, dy)
+    return dy, ws
+
+
+def compare(b: Bench, y: np.ndarray, t: float | np.ndarray, tolerance: float) -> ka.Workspace:
+    """All lanes against runs of their own: NaN where they have it, else per largest entry."""
+    count = y.shape[1]
+    kept, ws, dy = copies(b.ws), lane_workspace(b.ws, (0.0,) * count), np.zeros_like(y)
+    derivatives(b.system, t, y, ws, dy)
+    for k in range(count):
+        expected, room = alone(b, b.system, float(t[k]) if isinstance(t, np.ndarray) else t, y[:, k], kept)
+        np.testing.assert_array_equal(np.isnan(dy[:, k]), np.isnan(expected))
+        assert np.nanmax(np.abs(dy[:, k] - expected)) <= tolerance * np.nanmax(np.abs(expected))
+        forces, forces_alone = ws.rows[:, ka.FORCE, k], room.rows[:, ka.FORCE]
+        largest = np.nanmax(np.abs(forces_alone), initial=1e-300)
+        np.testing.assert_allclose(forces, forces_alone, rtol=0.0, atol=max(FORCES, tolerance) * largest)
+        np.testing.assert_array_equal(ws.rows[:, ka.SIGN, k], room.rows[:, ka.SIGN])
+    return ws
+
+
+@pytest.mark.parametrize("name", [*CASES, *TIMED])
+def test_every_case_of_branches(name):
+    """Lanes far apart, so that they take different branches wherever there are any."""
+    case = (CASES | TIMED)[name]()
+    t = case.t + case.t_step * np.arange(8.0) if name in TIMED else case.t
+    compare(case.bench, spread(case, 8, np.random.default_rng(99)), t, AMPLIFIED.get(name, ROUNDING))
+
+
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("count", [4, 8])
+def test_random_trees(seed, count):
+    """Motors, some at their limits, and contacts on planes and curved surfaces by both laws of friction."""
+    rng = np.random.default_rng(seed)
+    n, c = int(rng.integers(5, 12)), int(rng.integers(1, 4))
+    robot = random_robot(rng, n)
+    b = bench(robot, random_contacts(rng, robot, random_positions(rng, robot), c))
+    b.system.drives.motor[:, ka.U_MAX] = 15.0
+    y = np.zeros((b.system.layout.size, count))
+    for k in range(count):
+        y[:, k] = b.state(random_positions(rng, robot), rng.normal(size=n))
+        b.part(y[:, k], "current")[:] = rng.normal(size=len(robot.motors))
+    compare(b, y, 0.3, ROUNDING)
+
+
+def test_the_cases_have_lanes_that_differ():
+    """Signs of friction and limits of voltage are not the same in all lanes above."""
+    case = CASES["dissipative"]()
+    ws = compare(case.bench, spread(case, 8, np.random.default_rng(99)), 0.0, ROUNDING)
+    assert {*ws.rows[:3, ka.SIGN].flat} == {-1.0, 1.0}
+    assert np.ptp(ws.rows[:3, ka.SIGN], axis=1).max() > 0.0
+    case = CASES["voltage limits"]()
+    ws = compare(case.bench, spread(case, 8, np.random.default_rng(99)), 0.0, ROUNDING)
+    held = np.abs(ws.motors[:, ka.VOLTAGE]) == 15.0
+    assert np.any(held)
+    assert not np.all(held)
+
+
+def varied(system: System, count: int, rng: np.random.Generator) -> System:
+    """The system with parameters of their own for so many lanes."""
+    tables = spread_tables(system, count)
+    tables.model.body[:, ka.MASS] *= rng.uniform(0.9, 1.1, size=(len(system.model.body), count))
+    tables.drives.motor[:, ka.K_P] *= rng.uniform(0.9, 1.1, size=(len(system.drives.motor), count))
+    tables.contacts.point[:, ka.V_S] *= rng.uniform(0.9, 1.1, size=(len(system.contacts.point), count))
+    tables.reference.held[:] += rng.normal(scale=0.1, size=tables.reference.held.shape)
+    return tables
+
+
+def of_lane(tables: System, k: int) -> System:
+    """The system of lane k, tables of its own."""
+    parts = {}
+    for name, part in tables._asdict().items():
+        axes = AXES.get(type(part), {})
+        if axes:
+            part = part._replace(
+                **{
+                    key: reals(table[..., k])
+                    for key, table in part._asdict().items()
+                    if key in axes and table is not None
+                }
+            )
+        parts[name] = part
+    return tables._replace(**parts)
+
+
+def braced(seed: int = 3) -> tuple[Bench, np.ndarray]:
+    """A tree with gentle motors and two points on their surfaces: what is fast and chatters amplifies rounding."""
+    rng = np.random.default_rng(seed)
+    robot = random_robot(rng, 7)
+    q = random_positions(rng, robot)
+    return bench(robot, random_contacts(rng, robot, q, 2), k_p=0.3, k_d=0.01), q
+
+
+def test_runs_of_their_own_parameters():
+    """Eight runs of RK4 with masses, gains and references of their own, projected, against each alone."""
+    (b, q), rng = braced(), np.random.default_rng(5)
+    tables = varied(b.system, 8, rng)
+    y0 = b.state(q, np.zeros(len(b.robot.links)))
+    y, ws, h, steps = aligned(len(y0), 8), lane_workspace(b.ws, EIGHT), 1e-3, 100
+    y[:] = y0[:, None]
+    assert advance_rk4(EIGHT, tables, 0.0, h, steps, y, ws, stages(len(y0), 8)) == 0
+    for k in range(8):
+        single = Bench(b.robot, of_lane(tables, k), copies(b.ws))
+        run = single.new_run(y0, np.array([0.0, h * steps]), "rk4", step=h)
+        advance(single.system, single.ws, run, 10**6)
+        scale = np.abs(run.y).max()
+        assert run.count[PROJECTIONS] > 0
+        assert np.abs(y[:, k] - run.y).max() <= 1e-13 * scale
+    assert np.ptp(y, axis=1).max() > 1e-4
+
+
+PLAIN = """
+import sys
+sys.path[:0] = sys.argv[1:]
+import numpy as np
+from lane_cases import CASES
+from test_lanes_compiled import compare, spread
+for name in ("curved", "dissipative"):
+    case = CASES[name]()
+    compare(case.bench, spread(case, 4, np.random.default_rng(99)), 0.0, 0.0)
+case = CASES["voltage limits"]()
+compare(case.bench, spread(case, 4, np.random.default_rng(99)), 0.0, 1e-15)
+"""
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [
+        {"NUMBA_DISABLE_JIT": "1"},
+        {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""},
+        {"NUMBA_CPU_NAME": "haswell"},
+    ],
+    ids=["python", "no vectors", "AVX2"],
+)
+def test_other_processors_and_none(environment, tmp_path):
+    """As plain Python, without vector instructions, and with registers of four doubles."""
+    folders = [str(Path(__file__).parents[1]), str(Path(__file__).parent)]
+    tolerance = "0.0" if "NUMBA_DISABLE_JIT" in environment else "1e-15"
+    subprocess.run(
+        [sys.executable, "-c", PLAIN.replace("0.0, 0.0)", f"0.0, {tolerance})"), *folders],
+        env={**os.environ, **environment},
+        check=True,
+        timeout=600,
+    )

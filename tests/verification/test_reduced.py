@@ -1,0 +1,69 @@
+"""Newton's linear systems of RADAU5: lanes of one, compiled, against the two that they are, and against the whole J."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from lanes import copies
+from random_robots import Bench, bench, random_positions, random_robot, random_robot_of
+
+from dynsim.kernels.integrate.reduced import factor_both, solve_both
+from dynsim.kernels.integrate.tableaux import ALPHA_RADAU, BETA_RADAU, GAMMA_RADAU
+from dynsim.kernels.jit import kernel
+
+
+@kernel
+def solve_compiled(system, ws, y, r, h):
+    """Factors and solution as RADAU5 has them."""
+    factor_both(system, r, h)
+    solve_both(system, ws, y, r, h)
+
+
+def driven() -> Bench:
+    return bench(random_robot(np.random.default_rng(0), 8))
+
+
+def every_joint() -> Bench:
+    kinds = ["ball", "rolling", "planar", "floating", "wheeled", "prismatic", "revolute"]
+    return bench(random_robot_of(np.random.default_rng(1), kinds))
+
+
+@pytest.mark.parametrize("make", [driven, every_joint])
+@pytest.mark.parametrize("h", [1e-4, 0.1])
+def test_lanes_solve_what_the_two_systems_are(make, h):
+    rng, b = np.random.default_rng(2), make()
+    y = b.state(random_positions(rng, b.robot), rng.normal(size=len(b.robot.links)))
+    run = b.advance(b.new_run(y, np.array([1.0]), "radau5"), 2)
+    tracked = b.system.layout.tracked
+    run.newton.one[:] = rng.normal(size=tracked)
+    run.newton.two[:] = rng.normal(size=tracked) + 1j * rng.normal(size=tracked)
+    two, lanes = copies(run.newton), copies(run.newton)
+    factor_both(b.system, two, h)  # as Python
+    solve_both(b.system, b.ws, run.y, two, h)
+    solve_compiled(b.system, b.ws, run.y, lanes, h)
+    for expected, found in ((two.one, lanes.one), (two.two, lanes.two)):
+        assert np.abs(found - expected).max() <= 1e-9 * np.abs(expected).max()
+
+
+def test_they_are_the_whole_systems():
+    """(g I − J) u = r with J in full, by blocks, for a robot whose positions are its angles."""
+    rng, b, h = np.random.default_rng(2), driven(), 0.01
+    y = b.state(random_positions(rng, b.robot), rng.normal(size=len(b.robot.links)))
+    run = b.advance(b.new_run(y, np.array([1.0]), "radau5"), 2)
+    r, layout, n = run.newton, b.system.layout, len(b.robot.links)
+    J = np.zeros((layout.tracked, layout.tracked))
+    J[layout.q : layout.q + n, layout.v : layout.v + n] = np.eye(n)
+    J[layout.v : layout.v + n, :] = r.along.T
+    for a, (driven_joint, _, circuit, *_) in enumerate(b.system.drives.table):
+        row = J[layout.current + circuit]
+        row[layout.q + driven_joint], row[layout.v + driven_joint] = r.linear[a, 3], r.linear[a, 4]
+        row[layout.current + circuit] = r.linear[a, 5]
+    one, two = rng.normal(size=layout.tracked), rng.normal(size=layout.tracked) + 1j * rng.normal(size=layout.tracked)
+    r.one[:], r.two[:] = one, two
+    solve_compiled(b.system, b.ws, run.y, r, h)
+    for g, right, found in (
+        (GAMMA_RADAU / h, one, r.one),
+        (complex(ALPHA_RADAU / h, BETA_RADAU / h), two, r.two),
+    ):
+        expected = np.linalg.solve(g * np.eye(layout.tracked) - J, right)
+        assert np.abs(found - expected).max() <= 1e-9 * np.abs(expected).max()

@@ -1,0 +1,32 @@
+"""Samples of RADAU5 that are computed together are those that are computed alone."""
+
+from __future__ import annotations
+
+import numpy as np
+from random_robots import bench, random_contacts, random_positions, random_robot
+
+from dynsim.kernels.integrate.run import EVALUATIONS, PROJECTIONS, SAMPLE
+
+STEP = 5e-3
+
+
+def test_samples_together_are_samples_alone():
+    """Seven to a step, which are four and three, against one to a step; some are projected, and alone then too."""
+    rng = np.random.default_rng(3)
+    robot = random_robot(rng, 7)
+    q = random_positions(rng, robot)
+    b = bench(robot, random_contacts(rng, robot, q, 2), k_p=0.3, k_d=0.01)
+    y = b.state(q, rng.normal(size=len(robot.links)))
+    middles = STEP * (np.arange(25) + 0.5)
+    many = np.sort((middles + STEP * np.linspace(-0.45, 0.45, 7)[:, None]).ravel())
+    end = STEP * 25
+    together = b.advance(b.new_run(y, np.append(many, end), "radau5", step=STEP, fixed=True))
+    alone = b.advance(b.new_run(y, np.append(middles, end), "radau5", step=STEP, fixed=True))
+    assert together.count[SAMPLE] == 176
+    assert alone.count[SAMPLE] == 26
+    assert together.count[EVALUATIONS] - alone.count[EVALUATIONS] >= 150
+    assert together.count[PROJECTIONS] > alone.count[PROJECTIONS]
+    np.testing.assert_array_equal(together.y, alone.y)
+    for found, expected in ((together.sample, alone.sample), (together.output, alone.output)):
+        scale = np.abs(expected).max(axis=0)
+        assert np.all(np.abs(found[3:175:7] - expected[:25]) <= 1e-9 * np.maximum(scale, scale.max() * 1e-3))
