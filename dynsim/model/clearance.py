@@ -34,12 +34,16 @@ class Sinking:
     sample: int
 
 
-def poses(robot: Robot, q: Array, bodies: Collection[str] | None = None) -> Iterator[tuple[Link, Array, Array]]:
+def poses(
+    robot: Robot, q: Array, bodies: Collection[str] | None = None, directions: Array | None = None
+) -> Iterator[tuple[Link, Array, Array]]:
     """R_WB, (3, 3, T), and p_WB, (3, T) [m], of each body in turn at joint positions q, (T, nq).
 
     Vectorised over the samples, which lie together in memory: thousands of them cost a millisecond. ``bodies``: only
-    these and those that carry them.
+    these and those that carry them. ``directions``, (k, 3) in W: d·R_WB, (k, 3, T), and d·p_WB, (k, T), instead.
     """
+    view = np.eye(3) if directions is None else directions
+    q = np.ascontiguousarray(q.T)
     links = {link.name: link for link in robot.links}
     wanted = set(links if bodies is None else bodies)
     for link in reversed(robot.links):
@@ -49,14 +53,14 @@ def poses(robot: Robot, q: Array, bodies: Collection[str] | None = None) -> Iter
     for name in wanted:
         if (parent := links[name].parent) is not None:
             waiting[parent] += 1
-    count = len(q)
+    count = q.shape[1]
     known: dict[str, tuple[Array, Array]] = {}
     index = robot.position_index
     for i, link in enumerate(robot.links):
         if link.name not in wanted:
             continue
         if link.parent is None:
-            R, p = np.repeat(link.R_PJ[:, :, None], count, axis=2), np.repeat(link.p_PJ[:, None], count, axis=1)
+            R, p = (np.repeat((view @ part)[..., None], count, axis=-1) for part in (link.R_PJ, link.p_PJ))
         else:
             R_WP, p_WP = known[link.parent]
             R, p = link.R_PJ.T @ R_WP, p_WP + link.p_PJ @ R_WP
@@ -65,18 +69,18 @@ def poses(robot: Robot, q: Array, bodies: Collection[str] | None = None) -> Iter
                 del known[link.parent]
         k, row = index[i], link.row
         if link.kind == "prismatic":
-            p = p + q[:, k] * (link.axis @ R)
+            p = p + q[k] * (link.axis @ R)
         elif link.kind != "revolute":
             # Later rows of a joint stay where its first one has put the body.
             if row.motion is not None:
-                turn, shift = row.motion(link, q[:, k : k + len(row.neutral)].T)
+                turn, shift = row.motion(link, q[k : k + len(row.neutral)])
                 p = p + np.einsum("ijt,jt->it", R, shift)
                 R = np.einsum("ijt,jkt->ikt", R, turn)
         else:
             x, y, z = link.axis
             K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
             # R (1 + sin q K + (1 − cos q) K²); a product from the right is K'ᵀ from the left on the middle axis.
-            R = R + np.sin(q[:, k]) * (K.T @ R) + (1.0 - np.cos(q[:, k])) * ((K @ K).T @ R)
+            R = R + np.sin(q[k]) * (K.T @ R) + (1.0 - np.cos(q[k])) * ((K @ K).T @ R)
         if waiting[link.name]:
             known[link.name] = R, p
         yield link, R, p
