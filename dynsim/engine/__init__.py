@@ -72,19 +72,19 @@ def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: 
     ModelError, UnreachableReference
         The scenario describes no physics, or a path that the hand cannot follow.
     """
-    with _named(scenario):
+    with named(scenario):
         interruption.heed()
         interruption.check()
         try:
             record: Record = _module(scenario).simulate(scenario, progress, pictured=pictured)
         except SimulationStopped as stop:
-            _log_warnings(scenario, stop.record)
+            note_warnings(scenario, stop.record)
             raise
-        _log_warnings(scenario, record)
+        note_warnings(scenario, record)
         return record
 
 
-def _log_warnings(scenario: Scenario, record: Record | None) -> None:
+def note_warnings(scenario: Scenario, record: Record | None) -> None:
     for warning in record.summary["warnings"] if record is not None else ():
         log.warning("%s: %s", scenario.title, warning)
 
@@ -101,13 +101,13 @@ def check(scenario: Scenario) -> Start:
     ------
     ModelError, UnreachableReference, ScenarioError
     """
-    with _named(scenario):
+    with named(scenario):
         module = _module(scenario)
         return module.start(module.prepare(scenario))
 
 
 @contextmanager
-def _named(scenario: Scenario) -> Iterator[None]:
+def named(scenario: Scenario) -> Iterator[None]:
     """Say in errors which scenario and variant they are about; those of reading it name file and line themselves."""
     require_scenario(scenario)
     variant = f" ({scenario.variant})" if scenario.variant else ""

@@ -19,11 +19,11 @@ from random_robots import Bench, bench, random_contacts, random_positions, rando
 
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate.driver import advance
-from dynsim.kernels.integrate.run import PROJECTIONS
+from dynsim.kernels.integrate.run import FINISHED, PROJECTIONS, SAMPLE, STATUS
 from dynsim.kernels.jit import reals
-from dynsim.kernels.lanes.fixed_step import advance_rk4, stages
+from dynsim.kernels.lanes.fixed_step import advance_lanes, lane_runs
 from dynsim.kernels.lanes.system import EIGHT, derivatives, lane_workspace
-from dynsim.kernels.lanes.tables import AXES, aligned, spread_tables
+from dynsim.kernels.lanes.tables import AXES, spread_tables
 from dynsim.kernels.system import System, derivative
 
 # Of cases whose matrices are ill-conditioned, where one rounding more or less is seen by as much.
@@ -133,21 +133,28 @@ def braced(seed: int = 3) -> tuple[Bench, np.ndarray]:
 
 
 def test_runs_of_their_own_parameters():
-    """Eight runs of RK4 with masses, gains and references of their own, projected, against each alone."""
+    """Eight runs of RK4 with masses, gains and references of their own, projected and sampled, against each alone."""
     (b, q), rng = braced(), np.random.default_rng(5)
     tables = varied(b.system, 8, rng)
-    y0 = b.state(q, np.zeros(len(b.robot.links)))
-    y, ws, h, steps = aligned(len(y0), 8), lane_workspace(b.ws, EIGHT), 1e-3, 100
-    y[:] = y0[:, None]
-    assert advance_rk4(EIGHT, tables, 0.0, h, steps, y, ws, stages(len(y0), 8)) == 0
+    y, times, h = b.state(q, np.zeros(len(b.robot.links))), np.linspace(0.0, 0.1, 38), 1e-3
+    lanes, ws = lane_runs([b.new_run(y, times, "rk4", step=h) for _ in range(8)]), lane_workspace(b.ws, EIGHT)
+    for limit in (0, 1, 10**6):
+        advance_lanes(EIGHT, tables, ws, lanes, limit)
+    assert lanes.count[STATUS] == FINISHED
+    assert not lanes.failed.any()
     for k in range(8):
         single = Bench(b.robot, of_lane(tables, k), copies(b.ws))
-        run = single.new_run(y0, np.array([0.0, h * steps]), "rk4", step=h)
+        run = single.new_run(y, times, "rk4", step=h)
         advance(single.system, single.ws, run, 10**6)
-        scale = np.abs(run.y).max()
         assert run.count[PROJECTIONS] > 0
-        assert np.abs(y[:, k] - run.y).max() <= 1e-13 * scale
-    assert np.ptp(y, axis=1).max() > 1e-4
+        assert lanes.projections[k] == run.count[PROJECTIONS]
+        assert lanes.count[SAMPLE] == run.count[SAMPLE] == 38
+        for name in ("y", "sample", "output", "extremes"):
+            found, expected = getattr(lanes, name)[..., k], getattr(run, name)
+            known = np.isfinite(expected)
+            np.testing.assert_array_equal(found[~known], expected[~known])
+            assert np.abs(found[known] - expected[known]).max() <= 1e-13 * np.abs(expected[known]).max()
+    assert np.ptp(lanes.y, axis=1).max() > 1e-4
 
 
 PLAIN = """

@@ -23,6 +23,7 @@ from dynsim.kernels.arrays import (
 from dynsim.kernels.compiler import form_of
 from dynsim.kernels.constraint.delassus import solve_small
 from dynsim.kernels.constraint.surface import sign_changed, surface_distance
+from dynsim.kernels.constraint.uniqueness import CLEAR, clearly_unique
 from dynsim.kernels.drive.law import evaluate_reference, fed_forward
 from dynsim.kernels.drive.limit import clipped
 from dynsim.kernels.drive.servo import servo_circuit
@@ -82,6 +83,21 @@ def solve_small_lanes(small, state, active, p):
     for k in range(lane_count(small)):
         dependent += solve_small(lane(small, k), lane(state, k), active, p)
     return dependent
+
+
+@form_of(clearly_unique, any_lanes)
+def all_clearly_unique(ws):
+    """True when it is so of every lane."""
+    small, p = ws.small, ws.counts[ROWS]
+    if p == 0 or p > 2:
+        return p == 0
+    for k in range(p):
+        if ws.active[k, LAW] == FRICTION_DISSIPATIVE or not every(small[0, k, k] > 0.0):
+            return False
+    if p == 1:
+        return True
+    straight, crossed = small[0, 0, 0] * small[0, 1, 1], small[0, 0, 1] * small[0, 1, 0]
+    return every(straight - crossed > CLEAR * (straight + abs(crossed)))
 
 
 @form_of(sign_changed, any_lanes)

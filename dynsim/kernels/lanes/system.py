@@ -21,6 +21,8 @@ from dynsim.kernels.lanes.tables import (
 )
 from dynsim.kernels.system import System, derivative
 
+# Without the compiler there are no lanes: their kernels are for it alone.
+COMPILED = not config.DISABLE_JIT
 # What says how wide lanes are: a tuple of so many zeros. Eight pay where states are many, four for three stages.
 FOUR, EIGHT = (0.0,) * 4, (0.0,) * 8
 
@@ -97,7 +99,7 @@ def derivatives(system: System, t: Any, y: np.ndarray, ws: Workspace, dy: np.nda
     ws : of :func:`lane_workspace`
     """
     width = (0.0,) * y.shape[-1]
-    if config.DISABLE_JIT:
+    if not COMPILED:
         for k in range(len(width)):
             at = t[k] if isinstance(t, np.ndarray) else t
             derivative(lane_tables(system, k), at, y[:, k], lane_tables(ws, k), dy[:, k])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,20 @@ def _spread_table(table: np.ndarray, count: int) -> np.ndarray:
     result = aligned(*table.shape, count)
     result[...] = table[..., None]
     return result
+
+
+def stack_tables(tables: Sequence[Any]) -> Any:
+    """Named tuples of one kind as one, whose tables of :data:`AXES` have them as lanes; the others are the first's."""
+    first, parts = tables[0], {}
+    axes = AXES.get(type(first), {})
+    for name, part in first._asdict().items():
+        if hasattr(part, "_asdict"):
+            parts[name] = stack_tables([getattr(one, name) for one in tables])
+        elif part is not None and name in axes:
+            parts[name] = aligned(*part.shape, len(tables))
+            for k, one in enumerate(tables):
+                parts[name][..., k] = getattr(one, name)
+    return first._replace(**parts)
 
 
 def lane_tables(tables: Any, k: int) -> Any:
