@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from typing import TypeGuard
 
 import numpy as np
 
@@ -101,6 +103,39 @@ def axis_ends(robot: Robot) -> dict[str, list[Array]]:
     return tips
 
 
+def gaps(
+    robot: Robot, q: Array, points: Mapping[str, Sequence[tuple[Surface, Array]]]
+) -> Iterator[tuple[Link, list[Array]]]:
+    """Signed distances, (T,) [m], of points from surfaces, of each body in turn at joint positions q, (T, nq).
+
+    ``points`` : by body, with the surface of each; (3,) in the body's frame [m]. Of planes alone only what counts
+    along their normals is computed, a third.
+    """
+    surfaces = {id(surface): surface for held in points.values() for surface, _ in held}
+    planes = {key: surface for key, surface in surfaces.items() if is_plane(surface)}
+    flat = len(planes) == len(surfaces)
+    # Of each plane its place among the normals, and its distance from the origin.
+    place = {key: (k, surface.c / np.linalg.norm(surface.b)) for k, (key, surface) in enumerate(planes.items())}
+    normals = np.array([surface.b / np.linalg.norm(surface.b) for surface in planes.values()])
+    for link, R, p in poses(robot, q, points, normals if flat else None):
+        if link.name not in points:
+            continue
+        found = []
+        for surface, point in points[link.name]:
+            position = p + point @ R if point.any() else p
+            if flat:
+                k, offset = place[id(surface)]
+                found.append(position[k] + offset)
+            else:
+                found.append(surface.gaps(position.T))
+        yield link, found
+
+
+def is_plane(surface: Surface) -> TypeGuard[Quadric]:
+    """True for a quadric without curvature."""
+    return isinstance(surface, Quadric) and not surface.Q.any()
+
+
 def sinking(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> list[Sinking]:
     """Bodies whose axes lie below a surface by more than their radius, at samples q, (T, nq).
 
@@ -109,19 +144,38 @@ def sinking(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> list[Sin
     found: list[Sinking] = []
     if not surfaces or not len(q):
         return found
-    tips, carriers = axis_ends(robot), robot.carriers
     # Of a run that diverged the last samples may be beyond what squares of floats can hold.
     with np.errstate(over="ignore", invalid="ignore"):
-        for link, R, p in poses(robot, q):
-            for name, surface in surfaces.items() if link.name not in carriers else ():
-                gap = surface.gaps(p.T)
-                for tip in tips[link.name]:
-                    gap = np.minimum(gap, _segment_gap(surface, p.T, (tip @ R).T))
-                depth = np.where(np.isfinite(gap), -gap, -np.inf)
-                beyond = np.flatnonzero(depth > link.radius + SLACK)
-                if beyond.size:
-                    found.append(Sinking(link.name, name, float(depth.max()), link.radius, int(beyond[0])))
+        for link, name, gap in _axis_gaps(robot, surfaces, q):
+            if gap.min() >= -link.radius - SLACK:
+                continue
+            depth = np.where(np.isfinite(gap), -gap, -np.inf)
+            beyond = np.flatnonzero(depth > link.radius + SLACK)
+            if beyond.size:
+                found.append(Sinking(link.name, name, float(depth.max()), link.radius, int(beyond[0])))
     return found
+
+
+def _axis_gaps(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> Iterator[tuple[Link, str, Array]]:
+    """Least distance of each body's axes from each surface, (T,) [m]; at their ends where all surfaces are planes."""
+    tips, carriers = axis_ends(robot), robot.carriers
+    bodies = [link.name for link in robot.links if link.name not in carriers]
+    if all(map(is_plane, surfaces.values())):
+        ends = {
+            body: [(surface, end) for surface in surfaces.values() for end in (np.zeros(3), *tips[body])]
+            for body in bodies
+        }
+        for link, each in gaps(robot, q, ends):
+            count = 1 + len(tips[link.name])
+            for k, name in enumerate(surfaces):
+                yield link, name, reduce(np.minimum, each[k * count : (k + 1) * count])
+        return
+    for link, R, p in poses(robot, q, bodies):
+        for name, surface in surfaces.items() if link.name in bodies else ():
+            gap = surface.gaps(p.T)
+            for tip in tips[link.name]:
+                gap = np.minimum(gap, _segment_gap(surface, p.T, (tip @ R).T))
+            yield link, name, gap
 
 
 def _segment_gap(surface: Surface, start: Array, along: Array) -> Array:
