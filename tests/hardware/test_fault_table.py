@@ -7,7 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from dynsim.hardware.fault_table import CASES, POLICIES, STATES, broken_promises, cells, markdown, rig
+from dynsim.hardware.bus.packet import Instruction, Packet
+from dynsim.hardware.fault_table import (
+    CASES,
+    POLICIES,
+    STATES,
+    TORQUE_ADDRESS,
+    broken_promises,
+    cells,
+    markdown,
+    rig,
+)
 
 ROOT = Path(__file__).parents[2]
 KEPT = json.loads((ROOT / "results/reference/bridge_faults.json").read_text(encoding="utf-8"))["cells"]
@@ -55,3 +65,6 @@ def test_broken_promises_are_seen():
     time, id_, value = run.result.policy_goals[0]
     run.result.policy_goals[0] = (time, id_, value + 1)
     assert "a goal after the fault that was not the policy's" in list(broken_promises(run))
+    torque_on = Packet(1, Instruction.WRITE, bytes([TORQUE_ADDRESS, 0, 1]))
+    run.sent.append((run.result.fault_time + 0.1, torque_on))
+    assert "torque was switched on after the fault" in list(broken_promises(run))

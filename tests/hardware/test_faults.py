@@ -10,7 +10,7 @@ import pytest
 
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.bus.packet import Instruction
-from dynsim.hardware.fault_table import CASES, POLICIES, Case
+from dynsim.hardware.fault_table import CASES, POLICIES, Case, broken_promises
 from dynsim.hardware.replay.check import velocity_limit
 from dynsim.hardware.replay.rules import Cause, reaction_bound
 from dynsim.hardware.replay.states import State
@@ -52,13 +52,10 @@ def check_case(rig, case: Case, seed: int) -> None:
 
 def check_nothing_but_the_policy_after(run) -> None:
     result = run.result
-    on_the_wire = [(id_, value) for time, id_, value in run.goals() if time > result.fault_time]
-    declared = [(id_, value) for _, id_, value in result.policy_goals]
-    # What was declared last may not have reached the wire when the port died under it.
-    assert on_the_wire == declared[: len(on_the_wire)]
-    assert not [value for time, _, value in run.writes_of(64) if time > result.fault_time and value == 1]
+    assert list(broken_promises(run)) == []
+    on_the_wire = [id_ for time, id_, _ in run.goals() if time > result.fault_time]
     if run.replay.policy == "hold" and result.fault.cause != Cause.WATCHDOG:
-        assert len({id_ for id_, _ in on_the_wire}) == len(on_the_wire), "hold speaks once to every servo"
+        assert len(set(on_the_wire)) == len(on_the_wire), "hold speaks once to every servo"
     if run.replay.policy == "off":
         assert not on_the_wire
     everybody = set(result.fault.ids) == set(run.map.ids)  # nobody is left to slow down along the path
@@ -127,15 +124,14 @@ def check_end_state(run, policy: str, entry: dict[str, Any], what: str) -> None:
 
 
 def check_what_was_read(run, silent: set[int], what: str) -> None:
-    """The servos reported are the servos there are."""
+    """The servos reported are the servos there are; that they are as reported is one of the kept promises."""
     servos = run.line.servos
     for servo, end in zip(run.map.servos, run.result.servos, strict=True):
         assert (end.joint, end.id) == (servo.joint, servo.id)
         if servo.id in silent:
             assert (end.torque, end.error, end.position, end.doing) == (None, None, None, "does not answer"), what
             continue
-        registers, index = servos.registers[servo.id], servos.ids.index(servo.id)
-        assert (end.torque, end.error) == (bool(registers["torque_enable"]), registers["hardware_error"]), what
+        index = servos.ids.index(servo.id)
         assert end.torque == (end.doing in ("holding", "moving", "watchdog tripped")), what
         speed = servo.sign * servos.plant.velocity[index]
         # Who is limp coasts to a halt while it is asked.

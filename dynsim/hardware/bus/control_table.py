@@ -116,6 +116,14 @@ class ServoModel:
         """True when address 126 is a current, False when it is a load in 0.1 % of stall torque."""
         return "present_current" in self.fields
 
+    def registers_in(self, start: int, data: bytes) -> dict[str, int]:
+        """Registers by name of which all bytes are in ``data``, the table from address ``start`` on."""
+        return {
+            name: item.decode(data[item.address - start : item.address - start + item.size])
+            for name, item in self.fields.items()
+            if start <= item.address and item.address + item.size <= start + len(data)
+        }
+
     @property
     def torque_constant(self) -> float:
         """Output torque per ampere [N·m/A], from the stall point (unverified away from it)."""
@@ -208,6 +216,20 @@ def _delivered(fields: dict[str, Field], **defaults: int) -> dict[str, Field]:
     return fields | {name: replace(fields[name], default=value) for name, value in defaults.items()}
 
 
+def _geared(
+    servo: ServoModel, name: str, number: int, *, rpm: float, stall_torque: float, velocity_limit: int
+) -> ServoModel:
+    """The same motor and table behind another gear; ``rpm`` without load."""
+    return replace(
+        servo,
+        name=name,
+        number=number,
+        no_load_speed=rpm * _RAD_S_PER_RPM,
+        stall_torque=stall_torque,
+        fields=_delivered(servo.fields, velocity_limit=velocity_limit),
+    )
+
+
 MX_106 = ServoModel(
     name="MX-106",
     number=321,
@@ -251,15 +273,7 @@ XM430_W210 = ServoModel(
     fields=_delivered(_X, velocity_limit=330) | _current(1193),
     ampere_per_unit=2.69e-3,
 )
-XM430_W350 = ServoModel(
-    name="XM430-W350",
-    number=1020,
-    no_load_speed=46 * _RAD_S_PER_RPM,
-    stall_torque=4.1,
-    stall_current=2.3,
-    fields=_delivered(_X, velocity_limit=200) | _current(1193),
-    ampere_per_unit=2.69e-3,
-)
+XM430_W350 = _geared(XM430_W210, "XM430-W350", 1020, rpm=46, stall_torque=4.1, velocity_limit=200)
 XH540_W150 = ServoModel(
     name="XH540-W150",
     number=1110,
@@ -269,15 +283,7 @@ XH540_W150 = ServoModel(
     fields=_delivered(_X, velocity_limit=300) | _EXTERNAL_PORTS | _current(2047),
     ampere_per_unit=2.69e-3,
 )
-XH540_W270 = ServoModel(
-    name="XH540-W270",
-    number=1100,
-    no_load_speed=39 * _RAD_S_PER_RPM,
-    stall_torque=9.9,
-    stall_current=4.9,
-    fields=_delivered(_X, velocity_limit=167) | _EXTERNAL_PORTS | _current(2047),
-    ampere_per_unit=2.69e-3,
-)
+XH540_W270 = _geared(XH540_W150, "XH540-W270", 1100, rpm=39, stall_torque=9.9, velocity_limit=167)
 MODELS = {model.name: model for model in (MX_106, MX_28, XL430_W250, XM430_W210, XM430_W350, XH540_W150, XH540_W270)}
 MODEL_BY_NUMBER = {model.number: model for model in MODELS.values()}
 

@@ -200,19 +200,30 @@ def compare_records(simulated: Record, measured: Record) -> Comparison:
         shifted = actual[:, column] - at(time - delay)[:, column]
         only = np.zeros_like(moving)
         only[column] = moving[column]
-        worst = int(np.nanargmax(np.abs(error)))
+        largest, time_of_max = _largest(error, time)
         joints.append(
             JointError(
                 joint=label,
-                rms=float(np.sqrt(np.nanmean(error**2))),
-                max=float(abs(error[worst])),
-                time_of_max=float(time[worst]),
-                rms_delay_removed=float(np.sqrt(np.nanmean(shifted**2))),
+                rms=_rms(error),
+                max=largest,
+                time_of_max=time_of_max,
+                rms_delay_removed=_rms(shifted),
                 delay=_delay(at, time, actual, only) / speed,
             )
         )
     wheels = _wheel_errors(simulated, measured, rows, time, speed)
     return Comparison(delay / speed, tuple(joints), wheels, time, at(time), actual)
+
+
+def _rms(error: Array) -> float:
+    """Of an error that is NaN where an answer was missed."""
+    return float(np.sqrt(np.nanmean(error**2)))
+
+
+def _largest(error: Array, time: Array) -> tuple[float, float]:
+    """Magnitude of the largest of these errors, and when it was; NaN where an answer was missed."""
+    worst = int(np.nanargmax(np.abs(error)))
+    return float(abs(error[worst])), float(time[worst])
 
 
 def _wheel_errors(
@@ -229,13 +240,13 @@ def _wheel_errors(
         turned = angles[label][1][rows]
         seen = np.flatnonzero(np.isfinite(turned))  # not NaN, as where an answer was missed
         angle = (turned - turned[seen[0]]) - (asked - asked[seen[0]])
-        worst = int(np.nanargmax(np.abs(rate)))
+        rate_max, time_of_max = _largest(rate, time)
         found.append(
             WheelError(
                 wheel=label,
-                rate_rms=float(np.sqrt(np.nanmean(rate**2))),
-                rate_max=float(abs(rate[worst])),
-                time_of_max=float(time[worst]),
+                rate_rms=_rms(rate),
+                rate_max=rate_max,
+                time_of_max=time_of_max,
                 turned=float(asked[seen[-1]] - asked[seen[0]]),
                 angle_max=float(np.nanmax(np.abs(angle))),
                 angle_end=float(angle[seen[-1]]),

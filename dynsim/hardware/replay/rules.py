@@ -276,23 +276,6 @@ def _count(counters: NDArray[np.int64], hit: NDArray[np.bool_], unknown: NDArray
     return np.where(unknown, counters, np.where(hit, counters + 1, 0))
 
 
-HEALTH = (
-    "torque_enable",
-    "hardware_error",
-    "bus_watchdog",
-    "present_velocity",
-    "present_position",
-    "present_voltage",
-    "present_temperature",
-)
-"""What is looked at of a health block."""
-
-
 def decode_health(servo: Servo, data: bytes) -> dict[str, int]:
-    """The registers :data:`HEALTH` out of a health block, by name."""
-    start, _ = HEALTH_BLOCK
-    fields = servo.model.fields
-    return {
-        name: fields[name].decode(data[fields[name].address - start : fields[name].address - start + fields[name].size])
-        for name in HEALTH
-    }
+    """Registers in a health block, by name."""
+    return servo.model.registers_in(HEALTH_BLOCK[0], data)

@@ -35,12 +35,7 @@ def snapshot(bus: Bus, servo: Servo) -> Registers:
     """All registers of a servo, by name. Raises NoAnswer or RequestRefused."""
     eeprom = bus.read_block(servo.id, *EEPROM_BLOCK).data
     ram = bus.read_block(servo.id, *HEALTH_BLOCK).data
-    table = eeprom + ram
-    return {
-        name: item.decode(table[item.address : item.address + item.size])
-        for name, item in servo.model.fields.items()
-        if item.address + item.size <= len(table)
-    }
+    return servo.model.registers_in(EEPROM_BLOCK[0], eeprom + ram)
 
 
 def all_registers(bus: Bus, servo_map: ServoMap) -> dict[str, Registers | str]:

@@ -93,6 +93,9 @@ NORMAL_GUARD, SLIP_GUARD, STOP_GUARD = 10, 11, 12
 LANDING, LIFT_OFF, SLIP_START, SLIP_STOP, BOUNCE, CHATTERS, STOP_HIT, STOP_LEFT = 0, 1, 2, 3, 4, 5, 6, 7
 LOG_KINDS = 8
 
+# Run.gaps: what a candidate was like at the start of the step.
+GAP_THEN, RATE_THEN, NORMAL_THEN, PLACE_THEN = 0, 1, 2, 5
+
 # A candidate that starts, or comes to rest, this close to its surface touches it [m].
 TOUCH = 1e-9
 # More events of a candidate than MOST_EVENTS in WINDOW [s] are chatter; SETTLE grows tenfold then, up to MOST_SETTLE.
@@ -152,9 +155,10 @@ def too_long(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
                 found = min(found, max(1.5 * slow / speed, 0.01))
         if passes_through(ws, gaps, k):
             found = min(found, 0.5)
-        if ws.active[k, MODE] != OPEN or gaps[k, 1] >= 0.0 or ws.contacts[k, GAP_RATE] <= 0.0:
+        if ws.active[k, MODE] != OPEN or gaps[k, RATE_THEN] >= 0.0 or ws.contacts[k, GAP_RATE] <= 0.0:
             continue
-        g0, g1, d0, d1 = gaps[k, 0], ws.contacts[k, GAP], h * gaps[k, 1], h * ws.contacts[k, GAP_RATE]
+        g0, g1 = gaps[k, GAP_THEN], ws.contacts[k, GAP]
+        d0, d1 = h * gaps[k, RATE_THEN], h * ws.contacts[k, GAP_RATE]
         # Hermite: g0 + d0 x + a x² + b x³.
         a, b = 3.0 * (g1 - g0) - 2.0 * d0 - d1, 2.0 * (g0 - g1) + d0 + d1
         root = a * a - 3.0 * b * d0
@@ -174,13 +178,13 @@ def passes_through(ws: Workspace, gaps, k):
     by half a turn is π/2 as long as it looks.
     """
     state = ws.contacts[k]
-    g0, g1 = gaps[k, 0], state[GAP]
+    g0, g1 = gaps[k, GAP_THEN], state[GAP]
     if ws.active[k, MODE] != OPEN or g0 <= 0.0 or g1 <= 0.0:
         return False
     turned, square = 0.0, 0.0
     for s in range(3):
-        turned += gaps[k, 2 + s] * state[NORMAL + s]
-        way = state[POSITION + s] - gaps[k, 5 + s]
+        turned += gaps[k, NORMAL_THEN + s] * state[NORMAL + s]
+        way = state[POSITION + s] - gaps[k, PLACE_THEN + s]
         square += way * way
     return turned < 0.0 and 2.5 * square >= (g0 + g1) * (g0 + g1)
 
@@ -189,9 +193,9 @@ def passes_through(ws: Workspace, gaps, k):
 def note_gaps(ws: Workspace, gaps):
     """Gaps, their rates, normals and places at the start of a step, for :func:`too_long`."""
     for k in range(gaps.shape[0]):
-        gaps[k, 0], gaps[k, 1] = ws.contacts[k, GAP], ws.contacts[k, GAP_RATE]
+        gaps[k, GAP_THEN], gaps[k, RATE_THEN] = ws.contacts[k, GAP], ws.contacts[k, GAP_RATE]
         for s in range(3):
-            gaps[k, 2 + s], gaps[k, 5 + s] = ws.contacts[k, NORMAL + s], ws.contacts[k, POSITION + s]
+            gaps[k, NORMAL_THEN + s], gaps[k, PLACE_THEN + s] = ws.contacts[k, NORMAL + s], ws.contacts[k, POSITION + s]
 
 
 @internal_kernel

@@ -36,6 +36,7 @@ from dynsim.kernels.constraint.unilateral import (
     STOP_LOSS,
     STOP_ROW,
     UnilateralArrays,
+    note_stop_forces,
 )
 from dynsim.kernels.drive.law import drive, take_commands
 from dynsim.kernels.integrate.balance import begin_energy, drive_work, midpoint_work, stored_energy
@@ -94,7 +95,6 @@ from dynsim.kernels.integrate.time_stepping import (
     place_joints,
     slip_of_rates,
     solve_contacts,
-    stop_forces,
     tangent_rows,
 )
 from dynsim.kernels.integrate.time_stepping import MECHANICAL as ENERGY
@@ -167,7 +167,7 @@ def step_moreau(system: System, ws: Workspace, run: Run):
     if ws.counts[ROWS] > 0:
         row_system(model, ws)
         solve_contacts(system.unilateral, s, ws, h)
-        stop_forces(system.unilateral, ws)
+        note_stop_forces(system.unilateral, ws)
         add_row_forces(model, ws)
     accelerate(model, ws)
     run.count[EVALUATIONS] += 1

@@ -80,7 +80,6 @@ from dynsim.kernels.constraint.unilateral import (
     STATIC,
     STOP_CLOSED,
     UnilateralArrays,
-    note_stop_forces,
     sliding_friction,
     stop_gap,
 )
@@ -249,14 +248,6 @@ def close_stops(unilateral: UnilateralArrays | None, ws: Workspace):
         changed = changed or closed != table[k, STOP_CLOSED]
         table[k, STOP_CLOSED] = closed
     return changed
-
-
-@internal_kernel
-def stop_forces(unilateral: UnilateralArrays | None, ws: Workspace):
-    """Forces of the joint stops, after the contact problem."""
-    if unilateral is None:  # known to the compiler
-        return
-    note_stop_forces(unilateral, ws)
 
 
 @internal_kernel

@@ -197,6 +197,19 @@ def read_positions(compound, model: ModelArrays, y, start, ws: Workspace):
             joints[i, EXTRA] = y[k + 2]
 
 
+@inlined_kernel
+def quaternion_rate(w, x, y, z, a, b, c):
+    """q̇ = ½ q ∘ (0, ω) of q = (w, x, y, z), from the angular velocity ω = (a, b, c) in the body."""
+    a, b, c = 0.5 * a, 0.5 * b, 0.5 * c
+    return -(x * a + y * b + z * c), w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a
+
+
+@inlined_kernel
+def quaternion_turn(w, x, y, z, dw, dx, dy, dz):
+    """vec(q̄ ∘ δq) of q = (w, x, y, z): half the turn, in the body, that changes a unit quaternion q by δq."""
+    return w * dx - x * dw - y * dz + z * dy, w * dy - y * dw - z * dx + x * dz, w * dz - z * dw - x * dy + y * dx
+
+
 @apart_kernel
 def position_rates(compound, model: ModelArrays, ws: Workspace, dy, start):
     """q̇ = N(q) v into dy[start:]. Ball: ½ q ∘ (0, ω) with ω in the body; rolling: V (cos ψ, sin ψ), ω.
@@ -210,11 +223,9 @@ def position_rates(compound, model: ModelArrays, ws: Workspace, dy, start):
         k, kind = start + compound[i, POSITION_INDEX], tree[i, KIND]
         if kind == BALL_X:
             w, x, y, z = joints[i, Q], joints[i, EXTRA], joints[i + 1, Q], joints[i + 2, Q]
-            a, b, c = 0.5 * joints[i, QD], 0.5 * joints[i + 1, QD], 0.5 * joints[i + 2, QD]
-            dy[k] = -(x * a + y * b + z * c)
-            dy[k + 1] = w * a + y * c - z * b
-            dy[k + 2] = w * b + z * a - x * c
-            dy[k + 3] = w * c + x * b - y * a
+            rate = quaternion_rate(w, x, y, z, joints[i, QD], joints[i + 1, QD], joints[i + 2, QD])
+            for s in range(4):
+                dy[k + s] = rate[s]
         elif kind == ROLL:
             dy[k] = joints[i, QD] * ws.trig[1, i + 1]
             dy[k + 1] = joints[i, QD] * ws.trig[0, i + 1]
@@ -238,11 +249,9 @@ def displace(compound, model: ModelArrays, ws: Workspace, y, start):
         k, kind = start + compound[i, POSITION_INDEX], tree[i, KIND]
         if kind == BALL_X:
             w, x, y0, z = y[k], y[k + 1], y[k + 2], y[k + 3]
-            a, b, c = 0.5 * joints[i, QDD], 0.5 * joints[i + 1, QDD], 0.5 * joints[i + 2, QDD]
-            y[k] -= x * a + y0 * b + z * c
-            y[k + 1] += w * a + y0 * c - z * b
-            y[k + 2] += w * b + z * a - x * c
-            y[k + 3] += w * c + x * b - y0 * a
+            change = quaternion_rate(w, x, y0, z, joints[i, QDD], joints[i + 1, QDD], joints[i + 2, QDD])
+            for s in range(4):
+                y[k + s] += change[s]
         elif kind == ROLL:
             y[k] += joints[i, QDD] * ws.trig[1, i + 1]
             y[k + 1] += joints[i, QDD] * ws.trig[0, i + 1]
@@ -290,9 +299,8 @@ def position_error(compound, model: ModelArrays, y, y_new, error, start, rtol, a
             w, x, y0, z = y_new[k], y_new[k + 1], y_new[k + 2], y_new[k + 3]
             dw, dx, dy, dz = error[k], error[k + 1], error[k + 2], error[k + 3]
             scale = 2.0 / ((w * w + x * x + y0 * y0 + z * z) * (atol + rtol))
-            ex = scale * (w * dx - x * dw - y0 * dz + z * dy)
-            ey = scale * (w * dy - y0 * dw - z * dx + x * dz)
-            ez = scale * (w * dz - z * dw - x * dy + y0 * dx)
+            ex, ey, ez = quaternion_turn(w, x, y0, z, dw, dx, dy, dz)
+            ex, ey, ez = scale * ex, scale * ey, scale * ez
             total += ex * ex + ey * ey + ez * ez
             count += 3
         elif kind != BALL_Y and kind != BALL_Z and kind != RIGHT_WHEEL:
@@ -312,12 +320,9 @@ def positions_along(compound, model: ModelArrays, y, start, u, out):
     for i in range(tree.shape[0]):
         k, kind = start + compound[i, POSITION_INDEX], tree[i, KIND]
         if kind == BALL_X:
-            w, x, y0, z = y[k], y[k + 1], y[k + 2], y[k + 3]
-            a, b, c = 0.5 * u[i], 0.5 * u[i + 1], 0.5 * u[i + 2]
-            out[k] -= x * a + y0 * b + z * c
-            out[k + 1] += w * a + y0 * c - z * b
-            out[k + 2] += w * b + z * a - x * c
-            out[k + 3] += w * c + x * b - y0 * a
+            change = quaternion_rate(y[k], y[k + 1], y[k + 2], y[k + 3], u[i], u[i + 1], u[i + 2])
+            for s in range(4):
+                out[k + s] += change[s]
         elif kind == ROLL:
             s, c = sine_cosine_of(y[start + compound[i + 1, POSITION_INDEX]])
             out[k] += c * u[i]
@@ -342,11 +347,9 @@ def rates_across(compound, model: ModelArrays, y, start, d, out):
     for i in range(tree.shape[0]):
         k, kind = start + compound[i, POSITION_INDEX], tree[i, KIND]
         if kind == BALL_X:
-            w, x, y0, z = y[k], y[k + 1], y[k + 2], y[k + 3]
-            a, b, c, e = 2.0 * d[k], 2.0 * d[k + 1], 2.0 * d[k + 2], 2.0 * d[k + 3]
-            out[i] = w * b - x * a - y0 * e + z * c
-            out[i + 1] = w * c - y0 * a - z * b + x * e
-            out[i + 2] = w * e - z * a - x * c + y0 * b
+            turn = quaternion_turn(y[k], y[k + 1], y[k + 2], y[k + 3], d[k], d[k + 1], d[k + 2], d[k + 3])
+            for s in range(3):
+                out[i + s] = 2.0 * turn[s]
         elif kind == ROLL:
             s, c = sine_cosine_of(y[start + compound[i + 1, POSITION_INDEX]])
             out[i] = c * d[k] + s * d[k + 1]
