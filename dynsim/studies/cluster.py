@@ -15,6 +15,7 @@ from dynsim._version import __version__
 from dynsim.engine import SIMULATION, Progress
 from dynsim.errors import DynsimError
 from dynsim.studies.batch import LOST, RunResult
+from dynsim.studies.processes import keep_memory
 
 Task = TypeVar("Task")
 
@@ -113,6 +114,7 @@ def _work_through(
     """On a worker: what there is to do for each task."""
     if version != __version__:
         raise ClusterError(f"a worker has dynsim {__version__}, this is {version}; install the same on all")
+    keep_memory()
     with _one_at_a_time:
         parts = [tasks[first : first + together] for first in range(0, len(tasks), together)]
         return [result for part in parts for result in work(part, _no_look)]
