@@ -30,7 +30,7 @@ from dynsim.model.arrays import (
     compile_loads,
     compile_support,
 )
-from dynsim.model.clearance import poses
+from dynsim.model.clearance import gaps
 from dynsim.model.control import JointControl
 from dynsim.model.description import Array, Contact, Load, Robot
 from dynsim.model.drives import Drive, Motor
@@ -111,7 +111,7 @@ def prepare(
     _check_work(scenario, n, c + joint_rows)
     control = _control(scenario, model, contacts, progress)
     if not real:
-        _check_references(scenario, robot, contacts, control)
+        _check_references(scenario, model, contacts, control)
     options, size = scenario.integrator, n + ka.row_limit(c, joint_rows) + robot.circuits
     sampled = control.sample_time is not None
     drives = compile_drives(robot, k_p=list(control.k_p), k_d=list(control.k_d), sampled=sampled)
@@ -275,8 +275,9 @@ def _control(scenario: Scenario, model: Model, contacts: Sequence[Contact], prog
     return control
 
 
-def _check_references(scenario: Scenario, robot: Robot, contacts: Sequence[Contact], control: JointControl) -> None:
+def _check_references(scenario: Scenario, model: Model, contacts: Sequence[Contact], control: JointControl) -> None:
     """Refuse references that, followed exactly, would take a contact point off the surface that holds it."""
+    robot = model.robot
     links = {link.name: link for link in robot.links}
     motor_of = {motor.joint: a for a, motor in enumerate(robot.motors)}
     held: dict[str, list[tuple[Contact, Array]]] = {}
@@ -300,24 +301,24 @@ def _check_references(scenario: Scenario, robot: Robot, contacts: Sequence[Conta
     tolerance = scenario.config.contacts.reference_tolerance_m
     worst: dict[str, tuple[float, float, np.ndarray]] = {}
     first: dict[str, float] = {}
+    points = {body: [(contact.surface, point) for contact, point in pairs] for body, pairs in held.items()}
     for times, q in control.positions(robot):
-        for link, R, p in poses(robot, q, held):
-            for contact, point in held.get(link.name, ()):
-                position = (p + point @ R).T
-                gap = contact.surface.gaps(position)
+        for link, found in gaps(robot, q, points):
+            for (contact, _), gap in zip(held[link.name], found, strict=True):
                 k = int(np.abs(gap).argmax())
                 if abs(gap[k]) > tolerance:
                     first.setdefault(contact.name, float(times[np.abs(gap) > tolerance][0]))
                     if abs(gap[k]) > abs(worst.get(contact.name, (0.0,))[0]):
-                        worst[contact.name] = float(gap[k]), float(times[k]), position[k]
+                        worst[contact.name] = float(gap[k]), float(times[k]), q[k].copy()
     if not worst:
         return
-    name, (gap_max, time, place) = max(worst.items(), key=lambda item: abs(item[1][0]))
-    surface = next(contact.surface_name for contact in contacts if contact.name == name)
+    name, (gap_max, time, there) = max(worst.items(), key=lambda item: abs(item[1][0]))
+    contact = next(contact for contact in contacts if contact.name == name)
+    x, y, z = model.point_position(contact.body, contact.point, there)
     others = ", ".join(other for other in worst if other != name)
     raise ModelError(
-        f"contact {name}: the references of the joints take its point {gap_max:+.4g} m off surface {surface!r} at "
-        f"t = {time:.3f} s, at ({place[0]:.4g}, {place[1]:.4g}, {place[2]:.4g}) m, and beyond "
+        f"contact {name}: the references of the joints take its point {gap_max:+.4g} m off surface "
+        f"{contact.surface_name!r} at t = {time:.3f} s, at ({x:.4g}, {y:.4g}, {z:.4g}) m, and beyond "
         f"contacts.reference_tolerance_m = {tolerance:g} m from t = {first[name]:.3f} s on"
         f"{f' (also {others})' if others else ''}; "
         "let the joints before the contact hold, change their path, or disable the contact"

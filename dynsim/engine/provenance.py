@@ -39,8 +39,9 @@ def _version(library: str) -> str:
         return "unknown"
 
 
+@lru_cache
 def commit() -> str:
-    """Commit of the checkout that runs, "" when it is not one. Read from .git: starting git would cost more."""
+    """Commit of the checkout that runs, "" when it is not one. Read from .git, once: starting git would cost more."""
     git = Path(__file__).resolve().parents[2] / ".git"
     try:
         if git.is_file():  # a linked work tree

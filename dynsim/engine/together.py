@@ -51,7 +51,7 @@ def simulate_together(scenarios: Sequence[Scenario], *, pictured: bool = True) -
 
     A record does not depend on the runs beside it; from that of ``simulate`` it differs by rounding, 1e-15 of the
     largest entry in each right-hand side, times what the system makes of it. A run that cannot be completed on its
-    lane is simulated again, alone, and ends as it ends there; so is whatever cannot share.
+    lane is simulated again, alone, and ends as it ends there; so is whatever cannot share. ``pictured``: see there.
 
     Parameters
     ----------

@@ -5,6 +5,7 @@ Drawn from the table alone.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from dynsim.figures import style
@@ -137,14 +139,17 @@ def heat_map(sweep: Sweep) -> Figure | None:
                     found = _values(_at(sweep.of(variant), {x: a, y: b}), metric) * scale
                     table[j, i] = found.mean() if len(found) else np.nan
         low, high = np.nanmin(tables), np.nanmax(tables)
+        norm = LogNorm(low, high) if _is_wide(low, high) else Normalize(low, high)
         for axes, table, variant in zip(column, tables, variants, strict=True):
-            image = axes.imshow(table, origin="lower", aspect="auto", cmap="viridis", vmin=low, vmax=high)
+            image = axes.imshow(table, origin="lower", aspect="auto", cmap="viridis", norm=norm)
             axes.grid(visible=False)
             axes.set_facecolor(style.GREY)
             axes.set_title(variant)
             _name_cells(axes, "y", y, ys)
             _name_cells(axes, "x", x, xs)
-        figure.colorbar(image, ax=list(column), label=label)
+        bar = figure.colorbar(image, ax=list(column), label=label)
+        if isinstance(norm, LogNorm):
+            style.log_axis(bar.ax)
     for axes in panels[:, 1:].flat:
         axes.set_ylabel("")
     for axes in panels[:-1].flat:
@@ -175,6 +180,8 @@ def pareto(sweep: Sweep) -> Figure | None:
         *front.T,
         color=style.BLACK,
         linewidth=0.7,
+        # What lies left of and below the steps, no run reaches.
+        drawstyle="steps-post",
         marker="o",
         markersize=5,
         markerfacecolor="none",
@@ -184,7 +191,7 @@ def pareto(sweep: Sweep) -> Figure | None:
     axes.set(xlabel=error_label, ylabel=energy_label)
     _scale(axes, "x", np.array([scale * row[error] for row in rows]))
     _scale(axes, "y", np.array([row[energy] for row in rows]))
-    axes.legend()
+    style.legend_above(axes, columns=len(sweep.variants) + 1)
     return figure
 
 
@@ -215,14 +222,15 @@ def samples(sweep: Sweep) -> Figure | None:
             axes.set_ylabel("runs")
             if len(values) < 2:
                 continue
-            axes.hist(values, bins=min(_BINS, max(len(values) // 5, 5)), color=styles[variant]["color"], alpha=0.7)
+            # Freedman and Diaconis: as narrow as the number of samples allows.
+            bins = min(_BINS, len(np.histogram_bin_edges(values, "fd")) - 1)
+            axes.hist(values, bins=bins, color=styles[variant]["color"], alpha=0.7)
             one = spread(values)
             axes.axvline(one.mean, color=style.BLACK, linewidth=1.0)
             for limit in (one.low, one.high):
                 axes.axvline(limit, color=style.BLACK, linewidth=0.8, linestyle=(0, (4, 2)))
-            half = style.number(one.mean_high - one.mean, 2)
             axes.set_title(
-                f"{variant + ': ' if variant else ''}mean {style.number(one.mean, 5)} ± {half}, "
+                f"{variant + ': ' if variant else ''}mean {_with_interval(one.mean, one.mean_high - one.mean)}, "
                 f"{100 * LEVEL:g} % in {style.number(one.low)} … {style.number(one.high)}",
                 fontsize=7.5,
             )
@@ -318,10 +326,21 @@ def _scale(axes: Axes, which: str, values: Array) -> None:
     """A logarithmic axis for positive values of very different size; else one from zero, unless that squeezes them."""
     values = values[np.isfinite(values)]
     low, high = values.min(initial=np.inf), values.max(initial=-np.inf)
-    if low > 0.0 and high > _WIDE * low:
+    if _is_wide(low, high):
         style.log_axis(axes, which)
     elif 0.0 <= low < 0.7 * high:
         axes.set(**{f"{which}lim": (0.0, 1.05 * high)})
+
+
+def _with_interval(value: float, half: float) -> str:
+    """A value and its half width to two digits of that."""
+    places = max(1 - math.floor(math.log10(half)), 0) if half > 0.0 else 3
+    return f"{value:.{places}f} ± {half:.{places}f}".replace("-", "−")
+
+
+def _is_wide(low: float, high: float) -> bool:
+    """Whether values between these are positive and of very different size."""
+    return bool(low > 0.0 and high > _WIDE * low)
 
 
 def _short(text: str) -> str:

@@ -39,7 +39,7 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         raise ModelError(f"{robot.name}: a robot needs at least one link")
     _check_couplings(robot)
     _check_shapes(robot)
-    initial, position = robot.initial, robot.position_index
+    initial, position, unturned = robot.initial, robot.position_index, np.eye(3)
     index: dict[str, int] = {}
     joints: dict[str, int] = {}
     tree = np.zeros((len(links), ka.TREE_SIZE), dtype=np.int64)
@@ -66,7 +66,8 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         if not abs(norm - 1.0) < 1e-9:
             raise ModelError(f"{link.joint}: the axis {link.axis} has length {norm:.6g}; it must be a unit vector")
         R_PJ = np.asarray(link.R_PJ)
-        if np.abs(R_PJ @ R_PJ.T - np.eye(3)).max() > 1e-9 or np.linalg.det(R_PJ) < 0.0:
+        turned = not np.array_equal(R_PJ, unturned)
+        if turned and (np.abs(R_PJ @ R_PJ.T - unturned).max() > 1e-9 or np.linalg.det(R_PJ) < 0.0):
             raise ModelError(f"{link.joint}: R_PJ is not a rotation")
         parent = -1 if link.parent is None else index[link.parent]
         index[link.name], joints[link.joint] = i, i
@@ -75,7 +76,7 @@ def compile_model(robot: Robot) -> ka.ModelArrays:
         compound[i, ka.POSITION_INDEX] = position[i]
         # Later rows of a joint are mounted where its first one is.
         compound[i, ka.BASE] = parent if link.row.neutral else compound[parent, ka.BASE]
-        tree[i, ka.TURNED] = int(not np.array_equal(R_PJ, np.eye(3)))
+        tree[i, ka.TURNED] = int(turned)
         if parent >= 0 and parent != i - 1:
             tree[parent, ka.BRANCHES] += 1
         tensor = np.asarray(link.inertia.tensor)

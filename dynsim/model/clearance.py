@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from typing import TypeGuard
 
 import numpy as np
 
@@ -34,12 +36,16 @@ class Sinking:
     sample: int
 
 
-def poses(robot: Robot, q: Array, bodies: Collection[str] | None = None) -> Iterator[tuple[Link, Array, Array]]:
+def poses(
+    robot: Robot, q: Array, bodies: Collection[str] | None = None, directions: Array | None = None
+) -> Iterator[tuple[Link, Array, Array]]:
     """R_WB, (3, 3, T), and p_WB, (3, T) [m], of each body in turn at joint positions q, (T, nq).
 
     Vectorised over the samples, which lie together in memory: thousands of them cost a millisecond. ``bodies``: only
-    these and those that carry them.
+    these and those that carry them. ``directions``, (k, 3) in W: d·R_WB, (k, 3, T), and d·p_WB, (k, T), instead.
     """
+    view = np.eye(3) if directions is None else directions
+    q = np.ascontiguousarray(q.T)
     links = {link.name: link for link in robot.links}
     wanted = set(links if bodies is None else bodies)
     for link in reversed(robot.links):
@@ -49,14 +55,14 @@ def poses(robot: Robot, q: Array, bodies: Collection[str] | None = None) -> Iter
     for name in wanted:
         if (parent := links[name].parent) is not None:
             waiting[parent] += 1
-    count = len(q)
+    count = q.shape[1]
     known: dict[str, tuple[Array, Array]] = {}
     index = robot.position_index
     for i, link in enumerate(robot.links):
         if link.name not in wanted:
             continue
         if link.parent is None:
-            R, p = np.repeat(link.R_PJ[:, :, None], count, axis=2), np.repeat(link.p_PJ[:, None], count, axis=1)
+            R, p = (np.repeat((view @ part)[..., None], count, axis=-1) for part in (link.R_PJ, link.p_PJ))
         else:
             R_WP, p_WP = known[link.parent]
             R, p = link.R_PJ.T @ R_WP, p_WP + link.p_PJ @ R_WP
@@ -65,18 +71,18 @@ def poses(robot: Robot, q: Array, bodies: Collection[str] | None = None) -> Iter
                 del known[link.parent]
         k, row = index[i], link.row
         if link.kind == "prismatic":
-            p = p + q[:, k] * (link.axis @ R)
+            p = p + q[k] * (link.axis @ R)
         elif link.kind != "revolute":
             # Later rows of a joint stay where its first one has put the body.
             if row.motion is not None:
-                turn, shift = row.motion(link, q[:, k : k + len(row.neutral)].T)
+                turn, shift = row.motion(link, q[k : k + len(row.neutral)])
                 p = p + np.einsum("ijt,jt->it", R, shift)
                 R = np.einsum("ijt,jkt->ikt", R, turn)
         else:
             x, y, z = link.axis
             K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
             # R (1 + sin q K + (1 − cos q) K²); a product from the right is K'ᵀ from the left on the middle axis.
-            R = R + np.sin(q[:, k]) * (K.T @ R) + (1.0 - np.cos(q[:, k])) * ((K @ K).T @ R)
+            R = R + np.sin(q[k]) * (K.T @ R) + (1.0 - np.cos(q[k])) * ((K @ K).T @ R)
         if waiting[link.name]:
             known[link.name] = R, p
         yield link, R, p
@@ -97,6 +103,39 @@ def axis_ends(robot: Robot) -> dict[str, list[Array]]:
     return tips
 
 
+def gaps(
+    robot: Robot, q: Array, points: Mapping[str, Sequence[tuple[Surface, Array]]]
+) -> Iterator[tuple[Link, list[Array]]]:
+    """Signed distances, (T,) [m], of points from surfaces, of each body in turn at joint positions q, (T, nq).
+
+    ``points`` : by body, with the surface of each; (3,) in the body's frame [m]. Of planes alone only what counts
+    along their normals is computed, a third.
+    """
+    surfaces = {id(surface): surface for held in points.values() for surface, _ in held}
+    planes = {key: surface for key, surface in surfaces.items() if is_plane(surface)}
+    flat = len(planes) == len(surfaces)
+    # Of each plane its place among the normals, and its distance from the origin.
+    place = {key: (k, surface.c / np.linalg.norm(surface.b)) for k, (key, surface) in enumerate(planes.items())}
+    normals = np.array([surface.b / np.linalg.norm(surface.b) for surface in planes.values()])
+    for link, R, p in poses(robot, q, points, normals if flat else None):
+        if link.name not in points:
+            continue
+        found = []
+        for surface, point in points[link.name]:
+            position = p + point @ R if point.any() else p
+            if flat:
+                k, offset = place[id(surface)]
+                found.append(position[k] + offset)
+            else:
+                found.append(surface.gaps(position.T))
+        yield link, found
+
+
+def is_plane(surface: Surface) -> TypeGuard[Quadric]:
+    """True for a quadric without curvature."""
+    return isinstance(surface, Quadric) and not surface.Q.any()
+
+
 def sinking(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> list[Sinking]:
     """Bodies whose axes lie below a surface by more than their radius, at samples q, (T, nq).
 
@@ -105,19 +144,38 @@ def sinking(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> list[Sin
     found: list[Sinking] = []
     if not surfaces or not len(q):
         return found
-    tips, carriers = axis_ends(robot), robot.carriers
     # Of a run that diverged the last samples may be beyond what squares of floats can hold.
     with np.errstate(over="ignore", invalid="ignore"):
-        for link, R, p in poses(robot, q):
-            for name, surface in surfaces.items() if link.name not in carriers else ():
-                gap = surface.gaps(p.T)
-                for tip in tips[link.name]:
-                    gap = np.minimum(gap, _segment_gap(surface, p.T, (tip @ R).T))
-                depth = np.where(np.isfinite(gap), -gap, -np.inf)
-                beyond = np.flatnonzero(depth > link.radius + SLACK)
-                if beyond.size:
-                    found.append(Sinking(link.name, name, float(depth.max()), link.radius, int(beyond[0])))
+        for link, name, gap in _axis_gaps(robot, surfaces, q):
+            if gap.min() >= -link.radius - SLACK:
+                continue
+            depth = np.where(np.isfinite(gap), -gap, -np.inf)
+            beyond = np.flatnonzero(depth > link.radius + SLACK)
+            if beyond.size:
+                found.append(Sinking(link.name, name, float(depth.max()), link.radius, int(beyond[0])))
     return found
+
+
+def _axis_gaps(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> Iterator[tuple[Link, str, Array]]:
+    """Least distance of each body's axes from each surface, (T,) [m]; at their ends where all surfaces are planes."""
+    tips, carriers = axis_ends(robot), robot.carriers
+    bodies = [link.name for link in robot.links if link.name not in carriers]
+    if all(map(is_plane, surfaces.values())):
+        ends = {
+            body: [(surface, end) for surface in surfaces.values() for end in (np.zeros(3), *tips[body])]
+            for body in bodies
+        }
+        for link, each in gaps(robot, q, ends):
+            count = 1 + len(tips[link.name])
+            for k, name in enumerate(surfaces):
+                yield link, name, reduce(np.minimum, each[k * count : (k + 1) * count])
+        return
+    for link, R, p in poses(robot, q, bodies):
+        for name, surface in surfaces.items() if link.name in bodies else ():
+            gap = surface.gaps(p.T)
+            for tip in tips[link.name]:
+                gap = np.minimum(gap, _segment_gap(surface, p.T, (tip @ R).T))
+            yield link, name, gap
 
 
 def _segment_gap(surface: Surface, start: Array, along: Array) -> Array:

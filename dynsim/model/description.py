@@ -84,7 +84,8 @@ class Inertia:
         if not (np.isfinite(self.mass) and self.mass >= 0.0):
             raise ModelError(f"{name}: mass {self.mass} kg; a mass must be zero or positive")
         small = 1e-12 * self.mass
-        if not np.allclose(self.tensor, self.tensor.T, rtol=0, atol=1e-9 * abs(self.tensor).max() + small):
+        # Not NaN either.
+        if not np.abs(self.tensor - self.tensor.T).max() <= 1e-9 * np.abs(self.tensor).max() + small:
             raise ModelError(f"{name}: the inertia tensor is not symmetric")
         moments = np.linalg.eigvalsh(self.tensor)
         slack = 1e-9 * float(abs(moments).max()) + small

@@ -20,6 +20,8 @@ Task = TypeVar("Task")
 
 # Processes that a run may take with it before it is given up: the first may have been ended for another's memory.
 ATTEMPTS = 2
+# Runs of fixed steps that are handed out at once.
+LANES = 8
 LOST = "its process was ended from outside"
 
 
@@ -58,7 +60,9 @@ def simulate_batch(
 ) -> list[RunResult]:
     """Simulate many scenarios; one that fails does not keep the others from running.
 
-    Every run is that of :func:`dynsim.simulate`, to the bit, whatever ``jobs`` and whichever runs are beside it.
+    Every run is the same to the bit whatever ``jobs`` and whichever runs are beside it, and that of
+    :func:`dynsim.simulate`; runs of ``rk4`` share lanes, where they differ from it by rounding
+    (:func:`dynsim.engine.together.simulate_together`).
 
     Parameters
     ----------
@@ -92,17 +96,66 @@ def simulate_batch(
         if finished is not None:
             finished(task[0], result)
 
-    if run_all(partial(_numbered, keep_records), list(enumerate(runs)), take, jobs=jobs, scheduler=scheduler):
+    lanes = any(map(shares_lanes, runs))
+    if run_all(partial(_numbered, keep_records), list(enumerate(runs)), take, lanes, jobs=jobs, scheduler=scheduler):
         raise SimulationInterrupted(f"interrupted when {len(results)} of {len(runs)} runs were done")
     return [results[k] for k in range(len(runs))]
 
 
-def _numbered(keep: Keep, task: tuple[int, Scenario], look: Progress) -> RunResult:
-    return run_one(lambda: task[1], keep, look)
+def _numbered(keep: Keep, tasks: Sequence[tuple[int, Scenario]], look: Progress) -> list[RunResult]:
+    return run_some([partial(_same, scenario) for _, scenario in tasks], keep, look)
 
 
-def run_one(load: Callable[[], Scenario], keep: Keep, look: Progress | None) -> RunResult:
-    """Load a scenario and simulate it, whatever becomes of it.
+def _same(scenario: Scenario) -> Scenario:
+    return scenario
+
+
+def shares_lanes(scenario: Scenario) -> bool:
+    """Whether several such scenarios are simulated at once, as far as is known without building them."""
+    if scenario.integrator.method != "rk4":
+        return False
+    # Imported here, as below: other methods need nothing of it.
+    from dynsim.engine.together import can_share
+
+    return can_share(scenario)
+
+
+def run_some(loads: Sequence[Callable[[], Scenario]], keep: Keep, look: Progress | None) -> list[RunResult]:
+    """Load some scenarios and simulate them, those that can together; see :func:`run_one`."""
+    results: dict[int, RunResult] = {}
+    together: dict[int, Scenario] = {}
+    for k, load in enumerate(loads):
+        try:
+            scenario = load()
+        except Exception as error:
+            results[k] = _failed(error)
+            continue
+        if shares_lanes(scenario):
+            together[k] = scenario
+        else:
+            results[k] = run_one(scenario, keep, look)
+    return [one for _, one in sorted((results | _run_together(together, keep, look)).items())]
+
+
+def _run_together(scenarios: dict[int, Scenario], keep: Keep, look: Progress | None) -> dict[int, RunResult]:
+    if not scenarios:
+        return {}
+    from dynsim.engine.together import simulate_together
+
+    started = clock.perf_counter()
+    try:
+        ended = simulate_together(list(scenarios.values()), pictured=keep != "none")
+    except SimulationInterrupted:
+        raise
+    except Exception:
+        # A fault of dynsim in one of them: each by itself, as it would have been found alone.
+        return {k: run_one(scenario, keep, look) for k, scenario in scenarios.items()}
+    wall = (clock.perf_counter() - started) / len(scenarios)
+    return {k: _ended(one, keep, wall) for k, one in zip(scenarios, ended, strict=True)}
+
+
+def run_one(scenario: Scenario, keep: Keep, look: Progress | None) -> RunResult:
+    """Simulate a scenario, whatever becomes of it.
 
     Raises
     ------
@@ -111,20 +164,29 @@ def run_one(load: Callable[[], Scenario], keep: Keep, look: Progress | None) -> 
     """
     started = clock.perf_counter()
     try:
-        record = simulate(load(), look, pictured=keep != "none")
+        ended: Record | DynsimError = simulate(scenario, look, pictured=keep != "none")
     except SimulationInterrupted:
         raise
-    except SimulationStopped as stop:
-        kept = None if keep == "none" else stop.record
-        summary = stop.record.summary if stop.record is not None else {}
-        return RunResult(summary, _line(stop), record=kept, wall_s=clock.perf_counter() - started)
     except DynsimError as error:
-        return RunResult({}, _line(error), wall_s=clock.perf_counter() - started)
+        ended = error
     except Exception as error:
         # Hours of other runs must not go for a fault of dynsim in one.
-        return RunResult({}, f"{type(error).__name__}: {_line(error)}", wall_s=clock.perf_counter() - started)
-    wall = clock.perf_counter() - started
-    return RunResult(record.summary, record=record if keep == "all" else None, wall_s=wall)
+        return _failed(error)
+    return _ended(ended, keep, clock.perf_counter() - started)
+
+
+def _ended(ended: Record | DynsimError, keep: Keep, wall: float) -> RunResult:
+    """The record of a run that came to its end, or the error of one that did not, as its result."""
+    if isinstance(ended, Record):
+        return RunResult(ended.summary, record=ended if keep == "all" else None, wall_s=wall)
+    record = ended.record if isinstance(ended, SimulationStopped) else None
+    summary = {} if record is None else record.summary
+    return RunResult(summary, _line(ended), record=None if keep == "none" else record, wall_s=wall)
+
+
+def _failed(error: Exception) -> RunResult:
+    """Without anything simulated; a fault of dynsim by its kind."""
+    return RunResult({}, _line(error) if isinstance(error, DynsimError) else f"{type(error).__name__}: {_line(error)}")
 
 
 def _line(error: Exception) -> str:
@@ -132,14 +194,17 @@ def _line(error: Exception) -> str:
 
 
 def run_all(
-    work: Callable[[Task, Progress], RunResult],
+    work: Callable[[Sequence[Task], Progress], list[RunResult]],
     tasks: Sequence[Task],
     take: Callable[[Task, RunResult], None],
+    lanes: bool,
     *,
     jobs: int = 1,
     scheduler: str | None = None,
 ) -> bool:
     """Do ``work`` for all tasks here, in processes or on a cluster, and hand every result to ``take`` as it comes.
+
+    It gets neighbours at once where ``lanes`` says that they may share some, else one task at a time.
 
     Returns
     -------
@@ -153,29 +218,31 @@ def run_all(
     """
     if not isinstance(jobs, int) or jobs < 1:
         raise ScenarioError(f"jobs = {shown(jobs)}: must be a whole number of processes, 1 or more")
+    size = max(min(LANES, -(-len(tasks) // jobs)), 1) if lanes else 1
     if scheduler is not None:
         from dynsim.studies.cluster import run_on_cluster
 
-        return run_on_cluster(work, tasks, take, scheduler)
+        return run_on_cluster(work, tasks, take, size, scheduler)
+    pieces = [tasks[first : first + size] for first in range(0, len(tasks), size)]
     if jobs > 1:
 
-        def take_late(task: Task, result: Callable[[], RunResult | None]) -> None:
+        def take_late(piece: Sequence[Task], result: Callable[[], list[RunResult] | None]) -> None:
             try:
                 found = result()
             except WorkerLost:
-                take(task, RunResult({}, f"{LOST}; is memory short for so many jobs?", lost=True))
+                found = [RunResult({}, f"{LOST}; is memory short for so many jobs?", lost=True)] * len(piece)
             except SimulationInterrupted:
                 return
-            else:
-                if found is not None:
-                    take(task, found)
+            for task, one in zip(piece, found, strict=True) if found is not None else ():
+                take(task, one)
 
-        return run_in_processes(work, tasks, jobs, take_late, attempts=ATTEMPTS)
+        return run_in_processes(work, pieces, jobs, take_late, attempts=ATTEMPTS)
     try:
-        for task in tasks:
-            result = work(task, _no_look)
+        for piece in pieces:
+            results = work(piece, _no_look)
             interruption.keep()
-            take(task, result)
+            for task, one in zip(piece, results, strict=True):
+                take(task, one)
             interruption.heed()
             interruption.check()
     except SimulationInterrupted:

@@ -18,7 +18,7 @@ from dynsim.engine.provenance import commit
 from dynsim.errors import RecordError, ScenarioError, SimulationInterrupted
 from dynsim.files import json_text, replacing, write_text
 from dynsim.results import save_run
-from dynsim.studies.batch import Keep, RunResult, run_all, run_one
+from dynsim.studies.batch import Keep, RunResult, run_all, run_some, shares_lanes
 from dynsim.studies.columns import numbers
 from dynsim.studies.plan import Plan, Point
 from dynsim.studies.sweep_statistics import statistics
@@ -104,8 +104,8 @@ def run_sweep(
     rows = {point.run: _renumbered(earlier[point.identity], point) for point in points if point.identity in earlier}
     left = [point for point in points if point.run not in rows]
     # A key that no scenario has would fail in every run: the first of each variant tells.
-    for point in {point.variant: point for point in reversed(left)}.values():
-        plan.scenario(point)
+    firsts = [plan.scenario(point) for point in {point.variant: point for point in reversed(left)}.values()]
+    lanes = any(map(shares_lanes, firsts))
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / PLAN, json_text(header))
     failed = sum(row.status != OK for row in rows.values())
@@ -125,7 +125,8 @@ def run_sweep(
 
         if progress is not None:
             progress(len(rows), failed)
-        interrupted = run_all(partial(_run, plan, keep_records), left, take, jobs=jobs, scheduler=scheduler)
+        work = partial(_run, plan, keep_records)
+        interrupted = run_all(work, left, take, lanes, jobs=jobs, scheduler=scheduler)
     done = [rows[run] for run in sorted(rows)]
     write_tables(done, plan, folder)
     if plan.laws:
@@ -135,9 +136,9 @@ def run_sweep(
     return done
 
 
-def _run(plan: Plan, keep: Keep, point: Point, look: Progress) -> RunResult:
+def _run(plan: Plan, keep: Keep, points: Sequence[Point], look: Progress) -> list[RunResult]:
     """In a worker, too."""
-    return run_one(lambda: plan.scenario(point), keep, look)
+    return run_some([partial(plan.scenario, point) for point in points], keep, look)
 
 
 def _header(plan: Plan) -> dict[str, Any]:

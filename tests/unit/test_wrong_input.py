@@ -289,9 +289,12 @@ def test_provenance_does_without_the_metadata_of_a_library_and_finds_the_commit_
     (tmp_path / "outer" / "inner" / ".git").write_text("gitdir: ../.git/modules/inner\n")
     (git / "HEAD").write_text("0123abcd\n")
     monkeypatch.setattr(provenance, "__file__", str(package / "provenance.py"))
+    provenance.commit.cache_clear()
     assert provenance.commit() == "0123abcd"
     (git / "HEAD").write_bytes(b"\xff\xfe")
+    provenance.commit.cache_clear()
     assert provenance.commit() == ""
+    provenance.commit.cache_clear()
 
 
 def test_an_initial_angle_without_digits_is_refused():
