@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import json
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,7 +12,8 @@ import typer
 
 from dynsim import completion, interruption
 from dynsim.cli.app import FigureFormat, FiguresOption, FormatOption, QuietOption, ScenarioArgument, SetOption, app
-from dynsim.cli.display import console, draw_comparison, draw_run, errors, progress
+from dynsim.cli.display import console, draw_comparison, draw_run, errors, labelled, progress
+from dynsim.cli.view import open_page, view, write_view
 from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
 from dynsim.hardware.cli import export, hw
 from dynsim.terminal import escaped
@@ -35,9 +35,10 @@ def run(
     ] = None,
     no_figures: FiguresOption = False,
     format_: FormatOption = FigureFormat.png,
+    view: Annotated[bool, typer.Option("--view", help="Open the page that shows the run in a browser.")] = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Simulate one scenario and write its record, summary and figures."""
+    """Simulate one scenario and write its record, summary, figures and a page to look at it."""
     from dynsim.engine import simulate
     from dynsim.files import check_writable
     from dynsim.results import RUN_FILES, save_run
@@ -64,6 +65,9 @@ def run(
 
         print_summary(console, record.summary)
         console.print(f"Written to {escaped(folder)}", highlight=False, soft_wrap=True)
+    page = write_view({loaded.variant or loaded.name: record}, folder, quiet) if view or not no_figures else None
+    if view and page is not None:
+        open_page(page)
 
 
 @app.command(epilog="Example: dynsim compare scenarios/elbow_comparison.yaml --jobs 2")
@@ -129,6 +133,8 @@ def compare(
 
             print_comparison(console, {name: record.summary for name, record in records.items()})
             console.print(f"Written to {escaped(folder)}", highlight=False, soft_wrap=True)
+        if not no_figures:
+            write_view(records, folder, quiet)
     if failure is not None:
         raise failure
 
@@ -194,20 +200,18 @@ def plot(
     format_: FormatOption = FigureFormat.png,
 ) -> None:
     """Draw the figures of records; two or more are also laid over each other."""
-    from dynsim.record import Record
-
-    labelled: dict[str, Record] = {}
-    for path in records:
-        record = Record.load(path)
-        label = _label(path, record, labelled)
-        labelled[label] = record
+    named = labelled(records)
+    for path, (label, record) in zip(records, named.items(), strict=True):
         folder = path.parent / "figures" if out is None else out if len(records) == 1 else out / label
         try:
             draw_run(record, folder, quiet=False, format_=format_)
         except RecordError as error:
             raise RecordError(f"{path}: {error}") from error
-    if len(labelled) > 1:
-        draw_comparison(labelled, out or Path("figures"), quiet=False, format_=format_)
+    if len(named) > 1:
+        draw_comparison(named, out or Path("figures"), quiet=False, format_=format_)
+
+
+app.command(epilog="Example: dynsim view results/elbow_comparison/*/record.h5 --ghost")(view)
 
 
 @app.command(epilog="Example: dynsim bench --quick --json bench.json")
@@ -256,11 +260,3 @@ def _overrides(given: list[str] | None) -> dict[str, Any]:
     from dynsim.scenario import SetOptions, parse_override
 
     return SetOptions(parse_override(text) for text in given or ())
-
-
-def _label(path: Path, record: Record, taken: Container[str]) -> str:
-    """A name for a record and its folder among others: its variant, numbered where another has the same."""
-    from dynsim.files import file_name
-
-    name = file_name(record.summary.get("variant") or path.parent.name or path.stem)
-    return next(label for k in itertools.count(1) if (label := name if k == 1 else f"{name}_{k}") not in taken)

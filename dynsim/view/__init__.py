@@ -5,7 +5,8 @@
 It knows records and nothing of who made them: simulated and measured ones look the same.
 """
 
+from dynsim.view.content import viewable
 from dynsim.view.html import page, write
 from dynsim.view.inline import Inline
 
-__all__ = ["Inline", "page", "write"]
+__all__ = ["Inline", "page", "viewable", "write"]

@@ -1,8 +1,8 @@
 """Numbers over time as small blocks of bytes: quantised, differenced and split by bytes, so that they compress well.
 
-A column x becomes k = round((x − offset)/scale), 0 ≤ k < 2^b − 1 with b = 16 or 32; the last code stands for what is not
-finite. Differences of k modulo 2^b are stored, the lowest byte of all of them first. The page has the way back in
-``decode.js``.
+A column x becomes k = round((x − offset)/scale), 0 ≤ k < 2^b − 1 with b = 16 or 32; the last code stands for what is
+not finite. Differences of k modulo 2^b are stored, the lowest byte of all of them first. ``decode.js`` of the page has
+the way back.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Blocks:
             codes = np.rint((np.where(known, data, low) - low) / np.where(scale > 0.0, scale, 1.0))
         kind = _TYPES[bits]
         codes = np.where(known, codes, float(_CODES[bits] + 1)).astype(kind)
-        steps = np.diff(codes.T, axis=1, prepend=np.zeros((codes.shape[1], 1), kind))
+        steps = np.diff(codes.T, axis=1, prepend=kind.type(0))
         planes = np.ascontiguousarray(steps).view(np.uint8).reshape(-1, bits // 8).T
         content = np.ascontiguousarray(planes).tobytes()
         self._parts.append(content)

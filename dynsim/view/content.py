@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from dynsim._version import __version__
 from dynsim.errors import RecordError
 from dynsim.measures import hand_target
-from dynsim.record import TIME, Record
+from dynsim.record import TIME, Record, Signal
 from dynsim.record.poses import ORIENTATION, POSITION, point_positions
 from dynsim.record.scene import Scene
 from dynsim.view.blocks import Blocks
@@ -44,6 +44,7 @@ def packed(records: Mapping[str, Record], *, ghost: bool = False) -> str:
     if not shown:
         raise RecordError("nothing to view: a record needs samples, a scene, and the poses of its bodies")
     low, high = _bounds(shown.values())
+    azimuth = _azimuth(shown.values())
     blocks = Blocks()
     meshes = Meshes(blocks)
     parts = [_record(name, robot, blocks, meshes, low, high) for name, robot in shown.items()]
@@ -51,14 +52,18 @@ def packed(records: Mapping[str, Record], *, ghost: bool = False) -> str:
         "version": 1,
         "by": f"dynsim {__version__}",
         "ghost": ghost,
-        "low": low.tolist(),
-        "high": high.tolist(),
-        "azimuth": _azimuth(shown.values()),
+        "azimuth": azimuth,
+        "box": [corner.tolist() for corner in _bounds(shown.values(), azimuth)],
         "records": parts,
         "meshes": meshes.found,
         "notes": meshes.notes(),
     }
     return blocks.packed(head)
+
+
+def viewable(record: Record) -> bool:
+    """Whether a page has something to show of a record: samples, a scene, and the poses of its bodies."""
+    return _robot(record) is not None
 
 
 @dataclass(frozen=True)
@@ -113,8 +118,8 @@ def _every(count: int, stride: int) -> NDArray[np.intp]:
     return np.unique(np.append(np.arange(0, count, stride), count - 1))
 
 
-def _bounds(robots: Iterable[Robot]) -> tuple[Array, Array]:
-    """The box in which everything moves, with some room, (3,) and (3,) [m]."""
+def _bounds(robots: Iterable[Robot], azimuth: float = 0.0) -> tuple[Array, Array]:
+    """The box, turned about z by ``azimuth``, in which everything moves, with some room, (3,) and (3,) [m]."""
     points = []
     for robot in robots:
         record = robot.record
@@ -122,6 +127,8 @@ def _bounds(robots: Iterable[Robot]) -> tuple[Array, Array]:
         points += [one for _, one in _paths(record, robot.scene)]
     pooled = np.concatenate(points)
     pooled = pooled[np.isfinite(pooled).all(axis=1)]
+    c, s = math.cos(azimuth), math.sin(azimuth)
+    pooled = pooled @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     low, high = pooled.min(axis=0), pooled.max(axis=0)
     room = np.maximum(0.12 * float((high - low).max() or 1.0) - 0.5 * (high - low), 0.0) + 0.03
     return low - room, high + room
@@ -155,7 +162,7 @@ def _record(name: str, robot: Robot, blocks: Blocks, meshes: Meshes, low: Array,
     position, turn = record[POSITION][rows], record[ORIENTATION][rows]
     shapes = body_shapes(scene, robot.reach, meshes)
     groups = wheel_groups(record, scene)
-    bodies = [
+    bodies: list[dict[str, Any]] = [
         {"name": body.name, "parent": body.parent, "joint": body.joint.name, "shapes": one}
         for body, one in zip(scene.bodies, shapes, strict=True)
     ]
@@ -246,7 +253,9 @@ def _motors(record: Record, scene: Scene) -> list[list[Any]]:
     """Name of each motor and the index of the body that it moves; of a wheel of a base, the wheel."""
     names = record.labels["current"] if "current" in record else record.labels.get("v", ())
     by_joint = {body.joint.name: k for k, body in enumerate(scene.bodies)}
-    by_label = {label: k for k, body in enumerate(scene.bodies) if body.joint.kind != "planar" for label in body.joint.labels}
+    by_label = {
+        label: k for k, body in enumerate(scene.bodies) if body.joint.kind != "planar" for label in body.joint.labels
+    }
     places = [(name, by_label.get(name, by_joint.get(name))) for name in names]
     return [[name, body] for name, body in places if body is not None]
 
@@ -273,7 +282,7 @@ def _named(tree: Any, key: str) -> Iterator[float]:
 def _signals(record: Record, blocks: Blocks) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Signals for the plots, and their time axes."""
     found, axes = [], {}
-    for name, signal in record.signals.items():
+    for name, signal in (record.signals | _hand_error(record)).items():
         data = signal.data
         if name in _SHOWN or not data.size or data.ndim > 3:
             continue
@@ -281,7 +290,8 @@ def _signals(record: Record, blocks: Blocks) -> tuple[list[dict[str, Any]], dict
         if data.ndim == 3:
             parts = "xyz" if data.shape[2] == 3 else range(data.shape[2])
             labels = [f"{label} {part}" for label in labels for part in parts]
-        time, values = _thinned(record.times(name), data.reshape(len(data), -1))
+        every = record.time if signal.axis == TIME else record.axes[signal.axis]
+        time, values = _thinned(every, data.reshape(len(data), -1))
         if signal.axis not in axes:
             axes[signal.axis] = blocks.add(time, 1e-9)
         found.append(
@@ -299,8 +309,17 @@ def _signals(record: Record, blocks: Blocks) -> tuple[list[dict[str, Any]], dict
     return found, axes
 
 
+def _hand_error(record: Record) -> dict[str, Signal]:
+    """How far the hand is from its target, where a record says both and not this."""
+    target = hand_target(record)
+    if target is None or "hand_position" not in record or "hand_error" in record:
+        return {}
+    distance = np.linalg.norm(record["hand_position"] - target, axis=1)
+    return {"hand_error": Signal(distance, "m", description="distance of the hand from its target")}
+
+
 def _thinned(time: Array, values: NDArray[Any]) -> tuple[Array, Array]:
-    """At most ``PLOTTED`` instants; of a longer run two for each bin, with the first and then the other extreme there."""
+    """At most ``PLOTTED`` instants; of a longer run two for each bin, its extremes in their order."""
     values = np.asarray(values, dtype=np.float64)
     if len(time) <= PLOTTED:
         return time, values

@@ -28,11 +28,7 @@ class Actor {
     this.paths = Object.entries(data.paths).map(([kind, block]) => {
       const path = kind === "hand" ? new M.Path(this.inner, this.times, table(block), 1.6, 0.35) : null;
       if (path) return { kind, path };
-      const points = [], at = table(block);
-      for (let i = 0; i < this.times.length; i++) {
-        const p = [0, 1, 2].map((k) => at.value(i, k));
-        if (p.every(Number.isFinite)) points.push(...p);
-      }
+      const { points } = M.thinned(this.times, table(block));
       const line = S.line(points, 1.5, 0.025 * data.reach);
       line.renderOrder = 4;
       this.inner.add(line);
@@ -103,7 +99,7 @@ class Actor {
     }
     // Two fingers ahead of the controlled point, which close.
     this.fingers = [-1, 1].map((side) => {
-      const finger = new THREE.Mesh(new THREE.BoxGeometry(2.4 * size, 0.5 * size, 0.9 * size), this.handMaterial);
+      const finger = new THREE.Mesh(new THREE.BoxGeometry(1.6 * size, 0.4 * size, 0.8 * size), this.handMaterial);
       finger.userData = { side, size };
       this.hand.add(finger);
       return finger;
@@ -165,7 +161,7 @@ class Actor {
     }
     if (this.support) this.support.show(this.supportPoints(sample), this.pressure(sample), layers.support, colours);
     if (this.fingers)
-      for (const f of this.fingers) f.position.set(0.6 * f.userData.size, f.userData.side * f.userData.size * (sample.gripper ? 0.35 : 1.1), 0);
+      for (const f of this.fingers) f.position.set(0.5 * f.userData.size, f.userData.side * f.userData.size * (sample.gripper ? 0.28 : 0.8), 0);
     for (const one of this.paths) {
       if (one.line) one.line.visible = layers.target;
       else one.path.shown = layers.trace, one.path.show(sample.time);

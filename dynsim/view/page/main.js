@@ -13,7 +13,7 @@ class App {
     const meshes = head.meshes.map((mesh) => S.mesh(bytes, mesh));
     this.actors = head.records.map((record, k) => new Actor(record, bytes, meshes, k));
     this.span = [Math.min(...this.actors.map((a) => a.span[0])), Math.max(...this.actors.map((a) => a.span[1]))];
-    this.stage = new Stage(document.getElementById("scene"), head.low, head.high, head.azimuth);
+    this.stage = new Stage(document.getElementById("scene"), head.azimuth);
     this.layers = { forces: true, cones: true, trace: true, target: true, support: true, labels: true };
     Object.assign(this, { time: this.span[0], playing: false, speed: 1, follow: false, ghost: head.ghost, colouring: "", live: false, cost: 0 });
     this.theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
@@ -39,7 +39,8 @@ class App {
   }
 
   firstPlots() {
-    const wanted = ["contact_normal_force", "wheel_load", "power", "position_error", "q", "phi", "hand_position"];
+    const wanted = this.actors.length > 1 ? ["contact_normal_force", "tip_margin", "energy_electrical_drawn", "hand_error", "position_error", "support_margin"]
+      : ["contact_normal_force", "wheel_load", "hand_error", "position_error", "support_margin", "power", "q", "phi"];
     return wanted.filter((name) => this.actors.some((a) => a.signals.get(name))).slice(0, 3);
   }
 
@@ -47,7 +48,7 @@ class App {
   surfaces() {
     const flat = (s) => s.kind === "plane" && Math.abs(s.q[1]) < 1e-6 && Math.abs(s.q[2]) < 1e-6;
     const floors = this.actors.flatMap((a) => a.data.surfaces.filter(flat)).map((s) => s.p[2]);
-    this.floor = floors.length ? floors[0] : Math.min(0, this.head.low[2]);
+    this.floor = floors.length ? floors[0] : Math.min(0, this.head.box[0][2]);
     this.stage.sheets = [];
     for (const actor of this.actors) {
       actor.surfaces = [];
@@ -62,18 +63,16 @@ class App {
     }
   }
 
-  // Variants beside each other along the shorter side of the box, or all at one place.
+  // Variants behind each other as the reader sees them, or all at one place.
   arrange() {
-    const low = new THREE.Vector3(...this.head.low), high = new THREE.Vector3(...this.head.high);
-    const shown = this.actors.filter((a) => a.object.visible), size = high.clone().sub(low);
-    const along = size.x < size.y ? "x" : "y", apart = this.ghost ? 0 : 1.12 * size[along];
-    this.actors.forEach((actor) => actor.object.position.set(0, 0, 0));
+    const [low, high] = this.head.box.map((corner) => new THREE.Vector3(...corner));
+    const shown = this.actors.filter((a) => a.object.visible);
+    const apart = this.ghost ? 0 : high.y - low.y + 0.06 * (high.x - low.x);
     shown.forEach((actor, k) => {
-      // The first one is next to the reader, who looks along y.
-      actor.object.position[along] = k * apart;
+      this.stage.turned(actor.object.position.set(0, k * apart, 0));
       for (const one of actor.surfaces) one.visible = !this.ghost || k === 0;
     });
-    high[along] += apart * Math.max(shown.length - 1, 0);
+    high.y += apart * Math.max(shown.length - 1, 0);
     this.stage.settle(low, high, this.floor);
     this.stage.dress(D.palette[this.theme]);
   }

@@ -97,24 +97,39 @@ M.Contact = class {
   }
 };
 
+// Points of a path, no nearer to each other than a part of its length: fat lines of thousands of pieces take seconds
+// to draw without a graphics card.
+M.thinned = function (times, table, most = 360) {
+  const [x, y, z] = [0, 1, 2].map((k) => table.column(k)), rows = [];
+  for (let i = 0; i < times.length; i++) if (Number.isFinite(x[i] + y[i] + z[i])) rows.push(i);
+  const way = (i, j) => Math.hypot(x[j] - x[i], y[j] - y[i], z[j] - z[i]);
+  let length = 0;
+  for (let k = 1; k < rows.length; k++) length += way(rows[k - 1], rows[k]);
+  const kept = rows.slice(0, 1);
+  let since = 0;
+  for (let k = 1; k < rows.length; k++) {
+    since += way(rows[k - 1], rows[k]);
+    if (since < length / most && k < rows.length - 1) continue;
+    kept.push(rows[k]);
+    since = 0;
+  }
+  return { times: kept.map((i) => times[i]), points: kept.flatMap((i) => [x[i], y[i], z[i]]) };
+};
+
 // A path: all of it faint, what was passed so far bold.
 M.Path = class {
   constructor(parent, times, table, width, faint) {
-    const points = [];
-    this.times = [];
-    for (let i = 0; i < times.length; i++) {
-      const p = [0, 1, 2].map((k) => table.value(i, k));
-      if (p.every(Number.isFinite)) points.push(...p), this.times.push(times[i]);
-    }
-    this.whole = S.line(points, width);
+    const path = M.thinned(times, table);
+    this.times = path.times;
+    this.whole = S.line(path.points, width);
     this.whole.material.opacity = faint;
-    this.part = S.line(points, 1.6 * width);
+    this.part = S.line(path.points, 1.6 * width);
     this.whole.renderOrder = this.part.renderOrder = 3;
     parent.add(this.whole, this.part);
   }
 
   show(t) {
-    const done = this.times.length && t >= this.times[0] ? D.before(this.times, t) + 1 : 0;
+    const done = this.times.length > 1 && t >= this.times[0] ? D.before(this.times, t) + 1 : 0;
     this.part.geometry.instanceCount = done;
     this.part.visible = this.shown && done > 0;
     this.whole.visible = this.shown;

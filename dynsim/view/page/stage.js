@@ -2,7 +2,8 @@
 // Renderer, camera, light and floor. Draws only when something has changed.
 
 class Stage {
-  constructor(canvas, low, high, azimuth) {
+  // The box in which everything moves is turned by the azimuth about z.
+  constructor(canvas, azimuth) {
     this.azimuth = azimuth;
     this.canvas = canvas;
     const software = Stage.software();
@@ -11,8 +12,8 @@ class Stage {
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(38, 1, 0.01, 100);
     this.camera.up.set(0, 0, 1);
-    this.low = new THREE.Vector3(...low);
-    this.high = new THREE.Vector3(...high);
+    this.low = new THREE.Vector3();
+    this.high = new THREE.Vector3();
     this.controls = new THREE.OrbitControls(this.camera, canvas);
     this.controls.addEventListener("change", () => this.touch());
     this.controls.addEventListener("start", () => { this.preset = null; });
@@ -75,7 +76,12 @@ class Stage {
   }
 
   centre() {
-    return this.low.clone().add(this.high).multiplyScalar(0.5);
+    return this.turned(this.low.clone().add(this.high).multiplyScalar(0.5));
+  }
+
+  // From the frame of the box to the world.
+  turned(point) {
+    return point.applyAxisAngle(M.z, this.azimuth);
   }
 
   dress(colours) {
@@ -94,14 +100,14 @@ class Stage {
     this.preset = preset;
     // Seen with the robot's longest way from left to right: that is x before the turn by the azimuth.
     const from = { iso: [-0.5, -1, 0.5], side: [0, -1, 0.06], front: [1, 0, 0.06], top: [0, -0.001, 1] }[preset];
-    const back = new THREE.Vector3(...from).normalize().applyAxisAngle(M.z, this.azimuth), centre = this.centre();
+    const back = this.turned(new THREE.Vector3(...from).normalize()), centre = this.centre();
     const right = new THREE.Vector3().crossVectors(this.camera.up, back).normalize();
     const up = new THREE.Vector3().crossVectors(back, right);
     const tan = Math.tan((this.camera.fov * Math.PI) / 360), aspect = this.camera.aspect;
     let distance = 0;
     for (let k = 0; k < 8; k++) {
-      const corner = new THREE.Vector3(k & 1 ? this.high.x : this.low.x, k & 2 ? this.high.y : this.low.y,
-        k & 4 ? this.high.z : this.low.z).sub(centre);
+      const corner = this.turned(new THREE.Vector3(k & 1 ? this.high.x : this.low.x, k & 2 ? this.high.y : this.low.y,
+        k & 4 ? this.high.z : this.low.z)).sub(centre);
       const near = corner.dot(back);
       distance = Math.max(distance, near + Math.abs(corner.dot(up)) / tan, near + Math.abs(corner.dot(right)) / (tan * aspect));
     }
