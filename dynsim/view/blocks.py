@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 # Half a step of a code is at most this, where a largest error is asked for: else 32 bits are taken.
 _CODES = {16: 2**16 - 2, 32: 2**32 - 2}
-_TYPES = {16: np.dtype("<u2"), 32: np.dtype("<u4")}
+_TYPES: dict[int, np.dtype[Any]] = {16: np.dtype("<u2"), 32: np.dtype("<u4")}
 
 
 class Blocks:
@@ -42,7 +42,7 @@ class Blocks:
             codes = np.rint((np.where(known, data, low) - low) / np.where(scale > 0.0, scale, 1.0))
         kind = _TYPES[bits]
         codes = np.where(known, codes, float(_CODES[bits] + 1)).astype(kind)
-        steps = np.diff(codes.T, axis=1, prepend=kind.type(0))
+        steps = np.diff(codes.T, axis=1, prepend=np.zeros((codes.shape[1], 1), dtype=kind))
         planes = np.ascontiguousarray(steps).view(np.uint8).reshape(-1, bits // 8).T
         content = np.ascontiguousarray(planes).tobytes()
         self._parts.append(content)
