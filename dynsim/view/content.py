@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,8 +43,8 @@ def packed(records: Mapping[str, Record], *, ghost: bool = False) -> str:
     shown = {name: robot for name, record in records.items() if (robot := _robot(record)) is not None}
     if not shown:
         raise RecordError("nothing to view: a record needs samples, a scene, and the poses of its bodies")
-    low, high = _bounds(shown.values())
-    azimuth = _azimuth(shown.values())
+    robots = list(shown.values())
+    azimuth, (low, high) = _azimuth(robots), _bounds(robots)
     blocks = Blocks()
     meshes = Meshes(blocks)
     parts = [_record(name, robot, blocks, meshes, low, high) for name, robot in shown.items()]
@@ -53,7 +53,7 @@ def packed(records: Mapping[str, Record], *, ghost: bool = False) -> str:
         "by": f"dynsim {__version__}",
         "ghost": ghost,
         "azimuth": azimuth,
-        "box": [corner.tolist() for corner in _bounds(shown.values(), azimuth)],
+        "box": [corner.tolist() for corner in _bounds(robots, azimuth)],
         "records": parts,
         "meshes": meshes.found,
         "notes": meshes.notes(),
@@ -118,23 +118,37 @@ def _every(count: int, stride: int) -> NDArray[np.intp]:
     return np.unique(np.append(np.arange(0, count, stride), count - 1))
 
 
-def _bounds(robots: Iterable[Robot], azimuth: float = 0.0) -> tuple[Array, Array]:
+def _bounds(robots: Sequence[Robot], azimuth: float = 0.0) -> tuple[Array, Array]:
     """The box, turned about z by ``azimuth``, in which everything moves, with some room, (3,) and (3,) [m]."""
     points = []
     for robot in robots:
         record = robot.record
         points += [record[POSITION].reshape(-1, 3).astype(np.float64)]
         points += [one for _, one in _paths(record, robot.scene)]
+        for shape in robot.scene.fixed:
+            middle, half = np.array(shape.position), 0.5 * max(shape.size) if shape.kind != "mesh" else 0.0
+            points += [np.stack([middle - half, middle + half])]
     pooled = np.concatenate(points)
     pooled = pooled[np.isfinite(pooled).all(axis=1)]
     c, s = math.cos(azimuth), math.sin(azimuth)
     pooled = pooled @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     low, high = pooled.min(axis=0), pooled.max(axis=0)
-    room = np.maximum(0.12 * float((high - low).max() or 1.0) - 0.5 * (high - low), 0.0) + 0.03
+    # What hardly moves is not blown up to fill the window, and what is flat has some depth to stand in.
+    least = max(0.24 * float((high - low).max()), 0.6 * max(robot.reach for robot in robots))
+    room = np.maximum(0.5 * (least - (high - low)), 0.0) + 0.03 * least + max(map(_thickness, robots))
     return low - room, high + room
 
 
-def _azimuth(robots: Iterable[Robot]) -> float:
+def _thickness(robot: Robot) -> float:
+    """How far shapes reach beside the lines between the bodies, more or less [m]."""
+    shapes = [shape for body in robot.scene.bodies for shape in body.shapes]
+    round_ = [shape.size[0] for shape in shapes if shape.kind in ("cylinder", "capsule", "sphere")]
+    boxes = [0.5 * sorted(shape.size)[1] for shape in shapes if shape.kind == "box"]
+    meshes = [0.08 * robot.reach for shape in shapes if shape.kind == "mesh"]
+    return min(max([*round_, *boxes, *meshes], default=0.0), 0.5 * robot.reach)
+
+
+def _azimuth(robots: Sequence[Robot]) -> float:
     """Direction in which robot and hand reach furthest, (−π/2, π/2] about z [rad]: the page looks across it."""
     clouds = [robot.record[POSITION][robot.rows][..., :2].reshape(-1, 2).astype(np.float64) for robot in robots]
     clouds += [path[robot.rows, :2] for robot in robots for _, path in _paths(robot.record, robot.scene)]
@@ -301,12 +315,21 @@ def _signals(record: Record, blocks: Blocks) -> tuple[list[dict[str, Any]], dict
                 "about": signal.description,
                 "labels": labels,
                 "axis": signal.axis,
-                "data": blocks.add(values),
+                "data": blocks.add(values, _resolution(values)),
             }
         )
     if TIME not in axes:
         axes[TIME] = blocks.add(_thinned(record.time, record.time[:, None])[0], 1e-9)
     return found, axes
+
+
+def _resolution(values: Array) -> float:
+    """What can be told apart in a plot that shows most of the values: a spike at the start does not coarsen the rest."""
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return np.inf
+    low, high = np.percentile(known, (5.0, 95.0))
+    return 5e-4 * float(high - low) or np.inf
 
 
 def _hand_error(record: Record) -> dict[str, Signal]:

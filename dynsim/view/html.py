@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 
@@ -19,13 +19,15 @@ SCRIPTS = ("decode", "solids", "marks", "actor", "stage", "plots", "controls", "
 _THREE = ("jupyter_threejs_sage", "static/r130/three.min.js")
 
 
-def page(records: Mapping[str, Record], *, ghost: bool = False) -> str:
+def page(records: Mapping[str, Record], *, ghost: bool = False, scripts: Sequence[str] = (), connect: str = "") -> str:
     """The page of one record, or of several beside each other.
 
     Parameters
     ----------
     records : by the names that the page shows
     ghost : several are laid over each other, the first one solid
+    scripts : texts of further programs, which run after the page's own and find it as ``dynsim``
+    connect : the one address that a page of a live drive may connect to; a page of records has none
 
     Raises
     ------
@@ -34,7 +36,8 @@ def page(records: Mapping[str, Record], *, ghost: bool = False) -> str:
     """
     data = packed(records, ghost=ghost)
     title = next((str(name) for record in records.values() if (name := _scenario(record))), "record")
-    return _filled({"title": html.escape(title), "data": data})
+    allowed = f"; connect-src {html.escape(connect)}" if connect else ""
+    return _filled({"title": html.escape(title), "data": data, "connect": allowed}, scripts)
 
 
 def write(records: Mapping[str, Record], path: str | os.PathLike[str], *, ghost: bool = False) -> Path:
@@ -51,10 +54,11 @@ def write(records: Mapping[str, Record], path: str | os.PathLike[str], *, ghost:
     return Path(path)
 
 
-def _filled(values: Mapping[str, str]) -> str:
+def _filled(values: Mapping[str, str], scripts: Sequence[str]) -> str:
     own = resources.files("dynsim.view").joinpath("page")
     style = own.joinpath("style.css").read_text(encoding="utf-8")
     program = "\n".join(own.joinpath(f"{name}.js").read_text(encoding="utf-8") for name in SCRIPTS)
+    program = "\n".join([program, *scripts])
     parts = {"style": style, "three": _inline(three()), "program": _inline(program), **values}
     text = own.joinpath("page.html").read_text(encoding="utf-8")
     return re.sub(r"<!--\{(\w+)\}-->", lambda found: parts[found[1]], text)

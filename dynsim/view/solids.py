@@ -122,7 +122,7 @@ def drawn_surface(surface: Surface, low: Array, high: Array) -> dict[str, Any]:
         return found | {
             "p": (centre - surface.gap(centre) * normal).tolist(),
             "q": from_z(normal).tolist(),
-            "half": 0.8 * float(np.linalg.norm(high - low)),
+            "half": 1.1 * float(np.linalg.norm(high - low)),
         }
     if surface.kind == "sphere" and near:
         return found | {"p": list(surface.position or ()), "radius": surface.radius}

@@ -168,6 +168,16 @@ class Actor {
     }
   }
 
+  // A live frame: the path of the hand grows, that of the record is not shown.
+  extend(sample) {
+    if (!this.hand) return;
+    this.live ??= new M.Growing(this.inner);
+    this.live.line.material.color.set(this.colours.hand);
+    for (const one of this.paths) if (one.path) one.path.times = [];
+    const body = this.data.hand.body, o = 7 * body, p = sample.poses, q = new THREE.Quaternion(p[o + 4], p[o + 5], p[o + 6], p[o + 3]);
+    this.live.add(this.supportPoint.set(...this.data.hand.p).applyQuaternion(q).add(new THREE.Vector3(p[o], p[o + 1], p[o + 2])));
+  }
+
   supportPoints(sample) {
     const found = [];
     for (const support of this.data.supports) {
@@ -230,6 +240,7 @@ class Actor {
       contacts: this.contacts.map((c) => ({ ...c.state, visible: c.push.object.visible })),
       wheels: Object.fromEntries((this.data.wheels?.names ?? []).map((name, k) => [name, this.shown.wheels[k] > 0])),
       support: this.support && { corners: this.support.hull.length, inside: this.support.inside },
+      hand: this.hand ? this.handPosition(new THREE.Vector3()).sub(this.object.position).toArray() : null,
       gripper: this.shown.gripper, saturated: this.saturated ?? [],
       offset: this.object.position.toArray(),
     };

@@ -63,7 +63,8 @@ D.number = function (x, digits = 4) {
   if (x === null || x === undefined || !Number.isFinite(x)) return "–";
   if (x === 0) return "0";
   const size = Math.abs(x);
-  const text = size >= 1e5 || size < 1e-3 ? x.toExponential(2) : String(Number(x.toPrecision(digits)));
+  const round = Number(x.toPrecision(digits));
+  const text = size >= 1e5 || size < 1e-3 ? Number(x.toPrecision(3)).toExponential() : String(round);
   return text.replace("-", "−").replace("e+", "e");
 };
 

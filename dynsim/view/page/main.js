@@ -48,7 +48,10 @@ class App {
   surfaces() {
     const flat = (s) => s.kind === "plane" && Math.abs(s.q[1]) < 1e-6 && Math.abs(s.q[2]) < 1e-6;
     const floors = this.actors.flatMap((a) => a.data.surfaces.filter(flat)).map((s) => s.p[2]);
-    this.floor = floors.length ? floors[0] : Math.min(0, this.head.box[0][2]);
+    // Without one a faint grid lies below everything, to see by where things are.
+    const bare = this.actors.every((a) => !a.data.surfaces.length && !a.data.fixed.length);
+    this.stage.real = floors.length > 0 || this.actors.every((a) => !a.data.surfaces.length);
+    this.floor = floors.length ? floors[0] : bare ? this.head.box[0][2] : Math.min(0, this.head.box[0][2]);
     this.stage.sheets = [];
     for (const actor of this.actors) {
       actor.surfaces = [];
@@ -164,6 +167,7 @@ class App {
     this.live = true;
     this.time = frame.time;
     Object.assign(sample, frame);
+    actor.extend(sample);
     this.update([[actor, sample]]);
   }
 

@@ -132,7 +132,31 @@ M.Path = class {
     const done = this.times.length > 1 && t >= this.times[0] ? D.before(this.times, t) + 1 : 0;
     this.part.geometry.instanceCount = done;
     this.part.visible = this.shown && done > 0;
-    this.whole.visible = this.shown;
+    this.whole.visible = this.shown && this.times.length > 0;
+  }
+};
+
+// A path that grows with live frames; where it is full, every second of its points goes.
+M.Growing = class {
+  constructor(parent, most = 4000) {
+    this.most = most;
+    this.count = 0;
+    this.points = new Float32Array(3 * most);
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(this.points, 3));
+    this.line = new THREE.Line(geometry, new THREE.LineBasicMaterial());
+    this.line.frustumCulled = false;
+    parent.add(this.line);
+  }
+
+  add(point) {
+    if (this.count === this.most) {
+      this.count = this.most >> 1;
+      for (let i = 0; i < this.count; i++) for (let k = 0; k < 3; k++) this.points[3 * i + k] = this.points[6 * i + k];
+    }
+    point.toArray(this.points, 3 * this.count++);
+    this.line.geometry.setDrawRange(0, this.count);
+    this.line.geometry.attributes.position.needsUpdate = true;
   }
 };
 

@@ -24,17 +24,30 @@ S.capsule = function (radius, length) {
   return new THREE.LatheGeometry(profile, 24).rotateX(Math.PI / 2);
 };
 
-// Triangles with 16-bit corners within a box: {vertices, triangles, low, step}.
+// Triangles with 16-bit corners within a box: {vertices, triangles, low, step}. Edges of more than 40° stay sharp.
 S.mesh = function (bytes, mesh) {
   const codes = (block) => new Uint16Array(bytes.slice(block.at, block.at + 2 * block.count).buffer);
-  const raw = codes(mesh.vertices), points = new Float32Array(raw.length);
-  for (let i = 0; i < raw.length; i++) points[i] = mesh.low[i % 3] + mesh.step[i % 3] * raw[i];
-  let made = new THREE.BufferGeometry();
-  made.setAttribute("position", new THREE.BufferAttribute(points, 3));
-  made.setIndex(new THREE.BufferAttribute(codes(mesh.triangles), 1));
-  // Flat faces: corners are shared by faces at sharp edges.
-  made = made.toNonIndexed();
-  made.computeVertexNormals();
+  const raw = codes(mesh.vertices), corner = codes(mesh.triangles), faces = corner.length / 3;
+  const at = (i, k) => mesh.low[k] + mesh.step[k] * raw[3 * i + k];
+  const normals = new Float32Array(corner.length), around = new Map();
+  for (let f = 0; f < faces; f++) {
+    const [a, b, c] = [0, 1, 2].map((j) => corner[3 * f + j]);
+    const u = [0, 1, 2].map((k) => at(b, k) - at(a, k)), v = [0, 1, 2].map((k) => at(c, k) - at(a, k));
+    for (let k = 0; k < 3; k++) normals[3 * f + k] = u[(k + 1) % 3] * v[(k + 2) % 3] - u[(k + 2) % 3] * v[(k + 1) % 3];
+    for (const i of [a, b, c]) around.has(i) ? around.get(i).push(f) : around.set(i, [f]);
+  }
+  const positions = new Float32Array(9 * faces), smooth = new Float32Array(9 * faces);
+  const dot = (f, g) => normals[3 * f] * normals[3 * g] + normals[3 * f + 1] * normals[3 * g + 1] + normals[3 * f + 2] * normals[3 * g + 2];
+  for (let f = 0; f < faces; f++)
+    for (let j = 0; j < 3; j++) {
+      const i = corner[3 * f + j], o = 9 * f + 3 * j, own = Math.sqrt(dot(f, f)), sum = [0, 0, 0];
+      for (const g of around.get(i)) if (dot(f, g) >= 0.766 * own * Math.sqrt(dot(g, g))) for (let k = 0; k < 3; k++) sum[k] += normals[3 * g + k];
+      const size = Math.hypot(...sum) || 1;
+      for (let k = 0; k < 3; k++) positions[o + k] = at(i, k), smooth[o + k] = sum[k] / size;
+    }
+  const made = new THREE.BufferGeometry();
+  made.setAttribute("position", new THREE.BufferAttribute(positions, 3));
+  made.setAttribute("normal", new THREE.BufferAttribute(smooth, 3));
   return made;
 };
 

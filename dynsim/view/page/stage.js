@@ -58,6 +58,8 @@ class Stage {
     if (this.floor) this.scene.remove(this.floor, this.shade);
     this.step = Stage.round(span / 12);
     this.floor = S.sheet(1.5 * span, this.step, true);
+    // What is no surface of the scenario is only there to see by.
+    this.floor.material.uniforms.strength.value = this.real ? 1 : 0.4;
     // Lines of the grid are at multiples of its step in the world.
     const at = (x) => Math.round(x / (5 * this.step)) * 5 * this.step;
     this.floor.position.set(at(centre.x), at(centre.y), floor);
