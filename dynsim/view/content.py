@@ -134,7 +134,8 @@ def _bounds(robots: Sequence[Robot], azimuth: float = 0.0) -> tuple[Array, Array
     pooled = pooled @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     low, high = pooled.min(axis=0), pooled.max(axis=0)
     # What hardly moves is not blown up to fill the window, and what is flat has some depth to stand in.
-    least = max(0.24 * float((high - low).max()), 0.6 * max(robot.reach for robot in robots))
+    span, reach = float((high - low).max()), max(robot.reach for robot in robots)
+    least = max(0.24 * span, 0.6 * reach if span < 0.6 * reach else 0.0)
     room = np.maximum(0.5 * (least - (high - low)), 0.0) + 0.03 * least + max(map(_thickness, robots))
     return low - room, high + room
 
@@ -324,7 +325,7 @@ def _signals(record: Record, blocks: Blocks) -> tuple[list[dict[str, Any]], dict
 
 
 def _resolution(values: Array) -> float:
-    """What can be told apart in a plot that shows most of the values: a spike at the start does not coarsen the rest."""
+    """What is told apart where a plot shows most of the values: a spike at the start does not coarsen the rest."""
     known = values[np.isfinite(values)]
     if not len(known):
         return np.inf

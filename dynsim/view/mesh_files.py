@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -65,7 +66,7 @@ def _obj(content: bytes) -> Triangles:
         elif len(words) >= 4 and words[0] == "f":
             found = [int(word.split("/")[0]) for word in words[1:]]
             face = [k - 1 if k > 0 else len(corners) + k for k in found]
-            triangles += [(face[0], b, c) for b, c in zip(face[1:], face[2:], strict=False)]
+            triangles += [(face[0], b, c) for b, c in itertools.pairwise(face[1:])]
     return np.array(corners, dtype=np.float64).reshape(-1, 3), np.array(triangles, dtype=np.int64).reshape(-1, 3)
 
 

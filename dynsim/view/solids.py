@@ -42,16 +42,17 @@ def body_shapes(scene: Scene, reach: float, meshes: Meshes) -> list[list[dict[st
     """Shapes of every body; rods to what it carries where it has none, and a hub about the axis of its joint."""
     radius = _radius(scene, ROD * reach)
     base = set(scene.base)
-    tubes = [_is_tube(body) for body in scene.bodies]
     found = []
     for k, body in enumerate(scene.bodies):
         shapes = [one for shape in body.shapes if (one := drawn_shape(shape, meshes)) is not None]
         wanted = [child for child in scene.bodies if child.parent == k]
+        # A rod leads away from its joint, a wheel lies about it.
+        bare = not shapes or (_is_tube(body) and np.abs(body.shapes[0].position).max() > 1e-9)
         if not shapes and k not in base:
             ends = [np.array(child.joint.position) for child in wanted if not child.joint.part_of]
             ends += [np.array(point.position) for point in scene.points if point.role == "hand" and point.body == k]
             shapes = [_rod(end, radius) for end in ends if np.linalg.norm(end) > 2.0 * radius]
-        if body.joint.kind == "revolute" and not body.joint.part_of and k not in base and _bare(scene, tubes, k):
+        if body.joint.kind == "revolute" and not body.joint.part_of and k not in base and bare:
             shapes.append(_hub(body, 1.45 * radius))
         found.append(shapes)
     if not any(found):
@@ -69,16 +70,6 @@ def _radius(scene: Scene, default: float) -> float:
 def _is_tube(body: Body) -> bool:
     """Whether it is drawn as a rod of dynsim's own: a cylinder without colour through the body's origin."""
     return bool(body.shapes) and body.shapes[0].kind in ("cylinder", "capsule") and body.shapes[0].colour is None
-
-
-def _bare(scene: Scene, tubes: list[bool], k: int) -> bool:
-    """Whether rods meet at the body's joint, so that a hub belongs there; not at a wheel."""
-    body = scene.bodies[k]
-    if tubes[k]:
-        # A wheel lies about its axis, a rod leads away from it.
-        along = np.abs(np.array(body.shapes[0].position))
-        return bool(along.max() > 1e-9)
-    return not body.shapes
 
 
 def _rod(end: Array, radius: float) -> dict[str, Any]:

@@ -152,7 +152,8 @@ class App {
   step(frames) {
     this.set("playing", false);
     const times = this.actors.find((a) => a.object.visible).times;
-    const i = times[D.before(times, this.time) + 1] <= this.time ? times.length - 1 : D.before(times, this.time);
+    let i = D.before(times, this.time + 1e-9);
+    if (times[i + 1] <= this.time + 1e-9) i++;
     this.seek(times[Math.min(Math.max(i + frames, 0), times.length - 1)]);
   }
 
