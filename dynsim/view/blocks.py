@@ -48,7 +48,7 @@ class Blocks:
         self._parts.append(content)
         start, self._size = self._size, self._size + len(content)
         place = {"at": start, "rows": len(data), "columns": int(codes.shape[1]), "bits": bits}
-        return place | {"offset": _short(low), "scale": _short(scale)}
+        return place | {"offset": low.tolist(), "scale": scale.tolist()}
 
     def raw(self, data: NDArray[Any]) -> dict[str, Any]:
         """Add an array of 16-bit codes as it is (a mesh), little endian."""
@@ -63,7 +63,3 @@ class Blocks:
         content = len(text).to_bytes(4, "little") + text + b"".join(self._parts)
         # No time in it: the same record gives the same page.
         return base64.b64encode(gzip.compress(content, 6, mtime=0)).decode("ascii")
-
-
-def _short(values: NDArray[np.float64]) -> list[float]:
-    return [float(f"{value:.12g}") for value in values]

@@ -21,8 +21,8 @@ import dynsim
 from dynsim import cli
 from dynsim.errors import RecordError
 from dynsim.record import Record
-from dynsim.record.poses import ORIENTATION, POSITION
-from dynsim.scenario import build_model, load_scenario
+from dynsim.record.poses import ORIENTATION, POSITION, add_body_poses
+from dynsim.scenario import build_model, load_scenario, variant_names
 from dynsim.view import content, page, viewable, write
 from dynsim.view.blocks import Blocks
 from dynsim.view.html import three
@@ -94,8 +94,6 @@ def test_frames_are_thinned_only_as_far_as_poses_allow(braced: Record) -> None:
     still = Record(braced.time)
     still.add("q", np.repeat(braced["q"][:1], len(braced), axis=0), "rad", labels=braced.labels["q"])
     still.scene = braced.scene
-    from dynsim.record.poses import add_body_poses
-
     assert add_body_poses(still)
     assert data_of(page({"one": still}))[0]["records"][0]["frames"]["rows"] <= 5
 
@@ -245,7 +243,7 @@ def test_commands_write_pages(
     assert opened == [path.as_uri()]
     assert run(monkeypatch, "compare", "elbow_comparison", *short, "-q", "--out", tmp_path / "all") == 0
     head, _ = data_of((tmp_path / "all" / "view.html").read_text(encoding="utf-8"))
-    assert [part["name"] for part in head["records"]] == ["no_elbow", "elbow_4", "elbow_7", "two_elbows"]
+    assert [part["name"] for part in head["records"]] == variant_names("elbow_comparison")
     records = [tmp_path / "all" / name / "record.h5" for name in ("elbow_4", "elbow_7")]
     assert run(monkeypatch, "view", *records, "--ghost", "--out", tmp_path / "two.html", "--no-open") == 0
     head, _ = data_of((tmp_path / "two.html").read_text(encoding="utf-8"))

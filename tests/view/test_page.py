@@ -1,4 +1,4 @@
-"""Pages in a real browser: poses, forces, wheels and plots are those of the record, and the controls do what they say."""
+"""Pages in a real browser: poses, forces, wheels and plots are the record's, and controls do what they say."""
 
 from __future__ import annotations
 
@@ -92,7 +92,8 @@ def test_arrows_have_the_sign_of_the_force(braced: Record, opened: Opens) -> Non
             assert contact["colour"] == (colours["pull"] if force < 0.0 else colours["push"])
             assert contact["state"] == ("pulls" if force < 0.0 else "pushes")
             tail, head = page.js(
-                """k => { const { push, at } = dynsim.app.actors[0].contacts[k], o = push.object; o.updateMatrixWorld(true);
+                """k => { const { push, at } = dynsim.app.actors[0].contacts[k], o = push.object;
+                   o.updateMatrixWorld(true);
                    const p = new THREE.Vector3(0, 0, push.head.position.z).applyMatrix4(o.matrixWorld);
                    return [o.position.z, p.z].map((z) => z - at.z); }""",
                 k,
