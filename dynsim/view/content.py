@@ -98,11 +98,12 @@ def _frames(record: Record, reach: float) -> NDArray[np.intp]:
     stride, arm = 1, min(reach, 1.0)
     while 4 * stride < count:
         rows = _every(count, 2 * stride)
-        between = np.arange(stride, count - 1, 2 * stride)
-        left = np.searchsorted(rows, between, side="right") - 1
+        # What is left out, and the ends of its interval.
+        between = np.delete(np.arange(count), rows)
+        left = np.searchsorted(rows, between) - 1
         a, b = rows[left], rows[left + 1]
         t = record.time
-        share = ((t[between] - t[a]) / np.maximum(t[b] - t[a], 1e-12))[:, None]
+        share = ((t[between] - t[a]) / np.maximum(t[b] - t[a], 1e-12))[:, None].astype(np.float32)
         with np.errstate(all="ignore"):
             off = [
                 np.abs(x[between] - (x[a] + share * (x[b] - x[a]))).max(initial=0.0) * weight

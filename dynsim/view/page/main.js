@@ -89,7 +89,7 @@ class App {
       actor.dress(colours, this.actors.length > 1 ? this.colourOf(actor) : colours.hand, this.ghost && actor !== first);
       if (this.actors.length === 1) actor.tint.set(colours.hub), actor.dress(colours, colours.hub, false), this.trace(actor, colours);
       actor.plain = new THREE.Color(colours.body);
-      for (const one of actor.surfaces) if (one.material.color) one.material.color.set(colours.ground);
+      for (const one of actor.surfaces) if (one.material.color) one.material.color.set(colours.surface);
     }
     this.stage.dress(colours);
     this.plots.redraw();
@@ -247,7 +247,7 @@ class App {
 
   // From dark blue over grey to yellow (cividis), which colour-blind readers see as well.
   static heat(share) {
-    const stops = [[0, 32, 77], [49, 68, 108], [102, 105, 112], [149, 143, 120], [203, 186, 105], [255, 234, 70]];
+    const stops = [[30, 62, 120], [58, 80, 122], [102, 105, 112], [149, 143, 120], [203, 186, 105], [255, 234, 70]];
     const x = Math.min(Math.max(share || 0, 0), 1) * 5, k = Math.min(Math.floor(x), 4), f = x - k;
     return new THREE.Color().setRGB(...[0, 1, 2].map((i) => (stops[k][i] + f * (stops[k + 1][i] - stops[k][i])) / 255));
   }

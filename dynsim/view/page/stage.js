@@ -6,7 +6,8 @@ class Stage {
   constructor(canvas, azimuth) {
     this.azimuth = azimuth;
     this.canvas = canvas;
-    const software = Stage.software();
+    // view.html#fine is drawn well without a graphics card too, and slowly.
+    const software = Stage.software() && location.hash !== "#fine";
     this.renderer = new THREE.WebGLRenderer({ canvas, powerPreference: "high-performance", antialias: !software });
     this.software = software;
     this.scene = new THREE.Scene();
