@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dynsim.cli.display import console, labelled
-from dynsim.results import VIEW
 from dynsim.terminal import escaped
 
 if TYPE_CHECKING:
@@ -30,6 +29,7 @@ def view(
     ] = None,
 ) -> None:
     """Write a page that shows records in 3D, with plots and forces over time, for any browser and without a network."""
+    from dynsim.results import VIEW
     from dynsim.view import write
 
     named = labelled(records)
@@ -43,6 +43,7 @@ def view(
 
 def write_view(records: Mapping[str, Record], folder: Path, quiet: bool) -> Path | None:
     """The page of records in a folder; None where they have nothing to be seen."""
+    from dynsim.results import VIEW
     from dynsim.view import viewable, write
 
     shown = {name: record for name, record in records.items() if viewable(record)}

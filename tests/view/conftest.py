@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,9 +31,16 @@ class Opened:
         """The value of an expression in the page."""
         return self.page.evaluate(program, argument)
 
-    def seek(self, time: float) -> dict[str, Any]:
+    def seek(self, instant: float) -> dict[str, Any]:
         """What the page shows at an instant."""
-        return dict(self.js("t => { dynsim.seek(t); return dynsim.state(); }", time))
+        return dict(self.js("t => { dynsim.seek(t); return dynsim.state(); }", instant))
+
+    def until(self, program: str) -> None:
+        """Wait until an expression holds; the page itself may not evaluate texts."""
+        end = time.monotonic() + PATIENCE_MS / 1e3
+        while not self.js(program):
+            assert time.monotonic() < end, program
+            self.page.wait_for_timeout(20)
 
     def state(self) -> dict[str, Any]:
         """What the page shows."""

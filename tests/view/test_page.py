@@ -145,7 +145,7 @@ def test_play_slider_and_keys(braced: Record, opened: Opens) -> None:
     keys = page.page.keyboard
     page.page.select_option("#speed", "0.05")
     page.page.click("#play")
-    page.page.wait_for_function("dynsim.state().time > 0.01")
+    page.until("dynsim.state().time > 0.01")
     page.page.click("#play")
     state = page.state()
     assert not state["playing"]
@@ -175,7 +175,7 @@ def test_play_slider_and_keys(braced: Record, opened: Opens) -> None:
     # From the end it plays anew, and stops there again.
     page.page.select_option("#speed", "10")
     keys.press("Space")
-    page.page.wait_for_function("!dynsim.state().playing && dynsim.state().time === dynsim.app.span[1]")
+    page.until("!dynsim.state().playing && dynsim.state().time === dynsim.app.span[1]")
 
 
 def test_plots_show_the_signals(braced: Record, opened: Opens) -> None:
@@ -233,7 +233,7 @@ def test_a_phone(mobile: Record, opened: Opens) -> None:
         width, height = page.js("dynsim.app.stage.size")
         assert all(0.0 < x < width and 0.0 < y < height for x, y in places)
     page.page.click("#play")
-    page.page.wait_for_function("dynsim.state().time > 0.02")
+    page.until("dynsim.state().time > 0.02")
 
 
 def test_the_picture_is_not_blank(robot: Record, opened: Opens) -> None:

@@ -34,7 +34,12 @@ function wire(app) {
   $("colouring").hidden = !app.colourings().length;
   $("colour").onchange = () => app.set("colouring", $("colour").value);
   $("play").onclick = () => app.set("playing", !app.playing);
-  $("slider").oninput = () => { app.set("playing", false); app.seek(Number($("slider").value)); };
+  $("slider").oninput = () => {
+    // Read first: what is shown moves the slider too.
+    const time = Number($("slider").value);
+    app.set("playing", false);
+    app.seek(time);
+  };
   $("theme").onclick = () => app.set("theme", app.theme === "dark" ? "light" : "dark");
   $("shot").onclick = () => app.screenshot();
   $("help").onclick = () => $("keys").open ? $("keys").close() : $("keys").showModal();
