@@ -124,8 +124,9 @@ def _bounds(robots: Sequence[Robot], azimuth: float = 0.0) -> tuple[Array, Array
     points = []
     for robot in robots:
         record = robot.record
-        points += [record[POSITION].reshape(-1, 3).astype(np.float64)]
-        points += [one for _, one in _paths(record, robot.scene)]
+        found = [record[POSITION].reshape(-1, 3).astype(np.float64), *(one for _, one in _paths(record, robot.scene))]
+        # The last samples of a run that diverged are far from everything else.
+        points += found if record.complete else [_without_ends(one) for one in found]
         for shape in robot.scene.fixed:
             middle, half = np.array(shape.position), 0.5 * max(shape.size) if shape.kind != "mesh" else 0.0
             points += [np.stack([middle - half, middle + half])]
@@ -139,6 +140,12 @@ def _bounds(robots: Sequence[Robot], azimuth: float = 0.0) -> tuple[Array, Array
     least = max(0.24 * span, 0.6 * reach if span < 0.6 * reach else 0.0)
     room = np.maximum(0.5 * (least - (high - low)), 0.0) + 0.03 * least + max(map(_thickness, robots))
     return low - room, high + room
+
+
+def _without_ends(points: Array) -> Array:
+    """Points without the outermost hundredth at either end of each axis, (T, 3)."""
+    points = points[np.isfinite(points).all(axis=1)]
+    return np.clip(points, *np.percentile(points, (1.0, 99.0), axis=0)) if len(points) else points
 
 
 def _thickness(robot: Robot) -> float:
@@ -156,7 +163,8 @@ def _azimuth(robots: Sequence[Robot]) -> float:
     clouds += [path[robot.rows, :2] for robot in robots for _, path in _paths(robot.record, robot.scene)]
     points = np.concatenate(clouds)
     points = points[np.isfinite(points).all(axis=1)]
-    x, y = np.linalg.eigh(np.cov(points - points.mean(axis=0), rowvar=False))[1][:, 1].tolist()
+    spread = points - points.mean(axis=0)
+    x, y = np.linalg.eigh(spread.T @ spread)[1][:, 1].tolist()
     return math.atan2(y, x) if x > 0.0 or (x == 0.0 and y > 0.0) else math.atan2(-y, -x)
 
 
@@ -204,7 +212,7 @@ def _record(name: str, robot: Robot, blocks: Blocks, meshes: Meshes, low: Array,
         "supports": supports(scene, groups),
         "motors": _motors(record, scene),
         "limit": voltage_limits(record),
-        "events": [[event.time, event.kind, event.name, event.value] for event in record.events],
+        "events": [[event.time, event.kind, event.name, _finite(event.value)] for event in record.events],
     }
     if (pressure := cop_of(record)) is not None:
         part["pressure"] = {"name": pressure[0], "at": blocks.add(pressure[1][rows], 1e-4)}
@@ -279,7 +287,12 @@ def _motors(record: Record, scene: Scene) -> list[list[Any]]:
 def voltage_limits(record: Record) -> float | None:
     """The voltage limit of the motors [V] where they share one; None where there is none, or several."""
     found = set(_named(record.provenance.get("scenario", {}).get("plant", {}), "voltage_limit_V"))
-    return found.pop() if len(found) == 1 else None
+    return _finite(found.pop()) if len(found) == 1 else None
+
+
+def _finite(value: float | None) -> float | None:
+    """JSON has no infinity."""
+    return value if value is not None and math.isfinite(value) else None
 
 
 def _named(tree: Any, key: str) -> Iterator[float]:

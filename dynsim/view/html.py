@@ -48,7 +48,7 @@ def write(records: Mapping[str, Record], path: str | os.PathLike[str], *, ghost:
     RecordError
         As :func:`page`, or the file cannot be written.
     """
-    content = page(records, ghost=ghost).encode("utf-8")
+    content = page(records, ghost=ghost).encode("utf-8", errors="replace")
     with replacing(Path(path)) as stream:
         stream.write(content)
     return Path(path)

@@ -36,5 +36,5 @@ class Inline:
             The file cannot be written.
         """
         with replacing(Path(path)) as stream:
-            stream.write(self.page.encode("utf-8"))
+            stream.write(self.page.encode("utf-8", errors="replace"))
         return Path(path)

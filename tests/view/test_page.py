@@ -16,6 +16,7 @@ from PIL import Image
 import dynsim
 from dynsim.record import Record
 from dynsim.record.poses import ORIENTATION, POSITION, add_body_poses
+from dynsim.record.scene import HERE, Body, Joint, Scene, Shape
 from dynsim.scenario import build_model, load_scenario
 
 Opens = Callable[..., Any]
@@ -333,3 +334,78 @@ def test_a_file_that_the_command_wrote(
     assert stop.value.code == 0
     page = opened(tmp_path / "view.html")
     assert page.page.title() == "elbow_comparison"
+
+
+def test_what_is_under_the_pointer(robot: Record, opened: Opens) -> None:
+    page = opened({"one": robot})
+    page.seek(0.25)
+    x, y = page.js(
+        "(() => { const b = dynsim.app.actors[0].bodies[0].object; b.updateMatrixWorld(true);"
+        " return dynsim.app.stage.project(new THREE.Vector3(0.02, 0.02, 0.05).applyMatrix4(b.matrixWorld),"
+        " new THREE.Vector3()); })()"
+    )
+    page.page.mouse.move(5, 300)
+    page.page.wait_for_timeout(100)
+    page.page.locator("#scene").hover(position={"x": x, "y": y})
+    page.until("!document.getElementById('hover').hidden")
+    text = page.page.inner_text("#hover")
+    assert "l0" in text
+    assert "torque" in text
+
+
+def test_a_screenshot(robot: Record, opened: Opens) -> None:
+    page = opened({"one": robot})
+    with page.page.expect_download() as waited:
+        page.page.click("#shot")
+    assert waited.value.suggested_filename.endswith(".png")
+    pixels = np.asarray(Image.open(waited.value.path()).convert("L"), dtype=float)
+    assert pixels.std() > 5.0
+
+
+def test_motors_at_their_voltage_limit(tmp_path: Path, opened: Opens) -> None:
+    path = meshed_robot(tmp_path)
+    path.write_text(path.read_text().replace("voltage_limit_V: 48", "voltage_limit_V: 0.2"))
+    record = dynsim.simulate(load_scenario(path))
+    page, seen = opened({"one": record}), set()
+    for row in range(0, len(record), 7):
+        (shown,) = page.seek(float(record.time[row]))["records"]
+        at_limit = [
+            name
+            for name, u in zip(record.labels["voltage"], record["voltage"][row], strict=True)
+            if abs(u) >= 0.9999 * 0.2
+        ]
+        assert shown["saturated"] == at_limit
+        assert ("voltage limit" in page.page.inner_text("#status")) == bool(at_limit)
+        seen.add(bool(at_limit))
+    assert True in seen
+
+
+def test_a_single_sample_and_a_stranger(opened: Opens) -> None:
+    """A record of one instant, without a name, with numbers that JSON does not know."""
+    record = Record([0.5])
+    record.add("q", [[0.3]], "rad", labels=("j",))
+    record.add("odd", [np.inf], "1")
+    record.add_event(0.5, "odd", "\ud800", value=np.inf)
+    joint = Joint("j", "revolute", (0.0, 1.0, 0.0), (0.0, 0.0, 0.1), HERE, "q", ("j",))
+    shape = Shape("capsule", (0.01, 0.2), (0.0, 0.0, 0.1))
+    record.scene = Scene((Body("b", -1, joint, (shape,)),))
+    assert add_body_poses(record)
+    page = opened({"\ud800": record})
+    (shown,) = page.seek(3.0)["records"]
+    np.testing.assert_allclose(shown["bodies"]["b"]["p"], [0.0, 0.0, 0.1], atol=NEAR)
+    assert page.state()["time"] == 0.5
+
+
+def test_a_notebook_shows_the_page(braced: Record, browser: Any, tmp_path: Path) -> None:
+    (tmp_path / "notebook.html").write_text(f"<!DOCTYPE html><body>{braced.view()._repr_html_()}</body>", "utf-8")
+    context = browser.new_context(offline=True)
+    page = context.new_page()
+    complaints: list[str] = []
+    page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+    page.goto((tmp_path / "notebook.html").as_uri())
+    frame = page.frames[1]
+    frame.evaluate("dynsim.ready")
+    frame.evaluate("dynsim.seek(1.0)")
+    assert frame.evaluate("dynsim.state().time") == 1.0
+    assert complaints == []
+    context.close()

@@ -232,6 +232,17 @@ class Actor {
     });
   }
 
+  // Hubs of motors at their voltage limit have a colour of their own.
+  mark(saturated) {
+    const key = saturated.join();
+    if (key === this.marked) return;
+    this.marked = key;
+    const bodies = new Set(this.data.motors.filter(([name]) => saturated.includes(name)).map(([, body]) => body));
+    this.bodies.forEach((body, k) => {
+      for (const part of body.paint) if (part.role === "hub") part.material.emissive.set(bodies.has(k) ? this.colours.saturated : 0x000000);
+    });
+  }
+
   state() {
     return {
       name: this.name, time: this.shown.time,

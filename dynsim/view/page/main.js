@@ -259,6 +259,7 @@ class App {
       const parts = actor.contacts.map(({ state }) => state.force === null || state.state === "open" ? `${state.name}: open`
         : `${state.name}: ${D.number(state.force, 3)} N, ${state.state}`);
       actor.saturated = this.saturated(actor);
+      actor.mark(actor.saturated);
       if (actor.saturated.length) parts.push(`voltage limit: ${actor.saturated.join(", ")}`);
       if (actor.data.wheels) {
         const up = actor.data.wheels.names.filter((_, k) => !(actor.shown.wheels[k] > 0));
