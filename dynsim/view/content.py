@@ -267,10 +267,14 @@ def _contacts(robot: Robot, blocks: Blocks) -> list[dict[str, Any]]:
 
 
 def _friction(record: Record, name: str) -> float:
+    """The coefficient of the cone that the force of a contact cannot leave; 0 where it is not known."""
     contacts = record.provenance.get("scenario", {}).get("contacts", {})
     points = contacts.get("points") or {}
     point = points.get(name, {}) if isinstance(points, Mapping) else {}
-    return float(point.get("friction") or contacts.get("friction") or 0.0)
+    kinetic = [one.get("friction") for one in (point, contacts)]
+    held = [one.get("static_friction") for one in (point, contacts)]
+    known = [next((float(one) for one in both if one is not None), 0.0) for both in (kinetic, held)]
+    return max(known)
 
 
 def _motors(record: Record, scene: Scene) -> list[list[Any]]:

@@ -78,7 +78,7 @@ def test_between_samples_bodies_are_where_the_model_has_them(braced: Record, ope
 
 def test_arrows_have_the_sign_of_the_force(braced: Record, opened: Opens) -> None:
     """Blue away from the surface for a push, orange towards it for a pull; the head of both is seen above the floor."""
-    page, signs = opened({"one": braced}), set()
+    page, signs, inclined = opened({"one": braced}), set(), 0
     colours = page.js("dynsim.app.colours")
     for row in range(5, len(braced), 37):
         (shown,) = page.seek(float(braced.time[row]))["records"]
@@ -101,7 +101,17 @@ def test_arrows_have_the_sign_of_the_force(braced: Record, opened: Opens) -> Non
             )
             assert (head - tail) * force > 0.0
             assert min(head, tail) == pytest.approx(0.0, abs=1e-6)
+            along, seen = page.js(
+                """k => { const { slide } = dynsim.app.actors[0].contacts[k], z = new THREE.Vector3(0, 0, 1);
+                   return [z.applyQuaternion(slide.object.quaternion).toArray(), slide.object.visible]; }""",
+                k,
+            )
+            whole = braced["contact_force"][row, k]
+            if seen:
+                np.testing.assert_allclose(along, whole / np.linalg.norm(whole), atol=2e-3)
+                inclined += 1
     assert signs == {-1.0, 1.0}
+    assert inclined > 5
 
 
 def test_states_of_real_contacts_and_events(opened: Opens) -> None:
@@ -303,8 +313,11 @@ def test_frames_from_elsewhere(braced: Record, opened: Opens) -> None:
     place = [body["p"] for body in state["records"][0]["bodies"].values()]
     np.testing.assert_allclose(place, braced[POSITION][50] + 0.25, atol=1e-6)
     assert state["time"] == 77.0
+    seen = "(a => [a.grown.count, a.grown.line.visible, a.paths[0].path.whole.visible])(dynsim.app.actors[0])"
+    assert page.js(seen) == [1, True, False]
     (shown,) = page.seek(float(braced.time[50]))["records"]
     np.testing.assert_allclose([b["p"] for b in shown["bodies"].values()], braced[POSITION][50], atol=NEAR)
+    assert page.js(seen) == [1, False, True]
 
 
 def test_names_are_text(braced: Record, opened: Opens) -> None:

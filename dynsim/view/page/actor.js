@@ -108,6 +108,7 @@ class Actor {
 
   // The sample of the record at a time: positions in straight lines, turns along them, modes as they were.
   at(t) {
+    this.live = false;
     const times = this.times, out = this.sample, n = this.bodies.length;
     const clipped = Math.min(Math.max(t, this.span[0]), this.span[1]);
     const i = times.length > 1 ? D.before(times, clipped) : 0, j = Math.min(i + 1, times.length - 1);
@@ -164,18 +165,19 @@ class Actor {
       for (const f of this.fingers) f.position.set(0.5 * f.userData.size, f.userData.side * f.userData.size * (sample.gripper ? 0.28 : 0.8), 0);
     for (const one of this.paths) {
       if (one.line) one.line.visible = layers.target;
-      else one.path.shown = layers.trace, one.path.show(sample.time);
+      else one.path.shown = layers.trace && !this.live, one.path.show(sample.time);
     }
+    if (this.grown) this.grown.line.visible = Boolean(layers.trace && this.live);
   }
 
   // A live frame: the path of the hand grows, that of the record is not shown.
   extend(sample) {
     if (!this.hand) return;
-    this.live ??= new M.Growing(this.inner);
-    this.live.line.material.color.set(this.colours.hand);
-    for (const one of this.paths) if (one.path) one.path.times = [];
+    this.grown ??= new M.Growing(this.inner);
+    this.grown.line.material.color.set(this.colours.hand);
+    this.live = true;
     const body = this.data.hand.body, o = 7 * body, p = sample.poses, q = new THREE.Quaternion(p[o + 4], p[o + 5], p[o + 6], p[o + 3]);
-    this.live.add(this.supportPoint.set(...this.data.hand.p).applyQuaternion(q).add(new THREE.Vector3(p[o], p[o + 1], p[o + 2])));
+    this.grown.add(this.supportPoint.set(...this.data.hand.p).applyQuaternion(q).add(new THREE.Vector3(p[o], p[o + 1], p[o + 2])));
   }
 
   supportPoints(sample) {
@@ -198,11 +200,12 @@ class Actor {
     return this.hand.getWorldPosition(out);
   }
 
-  // Colours of the theme; a variant that is a ghost is translucent and has its own colour.
-  dress(colours, own, ghost) {
+  // Colours of the theme, of hubs (and all of a ghost, which is translucent), and of the hand's way.
+  dress(colours, tint, way, ghost) {
     this.colours = colours;
-    this.tint = new THREE.Color(own);
+    this.tint = new THREE.Color(tint);
     this.ghost = ghost;
+    this.marked = null;
     for (const body of this.bodies)
       for (const part of body.paint) {
         part.base = part.own ? part.own.clone() : new THREE.Color(colours[part.role]);
@@ -216,10 +219,10 @@ class Actor {
       }
     for (const one of this.fixed) one.mesh.material.color.copy(one.own ?? new THREE.Color(colours.hub));
     for (const wheel of this.wheels) wheel.colours = null;
-    if (this.handMaterial) this.handMaterial.color.set(own);
+    if (this.handMaterial) this.handMaterial.color.set(tint);
     for (const one of this.paths) {
       if (one.line) one.line.material.color.set(colours.target);
-      else for (const line of [one.path.whole, one.path.part]) line.material.color.set(own);
+      else for (const line of [one.path.whole, one.path.part]) line.material.color.set(way);
     }
   }
 

@@ -5,7 +5,7 @@
 //   dynsim.state()         what is shown: time, poses of all bodies, arrows, wheels, support
 //   dynsim.frame(f, k)     show a frame that comes from elsewhere with robot k:
 //                          {time, poses: [x, y, z, qw, qx, qy, qz of each body], contacts, wheels, pressure, gripper}
-//   dynsim.set(name, value), dynsim.camera(name), dynsim.image() (PNG as a data URL), dynsim.cost (ms of the last update)
+//   dynsim.set(name, value) (playing, speed, theme, ghost, follow, colouring, or a layer), dynsim.camera(name), dynsim.image() (PNG as a data URL), dynsim.cost (ms of the last update)
 
 class App {
   constructor({ head, bytes }) {
@@ -86,8 +86,8 @@ class App {
     this.colours = colours;
     const first = this.actors.find((a) => a.object.visible);
     for (const actor of this.actors) {
-      actor.dress(colours, this.actors.length > 1 ? this.colourOf(actor) : colours.hand, this.ghost && actor !== first);
-      if (this.actors.length === 1) actor.tint.set(colours.hub), actor.dress(colours, colours.hub, false), this.trace(actor, colours);
+      const own = this.actors.length > 1 ? this.colourOf(actor) : null;
+      actor.dress(colours, own ?? colours.hub, own ?? colours.hand, this.ghost && actor !== first);
       actor.plain = new THREE.Color(colours.body);
       for (const one of actor.surfaces) if (one.material.color) one.material.color.set(colours.surface);
     }
@@ -95,10 +95,6 @@ class App {
     this.plots.redraw();
     this.sync();
     this.show();
-  }
-
-  trace(actor, colours) {
-    for (const one of actor.paths) if (one.path) for (const line of [one.path.whole, one.path.part]) line.material.color.set(colours.hand);
   }
 
   colourOf(actor) {

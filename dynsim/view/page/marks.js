@@ -7,7 +7,7 @@ M.above = { depthTest: false, depthWrite: false, transparent: true };
 
 // An arrow along z, of length 1 when it is set so: a shaft that is stretched, a head that is not.
 M.Arrow = class {
-  constructor(parent, radius) {
+  constructor(parent, radius, order) {
     this.radius = radius;
     this.material = new THREE.MeshBasicMaterial({ ...M.above });
     const shaft = new THREE.CylinderGeometry(radius, radius, 1, 12).rotateX(Math.PI / 2).translate(0, 0, 0.5);
@@ -17,7 +17,7 @@ M.Arrow = class {
     this.object = new THREE.Group();
     this.object.add(this.shaft, this.head);
     this.object.visible = false;
-    for (const part of [this.shaft, this.head]) part.renderOrder = 20;
+    for (const part of [this.shaft, this.head]) part.renderOrder = order;
     parent.add(this.object);
   }
 
@@ -39,7 +39,7 @@ M.Arrow = class {
 };
 M.z = new THREE.Vector3(0, 0, 1);
 
-// What one contact shows: its state, the normal force, the friction force within its cone.
+// What one contact shows: its state, the normal force, and the force with friction within its cone.
 M.Contact = class {
   constructor(parent, contact, size) {
     this.name = contact.name;
@@ -50,9 +50,9 @@ M.Contact = class {
     this.foot = new THREE.Vector3();
     this.along = new THREE.Vector3();
     this.state = { name: contact.name, force: null, friction: null, state: "", colour: "" };
-    this.push = new M.Arrow(parent, 0.035 * size);
-    this.slide = new M.Arrow(parent, 0.026 * size);
-    this.dot = new THREE.Mesh(new THREE.SphereGeometry(0.085 * size, 16, 12), new THREE.MeshBasicMaterial({ ...M.above }));
+    this.push = new M.Arrow(parent, 0.035 * size, 20);
+    this.slide = new M.Arrow(parent, 0.018 * size, 19);
+    this.dot = new THREE.Mesh(new THREE.SphereGeometry(0.07 * size, 16, 12), new THREE.MeshBasicMaterial({ ...M.above }));
     this.dot.renderOrder = 21;
     const angle = Math.atan(contact.friction), high = 0.9 * size;
     const cone = new THREE.ConeGeometry(high * Math.tan(angle), high, 36, 1, true).rotateX(-Math.PI / 2).translate(0, 0, 0.5 * high);
@@ -77,10 +77,12 @@ M.Contact = class {
       this.push.set(this.foot, this.along.copy(this.normal).negate(), high, colour);
     } else if (shown) this.push.set(this.at, this.normal, long, colour);
     else this.push.hide();
-    const slides = shown && slip > 1e-3 * scale;
-    if (slides) {
-      this.along.set(...now.tangent).normalize();
-      this.slide.set(this.at, this.along, this.size * Math.min(Math.sqrt(slip / scale), 1.6), colours.friction);
+    // With friction the whole force, within the cone: as the normal one, towards the contact where it pulls.
+    if (shown && slip > 1e-3 * scale) {
+      this.along.set(...now.tangent).addScaledVector(this.normal, force);
+      const all = this.size * Math.min(Math.sqrt(this.along.length() / scale), 1.6), high = Math.max(all, 8 * this.slide.radius);
+      this.along.normalize();
+      this.slide.set(pulls ? this.foot.copy(this.along).multiplyScalar(-high).add(this.at) : this.at, this.along, high, colours.friction);
     } else this.slide.hide();
     this.cone.visible = layers.cones && shown && this.contact.friction > 0;
     this.cone.position.copy(this.at);
@@ -132,7 +134,7 @@ M.Path = class {
     const done = this.times.length > 1 && t >= this.times[0] ? D.before(this.times, t) + 1 : 0;
     this.part.geometry.instanceCount = done;
     this.part.visible = this.shown && done > 0;
-    this.whole.visible = this.shown && this.times.length > 0;
+    this.whole.visible = this.shown;
   }
 };
 

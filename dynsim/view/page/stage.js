@@ -67,6 +67,7 @@ class Stage {
     this.shade = new THREE.Mesh(new THREE.PlaneGeometry(3 * span, 3 * span), new THREE.ShadowMaterial({ opacity: 0.18 }));
     this.shade.position.set(centre.x, centre.y, floor + 1e-4 * span);
     this.shade.receiveShadow = true;
+    this.shade.visible = this.real;
     this.scene.add(this.floor, this.shade);
     this.camera.near = 0.01 * span;
     this.camera.far = 30 * span;
