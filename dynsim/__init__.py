@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from dynsim.model.model import Model
     from dynsim.record import Record
     from dynsim.scenario import Scenario, build_model, load_scenario
+    from dynsim.studies.batch import simulate_batch
     from dynsim.studies.compare import compare
 
 __all__ = [
@@ -35,6 +36,7 @@ __all__ = [
     "compare",
     "load_scenario",
     "simulate",
+    "simulate_batch",
 ]
 
 # Loaded on first use: numba and pydantic take a second that `dynsim --help` need not wait for.
@@ -49,6 +51,7 @@ _HOME = {
     "compare": "dynsim.studies.compare",
     "load_scenario": "dynsim.scenario",
     "simulate": "dynsim.engine",
+    "simulate_batch": "dynsim.studies.batch",
 }
 
 

@@ -1,4 +1,4 @@
-"""Base of every part of a scenario: strict about keys, frozen after validation."""
+"""Base of every part of a scenario and of the bridge's files: strict about keys, frozen after validation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 
 
-def forbid_conversion(schema: Any) -> None:
+def _forbid_conversion(schema: Any) -> None:
     """Make the numbers of a pydantic core schema take numbers only.
 
     Otherwise ``true`` is 1 and the text "1_9.2" is 19.2: no file says so. Keys stay as they are, they are texts.
@@ -25,22 +25,28 @@ def forbid_conversion(schema: Any) -> None:
             schema["strict"] = True
         for name, part in schema.items():
             if name not in ("keys_schema", "metadata", "default"):
-                forbid_conversion(part)
+                _forbid_conversion(part)
     elif isinstance(schema, (list, tuple)):
         for part in schema:
-            forbid_conversion(part)
+            _forbid_conversion(part)
 
 
-class StrictConfig(BaseModel):
-    """A mapping of a scenario file; unknown keys are errors, numbers must be finite, and neither texts nor true."""
+class StrictModel(BaseModel):
+    """A mapping of a file: unknown keys are errors, and numbers are neither texts nor true."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, validate_default=True, defer_build=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> Any:
         schema = handler(source)
-        forbid_conversion(schema)
+        _forbid_conversion(schema)
         return schema
+
+
+class StrictConfig(StrictModel):
+    """A mapping of a scenario file: numbers must be finite too."""
+
+    model_config = ConfigDict(allow_inf_nan=False, validate_default=True, defer_build=True)
 
 
 class BodyPoint(StrictConfig):

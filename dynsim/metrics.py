@@ -89,6 +89,7 @@ class Counts:
     Attributes
     ----------
     wall : wall time of the integration [s]
+    choice : method of integration, and why that one
     steps, rejected : accepted and repeated steps
     evaluations : right-hand sides, those for samples and projections included
     projections : corrections onto the contact surfaces
@@ -104,6 +105,7 @@ class Counts:
     """
 
     wall: float
+    choice: tuple[str, str]
     steps: int
     rejected: int
     evaluations: int
@@ -170,6 +172,8 @@ def summarise(
         "duration_s": duration,
         "integration_wall_s": counts.wall,
         "real_time_factor": duration / counts.wall if counts.wall > 0.0 else 0.0,
+        "method": counts.choice[0],
+        "method_reason": counts.choice[1],
         "steps": counts.steps,
         "steps_rejected": counts.rejected,
         "rhs_evaluations": counts.evaluations,

@@ -14,7 +14,7 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate.driver import advance
 from dynsim.kernels.integrate.newton import CLOSE
 from dynsim.kernels.integrate.run import FINISHED, METHODS, STATUS, TIME_STEPPING, Run, new_run
-from dynsim.kernels.integrate.time_stepping import SteppingArrays, stepping_arrays
+from dynsim.kernels.integrate.time_stepping import stepping_arrays
 from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.lanes.system import has_forms
 from dynsim.kernels.state import LOSSES, block, output_layout, state_layout
@@ -239,17 +239,16 @@ class Bench:
         rtol: float = 1e-6,
         atol: float | None = None,
         theta: float = 0.5,
-        stepping: SteppingArrays | None = None,
     ) -> Run:
         """A run from y to the last of ``times``, recorded there, that has not begun.
 
         ``step`` 0 leaves the first step to the method; ``fixed`` holds adaptive methods at ``step`` too.
-        Time stepping has arrays of its own, by default those of ``theta``.
+        Time stepping has arrays of its own, with ``theta``, and goes by the unilateral law.
         """
         n, na, c = self.sizes
         couplings = len(self.robot.couplings) + len(self.stops)
-        system = self.system
-        if METHODS[method] == TIME_STEPPING and stepping is None:
+        system, stepping = self.system, None
+        if METHODS[method] == TIME_STEPPING:
             stepping = stepping_arrays(system.model, system.contacts, na, couplings, theta, system.unilateral)
         run = new_run(
             METHODS[method],
@@ -283,7 +282,11 @@ class Bench:
 
     def simulate(self, y: np.ndarray, times: np.ndarray, method: str = "dopri5", **options: Any) -> Run:
         """Integrate to the last of ``times``, which must be reached; ``options`` are those of :meth:`new_run`."""
-        run = self.advance(self.new_run(y, times, method, **options))
+        return self.finish(self.new_run(y, times, method, **options))
+
+    def finish(self, run: Run) -> Run:
+        """Advance a run to its end, which must be reached."""
+        self.advance(run)
         assert run.count[STATUS] == FINISHED
         return run
 

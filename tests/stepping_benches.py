@@ -6,7 +6,6 @@ import numpy as np
 from random_robots import Bench, bench
 
 from dynsim.kernels.integrate.run import Run
-from dynsim.kernels.integrate.time_stepping import stepping_arrays
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.model.drives import Servo
 from dynsim.model.joints.ball import floating
@@ -14,10 +13,10 @@ from dynsim.model.joints.ball import floating
 
 def stepped(b: Bench, y: np.ndarray, times: np.ndarray, step: float, theta: float, law: dict | None = None) -> Run:
     """A run by time stepping; law: columns of the contacts' law."""
-    stepping = stepping_arrays(b.system.model, b.system.contacts, len(b.robot.motors), len(b.robot.couplings), theta)
+    run = b.new_run(y, times, "time_stepping", step=step, theta=theta)
     for column, value in (law or {}).items():
-        stepping.law[:, column] = value
-    return b.simulate(y, times, "time_stepping", step=step, stepping=stepping)
+        run.stepping.law[:, column] = value
+    return b.finish(run)
 
 
 def plane(normal: np.ndarray) -> Quadric:
@@ -49,7 +48,7 @@ def snake(joints: int = 12, wheels: int = 14) -> tuple[Bench, np.ndarray]:
     ]
     robot = Robot("snake", tuple(links), tuple(motors), (f"link_{joints}", np.zeros(3)))
     held = np.array([0.35 * np.sin(0.8 * k) if k % 2 == 0 else 0.0 for k in range(joints)])
-    b = bench(robot, contacts, held=held)
+    b = bench(robot, contacts, held=held, real=True)
     q = np.zeros(robot.nq)
     q[2], q[3] = 0.03, 1.0
     return b, b.state(q, np.zeros(len(robot.links)))

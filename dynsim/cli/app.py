@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from enum import StrEnum
-from typing import Annotated, TextIO
+from typing import Annotated, Any, TextIO
 
 import typer
 
@@ -34,6 +34,13 @@ SetOption = Annotated[
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 FiguresOption = Annotated[bool, typer.Option("--no-figures", help="Do not draw figures.")]
+
+
+def parsed_overrides(given: list[str] | None) -> dict[str, Any]:
+    """Values by key of ``--set``."""
+    from dynsim.scenario import SetOptions, parse_override
+
+    return SetOptions(parse_override(text) for text in given or ())
 
 
 class FigureFormat(StrEnum):

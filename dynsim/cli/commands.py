@@ -6,13 +6,24 @@ import json
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from dynsim import completion, interruption
-from dynsim.cli.app import FigureFormat, FiguresOption, FormatOption, QuietOption, ScenarioArgument, SetOption, app
-from dynsim.cli.display import console, draw_comparison, draw_run, errors, labelled, progress
+from dynsim.cli.app import (
+    FigureFormat,
+    FiguresOption,
+    FormatOption,
+    QuietOption,
+    ScenarioArgument,
+    SetOption,
+    app,
+    parsed_overrides,
+)
+from dynsim.cli.display import console, errors, labelled, progress
+from dynsim.cli.drawing import Figures, draw, draw_all
+from dynsim.cli.sweep import sweep
 from dynsim.cli.view import open_page, view, write_view
 from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
 from dynsim.hardware.cli import export, hw
@@ -44,7 +55,7 @@ def run(
     from dynsim.results import RUN_FILES, save_run
     from dynsim.scenario import load_scenario
 
-    loaded = load_scenario(scenario, variant, _overrides(overrides))
+    loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
     folder = out or Path("results", loaded.name, loaded.variant)
     check_writable(folder, RUN_FILES)
     try:
@@ -59,7 +70,7 @@ def run(
     interruption.heed()
     interruption.check()
     if not no_figures:
-        draw_run(record, folder / "figures", quiet, format_)
+        draw(Figures({loaded.variant: record}, folder / "figures", format_), quiet)
     if not quiet:
         from dynsim.tables import print_summary
 
@@ -89,7 +100,7 @@ def compare(
     from dynsim.studies.compare import compare as compare_variants
     from dynsim.studies.compare import save_comparison
 
-    given = _overrides(overrides)
+    given = parsed_overrides(overrides)
     loaded = [load_scenario(scenario, name, given) for name in variant_names(scenario)]
     folder = out or Path("results", loaded[0].name if loaded else "")
     check_writable(folder, COMPARISON_FILES[:2])
@@ -125,9 +136,8 @@ def compare(
         interruption.heed()
         interruption.check()
         if not no_figures:
-            for name, record in records.items():
-                draw_run(record, folder / name / "figures", quiet, format_)
-            draw_comparison(records, folder, quiet, format_)
+            wanted = [Figures({name: one}, folder / name / "figures", format_) for name, one in records.items()]
+            draw_all([*wanted, Figures(records, folder, format_, together=True)], folder, quiet)
         if not quiet:
             from dynsim.tables import print_comparison
 
@@ -166,7 +176,7 @@ def check(
             starts = {}
             for variant in variants:
                 with console.status(f"checking {escaped(name)} {escaped(variant or '')}"):
-                    starts[variant or ""] = check_scenario(load_scenario(name, variant, _overrides(overrides)))
+                    starts[variant or ""] = check_scenario(load_scenario(name, variant, parsed_overrides(overrides)))
         except SimulationInterrupted:
             raise
         except DynsimError as error:
@@ -204,11 +214,11 @@ def plot(
     for path, (label, record) in zip(records, named.items(), strict=True):
         folder = path.parent / "figures" if out is None else out if len(records) == 1 else out / label
         try:
-            draw_run(record, folder, quiet=False, format_=format_)
+            draw(Figures({label: record}, folder, format_), quiet=False)
         except RecordError as error:
             raise RecordError(f"{path}: {error}") from error
     if len(named) > 1:
-        draw_comparison(named, out or Path("figures"), quiet=False, format_=format_)
+        draw(Figures(named, out or Path("figures"), format_, together=True), quiet=False)
 
 
 app.command(epilog="Example: dynsim view results/elbow_comparison/*/record.h5 --ghost")(view)
@@ -241,6 +251,7 @@ def schema() -> None:
     _warn_of_plugins()
 
 
+app.command(epilog="Example: dynsim sweep elbow_comparison --variants all --grid contacts.friction=0:1:5")(sweep)
 # These load serial ports and servos only when called.
 app.add_typer(hw, name="hw")
 app.command(
@@ -254,9 +265,3 @@ def _warn_of_plugins() -> None:
 
     for fault in faults():
         errors.print(f"[yellow]warning:[/] {escaped(fault)}")
-
-
-def _overrides(given: list[str] | None) -> dict[str, Any]:
-    from dynsim.scenario import SetOptions, parse_override
-
-    return SetOptions(parse_override(text) for text in given or ())

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from dynsim.terminal import Terminal, escaped
 
@@ -45,26 +45,11 @@ def labelled(paths: Sequence[Path]) -> dict[str, Record]:
     return found
 
 
-def draw_run(record: Record, folder: Path, quiet: bool, format_: str) -> None:
-    """Figures of one record into ``folder``; ``format_`` is that of the files."""
-    from dynsim import figures
-
-    _drawing(lambda: figures.draw(record, folder, format_), folder, quiet)
-
-
-def draw_comparison(records: dict[str, Record], folder: Path, quiet: bool, format_: str) -> None:
-    """Figures of several records over each other into ``folder``; ``format_`` is that of the files."""
-    from dynsim import figures
-
-    _drawing(lambda: figures.draw_comparison(records, folder, format_), folder, quiet)
-
-
-def _drawing(draw: Callable[[], Any], folder: Path, quiet: bool) -> None:
-    if quiet:
-        draw()
-    else:
-        with console.status(f"drawing {escaped(folder)}"):
-            draw()
+@contextmanager
+def drawing(folder: Path, quiet: bool) -> Iterator[None]:
+    """Says that figures are being drawn."""
+    with nullcontext() if quiet else console.status(f"drawing {escaped(folder)}"):
+        yield
 
 
 @contextmanager
@@ -104,5 +89,39 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
             bars.update(preparing[variant], completed=time, visible=stage == REFERENCES, refresh=stage == REFERENCES)
             if stage == SIMULATION:
                 bars.update(simulating[variant], completed=time)
+
+        yield report
+
+
+@contextmanager
+def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None]]:
+    """A bar over all runs of a sweep, with time, time to go and how many failed; yields its report."""
+    if quiet:
+        yield lambda done, failed: None
+        return
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+    from rich.table import Column
+
+    columns = (
+        TextColumn("runs"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[failed]}"),
+        TimeElapsedColumn(table_column=Column(no_wrap=True)),
+        TextColumn("to go"),
+        TimeRemainingColumn(table_column=Column(no_wrap=True)),
+    )
+    with Progress(*columns, console=console, transient=not console.is_terminal) as bar:
+        task = bar.add_task("", total=runs, failed="")
+
+        def report(done: int, failed: int) -> None:
+            bar.update(task, completed=done, failed=f"{failed} failed" if failed else "")
 
         yield report

@@ -17,19 +17,17 @@ import typer
 from dynsim import interruption
 from dynsim.cli.commands import app
 from dynsim.cli.display import errors
+from dynsim.cli.drawing import GARBAGE
 from dynsim.errors import DynsimError, SimulationInterrupted
 from dynsim.standard_streams import lenient_streams
 from dynsim.terminal import escaped
 
 # Of a process that a signal ended: this and the number of the signal.
 _SIGNAL_EXIT = 128
-# New objects after which Python looks for garbage.
-GARBAGE = 200_000
 
 
 def main() -> None:
     """Entry point: errors become one line and an exit code. Ctrl-C where nothing can be saved is typer's: 130."""
-    # What a command imports stays: to look through it for garbage, as often as Python does, takes a tenth of a run.
     gc.set_threshold(GARBAGE)
     with interruption.heeded() as received, lenient_streams() as output, _plain_warnings():
         code = _exit_code()

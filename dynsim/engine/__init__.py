@@ -49,13 +49,14 @@ class Start:
     contacts: Mapping[str, NDArray[np.float64]]
 
 
-def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
+def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:
     """Simulate a scenario.
 
     Parameters
     ----------
     scenario : Scenario
     progress : called with time [s] and stage, see :class:`Progress`
+    pictured : with scene and poses of bodies, which only figures and viewers need
 
     Returns
     -------
@@ -75,7 +76,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
         interruption.heed()
         interruption.check()
         try:
-            record: Record = _module(scenario).simulate(scenario, progress)
+            record: Record = _module(scenario).simulate(scenario, progress, pictured=pictured)
         except SimulationStopped as stop:
             note_warnings(scenario, stop.record)
             raise

@@ -33,7 +33,7 @@ def start(prepared: Prepared) -> Start:
     return Start(model.point_position(*model.robot.hand, q), contacts)
 
 
-def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
+def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:
     """See :func:`dynsim.engine.simulate`."""
     prepared = prepare(scenario, progress)
     run = prepared.run
@@ -46,7 +46,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
     happened: list[Event] = []
     started, limit, interrupted = clock.perf_counter(), 1, False
     try:
-        log.info("%s: integrating %g s by %s", scenario.title, scenario.duration_s, scenario.integrator.method)
+        log.info("%s: integrating %g s by %s (%s)", scenario.title, scenario.duration_s, *prepared.choice)
         while run.count[ki.STATUS] == ki.RUNNING:
             before = clock.perf_counter()
             driver.advance(prepared.system, prepared.workspace, run, limit)
@@ -63,7 +63,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None) -> Record:
         interrupted = True
     wall = clock.perf_counter() - started
     log.info("%s: integrated %g s in %d steps, %.3f s", scenario.title, run.clock[ki.TIME], run.count[ki.STEPS], wall)
-    record = make_record(scenario, prepared, wall, happened=happened)
+    record = make_record(scenario, prepared, wall, happened=happened, pictured=pictured)
     reached = float(run.clock[ki.TIME])
     if interrupted or run.count[ki.STATUS] != ki.FINISHED:
         if interrupted:

@@ -98,7 +98,13 @@ def start(run: Run) -> Start:
     return Start(run.state.w_target[:3].copy(), {})
 
 
-def simulate(scenario: Scenario, progress: Progress | None = None, source: CommandSource | None = None) -> Record:
+def simulate(
+    scenario: Scenario,
+    progress: Progress | None = None,
+    source: CommandSource | None = None,
+    *,
+    pictured: bool = True,
+) -> Record:
     """See :func:`dynsim.engine.simulate`; also raises what :func:`prepare` raises.
 
     A live ``source`` (joystick) replaces the commands and paths of the scenario. It is asked in every control period,
@@ -135,7 +141,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None, source: Comma
         )
     wall = clock.perf_counter() - started
     log.info("%s: integrated %d control periods in %.3f s", scenario.title, run.state.counts[TICKS], wall)
-    record = make_record(run, scenario, provenance(scenario), switcher, wall)
+    record = make_record(run, scenario, provenance(scenario), switcher, wall, pictured)
     if stop is not None:
         raise_stopped(stop, record)
     return record

@@ -64,7 +64,12 @@ def attitude_distance(w: NDArray[np.float64], w_target: NDArray[np.float64]) -> 
 
 
 def make_record(
-    run: Run, scenario: Scenario, provenance: dict[str, Any], switcher: ModeSwitcher, wall: float
+    run: Run,
+    scenario: Scenario,
+    provenance: dict[str, Any],
+    switcher: ModeSwitcher,
+    wall: float,
+    pictured: bool = True,
 ) -> Record:
     """Signals, units, summary and provenance of a run, finished or not.
 
@@ -72,6 +77,7 @@ def make_record(
     ----------
     run : after its last tick; the state at the end becomes the last sample.
     wall : time that the ticks took [s].
+    pictured : with the scene and the poses of its bodies.
     """
     description, state, law = run.description, run.state, run.controller.law
     model, period, ticks = run.model, run.controller.schedule.period, int(run.state.counts[TICKS])
@@ -123,8 +129,9 @@ def make_record(
     add("at_limit", trace.at_limit, "1", labels=names, description="1 joint out of the allocation, 2 clamped")
     labels = tuple(f"point{i}" for i in range(points.shape[1]))
     add("posture", points, "m", labels=labels, description="polyline: controlled point, joints, axles to the tail")
-    record.scene = snake_scene(description)
-    add_body_poses(record)
+    if pictured:
+        record.scene = snake_scene(description)
+        add_body_poses(record)
     record.summary = _summary(run, scenario, switcher, record, wall)
     return record
 

@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 
 from dynsim.engine import REFERENCES, Progress
+from dynsim.engine.method import AUTO, Choice, choose
 from dynsim.engine.outcome import check_size
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.kernels import arrays as ka
@@ -57,6 +58,7 @@ class Prepared:
     workspace: ka.Workspace
     loads: list[Load]
     stops: list[JointStop]
+    choice: Choice
 
 
 def prepare(
@@ -105,21 +107,22 @@ def prepare(
             "take rk43, or radau5 with motors, or a plant without mobile base",
             keys=("integrator", "method"),
         )
-    _check_stiffness(scenario, robot)
     joint_rows = len(robot.couplings) + len(stops)
     _check_work(scenario, n, c + joint_rows)
     control = _control(scenario, model, contacts, progress)
     if not real:
         _check_references(scenario, robot, contacts, control)
     options, size = scenario.integrator, n + ka.row_limit(c, joint_rows) + robot.circuits
-    method = ki.METHODS[options.method]
+    sampled = control.sample_time is not None
+    drives = compile_drives(robot, k_p=list(control.k_p), k_d=list(control.k_d), sampled=sampled)
+    choice = choose(options, model, contacts, control, drives)
+    _check_stiffness(choice.method, scenario.duration_s, robot)
+    method = ki.METHODS[choice.method]
     step = options.step_s or (1e-3 if method in ki.FIXED_STEP else 0.0)
     system = System(
         layout=layout,
         model=model.arrays,
-        drives=compile_drives(
-            robot, k_p=list(control.k_p), k_d=list(control.k_d), sampled=control.sample_time is not None
-        ),
+        drives=drives,
         reference=control.reference,
         contacts=compile_contacts(robot, contacts),
         loads=compile_loads(robot, loads),
@@ -157,7 +160,7 @@ def prepare(
         stepping=stepping,
         lanes=has_forms(system),
     )
-    return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops)
+    return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops, choice)
 
 
 def _ticks(control: JointControl) -> tuple[np.ndarray, np.ndarray] | None:
@@ -217,9 +220,8 @@ def sample_times(scenario: Scenario, layout: StateLayout, columns: OutputLayout,
     return times
 
 
-def _check_stiffness(scenario: Scenario, robot: Robot) -> None:
+def _check_stiffness(method: str, duration: float, robot: Robot) -> None:
     """Refuse an explicit method where the circuits' own poles R/L already ask for too many steps."""
-    method, duration = scenario.integrator.method, scenario.duration_s
     circuits = [motor for motor in robot.motors if isinstance(motor, Motor)]
     if method not in ("rk43", "dopri5") or not circuits:
         return
@@ -244,7 +246,7 @@ def _check_work(scenario: Scenario, n: int, p: int) -> None:
         seconds += 3e-10 * (n + p) ** 3
     # Motors and friction hold the explicit methods' steps at about a millisecond; an implicit one takes steps of some
     # hundredths of a second, of three iterations, with a Jacobian by differences and its factors now and then.
-    implicit = options.method == "radau5"
+    implicit = options.method in ("radau5", AUTO)
     per_step = (2 * n + 14) * seconds + 3e-9 * n**3 if implicit else 4.0 * seconds
     steps = scenario.duration_s / (
         options.step_s if options.step_s and ki.METHODS[options.method] in ki.FIXED_STEP else 1e-2 if implicit else 1e-3

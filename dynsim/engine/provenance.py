@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 from datetime import UTC, datetime
+from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,9 @@ def provenance(scenario: Scenario) -> dict[str, Any]:
     }
 
 
+@lru_cache
 def _version(library: str) -> str:
+    # Reading the metadata of all of them takes 6 ms, as long as a short run of a sweep.
     try:
         return metadata.version(library)
     except metadata.PackageNotFoundError:

@@ -34,12 +34,14 @@ def make_record(
     pushed: Sequence[int] | None = None,
     happened: Sequence[Event] = (),
     base_as_planned: bool = True,
+    pictured: bool = True,
 ) -> Record:
     """Name the columns that the kernels wrote.
 
     ``pushed`` : which of the bodies' own wrenches, the last of the loads, have been set; None: there are none
     ``happened`` : events of the run
     ``base_as_planned`` : whether the wheels of a base follow what ``prepared.control`` says, and from its start
+    ``pictured`` : with the scene and the poses of its bodies
     """
     model, run, contacts = prepared.model, prepared.run, prepared.contacts
     robot = model.robot
@@ -94,8 +96,9 @@ def make_record(
         _add_unilateral(record, prepared)
     for event in happened:
         record.add_event(event.time, event.kind, event.name)
-    record.scene = robot_scene(robot, contacts, build.surfaces(scenario))
-    add_body_poses(record)
+    if pictured:
+        record.scene = robot_scene(robot, contacts, build.surfaces(scenario))
+        add_body_poses(record)
     deficient, spread = int(prepared.workspace.counts[ka.DEPENDENT]), None
     shared: list[str] = []
     if prepared.system.unilateral is not None and deficient and rows:
@@ -111,6 +114,7 @@ def make_record(
         spread = motion_spread(prepared.system, run.sample_time[:rows], run.sample[:rows], joint_units)
     counts = metrics.Counts(
         wall=wall,
+        choice=prepared.choice,
         steps=int(run.count[ki.STEPS]),
         rejected=int(run.count[ki.REJECTED]),
         evaluations=int(run.count[ki.EVALUATIONS]),

@@ -48,7 +48,7 @@ def _listed(prepared: Prepared, *choices: NDArray[np.bool_]) -> str:
 
 def _reason(scenario: Scenario, prepared: Prepared) -> str:
     run, status = prepared.run, int(prepared.run.count[ki.STATUS])
-    t, method = float(run.clock[ki.TIME]), scenario.integrator.method
+    t, method = float(run.clock[ki.TIME]), prepared.choice.method
     where = f"stopped at t = {t:.6g} s"
     if status == ki.NOT_FINITE:
         advice = (

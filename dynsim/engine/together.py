@@ -46,12 +46,17 @@ def can_share(scenario: Scenario) -> bool:
     )
 
 
-def simulate_together(scenarios: Sequence[Scenario]) -> list[Record | DynsimError]:
+def simulate_together(scenarios: Sequence[Scenario], *, pictured: bool = True) -> list[Record | DynsimError]:
     """Simulate scenarios, those that can on shared lanes: what :func:`dynsim.simulate` gives of each, or raises.
 
     A record does not depend on the runs beside it; from that of ``simulate`` it differs by rounding, 1e-15 of the
     largest entry in each right-hand side, times what the system makes of it. A run that cannot be completed on its
     lane is simulated again, alone, and ends as it ends there; so is whatever cannot share.
+
+    Parameters
+    ----------
+    scenarios : of any plants and methods
+    pictured : see :func:`dynsim.engine.simulate`
 
     Returns
     -------
@@ -67,7 +72,7 @@ def simulate_together(scenarios: Sequence[Scenario]) -> list[Record | DynsimErro
     groups: dict[bytes, list[tuple[int, Prepared]]] = {}
     for k, scenario in enumerate(scenarios):
         if not can_share(scenario):
-            results[k] = alone(scenario)
+            results[k] = alone(scenario, pictured)
             continue
         try:
             with named(scenario):
@@ -80,7 +85,7 @@ def simulate_together(scenarios: Sequence[Scenario]) -> list[Record | DynsimErro
         if shareable(prepared):
             groups.setdefault(structure(prepared), []).append((k, prepared))
         else:
-            results[k] = alone(scenario)
+            results[k] = alone(scenario, pictured)
     for group in groups.values():
         for start in range(0, len(group), LANES):
             members = group[start : start + LANES]
@@ -88,25 +93,25 @@ def simulate_together(scenarios: Sequence[Scenario]) -> list[Record | DynsimErro
             ended = integrate([prepared for _, prepared in members])
             wall = (clock.perf_counter() - started) / len(members)
             for (k, prepared), done in zip(members, ended, strict=True):
-                results[k] = finish(scenarios[k], prepared, wall) if done else alone(scenarios[k])
+                results[k] = finish(scenarios[k], prepared, wall, pictured) if done else alone(scenarios[k], pictured)
     return [results[k] for k in range(len(scenarios))]
 
 
-def alone(scenario: Scenario) -> Record | DynsimError:
+def alone(scenario: Scenario, pictured: bool = True) -> Record | DynsimError:
     """As :func:`dynsim.simulate`, its errors as results."""
     try:
-        return simulate(scenario)
+        return simulate(scenario, pictured=pictured)
     except SimulationInterrupted:
         raise
     except DynsimError as error:
         return error
 
 
-def finish(scenario: Scenario, prepared: Prepared, wall: float) -> Record | DynsimError:
+def finish(scenario: Scenario, prepared: Prepared, wall: float, pictured: bool) -> Record | DynsimError:
     """The record of a run that is complete."""
     try:
         with named(scenario):
-            record = make_record(scenario, prepared, wall)
+            record = make_record(scenario, prepared, wall, pictured=pictured)
     except SimulationInterrupted:
         raise
     except DynsimError as error:
@@ -120,6 +125,7 @@ def shareable(prepared: Prepared) -> bool:
     run = prepared.run
     return (
         has_forms(prepared.system)
+        and prepared.system.unilateral is None
         and run.support is None
         and not (len(run.event) or len(run.tick) or len(run.breaks))
         and run.newton is None

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,12 +11,12 @@ from typing import Any, TypeVar
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
+from dynsim.figures.canvas import Canvas, heed_fonts
 from dynsim.files import replacing
 from dynsim.record import Record
 from dynsim.terminal import plain
@@ -70,15 +70,18 @@ TRANSIENT_ROOM, TRANSIENT_MOST = 1.2, 0.8
 LEGEND_ROW = 12.5
 
 
-def look() -> AbstractContextManager[None]:
+@contextmanager
+def look() -> Iterator[None]:
     """Matplotlib settings of all dynsim figures, for a ``with`` block; the caller's settings come back after it."""
-    return matplotlib.rc_context(_LOOK)
+    with matplotlib.rc_context(_LOOK):
+        heed_fonts()
+        yield
 
 
 def new_figure(height: float, title: str) -> Figure:
     """An empty figure [inch] that belongs to no pyplot and needs no display."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
-    FigureCanvasAgg(figure)
+    Canvas(figure)
     figure.suptitle(title)
     return figure
 
@@ -117,9 +120,7 @@ def write(figure: Figure, path: Path) -> Path:
     kind = path.suffix.removeprefix(".")
     with replacing(path) as stream, matplotlib.rc_context({"svg.hashsalt": path.stem}):
         if kind == "png":
-            # ``savefig`` draws all twice, the first time for the layout, which drawing makes anyway. Light compression:
-            # half the time for a third more bytes.
-            FigureCanvasAgg(figure).print_png(stream, pil_kwargs={"compress_level": 3})
+            stream.write(Canvas(figure).png())
         else:
             date = {"pdf": "CreationDate", "svg": "Date"}[kind]
             figure.savefig(stream, format=kind, dpi="figure", metadata={date: None})
@@ -163,14 +164,15 @@ def number(value: float, digits: int = 4) -> str:
     return f"{value:.{digits}g}".replace("-", "−")
 
 
-def log_axis(axes: Axes) -> None:
-    """A logarithmic y axis with plain numbers, also for ranges of less than a decade."""
-    axes.set_yscale("log")
-    low, high = axes.get_ylim()
+def log_axis(axes: Axes, which: str = "y") -> None:
+    """A logarithmic axis, "x" or "y", with plain numbers, also for ranges of less than a decade."""
+    axes.set(**{f"{which}scale": "log"})
+    low, high = axes.get_ylim() if which == "y" else axes.get_xlim()
     near = high < 200.0 * low
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if near else (1.0,)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    axis = axes.yaxis if which == "y" else axes.xaxis
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if near else (1.0,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def legend_above(axes: Axes, columns: int = 3) -> None:

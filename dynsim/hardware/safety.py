@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from dynsim.config import error_at
+from dynsim.config import StrictModel, error_at
 from dynsim.hardware.bus.control_table import BAUD_RATES
 from dynsim.hardware.data_sheet import Objection, rounded_up
-from dynsim.hardware.strict_yaml import Positive, StrictModel, Within
+from dynsim.hardware.strict_yaml import Positive, Within
 
 LONGEST_REACTION = 0.5
 """From the first cycle that shows a fault to the rule that declares it [s]."""

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
-from dynsim.config import error_at
+from dynsim.config import StrictModel, error_at
 from dynsim.errors import shown
 from dynsim.files import file_name
 from dynsim.hardware.bus.control_table import (
@@ -31,7 +31,7 @@ from dynsim.hardware.bus.control_table import (
 from dynsim.hardware.data_sheet import Objection, objections_to_limits, objections_to_safety, rounded_up
 from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.safety import Bus, Safety, objections_to_times
-from dynsim.hardware.strict_yaml import Finite, Positive, StrictModel, Within, read_yaml
+from dynsim.hardware.strict_yaml import Finite, Positive, Within, read_yaml
 from dynsim.inputs import is_file
 
 _PACKAGE = Path(__file__).resolve().parents[1]

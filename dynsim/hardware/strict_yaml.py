@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
+from pydantic import BaseModel, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
 from pydantic_core import core_schema
 
-from dynsim.config import forbid_conversion
 from dynsim.hardware.errors import ServoMapError
 from dynsim.inputs import parse_yaml, read_text
 from dynsim.problems import Origin, explain, unknown_keys
@@ -38,18 +37,6 @@ class Within:
             bounds = f"{self.low:g} to {self.high:g}{self.unit and ' ' + self.unit}"
             raise ValueError(f"{self.why}; use {bounds}")
         return value
-
-
-class StrictModel(BaseModel):
-    """Unknown keys are errors, and numbers neither texts nor true."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    @classmethod
-    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> Any:
-        schema = handler(source)
-        forbid_conversion(schema)
-        return schema
 
 
 _Schema = TypeVar("_Schema", bound=BaseModel)

@@ -21,6 +21,7 @@ from numba.core.compiler_machinery import PassManager
 from numba.core.typing.templates import infer, infer_global, make_overload_template
 
 from dynsim.kernels import numba_habits  # noqa: F401
+from dynsim.kernels.alongside import Need, needed_by, provide
 
 _NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
@@ -46,6 +47,12 @@ class _OwnCallees(JITCodeLibrary):
         # numba runs a cheaper set of passes before, for the sake of reference counting, which kernels do without.
         passes, builder = self._codegen._module_pass_manager()
         passes.run(self._final_module, builder)
+
+    def _finalize_final_module(self) -> None:
+        self.needs: list[Need] = needed_by(self._final_module)
+        for need in self.needs:
+            provide(need)
+        super()._finalize_final_module()
 
     def serialize_using_object_code(self) -> tuple[str, str, tuple[bytes, bytes]]:
         """For the cache: machine code, and the names by which it is found; not the code to merge into further kernels.

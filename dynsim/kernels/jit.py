@@ -25,6 +25,7 @@ from numba.core import config, serialize
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
 
+from dynsim.kernels.alongside import by_address, provide
 from dynsim.kernels.compiler import ApartCompiler, KernelCompiler, PartCompiler, as_part, register_part
 
 # Packs the scalar formulas of 3-vectors and wrenches into vector instructions (numba leaves it off): a right-hand side
@@ -67,13 +68,16 @@ class _KernelCache(_Cache):
         if hashlib.sha256(payload).digest() != digest:
             _warn(f"{path}: damaged machine code; compiling it anew")
             return None
-        return CompileResult._rebuild(target_context, *pickle.loads(payload))
+        *reduced, needs = pickle.loads(payload)
+        for need in needs:
+            provide(need)
+        return CompileResult._rebuild(target_context, *reduced)
 
     def save_overload(self, sig: Any, data: Any) -> None:
         if data.library.has_dynamic_globals:  # addresses of this process, which NUMBA_OPT=0 leaves in
             return
         path = self._path(sig, data.codegen)
-        payload = serialize.dumps(data._reduce())
+        payload = serialize.dumps((*data._reduce(), data.library.needs))
         try:
             with tempfile.NamedTemporaryFile(
                 dir=path.parent, prefix=f"{path.name}.", suffix=".tmp", delete=False
@@ -200,6 +204,15 @@ def exact_kernel(function: F) -> F:
     Which products of a sum are contracted depends on the place, and so would the last bits of what it computes.
     """
     return register_part(function, PartCompiler, {**_OPTIONS, "fastmath": False, "forceinline": True})
+
+
+def separate_kernel(function: F) -> F:
+    """For what several parts of a large kernel call and returns nothing: a kernel of its own, called by address.
+
+    It is compiled by a process of its own while its caller is, see dynsim.kernels.alongside. For kernels only.
+    """
+    compiled = _compile(function)
+    return function if config.DISABLE_JIT else by_address(function, compiled)
 
 
 def _compile(function: F, **options: Any) -> F:

@@ -3,10 +3,12 @@
 from dynsim.scenario.build import build_model, require_scenario
 from dynsim.scenario.editors import json_schema
 from dynsim.scenario.reading import (
+    ScenarioFile,
     SetOptions,
     find_scenario,
     load_scenario,
     parse_override,
+    read_scenario,
     scenario_from_resolved,
     to_yaml,
     variant_names,
@@ -18,12 +20,14 @@ __all__ = [
     "SHIPPED",
     "Scenario",
     "ScenarioConfig",
+    "ScenarioFile",
     "SetOptions",
     "build_model",
     "find_scenario",
     "json_schema",
     "load_scenario",
     "parse_override",
+    "read_scenario",
     "require_scenario",
     "scenario_from_resolved",
     "shipped_scenarios",

@@ -10,6 +10,7 @@ import io
 import itertools
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -60,8 +61,7 @@ def find_scenario(name: str | Path) -> Path:
 
 def variant_names(path: str | Path) -> list[str]:
     """Names of the variants in a scenario file, in its order; empty without variants."""
-    variants = _read(find_scenario(path)).get("variants")
-    return list(variants) if isinstance(variants, Mapping) else []
+    return read_scenario(path).variants
 
 
 def load_scenario(path: str | Path, variant: str | None = None, overrides: Mapping[str, Any] | None = None) -> Scenario:
@@ -78,39 +78,74 @@ def load_scenario(path: str | Path, variant: str | None = None, overrides: Mappi
     ScenarioError
         The message names file, line, key, value and the fix.
     """
+    return read_scenario(path).load(variant, overrides)
+
+
+def read_scenario(path: str | Path) -> ScenarioFile:
+    """Read a scenario file, or the shipped scenario of that name, without validating it.
+
+    Raises
+    ------
+    ScenarioError
+        It cannot be read, or is no mapping.
+    """
     path = find_scenario(path)
-    data = _read(path)
-    variants = data.get("variants")
-    if variants is None:
-        variants = {}
-    if not isinstance(variants, Mapping):
-        raise ScenarioError(f"{path}:{data.lines['variants']}: variants must be a mapping of names to what differs")
-    if variant is None and variants:
-        variant = next(iter(variants))
-    # A list of the names: what is no name need not be hashable.
-    if variant is not None and variants and variant not in list(variants):
-        raise ScenarioError(
-            f"{path}: no variant {variant!r}{suggest(str(variant), variants)}; "
-            f"variants: {', '.join(map(key_text, variants))}"
-        )
-    if variant is not None and not variants and variant != data.get("variant"):
-        raise ScenarioError(f"{path}: has no variants, so there is no {variant!r}")
-    if overrides is not None and not (
-        isinstance(overrides, Mapping) and all(isinstance(key, str) for key in overrides)
-    ):
-        raise ScenarioError(
-            f"overrides must map dotted keys to values, as {{'integrator.rtol': 1e-8}} does, not {shown(overrides)}"
-        )
-    merged, origin = _merged(path, data, variants, variant, overrides or {})
-    try:
-        config = ScenarioConfig.model_validate(merged)
-    except ValidationError as error:
-        unknown = unknown_keys(error, merged, origin, ScenarioConfig, TOP)
-        if unknown:
-            for other in [name for name in itertools.islice(variants, VARIANTS_SEARCHED) if name != variant]:
-                unknown += _unknown_keys_of(path, data, variants, other, overrides or {})
-        raise ScenarioError(explain(error, merged, origin, unknown)) from None
-    return Scenario(config.name, config.variant, config, path, origin)
+    return ScenarioFile(path, _read(path))
+
+
+@dataclass(frozen=True)
+class ScenarioFile:
+    """A scenario file as it was read: many scenarios can be loaded from it, also in processes that do not have it.
+
+    Attributes
+    ----------
+    path : where it was read from; files that it names are relative to its folder
+    data : its content
+    """
+
+    path: Path
+    data: YamlMapping
+
+    @property
+    def variants(self) -> list[str]:
+        """Names of the variants, in the order of the file; empty without variants."""
+        variants = self.data.get("variants")
+        return list(variants) if isinstance(variants, Mapping) else []
+
+    def load(self, variant: str | None = None, overrides: Mapping[str, Any] | None = None) -> Scenario:
+        """See :func:`load_scenario`."""
+        path, data = self.path, self.data
+        variants = data.get("variants")
+        if variants is None:
+            variants = {}
+        if not isinstance(variants, Mapping):
+            raise ScenarioError(f"{path}:{data.lines['variants']}: variants must be a mapping of names to what differs")
+        if variant is None and variants:
+            variant = next(iter(variants))
+        # A list of the names: what is no name need not be hashable.
+        if variant is not None and variants and variant not in list(variants):
+            raise ScenarioError(
+                f"{path}: no variant {variant!r}{suggest(str(variant), variants)}; "
+                f"variants: {', '.join(map(key_text, variants))}"
+            )
+        if variant is not None and not variants and variant != data.get("variant"):
+            raise ScenarioError(f"{path}: has no variants, so there is no {variant!r}")
+        if overrides is not None and not (
+            isinstance(overrides, Mapping) and all(isinstance(key, str) for key in overrides)
+        ):
+            raise ScenarioError(
+                f"overrides must map dotted keys to values, as {{'integrator.rtol': 1e-8}} does, not {shown(overrides)}"
+            )
+        merged, origin = _merged(path, data, variants, variant, overrides or {})
+        try:
+            config = ScenarioConfig.model_validate(merged)
+        except ValidationError as error:
+            unknown = unknown_keys(error, merged, origin, ScenarioConfig, TOP)
+            if unknown:
+                for other in [name for name in itertools.islice(variants, VARIANTS_SEARCHED) if name != variant]:
+                    unknown += _unknown_keys_of(path, data, variants, other, overrides or {})
+            raise ScenarioError(explain(error, merged, origin, unknown)) from None
+        return Scenario(config.name, config.variant, config, path, origin)
 
 
 def _merged(

@@ -101,11 +101,13 @@ def _elbows(variant: str = "two_elbows", **integrator: Any) -> Record:
 def residuals_by_tolerance() -> dict[str, float]:
     """Ledger residual over turnover of two elbows, by method, tolerance, step and duration."""
     cases: dict[str, dict[str, Any]] = {
-        "rk43, rtol 1e-6, 1 s": {"duration_s": 1},
-        "rk43, rtol 1e-8, 1 s": {"duration_s": 1, "rtol": 1e-8, "atol": 1e-10},
+        "rk43, rtol 1e-6, 1 s": {"duration_s": 1, "method": "rk43"},
+        "rk43, rtol 1e-8, 1 s": {"duration_s": 1, "method": "rk43", "rtol": 1e-8, "atol": 1e-10},
         "dopri5, rtol 1e-6, 1 s": {"duration_s": 1, "method": "dopri5"},
         "dopri5, rtol 1e-8, 1 s": {"duration_s": 1, "method": "dopri5", "rtol": 1e-8, "atol": 1e-10},
         "dopri5, rtol 1e-6, 10 s": {"method": "dopri5"},
+        "radau5, rtol 1e-6, 1 s": {"duration_s": 1, "method": "radau5"},
+        "radau5, rtol 1e-8, 1 s": {"duration_s": 1, "method": "radau5", "rtol": 1e-8, "atol": 1e-10},
         "radau5, rtol 1e-6, 10 s": {"method": "radau5"},
         "rk4, 1 ms, 1 s": {"duration_s": 1, "method": "rk4", "step_s": 1e-3},
         "rk4, 1 ms, 10 s": {"method": "rk4", "step_s": 1e-3},
@@ -120,7 +122,7 @@ def differences() -> dict[str, dict[str, float]]:
     reference = _elbows(method="dopri5", rtol=1e-11, atol=1e-13)
     found: dict[str, dict[str, float]] = {}
     cases: dict[str, dict[str, Any]] = {
-        "rk43": {},
+        "rk43": {"method": "rk43"},
         "dopri5": {"method": "dopri5"},
         "radau5": {"method": "radau5"},
         "rk4, 1 ms": {"method": "rk4", "step_s": 1e-3},

@@ -97,7 +97,15 @@ def communicate(process: subprocess.Popen[str]) -> tuple[str, str]:
     return process.communicate(timeout=DEADLINE_S)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda number: number.name)
+# Twins of what is tried here already, some seconds each.
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGINT, signal.SIGTERM, pytest.param(signal.SIGHUP, marks=SLOW)],
+    ids=lambda number: number.name,
+)
 def test_a_signal_saves_what_was_simulated(tmp_path: Path, number: signal.Signals):
     with started(tmp_path, "run", "elbow_comparison", *LONG) as process:
         wait_until(lambda: bool(pids(tmp_path, "simulating")), process)
@@ -122,7 +130,7 @@ def test_a_signal_saves_the_variant_that_runs(tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("number", "kill"),
-    [(signal.SIGINT, os.killpg), (signal.SIGTERM, os.kill), (signal.SIGHUP, os.killpg)],
+    [(signal.SIGINT, os.killpg), (signal.SIGTERM, os.kill), pytest.param(signal.SIGHUP, os.killpg, marks=SLOW)],
     ids=lambda value: getattr(value, "name", None) or value.__name__,
 )
 def test_a_signal_saves_all_variants_that_run_in_processes(
@@ -145,7 +153,9 @@ def test_a_signal_saves_all_variants_that_run_in_processes(
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at processes in /proc")
-@pytest.mark.parametrize("number", [signal.SIGQUIT, signal.SIGKILL], ids=lambda number: number.name)
+@pytest.mark.parametrize(
+    "number", [pytest.param(signal.SIGQUIT, marks=SLOW), signal.SIGKILL], ids=lambda number: number.name
+)
 def test_workers_end_with_their_parent(tmp_path: Path, number: signal.Signals):
     with started(tmp_path, "compare", "elbow_comparison", "--jobs", "2", *LONG, "--out", "out") as process:
         wait_until(lambda: len(pids(tmp_path, "simulating")) == 2, process)
@@ -221,13 +231,24 @@ main()
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+SUMMARY, SAVING = ("metrics", "module.summarise"), ("record", "module.Record.to_hdf5")
+
+
 @pytest.mark.parametrize(
-    ("module", "target"),
-    [("metrics", "module.summarise"), ("record", "module.Record.to_hdf5")],
-    ids=["summary", "saving"],
+    ("command", "module", "target", "number"),
+    [
+        # Every two of command, place and signal.
+        ("run", *SUMMARY, signal.SIGINT),
+        ("run", *SAVING, signal.SIGTERM),
+        ("compare", *SUMMARY, signal.SIGTERM),
+        ("compare", *SAVING, signal.SIGINT),
+        pytest.param("run", *SUMMARY, signal.SIGTERM, marks=SLOW),
+        pytest.param("run", *SAVING, signal.SIGINT, marks=SLOW),
+        pytest.param("compare", *SUMMARY, signal.SIGINT, marks=SLOW),
+        pytest.param("compare", *SAVING, signal.SIGTERM, marks=SLOW),
+    ],
+    ids=lambda value: getattr(value, "name", None) or value.removeprefix("module."),
 )
-@pytest.mark.parametrize("command", ["run", "compare"])
 def test_a_signal_after_the_last_step_loses_nothing(
     tmp_path: Path, number: signal.Signals, module: str, target: str, command: str
 ):

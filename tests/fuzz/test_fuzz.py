@@ -11,7 +11,7 @@ from fuzz import campaign
 from fuzz.case import KINDS, draw
 
 # Damaged records are slower to read than the rest.
-QUICK = {**dict.fromkeys(KINDS, 45), "record": 15}
+QUICK = {**dict.fromkeys(KINDS, 30), "record": 10}
 ALL = 6000
 
 

@@ -10,7 +10,7 @@ import sys
 import pytest
 from rich.console import Console
 
-from dynsim.studies.bench import job, programs, run
+from dynsim.studies.bench import job, programs, run, together
 from dynsim.studies.bench.table import format_table
 
 
@@ -40,12 +40,20 @@ def test_quick_run(small: None) -> None:
     # RK4 at 1 ms is near its stability limit in the first milliseconds; the adaptive run is held small by stability.
     assert errors[programs.DYNSIM_DEFAULT] < 1e-7
     assert errors[programs.DYNSIM_RK4] < 2e-5
+    assert errors[programs.DYNSIM_RADAU5] < 1e-6
     # First order at 1 ms, but the same arm: a millimetre, not a centimetre.
     assert 1e-5 < errors[programs.MUJOCO_EULER] < 3e-3
     ratios = [row["time"] for row in result["ratios"] if "time" in row]
     assert ratios
+    own = {(row["task"], row["dynsim"]) for row in result["ratios"] if row["peer"] == programs.ONE_STATE}
+    assert own == {
+        (together.RIGHT_HAND_SIDE, programs.FOUR_LANES),
+        (together.RIGHT_HAND_SIDE, programs.EIGHT_LANES),
+        (together.RUN, programs.EIGHT_LANES),
+    }
     assert all(map(math.isfinite, ratios))
-    assert "–" not in text(result)
+    # Runs have no four lanes.
+    assert text(result).count("–") == 1
 
 
 def test_without_mujoco(small: None, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -213,7 +213,7 @@ def test_an_edit_of_any_compiled_source_names_another_folder(tmp_path: Path, mon
 
 def test_every_file_with_kernels_is_in_a_package_that_names_the_folder() -> None:
     """Or holds none that another file compiles in: the benchmark's loop, whose file names its machine code."""
-    decorators = re.compile(r"^@(kernel|merged_kernel|internal_kernel|inlined_kernel|exact_kernel)$", re.MULTILINE)
+    decorators = re.compile(r"^@((merged|internal|inlined|exact|apart|separate)_)?kernel$", re.MULTILINE)
     package = Path(dynsim.__file__).parent
     elsewhere = {
         str(source.relative_to(package))

@@ -77,7 +77,7 @@ TIME = {
 # Lines that no state comes to, as far as is known; they do not branch.
 AGAIN = "M* begins with the signs that the articulated solve has found: only rounding could turn one"
 COMPOUND = "for the compiler: systems whose joints are all single rows do not call it"
-# The law of real contact has no lanes yet, nor have candidates that are more than points on quadrics.
+# Real contact has forms of its own, which test_lanes_compiled runs; bodies that are more than points have no lanes.
 WITHOUT_LANES = (admissible_forces, slide_direction, shaped_rows)
 UNILATERAL = "the cases here are of the bilateral law"
 NEVER = {

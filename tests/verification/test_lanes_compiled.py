@@ -13,14 +13,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lane_cases import CASES, TIMED, Case
+from lane_cases import CASES, TIMED, Case, of, plane
 from lanes import copies
 from random_robots import Bench, bench, random_contacts, random_positions, random_robot
 
 from dynsim.kernels import arrays as ka
+from dynsim.kernels.constraint.rows import set_modes
+from dynsim.kernels.constraint.unilateral import FROZEN, REFERENCE, STATIC, STRIBECK, VISCOUS
 from dynsim.kernels.integrate.driver import advance
 from dynsim.kernels.integrate.run import FINISHED, PROJECTIONS, SAMPLE, STATUS
-from dynsim.kernels.jit import reals
+from dynsim.kernels.jit import integers, reals
 from dynsim.kernels.lanes.fixed_step import advance_lanes, lane_runs
 from dynsim.kernels.lanes.system import EIGHT, derivatives, lane_workspace
 from dynsim.kernels.lanes.tables import AXES, spread_tables
@@ -60,7 +62,17 @@ def compare(b: Bench, y: np.ndarray, t: float | np.ndarray, tolerance: float) ->
     return ws
 
 
-@pytest.mark.parametrize("name", [*CASES, *TIMED])
+# Programs of their own to compile: M* goes lane by lane, and references are in "times of their own" too.
+SLOW = {name for name in CASES if "M*" in name} | {
+    "no choice of signs",
+    "references and loads",
+    "references and loads at their end",
+}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in (*CASES, *TIMED)]
+)
 def test_every_case_of_branches(name):
     """Lanes far apart, so that they take different branches wherever there are any."""
     case = (CASES | TIMED)[name]()
@@ -95,6 +107,25 @@ def test_the_cases_have_lanes_that_differ():
     held = np.abs(ws.motors[:, ka.VOLTAGE]) == 15.0
     assert np.any(held)
     assert not np.all(held)
+
+
+@pytest.mark.parametrize("frozen", [0.0, 1.0])
+def test_real_contact(frozen):
+    """Points that slide either way, stick, and are off their planes; friction that depends on the speed."""
+    rng = np.random.default_rng(12)
+    b = bench(random_robot(rng, 7), [plane(rng, f"body_{6 - k}") for k in range(4)], real=True)
+    case = of(rng, b, 1.0)
+    b.derivative(case.y, 0.0)
+    modes = integers([ka.SLIDING, ka.STICKING, ka.OPEN, ka.SLIDING])
+    set_modes(b.system.contacts, b.system.couplings, b.system.unilateral, b.ws, modes)
+    real = b.system.unilateral
+    real.slide[:, REFERENCE : REFERENCE + 3] = rng.normal(size=(4, 3))
+    real.slide[0, FROZEN] = frozen
+    real.law[:, STATIC], real.law[0, STRIBECK], real.law[3, VISCOUS] = 0.4, 0.5, 0.01
+    y = spread(case, 8, rng)
+    ws = compare(b, y, 0.0, 1e-13)
+    along = np.einsum("csk,cs->ck", ws.contacts[:, ka.SLIP_VELOCITY : ka.SLIP_VELOCITY + 3], real.slide[:, :3])
+    assert {*np.sign(along[3])} == {-1.0, 1.0}
 
 
 def varied(system: System, count: int, rng: np.random.Generator) -> System:
@@ -157,35 +188,43 @@ def test_runs_of_their_own_parameters():
     assert np.ptp(lanes.y, axis=1).max() > 1e-4
 
 
+def short_run() -> np.ndarray:
+    """Samples of RADAU5 with everything that it does on lanes."""
+    b, q = braced()
+    y = b.state(q, np.zeros(len(b.robot.links)))
+    return b.simulate(y, np.linspace(0.0, 0.01, 21), "radau5").sample
+
+
 PLAIN = """
 import sys
-sys.path[:0] = sys.argv[1:]
+samples, tolerance, *folders = sys.argv[1:]
+sys.path[:0] = folders
 import numpy as np
 from lane_cases import CASES
-from test_lanes_compiled import compare, spread
-for name in ("curved", "dissipative"):
+from test_lanes_compiled import compare, short_run, spread
+for name in ("curved", "dissipative", "voltage limits"):
     case = CASES[name]()
-    compare(case.bench, spread(case, 4, np.random.default_rng(99)), 0.0, 0.0)
-case = CASES["voltage limits"]()
-compare(case.bench, spread(case, 4, np.random.default_rng(99)), 0.0, 1e-15)
+    compare(case.bench, spread(case, 4, np.random.default_rng(99)), 0.0, float(tolerance))
+np.testing.assert_allclose(short_run(), np.load(samples), rtol=1e-9, atol=1e-9)
 """
 
 
 @pytest.mark.parametrize(
     "environment",
     [
-        {"NUMBA_DISABLE_JIT": "1"},
-        {"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""},
-        {"NUMBA_CPU_NAME": "haswell"},
+        pytest.param({"NUMBA_DISABLE_JIT": "1"}, id="python"),
+        pytest.param({"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}, id="SSE2", marks=pytest.mark.slow),
+        pytest.param({"NUMBA_CPU_NAME": "haswell"}, id="AVX2", marks=pytest.mark.slow),
     ],
-    ids=["python", "no vectors", "AVX2"],
 )
 def test_other_processors_and_none(environment, tmp_path):
-    """As plain Python, without vector instructions, and with registers of four doubles."""
+    """As plain Python, with the registers of two doubles that every such processor has, and with four."""
     folders = [str(Path(__file__).parents[1]), str(Path(__file__).parent)]
     tolerance = "0.0" if "NUMBA_DISABLE_JIT" in environment else "1e-15"
+    samples = tmp_path / "samples.npy"
+    np.save(samples, short_run())
     subprocess.run(
-        [sys.executable, "-c", PLAIN.replace("0.0, 0.0)", f"0.0, {tolerance})"), *folders],
+        [sys.executable, "-c", PLAIN, str(samples), tolerance, *folders],
         env={**os.environ, **environment},
         check=True,
         timeout=600,

@@ -231,7 +231,8 @@ def test_lowest_points_of_the_wheels_are_at_rest():
 
 
 @pytest.mark.parametrize("method", ["rk43", "dopri5"])
-@pytest.mark.parametrize("solver", ["articulated", "m_star"])
+# M* of wheels and a support polygon is a program of its own to compile.
+@pytest.mark.parametrize("solver", ["articulated", pytest.param("m_star", marks=pytest.mark.slow)])
 def test_the_ledger_closes(method, solver):
     """Circuits, gears and losses of wheels and arm, on a floor that is not level."""
     tilted = {**MOBILE["plant"], "arm": {**MOBILE["plant"]["arm"], "gravity_m_s2": [1.0, 0.5, -9.7]}}
@@ -241,6 +242,7 @@ def test_the_ledger_closes(method, solver):
     assert np.ptp(record["energy_kinetic"]) > 0.1
 
 
+@pytest.mark.slow  # a program of its own to compile; right-hand sides of both are compared in tests/oracle
 def test_both_solvers_are_one():
     """O(n) and M* over a run."""
     exact = {"method": "dopri5", "rtol": 1e-12, "atol": 1e-13}

@@ -292,6 +292,7 @@ def test_a_ball_and_a_cylinder_roll_down_a_slope(shape, share):
     np.testing.assert_allclose(run.outputs("contact")[:, :, OUT_FORCE].sum(axis=1), mass * G * np.cos(SLOPE), rtol=1e-8)
 
 
+@pytest.mark.slow  # a program of its own to compile
 def test_a_ball_rolls_over_a_sphere():
     """From near its top on a circle of R + r: its energy of motion is 7/10 m v² and comes from its height."""
     R, r, start = 0.5, 0.1, 0.2

@@ -341,7 +341,11 @@ FORWARD = {"type": "ramp", "start_s": 0.2, "duration_s": 1.0, "displacement": [0
 
 @pytest.mark.parametrize(
     "plant",
-    [{"yaw_joints": 30}, {"yaw_joints": 60}, {"link_length_m": 0.01, "wheel_radius_m": 0.005, "wheel_gap_m": 0.012}],
+    [
+        {"yaw_joints": 30},
+        pytest.param({"yaw_joints": 60}, marks=pytest.mark.slow),
+        {"link_length_m": 0.01, "wheel_radius_m": 0.005, "wheel_gap_m": 0.012},
+    ],
 )
 def test_damping_is_measured_by_the_robot_and_does_not_stop_long_or_small_ones(plant):
     """The smallest singular value falls with the number and the length of the links: no singularity."""

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 from scipy.optimize import minimize_scalar
 
+from dynsim.config import StrictModel
 from dynsim.errors import RecordError, shown
 from dynsim.files import replacing
 from dynsim.hardware.errors import ComparisonGateFailed
 from dynsim.hardware.replay.lifting import lifted
 from dynsim.hardware.replay.states import State
 from dynsim.hardware.servo_map import Lifts
-from dynsim.hardware.strict_yaml import StrictModel, read_yaml
+from dynsim.hardware.strict_yaml import read_yaml
 from dynsim.record import Record
 
 Array = NDArray[np.float64]

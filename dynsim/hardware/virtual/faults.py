@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, ValidationInfo, model_validator
 
-from dynsim.config import error_at
-from dynsim.hardware.strict_yaml import StrictModel, read_yaml
+from dynsim.config import StrictModel, error_at
+from dynsim.hardware.strict_yaml import read_yaml
 
 Probability = Annotated[float, Field(ge=0, le=1)]
 

@@ -124,10 +124,8 @@ def stop_gap(unilateral: UnilateralArrays, ws: Workspace, k):
 
 
 @inlined_kernel
-def note_stop_forces(unilateral: UnilateralArrays | None, ws: Workspace):
+def note_stop_forces(unilateral: UnilateralArrays, ws: Workspace):
     """Forces of the joint stops from their rows; none where they are open."""
-    if unilateral is None:  # known to the compiler
-        return
     table = unilateral.stop_table
     for k in range(table.shape[0]):
         closed = table[k, STOP_CLOSED] == 1

@@ -8,6 +8,7 @@ from numba.core import types
 
 from dynsim.kernels.arrays import Workspace
 from dynsim.kernels.compiler import form_of
+from dynsim.kernels.constraint.unilateral import UnilateralArrays
 from dynsim.kernels.integrate.newton import NewtonArrays
 from dynsim.kernels.integrate.output import fill_output, write_output
 from dynsim.kernels.integrate.project import off_surface, settle
@@ -123,13 +124,21 @@ def _together(newton: Any, system: Any, ws: Any, run: Any, *_: Any) -> bool:
     return bool(lanes and run[run.fields.index("support")] == types.none)
 
 
+@internal_kernel
+def has_stops(unilateral: UnilateralArrays | None):
+    """True where joints have stops, whose forces are kept for one state alone."""
+    if unilateral is None:  # known to the compiler
+        return False
+    return unilateral.stop.shape[0] > 0
+
+
 @form_of(sample_together, _together)
 def sample_on_lanes(newton, system, ws, run, first, until):
     """Up to four; one is done sooner alone, and so is what has left its surfaces."""
     lanes, times, count = newton.lanes, run.sample_time, 0
     while count < 4 and first + count < times.shape[0] and times[first + count] <= until:
         count += 1
-    if count == 1:
+    if count == 1 or has_stops(system.unilateral):
         return 0
     for k in range(4):
         s = first + min(k, count - 1)

@@ -251,13 +251,11 @@ def book(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
-def tell_changes(unilateral: UnilateralArrays | None, s: SteppingArrays, run: Run):
+def tell_changes(unilateral: UnilateralArrays, s: SteppingArrays, run: Run):
     """Log and count what the accepted step has changed, at its end; True when the caller is to empty the log.
 
     What a contact begins with is no event.
     """
-    if unilateral is None:  # known to the compiler
-        return False
     tally, table, stop = unilateral.tally, unilateral.stop_table, unilateral.stop
     for k in range(s.told.shape[0]):
         before, now = s.told[k], s.motion[k]
@@ -286,10 +284,8 @@ def tell_changes(unilateral: UnilateralArrays | None, s: SteppingArrays, run: Ru
 
 
 @internal_kernel
-def book_losses(unilateral: UnilateralArrays | None, system: System, s, ws: Workspace, y_new, h):
-    """Under the unilateral law what normals and joint stops take is a loss, not an error of the constraints."""
-    if unilateral is None:  # known to the compiler
-        return
+def book_losses(unilateral: UnilateralArrays, system: System, s, ws: Workspace, y_new, h):
+    """What normals and joint stops take is a loss, not an error of the constraints."""
     layout, tally = system.layout, unilateral.tally
     for k in range(unilateral.stop.shape[0]):
         if unilateral.stop_table[k, STOP_CLOSED] == 0:

@@ -13,7 +13,7 @@ from dynsim.kernels.arrays import QDD, Workspace
 from dynsim.kernels.compiler import form_of
 from dynsim.kernels.integrate.newton import NewtonArrays, StageLanes
 from dynsim.kernels.integrate.tableaux import NODE_RADAU
-from dynsim.kernels.jit import apart_kernel, internal_kernel
+from dynsim.kernels.jit import internal_kernel, separate_kernel
 from dynsim.kernels.lanes.system import FOUR, derivative_lanes
 from dynsim.kernels.lanes.tables import as_lanes, tables_as_lanes
 from dynsim.kernels.system import System, derivative
@@ -61,7 +61,7 @@ def _given(lanes: Any, *_: Any) -> bool:
     return bool(lanes != types.none)
 
 
-@apart_kernel
+@separate_kernel
 def evaluate_four(lanes: StageLanes, system: System):
     """The derivative of all lanes, one program for both of its callers."""
     derivative_lanes(

@@ -139,15 +139,15 @@ def stepping_arrays(
     na: int,
     joint_rows: int,
     theta: float,
-    unilateral: UnilateralArrays | None = None,
+    unilateral: UnilateralArrays | None,
 ) -> SteppingArrays:
     """Allocate :class:`SteppingArrays`: friction of the contacts and the law's restitution; isotropic."""
+    assert unilateral is not None, "time stepping is of the unilateral law"
     n, c = model.body.shape[0], contacts.link.shape[0]
     p = row_limit(c, joint_rows)
     law = np.zeros((c, LAW_SIZE))
     law[:, FRICTION_OF], law[:, GRIP], law[:, GRIP_AXIS] = contacts.point[:, MU], 1.0, 1.0
-    if unilateral is not None:
-        law[:, RESTITUTION] = unilateral.law[:, LAW_RESTITUTION]
+    law[:, RESTITUTION] = unilateral.law[:, LAW_RESTITUTION]
     return SteppingArrays(
         theta=float(theta),
         law=law,
@@ -238,10 +238,8 @@ def close_contacts(system, s: SteppingArrays, ws: Workspace):
 
 
 @internal_kernel
-def close_stops(unilateral: UnilateralArrays | None, ws: Workspace):
+def close_stops(unilateral: UnilateralArrays, ws: Workspace):
     """Close the joint stops whose gap is not open, open the others; True when one has changed."""
-    if unilateral is None:  # known to the compiler
-        return False
     table, changed = unilateral.stop_table, False
     for k in range(table.shape[0]):
         closed = 1 if stop_gap(unilateral, ws, k) <= MARGIN else 0
@@ -323,12 +321,11 @@ def implicit_drives(system, s: SteppingArrays, ws: Workspace, h):
 
 
 @internal_kernel
-def friction_of(unilateral: UnilateralArrays | None, s: SteppingArrays, k, speed):
+def friction_of(unilateral: UnilateralArrays, s: SteppingArrays, k, speed):
     """Coefficient of friction of candidate k in a step that begins at this speed of slip."""
-    mu = s.law[k, FRICTION_OF]
-    if unilateral is None:  # known to the compiler
-        return mu
-    return unilateral.law[k, STATIC] if speed <= BAD else sliding_friction(unilateral.law, k, mu, speed)
+    if speed <= BAD:
+        return unilateral.law[k, STATIC]
+    return sliding_friction(unilateral.law, k, s.law[k, FRICTION_OF], speed)
 
 
 @internal_kernel
@@ -339,7 +336,7 @@ def slip_of_rates(s: SteppingArrays, k, x, y):
 
 
 @internal_kernel
-def solve_contacts(unilateral: UnilateralArrays | None, s: SteppingArrays, ws: Workspace, h):
+def solve_contacts(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, h):
     """Impulses of all rows, by the last ones as a start; their mean forces into ``ws.rows``. Returns the residual."""
     p, coupled, rows = ws.counts[ROWS], ws.counts[COUPLED], ws.rows
     last = 3 * ws.contacts.shape[0]

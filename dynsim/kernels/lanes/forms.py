@@ -14,6 +14,7 @@ from dynsim.kernels.arrays import (
     I_MAX,
     K_M,
     LAW,
+    MU,
     OFF,
     RESISTANCE,
     RHS,
@@ -22,7 +23,9 @@ from dynsim.kernels.arrays import (
 )
 from dynsim.kernels.compiler import form_of
 from dynsim.kernels.constraint.delassus import solve_small
+from dynsim.kernels.constraint.splits import admissible_forces, look_at_forces
 from dynsim.kernels.constraint.surface import sign_changed, surface_distance
+from dynsim.kernels.constraint.unilateral import FROZEN, REDUNDANT, REFERENCE, slide_direction, sliding_friction
 from dynsim.kernels.constraint.uniqueness import CLEAR, clearly_unique
 from dynsim.kernels.drive.law import evaluate_reference, fed_forward
 from dynsim.kernels.drive.limit import clipped
@@ -98,6 +101,32 @@ def all_clearly_unique(ws):
         return True
     straight, crossed = small[0, 0, 0] * small[0, 1, 1], small[0, 0, 1] * small[0, 1, 0]
     return every(straight - crossed > CLEAR * (straight + abs(crossed)))
+
+
+@form_of(slide_direction, any_lanes)
+def slide_direction_lanes(unilateral, contacts, k, x, y, z):
+    """Each lane's own direction; ``unilateral.slide`` keeps the speed of the last state that was evaluated alone."""
+    slide, law = unilateral.slide, unilateral.law
+    a, b, c = slide[k, REFERENCE], slide[k, REFERENCE + 1], slide[k, REFERENCE + 2]
+    along = x * a + y * b + z * c
+    speed = along
+    if slide[k, FROZEN] == 0.0:
+        size = math.sqrt(x * x + y * y + z * z)
+        moves, on = size > 0.0, along >= 0.0
+        scale = select(on, 1.0 / size, -1.0 / size)
+        a, b, c = select(moves, x * scale, a), select(moves, y * scale, b), select(moves, z * scale, c)
+        speed = select(moves, select(on, size, -size), along)
+    return a, b, c, sliding_friction(law, k, contacts.point[k, MU], speed)
+
+
+@form_of(admissible_forces, any_lanes)
+def admissible_forces_lanes(unilateral, ws):
+    """One by one, where there is something to look at."""
+    if unilateral is None:  # known to the compiler
+        return
+    if unilateral.number[REDUNDANT] == 1.0 or unilateral.stop.shape[0] > 0:
+        for k in range(lane_count(ws)):
+            look_at_forces(unilateral, lane(ws, k))
 
 
 @form_of(sign_changed, any_lanes)

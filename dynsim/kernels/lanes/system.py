@@ -44,11 +44,11 @@ def derivative_lanes(system: System, t, y, ws: Workspace, dy):
 
 
 # Parts of a system whose kernels have no forms for lanes.
-_WITHOUT_FORMS = ("dense", "unilateral", "shapes")
+_WITHOUT_FORMS = ("dense", "shapes")
 
 
 def has_forms(system: System) -> bool:
-    """True of the bilateral law on points, by the articulated solve; other systems go lane by lane."""
+    """True of points on quadrics, by the articulated solve; other systems go lane by lane."""
     return all(getattr(system, name) is None for name in _WITHOUT_FORMS)
 
 

@@ -13,10 +13,19 @@ from numpy.typing import NDArray
 from dynsim.engine.dynamics import Prepared, prepare
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.driver import advance
+from dynsim.kernels.lanes.system import has_forms
 from dynsim.kernels.state import block
 from dynsim.scenario import build, load_scenario
 from dynsim.studies.bench import mujoco_peer
-from dynsim.studies.bench.programs import DYNSIM_DEFAULT, DYNSIM_RK4, MUJOCO_EULER, MUJOCO_IMPLICIT, SCENARIO, STEP
+from dynsim.studies.bench.programs import (
+    DYNSIM_DEFAULT,
+    DYNSIM_RADAU5,
+    DYNSIM_RK4,
+    MUJOCO_EULER,
+    MUJOCO_IMPLICIT,
+    SCENARIO,
+    STEP,
+)
 from dynsim.studies.bench.timing import Timed
 
 Array = NDArray[np.float64]
@@ -55,7 +64,11 @@ CASES = {
     ),
 }
 # Method, first or fixed step, rtol, atol.
-_INTEGRATORS = {DYNSIM_DEFAULT: ("rk43", 0.0, 1e-6, 1e-8), DYNSIM_RK4: ("rk4", STEP, 1e-6, 1e-8)}
+_INTEGRATORS = {
+    DYNSIM_DEFAULT: ("rk43", 0.0, 1e-6, 1e-8),
+    DYNSIM_RADAU5: ("radau5", 0.0, 1e-6, 1e-8),
+    DYNSIM_RK4: ("rk4", STEP, 1e-6, 1e-8),
+}
 _TIGHT = {"integrator.method": "dopri5", "integrator.rtol": 1e-11, "integrator.atol": 1e-13}
 
 
@@ -97,6 +110,7 @@ def measure_job(case_name: str, rounds: int, *, with_mujoco: bool) -> list[dict[
                 "wall_median_s": float(np.median(walls[job.name])),
                 "wall_minimum_s": float(np.min(walls[job.name])),
                 "cpu_median_s": float(np.median(cores[job.name])),
+                "cpu_minimum_s": float(np.min(cores[job.name])),
                 "same_physics": case.same_physics or job.name.startswith("dynsim"),
                 "hand_error_max_m": float(distance.max()),
                 "hand_error_rms_m": float(np.sqrt((distance**2).mean())),
@@ -150,13 +164,16 @@ def _dynsim_job(name: str, reference: Prepared, paths: dict[str, tuple[Array, Ar
         step_max=np.inf,
         rtol=rtol,
         atol=atol,
+        lanes=has_forms(reference.system),
     )
     prepared = replace(reference, run=run)
-    fresh = {field: getattr(run, field).copy() for field in ("y", "clock", "count", "extremes")}
+    fresh = [(table, table.copy()) for table in (run.y, run.clock, run.count, run.extremes)]
+    if run.newton is not None:
+        fresh += [(table, table.copy()) for table in (run.newton.clock, run.newton.count)]
 
     def call(count: int) -> int:
-        for field, values in fresh.items():
-            getattr(prepared.run, field)[:] = values
+        for table, values in fresh:
+            table[:] = values
         _advance(prepared)
         paths[name] = prepared.run.states("q"), prepared.run.states("current")
         return 1

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from dynsim.engine.dynamics import Prepared, prepare
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.jit import kernel
+from dynsim.kernels.lanes.system import derivative_lanes
+from dynsim.kernels.lanes.tables import as_lanes, tables_as_lanes
 from dynsim.kernels.state import block
 from dynsim.kernels.system import System, derivative
 from dynsim.scenario import load_scenario
@@ -46,6 +48,19 @@ def repeat_derivative(system: System, y: Array, ws: ka.Workspace, dy: Array, cou
         total += dy[y.shape[0] - 1]
     y[0] = first
     return total
+
+
+@kernel
+def repeat_lanes(width: Any, system: System, y: Array, ws: ka.Workspace, dy: Array, count: int) -> None:
+    """``count`` right-hand sides of all lanes."""
+    for k in range(count):
+        derivative_lanes(
+            tables_as_lanes(system, width),  # type: ignore[call-arg]
+            1e-3 * (k & 1023),
+            as_lanes(y, width),  # type: ignore[call-arg]
+            tables_as_lanes(ws, width),  # type: ignore[call-arg]
+            as_lanes(dy, width),  # type: ignore[call-arg]
+        )
 
 
 def measure(n: int, rounds: int, share: float, *, with_pinocchio: bool, with_mujoco: bool) -> dict[str, list[float]]:

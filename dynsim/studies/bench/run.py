@@ -9,19 +9,21 @@ from collections.abc import Callable
 from typing import Any
 
 from dynsim._version import __version__
-from dynsim.studies.bench import job, right_hand_side
+from dynsim.studies.bench import job, right_hand_side, together
 from dynsim.studies.bench.programs import (
     ABA,
     CONSTRAINT_DYNAMICS,
     DYNSIM_CONTACTS,
     DYNSIM_DEFAULT,
     DYNSIM_FREE,
+    DYNSIM_RADAU5,
     DYNSIM_RK4,
     LCABA,
     MUJOCO_CONTACTS,
     MUJOCO_EULER,
     MUJOCO_FREE,
     MUJOCO_IMPLICIT,
+    ONE_STATE,
     STEP,
 )
 
@@ -46,8 +48,9 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
     -------
     dict, ready for JSON
         ``machine``, ``versions``, ``method`` (how it was measured), ``right_hand_side`` (per size: microseconds by
-        contender, medians and minima), ``job`` (per case and program: wall time and errors), ``ratios`` (how many
-        times longer the other program takes), ``unavailable`` (what is missing and why).
+        contender, medians and minima), ``job`` (per case and program: wall time and errors), ``together`` (per state
+        and per step of a run: microseconds alone and on lanes), ``ratios`` (how many times longer the other program
+        takes, or dynsim otherwise), ``unavailable`` (what is missing and why).
     """
     report = progress or (lambda text, fraction: None)
     mujoco_missing = _why_no_mujoco()
@@ -67,8 +70,10 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
         sizes.append(right_hand_side.row(n, samples, python_call or 0.0))
     jobs: list[dict[str, Any]] = []
     for k, case in enumerate(job.CASES):
-        report(f"10 s job, {case}", 0.6 + 0.4 * k / len(job.CASES))
+        report(f"10 s job, {case}", 0.6 + 0.35 * k / len(job.CASES))
         jobs += job.measure_job(case, 3 if quick else 21, with_mujoco=not mujoco_missing)
+    report("runs that share lanes", 0.95)
+    shared = together.measure(rounds, share)
     report("done", 1.0)
     result: dict[str, Any] = {
         "machine": _machine(),
@@ -89,10 +94,42 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
         },
         "right_hand_side": sizes,
         "job": jobs,
+        "together": shared,
         "unavailable": {"mujoco": mujoco_missing} if mujoco_missing else {},
     }
-    result["ratios"] = _ratios(sizes, jobs)
+    result["ratios"] = [*_ratios(sizes, jobs), *_own_ratios(jobs, shared)]
     return result
+
+
+def _own_ratios(jobs: list[dict[str, Any]], shared: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """How many times longer dynsim takes by rk43 than by radau5, and for one after the other than together."""
+    rows = []
+    for case in job.CASES:
+        row = {one["program"]: one for one in jobs if one["case"] == case}
+        explicit, implicit = row[DYNSIM_DEFAULT], row[DYNSIM_RADAU5]
+        rows.append(
+            {
+                "task": f"10 s job, {case}, by method",
+                "peer": DYNSIM_DEFAULT,
+                "dynsim": DYNSIM_RADAU5,
+                "time": explicit["cpu_median_s"] / implicit["cpu_median_s"],
+                "time_minima": explicit["cpu_minimum_s"] / implicit["cpu_minimum_s"],
+                "hand_error": explicit["hand_error_max_m"] / implicit["hand_error_max_m"],
+            }
+        )
+    for one in shared:
+        for name in one["median_us"]:
+            if name != ONE_STATE:
+                rows.append(
+                    {
+                        "task": one["task"],
+                        "peer": ONE_STATE,
+                        "dynsim": name,
+                        "time": one["median_us"][ONE_STATE] / one["median_us"][name],
+                        "time_minima": one["minimum_us"][ONE_STATE] / one["minimum_us"][name],
+                    }
+                )
+    return rows
 
 
 def _ratios(sizes: list[dict[str, Any]], jobs: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -115,7 +152,7 @@ def _ratios(sizes: list[dict[str, Any]], jobs: list[dict[str, Any]]) -> list[dic
     for case in job.CASES:
         row = {one["program"]: one for one in jobs if one["case"] == case}
         for peer in (MUJOCO_EULER, MUJOCO_IMPLICIT):
-            for ours in (DYNSIM_DEFAULT, DYNSIM_RK4):
+            for ours in (DYNSIM_DEFAULT, DYNSIM_RADAU5, DYNSIM_RK4):
                 entry = {"task": f"10 s job, {case}", "peer": peer, "dynsim": ours}
                 known = peer in row
                 for key, kind in (

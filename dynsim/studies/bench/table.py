@@ -8,7 +8,17 @@ from rich import box
 from rich.table import Table
 
 from dynsim.studies.bench import job
-from dynsim.studies.bench.programs import CONTENDERS, DYNSIM_DEFAULT, DYNSIM_RK4, MUJOCO_EULER, MUJOCO_IMPLICIT
+from dynsim.studies.bench.programs import (
+    CONTENDERS,
+    DYNSIM_DEFAULT,
+    DYNSIM_RADAU5,
+    DYNSIM_RK4,
+    EIGHT_LANES,
+    FOUR_LANES,
+    MUJOCO_EULER,
+    MUJOCO_IMPLICIT,
+    ONE_STATE,
+)
 
 
 def format_table(result: dict[str, Any]) -> list[Table]:
@@ -27,7 +37,7 @@ def format_table(result: dict[str, Any]) -> list[Table]:
     for case in job.CASES:
         whole.add_row(f"[bold]{case}[/bold]")
         by_program = {row["program"]: row for row in result["job"] if row["case"] == case}
-        for program in (DYNSIM_DEFAULT, DYNSIM_RK4, MUJOCO_EULER, MUJOCO_IMPLICIT):
+        for program in (DYNSIM_DEFAULT, DYNSIM_RADAU5, DYNSIM_RK4, MUJOCO_EULER, MUJOCO_IMPLICIT):
             row = by_program.get(program, {})
             whole.add_row(
                 f"  {program}{'' if row.get('same_physics', True) else ' *'}",
@@ -52,7 +62,14 @@ def format_table(result: dict[str, Any]) -> list[Table]:
                 task = row["task"]
                 ratios.add_row(f"[bold]{task.removeprefix('10 s job, ')}[/bold]")
             ratios.add_row(f"  {row['peer']}", *("" for _ in sizes), _number(row["time"]), _number(row["hand_error"]))
-    return [times, whole, ratios]
+
+    together = _table("States evaluated together, median µs of each", "")
+    names = (ONE_STATE, FOUR_LANES, EIGHT_LANES)
+    for name in names:
+        together.add_column(name, justify="right")
+    for row in result["together"]:
+        together.add_row(row["task"], *(_number(row["median_us"].get(name)) for name in names))
+    return [times, whole, ratios, together]
 
 
 def _table(title: str, first: str) -> Table:

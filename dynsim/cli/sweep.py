@@ -1,0 +1,134 @@
+"""``dynsim sweep``: many runs of one scenario, a table and figures of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from dynsim.cli.app import (
+    FigureFormat,
+    FiguresOption,
+    FormatOption,
+    QuietOption,
+    ScenarioArgument,
+    SetOption,
+    parsed_overrides,
+)
+from dynsim.cli.display import console, drawing, errors, sweep_progress
+from dynsim.errors import ScenarioError
+from dynsim.terminal import escaped
+
+if TYPE_CHECKING:
+    from dynsim.studies.plan import Plan
+    from dynsim.studies.sweep import Row
+
+# Reasons of failed runs that are printed.
+_SHOWN = 5
+
+
+class KeepRecords(StrEnum):
+    none = "none"
+    failed = "failed"
+    all = "all"
+
+
+def sweep(
+    scenario: ScenarioArgument,
+    grid: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KEY=start:stop:count", help="Values of a key, both ends included, or KEY=a,b; may be repeated."
+        ),
+    ] = None,
+    sample: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KEY=normal(m,s)",
+            help="Draw a key, also by uniform(a,b); `*` in it is every entry; may be repeated.",
+        ),
+    ] = None,
+    count: Annotated[int, typer.Option(metavar="N", min=1, help="Draws of each sample.")] = 1,
+    seed: Annotated[int, typer.Option(metavar="S", min=0, help="Of the draws.")] = 0,
+    variants: Annotated[
+        str | None, typer.Option(metavar="all|NAMES", help="Variants to run, by names with commas; default: the first.")
+    ] = None,
+    overrides: SetOption = None,
+    jobs: Annotated[int | None, typer.Option(metavar="N", min=1, help="Processes; default: one for each core.")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler whose workers run instead, tcp://HOST:PORT.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="For the files; default: results/SCENARIO/sweep.")
+    ] = None,
+    keep_records: Annotated[KeepRecords, typer.Option(help="Runs whose records are saved.")] = KeepRecords.none,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the sweep in the folder.")] = False,
+    no_figures: FiguresOption = False,
+    format_: FormatOption = FigureFormat.png,
+    quiet: QuietOption = False,
+) -> None:
+    """Simulate a scenario over a grid, and with samples, of its values; write a table of all runs and figures."""
+    from dynsim.files import check_writable
+    from dynsim.scenario import read_scenario
+    from dynsim.studies.plan import Axis, Law, Plan
+    from dynsim.studies.processes import cores
+    from dynsim.studies.sweep import JOURNAL, OK, PLAN, STATISTICS, TABLES, has_parquet, run_sweep
+
+    if jobs is not None and scheduler is not None:
+        raise ScenarioError("--jobs are processes of this machine, --scheduler has its own workers: give one of them")
+    file = read_scenario(scenario)
+    axes, laws = tuple(map(Axis.parse, grid or ())), tuple(map(Law.parse, sample or ()))
+    plan = Plan(file, _variants(file.variants, variants), parsed_overrides(overrides), axes, laws, count, seed)
+    folder = out or Path("results", file.path.stem, "sweep")
+    check_writable(folder, (PLAN, JOURNAL, *TABLES, STATISTICS))
+    with sweep_progress(plan.runs, quiet) as report:
+        rows = run_sweep(
+            plan,
+            folder,
+            jobs=min(jobs or cores(), plan.runs),
+            keep_records=keep_records.value,
+            resume=resume,
+            scheduler=scheduler,
+            progress=report,
+        )
+    failed = [row for row in rows if row.status != OK]
+    for row in failed[:_SHOWN]:
+        errors.print(f"run {row.run} {row.status}: {escaped(row.reason)}")
+    if len(failed) > _SHOWN:
+        errors.print(f"… and {len(failed) - _SHOWN} more; the table has all reasons")
+    if not no_figures:
+        _draw(rows, plan, folder, quiet, format_)
+    if not quiet:
+        if not has_parquet():
+            console.print(escaped("No Parquet: it needs pyarrow (pip install 'dynsim[tables]')."), highlight=False)
+        console.print(
+            f"{len(rows) - len(failed)} of {len(rows)} runs ended well. Written to {escaped(folder)}",
+            highlight=False,
+            soft_wrap=True,
+        )
+
+
+def _variants(known: Sequence[str], wanted: str | None) -> tuple[str | None, ...]:
+    if not known:
+        if wanted is not None:
+            raise ScenarioError(f"--variants {wanted}: the scenario has no variants")
+        return (None,)
+    if wanted is None:
+        return (known[0],)
+    return tuple(known) if wanted == "all" else tuple(name.strip() for name in wanted.split(","))
+
+
+def _draw(rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool, format_: str) -> None:
+    from dynsim.figures.sweep import Sweep, draw
+
+    table = Sweep(
+        plan.file.path.stem,
+        [row.cells() for row in rows if row.numbers],
+        [axis.key for axis in plan.grid],
+        plan.sampled,
+    )
+    with drawing(folder, quiet):
+        draw(table, folder, format_)

@@ -1,0 +1,117 @@
+"""Which method integrates a system: its fastest rate at the start against the pace of its motion.
+
+An explicit method of these orders is stable while h |λ| is below about 3, however smooth the motion; RADAU5 is held to
+its accuracy only. Of the spectrum of ∂(v, v̇, di/dt)/∂(q, v, i) at the start the part that can hold steps counts, that
+of drives and losses, linear and under the constraints that hold there:
+
+    v̇ = W (∂τ/∂(q, v, i) − diag(D))       W = M⁻¹ − M⁻¹ Aᵀ (A M⁻¹ Aᵀ)⁺ A M⁻¹,  A: contacts and couplings
+
+Gravity and what grows with the speed are as slow as the motion itself. Nothing is timed: the choice is the same on
+every machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.drive.dc import dc_block
+from dynsim.kernels.drive.servo import servo_block
+from dynsim.model.control import JointControl
+from dynsim.model.description import Array, Contact
+from dynsim.model.model import Model
+from dynsim.model.posture import gaps_and_rates
+from dynsim.scenario.schema import Integrator
+
+AUTO = "auto"
+PACE = 0.02
+"""Step that the accuracy of an arm's motion allows at least [s]."""
+TOUCHING = 1e-6
+"""Contacts nearer than this hold at the start [m]."""
+TIGHT = 1e-8
+"""Relative tolerance from which on fewer steps of order five outweigh their cost."""
+
+DENSE = 300
+"""Size of matrices up to which all eigenvalues are found at once; of larger ones only the largest."""
+
+
+class Choice(NamedTuple):
+    """A method, and why."""
+
+    method: str
+    reason: str
+
+
+def choose(
+    options: Integrator, model: Model, contacts: Sequence[Contact], control: JointControl, drives: ka.DriveArrays
+) -> Choice:
+    """The method that ``integrator.method`` names, or for ``auto`` the one that suits the system."""
+    if options.method != AUTO:
+        return Choice(options.method, "named in the scenario")
+    pace = min(PACE, control.sample_time or PACE, options.step_max_s or PACE)
+    rate = fastest_rate(model, contacts, drives)
+    told = f"fastest rate {rate:.3g} 1/s, steps of {1e3 * pace:.3g} ms"
+    if rate * pace > worth_it(model.n):
+        return Choice("radau5", f"{told}: an implicit method is not held by it")
+    if 0.0 < rate * pace < 1.0 and options.rtol <= TIGHT:
+        return Choice("dopri5", f"{told} and a tight tolerance: accuracy holds the steps, and losses damp its errors")
+    return Choice("rk43", f"{told}: an explicit method takes them")
+
+
+def worth_it(n: int) -> float:
+    """h |λ| above which a step of RADAU5 costs less than the steps of RK4(3) that it replaces.
+
+    Those take four right-hand sides for each 2.8/|λ|. It takes about twenty, and at every eleventh step a Jacobian of
+    2 n columns and factors of n × n matrices: n³ multiplications in the time of 100 n right-hand sides of a link.
+    """
+    return (20.0 + (2.0 * n + 0.03 * n**2) / 11.0) * 2.8 / 4.0
+
+
+def fastest_rate(model: Model, contacts: Sequence[Contact], drives: ka.DriveArrays) -> float:
+    """Largest |λ| of drives and losses at the start, at rest [1/s]."""
+    n, q = model.n, model.robot.initial
+    circuits = int(model.robot.circuits)
+    force = np.zeros((n, 2 * n + circuits))
+    A = np.zeros((2 * n + circuits, 2 * n + circuits))
+    A[:n, n : 2 * n] = np.eye(n)
+    force[:, n : 2 * n] = -np.diag(model.damping)
+    for a in range(len(drives.table)):
+        kind, j, sampled = drives.table[a, ka.DRIVE_KIND], drives.table[a, ka.DRIVEN], drives.table[a, ka.SAMPLED] != 0
+        if kind == ka.DC_MOTOR:
+            e = 2 * n + drives.table[a, ka.CIRCUIT]
+            block = dc_block(drives.motor, a, 0.0 if sampled else 1.0)
+            force[j, [j, n + j, e]] += block[:3]
+            A[e, [j, n + j, e]] = block[3:]
+        elif kind == ka.POSITION_SERVO:
+            force[j, [j, n + j]] += servo_block(drives.motor, a, drives.table[a, ka.SERVO_MODE], sampled, 0.0, 0.0)
+    if not force.any():
+        return 0.0
+    mobility = np.linalg.inv(model.mass_matrix(q) + np.diag(model.armature))
+    held = _held(model, contacts, q)
+    if len(held):
+        through = mobility @ held.T
+        mobility = mobility - through @ np.linalg.pinv(held @ through) @ through.T
+    A[n : 2 * n] = mobility @ force
+    return _spectral_radius(A)
+
+
+def _spectral_radius(A: Array) -> float:
+    if len(A) <= DENSE:
+        return float(np.abs(np.linalg.eigvals(A)).max())
+    from scipy.sparse.linalg import eigs  # here, because short chains do without
+
+    start = np.random.default_rng(0).normal(size=len(A))
+    return float(np.abs(eigs(A, k=1, v0=start, tol=1e-2, return_eigenvectors=False)[0]))
+
+
+def _held(model: Model, contacts: Sequence[Contact], q: Array) -> Array:
+    """Rows of what does not move at the start, (p, n): contacts that touch, along their normals, and couplings."""
+    gaps, rates = gaps_and_rates(model, contacts, q)
+    joints = {link.joint: i for i, link in enumerate(model.robot.links)}
+    coupled = np.zeros((len(model.robot.couplings), model.n))
+    for row, coupling in zip(coupled, model.robot.couplings, strict=True):
+        row[joints[coupling.joint]], row[joints[coupling.leader]] = 1.0, -coupling.ratio
+    return np.vstack([rates[np.abs(gaps) < TOUCHING], coupled])

@@ -1,0 +1,328 @@
+"""Many runs of one scenario: numbers over the grid, energy against error, distributions and sensitivities of samples.
+
+Drawn from the table alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dynsim.figures import style
+from dynsim.figures.style import Array
+from dynsim.sensitivity import LEVEL, sensitivities, spread
+
+ENERGY = "electrical_energy_J"
+# Label, and what the number is multiplied by for it. The first error that the table has is drawn.
+ENERGIES = {ENERGY: ("electrical energy [J]", 1.0)}
+ERRORS = {
+    "hand_error_rms_m": ("hand error, rms [mm]", 1e3),
+    "final_position_error_m": ("final position error [mm]", 1e3),
+}
+# Parameters of a tornado, and bars of a histogram.
+_BARS, _BINS = 12, 40
+# Values whose ratio is larger are of very different size.
+_WIDE = 8.0
+# Height of a panel, of a bar of a tornado, and of what is about them [inch].
+_PANEL, _BAR, _ROOM = 2.1, 0.22, 0.9
+# A label of an axis is not longer [characters].
+_LABEL = 34
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A table of runs.
+
+    Attributes
+    ----------
+    name : of the scenario
+    rows : numbers and values by column, of the runs that have some
+    grid, sampled : columns that were varied
+    """
+
+    name: str
+    rows: Sequence[Mapping[str, Any]]
+    grid: Sequence[str]
+    sampled: Sequence[str]
+
+    @property
+    def variants(self) -> list[str]:
+        """In the order of the table; one without a name where there are none."""
+        return list(dict.fromkeys(str(row.get("variant", "")) for row in self.rows))
+
+    @property
+    def metrics(self) -> dict[str, tuple[str, float]]:
+        """Energy and error, as far as the table has them."""
+        energies = {key: look for key, look in ENERGIES.items() if self._has(key)}
+        errors = [key for key in ERRORS if self._has(key)][:1]
+        return energies | {key: ERRORS[key] for key in errors}
+
+    def _has(self, key: str) -> bool:
+        return any(row.get(key) is not None for row in self.rows)
+
+    def of(self, variant: str) -> list[Mapping[str, Any]]:
+        """Rows of one variant."""
+        return [row for row in self.rows if str(row.get("variant", "")) == variant]
+
+
+def draw(sweep: Sweep, folder: Path, kind: str = "png") -> list[Path]:
+    """Every figure that the table has data for; returns the files.
+
+    Raises
+    ------
+    RecordError
+        A file cannot be written.
+    """
+    makers = {
+        "sweep_lines": lines,
+        "sweep_map": heat_map,
+        "sweep_pareto": pareto,
+        "sweep_samples": samples,
+        "sweep_tornado": tornado,
+    }
+    return style.save_all(makers, sweep, folder, kind) if sweep.rows and sweep.metrics else []
+
+
+def lines(sweep: Sweep) -> Figure | None:
+    """Energy and error over the only key of the grid, or else the first; None without a grid, or with two keys."""
+    if len(sweep.grid) != 1:
+        return None
+    (key,) = sweep.grid
+    styles, metrics = style.variant_styles(sweep.variants), sweep.metrics
+    figure = style.new_figure(_PANEL * len(metrics) + _ROOM, f"{sweep.name}: over {key}")
+    panels = figure.subplots(len(metrics), 1, sharex=True, squeeze=False)[:, 0]
+    levels = _levels(sweep.rows, key)
+    at = _places(levels)
+    for axes, (metric, (label, scale)) in zip(panels, metrics.items(), strict=True):
+        for variant in sweep.variants:
+            look, name = styles[variant], variant or None
+            groups = [_values(_at(sweep.of(variant), {key: level}), metric) * scale for level in levels]
+            means = np.array([group.mean() if len(group) else np.nan for group in groups])
+            axes.plot(at, means, marker="o", markersize=3, label=name, clip_on=False, **look)
+            if any(len(group) > 1 for group in groups):
+                limits = np.array(
+                    [np.quantile(group, [0.025, 0.975]) if len(group) else (np.nan,) * 2 for group in groups]
+                )
+                axes.fill_between(at, *limits.T, color=look["color"], alpha=0.15, linewidth=0)
+        axes.set_ylabel(label)
+        _scale(axes, "y", scale * _values(sweep.rows, metric))
+    _name_places(panels[-1], "x", key, levels)
+    if len(sweep.variants) > 1:
+        style.legend_above(panels[0], columns=4)
+    return figure
+
+
+def heat_map(sweep: Sweep) -> Figure | None:
+    """Energy and error over the first two keys of the grid, for each variant; the mean over all else."""
+    if len(sweep.grid) < 2:
+        return None
+    x, y = sweep.grid[:2]
+    metrics, variants = sweep.metrics, sweep.variants
+    others = [*sweep.grid[2:], *sweep.sampled]
+    note = f" (mean over {_short(', '.join(others))})" if others else ""
+    figure = style.new_figure(_PANEL * len(variants) + _ROOM, f"{sweep.name}: over {x} and {y}{note}")
+    panels = figure.subplots(len(variants), len(metrics), squeeze=False, sharex=True, sharey=True)
+    xs, ys = _levels(sweep.rows, x), _levels(sweep.rows, y)
+    for column, (metric, (label, scale)) in zip(panels.T, metrics.items(), strict=True):
+        tables = [np.full((len(ys), len(xs)), np.nan) for _ in variants]
+        for table, variant in zip(tables, variants, strict=True):
+            for j, b in enumerate(ys):
+                for i, a in enumerate(xs):
+                    found = _values(_at(sweep.of(variant), {x: a, y: b}), metric) * scale
+                    table[j, i] = found.mean() if len(found) else np.nan
+        low, high = np.nanmin(tables), np.nanmax(tables)
+        for axes, table, variant in zip(column, tables, variants, strict=True):
+            image = axes.imshow(table, origin="lower", aspect="auto", cmap="viridis", vmin=low, vmax=high)
+            axes.grid(visible=False)
+            axes.set_facecolor(style.GREY)
+            axes.set_title(variant)
+            _name_cells(axes, "y", y, ys)
+            _name_cells(axes, "x", x, xs)
+        figure.colorbar(image, ax=list(column), label=label)
+    for axes in panels[:, 1:].flat:
+        axes.set_ylabel("")
+    for axes in panels[:-1].flat:
+        axes.set_xlabel("")
+    return figure
+
+
+def pareto(sweep: Sweep) -> Figure | None:
+    """Energy against error of all runs, and those that no other run beats in both; None where the table lacks one."""
+    if len(sweep.metrics) < 2:
+        return None
+    (energy, (energy_label, _)), (error, (error_label, scale)) = sweep.metrics.items()
+    figure = style.new_figure(3.6, f"{sweep.name}: energy against error, {len(sweep.rows)} runs")
+    axes = figure.subplots()
+    styles = style.variant_styles(sweep.variants)
+    for variant in sweep.variants:
+        found = [
+            (row[error], row[energy]) for row in sweep.of(variant) if None not in (row.get(error), row.get(energy))
+        ]
+        xs, ys = np.array(found, dtype=float).reshape(-1, 2).T
+        size = 14 if len(sweep.rows) < 500 else 4
+        axes.scatter(
+            scale * xs, ys, s=size, color=styles[variant]["color"], label=variant or None, linewidths=0, zorder=3
+        )
+    rows = [row for row in sweep.rows if None not in (row.get(error), row.get(energy))]
+    front = best([(scale * row[error], row[energy]) for row in rows])
+    axes.plot(
+        *front.T,
+        color=style.BLACK,
+        linewidth=0.7,
+        marker="o",
+        markersize=5,
+        markerfacecolor="none",
+        label="no run is better in both",
+    )
+    axes.margins(0.05)
+    axes.set(xlabel=error_label, ylabel=energy_label)
+    _scale(axes, "x", np.array([scale * row[error] for row in rows]))
+    _scale(axes, "y", np.array([row[energy] for row in rows]))
+    axes.legend()
+    return figure
+
+
+def best(points: Sequence[tuple[float, float]]) -> Array:
+    """Points that no other one is below in one coordinate and not above in the other, by the first, (k, 2)."""
+    found: list[tuple[float, float]] = []
+    for x, y in sorted(points):
+        if not found or y < found[-1][1]:
+            found.append((x, y))
+    return np.array(found).reshape(-1, 2)
+
+
+def samples(sweep: Sweep) -> Figure | None:
+    """Distribution of energy and error over the samples, a row for each variant; None without samples."""
+    if not sweep.sampled:
+        return None
+    metrics, variants = sweep.metrics, sweep.variants
+    note = f"; mean over {_short(', '.join(sweep.grid))}" if sweep.grid else ""
+    figure = style.new_figure(
+        _PANEL * len(variants) + _ROOM, f"{sweep.name}: {len(sweep.rows)} runs by the law of their parameters{note}"
+    )
+    panels = figure.subplots(len(variants), len(metrics), squeeze=False)
+    styles = style.variant_styles(variants)
+    for row, variant in zip(panels, variants, strict=True):
+        for axes, (metric, (label, scale)) in zip(row, metrics.items(), strict=True):
+            values = _values(sweep.of(variant), metric) * scale
+            axes.set_xlabel(label)
+            axes.set_ylabel("runs")
+            if len(values) < 2:
+                continue
+            axes.hist(values, bins=min(_BINS, max(len(values) // 5, 5)), color=styles[variant]["color"], alpha=0.7)
+            one = spread(values)
+            axes.axvline(one.mean, color=style.BLACK, linewidth=1.0)
+            for limit in (one.low, one.high):
+                axes.axvline(limit, color=style.BLACK, linewidth=0.8, linestyle=(0, (4, 2)))
+            half = style.number(one.mean_high - one.mean, 2)
+            axes.set_title(
+                f"{variant + ': ' if variant else ''}mean {style.number(one.mean, 5)} ± {half}, "
+                f"{100 * LEVEL:g} % in {style.number(one.low)} … {style.number(one.high)}",
+                fontsize=7.5,
+            )
+            axes.margins(x=0.03)
+    return figure
+
+
+def tornado(sweep: Sweep) -> Figure | None:
+    """What one standard deviation of each sampled key does to energy and error; None where no line can be fitted."""
+    found = {
+        (variant, metric): fit
+        for variant in sweep.variants
+        for metric in sweep.metrics
+        if (fit := _fit(sweep, variant, metric)) is not None
+    }
+    if not found:
+        return None
+    variants, metrics = sweep.variants, sweep.metrics
+    bars = min(len(sweep.sampled), _BARS)
+    figure = style.new_figure(
+        (_BAR * bars + _ROOM) * len(variants) + 0.5, f"{sweep.name}: what one standard deviation of each does"
+    )
+    panels = figure.subplots(len(variants), len(metrics), squeeze=False)
+    for row, variant in zip(panels, variants, strict=True):
+        for axes, (metric, (label, scale)) in zip(row, metrics.items(), strict=True):
+            axes.set_xlabel(f"change of {label}")
+            fit = found.get((variant, metric))
+            if fit is None:
+                axes.set_title(f"{variant}: no line fits")
+                continue
+            order = np.argsort(-np.abs(fit.effect), kind="stable")[:bars][::-1]
+            effect, half = scale * fit.effect[order], scale * fit.half_width[order]
+            colours = [style.BLUE if one > 0.0 else style.ORANGE for one in effect]
+            axes.barh(range(len(order)), effect, xerr=half, color=colours, height=0.7, error_kw={"elinewidth": 0.8})
+            axes.set_yticks(range(len(order)), [_short(sweep.sampled[k]) for k in order])
+            axes.axvline(0.0, color=style.BLACK, linewidth=0.6)
+            axes.grid(visible=False, axis="y")
+            axes.margins(x=0.05)
+            explained = f"a line explains {100.0 * fit.explained:.3g} % of the variance"
+            axes.set_title(f"{variant + ': ' if variant else ''}{explained}", fontsize=7.5)
+    return figure
+
+
+def _fit(sweep: Sweep, variant: str, metric: str) -> Any:
+    rows = [row for row in sweep.of(variant) if row.get(metric) is not None]
+    if not rows or not sweep.sampled:
+        return None
+    parameters = np.array([[row[key] for key in sweep.sampled] for row in rows], dtype=float)
+    values = np.array([row[metric] for row in rows], dtype=float)
+    # What the grid does is not what the samples do.
+    for place in {tuple(map(str, (row[key] for key in sweep.grid))) for row in rows}:
+        here = np.array([tuple(map(str, (row[key] for key in sweep.grid))) == place for row in rows])
+        values[here] -= values[here].mean()
+    return sensitivities(parameters, values)
+
+
+def _levels(rows: Sequence[Mapping[str, Any]], key: str) -> list[Any]:
+    """Values of a key of the grid: numbers by size, others as they come."""
+    found = list({str(row[key]): row[key] for row in rows}.values())
+    return sorted(found) if _numeric(found) else found
+
+
+def _numeric(levels: Sequence[Any]) -> bool:
+    return all(isinstance(level, (int, float)) and not isinstance(level, bool) for level in levels)
+
+
+def _places(levels: Sequence[Any]) -> Array:
+    return np.array(levels, dtype=float) if _numeric(levels) else np.arange(float(len(levels)))
+
+
+def _name_places(axes: Axes, which: str, key: str, levels: Sequence[Any]) -> None:
+    axes.set(**{f"{which}label": key})
+    if not _numeric(levels):
+        axes.set_xticks(range(len(levels)), list(map(str, levels)))
+
+
+def _name_cells(axes: Axes, which: str, key: str, levels: Sequence[Any]) -> None:
+    """Name the rows or columns of an image: at most about eight of them."""
+    shown = range(0, len(levels), -(-len(levels) // 8))
+    texts = [f"{levels[k]:.3g}" if _numeric(levels) else str(levels[k]) for k in shown]
+    axes.set(**{f"{which}ticks": list(shown), f"{which}ticklabels": texts, f"{which}label": _short(key)})
+
+
+def _at(rows: Sequence[Mapping[str, Any]], place: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    return (row for row in rows if all(row[key] == value for key, value in place.items()))
+
+
+def _values(rows: Sequence[Mapping[str, Any]] | Iterator[Mapping[str, Any]], metric: str) -> Array:
+    return np.array([row[metric] for row in rows if row.get(metric) is not None], dtype=float)
+
+
+def _scale(axes: Axes, which: str, values: Array) -> None:
+    """A logarithmic axis for positive values of very different size; else one from zero, unless that squeezes them."""
+    values = values[np.isfinite(values)]
+    low, high = values.min(initial=np.inf), values.max(initial=-np.inf)
+    if low > 0.0 and high > _WIDE * low:
+        style.log_axis(axes, which)
+    elif 0.0 <= low < 0.7 * high:
+        axes.set(**{f"{which}lim": (0.0, 1.05 * high)})
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _LABEL else f"…{text[1 - _LABEL :]}"

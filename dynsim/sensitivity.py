@@ -1,0 +1,81 @@
+"""Numbers of many runs: their mean with its interval, their spread, and what each sampled parameter does to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+Array = NDArray[np.float64]
+
+# Of all intervals.
+LEVEL = 0.95
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A number over samples.
+
+    Attributes
+    ----------
+    count : samples
+    mean : of them; ``mean_low``, ``mean_high``: its interval at ``LEVEL``, by Student's t
+    deviation : standard deviation of the samples
+    low, high : the samples' own interval at ``LEVEL``, by their quantiles
+    """
+
+    count: int
+    mean: float
+    mean_low: float
+    mean_high: float
+    deviation: float
+    low: float
+    high: float
+
+
+def spread(values: Array) -> Spread:
+    """Mean and spread of samples, (N,) with N ≥ 2: x̄ ± t(N − 1) s/√N."""
+    count, mean, deviation = len(values), float(values.mean()), float(values.std(ddof=1))
+    half = float(stdtrit(count - 1, 0.5 + 0.5 * LEVEL)) * deviation / np.sqrt(count)
+    low, high = np.quantile(values, [0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL])
+    return Spread(count, mean, mean - half, mean + half, deviation, float(low), float(high))
+
+
+@dataclass(frozen=True)
+class Sensitivities:
+    """The linear model y = b_0 + Σ b_j (x_j − x̄_j)/s_j of a number, by least squares.
+
+    Attributes
+    ----------
+    effect : (k,) b_j, what one standard deviation s_j of each parameter does to the number
+    half_width : (k,) of the intervals at ``LEVEL`` about them, by Student's t
+    explained : share of the number's variance that the model has, R²
+    """
+
+    effect: Array
+    half_width: Array
+    explained: float
+
+
+def sensitivities(parameters: Array, values: Array) -> Sensitivities | None:
+    """Fit parameters (N, k) to values (N,).
+
+    None where that has no answer: no more samples than coefficients, a parameter or a value that does not vary, or
+    parameters that depend on each other.
+    """
+    count, size = parameters.shape
+    free, deviations = count - size - 1, parameters.std(axis=0, ddof=1) if count > 1 else np.zeros(size)
+    total = float(((values - values.mean()) ** 2).sum())
+    if free < 1 or not deviations.all() or total == 0.0:
+        return None
+    scaled = np.column_stack([np.ones(count), (parameters - parameters.mean(axis=0)) / deviations])
+    normal = scaled.T @ scaled
+    if np.linalg.matrix_rank(scaled) <= size:
+        return None
+    inverse = np.linalg.inv(normal)
+    found = inverse @ (scaled.T @ values)
+    rest = float(((values - scaled @ found) ** 2).sum())
+    half = float(stdtrit(free, 0.5 + 0.5 * LEVEL)) * np.sqrt(np.diag(inverse) * rest / free)
+    return Sensitivities(found[1:], half[1:], 1.0 - rest / total)

@@ -1,0 +1,118 @@
+"""Work on a Dask cluster: its scheduler keeps it, its workers do it, results stream back.
+
+Whatever else a cluster does (start, retries after a worker's death, adaptive scaling) is left to Dask.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+from dynsim import interruption
+from dynsim._version import __version__
+from dynsim.engine import SIMULATION, Progress
+from dynsim.errors import DynsimError
+from dynsim.studies.batch import LOST, RunResult
+
+Task = TypeVar("Task")
+
+# Until the scheduler answers [s].
+_CONNECT_S = 10.0
+# Of one piece of work [s]: long beside what the scheduler needs for it (1 ms), short for a cluster to be even.
+_PIECE_S = 1.0
+_PIECE_MOST = 64
+# Pieces that are out at a time: some for each thread of the cluster, and enough for it to grow by.
+_OUT_EACH, _OUT_LEAST = 3, 64
+
+# Runs of one process do not share its interpreter: threads of a worker would only wait for each other.
+_one_at_a_time = threading.Lock()
+
+
+class ClusterError(DynsimError):
+    """No Dask, no scheduler, or workers that cannot do the work."""
+
+
+def run_on_cluster(
+    work: Callable[[Task, Progress], RunResult],
+    tasks: Sequence[Task],
+    take: Callable[[Task, RunResult], None],
+    address: str,
+) -> bool:
+    """Do ``work`` for all tasks on the workers of a scheduler, see :func:`dynsim.studies.batch.run_all`.
+
+    Tasks go in pieces of about a second, measured as they come back. A piece whose workers died again and again is
+    taken apart, and what is left of it in the end is lost.
+
+    Raises
+    ------
+    ClusterError
+        Dask is not installed, no scheduler answers at the address, or a worker has no dynsim or another version.
+    """
+    try:
+        from distributed import Client, KilledWorker, as_completed
+    except ImportError as error:
+        raise ClusterError("a scheduler needs Dask: pip install 'dynsim[cluster]'") from error
+    try:
+        client: Any = Client(address, timeout=_CONNECT_S, set_as_default=False)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise ClusterError(f"no Dask scheduler answers at {address} ({' '.join(str(error).split())})") from error
+    waiting, out = deque(tasks), dict[Any, list[Task]]()
+    wall = _PIECE_S
+
+    def submit(piece: list[Task]) -> Any:
+        future = client.submit(_work_through, work, piece, __version__, pure=False)
+        out[future] = piece
+        return future
+
+    def hand_out() -> list[Any]:
+        threads = sum(worker["nthreads"] for worker in client.scheduler_info(n_workers=-1)["workers"].values())
+        size = min(max(round(_PIECE_S / max(wall, 1e-9)), 1), _PIECE_MOST)
+        futures = []
+        while waiting and len(out) < max(_OUT_LEAST, _OUT_EACH * threads):
+            futures.append(submit([waiting.popleft() for _ in range(min(size, len(waiting)))]))
+        return futures
+
+    with client:
+        try:
+            queue = as_completed(hand_out(), loop=client.loop)
+            for future in queue:
+                interruption.keep()
+                piece = out.pop(future)
+                try:
+                    results = future.result()
+                except KilledWorker:
+                    if len(piece) == 1:
+                        take(piece[0], RunResult({}, f"{LOST}, on several workers", lost=True))
+                    else:
+                        queue.update([submit([task]) for task in piece])
+                except ImportError as error:
+                    raise ClusterError(
+                        f"a worker of {address} cannot load dynsim ({error}); install it there"
+                    ) from error
+                else:
+                    wall = sum(result.wall_s for result in results) / len(results)
+                    for task, result in zip(piece, results, strict=True):
+                        take(task, result)
+                future.release()
+                queue.update(hand_out())
+                interruption.heed()
+                interruption.check()
+        except KeyboardInterrupt:
+            interruption.answered()
+            client.cancel(list(out))
+            return True
+    return False
+
+
+def _work_through(work: Callable[[Task, Progress], RunResult], tasks: Sequence[Task], version: str) -> list[RunResult]:
+    """On a worker: what there is to do for each task."""
+    if version != __version__:
+        raise ClusterError(f"a worker has dynsim {__version__}, this is {version}; install the same on all")
+    with _one_at_a_time:
+        return [work(task, _no_look) for task in tasks]
+
+
+def _no_look(time: float, stage: str = SIMULATION) -> None:
+    """Dask ends a process that shall stop."""

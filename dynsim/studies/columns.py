@@ -1,0 +1,37 @@
+"""Summaries as columns of tables: one level of names, numbers only."""
+
+from __future__ import annotations
+
+from typing import Any
+
+# Names, which the table has elsewhere, and times of the machine, which no two runs share.
+_NOT_OF_THE_RUN = ("scenario", "variant", "dynsim_version", "integration_wall_s", "real_time_factor")
+
+
+def flat(summary: dict[str, Any]) -> dict[str, Any]:
+    """A summary whose numbers of a mobile base stand beside the others, under ``base.…``."""
+    base = dict(summary.get("base", {}))
+    for key in [key for key, value in base.items() if isinstance(value, dict)]:
+        base.update({f"{key}.{name}": value for name, value in base.pop(key).items()})
+    return summary | {f"base.{key}": value for key, value in base.items()}
+
+
+def is_text(value: Any) -> bool:
+    """True for what no column of numbers takes."""
+    return isinstance(value, str)
+
+
+def is_scalar(value: Any) -> bool:
+    """True for a number, a text or nothing."""
+    return value is None or isinstance(value, (int, float, str))
+
+
+def numbers(summary: dict[str, Any]) -> dict[str, Any]:
+    """All numbers of a summary that do not depend on the machine; those of contacts under ``CONTACT.…``."""
+    found = {key: value for key, value in flat(summary).items() if is_scalar(value) and not is_text(value)}
+    for key, value in summary.items():
+        if isinstance(value, dict) and key != "base":
+            found |= {f"{key}.{name}": one for name, one in value.items() if is_scalar(one) and not is_text(one)}
+    for contact in summary.get("contacts", ()):
+        found |= {f"{contact['name']}.{key}": value for key, value in contact.items() if not is_text(value)}
+    return {key: value for key, value in found.items() if value is not None and key not in _NOT_OF_THE_RUN}

@@ -1,0 +1,91 @@
+"""``integrator.method: auto``: the fastest rate of a system at its start, and what is chosen by it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dynsim import Scenario, load_scenario, simulate
+from dynsim.engine.method import fastest_rate
+from dynsim.engine.prepare import prepare
+from dynsim.kernels.state import block
+from dynsim.kernels.system import derivative
+from dynsim.scenario import scenario_from_resolved
+
+
+def chosen(scenario: Scenario) -> str:
+    return prepare(scenario, end=0.01, times=np.array([0.0])).choice.method
+
+
+def shipped(name: str, variant: str | None = None, **changes: Any) -> Scenario:
+    return load_scenario(name, variant, {"duration_s": 0.01, "integrator.method": "auto", **changes})
+
+
+def chain(links: int = 2, **more: Any) -> Scenario:
+    link = {"axis": "y", "length_m": 0.5, "radius_m": 0.01, "mass_kg": 1.0, "initial_deg": 30}
+    joint = more.pop("joint", {})
+    more["integrator"] = {"method": "auto", **more.get("integrator", {})}
+    plant = {"type": "serial_arm", "chain": [link | joint for _ in range(links)]}
+    return scenario_from_resolved({"name": "chain", "duration_s": 0.01, "plant": plant, **more})
+
+
+@pytest.mark.parametrize("variant", ["no_elbow", "elbow_7", "two_elbows"])
+def test_the_fastest_rate_is_that_of_the_right_hand_side(variant: str) -> None:
+    """Differences of the kernels' derivative, with gravity in it, which is slow."""
+    prepared = prepare(shipped("elbow_comparison", variant, **{"contacts.friction": 0.0}))
+    system, y = prepared.system, prepared.run.y.copy()
+    places = [k for name in ("q", "v", "current") for k in range(len(y))[block(system.layout, name)]]
+    low, high = np.zeros(len(y)), np.zeros(len(y))
+    columns = []
+    for k in places:
+        h = 1e-6
+        y[k] += h
+        derivative(system, 0.0, y, prepared.workspace, high)
+        y[k] -= 2 * h
+        derivative(system, 0.0, y, prepared.workspace, low)
+        y[k] += h
+        columns.append((high - low)[places] / (2 * h))
+    rate = np.abs(np.linalg.eigvals(np.array(columns).T)).max()
+    found = fastest_rate(prepared.model, prepared.contacts, prepared.system.drives)
+    assert found == pytest.approx(rate, rel=0.003)
+
+
+def test_motors_are_integrated_implicitly_and_the_summary_says_why() -> None:
+    record = simulate(shipped("elbow_comparison", "two_elbows"))
+    assert record.summary["method"] == "radau5"
+    assert "fastest rate 1.93e+03 1/s, steps of 20 ms" in record.summary["method_reason"]
+
+
+def test_what_is_named_is_taken() -> None:
+    for method in ("rk43", "dopri5", "rk4", "radau5"):
+        assert chosen(shipped("elbow_comparison", "no_elbow", **{"integrator.method": method})) == method
+
+
+def test_passive_systems_stay_with_rk43() -> None:
+    """It keeps their energy to the tolerance, which dopri5 does not."""
+    assert chosen(chain()) == "rk43"
+    assert chosen(chain(integrator={"rtol": 1e-10, "atol": 1e-12})) == "rk43"
+
+
+def test_slow_losses_and_a_tight_tolerance_are_for_order_five() -> None:
+    damped = {"damping_N_m_s_per_rad": 0.1}
+    assert chosen(chain(joint=damped)) == "rk43"
+    assert chosen(chain(joint=damped, integrator={"rtol": 1e-9, "atol": 1e-11})) == "dopri5"
+
+
+def test_fast_losses_without_motors_are_integrated_implicitly() -> None:
+    assert chosen(chain(joint={"damping_N_m_s_per_rad": 500.0})) == "radau5"
+
+
+def test_short_steps_of_a_sampled_controller_or_a_limit_are_for_explicit_methods() -> None:
+    assert chosen(shipped("elbow_comparison", "no_elbow", **{"integrator.step_max_s": 1e-3})) == "rk43"
+    assert chosen(shipped("elbow_comparison", "no_elbow", **{"controller.sample_time_s": 1e-3})) == "rk43"
+
+
+def test_the_largest_rate_of_a_long_chain_is_found_without_all_others() -> None:
+    prepared = prepare(chain(links=160, joint={"damping_N_m_s_per_rad": 0.5, "length_m": 0.02}))
+    mobility = np.linalg.inv(prepared.model.mass_matrix(prepared.model.robot.initial))
+    rate = np.linalg.eigvalsh(0.5 * mobility).max()
+    assert fastest_rate(prepared.model, [], prepared.system.drives) == pytest.approx(rate, rel=0.02)

@@ -1,0 +1,391 @@
+"""Sweeps: what is run, that it is what single runs give, and that nothing which ends it takes other runs with it."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.stats
+from hypothesis import given
+from hypothesis import strategies as st
+from processes import started, wait_for
+from sweep_work import DEADLY, REFUSED, once_deadly, square
+
+import dynsim
+from dynsim.errors import DynsimError, ScenarioError
+from dynsim.figures import sweep as pictures
+from dynsim.record import Record
+from dynsim.scenario import read_scenario
+from dynsim.sensitivity import sensitivities, spread
+from dynsim.studies import sweep as module
+from dynsim.studies.columns import numbers
+from dynsim.studies.plan import Axis, Law, Plan
+from dynsim.studies.processes import WorkerLost, run_in_processes
+from dynsim.studies.sweep import run_sweep
+
+PENDULUM = read_scenario("single_pendulum")
+SHORT = {"duration_s": 0.2}
+LENGTH = "plant.chain.0.length_m"
+# No link has the second.
+MASSES = Axis("plant.chain.0.mass_kg", (1.0, -1.0, 2.0))
+
+
+def plan(*grid: Axis, laws: tuple[Law, ...] = (), count: int = 1, seed: int = 0) -> Plan:
+    return Plan(PENDULUM, (None,), SHORT, grid, laws, count, seed)
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("a.b=0:1:5", (0.0, 0.25, 0.5, 0.75, 1.0)),
+        ("a=0.1:0.4:4", (0.1, 0.2, 0.3, 0.4)),
+        ("a=-1e-3:1e-3:3", (-1e-3, 0.0, 1e-3)),
+        ("a=0.1,0.2", (0.1, 0.2)),
+        ("a=rk43,radau5", ("rk43", "radau5")),
+        ("a=3", (3,)),
+        ("a=[0, 1],[1, 0]", ([0, 1], [1, 0])),
+    ],
+)
+def test_values_of_a_grid(text: str, values: tuple[Any, ...]):
+    assert Axis.parse(text).values == values
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Axis.parse("contacts.friction"), "must look like"),
+        (lambda: Axis.parse("a=0:1:1"), "2 or more"),
+        (lambda: Axis.parse("a=1,1"), "a value twice"),
+        (lambda: Law.parse("a=cauchy(0,1)"), r"laws: normal\(mean, standard deviation\), uniform"),
+        (lambda: Law.parse("a=normal(1,0)"), "spread that is positive"),
+        (lambda: Law.parse("a=uniform(2,1)"), "spread that is positive"),
+        (lambda: plan(), "nothing to sweep"),
+        (lambda: plan(MASSES, MASSES), "varied twice"),
+        (lambda: plan(MASSES, count=3), "all runs would be the same"),
+        (lambda: list(plan(laws=(Law.parse("loads.*.mass_kg=uniform(1,2)"),)).points()), "no entries"),
+    ],
+)
+def test_what_is_no_sweep_is_refused(make: Callable[[], Any], message: str):
+    with pytest.raises(ScenarioError, match=message):
+        make()
+
+
+def test_runs_are_variants_by_grid_by_samples():
+    law = Law.parse("plant.link.mass_kg=normal(0.1,0.005)")
+    swept = Plan(read_scenario("elbow_comparison"), ("elbow_7", "no_elbow"), {}, (Axis.parse("a=1,2"),), (law,), 3)
+    points = list(swept.points())
+    assert [point.run for point in points] == list(range(swept.runs)) == list(range(12))
+    assert [point.variant for point in points] == ["elbow_7"] * 6 + ["no_elbow"] * 6
+    assert [point.values["a"] for point in points[:6]] == [1, 1, 1, 2, 2, 2]
+    # The same samples at every place, so that places differ by nothing else.
+    drawn = [point.values[law.key] for point in points]
+    assert drawn == drawn[:3] * 4
+    assert len(set(drawn)) == 3
+
+
+def test_samples_depend_on_their_key_and_seed_alone():
+    mass, damping = Law("m", "normal", (1.0, 0.1)), Law("d", "uniform", (0.0, 1.0))
+
+    def drawn(*laws: Law, count: int = 4, seed: int = 1) -> list[Any]:
+        return [point.values["m"] for point in plan(laws=laws, count=count, seed=seed).points()]
+
+    assert drawn(mass) == drawn(damping, mass) == drawn(mass, count=9)[:4]
+    assert drawn(mass) != drawn(mass, seed=2)
+
+
+def test_a_star_is_every_entry():
+    file = read_scenario("elbow_comparison")
+    law, axis = Law.parse("contacts.points.*.friction=uniform(0,1)"), Axis.parse("surfaces.*.normal=[0,0,1],[0,0,2]")
+    swept = Plan(file, ("two_elbows",), {}, (axis,), (law,), 2)
+    keys = [f"contacts.points.{name}.friction" for name in ("elbow_4", "elbow_7")]
+    assert swept.parameters == [axis.key, *keys]
+    point = list(swept.points())[3]
+    config = swept.scenario(point).config
+    assert list(config.surfaces["floor"].normal) == [0, 0, 2]
+    frictions = [one.friction for one in config.contacts.points.values()]
+    assert frictions == [point.values[key] for key in keys]
+    assert frictions[0] != frictions[1]
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4))
+def test_sensitivities_find_the_line(seed: int, size: int):
+    generator = np.random.default_rng(seed)
+    parameters = generator.normal(size=(30, size)) * 10.0 ** generator.uniform(-3, 3, size)
+    slopes = generator.normal(size=size) / parameters.std(axis=0, ddof=1)
+    fit = sensitivities(parameters, 3.0 + parameters @ slopes)
+    assert fit is not None
+    np.testing.assert_allclose(fit.effect, slopes * parameters.std(axis=0, ddof=1), rtol=1e-8, atol=1e-10)
+    assert fit.explained == pytest.approx(1.0, abs=1e-10)
+
+
+def test_intervals_are_those_of_linear_regression():
+    generator = np.random.default_rng(3)
+    x = generator.normal(size=25)
+    y = 2.0 * x + generator.normal(size=25)
+    fit, reference = sensitivities(x[:, None], y), scipy.stats.linregress(x, y)
+    assert fit is not None
+    half = scipy.stats.t.ppf(0.975, 23) * reference.stderr * x.std(ddof=1)
+    assert fit.effect[0] == pytest.approx(reference.slope * x.std(ddof=1), rel=1e-12)
+    assert fit.half_width[0] == pytest.approx(half, rel=1e-12)
+    assert fit.explained == pytest.approx(reference.rvalue**2, rel=1e-12)
+    one = spread(y)
+    expected = scipy.stats.t.interval(0.95, 24, loc=y.mean(), scale=scipy.stats.sem(y))
+    assert (one.mean_low, one.mean_high) == pytest.approx(expected, rel=1e-12)
+
+
+def test_no_line_where_there_is_none():
+    x = np.arange(6.0)[:, None]
+    assert sensitivities(x, np.ones(6)) is None
+    assert sensitivities(np.ones((6, 1)), x[:, 0]) is None
+    assert sensitivities(np.hstack([x, 2.0 * x]), x[:, 0]) is None
+    assert sensitivities(x[:2], x[:2, 0]) is None
+
+
+@given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1))
+def test_the_pareto_front_is_what_no_run_beats(points: list[tuple[int, int]]):
+    def beaten(one: tuple[int, int]) -> bool:
+        return any(x <= one[0] and y <= one[1] and (x, y) != one for x, y in points)
+
+    assert {tuple(point) for point in pictures.best(points)} == {one for one in points if not beaten(one)}
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_batch_gives_what_single_runs_give(jobs: int):
+    scenarios = [dynsim.load_scenario("single_pendulum", overrides=SHORT | {LENGTH: length}) for length in (0.5, 1.0)]
+    # Refused, which is no reason not to run the last.
+    scenarios.insert(1, dynsim.load_scenario("single_pendulum", overrides=SHORT | {"integrator.time_limit_h": 1e-9}))
+    finished: dict[int, Any] = {}
+    results = dynsim.simulate_batch(
+        scenarios, jobs=jobs, keep_records="all", finished=lambda k, result: finished.update({k: result})
+    )
+    assert [finished[k] for k in range(3)] == results
+    assert [result.ok for result in results] == [True, False, True]
+    assert "time_limit_h" in results[1].reason
+    for scenario, result in zip(scenarios[::2], results[::2], strict=True):
+        alone = dynsim.simulate(scenario)
+        assert numbers(result.summary) == numbers(alone.summary)
+        np.testing.assert_array_equal(result.record["q"], alone["q"])
+        assert result.record.scene == alone.scene
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"jobs": 0}, "jobs = 0"), ({"keep_records": "some"}, "keep_records"), ({"scheduler": "nowhere"}, "Dask")],
+)
+def test_a_batch_that_cannot_run_is_refused(options: dict[str, Any], message: str):
+    with pytest.raises(DynsimError, match=message):
+        dynsim.simulate_batch([dynsim.load_scenario("single_pendulum", overrides=SHORT)], **options)
+
+
+def test_a_process_that_dies_costs_only_its_task():
+    taken: dict[int, Any] = {}
+
+    def take(number: int, result: Callable[[], int]) -> None:
+        try:
+            taken[number] = result()
+        except (WorkerLost, ValueError) as error:
+            taken[number] = type(error)
+
+    assert run_in_processes(square, range(10), 2, take, attempts=2) is False
+    expected = {number: number**2 for number in range(10)} | {DEADLY: WorkerLost, REFUSED: ValueError}
+    assert taken == expected
+
+
+def test_a_task_outlives_the_process_that_it_had_first(tmp_path: Path):
+    taken: dict[int, int] = {}
+    tasks = [(number, str(tmp_path)) for number in range(8)]
+    run_in_processes(once_deadly, tasks, 2, lambda task, result: taken.update({task[0]: result()}), attempts=2)
+    assert (tmp_path / "seen").exists()
+    assert taken == {number: number**2 for number in range(8)}
+
+
+def test_the_table_has_every_run_whatever_the_jobs(tmp_path: Path):
+    swept = plan(Axis.parse(f"{LENGTH}=0.5:1:3"), MASSES)
+    one = run_sweep(swept, tmp_path / "one")
+    assert run_sweep(swept, tmp_path / "two", jobs=2) == one
+    for name in module.TABLES[: 1 + module.has_parquet()]:
+        assert (tmp_path / "two" / name).read_bytes() == (tmp_path / "one" / name).read_bytes()
+    with (tmp_path / "one" / "sweep.csv").open() as file:
+        table = list(csv.DictReader(file))
+    assert [row["status"] for row in table] == ["ok", "failed", "ok"] * 3
+    assert "mass_kg = -1.0" in table[1]["reason"]
+    for row, point in zip(table, swept.points(), strict=True):
+        assert (float(row[LENGTH]), float(row[MASSES.key])) == (point.values[LENGTH], point.values[MASSES.key])
+        if row["status"] == "ok":
+            summary = dynsim.simulate(swept.scenario(point)).summary
+            assert all(float(row[key]) == value for key, value in numbers(summary).items())
+
+
+def test_parquet_is_the_table(tmp_path: Path):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    rows = run_sweep(plan(Axis.parse(f"{LENGTH}=0.5:1:3"), MASSES), tmp_path)
+    table = parquet.read_table(tmp_path / "sweep.parquet")
+    assert table.column_names == module.columns(rows)
+    for row, written in zip(rows, table.to_pylist(), strict=True):
+        assert {key: value for key, value in written.items() if value is not None} == row.cells()
+    assert json.loads(table.schema.metadata[b"dynsim"])["plan"]["runs"] == 9
+
+
+def test_resuming_runs_what_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    swept = plan(Axis.parse(f"{LENGTH}=0.5:1:5"))
+    whole = run_sweep(swept, tmp_path)
+    table, journal = (tmp_path / "sweep.csv").read_bytes(), tmp_path / module.JOURNAL
+    with pytest.raises(ScenarioError, match="--resume goes on"):
+        run_sweep(swept, tmp_path)
+    # As a process leaves it that is killed while it writes the third line; the second run was lost.
+    lines = journal.read_text().splitlines(keepends=True)
+    lost = json.dumps(json.loads(lines[1]) | {"status": module.LOST}) + "\n"
+    journal.write_text(lines[0] + lost + lines[2][:40])
+    ran: list[int] = []
+    run = module._run
+    monkeypatch.setattr(
+        module, "_run", lambda plan, keep, point, look: ran.append(point.run) or run(plan, keep, point, look)
+    )
+    assert run_sweep(swept, tmp_path, resume=True) == whole
+    assert ran == [1, 2, 3, 4]
+    assert (tmp_path / "sweep.csv").read_bytes() == table
+    # A finer grid keeps what it shares with the coarse one.
+    ran.clear()
+    finer = run_sweep(plan(Axis.parse(f"{LENGTH}=0.5:1:9")), tmp_path, resume=True)
+    assert ran == [1, 3, 5, 7]
+    assert [row.numbers for row in finer[::2]] == [row.numbers for row in whole]
+
+
+def test_another_scenario_is_not_gone_on_with(tmp_path: Path):
+    axis = Axis.parse(f"{LENGTH}=0.5,1")
+    run_sweep(plan(axis), tmp_path)
+    with pytest.raises(ScenarioError, match="of another overrides"):
+        run_sweep(Plan(PENDULUM, (None,), {"duration_s": 0.1}, (axis,)), tmp_path, resume=True)
+
+
+def test_a_misspelt_key_is_refused_before_the_first_run(tmp_path: Path):
+    with pytest.raises(ScenarioError, match="lenght_m"):
+        run_sweep(plan(Axis.parse("plant.chain.0.lenght_m=1,2")), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("keep", "kept"), [("none", []), ("failed", []), ("all", ["000000", "000002"])])
+def test_records_are_kept_as_asked(tmp_path: Path, keep: Any, kept: list[str]):
+    run_sweep(plan(MASSES), tmp_path, keep_records=keep)
+    folder = tmp_path / "records"
+    assert sorted(path.name for path in folder.glob("*")) == kept
+    assert all(Record.load(folder / name / "record.h5").complete for name in kept)
+
+
+ROWS: list[dict[str, Any]] = [
+    {"variant": variant, "a": a, "b": b, "mass": mass}
+    | {"electrical_energy_J": 9.0 + a + mass, "hand_error_rms_m": 1e-3 * mass}
+    for variant in ("one", "two")
+    for a in (0.0, 1.0)
+    for b in ("x", "y")
+    for mass in (1.0, 2.0, 4.0)
+]
+
+
+@pytest.mark.parametrize(
+    ("grid", "sampled", "files"),
+    [
+        (["a"], [], {"sweep_lines", "sweep_pareto"}),
+        (["b"], ["mass"], {"sweep_lines", "sweep_pareto", "sweep_samples", "sweep_tornado"}),
+        (["a", "b"], ["mass"], {"sweep_map", "sweep_pareto", "sweep_samples", "sweep_tornado"}),
+        ([], ["mass"], {"sweep_pareto", "sweep_samples", "sweep_tornado"}),
+    ],
+)
+def test_figures_by_what_was_varied(tmp_path: Path, grid: list[str], sampled: list[str], files: set[str]):
+    drawn = pictures.draw(pictures.Sweep("test", ROWS, grid, sampled), tmp_path)
+    assert {path.stem for path in drawn} == {path.stem for path in tmp_path.iterdir()} == files
+
+
+def test_the_tornado_shows_the_effect_of_a_deviation():
+    figure = pictures.tornado(pictures.Sweep("test", ROWS, ["a", "b"], ["mass"]))
+    assert figure is not None
+    deviation = np.array([row["mass"] for row in ROWS if row["variant"] == "one"]).std(ddof=1)
+    widths = [axes.patches[0].get_width() for axes in figure.axes]
+    assert widths == pytest.approx([deviation, deviation] * 2)
+
+
+# One run takes long enough to be met on its way.
+LONG = ["--set", "duration_s=100", "--set", "record.rate_hz=1", "--no-figures", "--jobs", "2"]
+GRID = ["single_pendulum", "--grid", f"{LENGTH}=0.5:1:12"]
+
+
+def command(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "dynsim", "sweep", *GRID, *LONG, *arguments]
+
+
+def done(folder: Path) -> int:
+    journal = folder / module.JOURNAL
+    return journal.read_text().count("\n") if journal.exists() else 0
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The table of a sweep that nothing ends."""
+    folder = tmp_path_factory.mktemp("whole")
+    subprocess.run(command("--out", str(folder), "-q"), check=True, timeout=300)
+    return (folder / "sweep.csv").read_bytes()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL], ids=lambda number: number.name)
+def test_whatever_ends_a_sweep_it_goes_on(tmp_path: Path, number: signal.Signals, whole: bytes):
+    out = tmp_path / "out"
+    with started(command("--out", str(out), "-q"), tmp_path / "errors", preexec_fn=_hears) as child:
+        wait_for(lambda: done(out) >= 2)
+        child.process.send_signal(number)
+        code = child.end()
+    kept = done(out)
+    assert 2 <= kept < 12
+    assert code == (130 if number == signal.SIGINT else -number)
+    if number == signal.SIGINT:
+        assert f"{kept} of 12 runs were done; --resume goes on" in child.stderr
+        assert (out / "sweep.csv").read_text().count("\n") == kept + 1
+    subprocess.run(command("--out", str(out), "--resume", "-q"), check=True, timeout=300)
+    assert done(out) == 12
+    assert (out / "sweep.csv").read_bytes() == whole
+
+
+def test_a_killed_worker_costs_nothing_but_time(tmp_path: Path, whole: bytes):
+    out = tmp_path / "out"
+    with started(command("--out", str(out), "-q"), tmp_path / "errors") as child:
+        wait_for(lambda: done(out) >= 2)
+        os.kill(workers_of(child.process.pid)[0], signal.SIGKILL)
+        assert child.end() == 0, child.stderr
+    assert (out / "sweep.csv").read_bytes() == whole
+
+
+def workers_of(pid: int) -> list[int]:
+    """Worker processes of a parent."""
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [int(child) for child in children if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text()]
+
+
+def _hears() -> None:
+    """Where tests run in the background, SIGINT is ignored."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def test_a_cluster_gives_the_same_and_outlives_a_worker(tmp_path: Path, whole: bytes):
+    pytest.importorskip("distributed")
+    file, out = tmp_path / "scheduler.json", tmp_path / "out"
+    dask = [sys.executable, "-m"]
+    scheduler = [*dask, "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"]
+    worker = [*dask, "distributed.cli.dask_worker", "--scheduler-file", str(file), "--nthreads", "1", "--no-dashboard"]
+    worker += ["--no-nanny", "--local-directory", str(tmp_path / "scratch")]
+    with started([*scheduler, "--scheduler-file", str(file)], tmp_path / "scheduler") as first:
+        wait_for(lambda: file.exists() and file.stat().st_size > 0)
+        address = json.loads(file.read_text())["address"]
+        with started(worker, tmp_path / "w1") as one, started(worker, tmp_path / "w2"):
+            first.wait_for("Register worker", 2)
+            arguments = ["sweep", *GRID, *LONG[:-2], "--out", str(out), "--scheduler", address]
+            with started([*dask, "dynsim", *arguments], tmp_path / "errors") as child:
+                wait_for(lambda: done(out) >= 2)
+                one.process.kill()
+                assert child.end() == 0, child.stderr
+    assert (out / "sweep.csv").read_bytes() == whole
