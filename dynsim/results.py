@@ -11,8 +11,9 @@ from dynsim.scenario import to_yaml
 RUN_FILES = ("record.h5", "summary.json", "scenario.yaml")
 # What only describes records, and is drawn or written anew from them.
 FIGURE_FORMATS = ("png", "pdf", "svg")
-FIGURES = (*(f"figures/*.{kind}" for kind in FIGURE_FORMATS), "figures/animation.gif")
-COMPARISON_FILES = ("comparison.json", "comparison.csv", *(f"compare_*.{kind}" for kind in FIGURE_FORMATS))
+VIEW = "view.html"
+FIGURES = (*(f"figures/*.{kind}" for kind in FIGURE_FORMATS), "figures/animation.gif", VIEW)
+COMPARISON_FILES = ("comparison.json", "comparison.csv", *(f"compare_*.{kind}" for kind in FIGURE_FORMATS), VIEW)
 
 
 def save_run(record: Record, folder: Path) -> None:

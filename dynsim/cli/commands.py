@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import json
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -22,9 +21,10 @@ from dynsim.cli.app import (
     app,
     parsed_overrides,
 )
-from dynsim.cli.display import console, errors, progress
+from dynsim.cli.display import console, errors, labelled, progress
 from dynsim.cli.drawing import Figures, draw, draw_all
 from dynsim.cli.sweep import sweep
+from dynsim.cli.view import open_page, view, write_view
 from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
 from dynsim.hardware.cli import export, hw
 from dynsim.terminal import escaped
@@ -46,9 +46,10 @@ def run(
     ] = None,
     no_figures: FiguresOption = False,
     format_: FormatOption = FigureFormat.png,
+    view: Annotated[bool, typer.Option("--view", help="Open the page that shows the run in a browser.")] = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Simulate one scenario and write its record, summary and figures."""
+    """Simulate one scenario and write its record, summary, figures and a page to look at it."""
     from dynsim.engine import simulate
     from dynsim.files import check_writable
     from dynsim.results import RUN_FILES, save_run
@@ -75,6 +76,9 @@ def run(
 
         print_summary(console, record.summary)
         console.print(f"Written to {escaped(folder)}", highlight=False, soft_wrap=True)
+    page = write_view({loaded.variant or loaded.name: record}, folder, quiet) if view or not no_figures else None
+    if view and page is not None:
+        open_page(page)
 
 
 @app.command(epilog="Example: dynsim compare scenarios/elbow_comparison.yaml --jobs 2")
@@ -139,6 +143,8 @@ def compare(
 
             print_comparison(console, {name: record.summary for name, record in records.items()})
             console.print(f"Written to {escaped(folder)}", highlight=False, soft_wrap=True)
+        if not no_figures:
+            write_view(records, folder, quiet)
     if failure is not None:
         raise failure
 
@@ -204,20 +210,18 @@ def plot(
     format_: FormatOption = FigureFormat.png,
 ) -> None:
     """Draw the figures of records; two or more are also laid over each other."""
-    from dynsim.record import Record
-
-    labelled: dict[str, Record] = {}
-    for path in records:
-        record = Record.load(path)
-        label = _label(path, record, labelled)
-        labelled[label] = record
+    named = labelled(records)
+    for path, (label, record) in zip(records, named.items(), strict=True):
         folder = path.parent / "figures" if out is None else out if len(records) == 1 else out / label
         try:
             draw(Figures({label: record}, folder, format_), quiet=False)
         except RecordError as error:
             raise RecordError(f"{path}: {error}") from error
-    if len(labelled) > 1:
-        draw(Figures(labelled, out or Path("figures"), format_, together=True), quiet=False)
+    if len(named) > 1:
+        draw(Figures(named, out or Path("figures"), format_, together=True), quiet=False)
+
+
+app.command(epilog="Example: dynsim view results/elbow_comparison/*/record.h5 --ghost")(view)
 
 
 @app.command(epilog="Example: dynsim bench --quick --json bench.json")
@@ -261,11 +265,3 @@ def _warn_of_plugins() -> None:
 
     for fault in faults():
         errors.print(f"[yellow]warning:[/] {escaped(fault)}")
-
-
-def _label(path: Path, record: Record, taken: Container[str]) -> str:
-    """A name for a record and its folder among others: its variant, numbered where another has the same."""
-    from dynsim.files import file_name
-
-    name = file_name(record.summary.get("variant") or path.parent.name or path.stem)
-    return next(label for k in itertools.count(1) if (label := name if k == 1 else f"{name}_{k}") not in taken)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -12,6 +13,7 @@ from dynsim.terminal import Terminal, escaped
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
+    from dynsim.record import Record
     from dynsim.scenario import Scenario
     from dynsim.studies.compare import VariantProgress
 
@@ -21,6 +23,26 @@ errors = Terminal(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
 # Of a progress bar.
 _TITLE_WIDTH = 22
+
+
+def labelled(paths: Sequence[Path]) -> dict[str, Record]:
+    """Records by names for them and their folders: their variants, numbered where another has the same.
+
+    Raises
+    ------
+    RecordError
+        See :meth:`dynsim.record.Record.load`.
+    """
+    from dynsim.files import file_name
+    from dynsim.record import Record
+
+    found: dict[str, Record] = {}
+    for path in paths:
+        record = Record.load(path)
+        name = file_name(record.summary.get("variant") or path.parent.name or path.stem)
+        label = next(one for k in itertools.count(1) if (one := name if k == 1 else f"{name}_{k}") not in found)
+        found[label] = record
+    return found
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from dynsim import notebook
 from dynsim.errors import ModelError, shown
 from dynsim.kernels import arrays as ka
 from dynsim.kernels import ledger
@@ -68,6 +69,25 @@ class Model:
         mass = sum(link.inertia.mass for link in robot.links)
         joints = f"joint{'s' if self.n > 1 else ''} {listed(self.joint_names)}"
         return f"<Model {robot.name}: {joints}, {motors}, hand on {robot.hand[0]}, {mass:.4g} kg>"
+
+    def _repr_html_(self) -> str:
+        robot = self.robot
+        motors = {motor.joint for motor in robot.motors}
+        head = ("body", "joint", "kind", "mass [kg]", "limits", "motor")
+        rows = [
+            (
+                link.name,
+                link.joint,
+                link.kind,
+                f"{link.inertia.mass:.4g}",
+                f"{link.lower:.4g} … {link.upper:.4g}"
+                if math.isfinite(link.lower) or math.isfinite(link.upper)
+                else "",
+                "yes" if link.joint in motors else "",
+            )
+            for link in robot.links
+        ]
+        return notebook.table(repr(self)[1:-1], [head, *rows])
 
     @classmethod
     def from_urdf(cls, path: str | os.PathLike[str], lock: Mapping[str, float] | None = None) -> Model:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynsim.record.content import TIME
 from dynsim.record.quaternion import Array, continuous, of_turn, product, rotated
@@ -51,7 +52,7 @@ def pose_columns(bodies: int) -> int:
     return -(-7 * bodies // 2)
 
 
-def point_positions(record: Record, point: Point, rows: slice | int = slice(None)) -> Array:
+def point_positions(record: Record, point: Point, rows: slice | int | NDArray[np.intp] = slice(None)) -> Array:
     """World positions of a point on a body at samples of a record with body poses, (…, 3) [m].
 
     Raises

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dynsim import notebook
 from dynsim.errors import MissingEntry, RecordError, shown
 from dynsim.files import replacing
 from dynsim.record import export, reader, writer
@@ -25,6 +26,8 @@ from dynsim.record.scene import Scene
 if TYPE_CHECKING:
     import pandas
     import xarray
+
+    from dynsim.view import Inline
 
 # Signals named in the repr.
 _SHOWN = 6
@@ -150,6 +153,36 @@ class Record:
         parts += [f"{len(self.events)} event{'s' if len(self.events) > 1 else ''}"] if self.events else []
         parts += [] if self.complete else ["incomplete"]
         return f"<Record {f'{title}: ' if title else ''}{', '.join(parts)}>"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (name, "×".join(map(str, signal.data.shape)), signal.unit, signal.description)
+            for name, signal in self.signals.items()
+        ]
+        what = "" if self.scene is None else "<p><code>record.view()</code> shows it in 3D.</p>"
+        return notebook.table(repr(self)[1:-1], rows, what)
+
+    def view(self, *others: Record, ghost: bool = False, height: int = 640) -> Inline:
+        """A page that shows the run in 3D, with plots over time; notebooks show it inline.
+
+        Parameters
+        ----------
+        others : records that are shown beside this one, or laid over it
+        ghost : others are laid over this one
+        height : of the frame in a notebook [pixel]
+
+        Raises
+        ------
+        RecordError
+            See :func:`dynsim.view.page`.
+        """
+        from dynsim.view import Inline, page
+
+        named: dict[str, Record] = {}
+        for record in (self, *others):
+            name = str(record.summary.get("variant") or "record")
+            named[name if name not in named else f"{name} {len(named) + 1}"] = record
+        return Inline(page(named, ghost=ghost), height)
 
     def keys(self) -> KeysView[str]:
         """Names of the signals."""

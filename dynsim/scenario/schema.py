@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
+from dynsim import notebook
 from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig, Vector3, error_at
 from dynsim.families import member, union
 from dynsim.problems import Origin, listed
@@ -257,6 +258,21 @@ class Scenario:
         if contacts:
             parts.append(f"contacts {listed(contacts)}")
         return f"<Scenario {self.title}: {', '.join(parts)}>"
+
+    def _repr_html_(self) -> str:
+        config = self.config
+        contacts = [name for name, point in config.contacts.points.items() if point.enabled]
+        rows = [
+            ("plant", config.plant.type),
+            ("controller", config.controller.type if config.controller else "–"),
+            ("duration", f"{config.duration_s:g} s"),
+            ("surfaces", ", ".join(config.surfaces) or "–"),
+            ("contacts", f"{', '.join(contacts)} ({config.contacts.law})" if contacts else "–"),
+            ("loads", ", ".join(config.loads) or "–"),
+            ("integrator", config.integrator.method),
+        ]
+        about = [("", " ".join(config.description.split()))] if config.description else []
+        return notebook.table(self.title, [*about, *rows])
 
     @property
     def title(self) -> str:

@@ -1,0 +1,65 @@
+"""Pages to look at records: ``dynsim view``, and what ``run`` and ``compare`` write."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from dynsim.cli.display import console, labelled
+from dynsim.terminal import escaped
+
+if TYPE_CHECKING:
+    from dynsim.record import Record
+
+
+def view(
+    records: Annotated[list[Path], typer.Argument(metavar="RECORD", help="Records (HDF5), measured ones too.")],
+    ghost: Annotated[
+        bool, typer.Option("--ghost", help="Lay several over each other, the first one solid; default: side by side.")
+    ] = False,
+    open_: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = True,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="For the page; default: view.html beside the record, here for several."),
+    ] = None,
+) -> None:
+    """Write a page that shows records in 3D, with plots and forces over time, for any browser and without a network."""
+    from dynsim.results import VIEW
+    from dynsim.view import write
+
+    named = labelled(records)
+    page = out or (records[0].parent if len(records) == 1 else Path()) / VIEW
+    with console.status(f"writing {escaped(page)}"):
+        write(named, page, ghost=ghost)
+    console.print(f"Written to {escaped(page)}", highlight=False, soft_wrap=True)
+    if open_:
+        open_page(page)
+
+
+def write_view(records: Mapping[str, Record], folder: Path, quiet: bool) -> Path | None:
+    """The page of records in a folder; None where they have nothing to be seen."""
+    from dynsim.results import VIEW
+    from dynsim.view import viewable, write
+
+    shown = {name: record for name, record in records.items() if viewable(record)}
+    if not shown:
+        return None
+    page = write(shown, folder / VIEW)
+    if not quiet:
+        console.print(f"To be seen in a browser: {escaped(page)}", highlight=False, soft_wrap=True)
+    return page
+
+
+def open_page(page: Path) -> None:
+    """Open a page in the user's browser, or say that there is no display to open one on."""
+    import webbrowser
+
+    # Without a display some systems start a browser within the terminal.
+    display = sys.platform in ("win32", "darwin") or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")))
+    if not display or not webbrowser.open(page.absolute().as_uri()):
+        console.print(f"No browser opened; open {escaped(page)} in one", highlight=False, soft_wrap=True)

@@ -1,0 +1,262 @@
+"use strict";
+// One robot in the scene. What it shows at an instant is a sample: from the tables of a record, or from a live frame.
+//   {time, poses: [x, y, z, w, x, y, z for each body], contacts: [{force, normal, tangent, mode}], wheels: [1 or 0],
+//    pressure: [x, y] or null, gripper: 1, 0 or null}
+
+class Actor {
+  constructor(data, bytes, meshes, index) {
+    this.data = data;
+    this.name = data.name;
+    this.index = index;
+    this.object = new THREE.Group();
+    this.inner = new THREE.Group();
+    this.object.add(this.inner);
+    const table = (block) => new D.Table(bytes, block);
+    this.times = table(data.frames).column(0);
+    this.position = table(data.position);
+    this.orientation = table(data.orientation);
+    this.size = Math.max(0.13 * data.reach, 3 * data.radius);
+    this.contactTables = data.contacts.map((c) => ({ force: table(c.force), normal: table(c.normal),
+      tangent: c.tangent && table(c.tangent), mode: c.mode && table(c.mode) }));
+    this.wheelTable = data.wheels && table(data.wheels.down);
+    this.pressureTable = data.pressure && table(data.pressure.at);
+    this.gripperTable = data.gripper && table(data.gripper);
+    this.axes = Object.fromEntries(Object.entries(data.axes).map(([name, block]) => [name, table(block)]));
+    this.signals = new Map(data.signals.map((s) => [s.name, { ...s, table: table(s.data) }]));
+    this.span = [this.times[0], this.times[this.times.length - 1]];
+    this.build(meshes);
+    this.paths = Object.entries(data.paths).map(([kind, block]) => {
+      const path = kind === "hand" ? new M.Path(this.inner, this.times, table(block), 1.6, 0.35) : null;
+      if (path) return { kind, path };
+      const { points } = M.thinned(this.times, table(block));
+      const line = S.line(points, 1.5, 0.025 * data.reach);
+      line.renderOrder = 4;
+      this.inner.add(line);
+      return { kind, line };
+    });
+    this.scale = this.contactTables.length
+      ? Math.max(D.percentile(this.contactTables.flatMap((c) => Array.from(c.force.column(0), Math.abs)), 0.98), 1e-6) : 1;
+    this.sample = this.emptySample();
+  }
+
+  emptySample() {
+    return { time: 0, poses: new Float64Array(7 * this.bodies.length), wheels: (this.data.wheels?.names ?? []).map(() => 1),
+      contacts: this.contacts.map(() => ({ force: NaN, normal: [0, 0, 1], tangent: [0, 0, 0], mode: null })),
+      pressure: this.pressureTable ? [0, 0] : null, gripper: null };
+  }
+
+  build(meshes) {
+    const data = this.data;
+    this.wheels = [];
+    this.bodies = data.bodies.map((body) => {
+      const group = new THREE.Group(), paint = [];
+      for (const shape of body.shapes) {
+        const own = shape.colour ? new THREE.Color().setRGB(...shape.colour) : null;
+        const material = new THREE.MeshLambertMaterial();
+        const mesh = new THREE.Mesh(S.geometry(shape, meshes), material);
+        mesh.position.set(...shape.p);
+        mesh.quaternion.set(...S.xyzw(shape.q));
+        mesh.castShadow = mesh.receiveShadow = true;
+        group.add(mesh);
+        const role = shape.wheel !== undefined ? "wheel" : shape.role === "hub" ? "hub" : "body";
+        const part = { mesh, material, own, role, alpha: shape.colour ? shape.colour[3] : 1, z: shape.p };
+        paint.push(part);
+        if (role === "wheel") {
+          // A mark on the rim, or nobody would see it turn.
+          const [radius, width] = shape.size;
+          const spoke = new THREE.Mesh(new THREE.BoxGeometry(1.5 * radius, 0.22 * radius, 1.06 * width), new THREE.MeshBasicMaterial());
+          mesh.add(spoke);
+          part.spoke = spoke;
+          this.wheels.push({ group: shape.wheel, part, body: group, rest: mesh.position.clone(), radius });
+        }
+      }
+      this.inner.add(group);
+      return { name: body.name, joint: body.joint, object: group, paint };
+    });
+    this.fixed = data.fixed.map((shape) => {
+      const mesh = new THREE.Mesh(S.geometry(shape, meshes), new THREE.MeshLambertMaterial());
+      mesh.position.set(...shape.p);
+      mesh.quaternion.set(...S.xyzw(shape.q));
+      mesh.castShadow = mesh.receiveShadow = true;
+      this.inner.add(mesh);
+      return { mesh, own: shape.colour ? new THREE.Color().setRGB(...shape.colour) : null };
+    });
+    this.contacts = data.contacts.map((contact) => new M.Contact(this.inner, contact, this.size));
+    this.support = data.supports.length ? new M.Support(this.inner, data.supports.length, this.size) : null;
+    this.supportPoint = new THREE.Vector3();
+    if (data.hand) this.buildHand();
+  }
+
+  buildHand() {
+    const size = Math.max(1.7 * this.data.radius, 0.012 * this.data.reach);
+    this.handMaterial = new THREE.MeshBasicMaterial();
+    this.hand = new THREE.Group();
+    this.hand.position.set(...this.data.hand.p);
+    this.bodies[this.data.hand.body]?.object.add(this.hand);
+    if (!this.data.gripper) {
+      this.hand.add(new THREE.Mesh(new THREE.SphereGeometry(0.75 * size, 16, 12), this.handMaterial));
+      return;
+    }
+    // Two fingers ahead of the controlled point, which close.
+    this.fingers = [-1, 1].map((side) => {
+      const finger = new THREE.Mesh(new THREE.BoxGeometry(1.6 * size, 0.4 * size, 0.8 * size), this.handMaterial);
+      finger.userData = { side, size };
+      this.hand.add(finger);
+      return finger;
+    });
+  }
+
+  // The sample of the record at a time: positions in straight lines, turns along them, modes as they were.
+  at(t) {
+    this.live = false;
+    const times = this.times, out = this.sample, n = this.bodies.length;
+    const clipped = Math.min(Math.max(t, this.span[0]), this.span[1]);
+    const i = times.length > 1 ? D.before(times, clipped) : 0, j = Math.min(i + 1, times.length - 1);
+    const gap = times[j] - times[i], share = gap > 0 ? Math.min((clipped - times[i]) / gap, 1) : 0;
+    // The instant of a frame shows what was then, not what was just before it.
+    const held = share > 1 - 1e-9 ? j : i;
+    const mix = (table, k) => { const c = table.column(k), a = c[i]; return share > 0 ? a + share * (c[j] - a) : a; };
+    out.time = clipped;
+    for (let b = 0; b < n; b++) {
+      for (let k = 0; k < 3; k++) out.poses[7 * b + k] = mix(this.position, 3 * b + k);
+      for (let k = 0; k < 4; k++) out.poses[7 * b + 3 + k] = mix(this.orientation, 4 * b + k);
+    }
+    this.contactTables.forEach((c, m) => {
+      const one = out.contacts[m];
+      one.force = mix(c.force, 0);
+      one.mode = c.mode ? Math.round(c.mode.value(held, 0)) : null;
+      for (let k = 0; k < 3; k++) {
+        one.normal[k] = mix(c.normal, k);
+        one.tangent[k] = c.tangent ? mix(c.tangent, k) : 0;
+      }
+    });
+    for (let k = 0; k < out.wheels.length; k++) out.wheels[k] = this.wheelTable ? Math.round(this.wheelTable.value(held, k)) : 1;
+    if (this.pressureTable) out.pressure = [0, 1].map((k) => mix(this.pressureTable, k));
+    out.gripper = this.gripperTable ? Math.round(this.gripperTable.value(held, 0)) : null;
+    return out;
+  }
+
+  // Put everything where a sample has it.
+  show(sample, layers, colours) {
+    this.shown = sample;
+    const poses = sample.poses;
+    for (let b = 0; b < this.bodies.length; b++) {
+      const o = 7 * b, object = this.bodies[b].object;
+      if (!(poses[o] - poses[o] === 0)) continue;  // a run that diverged: it stays where it was last
+      object.position.set(poses[o], poses[o + 1], poses[o + 2]);
+      object.quaternion.set(poses[o + 4], poses[o + 5], poses[o + 6], poses[o + 3]).normalize();
+    }
+    for (let k = 0; k < this.contacts.length; k++) {
+      const contact = this.contacts[k];
+      contact.show(this.bodies[contact.contact.body].object, sample.contacts[k], this.scale, layers, colours);
+    }
+    for (const wheel of this.wheels) {
+      const down = sample.wheels[wheel.group] > 0;
+      if (wheel.down === down && wheel.colours === colours) continue;
+      Object.assign(wheel, { down, colours });
+      wheel.part.material.color.set(down ? colours.down : colours.lifted);
+      wheel.part.spoke.material.color.set(down ? colours.lifted : colours.down);
+      // The model has no height for a lifted wheel; it is drawn a little above the ground.
+      wheel.part.mesh.position.copy(wheel.rest);
+      if (!down) wheel.part.mesh.position.z += 0.35 * wheel.radius;
+    }
+    if (this.support) this.support.show(this.supportPoints(sample), this.pressure(sample), layers.support, colours);
+    if (this.fingers)
+      for (const f of this.fingers) f.position.set(0.5 * f.userData.size, f.userData.side * f.userData.size * (sample.gripper ? 0.28 : 0.8), 0);
+    for (const one of this.paths) {
+      if (one.line) one.line.visible = layers.target;
+      else one.path.shown = layers.trace && !this.live, one.path.show(sample.time);
+    }
+    if (this.grown) this.grown.line.visible = Boolean(layers.trace && this.live);
+  }
+
+  // A live frame: the path of the hand grows, that of the record is not shown.
+  extend(sample) {
+    if (!this.hand) return;
+    this.grown ??= new M.Growing(this.inner);
+    this.grown.line.material.color.set(this.colours.hand);
+    this.live = true;
+    const body = this.data.hand.body, o = 7 * body, p = sample.poses, q = new THREE.Quaternion(p[o + 4], p[o + 5], p[o + 6], p[o + 3]);
+    this.grown.add(this.supportPoint.set(...this.data.hand.p).applyQuaternion(q).add(new THREE.Vector3(p[o], p[o + 1], p[o + 2])));
+  }
+
+  supportPoints(sample) {
+    const found = [];
+    for (const support of this.data.supports) {
+      if (support.group >= 0 && !(sample.wheels[support.group] > 0)) continue;
+      const body = this.bodies[support.body].object;
+      this.supportPoint.set(...support.p).applyQuaternion(body.quaternion).add(body.position);
+      found.push([this.supportPoint.x, this.supportPoint.y]);
+    }
+    return found;
+  }
+
+  pressure(sample) {
+    return sample.pressure && sample.pressure.every(Number.isFinite) ? sample.pressure : null;
+  }
+
+  handPosition(out) {
+    if (!this.hand) return this.bodies[0].object.getWorldPosition(out);
+    return this.hand.getWorldPosition(out);
+  }
+
+  // Colours of the theme, of hubs (and all of a ghost, which is translucent), and of the hand's way.
+  dress(colours, tint, way, ghost) {
+    this.colours = colours;
+    this.tint = new THREE.Color(tint);
+    this.ghost = ghost;
+    this.marked = null;
+    for (const body of this.bodies)
+      for (const part of body.paint) {
+        part.base = part.own ? part.own.clone() : new THREE.Color(colours[part.role]);
+        if (this.ghost) part.base = this.tint.clone();
+        else if (!part.own && part.role === "hub") part.base.copy(this.tint);
+        part.material.transparent = ghost || part.alpha < 1;
+        part.material.opacity = ghost ? 0.3 : part.alpha;
+        part.material.depthWrite = !ghost;
+        part.material.needsUpdate = true;
+        if (part.role !== "wheel") part.material.color.copy(part.base);
+      }
+    for (const one of this.fixed) one.mesh.material.color.copy(one.own ?? new THREE.Color(colours.hub));
+    for (const wheel of this.wheels) wheel.colours = null;
+    if (this.handMaterial) this.handMaterial.color.set(tint);
+    for (const one of this.paths) {
+      if (one.line) one.line.material.color.set(colours.target);
+      else for (const line of [one.path.whole, one.path.part]) line.material.color.set(way);
+    }
+  }
+
+  // Paint the body that each motor moves; colours by body index, none: as they were dressed.
+  paint(colourOf) {
+    this.bodies.forEach((body, k) => {
+      const colour = colourOf ? colourOf.get(k) : null;
+      for (const part of body.paint)
+        if (part.role !== "wheel") part.material.color.copy(colour ?? (colourOf ? this.plain : part.base));
+    });
+  }
+
+  // Hubs of motors at their voltage limit have a colour of their own.
+  mark(saturated) {
+    const key = saturated.join();
+    if (key === this.marked) return;
+    this.marked = key;
+    const bodies = new Set(this.data.motors.filter(([name]) => saturated.includes(name)).map(([, body]) => body));
+    this.bodies.forEach((body, k) => {
+      for (const part of body.paint) if (part.role === "hub") part.material.emissive.set(bodies.has(k) ? this.colours.saturated : 0x000000);
+    });
+  }
+
+  state() {
+    return {
+      name: this.name, time: this.shown.time,
+      bodies: Object.fromEntries(this.bodies.map(({ name, object: o }) => [name,
+        { p: o.position.toArray(), q: [o.quaternion.w, o.quaternion.x, o.quaternion.y, o.quaternion.z] }])),
+      contacts: this.contacts.map((c) => ({ ...c.state, visible: c.push.object.visible })),
+      wheels: Object.fromEntries((this.data.wheels?.names ?? []).map((name, k) => [name, this.shown.wheels[k] > 0])),
+      support: this.support && { corners: this.support.hull.length, inside: this.support.inside },
+      hand: this.hand ? this.handPosition(new THREE.Vector3()).sub(this.object.position).toArray() : null,
+      gripper: this.shown.gripper, saturated: this.saturated ?? [],
+      offset: this.object.position.toArray(),
+    };
+  }
+}

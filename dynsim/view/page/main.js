@@ -1,0 +1,335 @@
+"use strict";
+// The player. `dynsim` is what a test, a film or a live drive may use of the page:
+//   dynsim.ready           a promise that holds when everything is there
+//   dynsim.seek(t)         show an instant [s] and draw it
+//   dynsim.state()         what is shown: time, poses of all bodies, arrows, wheels, support
+//   dynsim.frame(f, k)     show a frame that comes from elsewhere with robot k:
+//                          {time, poses: [x, y, z, qw, qx, qy, qz of each body], contacts, wheels, pressure, gripper}
+//   dynsim.set(name, value) (playing, speed, theme, ghost, follow, colouring, or a layer), dynsim.camera(name), dynsim.image() (PNG as a data URL), dynsim.cost (ms of the last update)
+
+class App {
+  constructor({ head, bytes }) {
+    this.head = head;
+    const meshes = head.meshes.map((mesh) => S.mesh(bytes, mesh));
+    this.actors = head.records.map((record, k) => new Actor(record, bytes, meshes, k));
+    this.span = [Math.min(...this.actors.map((a) => a.span[0])), Math.max(...this.actors.map((a) => a.span[1]))];
+    this.stage = new Stage(document.getElementById("scene"), head.azimuth);
+    this.layers = { forces: true, cones: true, trace: true, target: true, support: true, labels: true };
+    Object.assign(this, { time: this.span[0], playing: false, speed: 1, follow: false, ghost: head.ghost, colouring: "", live: false, cost: 0 });
+    this.theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
+    this.point = new THREE.Vector3();
+    this.surfaces();
+    for (const actor of this.actors) this.stage.scene.add(actor.object);
+    this.tags = this.actors.flatMap((actor) => actor.contacts.map((contact) => ({ actor, contact, box: D.element("div") })));
+    document.getElementById("labels").append(...this.tags.map((tag) => tag.box));
+    this.plots = new Plots(document.getElementById("plots"), this.actors, { seek: (t) => this.seek(t), span: () => this.span,
+      colour: (actor) => this.colourOf(actor), palette: () => D.variants[this.theme] });
+    document.getElementById("add-plot").onclick = () => this.plots.add(this.plots.names.find((n) => !this.plots.plots.some((p) => p.signal === n)));
+    this.sync = wire(this);
+    hovering(this, this.stage.canvas, document.getElementById("hover"));
+    document.getElementById("title").textContent = this.actors.length > 1 ? document.title : this.actors[0].data.title;
+    document.getElementById("notes").append(...[...head.notes, `written by ${head.by}`].map((n) => D.element("div", { textContent: n })));
+    this.arrange();
+    this.dress();
+    for (const name of this.firstPlots()) this.plots.add(name);
+    this.stage.resize();
+    this.show();
+    const tick = (now) => { this.tick(now); requestAnimationFrame(tick); };
+    requestAnimationFrame(tick);
+  }
+
+  firstPlots() {
+    const wanted = this.actors.length > 1 ? ["contact_normal_force", "tip_margin", "energy_electrical_drawn", "hand_error", "position_error", "support_margin"]
+      : ["contact_normal_force", "wheel_load", "hand_error", "position_error", "support_margin", "power", "q", "phi"];
+    return wanted.filter((name) => this.actors.some((a) => a.signals.get(name))).slice(0, 3);
+  }
+
+  // Surfaces once for all: the floor as the stage's own, others with each robot.
+  surfaces() {
+    const flat = (s) => s.kind === "plane" && Math.abs(s.q[1]) < 1e-6 && Math.abs(s.q[2]) < 1e-6;
+    const floors = this.actors.flatMap((a) => a.data.surfaces.filter(flat)).map((s) => s.p[2]);
+    // Without one a faint grid lies below everything, to see by where things are.
+    const bare = this.actors.every((a) => !a.data.surfaces.length && !a.data.fixed.length);
+    this.stage.real = floors.length > 0 || this.actors.every((a) => !a.data.surfaces.length);
+    this.floor = floors.length ? floors[0] : bare ? this.head.box[0][2] : Math.min(0, this.head.box[0][2]);
+    this.stage.sheets = [];
+    for (const actor of this.actors) {
+      actor.surfaces = [];
+      for (const surface of actor.data.surfaces) {
+        if (flat(surface) && Math.abs(surface.p[2] - this.floor) < 1e-6) continue;
+        const made = S.surface(surface, Stage.round(actor.data.reach / 8));
+        if (surface.kind === "plane") this.stage.sheets.push(made);
+        made.receiveShadow = true;
+        actor.surfaces.push(made);
+        actor.object.add(made);
+      }
+    }
+  }
+
+  // Variants behind each other as the reader sees them, or all at one place.
+  arrange() {
+    const [low, high] = this.head.box.map((corner) => new THREE.Vector3(...corner));
+    const shown = this.actors.filter((a) => a.object.visible);
+    const apart = this.ghost ? 0 : high.y - low.y + 0.06 * (high.x - low.x);
+    shown.forEach((actor, k) => {
+      this.stage.turned(actor.object.position.set(0, k * apart, 0));
+      for (const one of actor.surfaces) one.visible = !this.ghost || k === 0;
+    });
+    high.y += apart * Math.max(shown.length - 1, 0);
+    this.stage.settle(low, high, this.floor);
+    this.stage.dress(D.palette[this.theme]);
+  }
+
+  dress() {
+    document.documentElement.dataset.theme = this.theme;
+    const colours = D.palette[this.theme];
+    this.colours = colours;
+    const first = this.actors.find((a) => a.object.visible);
+    for (const actor of this.actors) {
+      const own = this.actors.length > 1 ? this.colourOf(actor) : null;
+      actor.dress(colours, own ?? colours.hub, own ?? colours.hand, this.ghost && actor !== first);
+      actor.plain = new THREE.Color(colours.body);
+      for (const one of actor.surfaces) if (one.material.color) one.material.color.set(colours.surface);
+    }
+    this.stage.dress(colours);
+    this.plots.redraw();
+    this.sync();
+    this.show();
+  }
+
+  colourOf(actor) {
+    return D.variants[this.theme][actor.index % 7];
+  }
+
+  has(layer) {
+    const some = (test) => this.actors.some(test);
+    return { forces: some((a) => a.contacts.length), cones: some((a) => a.data.contacts.some((c) => c.friction > 0)), labels: some((a) => a.contacts.length),
+      trace: some((a) => a.data.paths.hand), target: some((a) => a.data.paths.target), support: some((a) => a.support) }[layer];
+  }
+
+  // Signals of the motors by which links may be painted.
+  colourings() {
+    const list = [["power", "power |u i|", "W", (x) => Math.abs(x)], ["current", "heat ∝ i²", "A²", (x) => x * x],
+      ["torque", "|torque|", "", (x) => Math.abs(x)], ["voltage", "|voltage|", "V", (x) => Math.abs(x)], ["phi_dot", "|joint rate|", "rad/s", (x) => Math.abs(x)]];
+    return list.filter(([name]) => this.actors.some((a) => a.signals.has(name))).map(([name, text, unit, of]) => ({ name, text, unit, of }));
+  }
+
+  set(name, value) {
+    if (name in this.layers) this.layers[name] = value;
+    else this[name] = value;
+    if (name === "playing" && value && this.time >= this.span[1]) this.time = this.span[0];
+    if (name === "ghost") this.arrange();
+    if (name === "ghost" || name === "theme") this.dress();
+    if (name === "colouring") this.rate();
+    if (name === "follow" && value) this.target = null;
+    this.sync();
+    this.show();
+  }
+
+  toggle(actor) {
+    actor.object.visible = !actor.object.visible;
+    if (!this.actors.some((a) => a.object.visible)) actor.object.visible = true;
+    this.arrange();
+    this.dress();
+  }
+
+  camera(name) {
+    this.set("follow", false);
+    this.stage.look(name);
+    this.sync();
+  }
+
+  seek(t) {
+    this.time = Math.min(Math.max(t, this.span[0]), this.span[1]);
+    this.live = false;
+    this.show();
+  }
+
+  step(frames) {
+    this.set("playing", false);
+    const times = this.actors.find((a) => a.object.visible).times;
+    let i = D.before(times, this.time + 1e-9);
+    if (times[i + 1] <= this.time + 1e-9) i++;
+    this.seek(times[Math.min(Math.max(i + frames, 0), times.length - 1)]);
+  }
+
+  faster(way) {
+    const k = SPEEDS.indexOf(this.speed);
+    this.set("speed", SPEEDS[Math.min(Math.max(k + way, 0), SPEEDS.length - 1)]);
+  }
+
+  // A frame from elsewhere: nothing of the record is shown but what the frame has.
+  frame(frame, k = 0) {
+    const actor = this.actors[k], sample = actor.emptySample();
+    this.live = true;
+    this.time = frame.time;
+    Object.assign(sample, frame);
+    actor.extend(sample);
+    this.update([[actor, sample]]);
+  }
+
+  tick(now) {
+    const passed = Math.min((now - (this.before ?? now)) / 1000, 0.25);
+    this.before = now;
+    if (this.playing && !this.live) {
+      this.time += passed * this.speed;
+      if (this.time >= this.span[1]) this.time = this.span[1], this.playing = false, this.sync();
+      this.show();
+    }
+    if (!this.stage.changed) return;
+    this.stage.draw();
+    this.label();
+  }
+
+  show() {
+    if (this.live) return;
+    this.update(this.actors.filter((a) => a.object.visible).map((actor) => [actor, actor.at(this.time)]));
+    this.plots.show(this.time);
+  }
+
+  update(pairs) {
+    const start = performance.now();
+    for (const [actor, sample] of pairs) actor.show(sample, this.layers, this.colours);
+    this.cost = performance.now() - start;
+    for (const [actor] of pairs) this.paint(actor);
+    if (this.follow) this.chase(pairs[0][0]);
+    document.getElementById("slider").value = this.time;
+    document.getElementById("clock").textContent = `${this.time.toFixed(3)} s`;
+    this.tell(pairs);
+    this.stage.touch();
+  }
+
+  chase(actor) {
+    actor.object.updateMatrixWorld(true);
+    actor.handPosition(this.point);
+    if (this.target) this.stage.follow(this.point.clone().add(this.target));
+    else this.target = this.stage.controls.target.clone().sub(this.point);
+  }
+
+  // Scale of the colouring: the 98th percentile, so that a spike at the start does not darken the rest.
+  rate() {
+    const chosen = this.colourings().find((c) => c.name === this.colouring);
+    this.rating = null;
+    document.getElementById("scale").hidden = !chosen;
+    if (!chosen) { for (const actor of this.actors) actor.paint(null); return; }
+    const all = this.actors.flatMap((a) => {
+      const signal = a.signals.get(chosen.name), found = [];
+      for (let k = 0; signal && k < signal.table.columns; k++) found.push(...Array.from(signal.table.column(k), chosen.of));
+      return found;
+    });
+    const limit = chosen.name === "voltage" && this.actors[0].data.limit;
+    const top = limit || Math.max(D.percentile(all, 0.98), 1e-12);
+    this.rating = { ...chosen, top };
+    const unit = chosen.unit || this.actors[0].signals.get(chosen.name)?.unit || "";
+    const [bar, ends] = document.getElementById("scale").children, c = bar.getContext("2d");
+    for (let x = 0; x < 120; x++) c.fillStyle = App.heat(x / 119).getStyle(), c.fillRect(x, 0, 1, 8);
+    ends.children[0].textContent = "0";
+    ends.children[1].textContent = `${limit ? "limit " : "≥ "}${D.number(top, 3)} ${unit}`;
+  }
+
+  paint(actor) {
+    if (!this.rating) return;
+    const signal = actor.signals.get(this.rating.name), found = new Map();
+    if (!signal) return;
+    const times = actor.axes[signal.axis].column(0);
+    for (const [name, body] of actor.data.motors) {
+      const k = signal.labels.indexOf(name);
+      if (k < 0) continue;
+      const value = this.rating.of(Plots.value({ times, values: signal.table.column(k) }, Math.min(this.time, times[times.length - 1])));
+      found.set(body, App.heat(value / this.rating.top));
+    }
+    actor.paint(found);
+  }
+
+  // From dark blue over grey to yellow (cividis), which colour-blind readers see as well.
+  static heat(share) {
+    const stops = [[30, 62, 120], [58, 80, 122], [102, 105, 112], [149, 143, 120], [203, 186, 105], [255, 234, 70]];
+    const x = Math.min(Math.max(share || 0, 0), 1) * 5, k = Math.min(Math.floor(x), 4), f = x - k;
+    return new THREE.Color().setRGB(...[0, 1, 2].map((i) => (stops[k][i] + f * (stops[k + 1][i] - stops[k][i])) / 255));
+  }
+
+  // Status in words: contacts, wheels, support, saturated motors.
+  tell(pairs) {
+    const lines = [];
+    for (const [actor] of pairs) {
+      const parts = actor.contacts.map(({ state }) => state.force === null || state.state === "open" ? `${state.name}: open`
+        : `${state.name}: ${D.number(state.force, 3)} N, ${state.state}`);
+      actor.saturated = this.saturated(actor);
+      actor.mark(actor.saturated);
+      if (actor.saturated.length) parts.push(`voltage limit: ${actor.saturated.join(", ")}`);
+      if (actor.data.wheels) {
+        const up = actor.data.wheels.names.filter((_, k) => !(actor.shown.wheels[k] > 0));
+        if (up.length) parts.push(`lifted: ${up.join(", ")}`);
+      }
+      if (actor.support?.inside === false) parts.push(`${actor.data.pressure.name} outside the support`);
+      if (parts.length > 6) parts.splice(6, parts.length, `… ${parts.length - 6} more`);
+      if (parts.length) lines.push([actor, parts.join(" · ")]);
+    }
+    document.getElementById("status").replaceChildren(...lines.map(([actor, text]) => {
+      const line = D.element("div", {}, this.actors.length > 1 ? D.element("b", { textContent: `${actor.name} ` }) : "", text);
+      if (this.actors.length > 1) line.firstChild.style.color = this.colourOf(actor);
+      return line;
+    }));
+  }
+
+  saturated(actor) {
+    const limit = actor.data.limit, signal = actor.signals.get("voltage");
+    if (!limit || !signal || this.live) return [];
+    const times = actor.axes[signal.axis].column(0);
+    return signal.labels.filter((_, k) => Math.abs(Plots.value({ times, values: signal.table.column(k) }, this.time)) > 0.998 * limit);
+  }
+
+  about(actor, k) {
+    const body = actor.bodies[k], p = body.object.position.toArray().map((x) => D.number(x, 4)).join(", "), found = [`at (${p}) m`];
+    for (const [name, moved] of actor.data.motors)
+      if (moved === k)
+        for (const wanted of ["q", "v", "torque", "power", "phi", "phi_dot"]) {
+          const signal = actor.signals.get(wanted), column = signal ? signal.labels.indexOf(name) : -1;
+          if (column >= 0) found.push(`${wanted} ${D.number(Plots.value({ times: actor.axes[signal.axis].column(0), values: signal.table.column(column) }, this.time))} ${signal.unit}`);
+        }
+    return found;
+  }
+
+  // Names and forces beside the contacts.
+  label() {
+    for (const { actor, contact, box } of this.tags) {
+      const state = contact.state, shown = this.layers.labels && actor.object.visible && state.shown && !(this.ghost && actor.ghost);
+      const at = shown ? this.stage.project(this.point.copy(contact.at).add(actor.object.position), this.point) : null;
+      box.hidden = !at;
+      if (!at) continue;
+      box.textContent = `${state.name} ${D.number(state.force, 3)} N`;
+      box.style.color = state.colour;
+      box.style.transform = `translate(${Math.round(at[0])}px, ${Math.round(at[1])}px)`;
+    }
+  }
+
+  image() {
+    this.stage.draw();
+    return this.stage.canvas.toDataURL("image/png");
+  }
+
+  screenshot() {
+    const link = D.element("a", { href: this.image(), download: `${document.title.replace(/\W+/g, "_")}_${this.time.toFixed(3)}s.png` });
+    link.click();
+  }
+
+  state() {
+    return { time: this.time, playing: this.playing, speed: this.speed, theme: this.theme, ghost: this.ghost, follow: this.follow,
+      colouring: this.colouring, camera: this.stage.preset, plots: this.plots.plots.map((p) => p.signal),
+      records: this.actors.filter((a) => a.object.visible).map((a) => a.state()) };
+  }
+}
+
+const dynsim = { app: null };
+dynsim.ready = D.unpack(document.getElementById("data").textContent).then((data) => {
+  dynsim.app = new App(data);
+  for (const name of ["seek", "state", "frame", "set", "camera", "image"]) dynsim[name] = dynsim.app[name].bind(dynsim.app);
+  Object.defineProperty(dynsim, "cost", { get: () => dynsim.app.cost });
+  document.documentElement.dataset.ready = "yes";
+}).catch((error) => {
+  const box = document.getElementById("message");
+  box.textContent = `This page cannot be shown: ${error.message}`;
+  box.hidden = false;
+  console.error(error);
+});
+window.dynsim = dynsim;

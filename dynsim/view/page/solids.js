@@ -1,0 +1,130 @@
+"use strict";
+// Geometry of shapes, surfaces and marks; what is round lies along z.
+const S = {};
+
+S.geometry = function (shape, meshes) {
+  const [a, b, c] = shape.size;
+  switch (shape.kind) {
+    case "box": return new THREE.BoxGeometry(a, b, c);
+    case "sphere": return new THREE.SphereGeometry(a, 24, 16);
+    case "cylinder": return new THREE.CylinderGeometry(a, a, b, 28).rotateX(Math.PI / 2);
+    case "capsule": return S.capsule(a, b);
+    case "mesh": return meshes[shape.mesh].clone().scale(a, b, c);
+  }
+  throw new Error("unknown shape " + shape.kind);
+};
+
+S.capsule = function (radius, length) {
+  const profile = [], steps = 8;
+  for (const side of [-1, 1])
+    for (let k = 0; k <= steps; k++) {
+      const angle = (side < 0 ? steps - k : k) / steps * Math.PI / 2;
+      profile.push(new THREE.Vector2(Math.max(radius * Math.cos(angle), 1e-9), side * (0.5 * length + radius * Math.sin(angle))));
+    }
+  return new THREE.LatheGeometry(profile, 24).rotateX(Math.PI / 2);
+};
+
+// Triangles with 16-bit corners within a box: {vertices, triangles, low, step}. Edges of more than 40° stay sharp.
+S.mesh = function (bytes, mesh) {
+  const codes = (block) => new Uint16Array(bytes.slice(block.at, block.at + 2 * block.count).buffer);
+  const raw = codes(mesh.vertices), corner = codes(mesh.triangles), faces = corner.length / 3;
+  const at = (i, k) => mesh.low[k] + mesh.step[k] * raw[3 * i + k];
+  const normals = new Float32Array(corner.length), around = new Map();
+  for (let f = 0; f < faces; f++) {
+    const [a, b, c] = [0, 1, 2].map((j) => corner[3 * f + j]);
+    const u = [0, 1, 2].map((k) => at(b, k) - at(a, k)), v = [0, 1, 2].map((k) => at(c, k) - at(a, k));
+    for (let k = 0; k < 3; k++) normals[3 * f + k] = u[(k + 1) % 3] * v[(k + 2) % 3] - u[(k + 2) % 3] * v[(k + 1) % 3];
+    for (const i of [a, b, c]) around.has(i) ? around.get(i).push(f) : around.set(i, [f]);
+  }
+  const positions = new Float32Array(9 * faces), smooth = new Float32Array(9 * faces);
+  const dot = (f, g) => normals[3 * f] * normals[3 * g] + normals[3 * f + 1] * normals[3 * g + 1] + normals[3 * f + 2] * normals[3 * g + 2];
+  for (let f = 0; f < faces; f++)
+    for (let j = 0; j < 3; j++) {
+      const i = corner[3 * f + j], o = 9 * f + 3 * j, own = Math.sqrt(dot(f, f)), sum = [0, 0, 0];
+      for (const g of around.get(i)) if (dot(f, g) >= 0.766 * own * Math.sqrt(dot(g, g))) for (let k = 0; k < 3; k++) sum[k] += normals[3 * g + k];
+      const size = Math.hypot(...sum) || 1;
+      for (let k = 0; k < 3; k++) positions[o + k] = at(i, k), smooth[o + k] = sum[k] / size;
+    }
+  const made = new THREE.BufferGeometry();
+  made.setAttribute("position", new THREE.BufferAttribute(positions, 3));
+  made.setAttribute("normal", new THREE.BufferAttribute(smooth, 3));
+  return made;
+};
+
+// A sheet with a grid, faint towards its edge.
+S.sheet = function (half, step, round) {
+  const uniforms = { ground: { value: new THREE.Color() }, lines: { value: new THREE.Color() }, extent: { value: half },
+    cell: { value: step }, disc: { value: round ? 1 : 0 }, strength: { value: 1 } };
+  const material = new THREE.ShaderMaterial({
+    uniforms, transparent: true, side: THREE.DoubleSide, depthWrite: false, extensions: { derivatives: true },
+    polygonOffset: true, polygonOffsetFactor: 2, polygonOffsetUnits: 4,
+    vertexShader: `varying vec2 at; void main() { at = position.xy;
+      gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); }`,
+    fragmentShader: `varying vec2 at; uniform vec3 ground, lines; uniform float extent, cell, disc, strength;
+      float line(vec2 x, float wide) { vec2 w = fwidth(x); vec2 d = abs(fract(x - 0.5) - 0.5) / w;
+        float a = 1.0 - min(min(d.x, d.y) / wide, 1.0); return a * (1.0 - smoothstep(0.15, 0.5, max(w.x, w.y))); }
+      void main() { float far = disc > 0.5 ? length(at) / extent : max(abs(at.x), abs(at.y)) / extent;
+        float fade = disc > 0.5 ? 1.0 - smoothstep(0.45, 1.0, far) : 1.0;
+        float rule = max(0.55 * line(at / cell, 1.1), line(at / (5.0 * cell), 1.4));
+        gl_FragColor = vec4(mix(ground, lines, rule), fade * strength * (0.55 + 0.45 * rule)); }`,
+  });
+  const made = new THREE.Mesh(new THREE.PlaneGeometry(2 * half, 2 * half), material);
+  made.renderOrder = -10;
+  return made;
+};
+
+S.grid = function (surface) {
+  const { rows, columns, points } = surface, at = (i, j) => 3 * (i * columns + j), index = [];
+  const known = (i, j) => points[at(i, j)] !== null;
+  for (let i = 0; i + 1 < rows; i++)
+    for (let j = 0; j + 1 < columns; j++)
+      if (known(i, j) && known(i + 1, j) && known(i, j + 1) && known(i + 1, j + 1)) {
+        const a = i * columns + j;
+        index.push(a, a + 1, a + columns, a + 1, a + columns + 1, a + columns);
+      }
+  const made = new THREE.BufferGeometry();
+  made.setAttribute("position", new THREE.Float32BufferAttribute(points.map((x) => x ?? 0), 3));
+  made.setIndex(index);
+  made.computeVertexNormals();
+  return made;
+};
+
+// A surface that is no floor: translucent, seen from both sides.
+S.surface = function (surface, step) {
+  if (surface.kind === "plane") {
+    const sheet = S.sheet(surface.half, step, true);
+    sheet.quaternion.set(...S.xyzw(surface.q));
+    sheet.position.set(...surface.p);
+    sheet.material.uniforms.strength.value = 0.8;
+    return sheet;
+  }
+  const geometry = {
+    sphere: () => new THREE.SphereGeometry(Math.abs(surface.radius), 48, 32).rotateX(Math.PI / 2),
+    cylinder: () => new THREE.CylinderGeometry(Math.abs(surface.radius), Math.abs(surface.radius), surface.length, 64, 1, true)
+      .rotateX(Math.PI / 2),
+    box: () => new THREE.BoxGeometry(...surface.size),
+    grid: () => S.grid(surface),
+  }[surface.kind]();
+  const solid = surface.kind === "grid" || surface.kind === "box";
+  const material = new THREE.MeshLambertMaterial({ transparent: !solid, opacity: solid ? 1 : 0.45, side: THREE.DoubleSide,
+    depthWrite: solid, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 2 });
+  const made = new THREE.Mesh(geometry, material);
+  if (surface.q) made.quaternion.set(...S.xyzw(surface.q));
+  if (surface.p) made.position.set(...surface.p);
+  made.renderOrder = solid ? 0 : -5;
+  return made;
+};
+
+S.xyzw = (q) => [q[1], q[2], q[3], q[0]];
+
+// A fat line through points (flat array of numbers).
+S.line = function (points, width, dashed) {
+  const geometry = new THREE.LineGeometry();
+  geometry.setPositions(points);
+  const material = new THREE.LineMaterial({ linewidth: width, dashed: Boolean(dashed), transparent: true });
+  if (dashed) Object.assign(material, { dashSize: dashed, gapSize: 0.7 * dashed, dashScale: 1 });
+  const made = new THREE.Line2(geometry, material);
+  if (dashed) made.computeLineDistances();
+  made.frustumCulled = false;
+  return made;
+};

@@ -1,0 +1,185 @@
+"""What stands still or moves with a body, as the page draws it: shapes, rods where a body has none, surfaces."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.record.quaternion import of_turn
+from dynsim.record.scene import HERE, WORLD, Body, Scene, Shape, Surface
+from dynsim.view.meshes import Meshes
+
+Array = NDArray[np.float64]
+# Radius of a rod drawn for a body without shapes, in parts of the robot's reach.
+ROD = 0.008
+# A sphere or cylinder of more than this many times what is shown is drawn only next to the robot.
+LARGE = 4.0
+# Points along each side of the part of a curved surface that is drawn.
+PATCH = 41
+
+
+def drawn_shape(shape: Shape, meshes: Meshes) -> dict[str, Any] | None:
+    """A shape as the page reads it; None for a mesh that was not found."""
+    found: dict[str, Any] = {
+        "kind": shape.kind,
+        "size": list(shape.size),
+        "p": list(shape.position),
+        "q": list(shape.orientation),
+    }
+    if shape.colour is not None:
+        found["colour"] = list(shape.colour)
+    if shape.kind == "mesh":
+        mesh = meshes.index(shape.file)
+        if mesh is None:
+            return None
+        found["mesh"] = mesh
+    return found
+
+
+def body_shapes(scene: Scene, reach: float, meshes: Meshes) -> list[list[dict[str, Any]]]:
+    """Shapes of every body; rods to what it carries where it has none, and a hub about the axis of its joint."""
+    radius = _radius(scene, ROD * reach)
+    base = set(scene.base)
+    found = []
+    for k, body in enumerate(scene.bodies):
+        shapes = [one for shape in body.shapes if (one := drawn_shape(shape, meshes)) is not None]
+        wanted = [child for child in scene.bodies if child.parent == k]
+        # A rod leads away from its joint, a wheel lies about it.
+        bare = not shapes or (_is_tube(body) and np.abs(body.shapes[0].position).max() > 1e-9)
+        if not shapes and k not in base:
+            ends = [np.array(child.joint.position) for child in wanted if not child.joint.part_of]
+            ends += [np.array(point.position) for point in scene.points if point.role == "hand" and point.body == k]
+            shapes = [_rod(end, radius) for end in ends if np.linalg.norm(end) > 2.0 * radius]
+        if body.joint.kind == "revolute" and not body.joint.part_of and k not in base and bare:
+            shapes.append(_hub(body, 1.45 * radius))
+        found.append(shapes)
+    if not any(found):
+        hands = {point.body for point in scene.points if point.body != WORLD} or {len(scene.bodies) - 1}
+        for k in hands & set(range(len(scene.bodies))):
+            found[k] = [{"kind": "box", "size": 3 * [0.06 * reach], "p": [0.0, 0.0, 0.03 * reach], "q": list(HERE)}]
+    return found
+
+
+def _radius(scene: Scene, default: float) -> float:
+    tubes = [shape.size[0] for body in scene.bodies if _is_tube(body) for shape in body.shapes[:1]]
+    return float(np.median(tubes)) if tubes else default
+
+
+def _is_tube(body: Body) -> bool:
+    """Whether it is drawn as a rod of dynsim's own: a cylinder without colour through the body's origin."""
+    return bool(body.shapes) and body.shapes[0].kind in ("cylinder", "capsule") and body.shapes[0].colour is None
+
+
+def _rod(end: Array, radius: float) -> dict[str, Any]:
+    length = float(np.linalg.norm(end))
+    return {
+        "kind": "capsule",
+        "size": [radius, length],
+        "p": (0.5 * end).tolist(),
+        "q": from_z(end / length).tolist(),
+        "role": "rod",
+    }
+
+
+def _hub(body: Body, radius: float) -> dict[str, Any]:
+    return {
+        "kind": "cylinder",
+        "size": [radius, 2.5 * radius],
+        "p": [0.0, 0.0, 0.0],
+        "q": from_z(np.array(body.joint.axis)).tolist(),
+        "role": "hub",
+    }
+
+
+def from_z(direction: Array) -> Array:
+    """A turn that takes z to a unit vector, (4,)."""
+    axis = np.cross([0.0, 0.0, 1.0], direction)
+    size = float(np.linalg.norm(axis))
+    if size < 1e-12:
+        return np.array(HERE if direction[2] > 0.0 else (0.0, 1.0, 0.0, 0.0))
+    return of_turn(axis / size, np.arctan2(size, direction[2]))
+
+
+def drawn_surface(surface: Surface, low: Array, high: Array) -> dict[str, Any]:
+    """A surface next to the box from ``low`` to ``high`` in which everything moves."""
+    found: dict[str, Any] = {"name": surface.name, "kind": surface.kind}
+    span = float((high - low).max())
+    near = abs(surface.radius or 0.0) <= LARGE * span
+    if surface.kind == "plane" and surface.direction is not None:
+        centre = 0.5 * (low + high)
+        normal = np.array(surface.direction)
+        return found | {
+            "p": (centre - surface.gap(centre) * normal).tolist(),
+            "q": from_z(normal).tolist(),
+            "half": 1.1 * float(np.linalg.norm(high - low)),
+        }
+    if surface.kind == "sphere" and near:
+        return found | {"p": list(surface.position or ()), "radius": surface.radius}
+    if surface.kind == "cylinder" and near and surface.direction is not None:
+        axis, place = np.array(surface.direction), np.array(surface.position)
+        along = [(corner - place) @ axis for corner in _corners(low, high)]
+        start, end = min(along) - 0.1 * span, max(along) + 0.1 * span
+        return found | {
+            "p": (place + 0.5 * (start + end) * axis).tolist(),
+            "q": from_z(axis).tolist(),
+            "radius": surface.radius,
+            "length": end - start,
+        }
+    if surface.kind == "box":
+        return found | {
+            "p": list(surface.position or ()),
+            "q": list(surface.orientation or HERE),
+            "size": list(surface.edges or ()),
+        }
+    if surface.kind == "height_field":
+        x, y = np.meshgrid(*surface.grid)
+        grid = np.stack([x, y, np.array(surface.heights)], axis=-1)
+    else:
+        grid = patch(surface, low, high)
+    rows, columns, _ = grid.shape
+    numbers = [None if not np.isfinite(value) else round(float(value), 5) for value in grid.ravel()]
+    return found | {"kind": "grid", "rows": rows, "columns": columns, "points": numbers}
+
+
+def patch(surface: Surface, low: Array, high: Array) -> Array:
+    """Points of a quadric over its tangent plane next to the box, (n, n, 3), NaN where there are none."""
+    anchor, normal = 0.5 * (low + high), np.array([0.0, 0.0, 1.0])
+    for _ in range(20):
+        slope = surface.gradient(anchor)
+        if not np.linalg.norm(slope) > 1e-12:
+            return np.full((2, 2, 3), np.nan)
+        normal = slope / np.linalg.norm(slope)
+        anchor = anchor - surface.gap(anchor) * normal
+    across = np.linalg.svd(normal[None])[2][1:]
+    reach = (_corners(low, high) - anchor) @ across.T
+    u, v = np.meshgrid(*(np.linspace(reach[:, k].min(), reach[:, k].max(), PATCH) for k in (0, 1)))
+    start = anchor + u[..., None] * across[0] + v[..., None] * across[1]
+    # C along the normal: a s² + b s + c = 0, the smaller root in the form that also holds for a = 0.
+    Q, c = np.array(surface.Q), surface.value(start)
+    a = 0.5 * float(normal @ Q @ normal)
+    b = start @ Q @ normal + float(np.array(surface.b) @ normal)
+    inside = b * b - 4.0 * a * c
+    with np.errstate(all="ignore"):
+        step = -2.0 * c / (b + np.copysign(np.sqrt(np.where(inside >= 0.0, inside, np.nan)), b))
+    points = start + step[..., None] * normal
+    points[~(np.abs(step) <= float((high - low).max()))] = np.nan
+    return np.asarray(points)
+
+
+def normals(surface: Surface, points: Array) -> Array:
+    """Unit normals into the free side at points, (T, 3) → (T, 3)."""
+    if surface.kind in ("box", "height_field"):
+        step = 1e-6
+        ends = [points + side * step * axis for axis in np.eye(3) for side in (1.0, -1.0)]
+        values = [surface.value(end) for end in ends]
+        slope = np.stack([values[2 * k] - values[2 * k + 1] for k in range(3)], axis=-1)
+    else:
+        slope = points @ np.array(surface.Q) + np.array(surface.b)
+    size = np.linalg.norm(slope, axis=-1, keepdims=True)
+    return np.asarray(slope / np.where(size > 0.0, size, 1.0))
+
+
+def _corners(low: Array, high: Array) -> Array:
+    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])

@@ -1,0 +1,277 @@
+"""What pages hold, without a browser: blocks of numbers, frames, meshes, the text of the page, the commands."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import html
+import json
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from meshed_robot import CORNERS, FACES, dae, meshed_robot, obj, stl, stl_text
+
+import dynsim
+from dynsim import cli
+from dynsim.errors import RecordError
+from dynsim.record import Record
+from dynsim.record.poses import ORIENTATION, POSITION, add_body_poses
+from dynsim.scenario import build_model, load_scenario, variant_names
+from dynsim.view import content, page, viewable, write
+from dynsim.view.blocks import Blocks
+from dynsim.view.html import three
+from dynsim.view.mesh_files import read_mesh
+from dynsim.view.meshes import TRIANGLES, Meshes, thinned
+
+SHORT = {"duration_s": 0.5, "metrics.settle_s": 0.1}
+
+
+@pytest.fixture(scope="module")
+def braced() -> Record:
+    return dynsim.simulate(load_scenario("elbow_comparison", "two_elbows", SHORT))
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Record:
+    return dynsim.simulate(load_scenario(meshed_robot(tmp_path_factory.mktemp("robot"))))
+
+
+def unpacked(text: str) -> tuple[dict[str, Any], bytes]:
+    content = gzip.decompress(base64.b64decode(text))
+    size = int.from_bytes(content[:4], "little")
+    return json.loads(content[4 : 4 + size]), content[4 + size :]
+
+
+def data_of(text: str) -> tuple[dict[str, Any], bytes]:
+    found = re.search(r'<script id="data"[^>]*>([^<]*)</script>', text)
+    assert found is not None
+    return unpacked(found[1])
+
+
+def values(block: dict[str, Any], content: bytes) -> np.ndarray:
+    """A second reader of blocks, beside that of the page."""
+    rows, columns, size = block["rows"], block["columns"], block["bits"] // 8
+    raw = np.frombuffer(content, np.uint8, rows * columns * size, block["at"]).reshape(size, columns, rows)
+    steps = sum(raw[k].astype(np.uint64) << np.uint64(8 * k) for k in range(size))
+    codes = np.cumsum(steps, axis=1, dtype=np.uint64) % np.uint64(2 ** block["bits"])
+    known = np.array(block["offset"])[:, None] + np.array(block["scale"])[:, None] * codes.astype(float)
+    return np.where(codes == 2 ** block["bits"] - 1, np.nan, known).T
+
+
+@given(st.lists(st.lists(st.floats(-1e6, 1e6) | st.just(np.nan), min_size=3, max_size=3), min_size=1, max_size=30))
+def test_blocks_come_back(rows: list[list[float]]) -> None:
+    data = np.array(rows)
+    blocks = Blocks()
+    blocks.raw(np.arange(7))
+    coarse, fine = blocks.add(data), blocks.add(data, 1e-6)
+    _, content = unpacked(blocks.packed({}))
+    spans = [np.ptp(column[np.isfinite(column)]) if np.isfinite(column).any() else 0.0 for column in data.T]
+    for block, error in ((coarse, 0.51 * np.array(spans) / 65534 + 1e-9), (fine, np.full(3, 1e-3))):
+        found = values(block, content)
+        assert (np.isnan(found) == np.isnan(data)).all()
+        assert (np.nan_to_num(np.abs(found - data)) <= error).all()
+    assert np.nan_to_num(np.abs(values(fine, content) - data)).max() <= max(1e-6, 1e-9 * max(spans))
+
+
+def test_frames_are_thinned_only_as_far_as_poses_allow(braced: Record) -> None:
+    head, blocks = data_of(page({"one": braced}))
+    (part,) = head["records"]
+    times = values(part["frames"], blocks)[:, 0]
+    assert times[[0, -1]] == pytest.approx(braced.time[[0, -1]])
+    position, turn = values(part["position"], blocks), values(part["orientation"], blocks)
+    truth = braced[POSITION].reshape(len(braced), -1)
+    between = np.stack([np.interp(braced.time, times, column) for column in position.T], axis=1)
+    assert np.abs(between - truth).max() <= 1.5 * content.POSE_ERROR  # and the rounding of the codes
+    turns = np.stack([np.interp(braced.time, times, column) for column in turn.T], axis=1)
+    assert np.abs(turns - braced[ORIENTATION].reshape(len(braced), -1)).max() <= 1e-4
+    # A record that stands still needs two.
+    still = Record(braced.time)
+    still.add("q", np.repeat(braced["q"][:1], len(braced), axis=0), "rad", labels=braced.labels["q"])
+    still.scene = braced.scene
+    assert add_body_poses(still)
+    assert data_of(page({"one": still}))[0]["records"][0]["frames"]["rows"] <= 5
+
+
+def test_long_signals_keep_their_extremes() -> None:
+    time = np.linspace(0.0, 100.0, 50_001)
+    data = np.stack([np.sin(time), np.zeros_like(time)], axis=1)
+    data[12_345, 1], data[33_333, 1] = 7.0, -5.0
+    at, kept = content._thinned(time, data)
+    assert len(at) == len(kept) <= content.PLOTTED + 1
+    assert (np.diff(at) > 0.0).all()
+    assert kept[:, 1].max() == 7.0
+    assert kept[:, 1].min() == -5.0
+    assert abs(at[kept[:, 1].argmax()] - time[12_345]) < 100.0 / content.PLOTTED * 2
+
+
+@pytest.mark.parametrize(
+    ("name", "text"), [("a.stl", stl()), ("b.STL", stl_text()), ("c.obj", obj()), ("d.dae", dae())]
+)
+def test_mesh_files(name: str, text: bytes | str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+    corners, triangles = read_mesh(tmp_path / name)
+    wanted = {tuple(map(tuple, np.round(CORNERS[face], 6))) for face in FACES}
+    found = {tuple(map(tuple, np.round(corners[face], 6) + 0.0)) for face in triangles}
+    assert found == wanted
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.stl", "solid nothing"),
+        ("a.stl", "vertex 1 2 x"),
+        ("a.obj", "v 0 0 0\nf 1 2 3"),
+        ("a.obj", "f 1 2"),
+        ("a.dae", "<COLLADA"),
+        ("a.dae", '<!DOCTYPE a [<!ENTITY b "c">]><COLLADA/>'),
+        ("a.dae", "<COLLADA/>"),
+        ("a.wrl", "#VRML"),
+    ],
+)
+def test_broken_meshes_are_refused(name: str, text: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(RecordError, match=re.escape(name)):
+        read_mesh(tmp_path / name)
+
+
+def test_meshes_are_thinned() -> None:
+    """A ball of many triangles becomes one of few, at the same place and turned to the same side."""
+    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 301)[:-1], np.linspace(0.01, np.pi - 0.01, 150))
+    corners = np.stack([np.sin(v) * np.cos(u), np.sin(v) * np.sin(u), np.cos(v)], axis=-1).reshape(-1, 3)
+    i = np.arange(149 * 300)
+    right = i - i % 300 + (i + 1) % 300
+    triangles = np.concatenate([np.stack([i, i + 300, right], 1), np.stack([right, i + 300, right + 300], 1)])
+    few, faces = thinned(corners, triangles)
+    assert 500 < len(faces) <= TRIANGLES < len(triangles)
+    volume = np.linalg.det(few[faces]).sum() / 6.0
+    assert volume == pytest.approx(np.linalg.det(corners[triangles]).sum() / 6.0, rel=0.03)
+
+
+def test_meshes_are_found_where_the_robot_is(robot: Record) -> None:
+    head, _ = data_of(page({"one": robot}))
+    (part,) = head["records"]
+    kinds = [[shape["kind"] for shape in body["shapes"]] for body in part["bodies"]]
+    assert kinds[:3] == [["mesh"]] * 3
+    assert len(head["meshes"]) == 3
+    assert "no.stl" in head["notes"][0]
+    # No path of this machine is in a page.
+    assert os.sep + "wedges" not in json.dumps(head)
+
+
+def test_a_mesh_is_packed_once(robot: Record) -> None:
+    meshes = Meshes(Blocks())
+    meshes.of_robot(robot)
+    file = "package://wedges/meshes/wedge.stl"
+    assert meshes.index(file) == meshes.index(file) == 0
+    assert len(meshes.found) == 1
+
+
+def test_the_page_is_one_file_without_a_network(braced: Record, tmp_path: Path) -> None:
+    text = page({"one": braced})
+    assert "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:" in text
+    assert "connect-src" not in text
+    rest = text.replace(three().replace("</script", "<\\/script"), "")
+    assert len(rest) < len(text)
+    assert not re.search(r"https?://|\bsrc=|href=\"|@import|url\(", rest)
+    # Each script that begins ends, and none earlier than meant.
+    assert len(re.findall(r"<script", text)) == len(re.findall(r"</script>", text)) == 3
+    assert page({"one": braced}) == text
+    assert write({"one": braced}, tmp_path / "p.html").read_text(encoding="utf-8") == text
+    assert "SPDX-License-Identifier: MIT" in text
+
+
+def test_an_arm_of_ten_seconds_is_small() -> None:
+    record = dynsim.simulate(load_scenario("elbow_comparison", "two_elbows", {"integrator.rtol": 1e-4}))
+    assert len(record) == 2001
+    assert len(page({"one": record}).encode()) < 2_000_000
+
+
+def test_what_has_nothing_to_be_seen(braced: Record) -> None:
+    bare = Record(braced.time)
+    bare.add("q", braced["q"], "rad", labels=braced.labels["q"])
+    assert not viewable(bare)
+    with pytest.raises(RecordError, match="nothing to view"):
+        page({"bare": bare})
+    assert [part["name"] for part in data_of(page({"bare": bare, "one": braced}))[0]["records"]] == ["one"]
+
+
+def test_a_run_that_diverged_is_shown_as_far_as_it_came(braced: Record) -> None:
+    record = Record(braced.time, provenance=braced.provenance)
+    for name in ("q", POSITION, ORIENTATION, "contact_normal_force", "contact_force"):
+        data = braced[name].astype(float)
+        data[-3:] = np.nan
+        record.add(name, data, braced.units[name], labels=braced.labels[name])
+    record.scene = braced.scene
+    head, blocks = data_of(page({"one": record}))
+    (part,) = head["records"]
+    assert np.isnan(values(part["position"], blocks)[-1]).all()
+    assert np.isfinite(np.array(head["box"])).all()
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr("sys.argv", ["dynsim", *map(str, arguments)])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    code = stop.value.code
+    assert isinstance(code, int)
+    return code
+
+
+def test_commands_write_pages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """``run`` and ``compare`` write a page unless told not to, and none opens a browser by itself."""
+    opened: list[str] = []
+    monkeypatch.setenv("DISPLAY", ":7")
+    monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url) or True)
+    short = ("--set", "duration_s=0.2", "--set", "metrics.settle_s=0.1")
+    assert run(monkeypatch, "run", "single_pendulum", *short, "--out", tmp_path / "run") == 0
+    path = tmp_path / "run" / "view.html"
+    assert data_of(path.read_text(encoding="utf-8"))[0]["records"][0]["name"] == "single_pendulum"
+    assert "view.html" in capsys.readouterr().out
+    # A later run without figures leaves no page of the earlier record.
+    assert run(monkeypatch, "run", "single_pendulum", *short, "--no-figures", "--out", tmp_path / "run") == 0
+    assert not path.exists()
+    assert opened == []
+    assert run(monkeypatch, "run", "single_pendulum", *short, "--view", "--no-figures", "--out", tmp_path / "run") == 0
+    assert opened == [path.as_uri()]
+    assert run(monkeypatch, "compare", "elbow_comparison", *short, "-q", "--out", tmp_path / "all") == 0
+    head, _ = data_of((tmp_path / "all" / "view.html").read_text(encoding="utf-8"))
+    assert [part["name"] for part in head["records"]] == variant_names("elbow_comparison")
+    records = [tmp_path / "all" / name / "record.h5" for name in ("elbow_4", "elbow_7")]
+    assert run(monkeypatch, "view", *records, "--ghost", "--out", tmp_path / "two.html", "--no-open") == 0
+    head, _ = data_of((tmp_path / "two.html").read_text(encoding="utf-8"))
+    assert head["ghost"]
+    assert len(opened) == 1
+    monkeypatch.delenv("DISPLAY")
+    monkeypatch.delenv("BROWSER", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    if os.name == "posix" and os.uname().sysname == "Linux":
+        assert run(monkeypatch, "view", records[0], "--out", tmp_path / "one.html") == 0
+        assert len(opened) == 1
+        assert "No browser" in capsys.readouterr().out
+    assert run(monkeypatch, "view", tmp_path / "none.h5", "--no-open") != 0
+
+
+def test_notebooks(braced: Record, tmp_path: Path) -> None:
+    shown = braced.view(braced, ghost=True, height=400)
+    frame = shown._repr_html_()
+    found = re.search(r'srcdoc="([^"]*)"', frame)
+    assert found is not None
+    assert html.unescape(found[1]) == shown.page
+    assert 'sandbox="allow-scripts allow-downloads"' in frame
+    assert "height:400px" in frame
+    assert [part["name"] for part in data_of(shown.page)[0]["records"]] == ["two_elbows", "two_elbows 2"]
+    assert shown.save(tmp_path / "p.html").read_text(encoding="utf-8") == shown.page
+    scenario = load_scenario("elbow_comparison", "two_elbows")
+    assert "serial_arm" in scenario._repr_html_()
+    assert "joint_10" in build_model(scenario)._repr_html_()
+    evil = Record(braced.time, provenance={"scenario": {"name": "<script>"}})
+    assert "<script>" not in evil._repr_html_()
+    assert "contact_gap" in braced._repr_html_()

@@ -1,0 +1,424 @@
+"""Pages in a real browser: poses, forces, wheels and plots are the record's, and controls do what they say."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from meshed_robot import meshed_robot
+from PIL import Image
+
+import dynsim
+from dynsim.record import Record
+from dynsim.record.poses import ORIENTATION, POSITION, add_body_poses
+from dynsim.record.scene import HERE, Body, Joint, Scene, Shape
+from dynsim.scenario import build_model, load_scenario
+
+Opens = Callable[..., Any]
+NEAR = 1e-4
+
+
+def short(name: str, variant: str | None = None, **options: Any) -> Record:
+    return dynsim.simulate(load_scenario(name, variant, {"duration_s": 1.0, **options}))
+
+
+@pytest.fixture(scope="module")
+def braced() -> Record:
+    return short("elbow_comparison", "two_elbows", duration_s=2.0)
+
+
+@pytest.fixture(scope="module")
+def snake() -> Record:
+    return short("snake_circle", duration_s=2.0)
+
+
+@pytest.fixture(scope="module")
+def mobile() -> Record:
+    return short("mobile_path")
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Record:
+    return dynsim.simulate(load_scenario(meshed_robot(tmp_path_factory.mktemp("robot"))))
+
+
+@pytest.mark.parametrize("kind", ["braced", "mobile", "snake", "robot"])
+def test_bodies_are_where_the_record_has_them(kind: str, request: pytest.FixtureRequest, opened: Opens) -> None:
+    record: Record = request.getfixturevalue(kind)
+    page = opened({"one": record})
+    rows = np.random.default_rng(1).integers(0, len(record), 12)
+    for row in [0, len(record) - 1, *rows]:
+        state = page.seek(float(record.time[row]))
+        (shown,) = state["records"]
+        assert state["time"] == pytest.approx(record.time[row], abs=1e-9)
+        assert list(shown["bodies"]) == list(record.labels[POSITION])
+        place = np.array([body["p"] for body in shown["bodies"].values()])
+        turn = np.array([body["q"] for body in shown["bodies"].values()])
+        np.testing.assert_allclose(place, record[POSITION][row], atol=NEAR)
+        np.testing.assert_allclose(np.abs((turn * record[ORIENTATION][row]).sum(axis=1)), 1.0, atol=1e-8)
+        # That of the kernels, not of the scene.
+        hand = record["w"][row, :3] if kind == "snake" else record["hand_position"][row]
+        np.testing.assert_allclose(shown["hand"], hand, atol=NEAR)
+
+
+def test_between_samples_bodies_are_where_the_model_has_them(braced: Record, opened: Opens) -> None:
+    model = build_model(load_scenario("elbow_comparison", "two_elbows"))
+    page = opened({"one": braced})
+    for time in np.random.default_rng(2).uniform(0.0, 2.0, 10):
+        (shown,) = page.seek(float(time))["records"]
+        q = np.array([np.interp(time, braced.time, column) for column in braced["q"].T])
+        for link in model.robot.links:
+            np.testing.assert_allclose(shown["bodies"][link.name]["p"], model.body_pose(link.name, q)[1], atol=NEAR)
+
+
+def test_arrows_have_the_sign_of_the_force(braced: Record, opened: Opens) -> None:
+    """Blue away from the surface for a push, orange towards it for a pull; the head of both is seen above the floor."""
+    page, signs, inclined = opened({"one": braced}), set(), 0
+    colours = page.js("dynsim.app.colours")
+    for row in range(5, len(braced), 37):
+        (shown,) = page.seek(float(braced.time[row]))["records"]
+        for k, contact in enumerate(shown["contacts"]):
+            force = braced["contact_normal_force"][row, k]
+            assert contact["name"] == braced.labels["contact_normal_force"][k]
+            assert contact["force"] == pytest.approx(force, abs=1e-3 * np.abs(braced["contact_normal_force"]).max())
+            if abs(force) < 0.01:
+                continue
+            signs.add(np.sign(force))
+            assert contact["visible"]
+            assert contact["colour"] == (colours["pull"] if force < 0.0 else colours["push"])
+            assert contact["state"] == ("pulls" if force < 0.0 else "pushes")
+            tail, head = page.js(
+                """k => { const { push, at } = dynsim.app.actors[0].contacts[k], o = push.object;
+                   o.updateMatrixWorld(true);
+                   const p = new THREE.Vector3(0, 0, push.head.position.z).applyMatrix4(o.matrixWorld);
+                   return [o.position.z, p.z].map((z) => z - at.z); }""",
+                k,
+            )
+            assert (head - tail) * force > 0.0
+            assert min(head, tail) == pytest.approx(0.0, abs=1e-6)
+            along, seen = page.js(
+                """k => { const { slide } = dynsim.app.actors[0].contacts[k], z = new THREE.Vector3(0, 0, 1);
+                   return [z.applyQuaternion(slide.object.quaternion).toArray(), slide.object.visible]; }""",
+                k,
+            )
+            whole = braced["contact_force"][row, k]
+            if seen:
+                np.testing.assert_allclose(along, whole / np.linalg.norm(whole), atol=2e-3)
+                inclined += 1
+    assert signs == {-1.0, 1.0}
+    assert inclined > 5
+
+
+def test_states_of_real_contacts_and_events(opened: Opens) -> None:
+    record = short("bouncing_link")
+    page, seen = opened({"one": record}), set()
+    names = {0: "open", 1: "slips", 2: "sticks"}
+    for row in range(0, len(record), 9):
+        (shown,) = page.seek(float(record.time[row]))["records"]
+        for contact in shown["contacts"]:
+            k = record.labels["contact_mode"].index(contact["name"])
+            assert contact["state"] == names[int(record["contact_mode"][row, k])]
+            assert contact["visible"] == (contact["state"] != "open" and abs(contact["force"]) > 0.0)
+            seen.add(contact["state"])
+    assert "open" in seen
+    assert len(seen) > 1
+    marks = page.page.locator("#marks i")
+    assert marks.count() == len(record.events) > 0
+    marks.first.dispatch_event("click")
+    assert page.state()["time"] == pytest.approx(record.events[0].time, abs=1e-6)
+
+
+def test_wheels_and_support_of_a_snake(snake: Record, opened: Opens) -> None:
+    page = opened({"one": snake})
+    for row in range(0, len(snake), 60):
+        (shown,) = page.seek(float(snake.time[row]))["records"]
+        assert list(shown["wheels"].values()) == snake["grounded"][row].astype(bool).tolist()
+        assert shown["support"]["inside"] == (snake["support_margin"][row] > 0.0)
+        assert shown["gripper"] == snake["gripper"][row]
+
+
+def test_centre_of_pressure_of_a_mobile_base(mobile: Record, opened: Opens) -> None:
+    page = opened({"one": mobile})
+    (shown,) = page.seek(0.5)["records"]
+    assert shown["support"] == {"corners": 3, "inside": True}
+    place = page.js("dynsim.app.actors[0].support.dot.position.toArray()")
+    row = int(np.searchsorted(mobile.time, 0.5))
+    np.testing.assert_allclose(place[:2], mobile["center_of_pressure"][row], atol=NEAR)
+
+
+def test_play_slider_and_keys(braced: Record, opened: Opens) -> None:
+    page = opened({"one": braced})
+    keys = page.page.keyboard
+    page.page.select_option("#speed", "0.05")
+    page.page.click("#play")
+    page.until("dynsim.state().time > 0.01")
+    page.page.click("#play")
+    state = page.state()
+    assert not state["playing"]
+    assert page.state()["time"] == state["time"]
+    page.page.locator("#slider").evaluate("s => { s.value = 1.25; s.dispatchEvent(new Event('input')); }")
+    assert page.state()["time"] == pytest.approx(1.25)
+    assert "1.250 s" in page.page.inner_text("#clock")
+    page.page.click("#scene", position={"x": 5, "y": 300})
+    keys.press("Home")
+    assert page.state()["time"] == 0.0
+    keys.press("ArrowRight")
+    first = page.state()["time"]
+    assert first > 0.0
+    keys.press("Shift+ArrowRight")
+    assert page.state()["time"] == pytest.approx(11 * first, rel=1e-6)
+    keys.press("End")
+    assert page.state()["time"] == pytest.approx(2.0)
+    keys.press("+")
+    assert page.state()["speed"] == 0.1
+    for key, camera in (("2", "side"), ("3", "front"), ("4", "top"), ("1", "iso")):
+        keys.press(key)
+        assert page.state()["camera"] == camera
+    keys.press("f")
+    assert page.state()["follow"]
+    keys.press("d")
+    assert page.state()["theme"] == "dark"
+    # From the end it plays anew, and stops there again.
+    page.page.select_option("#speed", "10")
+    keys.press("Space")
+    page.until("!dynsim.state().playing && dynsim.state().time === dynsim.app.span[1]")
+
+
+def test_plots_show_the_signals(braced: Record, opened: Opens) -> None:
+    page = opened({"one": braced})
+    assert page.state()["plots"][0] == "contact_normal_force"
+    page.seek(1.0)
+    row = int(np.searchsorted(braced.time, 1.0))
+    shown = page.page.locator(".plot .values").first.inner_text()
+    for name, force in zip(braced.labels["contact_normal_force"], braced["contact_normal_force"][row], strict=True):
+        assert f"{name} {force:.3g}".replace("-", "−")[:-1] in shown
+    curve = page.page.locator(".plot .curves").first
+    curve.click(position={"x": 44 + 20, "y": 40})
+    clicked = page.state()["time"]
+    assert 0.0 < clicked < 0.5
+    # A drag shows what lies between its ends, a double click everything.
+    box = curve.bounding_box()
+    page.page.mouse.move(box["x"] + 100, box["y"] + 40)
+    page.page.mouse.down()
+    page.page.mouse.move(box["x"] + 180, box["y"] + 40)
+    page.page.mouse.up()
+    low, high = page.js("dynsim.app.plots.range")
+    assert 0.0 < low < high < 2.0
+    curve.dblclick(position={"x": 100, "y": 40})
+    assert page.js("dynsim.app.plots.range") is None
+    page.page.locator(".plot select").first.select_option("torque")
+    assert page.state()["plots"][0] == "torque"
+    page.page.click("#add-plot")
+    assert len(page.state()["plots"]) == 4
+    page.page.locator(".plot .bar button").first.click()
+    assert "torque" not in page.state()["plots"]
+    # Every value of every signal, from the page's tables.
+    for name in ("q", "voltage", "energy_electrical", "contact_force"):
+        values = np.array(
+            page.js("n => { const t = dynsim.app.actors[0].signals.get(n).table;"
+                    " return Array.from({length: t.columns}, (_, k) => Array.from(t.column(k))); }", name)
+        ).T  # fmt: skip
+        data = braced[name].reshape(len(braced), -1)
+        np.testing.assert_allclose(values, data, atol=1e-5 * np.ptp(data, axis=0).max())
+
+
+def test_a_phone(mobile: Record, opened: Opens) -> None:
+    page = opened({"one": mobile}, size=(390, 844), dark=True)
+    assert page.js("document.documentElement.scrollWidth") <= 390
+    for name in ("#scene", "#play", "#slider", "#speed", "#theme"):
+        box = page.page.locator(name).bounding_box()
+        assert box is not None
+        assert box["x"] >= 0.0
+        assert box["x"] + box["width"] <= 390.0
+    # The whole way of the base, and the hand above it, are in the picture.
+    for time in (0.0, 0.5, 1.0):
+        page.seek(time)
+        places = page.js(
+            "dynsim.app.actors[0].bodies.map(b => dynsim.app.stage.project(b.object.position, new THREE.Vector3()))"
+        )
+        width, height = page.js("dynsim.app.stage.size")
+        assert all(0.0 < x < width and 0.0 < y < height for x, y in places)
+    page.page.click("#play")
+    page.until("dynsim.state().time > 0.02")
+
+
+def test_the_picture_is_not_blank(robot: Record, opened: Opens) -> None:
+    page = opened({"one": robot})
+    image = page.js("dynsim.image()")
+    _, _, text = image.partition(",")
+    pixels = np.asarray(Image.open(io.BytesIO(base64.b64decode(text))).convert("L"), dtype=float)
+    assert pixels.std() > 5.0
+    assert page.js("dynsim.app.actors[0].bodies.flatMap(b => b.paint).length") == 4  # a hub for the lost mesh
+
+
+def test_links_are_painted_by_their_motors(robot: Record, opened: Opens) -> None:
+    page = opened({"one": robot})
+    page.page.select_option("#colour", "torque")
+    painted = page.js("dynsim.app.actors[0].bodies.map(b => '#' + b.paint[0].material.color.getHexString())")
+    scale = page.page.inner_text("#scale")
+    assert "N m" in scale
+    torque = np.abs(robot["torque"])
+    shares = torque[0] / max(np.sort(torque.ravel())[int(0.98 * torque.size)], 1e-12)
+    expected = [page.js("x => '#' + App.heat(x).getHexString()", float(share)) for share in shares]
+    distance = [
+        max(abs(int(a[k : k + 2], 16) - int(b[k : k + 2], 16)) for k in (1, 3, 5))
+        for a, b in zip(painted, expected, strict=True)
+    ]
+    assert max(distance) <= 3
+    page.page.select_option("#colour", "")
+    plain = page.js("dynsim.app.actors[0].bodies.map(b => '#' + b.paint[0].material.color.getHexString())")
+    assert plain != painted
+
+
+def test_variants_beside_and_over_each_other(braced: Record, opened: Opens) -> None:
+    free = short("elbow_comparison", "no_elbow", duration_s=2.0)
+    page = opened({"braced": braced, "free": free})
+    first, second = page.seek(1.0)["records"]
+    assert (first["name"], second["name"]) == ("braced", "free")
+    assert first["offset"] == [0.0, 0.0, 0.0]
+    assert np.linalg.norm(second["offset"]) > 0.3
+    np.testing.assert_allclose(second["bodies"]["link_10"]["p"], free[POSITION][200, 9], atol=NEAR)
+    page.page.keyboard.press("g")
+    assert page.state()["ghost"]
+    assert [record["offset"] for record in page.state()["records"]] == [[0.0, 0.0, 0.0]] * 2
+    ghost = page.js("dynsim.app.actors.map(a => a.bodies[3].paint[0].material.opacity)")
+    assert ghost[0] == 1.0 > ghost[1]
+    page.page.click("#variants .chip >> nth=0")
+    assert [record["name"] for record in page.state()["records"]] == ["free"]
+
+
+def test_a_measured_record_beside_the_simulated_one(braced: Record, opened: Opens) -> None:
+    measured = Record(braced.time[::7] + 0.1, provenance={"robot": "arm"})
+    measured.add("q", braced["q"][::7] + 0.01, "rad", labels=braced.labels["q"])
+    measured.scene = braced.scene
+    assert add_body_poses(measured)
+    page = opened({"simulated": braced, "measured": measured}, ghost=True)
+    assert "measured" in page.page.locator("#variants .chip").nth(1).locator("em").inner_text()
+    row = 30
+    _, shown = page.seek(float(measured.time[row]))["records"]
+    place = [body["p"] for body in shown["bodies"].values()]
+    np.testing.assert_allclose(place, measured[POSITION][row], atol=NEAR)
+
+
+def test_frames_from_elsewhere(braced: Record, opened: Opens) -> None:
+    """What a live drive sends is shown as it is, and the record comes back when the time is chosen again."""
+    page = opened({"one": braced})
+    poses = np.concatenate([braced[POSITION][50] + 0.25, braced[ORIENTATION][50]], axis=1)
+    state = page.js("f => { dynsim.frame(f); return dynsim.state(); }", {"time": 77.0, "poses": poses.ravel().tolist()})
+    place = [body["p"] for body in state["records"][0]["bodies"].values()]
+    np.testing.assert_allclose(place, braced[POSITION][50] + 0.25, atol=1e-6)
+    assert state["time"] == 77.0
+    seen = "(a => [a.grown.count, a.grown.line.visible, a.paths[0].path.whole.visible])(dynsim.app.actors[0])"
+    assert page.js(seen) == [1, True, False]
+    (shown,) = page.seek(float(braced.time[50]))["records"]
+    np.testing.assert_allclose([b["p"] for b in shown["bodies"].values()], braced[POSITION][50], atol=NEAR)
+    assert page.js(seen) == [1, False, True]
+
+
+def test_names_are_text(braced: Record, opened: Opens) -> None:
+    """What a file calls its things is never taken for HTML or a program."""
+    evil = "</script><script>alert(1)</script><img src=x onerror=alert(2)>"
+    record = Record(braced.time, provenance={"scenario": {"name": evil, "variant": evil}})
+    record.add("q", braced["q"], "rad", labels=braced.labels["q"])
+    record.add(evil.replace("/", "|"), braced["q"][:, 0], evil, description=evil)
+    record.add_event(1.0, evil, evil)
+    record.scene = braced.scene
+    assert add_body_poses(record)
+    page = opened({evil: record, "two": record})
+    assert evil in page.page.inner_text("#variants")
+    assert evil in page.page.title()
+    assert page.page.locator("img").count() == 0
+
+
+def test_a_file_that_the_command_wrote(
+    braced: Record, opened: Opens, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from dynsim.cli import main
+
+    path = braced.save(tmp_path / "record.h5")
+    monkeypatch.setattr("sys.argv", ["dynsim", "view", str(path), "--no-open"])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 0
+    page = opened(tmp_path / "view.html")
+    assert page.page.title() == "elbow_comparison"
+
+
+def test_what_is_under_the_pointer(robot: Record, opened: Opens) -> None:
+    page = opened({"one": robot})
+    page.seek(0.25)
+    x, y = page.js(
+        "(() => { const b = dynsim.app.actors[0].bodies[0].object; b.updateMatrixWorld(true);"
+        " return dynsim.app.stage.project(new THREE.Vector3(0.02, 0.02, 0.05).applyMatrix4(b.matrixWorld),"
+        " new THREE.Vector3()); })()"
+    )
+    page.page.mouse.move(5, 300)
+    page.page.wait_for_timeout(100)
+    page.page.locator("#scene").hover(position={"x": x, "y": y})
+    page.until("!document.getElementById('hover').hidden")
+    text = page.page.inner_text("#hover")
+    assert "l0" in text
+    assert "torque" in text
+
+
+def test_a_screenshot(robot: Record, opened: Opens) -> None:
+    page = opened({"one": robot})
+    with page.page.expect_download() as waited:
+        page.page.click("#shot")
+    assert waited.value.suggested_filename.endswith(".png")
+    pixels = np.asarray(Image.open(waited.value.path()).convert("L"), dtype=float)
+    assert pixels.std() > 5.0
+
+
+def test_motors_at_their_voltage_limit(tmp_path: Path, opened: Opens) -> None:
+    path = meshed_robot(tmp_path)
+    path.write_text(path.read_text().replace("voltage_limit_V: 48", "voltage_limit_V: 0.2"))
+    record = dynsim.simulate(load_scenario(path))
+    page, seen = opened({"one": record}), set()
+    for row in range(0, len(record), 7):
+        (shown,) = page.seek(float(record.time[row]))["records"]
+        at_limit = [
+            name
+            for name, u in zip(record.labels["voltage"], record["voltage"][row], strict=True)
+            if abs(u) >= 0.9999 * 0.2
+        ]
+        assert shown["saturated"] == at_limit
+        assert ("voltage limit" in page.page.inner_text("#status")) == bool(at_limit)
+        seen.add(bool(at_limit))
+    assert True in seen
+
+
+def test_a_single_sample_and_a_stranger(opened: Opens) -> None:
+    """A record of one instant, without a name, with numbers that JSON does not know."""
+    record = Record([0.5])
+    record.add("q", [[0.3]], "rad", labels=("j",))
+    record.add("odd", [np.inf], "1")
+    record.add_event(0.5, "odd", "\ud800", value=np.inf)
+    joint = Joint("j", "revolute", (0.0, 1.0, 0.0), (0.0, 0.0, 0.1), HERE, "q", ("j",))
+    shape = Shape("capsule", (0.01, 0.2), (0.0, 0.0, 0.1))
+    record.scene = Scene((Body("b", -1, joint, (shape,)),))
+    assert add_body_poses(record)
+    page = opened({"\ud800": record})
+    (shown,) = page.seek(3.0)["records"]
+    np.testing.assert_allclose(shown["bodies"]["b"]["p"], [0.0, 0.0, 0.1], atol=NEAR)
+    assert page.state()["time"] == 0.5
+
+
+def test_a_notebook_shows_the_page(braced: Record, browser: Any, tmp_path: Path) -> None:
+    (tmp_path / "notebook.html").write_text(f"<!DOCTYPE html><body>{braced.view()._repr_html_()}</body>", "utf-8")
+    context = browser.new_context(offline=True)
+    page = context.new_page()
+    complaints: list[str] = []
+    page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
+    page.goto((tmp_path / "notebook.html").as_uri())
+    frame = page.frames[1]
+    frame.evaluate("dynsim.ready")
+    frame.evaluate("dynsim.seek(1.0)")
+    assert frame.evaluate("dynsim.state().time") == 1.0
+    assert complaints == []
+    context.close()
