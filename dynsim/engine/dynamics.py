@@ -46,7 +46,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: 
     happened: list[Event] = []
     started, limit, interrupted = clock.perf_counter(), 1, False
     try:
-        log.info("%s: integrating %g s by %s (%s)", scenario.title, scenario.duration_s, *prepared.choice)
+        log.info("%s: integrating %g s by %s", scenario.title, scenario.duration_s, prepared.choice.method)
         while run.count[ki.STATUS] == ki.RUNNING:
             before = clock.perf_counter()
             driver.advance(prepared.system, prepared.workspace, run, limit)

@@ -74,28 +74,35 @@ def fastest_rate(model: Model, contacts: Sequence[Contact], drives: ka.DriveArra
     """Largest |λ| of drives and losses at the start, at rest [1/s]."""
     n, q = model.n, model.robot.initial
     circuits = int(model.robot.circuits)
-    force = np.zeros((n, 2 * n + circuits))
-    A = np.zeros((2 * n + circuits, 2 * n + circuits))
-    A[:n, n : 2 * n] = np.eye(n)
-    force[:, n : 2 * n] = -np.diag(model.damping)
+    # ∂τ/∂(q, v, i) and ∂(di/dt)/∂(q, v, i).
+    torque_q, torque_v, torque_i = np.zeros((n, n)), -np.diag(model.damping), np.zeros((n, circuits))
+    rate_q, rate_v, rate_i = np.zeros((circuits, n)), np.zeros((circuits, n)), np.zeros((circuits, circuits))
     for a in range(len(drives.table)):
         kind, j, sampled = drives.table[a, ka.DRIVE_KIND], drives.table[a, ka.DRIVEN], drives.table[a, ka.SAMPLED] != 0
         if kind == ka.DC_MOTOR:
-            e = 2 * n + drives.table[a, ka.CIRCUIT]
-            block = dc_block(drives.motor, a, 0.0 if sampled else 1.0)
-            force[j, [j, n + j, e]] += block[:3]
-            A[e, [j, n + j, e]] = block[3:]
+            e, block = drives.table[a, ka.CIRCUIT], dc_block(drives.motor, a, 0.0 if sampled else 1.0)
+            torque_q[j, j], torque_v[j, j], torque_i[j, e] = block[0], torque_v[j, j] + block[1], block[2]
+            rate_q[e, j], rate_v[e, j], rate_i[e, e] = block[3:]
         elif kind == ka.POSITION_SERVO:
-            force[j, [j, n + j]] += servo_block(drives.motor, a, drives.table[a, ka.SERVO_MODE], sampled, 0.0, 0.0)
-    if not force.any():
+            by_q, by_v = servo_block(drives.motor, a, drives.table[a, ka.SERVO_MODE], sampled, 0.0, 0.0)
+            torque_q[j, j], torque_v[j, j] = by_q, torque_v[j, j] + by_v
+    if not (torque_q.any() or torque_v.any() or torque_i.any()):
         return 0.0
     mobility = np.linalg.inv(model.mass_matrix(q) + np.diag(model.armature))
     held = _held(model, contacts, q)
     if len(held):
         through = mobility @ held.T
         mobility = mobility - through @ np.linalg.pinv(held @ through) @ through.T
-    A[n : 2 * n] = mobility @ force
-    return _spectral_radius(A)
+    still = np.zeros((n, circuits))
+    return _spectral_radius(
+        np.block(
+            [
+                [np.zeros((n, n)), np.eye(n), still],
+                [mobility @ torque_q, mobility @ torque_v, mobility @ torque_i],
+                [rate_q, rate_v, rate_i],
+            ]
+        )
+    )
 
 
 def _spectral_radius(A: Array) -> float:
