@@ -454,7 +454,9 @@ def elbows(simulation: dynsim.Simulation) -> np.ndarray:
 STEPPING = {"integrator.method": "time_stepping", "integrator.step_s": 1e-3}
 
 
-@pytest.mark.parametrize("integrator", [{}, STEPPING, {"integrator.method": "radau5"}])
+@pytest.mark.parametrize(
+    "integrator", [{}, STEPPING, pytest.param({"integrator.method": "radau5"}, marks=pytest.mark.slow)]
+)
 def test_a_snapshot_with_contacts_has_the_same_future(tmp_path, integrator):
     """Taken while points stick, and within a step; in between others land, slip and lift off."""
     simulation = dynsim.Simulation(real_arm(tmp_path, **integrator))
