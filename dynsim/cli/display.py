@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from dynsim.terminal import Terminal, escaped
 
 if TYPE_CHECKING:
-    from rich.progress import TaskID
+    from rich.progress import ProgressColumn, TaskID
 
     from dynsim.record import Record
     from dynsim.scenario import Scenario
@@ -52,14 +52,25 @@ def drawing(folder: Path, quiet: bool) -> Iterator[None]:
         yield
 
 
+def _times() -> tuple[ProgressColumn, ...]:
+    """Columns of a bar: time since its start, and time to go."""
+    from rich.progress import TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.table import Column
+
+    return (
+        TimeElapsedColumn(table_column=Column(no_wrap=True)),
+        TextColumn("to go"),
+        TimeRemainingColumn(table_column=Column(no_wrap=True)),
+    )
+
+
 @contextmanager
 def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProgress]:
     """A progress bar per scenario, with time and time to go, and one while references take long; yields its report."""
     if quiet:
         yield lambda variant, time, stage="": None
         return
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-    from rich.table import Column
+    from rich.progress import BarColumn, Progress, TextColumn
 
     from dynsim.engine import REFERENCES, SIMULATION
     from dynsim.kernels.jit import is_cached
@@ -71,9 +82,7 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
         TextColumn("{task.description}"),
         BarColumn(),
         TextColumn("{task.completed:.2f} / {task.total:g} s {task.fields[what]}"),
-        TimeElapsedColumn(table_column=Column(no_wrap=True)),
-        TextColumn("to go"),
-        TimeRemainingColumn(table_column=Column(no_wrap=True)),
+        *_times(),
     )
     with Progress(*columns, console=console, transient=not console.is_terminal) as bars:
 
@@ -99,24 +108,14 @@ def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None
     if quiet:
         yield lambda done, failed: None
         return
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-    from rich.table import Column
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
     columns = (
         TextColumn("runs"),
         BarColumn(),
         MofNCompleteColumn(),
         TextColumn("{task.fields[failed]}"),
-        TimeElapsedColumn(table_column=Column(no_wrap=True)),
-        TextColumn("to go"),
-        TimeRemainingColumn(table_column=Column(no_wrap=True)),
+        *_times(),
     )
     with Progress(*columns, console=console, transient=not console.is_terminal) as bar:
         task = bar.add_task("", total=runs, failed="")
