@@ -61,8 +61,8 @@ def test_real_contact_keeps_its_laws(run, name, variant):
     record = run(name, variant)
     scenario = dynsim.load_scenario(name, variant)
     assert record.complete
-    # What nothing drives is integrated explicitly.
-    assert record.summary["energy_residual_relative"] <= (1e-7 if record.summary["method"] == "radau5" else 1e-6)
+    # Samples of the block that is pulled lie between steps of 0.1 s.
+    assert record.summary["energy_residual_relative"] <= (1e-7 if record["current"].size else 1e-6)
     contacts = scenario.config.contacts
     force, gap, mode = (record[f"contact_{what}"] for what in ("normal_force", "gap", "mode"))
     assert force.min(initial=0.0) >= -1e-9
