@@ -79,6 +79,7 @@ _ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = 
     ("least load, wheels, caster [N]", _least_load, lambda v: _number(v, digits=3)),
     ("ledger residual, relative", lambda s: s.get("energy_residual_relative"), lambda v: f"{v:.1e}"),
     ("constraint drift [m]", lambda s: s.get("constraint_drift_max_m"), lambda v: f"{v:.1e}"),
+    ("integrated by", lambda s: s.get("method"), str),
     ("integration [s]", lambda s: s.get("integration_wall_s"), lambda v: f"{v:.3f}"),
     ("times real time", lambda s: s.get("real_time_factor"), lambda v: f"{v:.0f}"),
 )

@@ -49,7 +49,10 @@ def run(
     view: Annotated[bool, typer.Option("--view", help="Open the page that shows the run in a browser.")] = False,
     quiet: QuietOption = False,
 ) -> None:
-    """Simulate one scenario and write its record, summary, figures and a page to look at it."""
+    """Simulate one scenario and write its record, summary, figures and a page to look at it.
+
+    The method of integration follows from the system, integrator.method auto; the summary says which it is and why.
+    """
     from dynsim.engine import simulate
     from dynsim.files import check_writable
     from dynsim.results import RUN_FILES, save_run

@@ -76,7 +76,7 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
     from dynsim.kernels.jit import is_cached
 
     if not is_cached():
-        console.print("Compiling the kernels: once after an installation or an edit, about half a minute.")
+        console.print("Compiling the kernels: once after an installation or an edit, up to a minute.")
     # In 80 columns all fits up to 9999 s: the bar gives way, the times do not.
     columns = (
         TextColumn("{task.description}"),

@@ -6,8 +6,10 @@ of drives and losses, linear and under the constraints that hold there:
 
     v̇ = W (∂τ/∂(q, v, i) − diag(D))       W = M⁻¹ − M⁻¹ Aᵀ (A M⁻¹ Aᵀ)⁺ A M⁻¹,  A: contacts and couplings
 
-Gravity and what grows with the speed are as slow as the motion itself. Nothing is timed: the choice is the same on
-every machine.
+Gravity and what grows with the speed are as slow as the motion itself. Where that part is zero, nothing damps what the
+steps are in error by, and the energy shows it: at rtol 1e-6 it is off by 1 to 17 rtol after ten seconds of the explicit
+methods, by 0.3 to 0.9 of RADAU5, in twice the time. (From 1e-9 on the rest that its Newton method leaves is the larger
+part.) Nothing is timed: the choice is the same on every machine.
 """
 
 from __future__ import annotations
@@ -31,8 +33,10 @@ PACE = 0.02
 """Step that the accuracy of an arm's motion allows at least [s]."""
 TOUCHING = 1e-6
 """Contacts nearer than this hold at the start [m]."""
+SMALL = 36
+"""Joints up to which Jacobians of RADAU5 cost less than half of its steps."""
 TIGHT = 1e-8
-"""Relative tolerance from which on fewer steps of order five outweigh their cost."""
+"""Relative tolerance from which on fewer steps of order five outweigh their cost, and to which RADAU5 keeps energy."""
 
 DENSE = 300
 """Size of matrices up to which all eigenvalues are found at once; of larger ones only the largest."""
@@ -56,6 +60,8 @@ def choose(
     told = f"fastest rate {rate:.3g} 1/s, steps of {1e3 * pace:.3g} ms"
     if rate * pace > worth_it(model.n):
         return Choice("radau5", f"{told}: an implicit method is not held by it")
+    if rate == 0.0 and model.n <= SMALL and options.rtol >= TIGHT:
+        return Choice("radau5", "no drive and no loss damps errors: the implicit method keeps energy to the tolerance")
     if 0.0 < rate * pace < 1.0 and options.rtol <= TIGHT:
         return Choice("dopri5", f"{told} and a tight tolerance: accuracy holds the steps, and losses damp its errors")
     return Choice("rk43", f"{told}: an explicit method takes them")

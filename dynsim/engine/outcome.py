@@ -16,10 +16,10 @@ from dynsim.scenario import Scenario
 
 @contextmanager
 def kernels_logged(log: logging.Logger) -> Iterator[None]:
-    """Log the time in which the kernels are loaded, or compiled, which takes about half a minute."""
+    """Log the time in which the kernels are loaded, or compiled, which takes up to a minute."""
     cached, started = is_cached(), clock.perf_counter()
     if not cached:
-        log.info("compiling the kernels: once after an installation or an edit, about half a minute")
+        log.info("compiling the kernels: once after an installation or an edit, up to a minute")
     yield
     log.info("%s the kernels in %.1f s", "loaded" if cached else "compiled", clock.perf_counter() - started)
 

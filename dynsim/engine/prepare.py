@@ -39,6 +39,7 @@ from dynsim.model.shapes import compile_shapes
 from dynsim.model.unilateral import JointStop, compile_grips, compile_unilateral, joint_stops
 from dynsim.record.poses import pose_columns
 from dynsim.scenario import Scenario, build
+from dynsim.scenario.schema import Integrator
 
 log = logging.getLogger(__name__)
 
@@ -104,11 +105,11 @@ def prepare(
     if stepped and robot.base is not None:
         raise ModelError(
             "integrator.method = 'time_stepping': it locates no events, so a mobile base would tip unseen; "
-            "take rk43, or radau5 with motors, or a plant without mobile base",
+            "take auto, or a plant without mobile base",
             keys=("integrator", "method"),
         )
     joint_rows = len(robot.couplings) + len(stops)
-    _check_work(scenario, n, c + joint_rows)
+    _check_work(scenario, n, c + joint_rows, scenario.integrator.method)
     control = _control(scenario, model, contacts, progress)
     if not real:
         _check_references(scenario, model, contacts, control)
@@ -116,6 +117,7 @@ def prepare(
     sampled = control.sample_time is not None
     drives = compile_drives(robot, k_p=list(control.k_p), k_d=list(control.k_d), sampled=sampled)
     choice = choose(options, model, contacts, control, drives)
+    _check_work(scenario, n, c + joint_rows, choice.method)
     _check_stiffness(choice.method, scenario.duration_s, robot)
     method = ki.METHODS[choice.method]
     step = options.step_s or (1e-3 if method in ki.FIXED_STEP else 0.0)
@@ -154,7 +156,7 @@ def prepare(
         rtol=options.rtol,
         atol=options.atol,
         ticks=_ticks(control),
-        breaks=_breaks(loads),
+        breaks=_breaks(loads, control, method, options),
         events=guards(robot, contacts if real else (), stops),
         support=compile_support(robot),
         stepping=stepping,
@@ -198,10 +200,15 @@ def slow_slip(atol: float) -> float:
     return max(1000.0 * atol, 1e-9)
 
 
-def _breaks(loads: Sequence[Load]) -> np.ndarray:
-    """Times at which loads jump or bend [s]: a step that passed over them would not see a short push at all."""
-    knots = [load.knots for load in loads if len(load.coefficients) and (not load.hold or len(load.coefficients) > 1)]
-    return np.unique(np.concatenate(knots)) if knots else np.zeros(0)
+def _breaks(loads: Sequence[Load], control: JointControl, method: int, options: Integrator) -> np.ndarray:
+    """Times at which loads jump or bend [s]: a step that passed over them would not see a short push at all.
+
+    Of an implicit method also those at which references do, whose knots are nearer than its steps are long.
+    """
+    times = [load.knots for load in loads if len(load.coefficients) and (not load.hold or len(load.coefficients) > 1)]
+    if method == ki.RADAU5:
+        times.append(control.bends(options.rtol, options.atol))
+    return np.unique(np.concatenate(times)) if times else np.zeros(0)
 
 
 def _push(body: str) -> Load:
@@ -232,12 +239,16 @@ def _check_stiffness(method: str, duration: float, robot: Robot) -> None:
     if steps > STEPS_LIMIT:
         raise ScenarioError(
             f"{motor.joint}: R/L = {pole:.2g} 1/s holds integrator.method {method} to about {steps:.1g} steps for "
-            f"{duration:g} s; take integrator.method: radau5, or a larger inductance than {motor.inductance:g} H"
+            f"{duration:g} s; take integrator.method: auto or radau5, or a larger inductance than "
+            f"{motor.inductance:g} H"
         )
 
 
-def _check_work(scenario: Scenario, n: int, p: int) -> None:
-    """Refuse what would integrate for longer than ``integrator.time_limit_h``, by an estimate from its size."""
+def _check_work(scenario: Scenario, n: int, p: int, method: str) -> None:
+    """Refuse what would integrate for longer than ``integrator.time_limit_h``, by an estimate from its size.
+
+    While the method is not chosen yet, ``auto``, the estimate is that of the quicker one.
+    """
     options = scenario.integrator
     # Measured from 10 to 1000 links with up to 250 contacts, right to a factor of two: the sweeps, the p × p system of
     # chains as long as n, its elimination, twice that for dependent rows (p > n always are).
@@ -246,12 +257,10 @@ def _check_work(scenario: Scenario, n: int, p: int) -> None:
         seconds += 3e-10 * (n + p) ** 3
     # Motors and friction hold the explicit methods' steps at about a millisecond; an implicit one takes steps of some
     # hundredths of a second, of three iterations, with a Jacobian by differences and its factors now and then.
-    implicit = options.method in ("radau5", AUTO)
-    per_step = (2 * n + 14) * seconds + 3e-9 * n**3 if implicit else 4.0 * seconds
-    steps = scenario.duration_s / (
-        options.step_s if options.step_s and ki.METHODS[options.method] in ki.FIXED_STEP else 1e-2 if implicit else 1e-3
-    )
-    hours = steps * per_step / 3600.0
+    step = options.step_s if options.step_s and method != AUTO and ki.METHODS[method] in ki.FIXED_STEP else 1e-3
+    explicit, implicit = 4.0 * seconds / step, ((2 * n + 14) * seconds + 3e-9 * n**3) / 1e-2
+    rate = {"radau5": implicit, AUTO: min(explicit, implicit)}.get(method, explicit)
+    hours = scenario.duration_s * rate / 3600.0
     if hours > options.time_limit_h:
         raise ScenarioError(
             f"{n} joints with {p} contacts: a right-hand side takes about {seconds:.1g} s, so "

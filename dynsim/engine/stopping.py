@@ -24,7 +24,7 @@ def stopped(scenario: Scenario, prepared: Prepared) -> SimulationStopped:
     if found := paradox(prepared.system, prepared.workspace, run, prepared.contacts):
         reached, y, words = found
         if scenario.integrator.method == "rk4":
-            words += "; a shorter integrator.step_s or an adaptive method (rk43) tells whether the step is to blame"
+            words += "; a shorter integrator.step_s or an adaptive method (auto) tells whether the step is to blame"
         return SimulationStopped(
             f"stopped at t = {reached:.6g} s: {words}", time=reached, state=last_state(prepared, y)
         )
@@ -52,7 +52,7 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
     where = f"stopped at t = {t:.6g} s"
     if status == ki.NOT_FINITE:
         advice = (
-            f"take a smaller integrator.step_s than {run.clock[ki.STEP]:g}, or an adaptive method (rk43)"
+            f"take a smaller integrator.step_s than {run.clock[ki.STEP]:g}, or an adaptive method (auto)"
             if method == "rk4"
             else "look at the last state for a joint that runs away"
         )
@@ -106,5 +106,5 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
     else:
         what = f"contact {prepared.contacts[owner].name} cannot be kept on its surface (gap {gaps[worst]:+.2e} m)"
     return f"{where}: {what}; the contacts contradict each other or the arm is singular here" + (
-        ", or integrator.step_s is too long (try integrator.method: rk43)" if method == "rk4" else ""
+        ", or integrator.step_s is too long (try integrator.method: auto)" if method == "rk4" else ""
     )

@@ -368,7 +368,7 @@ def _check_motor(motor: Drive, joints: dict[str, Link]) -> None:
     if isinstance(motor, Motor) and not motor.inductance > 0.0:
         raise ModelError(
             f"motor of {motor.joint}: inductance {motor.inductance} H must be positive; "
-            "for a circuit without inductance take a small one (1e-6 H) and `integrator: {method: radau5}`"
+            "for a circuit without inductance take a small one (1e-6 H) and integrator.method: auto or radau5"
         )
     for quantity in _NOT_NEGATIVE[type(motor)]:
         if not getattr(motor, quantity) >= 0.0:

@@ -21,6 +21,8 @@ from dynsim.model.splines import quintic_coefficients
 # Samples in a segment of the reference splines, and segments that are looked at together.
 _PER_SEGMENT = 4
 _PIECE = 4096
+# Knots that the longest steps of an implicit method straddle (of 20 ms; 55 ms in the published arm).
+_STRADDLED = 3.0
 
 # Positions of a joint: samples, (T,) [rad or m], or a function of times, (T,) [s], that gives them.
 JointMotion = ArrayLike | Callable[[NDArray[np.float64]], ArrayLike]
@@ -141,6 +143,24 @@ class JointControl:
         begin, spacing = self.reference.grid
         moving = bool((self.reference.spline >= 0).any())
         return float(begin + spacing * len(self.reference.coefficients)) if moving else np.inf
+
+    def bends(self, rtol: float, atol: float) -> NDArray[np.float64]:
+        """Knots at which references bend within a long step [s], increasing: error control samples them too thinly.
+
+        The fifth derivative jumps there: three knots further on the polynomials of the segments before and behind
+        differ by more than ``atol`` + ``rtol`` × the spline's span. Commands that are taken at ticks bend nowhere.
+        """
+        spacing, found = float(self.reference.grid[1]), []
+        for splines in (self.reference.coefficients, self.reference.voltage):
+            if self.sample_time is not None or splines is None or len(splines) < 2:
+                continue
+            jumps = np.abs(np.diff(splines[:, :, 5], axis=0))  # (segments - 1, splines)
+            departure = jumps * (_STRADDLED * spacing) ** 5
+            values = splines[:, :, 0]  # at the knots
+            span = values.max(axis=0) - values.min(axis=0)
+            found.append((departure > atol + rtol * span).any(axis=1).nonzero()[0])
+        knots = np.unique(np.concatenate(found)) if found else np.zeros(0)
+        return np.asarray(self.reference.grid[0] + spacing * (knots + 1.0))
 
     def positions(self, robot: Robot) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
         """Times, (T,) [s], and the coordinates, (T, nq), of the references, in pieces of some thousand samples.

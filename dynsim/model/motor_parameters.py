@@ -55,7 +55,7 @@ class MotorParameters(DriveParameters):
     def _not_zero(cls, value: Any) -> Any:
         """L = 0 is a circuit many know from textbooks: say what to take instead."""
         if value == 0:
-            raise ValueError("must be positive; for none take 1e-6 with integrator.method: radau5")
+            raise ValueError("must be positive; for none take 1e-6 with integrator.method: auto or radau5")
         return value
 
     def motor(self, joint: str) -> Motor:

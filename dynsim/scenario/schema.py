@@ -132,9 +132,9 @@ class Integrator(StrictConfig):
     """Time integration."""
 
     method: Literal["auto", "rk43", "dopri5", "rk4", "radau5", "time_stepping"] = Field(
-        default="rk43",
-        description="adaptive 4(3) or 5(4), fixed step, adaptive implicit (where motors hold the steps of the others), "
-        "or fixed step with contacts that open and close; auto: one of the adaptive ones, by the system",
+        default="auto",
+        description="auto: one of the adaptive ones, by the system; adaptive 4(3), 5(4), fixed step, adaptive implicit "
+        "(where motors hold the steps of the others), or fixed step with contacts that open and close",
     )
     solver: Literal["articulated", "m_star"] = Field(default="articulated", description="O(n) sweeps or the dense M*")
     rtol: float = Field(default=1e-6, ge=1e-13, le=1e-1)

@@ -116,8 +116,15 @@ def test_compare_says_what_real_contacts_did(tmp_path: Path):
         ),
         (["check", "elbow_comparison", "--set", "a:b"], "--set a:b: must look like"),
         (
-            ["check", "elbow_comparison", "--set", "plant.link.motor.inductance_H=1e-9"],
-            "take integrator.method: radau5",
+            [
+                "check",
+                "elbow_comparison",
+                "--set",
+                "plant.link.motor.inductance_H=1e-9",
+                "--set",
+                "integrator.method=rk43",
+            ],
+            "take integrator.method: auto or radau5",
         ),
         (["plot", "other.h5"], "lacks parts"),
         (["run", "single_pendulum", "--out", "other.h5"], "is a file, not a folder"),

@@ -61,7 +61,8 @@ def test_real_contact_keeps_its_laws(run, name, variant):
     record = run(name, variant)
     scenario = dynsim.load_scenario(name, variant)
     assert record.complete
-    assert record.summary["energy_residual_relative"] <= 1e-6
+    # Samples of the block that is pulled lie between steps of 0.1 s.
+    assert record.summary["energy_residual_relative"] <= (1e-7 if record["current"].size else 1e-6)
     contacts = scenario.config.contacts
     force, gap, mode = (record[f"contact_{what}"] for what in ("normal_force", "gap", "mode"))
     assert force.min(initial=0.0) >= -1e-9
@@ -76,6 +77,16 @@ def test_real_contact_keeps_its_laws(run, name, variant):
     if all(point.static_friction is None and point.friction is None for point in contacts.points.values()):
         # The difference of two squares is good to the root of rounding.
         assert (friction - slope * force).max(initial=0.0) <= 1e-7 * max(1.0, total.max(initial=0.0))
+
+
+# All other arms, but for the one that tips over.
+GLUED = [case for case in CASES if case not in REAL and not case[0].startswith("snake_") and case[0] != "mobile_reach"]
+
+
+@pytest.mark.parametrize(("name", "variant"), GLUED)
+def test_the_ledger_closes_at_default_settings(run, name, variant):
+    """Also where references bend: the steps of the implicit method end at the knots there."""
+    assert run(name, variant).summary["energy_residual_relative"] <= 1e-7
 
 
 # Kinds of events in the order of time, or of how many there are at least; and why.
@@ -186,8 +197,8 @@ def test_two_elbows_on_a_real_floor_are_one(run):
     assert both["electrical_energy_J"] == pytest.approx(one["electrical_energy_J"], rel=1e-3)
     assert both["hand_error_rms_m"] == pytest.approx(one["hand_error_rms_m"], rel=1e-4)
     assert both["electrical_energy_J"] > 1.02 * glued["electrical_energy_J"]
-    # As many evaluations as glued, within a tenth: events and modes cost little.
-    assert both["rhs_evaluations"] < 1.1 * glued["rhs_evaluations"]
+    # Events and modes cost the implicit method Jacobians: 1.4 times the evaluations; an explicit one a tenth more.
+    assert both["rhs_evaluations"] < 1.5 * glued["rhs_evaluations"]
 
 
 def test_postures_of_the_arm_whose_links_touch():

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dynsim.engine.prepare import prepare
 from dynsim.errors import ModelError
 from dynsim.model.control import JointControl
 from dynsim.model.description import Robot
@@ -73,3 +74,46 @@ def test_references_that_end_before_the_run_are_refused(monkeypatch: pytest.Monk
     monkeypatch.setattr("dynsim.control.joint_pd.build", lambda config, context: replace(short))
     with pytest.raises(ModelError, match="controller 'joint_pd': its references end at 2 s, the run at 10 s"):
         build.controller(scenario, model)
+
+
+def kinked(t: np.ndarray) -> np.ndarray:
+    """Rest, and from 1 s on a constant acceleration."""
+    return 0.1 * np.maximum(t - 1.0, 0.0) ** 2
+
+
+def test_references_bend_where_the_polynomials_of_their_segments_part(robot: Robot) -> None:
+    """Each knot in turn: the segment before, continued for three knots, against the segment behind."""
+    rtol, atol = 1e-6, 1e-8
+    control = JointControl.following(robot, 500.0, 20.0, TIMES, {"joint_3": kinked})
+    splines, spacing = control.reference.coefficients[:, 0], control.reference.grid[1]
+    # The last three knots are too near the end to look three further, but what their segments are is known.
+    before, behind = (np.array([np.polyval(c[::-1], x * spacing) for c in splines]) for x in (4.0, 3.0))
+    parts = np.abs(before[:-1] - behind[1:]) > atol + rtol * 0.1
+    assert np.allclose(control.bends(rtol, atol), TIMES[1:-1][parts], rtol=0.0, atol=1e-12)
+    # The spline through samples of a kink rings on both sides of it, by 0.43 times from knot to knot.
+    near = np.abs(control.bends(rtol, atol) - 1.0)
+    assert len(near) >= 6
+    assert near.max() <= 0.25
+    assert len(control.bends(1e-3, 1e-4)) < len(near)
+
+
+def test_smooth_references_and_commands_that_are_held_bend_nowhere(robot: Robot) -> None:
+    smooth = {"joint_3": lambda t: 0.1 * np.sin(3.0 * t)}
+    assert not len(JointControl.following(robot, 500.0, 20.0, TIMES, smooth).bends(1e-6, 1e-8))
+    assert not len(JointControl.following(robot, 500.0, 20.0).bends(1e-6, 1e-8))
+    held = JointControl.following(robot, 500.0, 20.0, TIMES, {"joint_3": kinked}, sample_time=0.01)
+    assert not len(held.bends(1e-6, 1e-8))
+
+
+def test_planned_voltages_bend_too(robot: Robot) -> None:
+    voltages = np.zeros((len(TIMES), len(robot.motors)))
+    voltages[:, 4] = kinked(TIMES)
+    control = JointControl.following(robot, 500.0, 20.0, TIMES, voltages=voltages)
+    moved = JointControl.following(robot, 500.0, 20.0, TIMES, {"joint_3": kinked})
+    assert np.array_equal(control.bends(1e-6, 1e-8), moved.bends(1e-6, 1e-8))
+
+
+def test_only_the_steps_of_an_implicit_method_end_at_bends() -> None:
+    run = {m: prepare(load_scenario("wall_push", overrides={"integrator.method": m})).run for m in ("radau5", "rk43")}
+    assert {round(t, 9) for t in run["radau5"].breaks} >= {0.18, 0.22, 1.18, 1.22, 1.48, 1.52, 4.48, 4.52}
+    assert not len(run["rk43"].breaks)

@@ -29,7 +29,7 @@ def test_a_run_logs_what_takes_long_and_its_warnings(caplog: pytest.LogCaptureFi
     assert told[:2] == [f"{title}planning references over 0.3 s", told[1]]
     assert told[1].startswith(f"{title}planned references in 0.")
     assert told[-3].split(" in ")[0] in ("loaded the kernels", "compiled the kernels")
-    assert told[-2] == f"{title}integrating 0.3 s by rk43"
+    assert told[-2] == f"{title}integrating 0.3 s by radau5"
     assert told[-1].startswith(f"{title}integrated 0.3 s in {record.summary['steps']} steps, ")
     warned = [entry.getMessage() for entry in caplog.records if entry.levelno == logging.WARNING]
     assert warned == [title + warning for warning in record.summary["warnings"]]
@@ -58,7 +58,7 @@ def test_workers_log_in_their_parent(caplog: pytest.LogCaptureFixture) -> None:
     told = [entry.getMessage() for entry in caplog.records]
     for variant, record in records.items():
         title = f"elbow_comparison ({variant}): "
-        assert f"{title}integrating 0.3 s by rk43" in told
+        assert f"{title}integrating 0.3 s by radau5" in told
         for warning in record.summary["warnings"]:
             assert title + warning in told
 

@@ -178,7 +178,7 @@ def test_surfaces(tmp_path: Path, thing: str, said: str) -> None:
     ("law", "integrator", "said"),
     [
         ("unilateral", "method: time_stepping, theta: 0.3", "theta = 0.3: must be greater than or equal to 0.5"),
-        ("unilateral", "theta: 0.7", "theta = 0.7: is of method: time_stepping only, this is method: rk43"),
+        ("unilateral", "theta: 0.7", "theta = 0.7: is of method: time_stepping only, this is method: auto"),
         ("unilateral", "method: time_stepping, solver: m_star", "solver = 'm_star': is not of integrator.method"),
         ("bilateral", "method: time_stepping", "method = 'time_stepping': needs `contacts: {law: unilateral}`"),
     ],

@@ -98,6 +98,22 @@ def test_a_snapshot_has_the_same_future(method):
         dynsim.Simulation(dynsim.load_scenario("single_pendulum")).restore(snapshot)
 
 
+def test_steps_that_end_where_references_bend_are_the_same_ones():
+    """In pieces of any length, and again from a snapshot between two bends."""
+    scenario = dynsim.load_scenario("wall_push")
+    whole = dynsim.simulate(scenario)
+    assert whole.summary["method"] == "radau5"
+    simulation = dynsim.Simulation(scenario)
+    for until in (0.19, 0.2, 0.21, 1.17):
+        simulation.advance(until)
+    snapshot = simulation.snapshot()
+    for until in (*np.arange(1.2, 4.6, 0.17), 5.0):
+        simulation.advance(until)
+    assert same(simulation.record(), whole)
+    simulation.restore(snapshot)
+    np.testing.assert_array_equal(simulation.advance(5.0).q, whole["q"][-1])
+
+
 def test_going_on_from_a_record_is_going_on():
     scenario = arm()
     whole = dynsim.simulate(scenario)

@@ -11,6 +11,7 @@ from unilateral_checks import events, ledger_residual
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import contact_events as ce
 from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.integrate.project import GAP_TOLERANCE
 from dynsim.kernels.state import OUT_FORCE, OUT_GAP, OUT_MODE, OUT_VECTOR
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot, vector
 
@@ -228,4 +229,5 @@ def test_nothing_creeps_for_an_hour(scene):
     assert float(np.linalg.norm(force)) > 1.04 * f
     assert np.linalg.norm(run.outputs("contact")[:, 0, OUT_GAP]) <= 1e-9
     moved = run.outputs("hand") - run.outputs("hand")[0]
-    assert np.linalg.norm(moved, axis=1).max() <= 1e-10
+    # Of the gap and of both directions along the surface, each, the projection leaves what it tolerates.
+    assert np.linalg.norm(moved, axis=1).max() <= np.sqrt(3.0) * GAP_TOLERANCE
