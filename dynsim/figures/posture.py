@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection  # type: ignore[import-untyped]
 
-from dynsim.figures import style
+from dynsim.figures import penetration, style
 from dynsim.figures.hand import edge_on, target_name
 from dynsim.figures.skeleton import (
     LABEL_SIZE,
@@ -36,10 +36,14 @@ from dynsim.record.scene import Surface
 
 # An axis of the 3D view shorter than this share of the longest has two ticks.
 SHORT_AXIS = 0.45
+# Points along each side of the mesh of a sphere or cylinder.
+AROUND = 41
 # Joints are dots up to this many.
 DOTS = 40
 ARM_COLOUR = "#444444"
 BASE_COLOUR = "#D5D5D5"
+# Text at faint postures [point].
+TIME_SIZE = 6.0
 # Width of a side view in a figure of one column, and of two [point].
 FULL, HALF = 440.0, 205.0
 
@@ -93,16 +97,22 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     low, high = extent_of(plane, everything, some)
     scale = (FULL if columns == 1 else HALF) / (high[0] - low[0])
     scale = min(scale, 72.0 * 3.2 / (high[1] - low[1]))
-    labels = [label for name, body in shown.items() for label in contact_labels(body, plane, scale)]
-    low, high = with_labels((low, high), labels, scale)
-    height = 0.9 + lines * (0.3 + np.clip(3.2 * (high[1] - low[1]) / (high[0] - low[0]), 0.8, 3.2))
-    figure = style.new_figure(height, style.comparison_title(some, "postures at the end, and before (faint)"))
-    grid = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
+    # Rows without labels need no room for them.
+    rows = [list(shown)[start : start + columns] for start in range(0, len(shown), columns)]
+    extents = [
+        with_labels((low, high), [label for name in row for label in contact_labels(shown[name], plane, scale)], scale)
+        for row in rows
+    ]
+    heights = [float(np.clip(3.2 * (top[1] - base[1]) / (top[0] - base[0]), 0.8, 3.2)) for base, top in extents]
+    figure = style.new_figure(
+        0.9 + 0.3 * lines + sum(heights), style.comparison_title(some, "postures at the end, and before (faint)")
+    )
+    grid = figure.subplots(lines, columns, sharex=True, sharey="row", squeeze=False, height_ratios=heights)
     styles = style.variant_styles(list(records))
     for axes, (name, body) in zip(grid.ravel(), shown.items(), strict=False):
         colour = str(styles[name]["color"])
-        _side_view(axes, records[name], body, drawn[name], plane, scale, colour=colour, path=style.GREY)
-        _frame_side(axes, plane, (low, high), body.scene.surfaces)
+        _side_view(axes, records[name], body, drawn[name], plane, scale, colour=colour, path=style.GREY, named=False)
+        _frame_side(axes, plane, extents[list(shown).index(name) // columns], body.scene.surfaces)
         axes.set_title(name, color=styles[name]["color"], fontweight="bold")
         axes.label_outer()
     for axes in grid.ravel()[len(shown) :]:
@@ -147,7 +157,9 @@ def _side_view(
     *,
     colour: str,
     path: str = style.BLUE,
+    named: bool = True,
 ) -> None:
+    """``named``: the legend says how far below which surface."""
     for k, base in enumerate([] if body is None else body.bases()):
         last = k == len(drawn) - 1
         for solid in base:
@@ -156,6 +168,7 @@ def _side_view(
             axes.add_patch(
                 Polygon(corners, facecolor=face, edgecolor=colour, lw=0.8, alpha=1.0 if last else 0.22, zorder=2.5)
             )
+    sunk = [] if body is None else [penetration.below_surfaces(body, row) for row in body.shown()]
     for k, segments in enumerate(drawn):
         last = k == len(drawn) - 1
         flat = plane.project(segments)
@@ -169,6 +182,10 @@ def _side_view(
             zorder=3 if last else 2,
         )
         axes.add_collection(lines)
+        if len(sunk[k].pieces):
+            axes.add_collection(
+                LineCollection(list(plane.project(sunk[k].pieces)), zorder=3.2, **_sunk_look(last), capstyle="butt")
+            )
         if last and len(flat) <= DOTS:
             axes.plot(*flat[:-1, 1].T, "o", color="white", markeredgecolor=colour, markersize=4, zorder=4)
     if (wanted := hand_target(record)) is not None:
@@ -177,6 +194,11 @@ def _side_view(
     axes.plot(*plane.project(style.sparse(record["hand_position"])).T, color=path, lw=1.0, zorder=4, label="hand path")
     for _, _, position, force in () if body is None else body.contacts():
         axes.plot(*plane.project(position), zorder=6, linestyle="none", **_contact_mark(force))
+    if body is not None:
+        _write_times(axes, [float(record.time[row]) for row in body.shown()], [plane.project(s) for s in drawn], scale)
+    if (deepest := max(sunk, key=lambda one: one.depth, default=None)) is not None and deepest.depth > 0.0:
+        text = f"below {deepest.surface}, up to {style.number(1e3 * deepest.depth, 3)} mm"
+        axes.plot([], [], label=text if named else "below a surface", color=penetration.COLOUR, lw=4.0)
     for label in contact_labels(body, plane, scale):
         axes.annotate(
             label.text,
@@ -190,6 +212,41 @@ def _side_view(
             # A label further away says with a line where it belongs.
             arrowprops={"arrowstyle": "-", "color": style.GREY, "lw": 0.5, "shrinkB": 4} if label.level else None,
         )
+
+
+def _sunk_look(last: bool) -> dict[str, Any]:
+    """What of a posture lies below a surface."""
+    return {"colors": penetration.COLOUR, "linewidths": 4.0 if last else 2.2, "alpha": 1.0 if last else 0.5}
+
+
+def _write_times(axes: Axes, times: Sequence[float], drawn: Sequence[Array], scale: float) -> None:
+    """The times of the faint postures at their ends, as far as there is room: the earliest first."""
+    half = 0.5 * TIME_SIZE * 0.62 * np.array([5.5, 1.9])
+    # The last posture is the picture itself: nothing is written over its segments.
+    middles = np.linspace(drawn[-1][:, 0], drawn[-1][:, 1], 5).reshape(-1, 2) if drawn else np.zeros((0, 2))
+    taken = [(scale * point, np.array([1.0, 1.0])) for point in middles]
+    for time, flat in zip(times[:-1], drawn[:-1], strict=False):
+        if not len(flat) or not np.isfinite(flat[-1]).all():
+            continue
+        along = flat[-1, 1] - flat[-1, 0]
+        size = float(np.linalg.norm(along))
+        ahead = along / size if size > 0.0 else np.array([1.0, 0.0])
+        for direction in (ahead, np.array([0.0, 1.0]), np.array([1.0, 0.0]), np.array([0.0, -1.0])):
+            place = scale * flat[-1, 1] + direction * (half + 2.0)
+            if all((np.abs(place - other) > half + room).any() for other, room in taken):
+                taken.append((place, half))
+                axes.annotate(
+                    f"{time:{'.2g' if time < 100.0 else '.0f'}} s",
+                    flat[-1, 1],
+                    xytext=tuple(direction * (half + 2.0)),
+                    textcoords="offset points",
+                    ha="center",
+                    va="center",
+                    fontsize=TIME_SIZE,
+                    color=style.GREY,
+                    zorder=7,
+                )
+                break
 
 
 def _space_view(
@@ -211,6 +268,7 @@ def _space_view(
         shown = np.concatenate([faces(solid) for solid in base])
         solid = Poly3DCollection(shown, facecolors=BASE_COLOUR, linewidths=0, shade=True, antialiased=False, zorder=2.5)
         axes.add_collection3d(solid, autolim=False)
+    sunk = [] if body is None else [penetration.below_surfaces(body, row) for row in body.shown()]
     for k, segments in enumerate(drawn):
         last = k == len(drawn) - 1
         lines = Line3DCollection(
@@ -221,6 +279,9 @@ def _space_view(
             zorder=3 if last else 2,
         )
         axes.add_collection3d(lines, autolim=False)
+        if len(sunk[k].pieces):
+            sinking = Line3DCollection(list(sunk[k].pieces), zorder=3 if last else 2, **_sunk_look(last))
+            axes.add_collection3d(sinking, autolim=False)
         if last and len(segments) <= DOTS:
             axes.plot(*segments[:-1, 1].T, "o", color="white", markeredgecolor=ARM_COLOUR, markersize=3, zorder=4)
     if (wanted := hand_target(record)) is not None:
@@ -255,8 +316,13 @@ def _space_view(
 
 def _draw_surface(axes: Axes3D, surface: Surface, low: Array, high: Array) -> None:
     """The part of a surface next to the arm."""
-    grids = [_field(surface)] if surface.kind == "height_field" else _faces(surface) if surface.kind == "box" else []
-    grids = [_within(grid, low, high) for grid in grids] or [_quadric(surface, low, high)]
+    if surface.kind in ("sphere", "cylinder"):
+        grids = [_round(surface, low, high)]
+    elif surface.kind in ("height_field", "box"):
+        flat = [_field(surface)] if surface.kind == "height_field" else _faces(surface)
+        grids = [_within(grid, low, high) for grid in flat]
+    else:
+        grids = [_quadric(surface, low, high)]
     cells = [
         np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], axis=2).reshape(-1, 4, 3)
         for grid in grids
@@ -286,6 +352,40 @@ def _faces(surface: Surface) -> list[Array]:
             local = np.roll(np.stack([np.full_like(u, side), u, v], axis=-1), axis, axis=-1) * half
             found.append(np.array(surface.position) + local @ R.T)
     return found
+
+
+def _round(surface: Surface, low: Array, high: Array) -> Array:
+    """Points of a sphere or cylinder, (n, n, 3): whole if it is small, else the part around the point next to the arm.
+
+    Its meridians or generators start there, so that the part ends in a smooth edge.
+    """
+    centre, radius = np.array(surface.position), abs(float(surface.radius or 0.0))
+    middle, reach = 0.5 * (low + high), 0.6 * float(np.linalg.norm(high - low))
+    widest = min(np.pi, reach / radius)
+    away = middle - centre
+    axis = None if surface.kind == "sphere" else np.array(surface.direction)
+    if axis is not None:
+        away = away - axis * (away @ axis)
+    size = float(np.linalg.norm(away))
+    if not size > 1e-9:
+        away = np.linalg.svd((np.eye(3)[0] if axis is None else axis)[None])[2][1]
+        size = 1.0
+    towards = away / size
+    turn = np.linspace(-1.0, 1.0, AROUND)
+    if axis is None:
+        sides = np.linalg.svd(towards[None])[2][1:]
+        polar, round_about = np.meshgrid(0.5 * (turn + 1.0) * widest, np.pi * turn, indexing="ij")
+        across = np.cos(round_about)[..., None] * sides[0] + np.sin(round_about)[..., None] * sides[1]
+        return np.asarray(centre + radius * (np.cos(polar)[..., None] * towards + np.sin(polar)[..., None] * across))
+    angle, along = np.meshgrid(widest * turn, (middle - centre) @ axis + 0.5 * turn * _extent_along(axis, low, high))
+    side = np.cross(axis, towards)
+    ring = np.cos(angle)[..., None] * towards + np.sin(angle)[..., None] * side
+    return np.asarray(centre + radius * ring + along[..., None] * axis)
+
+
+def _extent_along(direction: Array, low: Array, high: Array) -> float:
+    """Length of a box along a direction [m]."""
+    return float(np.abs(direction) @ (high - low))
 
 
 def _within(grid: Array, low: Array, high: Array) -> Array:
