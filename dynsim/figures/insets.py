@@ -10,12 +10,14 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from dynsim.figures import style
-from dynsim.figures.style import TRANSIENT_ROOM, Series, transient_of
+from dynsim.figures.style import TRANSIENT_ROOM, Series, Transient, transient_of
 
 # Place of an inset in parts of its panel: left edge, width, height; the room that its labels take below and above.
 LEFT, WIDE, HIGH = 0.47, 0.51, 0.50
 UNDER, OVER = 0.16, 0.04
 MARK = "#DDE6EE"
+# What happens within this share of the run is not seen on its scale.
+NARROW = 0.1
 
 
 def inset_rows(figure: Figure, rows: Sequence[Sequence[Series]], settle: float) -> list[tuple[Axes, ...]]:
@@ -36,7 +38,7 @@ def inset_rows(figure: Figure, rows: Sequence[Sequence[Series]], settle: float) 
     grid[-1].set_xlabel("time [s]")
     found: list[tuple[Axes, ...]] = []
     for row, axes in zip(rows, grid, strict=True):
-        transient = transient_of(row, settle, end)
+        transient = transient_of(row, settle, end) or _first_only(row, settle, end)
         if transient is None:
             found.append((axes,))
             continue
@@ -60,6 +62,22 @@ def inset_rows(figure: Figure, rows: Sequence[Sequence[Series]], settle: float) 
         )
         found.append((inset, axes))
     return found
+
+
+def _first_only(row: Sequence[Series], settle: float, end: float) -> Transient | None:
+    """Of what is zero once it has settled, the short time in which it is not, if that is too narrow to be seen."""
+    last = largest = smallest = 0.0
+    for time, values in row:
+        some = np.isfinite(values) & (values != 0.0)
+        if (some & (time >= settle)).any():
+            return None
+        if some.any():
+            last = max(last, float(time[some][-1]))
+            smallest, largest = min(smallest, float(values[some].min())), max(largest, float(values[some].max()))
+    if not 0.0 < last < NARROW * end:
+        return None
+    room = 0.08 * (largest - smallest)
+    return Transient(1.5 * last, smallest - room, largest + room, max(largest, -smallest))
 
 
 def _room(row: Sequence[Series], limits: tuple[float, float], end: float) -> tuple[float, float, float]:

@@ -30,10 +30,7 @@ def motors(record: Record) -> Figure | None:
     late = settled if settled.any() else slice(None)
     effort = np.sqrt((record["current"][late] ** 2).mean(axis=0))
     shown = np.arange(count) if count <= LARGEST else np.sort(np.argsort(effort)[::-1][:LARGEST])
-    what = "motor currents and voltages" + (
-        f"; {LARGEST} of {count} with the largest rms current" if count > LARGEST else ""
-    )
-    figure = style.new_figure(4.4, style.title(record, what))
+    figure = style.new_figure(4.4, style.title(record, "motor currents and voltages"))
     rows = style.time_rows(
         figure, [[(record.time, record[name])] for name, _ in signals], style.settle_time(record), compress=True
     )
@@ -46,7 +43,8 @@ def motors(record: Record) -> Figure | None:
             _draw(axes, record, name, shown, looks)
         panels[0].set_ylabel(label)
     events.mark_all(rows, record)
-    figure.legend(*rows[0][-1].get_legend_handles_labels(), loc="outside right center")
+    named = f"{LARGEST} largest by\nrms current" if count > LARGEST else None
+    figure.legend(*rows[0][-1].get_legend_handles_labels(), loc="outside right center", title=named, title_fontsize=7.5)
     return figure
 
 

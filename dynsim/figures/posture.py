@@ -42,8 +42,8 @@ AROUND = 41
 DOTS = 40
 ARM_COLOUR = "#444444"
 BASE_COLOUR = "#D5D5D5"
-# Text at faint postures [point].
-TIME_SIZE = 6.0
+# Text at faint postures, and how far such a one is from the last at least, to be told from it [point].
+TIME_SIZE, APART = 6.0, 3.0
 # Width of a side view in a figure of one column, and of two [point].
 FULL, HALF = 440.0, 205.0
 
@@ -92,18 +92,20 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     everything = [segments for one in drawn.values() for segments in one]
     plane = side_plane(some[0], everything)
     everything += [solid for body in shown.values() for base in body.bases() for solid in base]
-    columns = 2 if len(shown) > 1 else 1
-    lines = -(-len(shown) // columns)
     low, high = extent_of(plane, everything, some)
-    scale = (FULL if columns == 1 else HALF) / (high[0] - low[0])
-    scale = min(scale, 72.0 * 3.2 / (high[1] - low[1]))
+    size = high - low
+    # Upright arms stand beside each other.
+    columns = min(len(shown), 4 if size[1] > size[0] else 2)
+    lines = -(-len(shown) // columns)
+    scale = min((FULL if columns == 1 else 2.0 * HALF / columns) / size[0], 72.0 * 3.2 / size[1])
     # Rows without labels need no room for them.
     rows = [list(shown)[start : start + columns] for start in range(0, len(shown), columns)]
     extents = [
         with_labels((low, high), [label for name in row for label in contact_labels(shown[name], plane, scale)], scale)
         for row in rows
     ]
-    heights = [float(np.clip(3.2 * (top[1] - base[1]) / (top[0] - base[0]), 0.8, 3.2)) for base, top in extents]
+    widest = 6.4 / columns
+    heights = [float(np.clip(widest * (top[1] - base[1]) / (top[0] - base[0]), 0.8, 3.2)) for base, top in extents]
     figure = style.new_figure(
         0.9 + 0.3 * lines + sum(heights), style.comparison_title(some, "postures at the end, and before (faint)")
     )
@@ -117,6 +119,9 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
         axes.label_outer()
     for axes in grid.ravel()[len(shown) :]:
         axes.set_axis_off()
+    # Labels of narrow panels would overlap: one stands for all.
+    for axes in grid[:, [k for k in range(columns) if columns > 2 and k != columns // 2]].ravel():
+        axes.set_xlabel("")
     _legend(figure, list(grid.ravel()))
     return figure
 
@@ -226,7 +231,7 @@ def _write_times(axes: Axes, times: Sequence[float], drawn: Sequence[Array], sca
     middles = np.linspace(drawn[-1][:, 0], drawn[-1][:, 1], 5).reshape(-1, 2) if drawn else np.zeros((0, 2))
     taken = [(scale * point, np.array([1.0, 1.0])) for point in middles]
     for time, flat in zip(times[:-1], drawn[:-1], strict=False):
-        if not len(flat) or not np.isfinite(flat[-1]).all():
+        if not len(flat) or not np.isfinite(flat[-1]).all() or scale * np.abs(flat - drawn[-1]).max() < APART:
             continue
         along = flat[-1, 1] - flat[-1, 0]
         size = float(np.linalg.norm(along))

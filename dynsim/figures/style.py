@@ -36,6 +36,8 @@ VARIANT_COLOURS = (BLUE, GREEN, ORANGE, PURPLE, SKY, BLACK, "#8C6D31")
 AXIS_COLOURS = {"x": BLUE, "y": GREEN, "z": ORANGE}
 
 WIDTH = 7.2
+# Size of a figure's title [point], and how many characters of it fit.
+TITLE, TITLE_LONG = 10.0, 88
 DPI = 170
 _LOOK: Any = {
     "font.size": 8.5,
@@ -44,7 +46,7 @@ _LOOK: Any = {
     "legend.fontsize": 7.5,
     "xtick.labelsize": 7.5,
     "ytick.labelsize": 7.5,
-    "figure.titlesize": 10,
+    "figure.titlesize": TITLE,
     "mathtext.fontset": "dejavusans",
     "lines.linewidth": 1.2,
     "lines.solid_capstyle": "round",
@@ -69,7 +71,7 @@ LINE_POINTS = 4000
 TRANSIENT_ROOM, TRANSIENT_MOST = 1.2, 0.8
 # Curves that lie closer together than this share of a panel's height hide each other; those on top get these dashes.
 SAME = 0.012
-OVER = ((0, (5, 4)), (0, (2, 4)), (0, (1, 3)))
+OVER = ((0, (5, 4)), (0, (2, 2.5)), (0, (6, 2, 1.5, 2)))
 # Height of a row of a legend [point].
 LEGEND_ROW = 12.5
 
@@ -86,7 +88,8 @@ def new_figure(height: float, title: str) -> Figure:
     """An empty figure [inch] that belongs to no pyplot and needs no display."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     Canvas(figure)
-    figure.suptitle(title)
+    # A long title is smaller: it would be cut off at both sides.
+    figure.suptitle(title, fontsize=TITLE * min(1.0, TITLE_LONG / max(len(title), 1)))
     return figure
 
 
