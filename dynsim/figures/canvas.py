@@ -43,7 +43,7 @@ class _Renderer(RendererAgg):
     def _get_font_height_metrics(self, prop: FontProperties) -> tuple[float, float, float]:
         """Ascent, descent and gap of lines [pixel], which matplotlib 3.11 asks for at each layout of a text.
 
-        It would read them from the tables of the font each time. The computation is its own; earlier versions never ask.
+        It would read them from the font each time. The computation is its own; earlier versions never ask.
         """
         key = self.dpi, prop.get_size_in_points(), hash(prop)
         if key not in _heights:
