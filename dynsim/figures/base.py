@@ -87,46 +87,61 @@ def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
 
 
 def tracking(record: Record) -> Figure | None:
-    """Reference and place of a mobile base over time, and what lies between; None without a reference."""
+    """Reference and place of a mobile base over time, and what lies between; None without a reference.
+
+    Of a base that is to stand, and does, only what lies between is drawn.
+    """
     if not {"base_pose", "base_target"} <= set(record):
         return None
     pose, target = record["base_pose"], record["base_target"]
     error = base_error(record)
-    figure = style.new_figure(6.6, style.title(record, "base, reference and actual"))
     heading = np.degrees(np.stack([target[:, 2], pose[:, 2]], axis=1))
+    stands = _spread(np.hstack([target[:, :2], pose[:, :2]])) < LEAST_POSITION and _spread(heading) < LEAST_HEADING
     # To a nanometre: beyond it a base that stands shows its rounding.
     away, turned = np.round(MILLI * error[:, :2], 6), np.round(180.0 / np.pi * error[:, 2:], 6)
-    parts = [np.hstack([target[:, :2], pose[:, :2]]), heading, away, turned]
-    rows = style.time_rows(figure, [[(record.time, one)] for one in parts], style.settle_time(record))
-    for panels, values, least in zip(rows, parts, (LEAST_POSITION, LEAST_HEADING, 0.0, 0.0), strict=True):
+    parts = {"error [mm]": away, "heading error [°]": turned}
+    if not stands:
+        parts = {"position [m]": np.hstack([target[:, :2], pose[:, :2]]), "heading [°]": heading, **parts}
+    what = "base, which stands: actual − reference" if stands else "base, reference and actual"
+    figure = style.new_figure(0.6 + 1.5 * len(parts), style.title(record, what))
+    found = style.time_rows(figure, [[(record.time, one)] for one in parts.values()], style.settle_time(record))
+    rows = dict(zip(parts, found, strict=True))
+    for name, panels in rows.items():
         for axes in panels:
-            if np.ptp(values[np.isfinite(values)]) < least and least:
+            values = parts[name]
+            least = {"position [m]": LEAST_POSITION, "heading [°]": LEAST_HEADING}.get(name, 0.0)
+            if _spread(values) < least:
                 middle = float(np.nanmean(values))
                 axes.set_ylim(middle - least, middle + least)
             axes.ticklabel_format(axis="y", useOffset=False)
     # Dashes: x and y may be the same.
     for k, (name, dashes) in enumerate((("x", "-"), ("y", (0, (5, 4))))):
-        for axes in rows[0]:
+        for axes in rows.get("position [m]", ()):
             _pair(axes, record.time, target[:, k], pose[:, k], name, style.AXIS_COLOURS[name], dashes)
-    for axes in rows[1]:
+    for axes in rows.get("heading [°]", ()):
         _pair(axes, record.time, heading[:, 0], heading[:, 1], "heading", style.BLACK, "-")
     for k, (name, colour) in enumerate((("ahead", style.BLUE), ("to the left", style.GREEN))):
         label = f"{name}: rms {style.number(_rms(away[:, k]), 3)} mm"
-        for axes in rows[2]:
+        for axes in rows["error [mm]"]:
             style.line(axes, record.time, away[:, k], color=colour, label=label)
-    for axes in rows[3]:
+    for axes in rows["heading error [°]"]:
         label = f"rms {style.number(_rms(turned), 3)}°"
         style.line(axes, record.time, turned[:, 0], color=style.BLACK, label=label)
-    for panels in rows[2:]:
-        for axes in panels:
+    for name in ("error [mm]", "heading error [°]"):
+        for axes in rows[name]:
             axes.axhline(0.0, color=style.GREY, linewidth=0.6)
-    labels = ("position [m]", "heading [°]", "error [mm]", "heading error [°]")
-    for panels, label in zip(rows, labels, strict=True):
-        panels[0].set_ylabel(label)
+    for name, panels in rows.items():
+        panels[0].set_ylabel(name)
         style.legend_above(panels[-1], columns=4)
-    events.mark_all(rows, record)
-    figure.align_ylabels([panels[0] for panels in rows])
+    events.mark_all(found, record)
+    figure.align_ylabels([panels[0] for panels in found])
     return figure
+
+
+def _spread(values: Array) -> float:
+    """How far the values of any column spread."""
+    known = values[np.isfinite(values).all(axis=1)]
+    return float(np.ptp(known, axis=0).max()) if len(known) else 0.0
 
 
 def base_error(record: Record) -> Array:

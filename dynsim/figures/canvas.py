@@ -9,11 +9,13 @@ from typing import Any
 import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg, RendererAgg
-from matplotlib.font_manager import FontProperties
+from matplotlib.font_manager import FontProperties, fontManager, get_font
 from numpy.typing import NDArray
 
 # Width, height and descent [pixel] of texts, by resolution, text, font and whether it is a formula.
 _sizes: dict[tuple[float, str, FontProperties, bool], tuple[float, float, float]] = {}
+# Ascent, descent and gap of lines [pixel], by resolution, size and font.
+_heights: dict[tuple[float, float, int], tuple[float, float, float]] = {}
 # What they were measured with.
 _settings: dict[str, Any] = {}
 
@@ -24,6 +26,7 @@ def heed_fonts() -> None:
     now = {key: value for key, value in parameters.items() if key.startswith(("font.", "text.", "mathtext."))}
     if now != _settings:
         _sizes.clear()
+        _heights.clear()
         _settings.clear()
         _settings.update(now)
 
@@ -36,6 +39,22 @@ class _Renderer(RendererAgg):
         if key not in _sizes:
             _sizes[key] = super().get_text_width_height_descent(s, prop, ismath)
         return _sizes[key]
+
+    def _get_font_height_metrics(self, prop: FontProperties) -> tuple[float, float, float]:
+        """Ascent, descent and gap of lines [pixel], which matplotlib 3.11 asks for at each layout of a text.
+
+        It would read them from the font each time. The computation is its own; earlier versions never ask.
+        """
+        key = self.dpi, prop.get_size_in_points(), hash(prop)
+        if key not in _heights:
+            font: Any = get_font(fontManager.findfont(prop))
+            table, names = font.get_sfnt_table("OS/2"), ("sTypoAscender", "sTypoDescender", "sTypoLineGap")
+            if table is None:
+                table, names = font.get_sfnt_table("hhea"), ("ascent", "descent", "lineGap")
+            scale = prop.get_size_in_points() * self.dpi / (72.0 * font.get_sfnt_table("head")["unitsPerEm"])
+            ascent, descent, gap = (table[name] * scale for name in names)
+            _heights[key] = ascent, -descent, gap
+        return _heights[key]
 
 
 class Canvas(FigureCanvasAgg):

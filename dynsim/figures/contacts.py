@@ -15,11 +15,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from dynsim.figures import events, style
+from dynsim.figures.insets import inset_rows
 from dynsim.figures.style import Array
 from dynsim.record import Record
 
-# More rows than this do not fit a page.
-ROWS = 8
+# More rows than this do not fit a page; height of one [inch].
+ROWS, ROW = 8, 1.75
 # More samples than this are not drawn as dots.
 DOTS = 150
 # A smaller share of a run is rounding of sums of times.
@@ -40,8 +41,8 @@ def forces(record: Record) -> Figure | None:
         return None
     chosen = _most_interesting(names, [record])
     note = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} contacts ({_choice([record])})"
-    figure = style.new_figure(1.0 + 1.5 * len(chosen), style.title(record, f"normal contact forces{note}"))
-    rows = style.time_rows(figure, [_series(record, name) for name in chosen], style.settle_time(record))
+    figure = style.new_figure(0.9 + ROW * len(chosen), style.title(record, f"normal contact forces{note}"))
+    rows = inset_rows(figure, [_series(record, name) for name in chosen], style.settle_time(record))
     for name, panels in zip(chosen, rows, strict=True):
         force = _force(record, name)
         for axes in panels:
@@ -57,9 +58,9 @@ def forces(record: Record) -> Figure | None:
             _mark_pulling(axes)
         if len(panels) > 1:
             _draw_samples(panels[0], record, name, style.BLUE)
-        panels[0].set_ylabel(f"{name}\n$f_n$ [N]")
+        panels[-1].set_ylabel(f"{name}\nfₙ [N]")
         style.legend_above(panels[-1], columns=4 if is_real(record) else 3)
-    _note_sampling(rows[-1], [record])
+    _note_sampling(rows, [record])
     events.explain(rows[-1][-1], events.marked(record, chosen))
     return figure
 
@@ -74,11 +75,14 @@ def forces_comparison(records: Mapping[str, Record]) -> Figure | None:
     title = style.comparison_title(list(records.values()), "normal contact forces")
     # A legend has an entry for each variant and one for the shading.
     more = sum(-(-(len(having[name]) + 1) // 2) - 1 for name in chosen) * style.LEGEND_ROW / 72.0
-    figure = style.new_figure(1.1 + 1.7 * len(chosen) + more, title)
+    figure = style.new_figure(1.0 + ROW * len(chosen) + more, title)
     series = [[one for r in having[name].values() for one in _series(r, name)] for name in chosen]
     settle = max(style.settle_time(record) for record in records.values())
-    styles = style.variant_styles(list(records))
-    rows = style.time_rows(figure, series, settle)
+    styles = style.told_apart(
+        style.variant_styles(list(records)),
+        *({v: (r.time, _force(r, name)) for v, r in having[name].items()} for name in chosen),
+    )
+    rows = inset_rows(figure, series, settle)
     for name, panels in zip(chosen, rows, strict=True):
         for axes in panels:
             for variant, record in having[name].items():
@@ -92,9 +96,9 @@ def forces_comparison(records: Mapping[str, Record]) -> Figure | None:
         if len(panels) > 1:
             for variant, record in having[name].items():
                 _draw_samples(panels[0], record, name, str(styles[variant]["color"]))
-        panels[0].set_ylabel(f"{name}\n$f_n$ [N]")
+        panels[-1].set_ylabel(f"{name}\nfₙ [N]")
         style.legend_above(panels[-1], columns=2)
-    _note_sampling(rows[-1], list(records.values()))
+    _note_sampling(rows, list(records.values()))
     events.explain(rows[-1][-1], [event for record in records.values() for event in events.marked(record, chosen)])
     return figure
 
@@ -176,16 +180,19 @@ def _draw_samples(axes: Axes, record: Record, name: str, colour: str) -> None:
         axes.plot(record.time[inside], _force(record, name)[inside], ".", color=colour, markersize=2.5)
 
 
-def _note_sampling(panels: Sequence[Axes], records: Sequence[Record]) -> None:
-    """Under the first panel: how often the curves are sampled, and what the dashed lines are."""
+def _note_sampling(rows: Sequence[Sequence[Axes]], records: Sequence[Record]) -> None:
+    """Under the last panel: how often the curves are sampled, what the dashed lines are, and the insets."""
     steps = [float(np.median(np.diff(record.time))) for record in records if len(record) > 1]
     if not steps:
         return
     note = f"sampled every {style.number(1e3 * max(steps), 3)} ms"
-    if any(line.get_marker() == "." for line in panels[0].get_lines()):
+    if any(line.get_marker() == "." for panels in rows for line in panels[0].get_lines()):
         note += " (dots)"
-    gap = "\n" if len(panels) > 1 else "; "
-    panels[0].set_xlabel(f"{panels[0].get_xlabel()}\n{note}{gap}dashed: extremes of all steps")
+    note += "; dashed: extremes of all steps"
+    if any(len(panels) > 1 for panels in rows):
+        note += "\naxes cut to the settled range; inset: the shaded beginning in full"
+    last = rows[-1][-1]
+    last.set_xlabel(f"{last.get_xlabel()}\n{note}")
 
 
 def _force(record: Record, name: str) -> Array:

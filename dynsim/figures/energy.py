@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullLocator
+from matplotlib.ticker import FuncFormatter, NullLocator
 
 from dynsim.figures import events, style
 from dynsim.figures.style import Array
@@ -33,6 +33,10 @@ LOG_RATIO = 8.0
 DOMINANT = 0.8
 # Less than this share of the largest term is rounding.
 NOTHING = 1e-9
+# Net and drawn energy that are nowhere further apart than this share of the largest are one curve.
+DIFFER = 0.01
+# A residual below this share of its limit is a number, not a picture.
+SMALL_RESIDUAL = 0.1
 
 
 def has_motors(record: Record) -> bool:
@@ -41,25 +45,27 @@ def has_motors(record: Record) -> bool:
 
 
 def energy(record: Record) -> Figure | None:
-    """Electrical energy, net and drawn, and mechanical work; None without motors."""
+    """Electrical energy, net and, where it differs, drawn; mechanical work. None without motors."""
     if not has_motors(record):
         return None
     figure = style.new_figure(4.2, style.title(record, "electrical energy and mechanical work"))
     top, bottom = figure.subplots(2, 1, sharex=True)
     net, drawn = record["energy_electrical"], record["energy_electrical_drawn"]
-    style.line(top, record.time, net, label=rf"net $\int\!\Sigma\,u\,i\,dt$: {_joules(net)}", color=style.BLUE, lw=1.8)
-    label = rf"drawn $\int\!\Sigma\,\max(u\,i,0)\,dt$: {_joules(drawn)}"
-    style.line(top, record.time, drawn, label=label, color=style.ORANGE, linestyle=(0, (4, 3)))
+    apart = bool(np.abs(drawn - net).max() > DIFFER * np.abs(drawn).max())
+    label = f"net ∫ Σ u·i dt: {_joules(net)}" + ("" if apart else f" (drawn ∫ Σ max(u·i, 0) dt: {_joules(drawn)})")
+    style.line(top, record.time, net, label=label, color=style.BLUE, lw=1.8)
+    if apart:
+        label = f"drawn ∫ Σ max(u·i, 0) dt: {_joules(drawn)}"
+        style.line(top, record.time, drawn, label=label, color=style.ORANGE, linestyle=(0, (4, 3)))
     top.set_ylabel("electrical energy [J]")
     work = record["work_mechanical"]
-    label = rf"$\int\!\Sigma\,\tau\,\dot{{q}}\,dt$: {_joules(work)}"
-    style.line(bottom, record.time, work, label=label, color=style.GREEN)
+    style.line(bottom, record.time, work, label=f"∫ Σ τ·q̇ dt: {_joules(work)}", color=style.GREEN)
     bottom.axhline(0.0, color=style.GREY, linewidth=0.6)
     bottom.set_ylabel("mechanical work [J]")
     bottom.set_xlabel("time [s]")
     events.mark_all([(top,), (bottom,)], record)
     for axes in (top, bottom):
-        axes.legend(loc="best")
+        style.legend_above(axes, columns=2)
     return figure
 
 
@@ -75,15 +81,25 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
     grid = figure.add_gridspec(2, 2, width_ratios=[1.6, 1.0])
     over_time, total = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[:, 1])
     work = figure.add_subplot(grid[1, 0], sharex=over_time)
-    styles = style.variant_styles(list(records))
+    finals = np.array([record["energy_electrical"][-1] for record in shown.values()])
+    logarithmic = bool(finals.min() > 0.0 and finals.max() > LOG_RATIO * finals.min())
+    least = 0.02 * float(finals.min())
+    styles = style.told_apart(
+        style.variant_styles(list(records)),
+        {
+            name: (record.time, np.log(np.maximum(energy, least)) if logarithmic else energy)
+            for name, record in shown.items()
+            for energy in (record["energy_electrical"],)
+        },
+        {name: (record.time, record["work_mechanical"]) for name, record in shown.items()},
+    )
     for name, record in shown.items():
         style.line(over_time, record.time, record["energy_electrical"], label=name, **styles[name])
         style.line(work, record.time, record["work_mechanical"], **styles[name])
-    finals = np.array([record["energy_electrical"][-1] for record in shown.values()])
-    if finals.min() > 0.0 and finals.max() > LOG_RATIO * finals.min():
+    if logarithmic:
         style.log_axis(over_time)
         # The first milliseconds would spread the axis over many decades in which nothing is to be seen.
-        over_time.set_ylim(0.02 * finals.min(), 1.6 * finals.max())
+        over_time.set_ylim(least, 1.6 * finals.max())
     over_time.set_ylabel("electrical energy [J]")
     over_time.tick_params(labelbottom=False)
     work.axhline(0.0, color=style.GREY, linewidth=0.6)
@@ -97,7 +113,10 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
 
 
 def ledger(record: Record) -> Figure | None:
-    """Where the energy went, stacked, and what the ledger does not explain; None without a ledger."""
+    """Where the energy went, stacked, and what the ledger does not explain; None without a ledger.
+
+    Where Joule heat would hide the rest, the rest has the panel, and a small one aside has all of it.
+    """
     if "energy_residual" not in record:
         return None
     terms = {name: record[name] - record[name][:1] for name in TERMS if name in record}
@@ -107,18 +126,40 @@ def ledger(record: Record) -> Figure | None:
         supplied, source = supplied + record["work_loads"].sum(axis=1), "electrical energy and work of loads"
     turnover = energy_turnover(record)
     dominant = bool(np.abs(terms["heat_joule"]).max() > DOMINANT * turnover > 0.0)
-    figure = style.new_figure(6.6 if dominant else 5.0, style.title(record, "energy ledger"))
-    panels = figure.subplots(2 + dominant, 1, sharex=True, height_ratios=[*[2.0] * (1 + dominant), 1.0])
-    _stack(panels[0], record.time, terms, supplied, source)
-    panels[0].set_ylabel("energy since start [J]")
+    near = bool(np.abs(record["energy_residual"]).max() > SMALL_RESIDUAL * RESIDUAL_LIMIT * turnover > 0.0)
+    figure = style.new_figure(3.9 + 1.3 * near, style.title(record, "energy ledger"))
+    grid = figure.add_gridspec(1 + near, 1 + dominant, width_ratios=[3.2, 1.0][: 1 + dominant])
+    if near:
+        grid.set_height_ratios([2.4, 1.0])
+    whole = figure.add_subplot(grid[0, -1])
+    _stack(whole, record.time, terms, supplied, source)
+    main = whole
     if dominant:
+        whole.set_title("with Joule heat", loc="left")
+        whole.set_xlabel("time [s]")
+        main = figure.add_subplot(grid[0, 0], sharex=whole)
         rest = {name: values for name, values in terms.items() if name != "heat_joule"}
-        _stack(panels[1], record.time, rest, supplied - terms["heat_joule"], source)
-        panels[1].set_ylabel("the same without\nJoule heat [J]")
-    _residual(panels[-1], record, turnover)
+        _stack(main, record.time, rest, supplied - terms["heat_joule"], source)
+        main.set_title("without Joule heat", loc="left")
+    main.set_ylabel("energy since start [J]")
+    panels = [main, figure.add_subplot(grid[1, 0], sharex=main)] if near else [main]
+    if near:
+        _residual(panels[1], record, turnover)
+        main.tick_params(labelbottom=False)
+    panels[-1].set_xlabel("time [s]")
     events.mark_all([(axes,) for axes in panels], record)
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    if not near:
+        panels[-1].set_xlabel(f"{panels[-1].get_xlabel()}\n{_residual_note(record, turnover)}")
+    figure.legend(*whole.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
+
+
+def _residual_note(record: Record, turnover: float) -> str:
+    largest = float(np.abs(record["energy_residual"]).max())
+    if not turnover > 0.0:
+        return f"unexplained: at most {style.number(largest, 2)} J"
+    share = style.number(largest / turnover, 2)
+    return f"unexplained: at most {style.number(largest, 2)} J, {share} of the turnover (limit {RESIDUAL_LIMIT:g})"
 
 
 def _stack(axes: Axes, time: Array, terms: Mapping[str, Array], supplied: Array, source: str) -> None:
@@ -147,6 +188,7 @@ def _residual(axes: Axes, record: Record, turnover: float) -> None:
     if np.any(size > 0.0):
         axes.set_yscale("log", nonpositive="mask")
         axes.yaxis.set_minor_locator(NullLocator())
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     shown = np.where(size > 0.0, size, np.nan)
     if np.isfinite(shown).any():
         style.line(axes, record.time, np.where(np.isnan(shown), np.nanmin(shown), shown), color=style.BLACK, lw=0.9)
@@ -154,7 +196,7 @@ def _residual(axes: Axes, record: Record, turnover: float) -> None:
         limit = RESIDUAL_LIMIT * turnover
         axes.axhline(limit, color=style.PULLING, linestyle="--", linewidth=0.9)
         axes.annotate(
-            "limit: $10^{-6}$ of the turnover",
+            f"limit: {RESIDUAL_LIMIT:g} of the turnover",
             (0.99, limit),
             xycoords=("axes fraction", "data"),
             xytext=(0, -9),
@@ -163,8 +205,7 @@ def _residual(axes: Axes, record: Record, turnover: float) -> None:
             color=style.PULLING,
             fontsize=7,
         )
-    axes.set_ylabel("|residual|\n[J]")
-    axes.set_xlabel("time [s]")
+    axes.set_ylabel("unexplained\n[J]")
 
 
 def _bars(axes: Axes, names: list[str], values: Array, colours: list[str]) -> None:

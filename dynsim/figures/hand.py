@@ -51,7 +51,10 @@ def path_comparison(records: Mapping[str, Record]) -> Figure | None:
         return None
     figure = style.new_figure(3.2, style.comparison_title(list(shown.values()), "hand paths"))
     panels = _planes(figure, list(shown.values()))
-    styles = style.variant_styles(list(records))
+    styles = style.told_apart(
+        style.variant_styles(list(records)),
+        *({name: (r.time, r["hand_position"][:, k]) for name, r in shown.items()} for k in range(3)),
+    )
     for axes, plane in zip(panels, PLANES, strict=True):
         _draw_target(axes, next(iter(shown.values())), plane)
         for name, record in shown.items():
@@ -70,7 +73,7 @@ def error(record: Record) -> Figure | None:
     figure = style.new_figure(4.1, style.title(record, "tracking error"))
     top, bottom = figure.subplots(2, 1, sharex=True)
     for k, name in enumerate("xyz"):
-        style.line(top, record.time, deviation[:, k], label=f"$e_{name}$", color=style.AXIS_COLOURS[name])
+        style.line(top, record.time, deviation[:, k], label=name, color=style.AXIS_COLOURS[name])
     top.set_ylabel(f"hand − {target_name(record)} [mm]")
     style.line(bottom, record.time, norm, label=_error_label("|e|", record), color=style.BLACK)
     bottom.set_ylabel(f"distance from {target_name(record)} [mm]")
@@ -91,16 +94,22 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
     height = 4.4 + 2.0 * events.height_of_variants(shown)
     figure = style.new_figure(height, style.comparison_title(list(shown.values()), "tracking error"))
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[1.3, 1.0])
-    styles = style.variant_styles(list(records))
+    deviations = {name: MILLI * (record["hand_position"] - hand_target(record)) for name, record in shown.items()}
+    norms = {name: np.linalg.norm(deviation, axis=1) for name, deviation in deviations.items()}
+    least = min((float(norm[norm > 0.0].min()) for norm in norms.values() if (norm > 0.0).any()), default=1.0)
+    styles = style.told_apart(
+        style.variant_styles(list(records)),
+        {name: (record.time, np.log(np.maximum(norms[name], least))) for name, record in shown.items()},
+        {name: (record.time, deviations[name][:, 2]) for name, record in shown.items()},
+    )
     for name, record in shown.items():
-        deviation = MILLI * (record["hand_position"] - hand_target(record))
-        norm = np.linalg.norm(deviation, axis=1)
+        norm, deviation = norms[name], deviations[name]
         style.line(top, record.time, norm, label=_error_label(name, record), **styles[name])
         style.line(bottom, record.time, deviation[:, 2], **styles[name])
     if any(line.get_ydata().max() > 0.0 for line in top.get_lines()):
         style.log_axis(top)
     top.set_ylabel("distance from target [mm]")
-    bottom.set_ylabel("vertical error $e_z$ [mm]")
+    bottom.set_ylabel("vertical error [mm]")
     bottom.set_xlabel("time [s]")
     _mark_settle((top, bottom), next(iter(shown.values())))
     colours = {name: str(look["color"]) for name, look in styles.items()}

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection  # type: ignore[import-untyped]
 
-from dynsim.figures import style
+from dynsim.figures import penetration, style
 from dynsim.figures.hand import edge_on, target_name
 from dynsim.figures.skeleton import (
     LABEL_SIZE,
@@ -32,7 +32,7 @@ from dynsim.figures.style import Array
 from dynsim.measures import hand_target
 from dynsim.record import Record
 from dynsim.record.scene import Surface
-from dynsim.record.surface_points import surface_grids
+from dynsim.record.surface_points import round_patch, surface_grids
 
 # An axis of the 3D view shorter than this share of the longest has two ticks.
 SHORT_AXIS = 0.45
@@ -40,6 +40,8 @@ SHORT_AXIS = 0.45
 DOTS = 40
 ARM_COLOUR = "#444444"
 BASE_COLOUR = "#D5D5D5"
+# Text at faint postures, and how far such a one is from the last at least, to be told from it [point].
+TIME_SIZE, APART = 6.0, 3.0
 # Width of a side view in a figure of one column, and of two [point].
 FULL, HALF = 440.0, 205.0
 
@@ -88,25 +90,36 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     everything = [segments for one in drawn.values() for segments in one]
     plane = side_plane(some[0], everything)
     everything += [solid for body in shown.values() for base in body.bases() for solid in base]
-    columns = 2 if len(shown) > 1 else 1
-    lines = -(-len(shown) // columns)
     low, high = extent_of(plane, everything, some)
-    scale = (FULL if columns == 1 else HALF) / (high[0] - low[0])
-    scale = min(scale, 72.0 * 3.2 / (high[1] - low[1]))
-    labels = [label for name, body in shown.items() for label in contact_labels(body, plane, scale)]
-    low, high = with_labels((low, high), labels, scale)
-    height = 0.9 + lines * (0.3 + np.clip(3.2 * (high[1] - low[1]) / (high[0] - low[0]), 0.8, 3.2))
-    figure = style.new_figure(height, style.comparison_title(some, "postures at the end, and before (faint)"))
-    grid = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
+    size = high - low
+    # Upright arms stand beside each other.
+    columns = min(len(shown), 4 if size[1] > size[0] else 2)
+    lines = -(-len(shown) // columns)
+    scale = min((FULL if columns == 1 else 2.0 * HALF / columns) / size[0], 72.0 * 3.2 / size[1])
+    # Rows without labels need no room for them.
+    rows = [list(shown)[start : start + columns] for start in range(0, len(shown), columns)]
+    extents = [
+        with_labels((low, high), [label for name in row for label in contact_labels(shown[name], plane, scale)], scale)
+        for row in rows
+    ]
+    widest = 6.4 / columns
+    heights = [float(np.clip(widest * (top[1] - base[1]) / (top[0] - base[0]), 0.8, 3.2)) for base, top in extents]
+    figure = style.new_figure(
+        0.9 + 0.3 * lines + sum(heights), style.comparison_title(some, "postures at the end, and before (faint)")
+    )
+    grid = figure.subplots(lines, columns, sharex=True, sharey="row", squeeze=False, height_ratios=heights)
     styles = style.variant_styles(list(records))
     for axes, (name, body) in zip(grid.ravel(), shown.items(), strict=False):
         colour = str(styles[name]["color"])
-        _side_view(axes, records[name], body, drawn[name], plane, scale, colour=colour, path=style.GREY)
-        _frame_side(axes, plane, (low, high), body.scene.surfaces)
+        _side_view(axes, records[name], body, drawn[name], plane, scale, colour=colour, path=style.GREY, named=False)
+        _frame_side(axes, plane, extents[list(shown).index(name) // columns], body.scene.surfaces)
         axes.set_title(name, color=styles[name]["color"], fontweight="bold")
         axes.label_outer()
     for axes in grid.ravel()[len(shown) :]:
         axes.set_axis_off()
+    # Labels of narrow panels would overlap: one stands for all.
+    for axes in grid[:, [k for k in range(columns) if columns > 2 and k != columns // 2]].ravel():
+        axes.set_xlabel("")
     _legend(figure, list(grid.ravel()))
     return figure
 
@@ -147,7 +160,9 @@ def _side_view(
     *,
     colour: str,
     path: str = style.BLUE,
+    named: bool = True,
 ) -> None:
+    """``named``: the legend says how far below which surface."""
     for k, base in enumerate([] if body is None else body.bases()):
         last = k == len(drawn) - 1
         for solid in base:
@@ -156,6 +171,7 @@ def _side_view(
             axes.add_patch(
                 Polygon(corners, facecolor=face, edgecolor=colour, lw=0.8, alpha=1.0 if last else 0.22, zorder=2.5)
             )
+    sunk = [] if body is None else [penetration.below_surfaces(body, row) for row in body.shown()]
     for k, segments in enumerate(drawn):
         last = k == len(drawn) - 1
         flat = plane.project(segments)
@@ -169,6 +185,10 @@ def _side_view(
             zorder=3 if last else 2,
         )
         axes.add_collection(lines)
+        if len(sunk[k].pieces):
+            axes.add_collection(
+                LineCollection(list(plane.project(sunk[k].pieces)), zorder=3.2, **_sunk_look(last), capstyle="butt")
+            )
         if last and len(flat) <= DOTS:
             axes.plot(*flat[:-1, 1].T, "o", color="white", markeredgecolor=colour, markersize=4, zorder=4)
     if (wanted := hand_target(record)) is not None:
@@ -177,6 +197,11 @@ def _side_view(
     axes.plot(*plane.project(style.sparse(record["hand_position"])).T, color=path, lw=1.0, zorder=4, label="hand path")
     for _, _, position, force in () if body is None else body.contacts():
         axes.plot(*plane.project(position), zorder=6, linestyle="none", **_contact_mark(force))
+    if body is not None:
+        _write_times(axes, [float(record.time[row]) for row in body.shown()], [plane.project(s) for s in drawn], scale)
+    if (deepest := max(sunk, key=lambda one: one.depth, default=None)) is not None and deepest.depth > 0.0:
+        text = f"below {deepest.surface}, up to {style.number(1e3 * deepest.depth, 3)} mm"
+        axes.plot([], [], label=text if named else "below a surface", color=penetration.COLOUR, lw=4.0)
     for label in contact_labels(body, plane, scale):
         axes.annotate(
             label.text,
@@ -190,6 +215,41 @@ def _side_view(
             # A label further away says with a line where it belongs.
             arrowprops={"arrowstyle": "-", "color": style.GREY, "lw": 0.5, "shrinkB": 4} if label.level else None,
         )
+
+
+def _sunk_look(last: bool) -> dict[str, Any]:
+    """What of a posture lies below a surface."""
+    return {"colors": penetration.COLOUR, "linewidths": 4.0 if last else 2.2, "alpha": 1.0 if last else 0.5}
+
+
+def _write_times(axes: Axes, times: Sequence[float], drawn: Sequence[Array], scale: float) -> None:
+    """The times of the faint postures at their ends, as far as there is room: the earliest first."""
+    half = 0.5 * TIME_SIZE * 0.62 * np.array([5.5, 1.9])
+    # The last posture is the picture itself: nothing is written over its segments.
+    middles = np.linspace(drawn[-1][:, 0], drawn[-1][:, 1], 5).reshape(-1, 2) if drawn else np.zeros((0, 2))
+    taken = [(scale * point, np.array([1.0, 1.0])) for point in middles]
+    for time, flat in zip(times[:-1], drawn[:-1], strict=False):
+        if not len(flat) or not np.isfinite(flat[-1]).all() or scale * np.abs(flat - drawn[-1]).max() < APART:
+            continue
+        along = flat[-1, 1] - flat[-1, 0]
+        size = float(np.linalg.norm(along))
+        ahead = along / size if size > 0.0 else np.array([1.0, 0.0])
+        for direction in (ahead, np.array([0.0, 1.0]), np.array([1.0, 0.0]), np.array([0.0, -1.0])):
+            place = scale * flat[-1, 1] + direction * (half + 2.0)
+            if all((np.abs(place - other) > half + room).any() for other, room in taken):
+                taken.append((place, half))
+                axes.annotate(
+                    f"{time:{'.2g' if time < 100.0 else '.0f'}} s",
+                    flat[-1, 1],
+                    xytext=tuple(direction * (half + 2.0)),
+                    textcoords="offset points",
+                    ha="center",
+                    va="center",
+                    fontsize=TIME_SIZE,
+                    color=style.GREY,
+                    zorder=7,
+                )
+                break
 
 
 def _space_view(
@@ -211,6 +271,7 @@ def _space_view(
         shown = np.concatenate([faces(solid) for solid in base])
         solid = Poly3DCollection(shown, facecolors=BASE_COLOUR, linewidths=0, shade=True, antialiased=False, zorder=2.5)
         axes.add_collection3d(solid, autolim=False)
+    sunk = [] if body is None else [penetration.below_surfaces(body, row) for row in body.shown()]
     for k, segments in enumerate(drawn):
         last = k == len(drawn) - 1
         lines = Line3DCollection(
@@ -221,6 +282,9 @@ def _space_view(
             zorder=3 if last else 2,
         )
         axes.add_collection3d(lines, autolim=False)
+        if len(sunk[k].pieces):
+            sinking = Line3DCollection(list(sunk[k].pieces), zorder=3 if last else 2, **_sunk_look(last))
+            axes.add_collection3d(sinking, autolim=False)
         if last and len(segments) <= DOTS:
             axes.plot(*segments[:-1, 1].T, "o", color="white", markeredgecolor=ARM_COLOUR, markersize=3, zorder=4)
     if (wanted := hand_target(record)) is not None:
@@ -255,7 +319,10 @@ def _space_view(
 
 def _draw_surface(axes: Axes3D, surface: Surface, low: Array, high: Array) -> None:
     """The part of a surface next to the arm."""
-    grids = surface_grids(surface, low, high)
+    if surface.kind in ("sphere", "cylinder"):
+        grids = [round_patch(surface, low, high)]
+    else:
+        grids = surface_grids(surface, low, high)
     if surface.kind in ("height_field", "box"):
         grids = [_within(grid, low, high) for grid in grids]
     cells = [

@@ -36,18 +36,36 @@ class Skeleton:
         Nothing leads from the world or a body to what moves freely beside it.
         """
         points = self.record[POSITION][row].astype(np.float64)
+        lines = []
+        for carrier, body in self._segments():
+            if body is None:
+                hand = self.scene.hand
+                assert hand is not None
+                lines.append((points[hand.body], point_positions(self.record, hand, row)))
+            elif carrier is None:
+                # A sliding joint at the root moves its body away from where it is mounted.
+                lines.append((np.array(self.scene.bodies[body].joint.position), points[body]))
+            else:
+                lines.append((points[carrier], points[body]))
+        return np.array(lines)
+
+    def carriers(self) -> list[int | None]:
+        """The body that each of the :meth:`segments` is of; None of what leads there from the world."""
+        return [carrier for carrier, _ in self._segments()]
+
+    def _segments(self) -> list[tuple[int | None, int | None]]:
+        """The body that a segment is of and the one that it leads to: None for the world, and for the hand."""
         # A mobile base is drawn as what it is, see dynsim.figures.solids.
         solid = self.scene.base
         bodies = [
             (k, body) for k, body in enumerate(self.scene.bodies) if k not in solid and not _moves_beside(body.joint)
         ]
-        # A sliding joint at the root moves its body away from where it is mounted.
-        lines = [(np.array(body.joint.position), points[k]) for k, body in bodies if body.parent == WORLD]
-        lines += [(points[body.parent], points[k]) for k, body in bodies if body.parent not in (WORLD, *solid)]
+        found: list[tuple[int | None, int | None]] = [(None, k) for k, body in bodies if body.parent == WORLD]
+        found += [(body.parent, k) for k, body in bodies if body.parent not in (WORLD, *solid)]
         hand = self.scene.hand
         if hand is not None and hand.body != WORLD:
-            lines.append((points[hand.body], point_positions(self.record, hand, row)))
-        return np.array(lines)
+            found.append((hand.body, None))
+        return found
 
     def solids(self, row: int) -> list[Array]:
         """Points on the shapes of a mobile base and its wheels at a sample, (n, 3) [m] each."""

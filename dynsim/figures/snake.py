@@ -11,9 +11,11 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from PIL import Image
 
 from dynsim.figures import style, tanaka2019
@@ -21,6 +23,7 @@ from dynsim.figures.snake_view import (
     BODY,
     GROUND,
     HEAD,
+    LEAST_HEIGHT,
     NUMBERED,
     STYLE,
     SYMBOLS,
@@ -44,6 +47,8 @@ from dynsim.studies.published.tanaka2019 import used_limit
 
 # Postures of an animation, in a row, and over each other in one picture.
 FRAMES, IN_A_ROW, IN_A_PICTURE = 50, 6, 7
+# Parts of a run of which range and lowest value are drawn where a line would fill the panel.
+TURNS = 160
 # Postures over time in grey: the lines beside them have the colours.
 SHADES = LinearSegmentedColormap.from_list("shades", ["#CFCFCF", "#000000"])
 
@@ -130,22 +135,45 @@ def postures(record: Record) -> Figure:
 
 
 def overview(record: Record) -> Figure:
-    """Top view of the whole run in one picture: postures over time, path of the controlled point and its target."""
+    """Top view of the whole run in one picture: postures over time, path of the controlled point and its target.
+
+    A robot that stays where it is, and works with its head, is a thin strip in it: below it then is the side view.
+    """
     rows = moments(record, IN_A_PICTURE)
     x0, x1, y0, y1 = limits([*record["posture"][rows][:, :, :2], record["w"][:, :2]], 0.06)
-    width = 5.0
-    figure, axis = plt.subplots(figsize=(width + 1.4, max(width * (y1 - y0) / (x1 - x0), 1.0) + 0.9))
-    shades = plt.cm.ScalarMappable(plt.Normalize(0.0, record.time[-1]), SHADES)
+    flat = y1 - y0 < LEAST_HEIGHT * (x1 - x0)
+    views = [View(record, row) for row in rows] if flat else []
+    width = 6.4 if flat else 5.0
+    high = width * (y1 - y0) / (x1 - x0)
+    side = limits([view.side for view in views], 0.06) if flat else (0.0, 1.0, 0.0, 0.0)
+    low = width * (side[3] - side[2]) / (side[1] - side[0])
+    figure, grid = plt.subplots(
+        1 + flat, 1, figsize=(width + 1.4, max(high + low, 1.0) + 0.9 + 0.5 * flat), squeeze=False,
+        height_ratios=[high, low] if flat else None,
+    )  # fmt: skip
+    axis = grid[0, 0]
+    shades = plt.cm.ScalarMappable(plt.Normalize(0.0, record.time[-1]), plt.colormaps["viridis_r"] if flat else SHADES)
+    body = {"lw": 1.6 if flat else 4.0, "solid_capstyle": "round"}
     for row in rows:
         points, shade = record["posture"][row], shades.to_rgba(record.time[row])
-        axis.plot(points[:, 0], points[:, 1], "-", color=shade, lw=4.0, solid_capstyle="round")
-        axis.plot(*points[0, :2], "o", color=shade, ms=6)
+        axis.plot(points[:, 0], points[:, 1], "-", color=shade, **body)
+        axis.plot(*points[0, :2], "o", color=shade, ms=4 if flat else 6)
+    for view in views:
+        shade = shades.to_rgba(record.time[view.row])
+        grid[1, 0].plot(*view.side.T, "-", color=shade, **body)
+        grid[1, 0].plot(*view.side[0], "o", color=shade, ms=4)
     axis.plot(*record["w"][:, :2].T, color=HEAD, lw=1.0, label="controlled point")
     axis.plot(*record["w_target"][:, :2].T, "--", color=TARGET, lw=1.0, label="target")
     axis.plot(*record["base_pose"][:, :2].T, color=GROUND, lw=0.8, label="wheel pair 1")
     axis.set(xlabel="x [m]", ylabel="y [m]", xlim=(x0, x1), ylim=(y0, y1))
     axis.set_aspect("equal", adjustable="box")
-    figure.colorbar(shades, ax=axis, label="posture at t [s]")
+    if flat:
+        below = grid[1, 0]
+        below.axhline(0.0, color="#BBBBBB", lw=0.8, zorder=0)
+        below.set(xlabel="along the heading of the base part [m]", ylabel="height [m]")
+        below.set(xlim=side[:2], ylim=(min(side[2], -0.02), side[3]))
+        below.set_aspect("equal", adjustable="box")
+    figure.colorbar(shades, ax=grid.ravel().tolist(), label="posture at t [s]")
     figure.legend(loc="outside upper center", ncols=3, frameon=False)
     return figure
 
@@ -215,15 +243,28 @@ def redundancy(record: Record) -> Figure:
     cost.plot(record.time, record["cost"], color=GROUND)
     cost.set_ylabel("cost V")
     cost.set_ylim(bottom=0)
-    sigma.plot(record.time, record["sigma_min"], color=GROUND)
+    _over_time(sigma, record, record["sigma_min"], many)
     sigma.set_ylabel("σ_min of B̃")
     sigma.set_ylim(bottom=0)
-    margin.plot(record.time, 1e3 * record["support_margin"], color=GROUND)
+    _over_time(margin, record, 1e3 * record["support_margin"], many)
     margin.axhline(0.0, color=HEAD, ls="-.", lw=0.8)
     margin.set_ylabel("support margin [mm]")
     margin.set_ylim(bottom=min(0.0, 1e3 * float(record["support_margin"].min())) - 4)
     margin.set_xlabel("t [s]      (margin below zero: the robot tips)")
     return figure
+
+
+def _over_time(axis: Axes, record: Record, values: NDArray[np.float64], many: bool) -> None:
+    """A line; where ``many`` changes of mode would fill the panel with it, its range and its lowest value by turns."""
+    if not many:
+        axis.plot(record.time, values, color=GROUND)
+        return
+    starts = np.unique(np.linspace(0, len(values), TURNS + 1).astype(int))[:-1]
+    low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+    time = np.append(record.time[starts], record.time[-1])
+    axis.stairs(high, time, baseline=low, fill=True, color=GROUND, alpha=0.25, lw=0, label="range")
+    axis.plot(record.time[starts], low, color=GROUND, lw=1.0, label="lowest")
+    axis.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
 def animate(record: Record, path: Path) -> Path:

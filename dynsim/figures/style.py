@@ -22,6 +22,7 @@ from dynsim.record import Record
 from dynsim.terminal import plain
 
 T = TypeVar("T")
+Name = TypeVar("Name", str, int)
 Array = NDArray[np.float64]
 # A quantity over time, (T,) and (T,) or (T, k).
 Series = tuple[Array, Array]
@@ -35,6 +36,8 @@ VARIANT_COLOURS = (BLUE, GREEN, ORANGE, PURPLE, SKY, BLACK, "#8C6D31")
 AXIS_COLOURS = {"x": BLUE, "y": GREEN, "z": ORANGE}
 
 WIDTH = 7.2
+# Size of a figure's title [point], and how many characters of it fit.
+TITLE, TITLE_LONG = 10.0, 88
 DPI = 170
 _LOOK: Any = {
     "font.size": 8.5,
@@ -43,7 +46,7 @@ _LOOK: Any = {
     "legend.fontsize": 7.5,
     "xtick.labelsize": 7.5,
     "ytick.labelsize": 7.5,
-    "figure.titlesize": 10,
+    "figure.titlesize": TITLE,
     "mathtext.fontset": "dejavusans",
     "lines.linewidth": 1.2,
     "lines.solid_capstyle": "round",
@@ -66,6 +69,9 @@ _LOOK: Any = {
 LINE_POINTS = 4000
 # A panel of the transient shows this times its length, and there is none where that is most of the run.
 TRANSIENT_ROOM, TRANSIENT_MOST = 1.2, 0.8
+# Curves that lie closer together than this share of a panel's height hide each other; those on top get these dashes.
+SAME = 0.012
+OVER = ((0, (5, 4)), (0, (2, 2.5)), (0, (6, 2, 1.5, 2)))
 # Height of a row of a legend [point].
 LEGEND_ROW = 12.5
 
@@ -82,7 +88,8 @@ def new_figure(height: float, title: str) -> Figure:
     """An empty figure [inch] that belongs to no pyplot and needs no display."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     Canvas(figure)
-    figure.suptitle(title)
+    # A long title is smaller: it would be cut off at both sides.
+    figure.suptitle(title, fontsize=TITLE * min(1.0, TITLE_LONG / max(len(title), 1)))
     return figure
 
 
@@ -157,6 +164,32 @@ def variant_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
         }
         for k, name in enumerate(names)
     }
+
+
+def told_apart(looks: Mapping[Name, Mapping[str, Any]], *panels: Mapping[Name, Series]) -> dict[Name, dict[str, Any]]:
+    """The looks with dashes for curves that would hide an earlier one, in any of the panels that they share.
+
+    One hides another where it is within ``SAME`` of the panel's height for more than half of the time. What lies below
+    shows through the gaps.
+    """
+    found = {name: dict(look) for name, look in looks.items()}
+    over: dict[Name, int] = dict.fromkeys(looks, 0)
+    for curves in panels:
+        start, end = (pick(float(time[k]) for time, _ in curves.values()) for pick, k in ((max, 0), (min, -1)))
+        at = np.linspace(start, end, 200)
+        sampled = {name: np.interp(at, *curve) for name, curve in curves.items()}
+        values = np.concatenate(list(sampled.values()))
+        values = values[np.isfinite(values)]
+        near = SAME * float(np.ptp(values)) if values.size else 0.0
+        done: list[Name] = []
+        for name, one in sampled.items():
+            hidden: list[Name] = [other for other in done if np.mean(np.abs(one - sampled[other]) <= near) > 0.5]
+            over[name] = max([over[name], *(over[other] + 1 for other in hidden)])
+            done.append(name)
+    for name, depth in over.items():
+        if depth:
+            found[name]["linestyle"] = OVER[min(depth, len(OVER)) - 1]
+    return found
 
 
 def number(value: float, digits: int = 4) -> str:
@@ -234,10 +267,7 @@ def time_rows(
         For each row (transient, whole run) or (whole run,); draw everything in all of them.
     """
     end = max(time[-1] for row in rows for time, _ in row)
-    longest = TRANSIENT_MOST * end / TRANSIENT_ROOM
-    found = [
-        one if one is not None and one.end < longest else None for one in (_transient(row, settle) for row in rows)
-    ]
+    found = [transient_of(row, settle, end) for row in rows]
     window = max((one.end for one in found if one is not None), default=0.0)
     split = window > 0.0
     grid = figure.subplots(
@@ -261,7 +291,7 @@ def time_rows(
 
 
 @dataclass(frozen=True)
-class _Transient:
+class Transient:
     """When a row settles [s], the range of its axis from then on, and the size of its largest value."""
 
     end: float
@@ -270,7 +300,13 @@ class _Transient:
     largest: float
 
 
-def _transient(row: Sequence[Series], settle: float) -> _Transient | None:
+def transient_of(row: Sequence[Series], settle: float, end: float) -> Transient | None:
+    """The transient of a row of a run up to ``end`` [s]; None where it lasts for most of it or nothing need be cut."""
+    found = _transient(row, settle)
+    return found if found is not None and found.end < TRANSIENT_MOST * end / TRANSIENT_ROOM else None
+
+
+def _transient(row: Sequence[Series], settle: float) -> Transient | None:
     """The transient of a row; None when the axis need not be cut."""
     settled = np.concatenate([values[time >= settle].ravel() for time, values in row])
     everything = np.concatenate([values.ravel() for _, values in row])
@@ -288,10 +324,10 @@ def _transient(row: Sequence[Series], settle: float) -> _Transient | None:
         if beyond.any():
             end = max(end, float(time[beyond][-1]))
     # Some of what follows belongs in the picture of the transient.
-    return _Transient(max(1.5 * end, 0.02 * settle), low, high, float(np.abs(everything).max()))
+    return Transient(max(1.5 * end, 0.02 * settle), low, high, float(np.abs(everything).max()))
 
 
-def _compress(axes: Axes, transient: _Transient) -> None:
+def _compress(axes: Axes, transient: Transient) -> None:
     """Linear within the settled range and logarithmic beyond, where a peak would hide what follows it."""
     settled = max(abs(transient.low), abs(transient.high))
     if transient.largest > 3.0 * settled:

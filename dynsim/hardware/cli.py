@@ -255,6 +255,9 @@ def compare(
     measured: Annotated[Path, typer.Argument(metavar="MEASURED", help="measured.h5 of a replay")],
     gate: Annotated[Path | None, typer.Option("--gate", help="YAML with bounds; exit code 5 beyond them")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="folder [that of MEASURED]")] = None,
+    joints: Annotated[
+        list[str] | None, typer.Option("--joint", help="in colour in the figure; may be repeated [the worst]")
+    ] = None,
 ) -> None:
     """Delay, rms and largest error between a simulated and a measured run, joints and wheels, with a figure."""
     from dynsim.hardware.replay.compare import check_gate, compare_records, draw_comparison, load_gate
@@ -291,7 +294,7 @@ def compare(
     console.print(f"delay {comparison.delay * 1e3:.1f} ms, worst joint {comparison.worst.joint}")
     folder = out or measured.parent
     write_json(folder / "comparison.json", comparison.summary())
-    console.print(f"figure: {draw_comparison(comparison, folder / 'comparison.png')}")
+    console.print(f"figure: {draw_comparison(comparison, folder / 'comparison.png', joints or ())}")
     if bounds:
         check_gate(comparison, bounds)
 

@@ -79,6 +79,36 @@ def quadric_patch(surface: Surface, low: Array, high: Array) -> Array:
     return np.asarray(points)
 
 
+def round_patch(surface: Surface, low: Array, high: Array) -> Array:
+    """Points of a sphere or cylinder, (n, n, 3) [m]: all of a small one, else the part around the point next to a box.
+
+    Its meridians or generators start there, so that the part ends in a smooth edge.
+    """
+    centre, radius = np.array(surface.position), abs(float(surface.radius or 0.0))
+    middle, reach = 0.5 * (low + high), 0.6 * float(np.linalg.norm(high - low))
+    widest = min(np.pi, reach / radius)
+    away = middle - centre
+    axis = None if surface.kind == "sphere" else np.array(surface.direction)
+    if axis is not None:
+        away = away - axis * (away @ axis)
+    size = float(np.linalg.norm(away))
+    if not size > 1e-9:
+        away = np.linalg.svd((np.eye(3)[0] if axis is None else axis)[None])[2][1]
+        size = 1.0
+    towards = away / size
+    turn = np.linspace(-1.0, 1.0, PATCH)
+    if axis is None:
+        sides = np.linalg.svd(towards[None])[2][1:]
+        polar, round_about = np.meshgrid(0.5 * (turn + 1.0) * widest, np.pi * turn, indexing="ij")
+        across = np.cos(round_about)[..., None] * sides[0] + np.sin(round_about)[..., None] * sides[1]
+        return np.asarray(centre + radius * (np.cos(polar)[..., None] * towards + np.sin(polar)[..., None] * across))
+    length = float(np.abs(axis) @ (high - low))
+    angle, along = np.meshgrid(widest * turn, (middle - centre) @ axis + 0.5 * turn * length)
+    side = np.cross(axis, towards)
+    ring = np.cos(angle)[..., None] * towards + np.sin(angle)[..., None] * side
+    return np.asarray(centre + radius * ring + along[..., None] * axis)
+
+
 def box_corners(low: Array, high: Array) -> Array:
     """The eight corners of a box, (8, 3)."""
     return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])

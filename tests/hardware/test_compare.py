@@ -241,3 +241,17 @@ def test_the_wheel_of_a_replay_follows_its_rate(rig, clean_run) -> None:
     assert 0 < wheel.rate_rms < 0.5
     assert wheel.angle_max < 0.25
     assert wheel.turned == pytest.approx(rig.record["rho"][-1, 0] - rig.record["rho"][0, 0], abs=0.05)
+
+
+def test_any_joint_can_be_drawn(tmp_path) -> None:
+    t = np.linspace(0, 4, 201)
+    simulated, measured = Record(t), Record(t)
+    names = tuple("abcdef")
+    simulated.add("q", np.outer(np.sin(t), np.ones(6)), "rad", labels=names)
+    measured.add("q", np.outer(np.sin(t), np.linspace(1.0, 1.1, 6)), "rad", labels=names)
+    comparison = compare_records(simulated, measured)
+    worst = draw_comparison(comparison, tmp_path / "worst.png").read_bytes()
+    assert draw_comparison(comparison, tmp_path / "named.png", ["f", "e", "d", "c"]).read_bytes() == worst
+    assert draw_comparison(comparison, tmp_path / "a.png", ["a"]).read_bytes() != worst
+    with pytest.raises(RecordError, match="no joint 'knee' was compared; there are: a, b, c, d, e, f"):
+        draw_comparison(comparison, tmp_path / "none.png", ["knee"])

@@ -9,12 +9,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 import dynsim
 from dynsim import figures, measures, metrics
 from dynsim.errors import RecordError
-from dynsim.figures import arm, contacts, energy, events, hand, motors, posture, skeleton, style
+from dynsim.figures import (
+    arm,
+    contacts,
+    energy,
+    events,
+    hand,
+    insets,
+    motors,
+    penetration,
+    posture,
+    skeleton,
+    style,
+)
 from dynsim.record import Event, Record
 from dynsim.scenario import load_scenario
 
@@ -205,13 +218,13 @@ def test_contact_figure_states_the_pulling_fraction(braced: Record) -> None:
 
 def test_contact_figures_show_the_extremes_of_all_steps(braced: Record) -> None:
     for figure in (drawn(contacts.forces(braced)), drawn(contacts.forces_comparison({"a": braced}))):
-        columns = len(figure.axes) // 2
-        for contact, axes in zip(braced.summary["contacts"], figure.axes[::columns], strict=True):
+        insets = [axes.child_axes[0] for axes in figure.axes]
+        for contact, axes in zip(braced.summary["contacts"], insets, strict=True):
             low, high = contact["normal_force_min_N"], contact["normal_force_max_N"]
             levels = [line.get_ydata()[0] for line in axes.get_lines() if len(line.get_xdata()) == 2]
             assert {low, high} <= set(levels)
             assert axes.get_ylim()[0] < low < high < axes.get_ylim()[1]
-        assert "sampled every 5 ms" in figure.axes[-columns].get_xlabel()
+        assert "sampled every 5 ms" in figure.axes[-1].get_xlabel()
 
 
 def test_pulling_area_ends_where_the_force_crosses_zero() -> None:
@@ -427,6 +440,8 @@ def test_every_time_figure_marks_the_events_of_contacts(real: Record, braced: Re
     for draw in (hand.error, energy.energy, energy.ledger, motors.motors):
         figure = drawn(draw(real))
         for axes in figure.axes:
+            if axes.get_title(loc="left") == "with Joule heat":
+                continue  # the small panel aside
             marks = [line for line in axes.get_lines() if line.get_label() == "_event"]
             low, high = axes.get_xlim()
             assert sum(len(line.get_xdata()) for line in marks) == sum(low <= e.time <= high for e in real.events)
@@ -528,3 +543,66 @@ def test_glued_beside_real(real: Record, braced: Record, tmp_path: Path) -> None
     assert "real: closed" in texts(figure)
     assert "surface pulls" in texts(figure)
     assert_pngs(figures.draw_comparison({"glued": braced, "real": real}, tmp_path), tmp_path, COMPARISONS)
+
+
+@pytest.mark.parametrize(("more", "curves"), [(1.0, 1), (1.2, 2)])
+def test_drawn_energy_is_a_curve_where_it_differs_from_net(braced: Record, more: float, curves: int) -> None:
+    record = without(braced, "energy_electrical_drawn")
+    record.add("energy_electrical_drawn", more * braced["energy_electrical"], "J")
+    top = drawn(energy.energy(record)).axes[0]
+    assert len([line for line in top.get_lines() if not str(line.get_label()).startswith("_")]) == curves
+    assert "drawn" in texts(drawn(energy.energy(record)))
+
+
+def test_ten_motors_are_an_envelope_and_six(braced: Record) -> None:
+    shown = texts(drawn(motors.motors(braced))).splitlines()
+    assert shown[0] == "all 10 motors"
+    assert len(shown) == 1 + motors.LARGEST
+
+
+def test_the_inset_shows_the_shaded_beginning_of_the_one_time_scale(braced: Record) -> None:
+    figure = drawn(contacts.forces(braced))
+    for axes in figure.axes:
+        assert axes.get_xlim() == (0.0, braced.time[-1])
+        (inset,) = axes.child_axes
+        shaded = [patch for patch in axes.patches if patch.get_facecolor()[:3] == to_rgb(insets.MARK)]
+        assert [patch.get_width() for patch in shaded] == [inset.get_xlim()[1]]
+
+
+def test_an_inset_lies_where_no_curve_is() -> None:
+    time = np.linspace(0.0, 10.0, 501)
+    for settled in (1.0, -1.0):
+        values = settled * (1.0 + 20.0 * np.exp(-time / 0.05))
+        ((_, whole),) = insets.inset_rows(style.new_figure(2.0, ""), [[(time, values)]], settle=1.0)
+        low, high = whole.get_ylim()
+        (inset,) = whole.child_axes
+        x0, y0, wide, tall = inset.get_axes_locator()._bounds
+        there = (values[(time > x0 * 10.0) & (time < (x0 + wide) * 10.0)] - low) / (high - low)
+        assert ((there < y0) | (there > y0 + tall)).all()
+
+
+def test_a_curve_on_another_is_dashed_and_others_are_not() -> None:
+    time = np.linspace(0.0, 1.0, 50)
+    curves = {"a": (time, time), "b": (time, time + 1e-3), "c": (time, 1.0 - time)}
+    looks = style.told_apart(style.variant_styles(list(curves)), curves)
+    assert [look["linestyle"] for look in looks.values()] == ["-", style.OVER[0], "-"]
+
+
+def test_what_lies_below_a_surface_is_marked(braced: Record) -> None:
+    body, _ = skeleton.skeleton(braced)
+    assert body is not None
+    assert penetration.below_surfaces(body, 0).depth == 0.0
+    sunk = copy.copy(braced)
+    sunk.signals = dict(braced.signals)
+    moved = braced["body_position"].copy()
+    moved[:, 4:, 2] -= 0.25
+    sunk.signals["body_position"] = dataclasses.replace(braced.signals["body_position"], data=moved)
+    body, _ = skeleton.skeleton(sunk)
+    assert body is not None
+    found = penetration.below_surfaces(body, len(sunk) - 1)
+    # Of a horizontal floor at zero the depth is the height of the lowest point.
+    lowest = -body.segments(len(sunk) - 1)[..., 2].min()
+    assert found.depth == pytest.approx(lowest, rel=1e-12)
+    assert (found.pieces[..., 2] < 0.0).all()
+    assert "below floor, up to" in texts(drawn(posture.posture(sunk)))
+    assert "below" not in texts(drawn(posture.posture(braced)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +14,6 @@ from scipy.optimize import minimize_scalar
 
 from dynsim.config import StrictModel
 from dynsim.errors import RecordError, shown
-from dynsim.files import replacing
 from dynsim.hardware.errors import ComparisonGateFailed
 from dynsim.hardware.replay.lifting import lifted
 from dynsim.hardware.replay.states import State
@@ -24,6 +24,8 @@ from dynsim.record import Record
 Array = NDArray[np.float64]
 MAX_DELAY = 0.5
 """Longest delay looked for [s]."""
+STRONG = 4
+"""Joints that the figure draws in colour where none are named: those with the largest rms."""
 MOVING = 1e-3
 """A joint that moves less than this [rad] says nothing about delay."""
 WHEEL_ANGLE, WHEEL_RATE = "rho", "rho_dot"
@@ -351,39 +353,57 @@ def check_gate(comparison: Comparison, gate: Gate) -> None:
         raise ComparisonGateFailed(f"gate failed (worst joint {comparison.worst.joint}): {', '.join(exceeded)}")
 
 
-def draw_comparison(comparison: Comparison, path: Path) -> Path:
-    """Figure: angles of the four worst joints, and every joint's error over time."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+def draw_comparison(comparison: Comparison, path: Path, joints: Sequence[str] = ()) -> Path:
+    """Figure: angles of some joints, measured over simulated, and every joint's error over time.
 
-    figure = Figure(figsize=(9, 7), layout="constrained")
-    FigureCanvasAgg(figure)
-    angles, errors = figure.subplots(2, 1, sharex=True)
-    ranking = sorted(range(len(comparison.joints)), key=lambda k: -comparison.joints[k].rms)
-    for colour, k in enumerate(ranking[:4]):
-        label = comparison.joints[k].joint
-        angles.plot(comparison.time, comparison.simulated[:, k], "--", color=f"C{colour}", linewidth=1)
-        angles.plot(comparison.time, comparison.measured[:, k], color=f"C{colour}", linewidth=1.2, label=label)
-    angles.set_ylabel("joint angle [rad]")
-    angles.set_title(
-        f"measured (solid) and simulated (dashed); delay {comparison.delay * 1e3:.1f} ms, worst joint "
-        f"{comparison.worst.joint}: rms {comparison.worst.rms:.4f} rad",
-        fontsize=10,
-    )
-    angles.legend(loc="upper right", fontsize=8)
-    for k in reversed(ranking):
-        strong = k in ranking[:4]
-        colour_name = f"C{ranking.index(k)}" if strong else "0.75"
-        errors.plot(
-            comparison.time,
-            1e3 * (comparison.measured[:, k] - comparison.simulated[:, k]),
-            color=colour_name,
-            linewidth=1.1 if strong else 0.7,
+    Parameters
+    ----------
+    joints : names of those drawn in colour; the ``STRONG`` worst if none are given
+
+    Raises
+    ------
+    RecordError
+        A joint is not among those compared, or the file cannot be written.
+    """
+    from dynsim.figures import style
+
+    names = [joint.joint for joint in comparison.joints]
+    for name in joints:
+        if name not in names:
+            raise RecordError(f"no joint {shown(name)} was compared; there are: {', '.join(names)}")
+    ranking = sorted(range(len(names)), key=lambda k: -comparison.joints[k].rms)
+    chosen = [names.index(name) for name in dict.fromkeys(joints)] or ranking[:STRONG]
+    looks = style.variant_styles([names[k] for k in chosen])
+    for look in looks.values():
+        del look["linewidth"]
+    with style.look():
+        figure = style.new_figure(
+            5.0 + style.LEGEND_ROW / 72.0 * -(-len(chosen) // 2),
+            f"measured and simulated joints: delay {comparison.delay * 1e3:.1f} ms, worst {comparison.worst.joint} "
+            f"with rms {1e3 * comparison.worst.rms:.3g} mrad",
         )
-    errors.set_ylabel("measured − simulated [mrad]")
-    errors.set_xlabel("record time [s]")
-    for axes in (angles, errors):
-        axes.grid(alpha=0.3)
-    with replacing(path) as stream:
-        figure.savefig(stream, format="png", dpi=140)
-    return path
+        angles, errors = figure.subplots(2, 1, sharex=True)
+        for k in chosen:
+            look = looks[names[k]] | {"lw": 1.2}
+            style.line(angles, comparison.time, comparison.measured[:, k], **look)
+            # On top and dashed: where both agree, both are seen.
+            over = {"color": style.BLACK, "linewidth": 0.9, "linestyle": (0, (4, 3))}
+            style.line(angles, comparison.time, comparison.simulated[:, k], **over)
+        for k in [k for k in reversed(ranking) if k not in chosen] + chosen:
+            joint = comparison.joints[k]
+            label = f"{joint.joint}: rms {1e3 * joint.rms:.3g} mrad, at most {1e3 * joint.max:.3g}"
+            look = (
+                looks[names[k]] | {"linewidth": 1.2, "label": label} if k in chosen else {"color": "#CFCFCF", "lw": 0.7}
+            )
+            error = 1e3 * (comparison.measured[:, k] - comparison.simulated[:, k])
+            style.line(errors, comparison.time, error, **look)
+        if len(chosen) < len(names):
+            errors.plot([], [], color="#CFCFCF", lw=0.7, label=f"the other {len(names) - len(chosen)} joints")
+        angles.plot([], [], color=style.BLACK, lw=0.9, linestyle=(0, (4, 3)), label="simulated (measured in colour)")
+        style.legend_above(angles)
+        angles.set_ylabel("joint angle [rad]")
+        errors.axhline(0.0, color=style.GREY, linewidth=0.6)
+        errors.set_ylabel("measured − simulated [mrad]")
+        errors.set_xlabel("record time [s]")
+        figure.legend(*errors.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+        return style.save(figure, path)
