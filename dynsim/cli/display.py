@@ -8,6 +8,7 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dynsim.errors import RecordError
 from dynsim.terminal import Terminal, escaped
 
 if TYPE_CHECKING:
@@ -23,10 +24,12 @@ errors = Terminal(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
 # Of a progress bar.
 _TITLE_WIDTH = 22
+# Of a run's folder.
+RECORD = "record.h5"
 
 
 def labelled(paths: Sequence[Path]) -> dict[str, Record]:
-    """Records by names for them and their folders: their variants, numbered where another has the same.
+    """Records, or those of folders, by names for them: their variants, numbered where another has the same.
 
     Raises
     ------
@@ -37,11 +40,33 @@ def labelled(paths: Sequence[Path]) -> dict[str, Record]:
     from dynsim.record import Record
 
     found: dict[str, Record] = {}
-    for path in paths:
+    for path in record_files(paths):
         record = Record.load(path)
         name = file_name(record.summary.get("variant") or path.parent.name or path.stem)
         label = next(one for k in itertools.count(1) if (one := name if k == 1 else f"{name}_{k}") not in found)
         found[label] = record
+    return found
+
+
+def record_files(paths: Sequence[Path]) -> list[Path]:
+    """Records as they were named; of a folder its record, or those of the variants in it.
+
+    Raises
+    ------
+    RecordError
+        A folder has no records.
+    """
+    found = []
+    for path in paths:
+        if not path.is_dir():
+            found.append(path)
+            continue
+        inside = [path / RECORD] if (path / RECORD).is_file() else sorted(path.glob(f"*/{RECORD}"))
+        if not inside:
+            raise RecordError(
+                f"{path}: no {RECORD} there, nor in a folder in it; name a record, or the folder of a run"
+            )
+        found += inside
     return found
 
 
@@ -125,3 +150,31 @@ def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None
             bar.update(task, completed=done, failed=f"{failed} failed" if failed else "")
 
         yield report
+
+
+@contextmanager
+def film_progress(quiet: bool) -> Iterator[Callable[[int, int], None]]:
+    """A bar over the frames of a film, with time and time to go; yields its report."""
+    if quiet:
+        yield lambda done, total: None
+        return
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("frames"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("to go"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=not console.is_terminal) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -1,4 +1,4 @@
-"""Meshes of robots from URDF files: found, thinned to what a page can carry, and packed once each."""
+"""Meshes of robots from URDF files: found, thinned to what a page can carry, read once each."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _CODES = 65535.0
 
 
 class Meshes:
-    """Meshes of a page, each once; those of a record are looked for where its robot's file is."""
+    """Meshes, each once, with at most so many triangles; those of a record are looked for where its robot's file is."""
 
-    def __init__(self, blocks: Blocks) -> None:
-        self.found: list[dict[str, Any]] = []
-        self._blocks = blocks
+    def __init__(self, most: int = TRIANGLES) -> None:
+        self.found: list[Triangles] = []
+        self._most = most
         self._folders: tuple[Path, ...] = ()
         self._known: dict[Path, int | None] = {}
         self._missing: dict[str, None] = {}
@@ -73,24 +73,27 @@ class Meshes:
         try:
             if not path.is_file():
                 return None
-            corners, triangles = thinned(*read_mesh(path))
+            self.found.append(thinned(*read_mesh(path), self._most))
         except (RecordError, OSError, ValueError):
             return None
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        step = np.where(high > low, (high - low) / _CODES, 1.0)
-        self.found.append(
-            {
-                "vertices": self._blocks.raw(np.rint((corners - low) / step)),
-                "triangles": self._blocks.raw(triangles),
-                "low": low.tolist(),
-                "step": step.tolist(),
-            }
-        )
         return len(self.found) - 1
 
 
-def thinned(corners: NDArray[np.float64], triangles: NDArray[np.int64]) -> Triangles:
-    """The same surface with at most ``TRIANGLES``: corners within one cell of a grid become one.
+def packed(mesh: Triangles, blocks: Blocks) -> dict[str, Any]:
+    """A mesh as the page reads it: corners in 16 bits within their box, and triangles."""
+    corners, triangles = mesh
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    step = np.where(high > low, (high - low) / _CODES, 1.0)
+    return {
+        "vertices": blocks.raw(np.rint((corners - low) / step)),
+        "triangles": blocks.raw(triangles),
+        "low": low.tolist(),
+        "step": step.tolist(),
+    }
+
+
+def thinned(corners: NDArray[np.float64], triangles: NDArray[np.int64], most: int = TRIANGLES) -> Triangles:
+    """The same surface with at most so many triangles: corners within one cell of a grid become one.
 
     Raises
     ------
@@ -110,7 +113,7 @@ def thinned(corners: NDArray[np.float64], triangles: NDArray[np.int64]) -> Trian
         # The same three corners in the same sense, beginning with the least.
         first = faces.argmin(axis=1)[:, None]
         faces = np.unique(np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1), axis=0)
-        if len(faces) <= TRIANGLES:
+        if len(faces) <= most:
             break
     if not len(faces):
         raise ValueError("a mesh without faces")

@@ -165,7 +165,7 @@ def test_meshes_are_found_where_the_robot_is(robot: Record) -> None:
 
 
 def test_a_mesh_is_packed_once(robot: Record) -> None:
-    meshes = Meshes(Blocks())
+    meshes = Meshes()
     meshes.of_robot(robot)
     file = "package://wedges/meshes/wedge.stl"
     assert meshes.index(file) == meshes.index(file) == 0
