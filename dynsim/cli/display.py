@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -24,8 +25,8 @@ errors = Terminal(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
 # Of a progress bar.
 _TITLE_WIDTH = 22
-# Of a run's folder.
-RECORD = "record.h5"
+# Of a run's folder, and of one of several.
+RECORD, COMPARISON = "record.h5", "comparison.json"
 
 
 def labelled(paths: Sequence[Path]) -> dict[str, Record]:
@@ -61,13 +62,23 @@ def record_files(paths: Sequence[Path]) -> list[Path]:
         if not path.is_dir():
             found.append(path)
             continue
-        inside = [path / RECORD] if (path / RECORD).is_file() else sorted(path.glob(f"*/{RECORD}"))
+        inside = [path / RECORD] if (path / RECORD).is_file() else _of_variants(path)
         if not inside:
             raise RecordError(
                 f"{path}: no {RECORD} there, nor in a folder in it; name a record, or the folder of a run"
             )
         found += inside
     return found
+
+
+def _of_variants(folder: Path) -> list[Path]:
+    """Records of the folders in a folder: in the order of a comparison's variants, others after them."""
+    found = sorted(folder.glob(f"*/{RECORD}"))
+    try:
+        order = list(json.loads((folder / COMPARISON).read_text(encoding="utf-8"))["variants"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return found
+    return sorted(found, key=lambda path: order.index(path.parent.name) if path.parent.name in order else len(order))
 
 
 @contextmanager

@@ -7,9 +7,10 @@ from fractions import Fraction
 from typing import Any, BinaryIO
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageColor
 
 from dynsim.errors import RecordError
+from dynsim.figures.style import GREY, PULLING, VARIANT_COLOURS
 
 # Of a GIF: instants are multiples of a hundredth of a second, and players slow down what is shorter than two.
 GIF_FPS_MAX = 50
@@ -50,7 +51,7 @@ def write_gif(
     times = (10 * np.diff(ends)).tolist()
     times[-1] += round(1000 * hold)
     first, *rest = indexed
-    first.save(stream, "GIF", save_all=True, append_images=rest, duration=times, loop=0, optimize=False, disposal=1)
+    first.save(stream, "GIF", save_all=True, append_images=rest, duration=times, loop=0, optimize=True, disposal=1)
 
 
 def _palette(frames: list[Image.Image]) -> Image.Image:
@@ -58,7 +59,12 @@ def _palette(frames: list[Image.Image]) -> Image.Image:
     sheet = Image.new("RGB", (width, height * len(frames)))
     for k, frame in enumerate(frames):
         sheet.paste(frame, (0, k * height))
-    return sheet.quantize(128, method=Image.Quantize.MEDIANCUT)
+    # Small marks have few pixels, and their colours must be told apart all the same.
+    kept = [part for colour in (*VARIANT_COLOURS, PULLING, GREY) for part in ImageColor.getrgb(colour)]
+    found = sheet.quantize(120, method=Image.Quantize.MEDIANCUT).getpalette() or []
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([*found[: 3 * 120], *kept])
+    return palette
 
 
 def write_mp4(stream: BinaryIO, frames: Iterable[Image.Image], fps: int, hold: float) -> None:

@@ -16,6 +16,7 @@ from PIL import Image, ImageColor
 
 import dynsim
 from dynsim import cli
+from dynsim.cli.display import record_files
 from dynsim.errors import RecordError
 from dynsim.figures.style import BLUE, PULLING
 from dynsim.film import Film, write
@@ -62,6 +63,14 @@ def test_a_gif_has_its_frames_size_and_duration(braced: Record, tmp_path: Path) 
     """30 a second is no whole number of hundredths: none is lost over the film."""
     path = write({"one": braced}, tmp_path / "film.gif", size=(320, 240), fps=30, hold=0.5)
     assert decoded(path) == (31, (320, 240), pytest.approx(31 / 30 + 0.5, abs=0.0101))
+
+
+def test_a_gif_keeps_the_colours_of_small_marks(braced: Record, tmp_path: Path) -> None:
+    path = write({"one": braced}, tmp_path / "film.gif", size=(480, 320), fps=5, view="side")
+    with Image.open(path) as film:
+        film.seek(4)
+        shown = {tuple(colour) for colour in np.asarray(film.convert("RGB")).reshape(-1, 3).tolist()}
+    assert {ImageColor.getrgb(BLUE), ImageColor.getrgb(PULLING)} <= shown
 
 
 def test_an_mp4_has_its_frames_size_and_duration(braced: Record, tmp_path: Path) -> None:
@@ -256,6 +265,17 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
         cli.main()
     assert isinstance(end.value.code, int)
     return end.value.code
+
+
+def test_records_of_a_folder_are_in_the_order_of_its_comparison(tmp_path: Path) -> None:
+    for name in ("a", "b", "c"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "record.h5").touch()
+    assert [path.parent.name for path in record_files([tmp_path])] == ["a", "b", "c"]
+    (tmp_path / "comparison.json").write_text('{"variants": {"c": {}, "gone": {}, "a": {}}}')
+    assert [path.parent.name for path in record_files([tmp_path])] == ["c", "a", "b"]
+    (tmp_path / "comparison.json").write_text("[]")
+    assert [path.parent.name for path in record_files([tmp_path])] == ["a", "b", "c"]
 
 
 def test_command(
