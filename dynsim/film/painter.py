@@ -25,7 +25,7 @@ from dynsim.record.quaternion import rotated
 from dynsim.record.scene import WORLD
 from dynsim.record.surface_points import surface_grids
 from dynsim.view.meshes import Meshes
-from dynsim.view.robot import Contact, Robot, contacts, largest_force, paths
+from dynsim.view.robot import Contact, Robot, Sunk, contacts, largest_force, paths, sunk
 from dynsim.view.solids import body_shapes, drawn_shape
 from dynsim.view.wheels import cop_of, supports, wheel_groups
 
@@ -35,6 +35,7 @@ FINER = 2
 TRIANGLES = 900
 PAPER, GROUND, LINES, FAINT, SURFACE = "#FFFFFF", "#F1F3F5", "#D3D8DE", "#ECEEF1", "#C9D3DE"
 BODY, HUB, WHEEL, SUPPORT = "#AEB7C4", "#4A5260", "#3A4048", "#D5EAF8"
+DEEP = "#A3195B"
 MODES = {0: GREY, 1: ORANGE, 2: GREEN}
 # Towards the light, seen by the viewer: right, up, near.
 LIGHT = np.array([-0.35, 0.75, 0.56]) / np.linalg.norm([-0.35, 0.75, 0.56])
@@ -85,6 +86,7 @@ class Painter:
         self._wheels = wheel_groups(record, robot.scene)
         self._solids = self._moving()
         self._contacts = contacts(robot)
+        self._sunk = sunk(robot)
         self._full = largest_force(self._contacts)
         self._ways = dict(paths(record, robot.scene))
         self._supports = supports(robot.scene, self._wheels)
@@ -107,6 +109,8 @@ class Painter:
             self._paint_bodies(draw, place, turn, row)
             self._paint_pressure(draw, hull, row)
             self._paint_way(draw, time, row)
+            for one in self._sunk:
+                self._paint_sunk(draw, one, place, turn, row, share)
             for contact in self._contacts:
                 self._paint_contact(draw, contact, place, turn, row, share)
             self._paint_hand(draw, place, turn)
@@ -306,6 +310,18 @@ class Painter:
             )
         radius = 3.0 * FINER
         draw.ellipse([x - radius, y - radius, x + radius, y + radius], fill=dot, outline=PAPER)
+
+    def _paint_sunk(
+        self, draw: ImageDraw.ImageDraw, one: Sunk, place: Array, turn: Array, row: int, share: float
+    ) -> None:
+        """A ring about a joint that is below a surface, and by how much."""
+        depth = float(_between(one.depth, row, share))
+        if not depth > one.least:
+            return
+        x, y, _ = self.camera.project(_on(one.body, np.array(one.position), place, turn))
+        _ring(draw, x, y, 6.0 * FINER, DEEP)
+        text = f"{1e3 * depth:.0f} mm" if depth >= 1e-3 else ""
+        draw.text((x, y + 8 * FINER), text, fill=DEEP, font=font(11 * FINER), anchor="mt")
 
     def _paint_hand(self, draw: ImageDraw.ImageDraw, place: Array, turn: Array) -> None:
         hand = self.robot.scene.hand

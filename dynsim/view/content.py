@@ -17,13 +17,15 @@ from dynsim.record.scene import Scene
 from dynsim.view.blocks import Blocks
 from dynsim.view.meshes import Meshes
 from dynsim.view.meshes import packed as packed_mesh
-from dynsim.view.robot import POSE_ERROR, Robot, azimuth, bounds, contacts, paths, robot_of, robots
+from dynsim.view.robot import POSE_ERROR, Robot, azimuth, bounds, contacts, paths, robot_of, robots, sunk
 from dynsim.view.solids import body_shapes, drawn_shape, drawn_surface
 from dynsim.view.wheels import cop_of, supports, wheel_groups
 
 Array = NDArray[np.float64]
 # Samples of a signal that plots get; longer ones keep the least and the largest of each bin.
 PLOTTED = 8000
+# Between samples currents may jump: the heat by trapezoids is that of the record to this share.
+HEAT_ERROR = 0.05
 # Signals that the scene itself shows.
 _SHOWN = {POSITION, ORIENTATION, "posture"}
 
@@ -88,10 +90,16 @@ def _record(name: str, robot: Robot, blocks: Blocks, meshes: Meshes, low: Array,
         "orientation": blocks.add(turn, 1e-5),
         "paths": {key: blocks.add(path[rows], 1e-5) for key, path in paths(record, scene)},
         "contacts": _contacts(robot, blocks),
+        "sunk": [
+            {"name": one.name, "surface": one.surface, "body": one.body, "p": list(one.position)}
+            | {"least": one.least, "depth": blocks.add(one.depth, 1e-5)}
+            for one in sunk(robot, rows)
+        ],
         "wheels": None if groups.down is None else {"names": groups.names, "down": blocks.add(groups.down[rows])},
         "supports": supports(scene, groups),
         "motors": _motors(record, scene),
-        "limit": voltage_limits(record),
+        "limit": shared(record, "voltage_limit_V"),
+        "resistance": resistance(record),
         "events": [[event.time, event.kind, event.name, _finite(event.value)] for event in record.events],
     }
     if (pressure := cop_of(record)) is not None:
@@ -145,10 +153,20 @@ def _motors(record: Record, scene: Scene) -> list[list[Any]]:
     return [[name, body] for name, body in places if body is not None]
 
 
-def voltage_limits(record: Record) -> float | None:
-    """The voltage limit of the motors [V] where they share one; None where there is none, or several."""
-    found = set(_named(record.provenance.get("scenario", {}).get("plant", {}), "voltage_limit_V"))
+def shared(record: Record, key: str) -> float | None:
+    """A number of the motors by its key in the scenario; None where they have none, or several."""
+    found = set(_named(record.provenance.get("scenario", {}).get("plant", {}), key))
     return _finite(found.pop()) if len(found) == 1 else None
+
+
+def resistance(record: Record) -> float | None:
+    """R of the motors [Ω] where they share one, and R ∫ Σ i² dt is the heat that was recorded."""
+    R = shared(record, "resistance_ohm")
+    if R is None or not {"current", "heat_joule"} <= set(record) or len(record) < 2:
+        return None
+    heat = float(record["heat_joule"][-1] - record["heat_joule"][0])
+    found = R * float(np.trapezoid((record["current"] ** 2).sum(axis=1), record.time))
+    return R if abs(found - heat) <= HEAT_ERROR * abs(heat) else None
 
 
 def _finite(value: float | None) -> float | None:

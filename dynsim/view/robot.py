@@ -13,7 +13,7 @@ from dynsim.errors import RecordError
 from dynsim.measures import hand_target
 from dynsim.record import Record
 from dynsim.record.poses import ORIENTATION, POSITION, point_positions
-from dynsim.record.scene import Point, Scene, Surface
+from dynsim.record.scene import WORLD, Point, Scene, Surface, Vector3
 from dynsim.record.surface_points import normals
 
 Array = NDArray[np.float64]
@@ -21,6 +21,9 @@ Array = NDArray[np.float64]
 POSE_ERROR = 4e-5
 # Frames of a longer run are thinned though poses between them be off by more.
 FRAMES = 20_000
+# What lies below a surface by less than this is on it [m]: poses are in single precision.
+SUNK = 1e-4
+HERE_POINT: Vector3 = (0.0, 0.0, 0.0)
 
 
 def robots(records: Mapping[str, Record]) -> dict[str, Robot]:
@@ -164,7 +167,6 @@ class Contact:
     force : normal force, positive where the surface pushes, (T,) [N]
     tangent : the rest of its force, (T, 3) [N], None where it was not recorded
     mode : 0 open, 1 slips, 2 sticks, (T,), under the unilateral law
-    depth : how far it is beyond the surface, (T,) [m], negative above it
     """
 
     point: Point
@@ -173,7 +175,6 @@ class Contact:
     force: Array
     tangent: Array | None
     mode: Array | None
-    depth: Array
 
 
 def contacts(robot: Robot, rows: NDArray[np.intp] | slice = slice(None)) -> list[Contact]:
@@ -197,8 +198,49 @@ def contacts(robot: Robot, rows: NDArray[np.intp] | slice = slice(None)) -> list
         tangent = None
         if "contact_force" in record:
             tangent = record["contact_force"][rows, k] - force[:, None] * normal
-        depth = -distance(surface, place)
-        found.append(Contact(point, _friction(record, point.name), normal, force, tangent, mode, depth))
+        found.append(Contact(point, _friction(record, point.name), normal, force, tangent, mode))
+    return found
+
+
+@dataclass(frozen=True)
+class Sunk:
+    """A joint or the hand that was below a surface by more than the radius of its link.
+
+    Attributes
+    ----------
+    body, position : index, and the point in the body's frame [m]
+    least : it counts from this depth on: the radius, and what poses are not told apart by [m]
+    depth : how far the point is below the surface, (T,) [m], negative above it
+    """
+
+    name: str
+    surface: str
+    body: int
+    position: Vector3
+    least: float
+    depth: Array
+
+
+def sunk(robot: Robot, rows: NDArray[np.intp] | slice = slice(None)) -> list[Sunk]:
+    """Joints, and the hand, below surfaces at samples of the record: surfaces hold contact points only.
+
+    Bodies of a mobile base, and wheels, stand where the model has them.
+    """
+    record, scene = robot.record, robot.scene
+    wheels = {k for k, body in enumerate(scene.bodies) if body.joint.signal == "rho"} | set(scene.base)
+    points = [(body.joint.name, k, HERE_POINT) for k, body in enumerate(scene.bodies) if k not in wheels]
+    if scene.hand is not None and scene.hand.body != WORLD:
+        points.append((scene.hand.name, scene.hand.body, scene.hand.position))
+    found = []
+    for name, k, position in points:
+        place = np.asarray(point_positions(record, Point(name, "hand", k, position), rows), dtype=np.float64)
+        shapes = scene.bodies[k].shapes[:1]
+        radius = max((shape.size[0] for shape in shapes if shape.kind in ("cylinder", "capsule")), default=0.0)
+        for surface in scene.surfaces:
+            with np.errstate(all="ignore"):
+                depth = -distance(surface, place)
+            if (depth > radius + SUNK).any():
+                found.append(Sunk(name, surface.name, k, position, radius + SUNK, depth))
     return found
 
 

@@ -21,8 +21,9 @@ from dynsim.errors import RecordError
 from dynsim.figures.style import BLUE, PULLING
 from dynsim.film import Film, write
 from dynsim.film.camera import view_axes
-from dynsim.film.painter import FINER, Painter
+from dynsim.film.painter import DEEP, FINER, Painter
 from dynsim.record import Record
+from dynsim.record.poses import POSITION, point_positions
 from dynsim.scenario import build_model, load_scenario
 
 MARK = "#FF00FF"
@@ -138,7 +139,7 @@ def test_arrows_have_the_colour_of_their_sign(braced: Record) -> None:
             force = braced["contact_normal_force"][row, k]
             if abs(force) < 0.05:
                 continue
-            place = dynsim.record.poses.point_positions(braced, point, row)
+            place = point_positions(braced, point, row)
             x, y = painter.camera.project(place)[:2] / FINER
             shown = {}
             for colour in (BLUE, PULLING):
@@ -149,6 +150,17 @@ def test_arrows_have_the_colour_of_their_sign(braced: Record) -> None:
             assert shown[wrong] == 0
             seen.add(right)
     assert seen == {BLUE, PULLING}
+
+
+def test_joints_below_the_floor_are_ringed() -> None:
+    record = short("elbow_comparison", "no_elbow")
+    painter = Film({"one": record}, view="side", plot="", size=(800, 500)).painters["one"]
+    assert len(pixels(painter.frame(0.0), DEEP)) == 0
+    found = pixels(painter.frame(1.0), DEEP)
+    depth = record[POSITION][-1, :, 2]
+    x, y = painter.camera.project(record[POSITION][-1, depth.argmin()].astype(float))[:2] / FINER
+    assert depth.min() < -0.05
+    assert np.sum(np.hypot(found[:, 0] - x, found[:, 1] - y) < 9) > 20
 
 
 @pytest.mark.parametrize("kind", ["arm", "mobile", "snake", "urdf"])

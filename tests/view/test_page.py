@@ -133,6 +133,41 @@ def test_states_of_real_contacts_and_events(opened: Opens) -> None:
     assert page.state()["time"] == pytest.approx(record.events[0].time, abs=1e-6)
 
 
+def test_joints_below_the_floor_are_marked(opened: Opens) -> None:
+    """Where the record has them deeper than their radius, and nowhere else."""
+    record = short("elbow_comparison", "no_elbow")
+    page, deepest = opened({"one": record}), 0.0
+    radius = 0.01
+    for row in range(0, len(record), 20):
+        (shown,) = page.seek(float(record.time[row]))["records"]
+        height = dict(zip(record.labels[POSITION], record[POSITION][row, :, 2].astype(float), strict=True))
+        joints = {body.name: body.joint.name for body in record.scene.bodies}
+        # Links without a shape have no radius.
+        thick = {body.name: radius if body.shapes else 0.0 for body in record.scene.bodies}
+        expected = {joints[name]: -z for name, z in height.items() if z < -thick[name] - 1e-4}
+        assert shown["sunk"] == pytest.approx(expected, abs=2e-5)
+        deepest = max(deepest, *expected.values(), 0.0)
+    assert deepest > 0.01
+    texts = page.page.locator("#labels div:visible").all_inner_texts()
+    assert any("mm deep" in text for text in texts)
+    assert "below floor" in page.page.locator("#status").inner_text()
+    page.js("dynsim.set('depths', false)")
+    assert not page.js("dynsim.app.actors[0].sunk.some((one) => one.mark.visible)")
+
+
+def test_heat_is_in_watts(braced: Record, opened: Opens) -> None:
+    """R i² of each motor; over the run it is the heat of the energy ledger."""
+    page = opened({"one": braced})
+    page.js("dynsim.set('colouring', 'current')")
+    rating = page.js("({ unit: dynsim.app.rating.unit, top: dynsim.app.rating.top, two: dynsim.app.rating.of(2) })")
+    heat = 1.1 * braced["current"] ** 2
+    assert rating["unit"] == "W"
+    assert rating["two"] == pytest.approx(1.1 * 4.0)
+    assert rating["top"] == pytest.approx(np.percentile(heat, 98), rel=0.02)
+    assert np.trapezoid(heat.sum(axis=1), braced.time) == pytest.approx(braced["heat_joule"][-1], rel=0.02)
+    assert "W" in page.page.locator("#scale").inner_text()
+
+
 def test_wheels_and_support_of_a_snake(snake: Record, opened: Opens) -> None:
     page = opened({"one": snake})
     for row in range(0, len(snake), 60):
