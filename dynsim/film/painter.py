@@ -148,10 +148,15 @@ class Painter:
                 wheel = group.get((k, j), -1)
                 plain = WHEEL if wheel >= 0 else self._hub if shape.get("role") == "hub" else BODY
                 colour = 255.0 * np.array(shape["colour"][:3]) if "colour" in shape else np.array(_rgb(plain))
+                colour = np.tile(colour, (len(cells), 1))
+                if "mesh" in shape and "colour" not in shape:
+                    own_colours = self._meshes.found[shape["mesh"]].colours
+                    if own_colours is not None:
+                        colour = np.where(np.isfinite(own_colours), 255.0 * own_colours, colour)
                 corners.append(points)
                 bodies.append(np.full(len(points), k))
                 faces.append(cells + count)
-                colours.append(np.tile(colour, (len(cells), 1)))
+                colours.append(colour)
                 wheels.append(np.full(len(cells), wheel))
                 count += len(points)
         if not faces:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.record.quaternion import rotated
-from dynsim.view.mesh_files import Triangles
+from dynsim.view.mesh_files import Mesh
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
@@ -16,12 +16,12 @@ Faces = NDArray[np.int64]
 AROUND, RINGS = 28, 4
 
 
-def solid(shape: dict[str, Any], meshes: list[Triangles]) -> tuple[Array, Faces]:
+def solid(shape: dict[str, Any], meshes: list[Mesh]) -> tuple[Array, Faces]:
     """Corners, (n, 3) [m], and faces, (m, 4), of a shape of :mod:`dynsim.view.solids`; a triangle repeats a corner."""
     size = shape["size"]
     if shape["kind"] == "mesh":
-        corners, triangles = meshes[shape["mesh"]]
-        corners, faces = corners * np.array(size), np.concatenate([triangles, triangles[:, -1:]], axis=1)
+        mesh = meshes[shape["mesh"]]
+        corners, faces = mesh.corners * np.array(size), np.concatenate([mesh.triangles, mesh.triangles[:, -1:]], axis=1)
         if np.prod(size) < 0.0:
             faces = faces[:, ::-1]
     elif shape["kind"] == "box":

@@ -60,7 +60,8 @@ class Actor {
         mesh.castShadow = mesh.receiveShadow = true;
         group.add(mesh);
         const role = shape.wheel !== undefined ? "wheel" : shape.role === "hub" ? "hub" : "body";
-        const part = { mesh, material, own, role, alpha: shape.colour ? shape.colour[3] : 1, z: shape.p };
+        const part = { mesh, material, own, role, alpha: shape.colour ? shape.colour[3] : 1, z: shape.p,
+          painted: !own && Boolean(mesh.geometry.attributes.color) };
         paint.push(part);
         if (role === "wheel") {
           // A mark on the rim, or nobody would see it turn.
@@ -212,12 +213,13 @@ class Actor {
     this.marked = null;
     for (const body of this.bodies)
       for (const part of body.paint) {
-        part.base = part.own ? part.own.clone() : new THREE.Color(colours[part.role]);
+        part.base = part.own ? part.own.clone() : new THREE.Color(part.painted ? 0xffffff : colours[part.role]);
         if (this.ghost) part.base = this.tint.clone();
         else if (!part.own && part.role === "hub") part.base.copy(this.tint);
         part.material.transparent = ghost || part.alpha < 1;
         part.material.opacity = ghost ? 0.3 : part.alpha;
         part.material.depthWrite = !ghost;
+        part.material.vertexColors = part.painted && !ghost;
         part.material.needsUpdate = true;
         if (part.role !== "wheel") part.material.color.copy(part.base);
       }
@@ -234,8 +236,12 @@ class Actor {
   paint(colourOf) {
     this.bodies.forEach((body, k) => {
       const colour = colourOf ? colourOf.get(k) : null;
-      for (const part of body.paint)
+      for (const part of body.paint) {
         if (part.role !== "wheel") part.material.color.copy(colour ?? (colourOf ? this.plain : part.base));
+        // Colours of a mesh's file give way to those of the motors.
+        const own = part.painted && !this.ghost && !colourOf;
+        if (part.painted && part.material.vertexColors !== own) Object.assign(part.material, { vertexColors: own, needsUpdate: true });
+      }
     });
   }
 

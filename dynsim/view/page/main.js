@@ -41,7 +41,7 @@ class App {
 
   firstPlots() {
     const wanted = this.actors.length > 1 ? ["contact_normal_force", "tip_margin", "energy_electrical_drawn", "hand_error", "position_error", "support_margin"]
-      : ["contact_normal_force", "wheel_load", "hand_error", "position_error", "support_margin", "power", "q", "phi"];
+      : ["contact_normal_force", "wheel_load", "hand_error", "support_margin", "position_error", "power", "q", "phi"];
     return wanted.filter((name) => this.actors.some((a) => a.signals.get(name))).slice(0, 3);
   }
 
@@ -104,7 +104,7 @@ class App {
 
   has(layer) {
     const some = (test) => this.actors.some(test);
-    return { forces: some((a) => a.contacts.length), cones: some((a) => a.data.contacts.some((c) => c.friction > 0)), labels: some((a) => a.contacts.length),
+    return { forces: some((a) => a.contacts.length), cones: some((a) => a.data.contacts.some((c) => c.friction > 0)), labels: some((a) => a.contacts.length + a.sunk.length),
       trace: some((a) => a.data.paths.hand), target: some((a) => a.data.paths.target), support: some((a) => a.support),
       depths: some((a) => a.sunk.length) }[layer];
   }
@@ -318,7 +318,7 @@ class App {
       if (!at) continue;
       box.textContent = `${D.number(1e3 * one.depth, 2)} mm deep`;
       box.style.color = one.colour;
-      box.style.transform = `translate(${Math.round(at[0])}px, ${Math.round(at[1]) + 30}px)`;
+      box.style.transform = `translate(${Math.round(at[0])}px, ${Math.round(at[1])}px)`;
     }
   }
 
