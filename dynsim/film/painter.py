@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -32,7 +33,7 @@ from dynsim.view.wheels import cop_of, supports, wheel_groups
 Array = NDArray[np.float64]
 FINER = 2
 # Triangles of a mesh at most: a film of a robot is some 500 pixels wide.
-TRIANGLES = 900
+TRIANGLES = 2000
 PAPER, GROUND, LINES, FAINT, SURFACE = "#FFFFFF", "#F1F3F5", "#D3D8DE", "#ECEEF1", "#C9D3DE"
 BODY, HUB, WHEEL, SUPPORT = "#AEB7C4", "#4A5260", "#3A4048", "#D5EAF8"
 DEEP = "#A3195B"
@@ -147,16 +148,10 @@ class Painter:
                 points, cells = solid(shape, self._meshes.found)
                 wheel = group.get((k, j), -1)
                 plain = WHEEL if wheel >= 0 else self._hub if shape.get("role") == "hub" else BODY
-                colour = 255.0 * np.array(shape["colour"][:3]) if "colour" in shape else np.array(_rgb(plain))
-                colour = np.tile(colour, (len(cells), 1))
-                if "mesh" in shape and "colour" not in shape:
-                    own_colours = self._meshes.found[shape["mesh"]].colours
-                    if own_colours is not None:
-                        colour = np.where(np.isfinite(own_colours), 255.0 * own_colours, colour)
                 corners.append(points)
                 bodies.append(np.full(len(points), k))
                 faces.append(cells + count)
-                colours.append(colour)
+                colours.append(self._colours(shape, len(cells), plain))
                 wheels.append(np.full(len(cells), wheel))
                 count += len(points)
         if not faces:
@@ -168,6 +163,15 @@ class Painter:
             np.concatenate(colours),
             np.concatenate(wheels),
         )
+
+    def _colours(self, shape: dict[str, Any], faces: int, plain: str) -> Array:
+        """Colours of a shape's faces, (n, 3): its own, those of its mesh's file, or a plain one."""
+        colours = np.tile(np.array(_rgb(plain), dtype=float), (faces, 1))
+        if "colour" in shape:
+            colours[:] = 255.0 * np.array(shape["colour"][:3])
+        elif "mesh" in shape and (own := self._meshes.found[shape["mesh"]].colours) is not None:
+            colours = np.where(np.isfinite(own), 255.0 * own, colours)
+        return colours
 
     def _background(self, low: Array, high: Array) -> Image.Image:
         image = Image.new("RGB", (self.size[0] * FINER, self.size[1] * FINER), PAPER)
@@ -184,8 +188,8 @@ class Painter:
                     self._paint_faces(draw, *grid_faces(grid), np.array(_rgb(SURFACE)), both=True)
         for shape in self.robot.scene.fixed:
             if (shown := drawn_shape(shape, self._meshes)) is not None:
-                own = 255.0 * np.array(shown["colour"][:3]) if "colour" in shown else np.array(_rgb(HUB))
-                self._paint_faces(draw, *solid(shown, self._meshes.found), own)
+                points, cells = solid(shown, self._meshes.found)
+                self._paint_faces(draw, points, cells, self._colours(shown, len(cells), HUB))
         if (target := self._ways.get("target")) is not None:
             _dashes(draw, _apart(self.camera.project(target)[:, :2]), 6.0 * FINER, BLACK, FINER)
         if (way := self._ways.get("hand")) is not None:

@@ -155,6 +155,29 @@ def test_joints_below_the_floor_are_marked(opened: Opens) -> None:
     assert not page.js("dynsim.app.actors[0].sunk.some((one) => one.mark.visible)")
 
 
+def test_meshes_have_the_colours_of_their_files(tmp_path: Path, opened: Opens) -> None:
+    """Unless the links are painted by their motors; the wedge from COLLADA is red on one of its sides."""
+    path = meshed_robot(tmp_path)
+    file = tmp_path / "wedges" / "meshes" / "wedge.dae"
+    library = (
+        "<library_effects><effect id='e'><phong><diffuse><color>1 0 0 1</color></diffuse></phong></effect>"
+        "</library_effects>"
+        "<library_materials><material id='m'><instance_effect url='#e'/></material></library_materials>"
+    )
+    text = file.read_text().replace("<library_geometries>", library + "<library_geometries>")
+    file.write_text(text.replace("<polylist ", "<polylist material='m' "))
+    page = opened({"one": dynsim.simulate(load_scenario(path))})
+    program = """dynsim.app.actors[0].bodies.map((b) => b.paint.filter((p) => p.role === 'body')
+                 .map((p) => p.material.vertexColors))"""
+    assert page.js(program)[:3] == [[False], [False], [True]]
+    colours = page.js("Array.from(dynsim.app.actors[0].bodies[2].paint[0].mesh.geometry.attributes.color.array)")
+    np.testing.assert_array_equal(np.reshape(colours, (-1, 3)), [[1, 0, 0]] * 12)
+    page.js("dynsim.set('colouring', 'power')")
+    assert page.js(program)[2] == [False]
+    page.js("dynsim.set('colouring', '')")
+    assert page.js(program)[2] == [True]
+
+
 def test_heat_is_in_watts(braced: Record, opened: Opens) -> None:
     """R i² of each motor; over the run it is the heat of the energy ledger."""
     page = opened({"one": braced})

@@ -81,7 +81,9 @@ class Actor {
       mesh.quaternion.set(...S.xyzw(shape.q));
       mesh.castShadow = mesh.receiveShadow = true;
       this.inner.add(mesh);
-      return { mesh, own: shape.colour ? new THREE.Color().setRGB(...shape.colour) : null };
+      const own = shape.colour ? new THREE.Color().setRGB(...shape.colour) : null;
+      if (!own && mesh.geometry.attributes.color) mesh.material.vertexColors = true;
+      return { mesh, own: own ?? (mesh.material.vertexColors ? new THREE.Color(0xffffff) : null) };
     });
     this.contacts = data.contacts.map((contact) => new M.Contact(this.inner, contact, this.size));
     this.sunk = data.sunk.map((one) => new M.Sunk(this.inner, one, this.size));
