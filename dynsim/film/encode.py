@@ -60,7 +60,7 @@ def _palette(frames: list[Image.Image]) -> Image.Image:
     for k, frame in enumerate(frames):
         sheet.paste(frame, (0, k * height))
     # Small marks have few pixels, and their colours must be told apart all the same.
-    kept = [part for colour in (*VARIANT_COLOURS, PULLING, GREY) for part in ImageColor.getrgb(colour)]
+    kept = [part for colour in (*VARIANT_COLOURS, PULLING, GREY, "#FFFFFF") for part in ImageColor.getrgb(colour)]
     found = sheet.quantize(120, method=Image.Quantize.MEDIANCUT).getpalette() or []
     palette = Image.new("P", (1, 1))
     palette.putpalette([*found[: 3 * 120], *kept])

@@ -16,6 +16,7 @@ from PIL import Image, ImageColor
 
 import dynsim
 from dynsim import cli
+from dynsim.cli import commands
 from dynsim.cli.display import record_files
 from dynsim.errors import RecordError
 from dynsim.figures.style import BLUE, PULLING
@@ -23,7 +24,7 @@ from dynsim.film import Film, write
 from dynsim.film.camera import view_axes
 from dynsim.film.painter import DEEP, FINER, Painter
 from dynsim.record import Record
-from dynsim.record.poses import POSITION, point_positions
+from dynsim.record.poses import ORIENTATION, POSITION, point_positions
 from dynsim.scenario import build_model, load_scenario
 
 MARK = "#FF00FF"
@@ -220,6 +221,26 @@ def test_the_cursor_is_at_the_time(braced: Record) -> None:
     assert steps.sum() > 400
 
 
+def test_a_run_that_diverged_and_one_of_a_single_sample(braced: Record, tmp_path: Path) -> None:
+    """Where there are no poses nothing moves into the picture; a single sample is one frame."""
+    for rows, count in ((slice(None), 26), (slice(0, 1), 1)):
+        record = Record(braced.time[rows], provenance=braced.provenance)
+        for name in ("q", POSITION, ORIENTATION, "hand_position", "contact_normal_force", "contact_force"):
+            data = braced[name][rows].astype(float)
+            if count > 1:
+                data[-30:] = np.nan
+            record.add(name, data, braced.units[name], labels=braced.labels[name])
+        record.scene = braced.scene
+        film = Film({"one": record}, size=(320, 240))
+        (painter,) = film.painters.values()
+        assert len(film.times) == count
+        first, last = (np.asarray(painter.frame(float(film.times[k]))) for k in (0, -1))
+        still = np.asarray(painter._still.reduce(FINER))
+        assert np.any(first != still)
+        assert np.array_equal(last, still) == (count > 1)
+        write({"one": record}, tmp_path / "film.gif", size=(320, 240), fps=5)
+
+
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
@@ -315,6 +336,12 @@ def test_command(
     assert run(monkeypatch, "animate", tmp_path / "empty", "--out", out) != 0
     assert "no record.h5 there" in " ".join(capsys.readouterr().err.split())
     assert not out.exists()
+    drawn: list[tuple[list[str], Path]] = []
+    monkeypatch.setattr(commands, "draw", lambda figures, quiet: drawn.append((list(figures.records), figures.folder)))
+    assert run(monkeypatch, "plot", tmp_path / "all", "--out", tmp_path / "figures") == 0
+    assert [folder.name for _, folder in drawn] == ["two_elbows", "two_elbows_2", "figures"]
+    assert run(monkeypatch, "plot", tmp_path / "all" / "a") == 0
+    assert drawn[-1] == (["two_elbows"], tmp_path / "all" / "a" / "figures")
     # The same folders elsewhere.
     assert run(monkeypatch, "view", tmp_path / "all", "--no-open") == 0
     assert (tmp_path / "all" / "view.html").is_file()
