@@ -16,6 +16,8 @@ from dynsim.figures.style import GREY, PULLING, VARIANT_COLOURS
 GIF_FPS_MAX = 50
 # Frames from which the colours of a GIF are taken.
 SAMPLED = 6
+# Colours of a palette that differ by no more of 255 are one.
+NEARLY = 9
 # Quality of H.264: less is better and larger; 18 is hardly told from the original.
 QUALITY = 20
 
@@ -59,11 +61,13 @@ def _palette(frames: list[Image.Image]) -> Image.Image:
     sheet = Image.new("RGB", (width, height * len(frames)))
     for k, frame in enumerate(frames):
         sheet.paste(frame, (0, k * height))
-    # Small marks have few pixels, and their colours must be told apart all the same.
-    kept = [part for colour in (*VARIANT_COLOURS, PULLING, GREY, "#FFFFFF") for part in ImageColor.getrgb(colour)]
+    # Small marks have few pixels, and their colours must be told apart all the same; what is nearly one of them is it.
+    kept = np.array([ImageColor.getrgb(one) for one in (*VARIANT_COLOURS, PULLING, GREY, "#FFFFFF")])
     found = sheet.quantize(120, method=Image.Quantize.MEDIANCUT).getpalette() or []
+    others = np.array(found, dtype=int).reshape(-1, 3)[:120]
+    others = others[np.abs(others[:, None] - kept).max(axis=2).min(axis=1) > NEARLY]
     palette = Image.new("P", (1, 1))
-    palette.putpalette([*found[: 3 * 120], *kept])
+    palette.putpalette(np.concatenate([kept, others]).ravel().tolist())
     return palette
 
 
