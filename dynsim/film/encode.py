@@ -14,12 +14,33 @@ from dynsim.figures.style import GREY, PULLING, VARIANT_COLOURS
 
 # Of a GIF: instants are multiples of a hundredth of a second, and players slow down what is shorter than two.
 GIF_FPS_MAX = 50
+# Pixels of all its frames, a byte each in memory.
+GIF_PIXELS_MAX = 1_000_000_000
+# More frames than this are no film any more, but hours of painting.
+FRAMES_MAX = 100_000
 # Frames from which the colours of a GIF are taken.
 SAMPLED = 6
 # Colours of a palette that differ by no more of 255 are one.
 NEARLY = 9
 # Quality of H.264: less is better and larger; 18 is hardly told from the original.
 QUALITY = 20
+
+
+def check_length(kind: str, count: int, size: tuple[int, int]) -> None:
+    """Refuse more frames than a film may have.
+
+    Raises
+    ------
+    RecordError
+        There are more; of a GIF all stay in memory until the last one is there.
+    """
+    if count > FRAMES_MAX:
+        raise RecordError(f"{count} frames are no film; take a higher --speed or a lower --fps")
+    if kind == "gif" and count * size[0] * size[1] > GIF_PIXELS_MAX:
+        raise RecordError(
+            f"a GIF of {count} frames of {size[0]}x{size[1]} pixels takes too much memory; write an .mp4, or take a "
+            "higher --speed, a lower --fps or a smaller --size"
+        )
 
 
 def check(kind: str, fps: int) -> None:
@@ -43,17 +64,17 @@ def check(kind: str, fps: int) -> None:
 
 
 def write_gif(
-    stream: BinaryIO, frames: Iterable[Image.Image], sampled: Iterable[Image.Image], fps: int, hold: float
+    stream: BinaryIO, frames: Iterable[Image.Image], sampled: Iterable[Image.Image], count: int, fps: int, hold: float
 ) -> None:
     """One palette for all frames, from those ``sampled``, so that nothing flickers; the last frame is held [s]."""
     palette = _palette(list(sampled))
-    indexed = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     # Hundredths of a second, rounded so that none is lost over the film.
-    ends = np.rint(100.0 * np.arange(len(indexed) + 1) / fps).astype(int)
+    ends = np.rint(100.0 * np.arange(count + 1) / fps).astype(int)
     times = (10 * np.diff(ends)).tolist()
     times[-1] += round(1000 * hold)
-    first, *rest = indexed
-    first.save(stream, "GIF", save_all=True, append_images=rest, duration=times, loop=0, optimize=True, disposal=1)
+    indexed = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
+    first = next(indexed)
+    first.save(stream, "GIF", save_all=True, append_images=indexed, duration=times, loop=0, optimize=True, disposal=1)
 
 
 def _palette(frames: list[Image.Image]) -> Image.Image:

@@ -31,8 +31,6 @@ PLOT_MIN, WITH_PLOT = 84, (240, 220)
 ROOM = 14
 SIZE_MIN, SIZE_MAX = 160, 4096
 FPS_MAX, SPEED_MAX = 120, 1000.0
-# More frames than this are no film any more, but hours of painting.
-FRAMES_MAX = 100_000
 
 
 class Film:
@@ -67,8 +65,7 @@ class Film:
         self.size, self.fps = size, fps
         shown = robots(records)
         self.times = _times(records, speed, fps)
-        if len(self.times) > FRAMES_MAX:
-            raise RecordError(f"{len(self.times)} frames are no film; take a higher --speed or a lower --fps")
+        encode.check_length("", len(self.times), size)
         self._speed = speed
         kept = {name: records[name] for name in shown}
         width, height = size
@@ -161,11 +158,12 @@ def write(
     encode.check(kind, fps)
     film = Film(records, view=view, size=size, speed=speed, fps=fps, plot=plot)
     total = len(film.times)
+    encode.check_length(kind, total, size)
     frames = film.frames(lambda done: progress(done, total))
     with replacing(path) as stream:
         if kind == "gif":
             some = np.unique(np.linspace(0, total - 1, encode.SAMPLED).astype(int))
-            encode.write_gif(stream, frames, (film.frame(float(film.times[k])) for k in some), fps, hold)
+            encode.write_gif(stream, frames, (film.frame(float(film.times[k])) for k in some), total, fps, hold)
         else:
             encode.write_mp4(stream, frames, fps, hold)
     return path

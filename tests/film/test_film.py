@@ -249,6 +249,7 @@ def test_a_run_that_diverged_and_one_of_a_single_sample(braced: Record, tmp_path
         ({"speed": 0.0}, "speed"),
         ({"speed": float("nan")}, "speed"),
         ({"speed": 1e-5}, "frames are no film"),
+        ({"speed": 0.001, "size": (960, 540)}, "too much memory"),
         ({"fps": 0}, "frames a second"),
         ({"plot": "no_such"}, "no signal 'no_such'"),
         ({"plot": "q", "size": (200, 200)}, "at least 240x220"),
@@ -353,7 +354,17 @@ def test_command(
 def test_ctrl_c_leaves_nothing(braced: Record, tmp_path: Path) -> None:
     braced.save(tmp_path / "record.h5")
     (tmp_path / "films").mkdir()
-    command = [sys.executable, "-m", "dynsim", "animate", str(tmp_path / "record.h5"), "--speed", "0.01"]
+    command = [
+        sys.executable,
+        "-m",
+        "dynsim",
+        "animate",
+        str(tmp_path / "record.h5"),
+        "--speed",
+        "0.01",
+        "--size",
+        "320x240",
+    ]
     process = subprocess.Popen(
         [*command, "--out", str(tmp_path / "films" / "film.gif")],
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True,
