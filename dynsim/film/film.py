@@ -100,7 +100,8 @@ class Film:
         }
         first = next(iter(kept.values()))
         name = first.provenance.get("scenario", {}).get("name", "")
-        self._title = plain(str(name) if len(some) > 1 else titled(first, "").rstrip(": "))
+        one = titled(first, "").replace(":  (", " (").rstrip(": ")
+        self._title = plain(str(name) if len(some) > 1 else one)
 
     def frame(self, time: float) -> Image.Image:
         """The picture at an instant of the records [s]."""

@@ -36,6 +36,9 @@ FINER = 2
 TRIANGLES = 2000
 PAPER, GROUND, LINES, FAINT, SURFACE = "#FFFFFF", "#F1F3F5", "#D3D8DE", "#ECEEF1", "#C9D3DE"
 BODY, HUB, WHEEL, SUPPORT = "#AEB7C4", "#4A5260", "#3A4048", "#D5EAF8"
+FRICTION = "#7A3E9D"
+# Friction of less than this share of the largest normal force has no arrow.
+FRICTION_SHOWN = 1e-3
 DEEP = "#882255"
 MODES = {0: GREY, 1: ORANGE, 2: GREEN}
 # Towards the light, seen by the viewer: right, up, near.
@@ -295,7 +298,7 @@ class Painter:
     def _paint_contact(
         self, draw: ImageDraw.ImageDraw, contact: Contact, place: Array, turn: Array, row: int, share: float
     ) -> None:
-        """Arrow of the normal force, above the surface: away from it for a push, towards it for a pull."""
+        """Arrows of the normal force, and of all of it with friction: away from the surface for a push, else to it."""
         at = _on(contact.point.body, np.array(contact.point.position), place, turn)
         force = float(_between(contact.force, row, share))
         mode = None if contact.mode is None else int(contact.mode[row])
@@ -303,14 +306,14 @@ class Painter:
         colour = arrow_colour(force)
         dot = colour if mode is None else MODES.get(mode, GREY)
         if np.isfinite(force) and force != 0.0 and mode != 0:
-            long = 0.13 * self.robot.reach * min(abs(force / self._full) ** 0.5, 1.6)
-            end = self.camera.project(at + contact.normal[row] * max(long, 14.0 * FINER / self.camera.scale))
-            tail, head = (end[:2], np.array([x, y])) if force < 0.0 else (np.array([x, y]), end[:2])
-            _arrow(draw, tail, head, colour)
-            text = f"{force:+.3g} N".replace("-", "−")
+            normal = force * contact.normal[row]
+            friction = None if contact.tangent is None else _between(contact.tangent, row, share)
+            if friction is not None and np.linalg.norm(friction) > FRICTION_SHOWN * self._full:
+                self._paint_force(draw, at, normal + friction, force < 0.0, FRICTION, 2 * FINER)
+            end = self._paint_force(draw, at, normal, force < 0.0, colour, 3 * FINER)
             draw.text(
                 (end[0], end[1] - 3 * FINER),
-                text,
+                f"{force:+.3g} N".replace("-", "−"),
                 fill=colour,
                 font=self._font,
                 anchor="mb",
@@ -331,6 +334,17 @@ class Painter:
         _ring(draw, x, y, 6.0 * FINER, DEEP)
         text = f"{1e3 * depth:.0f} mm" if depth >= 1e-3 else ""
         draw.text((x, y + 8 * FINER), text, fill=DEEP, font=font(11 * FINER), anchor="mt")
+
+    def _paint_force(
+        self, draw: ImageDraw.ImageDraw, at: Array, force: Array, pulls: bool, colour: str, width: int
+    ) -> Array:
+        """The arrow of a force [N] at a contact, on the free side; returns its end away from the contact [pixel]."""
+        size = float(np.linalg.norm(force))
+        long = max(0.13 * self.robot.reach * min((size / self._full) ** 0.5, 1.6), 14.0 * FINER / self.camera.scale)
+        here = self.camera.project(at)[:2]
+        there = self.camera.project(at + (-long if pulls else long) / size * force)[:2]
+        _arrow(draw, *((there, here) if pulls else (here, there)), colour, width)
+        return np.asarray(there)
 
     def _paint_hand(self, draw: ImageDraw.ImageDraw, place: Array, turn: Array) -> None:
         hand = self.robot.scene.hand
@@ -390,16 +404,16 @@ def _dashes(draw: ImageDraw.ImageDraw, points: Array, length: float, colour: str
         draw.line(dash.ravel().tolist(), fill=colour, width=width)
 
 
-def _arrow(draw: ImageDraw.ImageDraw, tail: Array, head: Array, colour: str) -> None:
+def _arrow(draw: ImageDraw.ImageDraw, tail: Array, head: Array, colour: str, width: int) -> None:
     along = head - tail
     size = float(np.linalg.norm(along))
     if size < 1e-6:
         return
     along = along / size
     across = np.array([-along[1], along[0]])
-    long = min(10.0 * FINER, size)
+    long = min(3.4 * width, size)
     neck = head - long * along
-    draw.line([*tail.tolist(), *neck.tolist()], fill=colour, width=3 * FINER)
+    draw.line([*tail.tolist(), *neck.tolist()], fill=colour, width=width)
     corners: Sequence[Array] = (head, neck + 0.45 * long * across, neck - 0.45 * long * across)
     draw.polygon([tuple(one.tolist()) for one in corners], fill=colour)
 

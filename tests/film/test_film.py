@@ -22,7 +22,7 @@ from dynsim.errors import RecordError
 from dynsim.figures.style import BLUE, PULLING
 from dynsim.film import Film, write
 from dynsim.film.camera import view_axes
-from dynsim.film.painter import DEEP, FINER, Painter
+from dynsim.film.painter import DEEP, FINER, FRICTION, Painter
 from dynsim.record import Record
 from dynsim.record.poses import ORIENTATION, POSITION, point_positions
 from dynsim.scenario import build_model, load_scenario
@@ -162,6 +162,24 @@ def test_joints_below_the_floor_are_ringed() -> None:
     x, y = painter.camera.project(record[POSITION][-1, depth.argmin()].astype(float))[:2] / FINER
     assert depth.min() < -0.05
     assert np.sum(np.hypot(found[:, 0] - x, found[:, 1] - y) < 9) > 20
+
+
+def test_the_force_with_friction_has_its_own_direction() -> None:
+    """Violet, along the whole force as it is seen; a block that the slope's friction holds: straight up."""
+    record = short("block_on_slope", duration_s=0.5, **{"metrics.settle_s": 0.1})
+    painter = Film({"one": record}, view="side", plot="", size=(800, 500)).painters["one"]
+    row = len(record) - 1
+    force = record["contact_force"][row, 0]
+    (point,) = record.scene.contacts
+    x, y = painter.camera.project(point_positions(record, point, row))[:2] / FINER
+    found = pixels(painter.frame(float(record.time[row])), FRICTION)
+    assert len(found) > 20
+    right, up = painter.camera.axes[:2] @ force
+    # Tilted by the angle of the slope against the normal arrow, which covers its beginning.
+    along = np.array([right, -up]) / np.hypot(right, up)
+    across = (found - [x, y]) @ [along[1], -along[0]]
+    assert np.abs(across).mean() < 5.0
+    assert np.all((found - [x, y]) @ along > 0.0)
 
 
 @pytest.mark.parametrize("kind", ["arm", "mobile", "snake", "urdf"])
