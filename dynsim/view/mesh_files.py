@@ -126,8 +126,11 @@ def _colours(root: ET.Element) -> dict[str, Array]:
     """Diffuse colours of materials by their ids; textures have none."""
     effects = {}
     for effect in root.iter("effect"):
-        found = effect.find(".//diffuse/color")
-        if found is not None and len(numbers := _numbers(found)) >= 3 and np.isfinite(numbers).all():
+        try:
+            numbers = _numbers(effect.find(".//diffuse/color"))
+        except ValueError:  # a mesh is worth more than its colours
+            continue
+        if len(numbers) >= 3 and np.isfinite(numbers).all():
             effects[f"#{effect.get('id')}"] = np.clip(numbers[:3], 0.0, 1.0)
     materials = {}
     for material in root.iter("material"):
