@@ -149,7 +149,7 @@ def test_joints_below_the_floor_are_marked(opened: Opens) -> None:
         deepest = max(deepest, *expected.values(), 0.0)
     assert deepest > 0.01
     texts = page.page.locator("#labels div:visible").all_inner_texts()
-    assert any("mm deep" in text for text in texts)
+    assert any(text.startswith("↓") and text.endswith("mm") for text in texts)
     assert "below floor" in page.page.locator("#status").inner_text()
     page.js("dynsim.set('depths', false)")
     assert not page.js("dynsim.app.actors[0].sunk.some((one) => one.mark.visible)")

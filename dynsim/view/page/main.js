@@ -316,7 +316,7 @@ class App {
       const at = shown ? this.stage.project(this.point.copy(one.at).add(actor.object.position), this.point) : null;
       box.hidden = !at;
       if (!at) continue;
-      box.textContent = `${D.number(1e3 * one.depth, 2)} mm deep`;
+      box.textContent = `↓ ${D.number(1e3 * one.depth, 2)} mm`;
       box.style.color = one.colour;
       box.style.transform = `translate(${Math.round(at[0])}px, ${Math.round(at[1])}px)`;
     }
