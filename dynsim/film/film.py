@@ -15,7 +15,7 @@ from dynsim.figures.style import GREY, VARIANT_COLOURS
 from dynsim.figures.style import title as titled
 from dynsim.files import replacing
 from dynsim.film import encode
-from dynsim.film.camera import Camera, View, view_axes
+from dynsim.film.camera import FROM, Camera, View, view_axes
 from dynsim.film.painter import FINER, PAPER, Painter, font
 from dynsim.film.strip import Strip
 from dynsim.record import Record
@@ -29,6 +29,8 @@ HEAD, PLOT = 26, 0.24
 PLOT_MIN, WITH_PLOT = 84, (240, 220)
 # Around a robot [pixel].
 ROOM = 14
+# Least width and height of what shows one robot [pixel].
+CELL_MIN = 60
 SIZE_MIN, SIZE_MAX = 160, 4096
 FPS_MAX, SPEED_MAX = 120, 1000.0
 
@@ -61,6 +63,8 @@ class Film:
         fps: int = 25,
         plot: str | None = None,
     ) -> None:
+        if view not in FROM:
+            raise RecordError(f"a film is seen from {', '.join(FROM)}, not {view!r}")
         _check(size, speed, fps)
         self.size, self.fps = size, fps
         shown = robots(records)
@@ -83,6 +87,8 @@ class Film:
         c, s = math.cos(turn), math.sin(turn)
         corners = box_corners(low, high) @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         self._places, cell = _layout(len(some), self._area, corners @ view_axes(view, turn).T)
+        if min(cell) < CELL_MIN:
+            raise RecordError(f"{len(some)} robots need a larger --size than {width}x{height}, or fewer records")
         area = [ROOM * FINER, ROOM * FINER, (cell[0] - ROOM) * FINER, (cell[1] - ROOM) * FINER]
         if len(some) > 1:
             area[1] += 14 * FINER

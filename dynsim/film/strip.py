@@ -23,6 +23,8 @@ CURSOR = "#202428"
 NAMED = 4
 # A narrower plot has no room for a legend beside it [pixel], and a name no more letters.
 LEGEND_MIN, LETTERS = 400, 16
+# Height of one name in it [pixel]; those that do not fit have none.
+LEGEND_ROW = 14
 
 
 class Strip:
@@ -87,7 +89,16 @@ class Strip:
         axes.set_xlim(start, end if end > start else start + 1.0)
         axes.set_ylim(*_limits([record[name] for record in records.values() if name in record]))
         if len(records) > 1 or len(axes.lines) > 1:
-            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=6.5, borderaxespad=0.2)
+            handles, labels = axes.get_legend_handles_labels()
+            most = max((self._size[1] - 20) // LEGEND_ROW, 1)
+            axes.legend(
+                handles[:most],
+                labels[:most],
+                loc="upper left",
+                bbox_to_anchor=(1.0, 1.0),
+                fontsize=6.5,
+                borderaxespad=0.2,
+            )
         canvas.draw()
         self._image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
         box = axes.get_window_extent()

@@ -272,12 +272,20 @@ def test_a_run_that_diverged_and_one_of_a_single_sample(braced: Record, tmp_path
         ({"plot": "no_such"}, "no signal 'no_such'"),
         ({"plot": "q", "size": (200, 200)}, "at least 240x220"),
         ({"hold": -1.0}, "held"),
+        ({"view": "front"}, "seen from side, top, iso, not 'front'"),
     ],
 )
 def test_numbers_beyond_bounds(braced: Record, tmp_path: Path, options: dict[str, object], problem: str) -> None:
     with pytest.raises(RecordError, match=problem):
         write({"one": braced}, tmp_path / "film.gif", **options)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_too_many_robots_for_the_size(braced: Record) -> None:
+    many = {str(k): braced for k in range(30)}
+    with pytest.raises(RecordError, match="30 robots need a larger"):
+        Film(many, size=(320, 240))
+    assert len(Film(dict(list(many.items())[:5]), size=(640, 480)).painters) == 5
 
 
 def test_other_kinds_of_files(braced: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
