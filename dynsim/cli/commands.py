@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dynsim import completion, interruption
+from dynsim.cli.animate import animate
 from dynsim.cli.app import (
     FigureFormat,
     FiguresOption,
@@ -21,7 +22,7 @@ from dynsim.cli.app import (
     app,
     parsed_overrides,
 )
-from dynsim.cli.display import console, errors, labelled, progress
+from dynsim.cli.display import console, errors, labelled, progress, record_files
 from dynsim.cli.drawing import Figures, draw, draw_all
 from dynsim.cli.sweep import sweep
 from dynsim.cli.view import open_page, view, write_view
@@ -205,7 +206,7 @@ def list_() -> None:
 
 @app.command(epilog="Example: dynsim plot results/elbow_comparison/two_elbows/record.h5")
 def plot(
-    records: Annotated[list[Path], typer.Argument(metavar="RECORD", help="Records (HDF5).")],
+    records: Annotated[list[Path], typer.Argument(metavar="RECORD", help="Records (HDF5), or folders of runs.")],
     out: Annotated[
         Path | None,
         typer.Option(metavar="FOLDER", help="For the figures; default: figures/ beside each record."),
@@ -213,9 +214,10 @@ def plot(
     format_: FormatOption = FigureFormat.png,
 ) -> None:
     """Draw the figures of records; two or more are also laid over each other."""
-    named = labelled(records)
-    for path, (label, record) in zip(records, named.items(), strict=True):
-        folder = path.parent / "figures" if out is None else out if len(records) == 1 else out / label
+    files = record_files(records)
+    named = labelled(files)
+    for path, (label, record) in zip(files, named.items(), strict=True):
+        folder = path.parent / "figures" if out is None else out if len(files) == 1 else out / label
         try:
             draw(Figures({label: record}, folder, format_), quiet=False)
         except RecordError as error:
@@ -225,6 +227,7 @@ def plot(
 
 
 app.command(epilog="Example: dynsim view results/elbow_comparison/*/record.h5 --ghost")(view)
+app.command(epilog="Example: dynsim animate results/elbow_comparison/two_elbows --out film.gif --view side")(animate)
 
 
 @app.command(epilog="Example: dynsim bench --quick --json bench.json")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import itertools
+import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dynsim.errors import RecordError
 from dynsim.terminal import Terminal, escaped
 
 if TYPE_CHECKING:
@@ -23,10 +25,12 @@ errors = Terminal(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
 # Of a progress bar.
 _TITLE_WIDTH = 22
+# Of a run's folder, and of one of several.
+RECORD, COMPARISON = "record.h5", "comparison.json"
 
 
 def labelled(paths: Sequence[Path]) -> dict[str, Record]:
-    """Records by names for them and their folders: their variants, numbered where another has the same.
+    """Records, or those of folders, by names for them: their variants, numbered where another has the same.
 
     Raises
     ------
@@ -37,12 +41,44 @@ def labelled(paths: Sequence[Path]) -> dict[str, Record]:
     from dynsim.record import Record
 
     found: dict[str, Record] = {}
-    for path in paths:
+    for path in record_files(paths):
         record = Record.load(path)
         name = file_name(record.summary.get("variant") or path.parent.name or path.stem)
         label = next(one for k in itertools.count(1) if (one := name if k == 1 else f"{name}_{k}") not in found)
         found[label] = record
     return found
+
+
+def record_files(paths: Sequence[Path]) -> list[Path]:
+    """Records as they were named; of a folder its record, or those of the variants in it.
+
+    Raises
+    ------
+    RecordError
+        A folder has no records.
+    """
+    found = []
+    for path in paths:
+        if not path.is_dir():
+            found.append(path)
+            continue
+        inside = [path / RECORD] if (path / RECORD).is_file() else _of_variants(path)
+        if not inside:
+            raise RecordError(
+                f"{path}: no {RECORD} there, nor in a folder in it; name a record, or the folder of a run"
+            )
+        found += inside
+    return found
+
+
+def _of_variants(folder: Path) -> list[Path]:
+    """Records of the folders in a folder: in the order of a comparison's variants, others after them."""
+    found = sorted(folder.glob(f"*/{RECORD}"))
+    try:
+        order = list(json.loads((folder / COMPARISON).read_text(encoding="utf-8"))["variants"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return found
+    return sorted(found, key=lambda path: order.index(path.parent.name) if path.parent.name in order else len(order))
 
 
 @contextmanager
@@ -124,3 +160,31 @@ def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None
             bar.update(task, completed=done, failed=f"{failed} failed" if failed else "")
 
         yield report
+
+
+@contextmanager
+def film_progress(quiet: bool) -> Iterator[Callable[[int, int], None]]:
+    """A bar over the frames of a film, with time and time to go; yields its report."""
+    if quiet:
+        yield lambda done, total: None
+        return
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("frames"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("to go"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=not console.is_terminal) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

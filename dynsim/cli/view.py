@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dynsim.cli.display import console, labelled
+from dynsim.cli.display import console, labelled, record_files
 from dynsim.terminal import escaped
 
 if TYPE_CHECKING:
@@ -18,22 +18,28 @@ if TYPE_CHECKING:
 
 
 def view(
-    records: Annotated[list[Path], typer.Argument(metavar="RECORD", help="Records (HDF5), measured ones too.")],
+    records: Annotated[
+        list[Path], typer.Argument(metavar="RECORD", help="Records (HDF5), measured ones too, or folders of runs.")
+    ],
     ghost: Annotated[
         bool, typer.Option("--ghost", help="Lay several over each other, the first one solid; default: side by side.")
     ] = False,
     open_: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = True,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="For the page; default: view.html beside the record, here for several."),
+        typer.Option(
+            metavar="FILE",
+            help="For the page; default: view.html beside the record or in the folder, here for several.",
+        ),
     ] = None,
 ) -> None:
     """Write a page that shows records in 3D, with plots and forces over time, for any browser and without a network."""
     from dynsim.results import VIEW
     from dynsim.view import write
 
-    named = labelled(records)
-    page = out or (records[0].parent if len(records) == 1 else Path()) / VIEW
+    named = labelled(record_files(records))
+    first = records[0] if records[0].is_dir() else records[0].parent
+    page = out or (first if len(records) == 1 else Path()) / VIEW
     with console.status(f"writing {escaped(page)}"):
         write(named, page, ghost=ghost)
     console.print(f"Written to {escaped(page)}", highlight=False, soft_wrap=True)

@@ -3,32 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynsim._version import __version__
-from dynsim.errors import RecordError
 from dynsim.measures import hand_target
 from dynsim.record import TIME, Record, Signal
-from dynsim.record.poses import ORIENTATION, POSITION, point_positions
+from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.scene import Scene
-from dynsim.record.surface_points import normals
 from dynsim.view.blocks import Blocks
 from dynsim.view.meshes import Meshes
+from dynsim.view.meshes import packed as packed_mesh
+from dynsim.view.robot import POSE_ERROR, Robot, azimuth, bounds, contacts, paths, robot_of, robots, sunk
 from dynsim.view.solids import body_shapes, drawn_shape, drawn_surface
 from dynsim.view.wheels import cop_of, supports, wheel_groups
 
 Array = NDArray[np.float64]
-# Poses between the frames of the page are interpolated: to this [m].
-POSE_ERROR = 4e-5
 # Samples of a signal that plots get; longer ones keep the least and the largest of each bin.
 PLOTTED = 8000
-# Frames of a longer run are thinned though poses between them be off by more.
-FRAMES = 20_000
+# Between samples currents may jump: the heat by trapezoids is that of the record to this share.
+HEAT_ERROR = 0.05
 # Signals that the scene itself shows.
 _SHOWN = {POSITION, ORIENTATION, "posture"}
 
@@ -41,22 +38,20 @@ def packed(records: Mapping[str, Record], *, ghost: bool = False) -> str:
     RecordError
         No record has samples and a scene with the poses of its bodies.
     """
-    shown = {name: robot for name, record in records.items() if (robot := _robot(record)) is not None}
-    if not shown:
-        raise RecordError("nothing to view: a record needs samples, a scene, and the poses of its bodies")
-    robots = list(shown.values())
-    azimuth, (low, high) = _azimuth(robots), _bounds(robots)
+    shown = robots(records)
+    every = list(shown.values())
+    turn, (low, high) = azimuth(every), bounds(every)
     blocks = Blocks()
-    meshes = Meshes(blocks)
+    meshes = Meshes()
     parts = [_record(name, robot, blocks, meshes, low, high) for name, robot in shown.items()]
     head = {
         "version": 1,
         "by": f"dynsim {__version__}",
         "ghost": ghost,
-        "azimuth": azimuth,
-        "box": [corner.tolist() for corner in _bounds(robots, azimuth)],
+        "azimuth": turn,
+        "box": [corner.tolist() for corner in bounds(every, turn)],
         "records": parts,
-        "meshes": meshes.found,
+        "meshes": [packed_mesh(mesh, blocks) for mesh in meshes.found],
         "notes": meshes.notes(),
     }
     return blocks.packed(head)
@@ -64,121 +59,7 @@ def packed(records: Mapping[str, Record], *, ghost: bool = False) -> str:
 
 def viewable(record: Record) -> bool:
     """Whether a page has something to show of a record: samples, a scene, and the poses of its bodies."""
-    return _robot(record) is not None
-
-
-@dataclass(frozen=True)
-class Robot:
-    """A record whose bodies were placed, and the samples that become frames of the page."""
-
-    record: Record
-    scene: Scene
-    rows: NDArray[np.intp]
-    reach: float
-
-
-def _robot(record: Record) -> Robot | None:
-    scene = record.scene
-    if scene is None or not scene.bodies or not {POSITION, ORIENTATION} <= set(record) or not len(record):
-        return None
-    if record[POSITION].shape != (len(record), len(scene.bodies), 3):
-        return None
-    position = record[POSITION][np.isfinite(record[POSITION]).all(axis=(1, 2))]
-    if not len(position):
-        return None
-    ends = [position[0], *(point_positions(record, p, 0)[None] for p in scene.points)]
-    known = np.concatenate(ends)
-    reach = float(np.ptp(known[np.isfinite(known).all(axis=1)], axis=0).max(initial=0.0)) or 0.5
-    return Robot(record, scene, _frames(record, reach), reach)
-
-
-def _frames(record: Record, reach: float) -> NDArray[np.intp]:
-    """Samples between which the poses of all others follow to ``POSE_ERROR``: each 2^n-th one, and the last."""
-    count = len(record)
-    position, turn = record[POSITION].reshape(count, -1), record[ORIENTATION].reshape(count, -1)
-    stride, arm = 1, min(reach, 1.0)
-    while 4 * stride < count:
-        rows = _every(count, 2 * stride)
-        # What is left out, and the ends of its interval.
-        between = np.delete(np.arange(count), rows)
-        left = np.searchsorted(rows, between) - 1
-        a, b = rows[left], rows[left + 1]
-        t = record.time
-        share = ((t[between] - t[a]) / np.maximum(t[b] - t[a], 1e-12))[:, None].astype(np.float32)
-        with np.errstate(all="ignore"):
-            off = [
-                np.abs(x[between] - (x[a] + share * (x[b] - x[a]))).max(initial=0.0) * weight
-                for x, weight in ((position, 1.0), (turn, 2.0 * arm))
-            ]
-        if not max(off) <= POSE_ERROR and count // stride <= FRAMES:
-            break
-        stride *= 2
-    return _every(count, stride)
-
-
-def _every(count: int, stride: int) -> NDArray[np.intp]:
-    return np.unique(np.append(np.arange(0, count, stride), count - 1))
-
-
-def _bounds(robots: Sequence[Robot], azimuth: float = 0.0) -> tuple[Array, Array]:
-    """The box, turned about z by ``azimuth``, in which everything moves, with some room, (3,) and (3,) [m]."""
-    points = []
-    for robot in robots:
-        record = robot.record
-        found = [record[POSITION].reshape(-1, 3).astype(np.float64), *(one for _, one in _paths(record, robot.scene))]
-        # The last samples of a run that diverged are far from everything else.
-        points += found if record.complete else [_without_ends(one) for one in found]
-        for shape in robot.scene.fixed:
-            middle, half = np.array(shape.position), 0.5 * max(shape.size) if shape.kind != "mesh" else 0.0
-            points += [np.stack([middle - half, middle + half])]
-    pooled = np.concatenate(points)
-    pooled = pooled[np.isfinite(pooled).all(axis=1)]
-    c, s = math.cos(azimuth), math.sin(azimuth)
-    pooled = pooled @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    low, high = pooled.min(axis=0), pooled.max(axis=0)
-    # What hardly moves is not blown up to fill the window, and what is flat has some depth to stand in.
-    span, reach = float((high - low).max()), max(robot.reach for robot in robots)
-    least = max(0.24 * span, 0.6 * reach if span < 0.6 * reach else 0.0)
-    room = np.maximum(0.5 * (least - (high - low)), 0.0) + 0.03 * least + max(map(_thickness, robots))
-    return low - room, high + room
-
-
-def _without_ends(points: Array) -> Array:
-    """Points without the outermost hundredth at either end of each axis, (T, 3)."""
-    points = points[np.isfinite(points).all(axis=1)]
-    return np.clip(points, *np.percentile(points, (1.0, 99.0), axis=0)) if len(points) else points
-
-
-def _thickness(robot: Robot) -> float:
-    """How far shapes reach beside the lines between the bodies, more or less [m]."""
-    shapes = [shape for body in robot.scene.bodies for shape in body.shapes]
-    round_ = [shape.size[0] for shape in shapes if shape.kind in ("cylinder", "capsule", "sphere")]
-    boxes = [0.5 * sorted(shape.size)[1] for shape in shapes if shape.kind == "box"]
-    meshes = [0.08 * robot.reach for shape in shapes if shape.kind == "mesh"]
-    return min(max([*round_, *boxes, *meshes], default=0.0), 0.5 * robot.reach)
-
-
-def _azimuth(robots: Sequence[Robot]) -> float:
-    """Direction in which robot and hand reach furthest, (−π/2, π/2] about z [rad]: the page looks across it."""
-    clouds = [robot.record[POSITION][robot.rows][..., :2].reshape(-1, 2).astype(np.float64) for robot in robots]
-    clouds += [path[robot.rows, :2] for robot in robots for _, path in _paths(robot.record, robot.scene)]
-    points = np.concatenate(clouds)
-    points = points[np.isfinite(points).all(axis=1)]
-    spread = points - points.mean(axis=0)
-    x, y = np.linalg.eigh(spread.T @ spread)[1][:, 1].tolist()
-    return math.atan2(y, x) if x > 0.0 or (x == 0.0 and y > 0.0) else math.atan2(-y, -x)
-
-
-def _paths(record: Record, scene: Scene) -> Iterator[tuple[str, Array]]:
-    if scene.hand is not None:
-        yield "hand", np.asarray(point_positions(record, scene.hand), dtype=np.float64)
-    target = hand_target(record)
-    if target is None and "hand_position_goal" in record:
-        target = record["hand_position_goal"]
-    if target is None and "w_target" in record:
-        target = record["w_target"][:, :3]
-    if target is not None:
-        yield "target", np.asarray(target, dtype=np.float64)
+    return robot_of(record) is not None
 
 
 def _record(name: str, robot: Robot, blocks: Blocks, meshes: Meshes, low: Array, high: Array) -> dict[str, Any]:
@@ -207,12 +88,18 @@ def _record(name: str, robot: Robot, blocks: Blocks, meshes: Meshes, low: Array,
         "frames": blocks.add(record.time[rows], 1e-9),
         "position": blocks.add(position, 0.5 * POSE_ERROR),
         "orientation": blocks.add(turn, 1e-5),
-        "paths": {key: blocks.add(path[rows], 1e-5) for key, path in _paths(record, scene)},
+        "paths": {key: blocks.add(path[rows], 1e-5) for key, path in paths(record, scene)},
         "contacts": _contacts(robot, blocks),
+        "sunk": [
+            {"name": one.name, "surface": one.surface, "body": one.body, "p": list(one.position)}
+            | {"least": one.least, "depth": blocks.add(one.depth, 1e-5)}
+            for one in sunk(robot, rows)
+        ],
         "wheels": None if groups.down is None else {"names": groups.names, "down": blocks.add(groups.down[rows])},
         "supports": supports(scene, groups),
         "motors": _motors(record, scene),
-        "limit": voltage_limits(record),
+        "limit": shared(record, "voltage_limit_V"),
+        "resistance": resistance(record),
         "events": [[event.time, event.kind, event.name, _finite(event.value)] for event in record.events],
     }
     if (pressure := cop_of(record)) is not None:
@@ -235,47 +122,24 @@ def _title(record: Record) -> str:
 
 def _contacts(robot: Robot, blocks: Blocks) -> list[dict[str, Any]]:
     """Every contact point: on which body, its normal, normal force and friction over time, mode where there is one."""
-    record, scene, rows = robot.record, robot.scene, robot.rows
-    if "contact_normal_force" not in record:
-        return []
-    names = record.labels["contact_normal_force"]
     found = []
-    for point in scene.contacts:
-        surface = scene.surface(point.surface)
-        if surface is None or point.name not in names:
-            continue
-        k = names.index(point.name)
-        normal = normals(surface, np.asarray(point_positions(record, point, rows), dtype=np.float64))
-        force = np.asarray(record["contact_normal_force"][rows, k], dtype=np.float64)
-        mode = record["contact_mode"][rows, k] if "contact_mode" in record else None
-        if mode is not None and not mode.any():
-            continue
+    for contact in contacts(robot, robot.rows):
+        point = contact.point
         one: dict[str, Any] = {
             "name": point.name,
             "surface": point.surface,
             "body": point.body,
             "p": list(point.position),
-            "friction": _friction(record, point.name),
-            "normal": blocks.add(normal),
-            "force": blocks.add(force),
+            "friction": contact.friction,
+            "normal": blocks.add(contact.normal),
+            "force": blocks.add(contact.force),
         }
-        if "contact_force" in record:
-            one["tangent"] = blocks.add(record["contact_force"][rows, k] - force[:, None] * normal)
-        if mode is not None:
-            one["mode"] = blocks.add(mode)
+        if contact.tangent is not None:
+            one["tangent"] = blocks.add(contact.tangent)
+        if contact.mode is not None:
+            one["mode"] = blocks.add(contact.mode)
         found.append(one)
     return found
-
-
-def _friction(record: Record, name: str) -> float:
-    """The coefficient of the cone that the force of a contact cannot leave; 0 where it is not known."""
-    contacts = record.provenance.get("scenario", {}).get("contacts", {})
-    points = contacts.get("points") or {}
-    point = points.get(name, {}) if isinstance(points, Mapping) else {}
-    kinetic = [one.get("friction") for one in (point, contacts)]
-    held = [one.get("static_friction") for one in (point, contacts)]
-    known = [next((float(one) for one in both if one is not None), 0.0) for both in (kinetic, held)]
-    return max(known)
 
 
 def _motors(record: Record, scene: Scene) -> list[list[Any]]:
@@ -289,10 +153,20 @@ def _motors(record: Record, scene: Scene) -> list[list[Any]]:
     return [[name, body] for name, body in places if body is not None]
 
 
-def voltage_limits(record: Record) -> float | None:
-    """The voltage limit of the motors [V] where they share one; None where there is none, or several."""
-    found = set(_named(record.provenance.get("scenario", {}).get("plant", {}), "voltage_limit_V"))
+def shared(record: Record, key: str) -> float | None:
+    """A number of the motors by its key in the scenario; None where they have none, or several."""
+    found = set(_named(record.provenance.get("scenario", {}).get("plant", {}), key))
     return _finite(found.pop()) if len(found) == 1 else None
+
+
+def resistance(record: Record) -> float | None:
+    """R of the motors [Ω] where they share one, and R ∫ Σ i² dt is the heat that was recorded."""
+    R = shared(record, "resistance_ohm")
+    if R is None or not {"current", "heat_joule"} <= set(record) or len(record) < 2:
+        return None
+    heat = float(record["heat_joule"][-1] - record["heat_joule"][0])
+    found = R * float(np.trapezoid((record["current"] ** 2).sum(axis=1), record.time))
+    return R if abs(found - heat) <= HEAT_ERROR * abs(heat) else None
 
 
 def _finite(value: float | None) -> float | None:

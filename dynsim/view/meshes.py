@@ -1,4 +1,4 @@
-"""Meshes of robots from URDF files: found, thinned to what a page can carry, and packed once each."""
+"""Meshes of robots from URDF files: found, thinned to what a page can carry, read once each."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.view.blocks import Blocks
-from dynsim.view.mesh_files import Triangles, read_mesh
+from dynsim.view.mesh_files import Mesh, read_mesh
 
 # Triangles of one mesh at most: seven links of a robot are then some 150 kB.
 TRIANGLES = 5000
@@ -23,11 +22,11 @@ _CODES = 65535.0
 
 
 class Meshes:
-    """Meshes of a page, each once; those of a record are looked for where its robot's file is."""
+    """Meshes, each once, with at most so many triangles; those of a record are looked for where its robot's file is."""
 
-    def __init__(self, blocks: Blocks) -> None:
-        self.found: list[dict[str, Any]] = []
-        self._blocks = blocks
+    def __init__(self, most: int = TRIANGLES) -> None:
+        self.found: list[Mesh] = []
+        self._most = most
         self._folders: tuple[Path, ...] = ()
         self._known: dict[Path, int | None] = {}
         self._missing: dict[str, None] = {}
@@ -73,30 +72,40 @@ class Meshes:
         try:
             if not path.is_file():
                 return None
-            corners, triangles = thinned(*read_mesh(path))
+            self.found.append(thinned(read_mesh(path), self._most))
         except (RecordError, OSError, ValueError):
             return None
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        step = np.where(high > low, (high - low) / _CODES, 1.0)
-        self.found.append(
-            {
-                "vertices": self._blocks.raw(np.rint((corners - low) / step)),
-                "triangles": self._blocks.raw(triangles),
-                "low": low.tolist(),
-                "step": step.tolist(),
-            }
-        )
         return len(self.found) - 1
 
 
-def thinned(corners: NDArray[np.float64], triangles: NDArray[np.int64]) -> Triangles:
-    """The same surface with at most ``TRIANGLES``: corners within one cell of a grid become one.
+def packed(mesh: Mesh, blocks: Blocks) -> dict[str, Any]:
+    """A mesh as the page reads it: corners in 16 bits within their box, triangles, and which colours they have."""
+    corners, triangles, colours = mesh
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    step = np.where(high > low, (high - low) / _CODES, 1.0)
+    paint: dict[str, Any] = {}
+    if colours is not None:
+        # −1 for none: numbers that are none are equal to nothing.
+        palette, number = np.unique(np.round(np.nan_to_num(colours, nan=-1.0), 3), axis=0, return_inverse=True)
+        paint["palette"] = [None if row[0] < 0.0 else row.tolist() for row in palette]
+        paint["paint"] = blocks.raw(number.reshape(-1))
+    return paint | {
+        "vertices": blocks.raw(np.rint((corners - low) / step)),
+        "triangles": blocks.raw(triangles),
+        "low": low.tolist(),
+        "step": step.tolist(),
+    }
+
+
+def thinned(mesh: Mesh, most: int = TRIANGLES) -> Mesh:
+    """The same surface with at most so many triangles: corners within one cell of a grid become one.
 
     Raises
     ------
     ValueError
         Nothing is left of it.
     """
+    corners, triangles, colours = mesh
     low = corners[triangles].min(axis=(0, 1))
     size = float((corners[triangles].max(axis=(0, 1)) - low).max())
     if not size > 0.0:
@@ -109,13 +118,16 @@ def thinned(corners: NDArray[np.float64], triangles: NDArray[np.int64]) -> Trian
         faces = faces[whole]
         # The same three corners in the same sense, beginning with the least.
         first = faces.argmin(axis=1)[:, None]
-        faces = np.unique(np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1), axis=0)
-        if len(faces) <= TRIANGLES:
+        faces, kept = np.unique(
+            np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1), axis=0, return_index=True
+        )
+        if len(faces) <= most:
             break
     if not len(faces):
         raise ValueError("a mesh without faces")
     used, faces = np.unique(faces, return_inverse=True)
-    return corners[place[used]], faces.reshape(-1, 3)
+    painted = None if colours is None else colours[whole][kept]
+    return Mesh(corners[place[used]], faces.reshape(-1, 3), painted)
 
 
 def _named(tree: Any, key: str) -> Iterator[str]:

@@ -8,6 +8,7 @@ import html
 import json
 import os
 import re
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,8 @@ from dynsim.scenario import build_model, load_scenario, variant_names
 from dynsim.view import content, page, viewable, write
 from dynsim.view.blocks import Blocks
 from dynsim.view.html import three
-from dynsim.view.mesh_files import read_mesh
-from dynsim.view.meshes import TRIANGLES, Meshes, thinned
+from dynsim.view.mesh_files import Mesh, read_mesh
+from dynsim.view.meshes import TRIANGLES, Meshes, packed, thinned
 
 SHORT = {"duration_s": 0.5, "metrics.settle_s": 0.1}
 
@@ -115,7 +116,7 @@ def test_long_signals_keep_their_extremes() -> None:
 )
 def test_mesh_files(name: str, text: bytes | str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
-    corners, triangles = read_mesh(tmp_path / name)
+    corners, triangles, _ = read_mesh(tmp_path / name)
     wanted = {tuple(map(tuple, np.round(CORNERS[face], 6))) for face in FACES}
     found = {tuple(map(tuple, np.round(corners[face], 6) + 0.0)) for face in triangles}
     assert found == wanted
@@ -140,6 +141,68 @@ def test_broken_meshes_are_refused(name: str, text: str, tmp_path: Path) -> None
         read_mesh(tmp_path / name)
 
 
+def painted(text: str) -> str:
+    """The wedge in COLLADA with a red effect on its first two triangles, through a symbol of the instance."""
+    first, rest = '<polylist count="4">', "<vcount>3 3 3 3</vcount>"
+    index = re.search(r"<p>([^<]*)</p>", text)
+    assert index is not None
+    words = index[1].split()
+    inputs = re.search(r"<polylist[^>]*>(.*?)<vcount>", text, re.DOTALL)
+    assert inputs is not None
+    halves = "".join(
+        f'<polylist count="2" material="{symbol}">{inputs[1]}<vcount>3 3</vcount><p>{" ".join(part)}</p></polylist>'
+        for symbol, part in (("coat", words[:12]), ("bare", words[12:]))
+    )
+    assert first in text
+    assert rest in text
+    text = re.sub(r"<polylist.*</polylist>", halves, text, flags=re.DOTALL)
+    library = (
+        '<library_effects><effect id="e"><profile_COMMON><technique sid="c"><phong><diffuse>'
+        "<color>0.8 0.1 0.2 1</color></diffuse></phong></technique></profile_COMMON></effect></library_effects>"
+        '<library_materials><material id="red"><instance_effect url="#e"/></material></library_materials>'
+    )
+    bind = (
+        '<instance_geometry url="#g"><bind_material><technique_common><instance_material symbol="coat" target="#red"/>'
+        "</technique_common></bind_material></instance_geometry>"
+    )
+    return text.replace("<library_geometries>", f"{library}<library_geometries>").replace(
+        '<instance_geometry url="#g"/>', bind
+    )
+
+
+def test_colours_of_collada_files(tmp_path: Path) -> None:
+    (tmp_path / "a.dae").write_text(painted(dae()))
+    mesh = read_mesh(tmp_path / "a.dae")
+    wanted = {tuple(map(tuple, np.round(CORNERS[face], 6))) for face in FACES[:2]}
+    assert mesh.colours is not None
+    red = np.isfinite(mesh.colours).all(axis=1)
+    np.testing.assert_allclose(mesh.colours[red], [[0.8, 0.1, 0.2]] * 2)
+    assert {tuple(map(tuple, np.round(mesh.corners[face], 6) + 0.0)) for face in mesh.triangles[red]} == wanted
+    # Thinned and packed they keep them.
+    few = thinned(mesh)
+    assert few.colours is not None
+    assert np.isfinite(few.colours).all(axis=1).sum() == 2
+    blocks = Blocks()
+    head = packed(mesh, blocks)
+    assert sorted(map(str, head["palette"])) == ["None", "[0.8, 0.1, 0.2]"]
+    for broken in ("red", "0.8 0.1", "nan 0 0", ""):
+        (tmp_path / "c.dae").write_text(painted(dae()).replace("0.8 0.1 0.2 1", broken))
+        assert read_mesh(tmp_path / "c.dae").colours is None
+    (tmp_path / "b.dae").write_text(dae())
+    assert read_mesh(tmp_path / "b.dae").colours is None
+    assert "palette" not in packed(read_mesh(tmp_path / "b.dae"), blocks)
+
+
+def test_colours_of_a_published_robot() -> None:
+    """The foot of Franka's Panda is of light and dark parts."""
+    places = [Path(str(one.locate())) for one in metadata.files("example-robot-data") or () if one.name == "link0.dae"]
+    mesh = read_mesh(next(path for path in places if "panda_description" in path.parts))
+    assert mesh.colours is not None
+    assert np.isfinite(mesh.colours).all()
+    found = {tuple(row) for row in np.round(mesh.colours, 3)}
+    assert {(0.902, 0.922, 0.929), (0.251, 0.251, 0.251)} <= found
+
+
 def test_meshes_are_thinned() -> None:
     """A ball of many triangles becomes one of few, at the same place and turned to the same side."""
     u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 301)[:-1], np.linspace(0.01, np.pi - 0.01, 150))
@@ -147,7 +210,7 @@ def test_meshes_are_thinned() -> None:
     i = np.arange(149 * 300)
     right = i - i % 300 + (i + 1) % 300
     triangles = np.concatenate([np.stack([i, i + 300, right], 1), np.stack([right, i + 300, right + 300], 1)])
-    few, faces = thinned(corners, triangles)
+    few, faces, _ = thinned(Mesh(corners, triangles))
     assert 500 < len(faces) <= TRIANGLES < len(triangles)
     volume = np.linalg.det(few[faces]).sum() / 6.0
     assert volume == pytest.approx(np.linalg.det(corners[triangles]).sum() / 6.0, rel=0.03)
@@ -165,7 +228,7 @@ def test_meshes_are_found_where_the_robot_is(robot: Record) -> None:
 
 
 def test_a_mesh_is_packed_once(robot: Record) -> None:
-    meshes = Meshes(Blocks())
+    meshes = Meshes()
     meshes.of_robot(robot)
     file = "package://wedges/meshes/wedge.stl"
     assert meshes.index(file) == meshes.index(file) == 0

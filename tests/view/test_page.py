@@ -133,6 +133,64 @@ def test_states_of_real_contacts_and_events(opened: Opens) -> None:
     assert page.state()["time"] == pytest.approx(record.events[0].time, abs=1e-6)
 
 
+def test_joints_below_the_floor_are_marked(opened: Opens) -> None:
+    """Where the record has them deeper than their radius, and nowhere else."""
+    record = short("elbow_comparison", "no_elbow")
+    page, deepest = opened({"one": record}), 0.0
+    radius = 0.01
+    for row in range(0, len(record), 20):
+        (shown,) = page.seek(float(record.time[row]))["records"]
+        height = dict(zip(record.labels[POSITION], record[POSITION][row, :, 2].astype(float), strict=True))
+        joints = {body.name: body.joint.name for body in record.scene.bodies}
+        # Links without a shape have no radius.
+        thick = {body.name: radius if body.shapes else 0.0 for body in record.scene.bodies}
+        expected = {joints[name]: -z for name, z in height.items() if z < -thick[name] - 1e-4}
+        assert shown["sunk"] == pytest.approx(expected, abs=2e-5)
+        deepest = max(deepest, *expected.values(), 0.0)
+    assert deepest > 0.01
+    texts = page.page.locator("#labels div:visible").all_inner_texts()
+    assert any(text.startswith("↓") and text.endswith("mm") for text in texts)
+    assert "below floor" in page.page.locator("#status").inner_text()
+    page.js("dynsim.set('depths', false)")
+    assert not page.js("dynsim.app.actors[0].sunk.some((one) => one.mark.visible)")
+
+
+def test_meshes_have_the_colours_of_their_files(tmp_path: Path, opened: Opens) -> None:
+    """Unless the links are painted by their motors; the wedge from COLLADA is red on one of its sides."""
+    path = meshed_robot(tmp_path)
+    file = tmp_path / "wedges" / "meshes" / "wedge.dae"
+    library = (
+        "<library_effects><effect id='e'><phong><diffuse><color>1 0 0 1</color></diffuse></phong></effect>"
+        "</library_effects>"
+        "<library_materials><material id='m'><instance_effect url='#e'/></material></library_materials>"
+    )
+    text = file.read_text().replace("<library_geometries>", library + "<library_geometries>")
+    file.write_text(text.replace("<polylist ", "<polylist material='m' "))
+    page = opened({"one": dynsim.simulate(load_scenario(path))})
+    program = """dynsim.app.actors[0].bodies.map((b) => b.paint.filter((p) => p.role === 'body')
+                 .map((p) => p.material.vertexColors))"""
+    assert page.js(program)[:3] == [[False], [False], [True]]
+    colours = page.js("Array.from(dynsim.app.actors[0].bodies[2].paint[0].mesh.geometry.attributes.color.array)")
+    np.testing.assert_array_equal(np.reshape(colours, (-1, 3)), [[1, 0, 0]] * 12)
+    page.js("dynsim.set('colouring', 'power')")
+    assert page.js(program)[2] == [False]
+    page.js("dynsim.set('colouring', '')")
+    assert page.js(program)[2] == [True]
+
+
+def test_heat_is_in_watts(braced: Record, opened: Opens) -> None:
+    """R i² of each motor; over the run it is the heat of the energy ledger."""
+    page = opened({"one": braced})
+    page.js("dynsim.set('colouring', 'current')")
+    rating = page.js("({ unit: dynsim.app.rating.unit, top: dynsim.app.rating.top, two: dynsim.app.rating.of(2) })")
+    heat = 1.1 * braced["current"] ** 2
+    assert rating["unit"] == "W"
+    assert rating["two"] == pytest.approx(1.1 * 4.0)
+    assert rating["top"] == pytest.approx(np.percentile(heat, 98), rel=0.02)
+    assert np.trapezoid(heat.sum(axis=1), braced.time) == pytest.approx(braced["heat_joule"][-1], rel=0.02)
+    assert "W" in page.page.locator("#scale").inner_text()
+
+
 def test_wheels_and_support_of_a_snake(snake: Record, opened: Opens) -> None:
     page = opened({"one": snake})
     for row in range(0, len(snake), 60):

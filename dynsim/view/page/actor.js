@@ -1,7 +1,7 @@
 "use strict";
 // One robot in the scene. What it shows at an instant is a sample: from the tables of a record, or from a live frame.
 //   {time, poses: [x, y, z, w, x, y, z for each body], contacts: [{force, normal, tangent, mode}], wheels: [1 or 0],
-//    pressure: [x, y] or null, gripper: 1, 0 or null}
+//    depths: [m] of data.sunk, pressure: [x, y] or null, gripper: 1, 0 or null}
 
 class Actor {
   constructor(data, bytes, meshes, index) {
@@ -18,6 +18,7 @@ class Actor {
     this.size = Math.max(0.13 * data.reach, 3 * data.radius);
     this.contactTables = data.contacts.map((c) => ({ force: table(c.force), normal: table(c.normal),
       tangent: c.tangent && table(c.tangent), mode: c.mode && table(c.mode) }));
+    this.depths = data.sunk.map((one) => table(one.depth));
     this.wheelTable = data.wheels && table(data.wheels.down);
     this.pressureTable = data.pressure && table(data.pressure.at);
     this.gripperTable = data.gripper && table(data.gripper);
@@ -42,7 +43,7 @@ class Actor {
   emptySample() {
     return { time: 0, poses: new Float64Array(7 * this.bodies.length), wheels: (this.data.wheels?.names ?? []).map(() => 1),
       contacts: this.contacts.map(() => ({ force: NaN, normal: [0, 0, 1], tangent: [0, 0, 0], mode: null })),
-      pressure: this.pressureTable ? [0, 0] : null, gripper: null };
+      depths: [], pressure: this.pressureTable ? [0, 0] : null, gripper: null };
   }
 
   build(meshes) {
@@ -59,7 +60,8 @@ class Actor {
         mesh.castShadow = mesh.receiveShadow = true;
         group.add(mesh);
         const role = shape.wheel !== undefined ? "wheel" : shape.role === "hub" ? "hub" : "body";
-        const part = { mesh, material, own, role, alpha: shape.colour ? shape.colour[3] : 1, z: shape.p };
+        const part = { mesh, material, own, role, alpha: shape.colour ? shape.colour[3] : 1, z: shape.p,
+          painted: !own && Boolean(mesh.geometry.attributes.color) };
         paint.push(part);
         if (role === "wheel") {
           // A mark on the rim, or nobody would see it turn.
@@ -79,9 +81,12 @@ class Actor {
       mesh.quaternion.set(...S.xyzw(shape.q));
       mesh.castShadow = mesh.receiveShadow = true;
       this.inner.add(mesh);
-      return { mesh, own: shape.colour ? new THREE.Color().setRGB(...shape.colour) : null };
+      const own = shape.colour ? new THREE.Color().setRGB(...shape.colour) : null;
+      if (!own && mesh.geometry.attributes.color) mesh.material.vertexColors = true;
+      return { mesh, own: own ?? (mesh.material.vertexColors ? new THREE.Color(0xffffff) : null) };
     });
     this.contacts = data.contacts.map((contact) => new M.Contact(this.inner, contact, this.size));
+    this.sunk = data.sunk.map((one) => new M.Sunk(this.inner, one, this.size));
     this.support = data.supports.length ? new M.Support(this.inner, data.supports.length, this.size) : null;
     this.supportPoint = new THREE.Vector3();
     if (data.hand) this.buildHand();
@@ -130,6 +135,7 @@ class Actor {
         one.tangent[k] = c.tangent ? mix(c.tangent, k) : 0;
       }
     });
+    this.depths.forEach((one, k) => { out.depths[k] = mix(one, 0); });
     for (let k = 0; k < out.wheels.length; k++) out.wheels[k] = this.wheelTable ? Math.round(this.wheelTable.value(held, k)) : 1;
     if (this.pressureTable) out.pressure = [0, 1].map((k) => mix(this.pressureTable, k));
     out.gripper = this.gripperTable ? Math.round(this.gripperTable.value(held, 0)) : null;
@@ -150,6 +156,7 @@ class Actor {
       const contact = this.contacts[k];
       contact.show(this.bodies[contact.contact.body].object, sample.contacts[k], this.scale, layers, colours);
     }
+    this.sunk.forEach((one, k) => one.show(this.bodies[one.point.body].object, sample.depths[k], layers, colours));
     for (const wheel of this.wheels) {
       const down = sample.wheels[wheel.group] > 0;
       if (wheel.down === down && wheel.colours === colours) continue;
@@ -208,12 +215,13 @@ class Actor {
     this.marked = null;
     for (const body of this.bodies)
       for (const part of body.paint) {
-        part.base = part.own ? part.own.clone() : new THREE.Color(colours[part.role]);
+        part.base = part.own ? part.own.clone() : new THREE.Color(part.painted ? 0xffffff : colours[part.role]);
         if (this.ghost) part.base = this.tint.clone();
         else if (!part.own && part.role === "hub") part.base.copy(this.tint);
         part.material.transparent = ghost || part.alpha < 1;
         part.material.opacity = ghost ? 0.3 : part.alpha;
         part.material.depthWrite = !ghost;
+        part.material.vertexColors = part.painted && !ghost;
         part.material.needsUpdate = true;
         if (part.role !== "wheel") part.material.color.copy(part.base);
       }
@@ -230,8 +238,12 @@ class Actor {
   paint(colourOf) {
     this.bodies.forEach((body, k) => {
       const colour = colourOf ? colourOf.get(k) : null;
-      for (const part of body.paint)
+      for (const part of body.paint) {
         if (part.role !== "wheel") part.material.color.copy(colour ?? (colourOf ? this.plain : part.base));
+        // Colours of a mesh's file give way to those of the motors.
+        const own = part.painted && !this.ghost && !colourOf;
+        if (part.painted && part.material.vertexColors !== own) Object.assign(part.material, { vertexColors: own, needsUpdate: true });
+      }
     });
   }
 
@@ -252,6 +264,7 @@ class Actor {
       bodies: Object.fromEntries(this.bodies.map(({ name, object: o }) => [name,
         { p: o.position.toArray(), q: [o.quaternion.w, o.quaternion.x, o.quaternion.y, o.quaternion.z] }])),
       contacts: this.contacts.map((c) => ({ ...c.state, visible: c.push.object.visible })),
+      sunk: Object.fromEntries(this.sunk.filter((one) => one.depth !== null).map((one) => [one.point.name, one.depth])),
       wheels: Object.fromEntries((this.data.wheels?.names ?? []).map((name, k) => [name, this.shown.wheels[k] > 0])),
       support: this.support && { corners: this.support.hull.length, inside: this.support.inside },
       hand: this.hand ? this.handPosition(new THREE.Vector3()).sub(this.object.position).toArray() : null,

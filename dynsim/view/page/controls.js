@@ -22,7 +22,7 @@ function wire(app) {
   for (const [name, text, key] of [["iso", "corner", 1], ["side", "side", 2], ["front", "front", 3], ["top", "top", 4]])
     button("cameras", text, `view (${key})`, () => app.camera(name), name);
   const follow = button("cameras", "follow", "follow the hand (f)", () => app.set("follow", !app.follow));
-  const switches = [["forces", "forces"], ["cones", "cones"], ["trace", "trace"], ["target", "target"], ["support", "support"], ["labels", "labels"]]
+  const switches = [["forces", "forces"], ["cones", "cones"], ["trace", "trace"], ["target", "target"], ["support", "support"], ["depths", "depths"], ["labels", "labels"]]
     .filter(([name]) => app.has(name)).map(([name, text]) =>
       [name, button("layers", text, `show or hide: ${text}`, () => app.set(name, !app.layers[name]))]);
   const layout = app.actors.length > 1 ? button("layers", "", "side by side or laid over each other (g)", () => app.set("ghost", !app.ghost)) : null;

@@ -14,14 +14,15 @@ class App {
     this.actors = head.records.map((record, k) => new Actor(record, bytes, meshes, k));
     this.span = [Math.min(...this.actors.map((a) => a.span[0])), Math.max(...this.actors.map((a) => a.span[1]))];
     this.stage = new Stage(document.getElementById("scene"), head.azimuth);
-    this.layers = { forces: true, cones: true, trace: true, target: true, support: true, labels: true };
+    this.layers = { forces: true, cones: true, trace: true, target: true, support: true, depths: true, labels: true };
     Object.assign(this, { time: this.span[0], playing: false, speed: 1, follow: false, ghost: head.ghost, colouring: "", live: false, cost: 0 });
     this.theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
     this.point = new THREE.Vector3();
     this.surfaces();
     for (const actor of this.actors) this.stage.scene.add(actor.object);
     this.tags = this.actors.flatMap((actor) => actor.contacts.map((contact) => ({ actor, contact, box: D.element("div") })));
-    document.getElementById("labels").append(...this.tags.map((tag) => tag.box));
+    this.deep = this.actors.flatMap((actor) => actor.sunk.map((one) => ({ actor, one, box: D.element("div") })));
+    document.getElementById("labels").append(...[...this.tags, ...this.deep].map((tag) => tag.box));
     this.plots = new Plots(document.getElementById("plots"), this.actors, { seek: (t) => this.seek(t), span: () => this.span,
       colour: (actor) => this.colourOf(actor), palette: () => D.variants[this.theme] });
     document.getElementById("add-plot").onclick = () => this.plots.add(this.plots.names.find((n) => !this.plots.plots.some((p) => p.signal === n)));
@@ -40,7 +41,7 @@ class App {
 
   firstPlots() {
     const wanted = this.actors.length > 1 ? ["contact_normal_force", "tip_margin", "energy_electrical_drawn", "hand_error", "position_error", "support_margin"]
-      : ["contact_normal_force", "wheel_load", "hand_error", "position_error", "support_margin", "power", "q", "phi"];
+      : ["contact_normal_force", "wheel_load", "hand_error", "support_margin", "position_error", "power", "q", "phi"];
     return wanted.filter((name) => this.actors.some((a) => a.signals.get(name))).slice(0, 3);
   }
 
@@ -103,13 +104,20 @@ class App {
 
   has(layer) {
     const some = (test) => this.actors.some(test);
-    return { forces: some((a) => a.contacts.length), cones: some((a) => a.data.contacts.some((c) => c.friction > 0)), labels: some((a) => a.contacts.length),
-      trace: some((a) => a.data.paths.hand), target: some((a) => a.data.paths.target), support: some((a) => a.support) }[layer];
+    return { forces: some((a) => a.contacts.length), cones: some((a) => a.data.contacts.some((c) => c.friction > 0)), labels: some((a) => a.contacts.length + a.sunk.length),
+      trace: some((a) => a.data.paths.hand), target: some((a) => a.data.paths.target), support: some((a) => a.support),
+      depths: some((a) => a.sunk.length) }[layer];
+  }
+
+  // Heat of the windings R i²; where the resistance is not one for all motors, the squares of their currents.
+  heat() {
+    const R = this.actors[0].data.resistance, one = R && this.actors.every((a) => a.data.resistance === R);
+    return one ? ["current", "heat R i²", "W", (x) => R * x * x] : ["current", "heat ∝ i²", "A²", (x) => x * x];
   }
 
   // Signals of the motors by which links may be painted.
   colourings() {
-    const list = [["power", "power |u i|", "W", (x) => Math.abs(x)], ["current", "heat ∝ i²", "A²", (x) => x * x],
+    const list = [["power", "power |u i|", "W", (x) => Math.abs(x)], this.heat(),
       ["torque", "|torque|", "", (x) => Math.abs(x)], ["voltage", "|voltage|", "V", (x) => Math.abs(x)], ["phi_dot", "|joint rate|", "rad/s", (x) => Math.abs(x)]];
     return list.filter(([name]) => this.actors.some((a) => a.signals.has(name))).map(([name, text, unit, of]) => ({ name, text, unit, of }));
   }
@@ -261,6 +269,8 @@ class App {
         const up = actor.data.wheels.names.filter((_, k) => !(actor.shown.wheels[k] > 0));
         if (up.length) parts.push(`lifted: ${up.join(", ")}`);
       }
+      const deep = actor.sunk.filter((one) => one.depth !== null).sort((a, b) => b.depth - a.depth);
+      if (deep.length) parts.push(`below ${deep[0].point.surface}: ${deep.slice(0, 3).map((one) => `${one.point.name} ${D.number(1e3 * one.depth, 2)} mm`).join(", ")}${deep.length > 3 ? " …" : ""}`);
       if (actor.support?.inside === false) parts.push(`${actor.data.pressure.name} outside the support`);
       if (parts.length > 6) parts.splice(6, parts.length, `… ${parts.length - 6} more`);
       if (parts.length) lines.push([actor, parts.join(" · ")]);
@@ -299,6 +309,15 @@ class App {
       if (!at) continue;
       box.textContent = `${state.name} ${D.number(state.force, 3)} N`;
       box.style.color = state.colour;
+      box.style.transform = `translate(${Math.round(at[0])}px, ${Math.round(at[1])}px)`;
+    }
+    for (const { actor, one, box } of this.deep) {
+      const shown = this.layers.labels && one.mark.visible && actor.object.visible && one.depth >= 1e-3 && !(this.ghost && actor.ghost);
+      const at = shown ? this.stage.project(this.point.copy(one.at).add(actor.object.position), this.point) : null;
+      box.hidden = !at;
+      if (!at) continue;
+      box.textContent = `↓ ${D.number(1e3 * one.depth, 2)} mm`;
+      box.style.color = one.colour;
       box.style.transform = `translate(${Math.round(at[0])}px, ${Math.round(at[1])}px)`;
     }
   }

@@ -99,6 +99,28 @@ M.Contact = class {
   }
 };
 
+// A joint below a surface: a ball about it that bodies and floor do not hide.
+M.Sunk = class {
+  constructor(parent, point, size) {
+    this.point = point;
+    this.at = new THREE.Vector3();
+    this.depth = null;
+    this.mark = new THREE.Mesh(new THREE.SphereGeometry(0.11 * size, 16, 12), new THREE.MeshBasicMaterial({ ...M.above, opacity: 0.6 }));
+    this.mark.renderOrder = 17;
+    parent.add(this.mark);
+  }
+
+  // depth [m]; not known: it is not below.
+  show(body, depth, layers, colours) {
+    this.depth = depth > this.point.least ? depth : null;
+    this.mark.visible = layers.depths && this.depth !== null;
+    this.at.set(...this.point.p).applyQuaternion(body.quaternion).add(body.position);
+    this.mark.position.copy(this.at);
+    this.colour = colours.sunk;
+    this.mark.material.color.set(colours.sunk);
+  }
+};
+
 // Points of a path, no nearer to each other than a part of its length: fat lines of thousands of pieces take seconds
 // to draw without a graphics card.
 M.thinned = function (times, table, most = 360) {

@@ -153,7 +153,8 @@ class Plots {
   static ticks(low, high, count) {
     const step = Stage.round((high - low) / Math.max(count, 1)), found = [];
     for (let v = Math.ceil(low / step) * step; v <= high + 1e-9 * step; v += step) found.push(Math.abs(v) < 1e-9 * step ? 0 : v);
-    return found;
+    // One number alone says nothing of the scale.
+    return found.length > 1 || count > 12 ? found : Plots.ticks(low, high, count + 1);
   }
 
   cursor(plot, t) {

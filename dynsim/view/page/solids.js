@@ -48,6 +48,12 @@ S.mesh = function (bytes, mesh) {
   const made = new THREE.BufferGeometry();
   made.setAttribute("position", new THREE.BufferAttribute(positions, 3));
   made.setAttribute("normal", new THREE.BufferAttribute(smooth, 3));
+  if (mesh.palette) {
+    // Colours of the file; what has none is grey.
+    const paint = codes(mesh.paint), colours = new Float32Array(9 * faces);
+    for (let f = 0; f < faces; f++) for (let j = 0; j < 9; j++) colours[9 * f + j] = (mesh.palette[paint[f]] ?? [0.68, 0.72, 0.77])[j % 3];
+    made.setAttribute("color", new THREE.BufferAttribute(colours, 3));
+  }
   return made;
 };
 

@@ -1,0 +1,72 @@
+"""``dynsim animate``: films of records."""
+
+from __future__ import annotations
+
+import re
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dynsim.cli.app import QuietOption
+from dynsim.cli.display import console, film_progress, labelled
+from dynsim.errors import RecordError
+from dynsim.terminal import escaped
+
+
+class ViewName(StrEnum):
+    iso = "iso"
+    side = "side"
+    top = "top"
+
+
+def animate(
+    records: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RECORD", help="Records (HDF5) or folders of runs; several are shown beside each other."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="The film: FILE.mp4 or FILE.gif.")],
+    view: Annotated[ViewName, typer.Option(help="From where it is seen.")] = ViewName.iso,
+    speed: Annotated[
+        float, typer.Option(metavar="X", help="1: as fast as the motion was; 0.1: ten times slower.")
+    ] = 1.0,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Width and height [pixel].")] = "960x540",
+    fps: Annotated[int, typer.Option(metavar="N", help="Frames a second.")] = 25,
+    hold: Annotated[float, typer.Option(metavar="S", help="How long the last frame stays [s].")] = 1.0,
+    plot: Annotated[
+        str | None,
+        typer.Option(metavar="SIGNAL", help="Signal to plot below; default: one that suits, none: no plot."),
+    ] = None,
+    quiet: QuietOption = False,
+) -> None:
+    """Write a film of records, without display or browser: bodies, forces, time, and a plot with a cursor."""
+    from dynsim.film import write
+    from dynsim.film.encode import check
+
+    wanted = _size(size)
+    check(out.suffix.lower().removeprefix("."), fps)
+    named = labelled(records)
+    with film_progress(quiet) as report:
+        write(
+            named,
+            out,
+            view=view.value,
+            size=wanted,
+            speed=speed,
+            fps=fps,
+            hold=hold,
+            plot="" if plot == "none" else plot,
+            progress=report,
+        )
+    if not quiet:
+        console.print(f"Written to {escaped(out)}", highlight=False, soft_wrap=True)
+
+
+def _size(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"([0-9]{1,5})[x×]([0-9]{1,5})", text)
+    if found is None:
+        raise RecordError(f"--size is WIDTHxHEIGHT, such as 960x540, not {text!r}")
+    return int(found[1]), int(found[2])

@@ -1,0 +1,137 @@
+"""The plot below the robots: drawn once, with a cursor that moves over it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw
+
+from dynsim.errors import RecordError
+from dynsim.figures import style
+from dynsim.figures.canvas import Canvas
+from dynsim.record import TIME, Record
+from dynsim.terminal import plain
+
+# What a strip shows unless told: the first that the record, or one of several, has.
+ONE = ("contact_normal_force", "wheel_load", "hand_error", "support_margin", "position_error", "power", "q", "phi")
+SEVERAL = ("energy_electrical", "hand_error", "position_error", "tip_margin", "support_margin", "q", "phi")
+DPI = 100
+CURSOR = "#202428"
+# Columns of a signal that have names of their own in the legend.
+NAMED = 4
+# A narrower plot has no room for a legend beside it [pixel], and a name no more letters.
+LEGEND_MIN, LETTERS = 400, 16
+# Height of one name in it [pixel]; those that do not fit have none.
+LEGEND_ROW = 14
+
+
+class Strip:
+    """A plot of one signal of all records over time, of a size [pixel].
+
+    Parameters
+    ----------
+    signal : name, None for the first of a list that is there
+
+    Raises
+    ------
+    RecordError
+        No record has the signal, or it is no quantity over the record's time.
+    """
+
+    def __init__(self, records: Mapping[str, Record], size: tuple[int, int], signal: str | None = None) -> None:
+        self._size = size
+        self.signal = chosen(records, signal)
+        self._image: Image.Image | None = None
+        if self.signal is not None:
+            with style.look():
+                self._draw(records, self.signal)
+
+    def frame(self, time: float) -> Image.Image | None:
+        """The plot with its cursor at an instant [s]; None where there is nothing to plot."""
+        if self._image is None:
+            return None
+        image = self._image.copy()
+        x = self._at(time)
+        ImageDraw.Draw(image).line([x, self._top, x, self._bottom], fill=CURSOR, width=2)
+        return image
+
+    def _at(self, time: float) -> float:
+        (t0, x0), (t1, x1) = self._scale
+        return x0 + (x1 - x0) * (time - t0) / (t1 - t0)
+
+    def _draw(self, records: Mapping[str, Record], name: str) -> None:
+        figure = Figure(figsize=(self._size[0] / DPI, self._size[1] / DPI), dpi=DPI, layout="constrained")
+        canvas = Canvas(figure)
+        axes = figure.add_subplot()
+        colours = style.variant_styles(list(records))
+        for label, record in records.items():
+            if name not in record:
+                continue
+            values = record[name].reshape(len(record), -1)
+            names = record.labels[name] or (name,) * values.shape[1]
+            for k, column in enumerate(values.T):
+                many = values.shape[1] > 1
+                colour = style.VARIANT_COLOURS[k % 7] if len(records) == 1 and many else colours[label]["color"]
+                text = plain(label if len(records) > 1 else names[k])
+                text = text if len(text) <= LETTERS else text[: LETTERS - 1] + "…"
+                known = k < NAMED if len(records) == 1 else k == 0
+                style.line(axes, record.time, column, color=colour, label=text if known else None)
+        some = next(record for record in records.values() if name in record)
+        unit = some.units[name]
+        shown = f"{name.replace('_', ' ')}{f' [{unit}]' if unit not in ('', '1') else ''}"
+        axes.set_title(shown, fontsize=7.5, loc="left", pad=3)
+        axes.set_xlabel("time [s]", fontsize=7, labelpad=0)
+        axes.tick_params(labelsize=7)
+        start = min(float(record.time[0]) for record in records.values())
+        end = max(float(record.time[-1]) for record in records.values())
+        axes.set_xlim(start, end if end > start else start + 1.0)
+        axes.set_ylim(*_limits([record[name] for record in records.values() if name in record]))
+        if len(records) > 1 or len(axes.lines) > 1:
+            handles, labels = axes.get_legend_handles_labels()
+            most = max((self._size[1] - 20) // LEGEND_ROW, 1)
+            axes.legend(
+                handles[:most],
+                labels[:most],
+                loc="upper left",
+                bbox_to_anchor=(1.0, 1.0),
+                fontsize=6.5,
+                borderaxespad=0.2,
+            )
+        canvas.draw()
+        self._image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+        box = axes.get_window_extent()
+        low, high = axes.get_xlim()
+        self._scale = (low, float(box.x0)), (high, float(box.x1))
+        self._top, self._bottom = self._size[1] - float(box.y1), self._size[1] - float(box.y0)
+
+
+def chosen(records: Mapping[str, Record], signal: str | None) -> str | None:
+    """The signal to plot, see :class:`Strip`."""
+
+    def plotted(name: str) -> bool:
+        return any(
+            name in r and r.signals[name].axis == TIME and r[name].ndim < 3 and r[name].size for r in records.values()
+        )
+
+    if signal is None:
+        return next((name for name in (SEVERAL if len(records) > 1 else ONE) if plotted(name)), None)
+    if not plotted(signal):
+        names = sorted({name for record in records.values() for name in record if plotted(name)})
+        raise RecordError(f"no signal {signal!r} over the record's time to plot; there are {', '.join(names)}")
+    return signal
+
+
+def _limits(values: list[style.Array]) -> tuple[float, float]:
+    """Range of the axis: a spike at the start does not squeeze the rest."""
+    pooled = np.concatenate([one.ravel() for one in values])
+    pooled = pooled[np.isfinite(pooled)]
+    if not len(pooled):
+        return -1.0, 1.0
+    low, high = float(pooled.min()), float(pooled.max())
+    a, b = np.percentile(pooled, (1.0, 99.0)).tolist()
+    if b > a and high - low > 4.0 * (b - a):
+        low, high = max(low, a - 0.6 * (b - a)), min(high, b + 0.6 * (b - a))
+    room = 0.06 * (high - low) or max(0.05 * abs(high), 1e-9)
+    return low - room, high + room

@@ -1,0 +1,411 @@
+"""Films: as many frames as asked for, of their size and length, that show what the record has, and where."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from meshed_robot import meshed_robot
+from PIL import Image, ImageColor
+
+import dynsim
+from dynsim import cli
+from dynsim.cli import commands
+from dynsim.cli.display import record_files
+from dynsim.errors import RecordError
+from dynsim.figures.style import BLUE, PULLING
+from dynsim.film import Film, write
+from dynsim.film.camera import view_axes
+from dynsim.film.painter import DEEP, FINER, FRICTION, Painter
+from dynsim.record import Record
+from dynsim.record.poses import ORIENTATION, POSITION, point_positions
+from dynsim.scenario import build_model, load_scenario
+
+MARK = "#FF00FF"
+
+
+def short(name: str | Path, variant: str | None = None, **options: object) -> Record:
+    return dynsim.simulate(load_scenario(name, variant, {"duration_s": 1.0, "metrics.settle_s": 0.2, **options}))
+
+
+@pytest.fixture(scope="module")
+def braced() -> Record:
+    return short("elbow_comparison", "two_elbows")
+
+
+@pytest.fixture(scope="module")
+def robots(braced: Record, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Record]:
+    mesh = dynsim.simulate(load_scenario(meshed_robot(tmp_path_factory.mktemp("robot"))))
+    return {"arm": braced, "mobile": short("mobile_path"), "snake": short("snake_circle"), "urdf": mesh}
+
+
+def decoded(path: Path) -> tuple[int, tuple[int, int], float]:
+    """Frames, size, and duration [s] of a film."""
+    if path.suffix == ".gif":
+        with Image.open(path) as film:
+            times = []
+            for k in range(film.n_frames):
+                film.seek(k)
+                times.append(film.info["duration"])
+            return film.n_frames, film.size, sum(times) / 1e3
+    av = pytest.importorskip("av")
+    with av.open(str(path)) as film:
+        (track,) = film.streams.video
+        frames = list(film.decode(track))
+        return len(frames), frames[0].to_image().size, float(track.duration * track.time_base)
+
+
+def test_a_gif_has_its_frames_size_and_duration(braced: Record, tmp_path: Path) -> None:
+    """30 a second is no whole number of hundredths: none is lost over the film."""
+    path = write({"one": braced}, tmp_path / "film.gif", size=(320, 240), fps=30, hold=0.5)
+    assert decoded(path) == (31, (320, 240), pytest.approx(31 / 30 + 0.5, abs=0.0101))
+
+
+def test_a_gif_keeps_the_colours_of_small_marks(braced: Record, tmp_path: Path) -> None:
+    path = write({"one": braced}, tmp_path / "film.gif", size=(480, 320), fps=5, view="side")
+    with Image.open(path) as film:
+        film.seek(4)
+        shown = {tuple(colour) for colour in np.asarray(film.convert("RGB")).reshape(-1, 3).tolist()}
+    assert {ImageColor.getrgb(BLUE), ImageColor.getrgb(PULLING), (255, 255, 255)} <= shown
+
+
+def test_an_mp4_has_its_frames_size_and_duration(braced: Record, tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    path = write({"one": braced}, tmp_path / "film.mp4", size=(320, 240), fps=20, speed=0.5, hold=1.0)
+    # 1 s at half the speed: 40 steps, the last frame, and that one for another second.
+    assert decoded(path) == (61, (320, 240), pytest.approx(61 / 20, abs=1e-3))
+
+
+def test_the_last_frame_is_the_last_sample(braced: Record) -> None:
+    film = Film({"one": braced}, fps=7, size=(320, 240))
+    assert film.times[-1] == braced.time[-1]
+    assert len(film.times) == 8
+    np.testing.assert_allclose(np.diff(film.times)[:-1], 1 / 7, atol=1e-12)
+
+
+def pixels(image: Image.Image, colour: str) -> np.ndarray:
+    """Places of the pixels of a colour, (n, 2) as x, y; those that edges mixed with others are left out."""
+    near = np.abs(np.asarray(image).astype(int) - ImageColor.getrgb(colour)).max(axis=2) < 40
+    return np.argwhere(near)[:, ::-1]
+
+
+@pytest.mark.parametrize("view", ["side", "top", "iso"])
+def test_the_hand_is_where_the_model_has_it(braced: Record, view: str) -> None:
+    """The mark's middle, to 2 pixels, at random instants between samples; positions are those of the kernels."""
+    film = Film({"one": braced}, view=view, plot="", size=(640, 480))
+    known = film.painters["one"]
+    painter = Painter(known.robot, known.camera, known.size, (np.zeros(3), np.ones(3)), tint=MARK)
+    painter._ways.clear()
+    model = build_model(load_scenario("elbow_comparison", "two_elbows"))
+    camera, hand = painter.camera, braced.scene.hand
+    # The projection in words: along the axes of the view, y down.
+    np.testing.assert_allclose(camera.axes @ camera.axes.T, np.eye(3), atol=1e-12)
+    for instant in np.random.default_rng(4).uniform(0.0, 1.0, 8):
+        q = np.array([np.interp(instant, braced.time, column) for column in braced["q"].T])
+        where = model.point_position(braced.scene.bodies[hand.body].name, hand.position, q)
+        right, up = camera.axes[:2] @ (where - camera.centre)
+        expected = (camera.middle + camera.scale * np.array([right, -up])) / FINER
+        found = pixels(painter.frame(float(instant)), MARK)
+        assert len(found) > 15
+        np.testing.assert_allclose(found.mean(axis=0), expected, atol=2.0)
+        assert painter.hand(float(instant)) == pytest.approx(tuple(expected), abs=0.1)
+
+
+def test_views_are_right_handed_and_show_up_as_up() -> None:
+    for view in ("side", "top", "iso"):
+        axes = view_axes(view, 0.7)
+        np.testing.assert_allclose(np.cross(axes[0], axes[1]), axes[2], atol=1e-12)
+        if view != "top":
+            assert axes[1][2] > 0.0
+            assert axes[0][2] == pytest.approx(0.0, abs=1e-12)
+        # The robot's longest way goes from left to right.
+        assert axes[0] @ np.array([np.cos(0.7), np.sin(0.7), 0.0]) > 0.5
+
+
+def test_arrows_have_the_colour_of_their_sign(braced: Record) -> None:
+    """Above each contact the colour of its force, and not the other one; longer for a larger force."""
+    film = Film({"one": braced}, view="side", plot="", size=(800, 500))
+    known = film.painters["one"]
+    painter = Painter(known.robot, known.camera, known.size, (np.zeros(3), np.ones(3)), tint=MARK)
+    seen = set()
+    for row in range(3, len(braced), 23):
+        image = painter.frame(float(braced.time[row]))
+        for k, point in enumerate(braced.scene.contacts):
+            force = braced["contact_normal_force"][row, k]
+            if abs(force) < 0.05:
+                continue
+            place = point_positions(braced, point, row)
+            x, y = painter.camera.project(place)[:2] / FINER
+            shown = {}
+            for colour in (BLUE, PULLING):
+                at = pixels(image, colour)
+                shown[colour] = np.sum((np.abs(at[:, 0] - x) < 20) & (at[:, 1] < y) & (at[:, 1] > y - 60))
+            right, wrong = (PULLING, BLUE) if force < 0.0 else (BLUE, PULLING)
+            assert shown[right] > 30
+            assert shown[wrong] == 0
+            seen.add(right)
+    assert seen == {BLUE, PULLING}
+
+
+def test_joints_below_the_floor_are_ringed() -> None:
+    record = short("elbow_comparison", "no_elbow")
+    painter = Film({"one": record}, view="side", plot="", size=(800, 500)).painters["one"]
+    assert len(pixels(painter.frame(0.0), DEEP)) == 0
+    found = pixels(painter.frame(1.0), DEEP)
+    depth = record[POSITION][-1, :, 2]
+    x, y = painter.camera.project(record[POSITION][-1, depth.argmin()].astype(float))[:2] / FINER
+    assert depth.min() < -0.05
+    assert np.sum(np.hypot(found[:, 0] - x, found[:, 1] - y) < 9) > 20
+
+
+def test_the_force_with_friction_has_its_own_direction() -> None:
+    """Violet, along the whole force as it is seen; a block that the slope's friction holds: straight up."""
+    record = short("block_on_slope", duration_s=0.5, **{"metrics.settle_s": 0.1})
+    painter = Film({"one": record}, view="side", plot="", size=(800, 500)).painters["one"]
+    row = len(record) - 1
+    force = record["contact_force"][row, 0]
+    (point,) = record.scene.contacts
+    x, y = painter.camera.project(point_positions(record, point, row))[:2] / FINER
+    found = pixels(painter.frame(float(record.time[row])), FRICTION)
+    assert len(found) > 20
+    right, up = painter.camera.axes[:2] @ force
+    # Tilted by the angle of the slope against the normal arrow, which covers its beginning.
+    along = np.array([right, -up]) / np.hypot(right, up)
+    across = (found - [x, y]) @ [along[1], -along[0]]
+    assert np.abs(across).mean() < 5.0
+    assert np.all((found - [x, y]) @ along > 0.0)
+
+
+@pytest.mark.parametrize("kind", ["arm", "mobile", "snake", "urdf"])
+@pytest.mark.parametrize("view", ["side", "iso"])
+def test_all_robots_are_painted_within_the_picture(kind: str, view: str, robots: dict[str, Record]) -> None:
+    film = Film({kind: robots[kind]}, view=view, size=(480, 320))
+    (painter,) = film.painters.values()
+    still = np.asarray(painter._still.reduce(FINER)).astype(int)
+    for instant in (film.times[0], film.times[-1]):
+        moving = np.abs(np.asarray(painter.frame(float(instant))).astype(int) - still).max(axis=2) > 20
+        rows, columns = np.nonzero(moving)
+        # It fills a good part of the picture and touches no edge.
+        assert np.ptp(rows) + np.ptp(columns) > 100
+        assert rows.min() > 0
+        assert columns.min() > 0
+        assert columns.max() < painter.size[0] - 1
+        assert film.frame(float(instant)).size == (480, 320)
+    assert np.any(np.asarray(film.frame(float(film.times[0]))) != np.asarray(film.frame(float(film.times[-1]))))
+
+
+def test_a_mesh_is_painted_with_its_faces(robots: dict[str, Record]) -> None:
+    painter = Film({"one": robots["urdf"]}, view="side").painters["one"]
+    # Three wedges of four triangles, a rod in place of the file that is not there, and hubs.
+    assert len(painter._meshes.found) == 3
+    lengths = np.ptp(painter._solids.corners[painter._solids.body == 0], axis=0)
+    np.testing.assert_allclose(lengths, [0.1, 0.1, 0.15], atol=1e-6)
+
+
+def test_faces_turn_outwards() -> None:
+    """A solid's volume by the divergence theorem is positive, and that of the shape."""
+    from dynsim.film.solids import solid
+
+    shapes = {
+        "box": ([0.1, 0.2, 0.3], 0.006),
+        "cylinder": ([0.1, 0.4], np.pi * 0.004),
+        "capsule": ([0.1, 0.4], np.pi * (0.004 + 4e-3 / 3)),
+        "sphere": ([0.1], np.pi * 4e-3 / 3),
+    }
+    for kind, (size, volume) in shapes.items():
+        corners, faces = solid({"kind": kind, "size": size, "p": [1.0, 2.0, 3.0], "q": [0.6, 0.0, 0.8, 0.0]}, [])
+        parts = [np.linalg.det(corners[face[list(three)]]) for face in faces for three in ((0, 1, 2), (0, 2, 3))]
+        # 28 sides and 8 rings enclose some 5 % less.
+        assert sum(parts) / 6 == pytest.approx(volume, rel=1e-9 if kind == "box" else 0.06)
+
+
+def test_the_cursor_is_at_the_time(braced: Record) -> None:
+    film = Film({"one": braced}, size=(640, 480), plot="q")
+    strip = film._strip
+    assert strip is not None
+    bare = np.asarray(strip._image).astype(int)
+    found = []
+    for instant in (0.0, 0.25, 0.5, 1.0):
+        changed = np.abs(np.asarray(strip.frame(instant)).astype(int) - bare).max(axis=2) > 0
+        found.append(np.nonzero(changed)[1].mean())
+    steps = np.diff(found)
+    np.testing.assert_allclose(steps, [steps.sum() / 4, steps.sum() / 4, steps.sum() / 2], atol=1.5)
+    assert steps.sum() > 400
+
+
+def test_a_run_that_diverged_and_one_of_a_single_sample(braced: Record, tmp_path: Path) -> None:
+    """Where there are no poses nothing moves into the picture; a single sample is one frame."""
+    for rows, count in ((slice(None), 26), (slice(0, 1), 1)):
+        record = Record(braced.time[rows], provenance=braced.provenance)
+        for name in ("q", POSITION, ORIENTATION, "hand_position", "contact_normal_force", "contact_force"):
+            data = braced[name][rows].astype(float)
+            if count > 1:
+                data[-30:] = np.nan
+            record.add(name, data, braced.units[name], labels=braced.labels[name])
+        record.scene = braced.scene
+        film = Film({"one": record}, size=(320, 240))
+        (painter,) = film.painters.values()
+        assert len(film.times) == count
+        first, last = (np.asarray(painter.frame(float(film.times[k]))) for k in (0, -1))
+        still = np.asarray(painter._still.reduce(FINER))
+        assert np.any(first != still)
+        assert np.array_equal(last, still) == (count > 1)
+        write({"one": record}, tmp_path / "film.gif", size=(320, 240), fps=5)
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        ({"size": (321, 240)}, "even numbers"),
+        ({"size": (32, 20)}, "even numbers"),
+        ({"speed": 0.0}, "speed"),
+        ({"speed": float("nan")}, "speed"),
+        ({"speed": 1e-5}, "frames are no film"),
+        ({"speed": 0.001, "size": (960, 540)}, "too much memory"),
+        ({"fps": 0}, "frames a second"),
+        ({"plot": "no_such"}, "no signal 'no_such'"),
+        ({"plot": "q", "size": (200, 200)}, "at least 240x220"),
+        ({"hold": -1.0}, "held"),
+        ({"view": "front"}, "seen from side, top, iso, not 'front'"),
+    ],
+)
+def test_numbers_beyond_bounds(braced: Record, tmp_path: Path, options: dict[str, object], problem: str) -> None:
+    with pytest.raises(RecordError, match=problem):
+        write({"one": braced}, tmp_path / "film.gif", **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_too_many_robots_for_the_size(braced: Record) -> None:
+    many = {str(k): braced for k in range(30)}
+    with pytest.raises(RecordError, match="30 robots need a larger"):
+        Film(many, size=(320, 240))
+    assert len(Film(dict(list(many.items())[:5]), size=(640, 480)).painters) == 5
+
+
+def test_other_kinds_of_files(braced: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(RecordError, match=r"\.mp4 or a file\.gif"):
+        write({"one": braced}, tmp_path / "film.avi")
+    with pytest.raises(RecordError, match="at most 50"):
+        write({"one": braced}, tmp_path / "film.gif", fps=60)
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(RecordError, match=r"pip install 'dynsim\[video\]'"):
+        write({"one": braced}, tmp_path / "film.mp4")
+    bare = Record(braced.time)
+    with pytest.raises(RecordError, match="nothing to view"):
+        write({"bare": bare}, tmp_path / "film.gif")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["gif", "mp4"])
+def test_interrupted_there_is_no_film_and_the_old_one_stays(braced: Record, tmp_path: Path, kind: str) -> None:
+    if kind == "mp4":
+        pytest.importorskip("av")
+    path = tmp_path / f"film.{kind}"
+    path.write_bytes(b"old")
+
+    def stop(done: int, total: int) -> None:
+        if done == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write({"one": braced}, path, size=(160, 160), progress=stop)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr("sys.argv", ["dynsim", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert isinstance(end.value.code, int)
+    return end.value.code
+
+
+def test_records_of_a_folder_are_in_the_order_of_its_comparison(tmp_path: Path) -> None:
+    for name in ("a", "b", "c"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "record.h5").touch()
+    assert [path.parent.name for path in record_files([tmp_path])] == ["a", "b", "c"]
+    (tmp_path / "comparison.json").write_text('{"variants": {"c": {}, "gone": {}, "a": {}}}')
+    assert [path.parent.name for path in record_files([tmp_path])] == ["c", "a", "b"]
+    (tmp_path / "comparison.json").write_text("[]")
+    assert [path.parent.name for path in record_files([tmp_path])] == ["a", "b", "c"]
+
+
+def test_command(
+    braced: Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("a", "b"):
+        (tmp_path / "all" / name).mkdir(parents=True)
+        braced.save(tmp_path / "all" / name / "record.h5")
+    out = tmp_path / "film.gif"
+    quick = ("--fps", 5, "--size", "320x240", "--hold", 0)
+    # A record, the folder of a run, the folder of a comparison.
+    for named in ("all/a/record.h5", "all/a", "all"):
+        assert run(monkeypatch, "animate", tmp_path / named, "--out", out, "--view", "side", *quick) == 0
+        assert decoded(out) == (6, (320, 240), pytest.approx(1.2))
+        assert "film.gif" in capsys.readouterr().out
+        out.unlink()
+    for wrong, problem in (
+        (("--size", "big"), "WIDTHxHEIGHT"),
+        (("--out", "film"), "FILE.mp4 or FILE.gif"),
+        (("--plot", "nothing"), "no signal"),
+    ):
+        assert run(monkeypatch, "animate", tmp_path / "all/a", "--out", out, *quick, *wrong) != 0
+        assert problem in capsys.readouterr().err
+    (tmp_path / "empty").mkdir()
+    assert run(monkeypatch, "animate", tmp_path / "empty", "--out", out) != 0
+    assert "no record.h5 there" in " ".join(capsys.readouterr().err.split())
+    assert not out.exists()
+    drawn: list[tuple[list[str], Path]] = []
+    monkeypatch.setattr(commands, "draw", lambda figures, quiet: drawn.append((list(figures.records), figures.folder)))
+    assert run(monkeypatch, "plot", tmp_path / "all", "--out", tmp_path / "figures") == 0
+    assert [folder.name for _, folder in drawn] == ["two_elbows", "two_elbows_2", "figures"]
+    assert run(monkeypatch, "plot", tmp_path / "all" / "a") == 0
+    assert drawn[-1] == (["two_elbows"], tmp_path / "all" / "a" / "figures")
+    # The same folders elsewhere.
+    assert run(monkeypatch, "view", tmp_path / "all", "--no-open") == 0
+    assert (tmp_path / "all" / "view.html").is_file()
+    assert run(monkeypatch, "view", tmp_path / "all" / "b", "--no-open") == 0
+    assert (tmp_path / "all" / "b" / "view.html").is_file()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
+def test_ctrl_c_leaves_nothing(braced: Record, tmp_path: Path) -> None:
+    braced.save(tmp_path / "record.h5")
+    (tmp_path / "films").mkdir()
+    command = [
+        sys.executable,
+        "-m",
+        "dynsim",
+        "animate",
+        str(tmp_path / "record.h5"),
+        "--speed",
+        "0.01",
+        "--size",
+        "320x240",
+    ]
+    process = subprocess.Popen(
+        [*command, "--out", str(tmp_path / "films" / "film.gif")],
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+    try:
+        end = time.monotonic() + 120.0
+        # The temporary file is there: it is at work.
+        while not list((tmp_path / "films").iterdir()):
+            assert process.poll() is None, process.stderr and process.stderr.read()
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(120.0) == 130
+        assert list((tmp_path / "films").iterdir()) == []
+    finally:
+        process.kill()
+        process.communicate()
