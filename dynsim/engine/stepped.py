@@ -108,3 +108,4 @@ class Snapshot:
     trace: tuple[tuple[Rows, ...], int]
     happened: tuple[Event, ...]
     frozen: bool
+    operator: dict[str, Any] | None = None
