@@ -183,4 +183,5 @@ class Timed:
         """The commands of one period."""
         if self._all is None:
             self._all = self.script.read(0, first + count, period)
-        return CommandBlock(*(column[first : first + 1] for column in self._all))
+        here = slice(first, first + 1)
+        return CommandBlock(self._all.velocity[here], self._all.request[here], self._all.gripper[here])

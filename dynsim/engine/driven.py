@@ -1,7 +1,7 @@
 """A scenario in the hands of a pilot: tick by tick, with a script of what was asked that gives the same run again.
 
-A script is part of a scenario, so a drive leaves a scenario: that of which it was made, with its commands and as long as
-it took. What the commands are is the plant's: :mod:`dynsim.engine.driven_snake`, :mod:`dynsim.engine.driven_arm`.
+A script is part of a scenario, so a drive leaves a scenario: that of which it was made, with its commands and as long
+as it took. What the commands are is the plant's: :mod:`dynsim.engine.driven_snake`, :mod:`dynsim.engine.driven_arm`.
 """
 
 from __future__ import annotations

@@ -13,10 +13,9 @@ from dynsim.engine.outcome import kernels_logged
 from dynsim.engine.simulation import Simulation
 from dynsim.errors import ScenarioError
 from dynsim.model.control import PLANNED
+from dynsim.model.drives import TorqueSource
 from dynsim.model.mobile_base import base_pose
 from dynsim.model.operated import BASE, HAND, VELOCITIES
-from dynsim.model.drives import TorqueSource
-from dynsim.model.scene import robot_scene
 from dynsim.record import Record
 from dynsim.record.poses import poses_at
 from dynsim.scenario import Scenario, build
@@ -55,7 +54,9 @@ class DrivenArm:
         self.simulation = Simulation(begun, duration=math.inf, operator=self._source)
         robot = self.simulation.robot
         self._still = _tried(begun, log)
-        self._scene = robot_scene(robot, self.simulation.contacts, build.surfaces(begun))
+        scene = self._still.scene
+        assert scene is not None
+        self._scene = scene
         self._rate = float(self._operator.get("rate_hz", 100.0))
         self.period, self.ticks = 1.0 / self._rate, 0
         self._commands: list[dict[str, Any]] = []

@@ -99,7 +99,7 @@ class DrivenSnake:
         return Shown(
             time=self.ticks * self.period,
             poses=poses_at(self._scene, signals),
-            hand=state.w_target.copy(),
+            hand=state.w_target[:3].copy(),
             waiting=run.blocked or run.recovering,
             extra={
                 "wheels": run.controller.law.grounded[row].tolist(),

@@ -1,8 +1,8 @@
 """An operator at a stepped simulation: velocities of hand and base become references, rewritten at every tick.
 
-The hand's target p_d moves with the velocity v that is asked for, in axes of the world, on a mobile base in those of the
-base, which carries it. Each tick of length h takes the joints to where the hand is at p_d + h v (damped Gauss–Newton,
-:func:`dynsim.kernels.inverse_kinematics.follow_path`), at constant rates:
+The hand's target p_d moves with the velocity v that is asked for, in axes of the world; on a mobile base in those of
+the base, which carries it. Each tick of length h takes the joints to where the hand is at p_d + h v, at constant rates
+(damped Gauss–Newton, :func:`dynsim.kernels.inverse_kinematics.follow_path`):
 
     q_d(t) = q_d + (q_d⁺ − q_d) (t − t_k)/h
 
@@ -122,9 +122,8 @@ class Operator:
         operated, arrays, q = self.operated, self._arrays, self._q.copy()
         place = arrays.place
         result, nothing = np.zeros((1, len(place))), np.zeros((1, 0))
-        ended, _ = ki.follow_path(
-            self._model.arrays, self._workspace, arrays, target[None].copy(), nothing, 0, 0, 1, operated.tolerance, q, result
-        )
+        targets, model, ws = target[None].copy(), self._model.arrays, self._workspace
+        ended, _ = ki.follow_path(model, ws, arrays, targets, nothing, 0, 0, 1, operated.tolerance, q, result)
         change = np.abs(q[place] - self._q[place]).max() * operated.rate
         within = bool((q[place] >= self._low).all() and (q[place] <= self._high).all())
         return (q, target) if ended == 1 and within and change <= operated.rate_limit else None

@@ -34,7 +34,6 @@ from dynsim.kernels.state import JOINT, block
 from dynsim.kernels.tree import loads as kl
 from dynsim.measures import TIP_OVER
 from dynsim.model.arrays import check_couplings
-from dynsim.model.description import Contact
 from dynsim.model.drives import Drive
 from dynsim.model.model import Model
 from dynsim.model.operated import VelocitySource
@@ -163,11 +162,6 @@ class Simulation:
     def model(self) -> Model:
         """Its rigid-body model; ``armature`` is very large where a brake is closed."""
         return self._prepared.model
-
-    @property
-    def contacts(self) -> Sequence[Contact]:
-        """Its contact points."""
-        return tuple(self._prepared.contacts)
 
     @property
     def operator(self) -> Operator | None:

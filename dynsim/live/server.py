@@ -1,7 +1,7 @@
 """The server: the page by HTTP, wishes and frames by a web socket, on this machine alone.
 
-Every user of a machine can reach its loopback, and every web page can ask a browser to: so there is a token in the path,
-``Host`` must be this server (against names that are bound to it anew), and ``Origin`` of a socket must be its own page.
+Every user of a machine can reach its loopback, and every web page can ask a browser to: so there is a token in the
+path, ``Host`` must be this server (against names that are bound to it anew), and a socket's ``Origin`` its own page.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ class Server:
             self._thread.join()
 
     def show(self, frame: Mapping[str, Any]) -> None:
-        """Give every client a new frame; from any thread. One that is still busy with older ones gets the newest only."""
+        """Give every client a new frame; from any thread. One that is still busy gets only the newest."""
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._announce, json.dumps(frame, separators=(",", ":")))
 

@@ -91,8 +91,10 @@ def _axes(values: Any, count: int) -> tuple[float, ...]:
     found = []
     for value in values:
         # Whole numbers may have thousands of digits, and decimals overflow to infinity.
-        if isinstance(value, bool) or not isinstance(value, int | float) or not (
-            isinstance(value, int) or math.isfinite(value)
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not (isinstance(value, int) or math.isfinite(value))
         ):
             raise Refused("axes: must be finite numbers")
         found.append(round(STEPS * max(-1.0, min(1.0, value))) / STEPS)
