@@ -139,7 +139,9 @@ def _tried(scenario: Scenario, log: logging.Logger) -> Record:
     with kernels_logged(log):
         trial = Simulation(scenario, duration=math.inf, operator=source)
         trial.advance(2.0 / trial.operator.operated.rate if trial.operator is not None else 0.0)
-    return trial.record()
+    moment = trial.record()
+    moment.complete = True
+    return moment
 
 
 def _followers(scenario: Scenario, controller: dict[str, Any]) -> dict[str, Any]:

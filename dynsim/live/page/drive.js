@@ -3,6 +3,9 @@
 // `dynsim.drive` is what a test may look at: role, state, axes now, round trip, frames seen.
 
 const PERIOD_MS = 20, DEAD_ZONE = 0.12;
+// Words later than this show that drawing takes too long [ms]: fewer points are drawn then, and fewer frames, because a
+// page that is busy hears no key let go. No longer silence is allowed for it.
+const BUSY_MS = 60, LEAST_RATIO = 0.35;
 // Keys by the name of an axis: forth and back.
 const AXIS_KEYS = {
   x: ["KeyW", "KeyS"], y: ["KeyA", "KeyD"], z: ["KeyR", "KeyF"],
@@ -21,7 +24,7 @@ class Drive {
     this.keys = new Set();
     this.sticks = new Map();
     Object.assign(this, { role: "watching", free: true, state: "connecting", count: 0, frames: 0, trip: NaN, closed: false, scale: 1,
-      request: null, sent: new Map(), newest: null, ended: false, refused: [], wish: null, grip: false });
+      request: null, slow: 0, drawnAt: 0, eased: 0, ratio: 1, sent: new Map(), newest: null, ended: false, refused: [], wish: null, grip: false });
     document.head.append(D.element("style", { textContent: DRIVE.style }));
     this.socket = new WebSocket(DRIVE.socket);
     this.socket.onmessage = (event) => this.hear(JSON.parse(event.data));
@@ -60,6 +63,9 @@ class Drive {
 
   // What is asked for, 50 times a second: each device counts while its own key is held.
   beat() {
+    const now = performance.now(), gap = now - (this.beatAt ?? now);
+    this.beatAt = now;
+    this.slow = Math.max(0.97 * this.slow, gap);
     if (this.role !== "pilot") return;
     const axes = this.names.map(() => 0), add = (values) => values.forEach((v, k) => { axes[k] += v; });
     let held = false;
@@ -160,7 +166,7 @@ class Drive {
     hold.id = "hold";
     hold.onpointerdown = (event) => { hold.setPointerCapture(event.pointerId); this.button = true; };
     hold.onpointerup = hold.onpointercancel = hold.onlostpointercapture = () => { this.button = false; };
-    const speed = D.element("input", { type: "range", min: "0.1", max: "1", step: "0.1", value: "1", title: "part of full speed", id: "scale" });
+    const speed = D.element("input", { type: "range", min: "0.1", max: "1", step: "0.1", value: "1", title: "part of full speed", id: "part" });
     speed.oninput = () => { this.scale = Number(speed.value); };
     this.grips = button("", "gripper (g)", () => this.toggleGripper());
     const modes = hello.modes.length ? D.element("select", { id: "mode", title: "mode, taken when the key is held" },
@@ -185,19 +191,34 @@ class Drive {
     this.bar = D.element("div", { className: "bar" }, this.stateBox, this.roleButton, acts, this.timing, this.lateBox, keys);
     this.box.append(sticks, this.bar);
     document.getElementById("view").append(this.box);
+    // What drives away is followed.
+    dynsim.set("follow", ["ahead", "gamma"].some((name) => this.names.includes(name)));
     this.tell();
   }
 
   draw() {
-    const frame = this.newest;
-    if (!frame) return;
+    const frame = this.newest, now = performance.now();
+    if (!frame || (this.slow > BUSY_MS && now - this.drawnAt < 2 * this.slow)) return;
+    this.ease(now);
+    this.drawnAt = now;
     this.newest = null;
     this.frames++;
-    dynsim.frame({ time: frame.time, poses: frame.poses, ...(frame.wheels ? { wheels: frame.wheels } : {}),
+    dynsim.frame({ time: frame.time, poses: frame.poses, pressure: null, ...(frame.wheels ? { wheels: frame.wheels } : {}),
       ...(frame.contacts ? { contacts: frame.contacts } : {}), ...(frame.gripper === undefined ? {} : { gripper: frame.gripper }) });
     this.last = frame;
     if (!this.ended) this.state = frame.state;
     this.tell();
+  }
+
+  ease(now) {
+    if (this.slow < BUSY_MS || this.ratio <= LEAST_RATIO || now - this.eased < 1000) return;
+    this.eased = now;
+    this.ratio *= 0.7;
+    const stage = dynsim.app.stage;
+    stage.shadows(false);
+    stage.renderer.setPixelRatio(this.ratio);
+    stage.renderer.setSize(...stage.size, false);
+    stage.touch();
   }
 
   tell() {
