@@ -31,8 +31,8 @@ from dynsim.figures.solids import faces, outline
 from dynsim.figures.style import Array
 from dynsim.measures import hand_target
 from dynsim.record import Record
-from dynsim.record.quaternion import rotated
 from dynsim.record.scene import Surface
+from dynsim.record.surface_points import surface_grids
 
 # An axis of the 3D view shorter than this share of the longest has two ticks.
 SHORT_AXIS = 0.45
@@ -255,8 +255,9 @@ def _space_view(
 
 def _draw_surface(axes: Axes3D, surface: Surface, low: Array, high: Array) -> None:
     """The part of a surface next to the arm."""
-    grids = [_field(surface)] if surface.kind == "height_field" else _faces(surface) if surface.kind == "box" else []
-    grids = [_within(grid, low, high) for grid in grids] or [_quadric(surface, low, high)]
+    grids = surface_grids(surface, low, high)
+    if surface.kind in ("height_field", "box"):
+        grids = [_within(grid, low, high) for grid in grids]
     cells = [
         np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], axis=2).reshape(-1, 4, 3)
         for grid in grids
@@ -270,59 +271,11 @@ def _draw_surface(axes: Axes3D, surface: Surface, low: Array, high: Array) -> No
         )
 
 
-def _field(surface: Surface) -> Array:
-    """Points of a height field, (ny, nx, 3)."""
-    x, y = np.meshgrid(*surface.grid)
-    return np.stack([x, y, np.array(surface.heights)], axis=-1)
-
-
-def _faces(surface: Surface) -> list[Array]:
-    """Points of the six faces of a box, its edges sharp, (n, n, 3) each."""
-    half, R = 0.5 * np.array(surface.edges), rotated(np.array(surface.orientation), np.eye(3))
-    u, v = np.meshgrid(*2 * [np.linspace(-1.0, 1.0, 13)])
-    found = []
-    for axis in range(3):
-        for side in (-1.0, 1.0):
-            local = np.roll(np.stack([np.full_like(u, side), u, v], axis=-1), axis, axis=-1) * half
-            found.append(np.array(surface.position) + local @ R.T)
-    return found
-
-
 def _within(grid: Array, low: Array, high: Array) -> Array:
     """Points as they are near the arm, NaN elsewhere."""
     room = 0.1 * float((high - low).max())
     near = ((grid >= low - room) & (grid <= high + room)).all(axis=-1, keepdims=True)
     return np.where(near, grid, np.nan)
-
-
-def _quadric(surface: Surface, low: Array, high: Array) -> Array:
-    """Points of a quadric: over its tangent plane next to the arm, along the normal to the nearest root of C."""
-    anchor = 0.5 * (low + high)
-    normal = np.zeros(3)
-    for _ in range(20):
-        slope = surface.gradient(anchor)
-        if not np.linalg.norm(slope) > 1e-12:
-            return np.full((1, 1, 3), np.nan)
-        normal = slope / np.linalg.norm(slope)
-        anchor = anchor - surface.gap(anchor) * normal
-    # Along the axes of the world where that is possible.
-    across = np.eye(3)[:2] if abs(normal[2]) > 0.99 else np.linalg.svd(normal[None])[2][1:]
-    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-    reach = (corners - anchor) @ across.T
-    # A flat surface is one polygon: seams between many would show.
-    Q = np.array(surface.Q)
-    count = 41 if Q.any() else 2
-    u, v = np.meshgrid(*(np.linspace(reach[:, k].min(), reach[:, k].max(), count) for k in (0, 1)))
-    start = anchor + u[..., None] * across[0] + v[..., None] * across[1]
-    a = 0.5 * float(normal @ Q @ normal)
-    b = start @ Q @ normal + float(np.array(surface.b) @ normal)
-    c = surface.value(start)
-    inside = b * b - 4.0 * a * c
-    # The smaller root, in the form that also holds for a = 0.
-    step = -2.0 * c / (b + np.copysign(np.sqrt(np.where(inside >= 0.0, inside, np.nan)), b))
-    points = start + step[..., None] * normal
-    points[np.abs(step) > float((high - low).max())] = np.nan
-    return np.asarray(points)
 
 
 def _contact_mark(force: float) -> dict[str, Any]:

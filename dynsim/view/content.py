@@ -16,9 +16,10 @@ from dynsim.measures import hand_target
 from dynsim.record import TIME, Record, Signal
 from dynsim.record.poses import ORIENTATION, POSITION, point_positions
 from dynsim.record.scene import Scene
+from dynsim.record.surface_points import normals
 from dynsim.view.blocks import Blocks
 from dynsim.view.meshes import Meshes
-from dynsim.view.solids import body_shapes, drawn_shape, drawn_surface, normals
+from dynsim.view.solids import body_shapes, drawn_shape, drawn_surface
 from dynsim.view.wheels import cop_of, supports, wheel_groups
 
 Array = NDArray[np.float64]

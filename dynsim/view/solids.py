@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from dynsim.record.quaternion import of_turn
 from dynsim.record.scene import HERE, WORLD, Body, Scene, Shape, Surface
+from dynsim.record.surface_points import box_corners, surface_grids
 from dynsim.view.meshes import Meshes
 
 Array = NDArray[np.float64]
@@ -16,8 +17,6 @@ Array = NDArray[np.float64]
 ROD = 0.008
 # A sphere or cylinder of more than this many times what is shown is drawn only next to the robot.
 LARGE = 4.0
-# Points along each side of the part of a curved surface that is drawn.
-PATCH = 41
 
 
 def drawn_shape(shape: Shape, meshes: Meshes) -> dict[str, Any] | None:
@@ -119,7 +118,7 @@ def drawn_surface(surface: Surface, low: Array, high: Array) -> dict[str, Any]:
         return found | {"p": list(surface.position or ()), "radius": surface.radius}
     if surface.kind == "cylinder" and near and surface.direction is not None:
         axis, place = np.array(surface.direction), np.array(surface.position)
-        along = [(corner - place) @ axis for corner in _corners(low, high)]
+        along = [(corner - place) @ axis for corner in box_corners(low, high)]
         start, end = min(along) - 0.1 * span, max(along) + 0.1 * span
         return found | {
             "p": (place + 0.5 * (start + end) * axis).tolist(),
@@ -133,53 +132,7 @@ def drawn_surface(surface: Surface, low: Array, high: Array) -> dict[str, Any]:
             "q": list(surface.orientation or HERE),
             "size": list(surface.edges or ()),
         }
-    if surface.kind == "height_field":
-        x, y = np.meshgrid(*surface.grid)
-        grid = np.stack([x, y, np.array(surface.heights)], axis=-1)
-    else:
-        grid = patch(surface, low, high)
+    (grid,) = surface_grids(surface, low, high)
     rows, columns, _ = grid.shape
     numbers = [None if not np.isfinite(value) else round(float(value), 5) for value in grid.ravel()]
     return found | {"kind": "grid", "rows": rows, "columns": columns, "points": numbers}
-
-
-def patch(surface: Surface, low: Array, high: Array) -> Array:
-    """Points of a quadric over its tangent plane next to the box, (n, n, 3), NaN where there are none."""
-    anchor, normal = 0.5 * (low + high), np.array([0.0, 0.0, 1.0])
-    for _ in range(20):
-        slope = surface.gradient(anchor)
-        if not np.linalg.norm(slope) > 1e-12:
-            return np.full((2, 2, 3), np.nan)
-        normal = slope / np.linalg.norm(slope)
-        anchor = anchor - surface.gap(anchor) * normal
-    across = np.linalg.svd(normal[None])[2][1:]
-    reach = (_corners(low, high) - anchor) @ across.T
-    u, v = np.meshgrid(*(np.linspace(reach[:, k].min(), reach[:, k].max(), PATCH) for k in (0, 1)))
-    start = anchor + u[..., None] * across[0] + v[..., None] * across[1]
-    # C along the normal: a s² + b s + c = 0, the smaller root in the form that also holds for a = 0.
-    Q, c = np.array(surface.Q), surface.value(start)
-    a = 0.5 * float(normal @ Q @ normal)
-    b = start @ Q @ normal + float(np.array(surface.b) @ normal)
-    inside = b * b - 4.0 * a * c
-    with np.errstate(all="ignore"):
-        step = -2.0 * c / (b + np.copysign(np.sqrt(np.where(inside >= 0.0, inside, np.nan)), b))
-    points = start + step[..., None] * normal
-    points[~(np.abs(step) <= float((high - low).max()))] = np.nan
-    return np.asarray(points)
-
-
-def normals(surface: Surface, points: Array) -> Array:
-    """Unit normals into the free side at points, (T, 3) → (T, 3)."""
-    if surface.kind in ("box", "height_field"):
-        step = 1e-6
-        ends = [points + side * step * axis for axis in np.eye(3) for side in (1.0, -1.0)]
-        values = [surface.value(end) for end in ends]
-        slope = np.stack([values[2 * k] - values[2 * k + 1] for k in range(3)], axis=-1)
-    else:
-        slope = points @ np.array(surface.Q) + np.array(surface.b)
-    size = np.linalg.norm(slope, axis=-1, keepdims=True)
-    return np.asarray(slope / np.where(size > 0.0, size, 1.0))
-
-
-def _corners(low: Array, high: Array) -> Array:
-    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import termios
+import time
 import tty
 from collections import deque
 
@@ -190,7 +191,6 @@ def test_6_a_dead_terminal_raises_more_than_serial_errors() -> None:
     assert stock_port.ser.write_timeout is None
     assert not PortHandler(name).setBaudRate(4_500_000)
     port = open_serial_port(name, 1_000_000, exclusive=False)
-    assert port.ser.write_timeout == WRITE_TIMEOUT
     os.close(slave)
     os.close(master)
     with pytest.raises((termios.error, OSError)):
@@ -201,6 +201,28 @@ def test_6_a_dead_terminal_raises_more_than_serial_errors() -> None:
         DynamixelBus(port).sync_read((1,), *STATE_BLOCK)
     stock_port.ser.close()
     DynamixelBus(port).close()
+
+
+def test_6_a_process_that_was_stopped_in_a_write_has_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    write = os.write
+
+    def stopped(descriptor: int, data: bytes) -> int:
+        written = write(descriptor, data)
+        time.sleep(1.2 * WRITE_TIMEOUT)
+        return written
+
+    port = open_serial_port(os.ttyname(slave), 1_000_000)
+    port.ser.write_timeout = WRITE_TIMEOUT
+    monkeypatch.setattr(os, "write", stopped)
+    with pytest.raises(serial.SerialTimeoutException):
+        port.ser.write(b"abc")
+    assert port.writePort(list(b"def")) == 3
+    assert os.read(master, 10) == b"abcdef"
+    port.closePort()
+    os.close(slave)
+    os.close(master)
 
 
 def test_6_a_port_that_blocks_is_given_up() -> None:

@@ -11,6 +11,7 @@ from dynsim.errors import RecordError
 from dynsim.model.description import Quadric
 from dynsim.model.protocols import BuildContext
 from dynsim.record.scene import Body, Joint, Point, Scene, Shape, Surface, quaternion
+from dynsim.record.surface_points import normals, surface_grids
 from dynsim.surfaces import cylinder, plane, sphere
 
 CONTEXT = BuildContext(1.0)
@@ -97,3 +98,29 @@ def test_quaternions_of_rotations():
         cross = np.array([[0.0, -x[2], x[1]], [x[2], 0.0, -x[0]], [-x[1], x[0], 0.0]])
         np.testing.assert_allclose(np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross, R, atol=1e-15)
         assert w >= 0.0
+
+
+@pytest.mark.parametrize(
+    "drawn",
+    [
+        Surface.of_quadric("cone", np.diag([1.0, 1.0, -1.0]), np.zeros(3), 0.0),
+        Surface.of_quadric("ellipsoid", np.diag([1.0, 4.0, 2.0]), [0.1, 0.0, -0.3], -0.5),
+        Surface.of_quadric("slope", np.zeros((3, 3)), [0.0, 0.6, 0.8], -0.1),
+    ],
+)
+def test_points_of_quadrics_are_on_them(drawn: Surface):
+    low, high = np.array([0.1, -0.4, 0.2]), np.array([0.9, 0.5, 0.8])
+    (grid,) = surface_grids(drawn, low, high)
+    points = grid[np.isfinite(grid).all(axis=-1)]
+    assert len(points) > 3
+    # Roots of a quadratic of numbers of the order of one.
+    np.testing.assert_allclose(drawn.value(points), 0.0, atol=1e-12)
+    # A flat one has no seams between cells.
+    assert grid.shape[:2] == ((2, 2) if drawn.kind == "plane" else (41, 41))
+    slopes = np.array([drawn.gradient(point) for point in points])
+    np.testing.assert_allclose(normals(drawn, points), slopes / np.linalg.norm(slopes, axis=1)[:, None], atol=1e-12)
+
+
+def test_a_surface_without_points_has_none_to_draw():
+    (grid,) = surface_grids(Surface.of_quadric("s", np.eye(3), np.zeros(3), 1.0), np.full(3, -1.0), np.ones(3))
+    assert np.isnan(grid).all()

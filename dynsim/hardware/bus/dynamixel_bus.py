@@ -13,12 +13,13 @@ each: when one fails, the library was mended and the detour can go):
 - Its single read takes any status of the servo for the answer, whatever its length: it is received here too.
 - ``getData`` knows no negative numbers: fields decode themselves.
 - A dead port raises termios.error or OSError beside SerialException; a stalled one blocks: all become PortError, and
-  writes have a time-out.
+  writes wait here. pyserial's write with a time-out counts the time in which this very process was stopped.
 """
 
 from __future__ import annotations
 
 import errno
+import os
 import select
 import termios
 from collections.abc import Iterable, Iterator, Sequence
@@ -35,6 +36,7 @@ from dynsim.hardware.bus.protocol import BlockRead, NoAnswer, RequestRefused, Se
 from dynsim.hardware.errors import PortError
 
 WRITE_TIMEOUT = 0.25
+"""Longest wait for a port that takes no byte [s]."""
 READ_WAIT = 5e-4
 """Longest wait for a byte before time-outs are looked at [s]."""
 NOTHING_TO_READ = "returned no data"
@@ -62,7 +64,6 @@ class SerialPort(PortHandler):
             baudrate=self.baudrate,
             bytesize=serial.EIGHTBITS,
             timeout=0,
-            write_timeout=WRITE_TIMEOUT,
             exclusive=self.exclusive or None,
         )
         self.is_open = True
@@ -80,6 +81,17 @@ class SerialPort(PortHandler):
             if self.exclusive or NOTHING_TO_READ not in str(error):
                 raise
             return b""
+
+    def writePort(self, packet: Iterable[int]) -> int:
+        # pyserial counts the time in which this process was stopped: a write that was done counted as one that blocked.
+        left = data = bytes(packet)
+        while left:
+            try:
+                left = left[os.write(self.ser.fileno(), left) :]
+            except BlockingIOError:
+                if not select.select([], [self.ser.fileno()], [], WRITE_TIMEOUT)[1]:
+                    raise serial.SerialTimeoutException("write timeout") from None
+        return len(data)
 
 
 def open_serial_port(name: str, baud: int, *, exclusive: bool = True) -> SerialPort:

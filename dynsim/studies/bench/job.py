@@ -18,9 +18,9 @@ from dynsim.kernels.state import block
 from dynsim.scenario import build, load_scenario
 from dynsim.studies.bench import mujoco_peer
 from dynsim.studies.bench.programs import (
-    DYNSIM_DEFAULT,
     DYNSIM_RADAU5,
     DYNSIM_RK4,
+    DYNSIM_RK43,
     MUJOCO_EULER,
     MUJOCO_IMPLICIT,
     SCENARIO,
@@ -65,7 +65,7 @@ CASES = {
 }
 # Method, first or fixed step, rtol, atol.
 _INTEGRATORS = {
-    DYNSIM_DEFAULT: ("rk43", 0.0, 1e-6, 1e-8),
+    DYNSIM_RK43: ("rk43", 0.0, 1e-6, 1e-8),
     DYNSIM_RADAU5: ("radau5", 0.0, 1e-6, 1e-8),
     DYNSIM_RK4: ("rk4", STEP, 1e-6, 1e-8),
 }

@@ -9,7 +9,7 @@ MUJOCO_FREE, MUJOCO_CONTACTS = "MuJoCo mj_step", "MuJoCo mj_step, 2 contacts"
 CONTENDERS = (DYNSIM_FREE, DYNSIM_CONTACTS, ABA, CONSTRAINT_DYNAMICS, LCABA, MUJOCO_FREE, MUJOCO_CONTACTS)
 """Of the right-hand side."""
 
-DYNSIM_DEFAULT, DYNSIM_RK4 = "dynsim rk43 rtol 1e-6", "dynsim RK4 1 ms"
+DYNSIM_RK43, DYNSIM_RK4 = "dynsim rk43 rtol 1e-6", "dynsim RK4 1 ms"
 DYNSIM_RADAU5 = "dynsim radau5 rtol 1e-6"
 MUJOCO_EULER, MUJOCO_IMPLICIT = "MuJoCo Euler 1 ms", "MuJoCo implicitfast 1 ms"
 """Of the whole job."""

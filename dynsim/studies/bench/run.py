@@ -9,21 +9,22 @@ from collections.abc import Callable
 from typing import Any
 
 from dynsim._version import __version__
-from dynsim.studies.bench import job, right_hand_side, together
+from dynsim.studies.bench import job, precision, right_hand_side, together
 from dynsim.studies.bench.programs import (
     ABA,
     CONSTRAINT_DYNAMICS,
     DYNSIM_CONTACTS,
-    DYNSIM_DEFAULT,
     DYNSIM_FREE,
     DYNSIM_RADAU5,
     DYNSIM_RK4,
+    DYNSIM_RK43,
     LCABA,
     MUJOCO_CONTACTS,
     MUJOCO_EULER,
     MUJOCO_FREE,
     MUJOCO_IMPLICIT,
     ONE_STATE,
+    SCENARIO,
     STEP,
 )
 
@@ -41,7 +42,7 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
 
     Parameters
     ----------
-    quick : fewer rounds, and MuJoCo only up to 300 links
+    quick : fewer rounds, MuJoCo only up to 300 links, work and precision of one scenario
     progress : called with what comes next and the fraction done
 
     Returns
@@ -49,7 +50,8 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
     dict, ready for JSON
         ``machine``, ``versions``, ``method`` (how it was measured), ``right_hand_side`` (per size: microseconds by
         contender, medians and minima), ``job`` (per case and program: wall time and errors), ``together`` (per state
-        and per step of a run: microseconds alone and on lanes), ``ratios`` (how many times longer the other program
+        and per step of a run: microseconds alone and on lanes), ``precision`` (per shipped scenario, method and
+        tolerance: time, error, ledger), ``ratios`` (how many times longer the other program
         takes, or dynsim otherwise), ``unavailable`` (what is missing and why).
     """
     report = progress or (lambda text, fraction: None)
@@ -59,7 +61,7 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
     sizes: list[dict[str, Any]] = []
     python_call = None
     for k, n in enumerate(SIZES):
-        report(f"right-hand side, {n} links", 0.6 * k / len(SIZES))
+        report(f"right-hand side, {n} links", 0.4 * k / len(SIZES))
         with_mujoco = not mujoco_missing and n <= MUJOCO_LINKS_MAX[quick]
         samples = right_hand_side.measure(
             n, rounds, share, with_pinocchio=n <= PINOCCHIO_LINKS_MAX[quick], with_mujoco=with_mujoco
@@ -70,10 +72,15 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
         sizes.append(right_hand_side.row(n, samples, python_call or 0.0))
     jobs: list[dict[str, Any]] = []
     for k, case in enumerate(job.CASES):
-        report(f"10 s job, {case}", 0.6 + 0.35 * k / len(job.CASES))
+        report(f"10 s job, {case}", 0.4 + 0.2 * k / len(job.CASES))
         jobs += job.measure_job(case, 3 if quick else 21, with_mujoco=not mujoco_missing)
-    report("runs that share lanes", 0.95)
+    report("runs that share lanes", 0.6)
     shared = together.measure(rounds, share)
+    exact: list[dict[str, Any]] = []
+    names = [SCENARIO] if quick else list(precision.scenarios())
+    for k, name in enumerate(names):
+        report(f"work and precision, {name}", 0.65 + 0.35 * k / len(names))
+        exact += precision.measure(name, 1 if quick else precision.ROUNDS)
     report("done", 1.0)
     result: dict[str, Any] = {
         "machine": _machine(),
@@ -95,9 +102,10 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
         "right_hand_side": sizes,
         "job": jobs,
         "together": shared,
+        "precision": exact,
         "unavailable": {"mujoco": mujoco_missing} if mujoco_missing else {},
     }
-    result["ratios"] = [*_ratios(sizes, jobs), *_own_ratios(jobs, shared)]
+    result["ratios"] = [*_ratios(sizes, jobs), *_own_ratios(jobs, shared), *_at_equal_error(exact)]
     return result
 
 
@@ -106,11 +114,11 @@ def _own_ratios(jobs: list[dict[str, Any]], shared: list[dict[str, Any]]) -> lis
     rows = []
     for case in job.CASES:
         row = {one["program"]: one for one in jobs if one["case"] == case}
-        explicit, implicit = row[DYNSIM_DEFAULT], row[DYNSIM_RADAU5]
+        explicit, implicit = row[DYNSIM_RK43], row[DYNSIM_RADAU5]
         rows.append(
             {
                 "task": f"10 s job, {case}, by method",
-                "peer": DYNSIM_DEFAULT,
+                "peer": DYNSIM_RK43,
                 "dynsim": DYNSIM_RADAU5,
                 "time": explicit["cpu_median_s"] / implicit["cpu_median_s"],
                 "time_minima": explicit["cpu_minimum_s"] / implicit["cpu_minimum_s"],
@@ -129,6 +137,23 @@ def _own_ratios(jobs: list[dict[str, Any]], shared: list[dict[str, Any]]) -> lis
                         "time_minima": one["minimum_us"][ONE_STATE] / one["minimum_us"][name],
                     }
                 )
+    return rows
+
+
+def _at_equal_error(exact: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """How many times longer the explicit methods take than radau5 for the same error of 1e-6."""
+    rows = []
+    for scenario in dict.fromkeys(row["scenario"] for row in exact):
+        of_one = [row for row in exact if row["scenario"] == scenario]
+        for explicit in ("rk43", "dopri5"):
+            rows.append(
+                {
+                    "task": f"{scenario}, error {precision.EQUAL_ERROR:g}",
+                    "peer": f"dynsim {explicit}",
+                    "dynsim": "dynsim radau5",
+                    "time": precision.work_at_equal_error(of_one, "radau5", explicit, precision.EQUAL_ERROR),
+                }
+            )
     return rows
 
 
@@ -152,7 +177,7 @@ def _ratios(sizes: list[dict[str, Any]], jobs: list[dict[str, Any]]) -> list[dic
     for case in job.CASES:
         row = {one["program"]: one for one in jobs if one["case"] == case}
         for peer in (MUJOCO_EULER, MUJOCO_IMPLICIT):
-            for ours in (DYNSIM_DEFAULT, DYNSIM_RADAU5, DYNSIM_RK4):
+            for ours in (DYNSIM_RK43, DYNSIM_RADAU5, DYNSIM_RK4):
                 entry = {"task": f"10 s job, {case}", "peer": peer, "dynsim": ours}
                 known = peer in row
                 for key, kind in (

@@ -7,12 +7,12 @@ from typing import Any
 from rich import box
 from rich.table import Table
 
-from dynsim.studies.bench import job
+from dynsim.studies.bench import job, precision
 from dynsim.studies.bench.programs import (
     CONTENDERS,
-    DYNSIM_DEFAULT,
     DYNSIM_RADAU5,
     DYNSIM_RK4,
+    DYNSIM_RK43,
     EIGHT_LANES,
     FOUR_LANES,
     MUJOCO_EULER,
@@ -37,7 +37,7 @@ def format_table(result: dict[str, Any]) -> list[Table]:
     for case in job.CASES:
         whole.add_row(f"[bold]{case}[/bold]")
         by_program = {row["program"]: row for row in result["job"] if row["case"] == case}
-        for program in (DYNSIM_DEFAULT, DYNSIM_RADAU5, DYNSIM_RK4, MUJOCO_EULER, MUJOCO_IMPLICIT):
+        for program in (DYNSIM_RK43, DYNSIM_RADAU5, DYNSIM_RK4, MUJOCO_EULER, MUJOCO_IMPLICIT):
             row = by_program.get(program, {})
             whole.add_row(
                 f"  {program}{'' if row.get('same_physics', True) else ' *'}",
@@ -57,7 +57,7 @@ def format_table(result: dict[str, Any]) -> list[Table]:
     for row in result["ratios"]:
         if "time_by_links" in row:
             ratios.add_row(row["peer"], *(_number(ratio) for ratio in row["time_by_links"].values()), "", "")
-        elif row["dynsim"] == DYNSIM_DEFAULT:
+        elif row["dynsim"] == DYNSIM_RK43:
             if row["task"] != task:
                 task = row["task"]
                 ratios.add_row(f"[bold]{task.removeprefix('10 s job, ')}[/bold]")
@@ -69,7 +69,24 @@ def format_table(result: dict[str, Any]) -> list[Table]:
         together.add_column(name, justify="right")
     for row in result["together"]:
         together.add_row(row["task"], *(_number(row["median_us"].get(name)) for name in names))
-    return [times, whole, ratios, together]
+
+    work = _table("Work and precision: CPU ms and error at rtol 1e-6", "")
+    work.caption = f"ratio: time of rk43 over that of radau5 for an error of {precision.EQUAL_ERROR:g}"
+    for method in precision.METHODS:
+        work.add_column(method, justify="right")
+        work.add_column("error", justify="right")
+    work.add_column("ratio", justify="right")
+    for scenario in dict.fromkeys(row["scenario"] for row in result["precision"]):
+        rows = [row for row in result["precision"] if row["scenario"] == scenario]
+        at = {row["method"]: row for row in rows if row["rtol"] == 1e-6}
+        cells = [
+            cell
+            for method in precision.METHODS
+            for cell in (_number(at[method]["cpu_minimum_s"], 1e3), f"{at[method]['error']:.0e}")
+        ]
+        equal = precision.work_at_equal_error(rows, "radau5", "rk43", precision.EQUAL_ERROR)
+        work.add_row(scenario, *cells, _number(equal))
+    return [times, whole, ratios, together, work]
 
 
 def _table(title: str, first: str) -> Table:

@@ -1,0 +1,97 @@
+"""Points on the surfaces of a scene, next to what moves: what pictures and pages draw of them, and their normals."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.record.quaternion import rotated
+from dynsim.record.scene import Surface
+
+Array = NDArray[np.float64]
+# Points along each side of the part of a curved surface that is drawn, and of a face of a box.
+PATCH, FACE = 41, 13
+
+
+def surface_grids(surface: Surface, low: Array, high: Array) -> list[Array]:
+    """Grids of points on a surface, (n, m, 3) [m] each, NaN where there are none.
+
+    All of a height field and of the six faces of a box, of a quadric the part next to the box from ``low`` to ``high``.
+    """
+    if surface.kind == "height_field":
+        x, y = np.meshgrid(*surface.grid)
+        return [np.stack([x, y, np.array(surface.heights)], axis=-1)]
+    if surface.kind == "box":
+        return _box_faces(surface)
+    return [quadric_patch(surface, low, high)]
+
+
+def _box_faces(surface: Surface) -> list[Array]:
+    """Points of the six faces of a box, its edges sharp, (n, n, 3) each."""
+    half, R = 0.5 * np.array(surface.edges), rotated(np.array(surface.orientation), np.eye(3))
+    u, v = np.meshgrid(*2 * [np.linspace(-1.0, 1.0, FACE)])
+    found = []
+    for axis in range(3):
+        for side in (-1.0, 1.0):
+            local = np.roll(np.stack([np.full_like(u, side), u, v], axis=-1), axis, axis=-1) * half
+            found.append(np.array(surface.position) + local @ R.T)
+    return found
+
+
+def quadric_patch(surface: Surface, low: Array, high: Array) -> Array:
+    """Points of a quadric over its tangent plane next to a box, along the normal to the nearest root of C.
+
+    With r = r₀ + s n on the normal n, C(r) = a s² + b s + c, where a = n·Q n/2, b = n·(Q r₀ + b) and c = C(r₀).
+
+    Parameters
+    ----------
+    low, high : (3,) corners of the box [m]; its middle is where the tangent plane is sought from
+
+    Returns
+    -------
+    Array
+        (n, n, 3) [m], NaN where there is no root, or none within the longest edge of the box. A plane has the four
+        corners only, without seams between.
+    """
+    anchor, normal = 0.5 * (low + high), np.array([0.0, 0.0, 1.0])
+    for _ in range(20):
+        slope = surface.gradient(anchor)
+        if not np.linalg.norm(slope) > 1e-12:
+            return np.full((2, 2, 3), np.nan)
+        normal = slope / np.linalg.norm(slope)
+        anchor = anchor - surface.gap(anchor) * normal
+    # Along the axes of the world where that is possible.
+    across = np.eye(3)[:2] if abs(normal[2]) > 0.99 else np.linalg.svd(normal[None])[2][1:]
+    reach = (box_corners(low, high) - anchor) @ across.T
+    Q = np.array(surface.Q)
+    count = PATCH if Q.any() else 2
+    u, v = np.meshgrid(*(np.linspace(reach[:, k].min(), reach[:, k].max(), count) for k in (0, 1)))
+    start = anchor + u[..., None] * across[0] + v[..., None] * across[1]
+    a = 0.5 * float(normal @ Q @ normal)
+    b = start @ Q @ normal + float(np.array(surface.b) @ normal)
+    c = surface.value(start)
+    inside = b * b - 4.0 * a * c
+    with np.errstate(all="ignore"):
+        # The smaller root, in the form that also holds for a = 0.
+        step = -2.0 * c / (b + np.copysign(np.sqrt(np.where(inside >= 0.0, inside, np.nan)), b))
+    points = start + step[..., None] * normal
+    points[~(np.abs(step) <= float((high - low).max()))] = np.nan
+    return np.asarray(points)
+
+
+def box_corners(low: Array, high: Array) -> Array:
+    """The eight corners of a box, (8, 3)."""
+    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+
+
+def normals(surface: Surface, points: Array) -> Array:
+    """Unit normals into the free side at points, (T, 3) → (T, 3)."""
+    if surface.kind in ("box", "height_field"):
+        step = 1e-6
+        ends = [points + side * step * axis for axis in np.eye(3) for side in (1.0, -1.0)]
+        values = [surface.value(end) for end in ends]
+        slope = np.stack([values[2 * k] - values[2 * k + 1] for k in range(3)], axis=-1)
+    else:
+        slope = points @ np.array(surface.Q) + np.array(surface.b)
+    size = np.linalg.norm(slope, axis=-1, keepdims=True)
+    return np.asarray(slope / np.where(size > 0.0, size, 1.0))
