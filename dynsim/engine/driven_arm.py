@@ -121,6 +121,7 @@ class DrivenArm:
 
     def record(self) -> Record:
         """The record of the drive; its scenario is the script."""
+        before = self.simulation.snapshot()
         if not self.simulation.finished:
             self.simulation.advance(self.ticks / self._rate)
         duration = max(self.ticks, 1) / self._rate
@@ -128,6 +129,8 @@ class DrivenArm:
             self._scenario, duration, {**self._controller, "operator": {**self._operator, "commands": self._commands}}
         )
         record = self.simulation.record(script)
+        # The order at this tick is yet to come.
+        self.simulation.restore(before)
         record.complete = "stopped" not in record.provenance
         return record
 
