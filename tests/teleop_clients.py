@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -105,9 +106,15 @@ class Client:
         from websockets.sync.client import connect
 
         origin = f"http://127.0.0.1:{teleop.port}"
-        self.socket = connect(f"ws://127.0.0.1:{teleop.port}{teleop.path}drive", origin=origin, compression=None)
+        address = f"ws://127.0.0.1:{teleop.port}{teleop.path}drive"
+        self._open = ExitStack()
+        self.socket = self._open.enter_context(connect(address, origin=origin, compression=None, ping_interval=None))
         self.count = 0
         self.hello: dict[str, Any] = self.until("hello")["hello"]
+
+    def close(self) -> None:
+        """Leave."""
+        self._open.close()
 
     def say(self, **message: Any) -> None:
         """One message."""

@@ -33,6 +33,9 @@ class Operator(StrictConfig):
     rate_limit_rad_s: Positive = Field(
         default=2.0, description="fastest joint rate, m/s of a prismatic joint: a hand that needs more is slower"
     )
+    hand_acceleration_m_s2: Positive = Field(default=0.5, description="in which velocities of the hand change")
+    base_acceleration_m_s2: Positive = Field(default=0.5, description="of the base ahead; more may tip it")
+    base_acceleration_rad_s2: Positive = Field(default=2.0, description="of its turns")
     tolerance_m: Positive = Field(default=1e-6, description="a target further off than this is unreachable: it waits")
     commands: list[Velocity] = Field(default=[], description="held until the next one")
 

@@ -6,8 +6,9 @@ the base, which carries it. Each tick of length h takes the joints to where the 
 
     q_d(t) = q_d + (q_d⁺ − q_d) (t − t_k)/h
 
-Where a joint would be too fast or pass its limit, the hand gets a part of v, down to an eighth, and then waits. Wheels
-get the rates (V ∓ ω T/2)/r of what they roll without slip.
+v and the velocities of the base change from tick to tick by no more than their accelerations times h. Where a joint
+would be too fast or pass its limit, the hand gets a part of v, down to an eighth, and then waits. Wheels get the rates
+(V ∓ ω T/2)/r of what they roll without slip.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from dynsim.kernels.arrays import workspace
 from dynsim.kernels.jit import reals
 from dynsim.model.mobile_base import base_pose, base_row
 from dynsim.model.model import Model
-from dynsim.model.operated import BASE, HAND, Operated, VelocitySource
+from dynsim.model.operated import BASE, HAND, VELOCITIES, Operated, VelocitySource
 from dynsim.model.reaching import path_arrays
 from dynsim.model.rolling import wheel_angles
 
@@ -34,6 +35,9 @@ Array = NDArray[np.float64]
 
 PARTS = (1.0, 0.5, 0.25, 0.125)
 """Of the hand's velocity, of which the first that the joints can follow is taken."""
+
+
+_BASE = tuple(slice(k, k + 1) for k in range(BASE.start, BASE.stop))
 
 
 class OperatorPath:
@@ -61,6 +65,7 @@ class Operator:
         # On a base that drives the target is in the axes of the base, where it has no path in the world.
         self.path = OperatorPath(operated.rate, self.target) if robot.base is None and operated.joints else None
         self._q, self._angles, self._axes = reals(robot.initial), np.zeros(2), np.eye(3)
+        self._velocity = np.zeros(VELOCITIES)
         if robot.base is not None:
             first, _ = base_row(robot)
             self._angles = robot.initial[first : first + 2].copy()
@@ -78,7 +83,7 @@ class Operator:
         """What the future depends on."""
         points = None if self.path is None else list(self.path.points)
         kept = {"ticks": self.ticks, "waiting": self.waiting, "_moving": self._moving, "points": points}
-        return kept | {name: getattr(self, name).copy() for name in ("target", "_q", "_angles")}
+        return kept | {name: getattr(self, name).copy() for name in ("target", "_q", "_angles", "_velocity")}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go back to a state of this operator."""
@@ -90,7 +95,7 @@ class Operator:
 
     def __call__(self, simulation: Simulation) -> None:
         """Rewrite the references for the time up to the next tick."""
-        velocity = self.source.read(self.ticks)
+        velocity = self._eased(self.source.read(self.ticks))
         self.ticks += 1
         lines = self._joint_lines(velocity[HAND]) | self._wheel_lines(velocity[BASE])
         moving = any(rate != 0.0 for _, rate in lines.values())
@@ -98,6 +103,17 @@ class Operator:
             for joint, (position, rate) in lines.items():
                 simulation.set_reference(joint, position, rate)
         self._moving = moving
+
+    def _eased(self, wanted: Array) -> Array:
+        """Velocities that have come as near to those that are wanted as accelerations allow."""
+        base = self.operated.base_acceleration
+        for part, most in ((HAND, self.operated.hand_acceleration), *zip(_BASE, base, strict=True)):
+            change = wanted[part] - self._velocity[part]
+            size = float(np.linalg.norm(change))
+            allowed = most / self.operated.rate
+            # What is reached is exact: a robot that is to rest rests.
+            self._velocity[part] = wanted[part] if size <= allowed else self._velocity[part] + allowed / size * change
+        return self._velocity
 
     def _joint_lines(self, velocity: Array) -> dict[str, tuple[float, float]]:
         """Position and rate of each joint that follows the hand."""
@@ -112,6 +128,8 @@ class Operator:
         self.waiting = found is None and bool(velocity.any())
         if found is not None:
             self._q, self.target = found
+        else:
+            self._velocity[HAND] = 0.0
         if self.path is not None:
             self.path.points.append(self.target.copy())
         rates = (self._q[place] - begin) * operated.rate

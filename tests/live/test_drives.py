@@ -74,11 +74,18 @@ def test_hand_goes_as_fast_as_it_is_asked_to() -> None:
     """The target exactly, the hand as well as the controller follows it."""
     driven = drive(load_scenario("six_axis_arm"))
     start = driven.shown().hand.copy()
+    velocity, still = np.array([0.05, -0.03, 0.02]), (0.0, 0.0, 0.0)
     for k in range(100):
-        driven.tick(Order((0.05, -0.03, 0.02) if k < 50 else (0.0, 0.0, 0.0)))
-    assert driven.shown().hand - start == pytest.approx([0.025, -0.015, 0.01], abs=1e-12)
+        driven.tick(Order(tuple(velocity.tolist()) if k < 50 else still))
+    # What it loses while it speeds up it makes up for while it slows down; sums of ticks, so to rounding.
+    way = 0.5 * velocity
+    assert driven.shown().hand - start == pytest.approx(way, abs=1e-3 * 0.025)
     record = driven.record()
-    assert record["target_position"][-1] - start == pytest.approx([0.025, -0.015, 0.01], abs=1e-12)
+    assert record["target_position"][-1] == pytest.approx(driven.shown().hand, abs=1e-12)
+    speed = np.linalg.norm(np.diff(record["target_position"], axis=0), axis=1) / np.diff(record.time)
+    assert speed.max() == pytest.approx(np.linalg.norm(velocity))
+    # By ticks of 10 ms, seen in samples of 5 ms.
+    assert np.abs(speed[2:] - speed[:-2]).max() == pytest.approx(0.5 * 0.01, rel=1e-6)
     assert record.summary["hand_error_max_m"] < 2e-3
 
 
@@ -92,7 +99,9 @@ def test_base_goes_along_its_arc() -> None:
         driven.tick(order if k < 100 else still)
     record = driven.record()
     x, y, heading = record["base_pose"][-1]
-    assert (x, y, heading) == pytest.approx((0.5 * math.sin(0.4), 0.5 * (1.0 - math.cos(0.4)), 0.4), abs=3e-3)
+    # A little different where it speeds up and slows down: there the radius is another one.
+    assert (x, y, heading) == pytest.approx((0.5 * math.sin(0.4), 0.5 * (1.0 - math.cos(0.4)), 0.4), abs=8e-3)
+    assert record["tip_margin"].min() > 0.2
     arm = record["q"][:, [k for k, name in enumerate(record.labels["q"]) if name.startswith("joint")]]
     assert np.abs(arm[-1] - arm[0]).max() < 5e-3
 
@@ -107,8 +116,9 @@ def test_hand_waits_where_it_cannot_go() -> None:
     assert top[2] < 3.0
     rates = np.abs(driven.record()["v"])
     assert rates.max() < 2.5
-    driven.tick(Order((0.0, 0.0, -0.05)))
-    assert driven.shown().hand[2] == pytest.approx(top[2] - 0.0005)
+    for _ in range(20):
+        driven.tick(Order((0.0, 0.0, -0.05)))
+    assert driven.shown().hand[2] < top[2] - 0.005
 
 
 def test_stepper_follows_the_script_and_goes_back() -> None:

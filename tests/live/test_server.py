@@ -72,8 +72,7 @@ def test_one_drives_and_others_watch(teleop: Callable[..., Teleop], nothing: Non
     first.wish({}, held=False)
     first.drive({"x": 1.0}, 0.8)
     assert first.until("state", lambda state: state == "driving")["hand"][0] > 0.34
-    first.socket.close()
-    second.until("role", lambda role: role == "watching")
+    first.close()
     second.until("free", bool)
     second.take()
     second.drive({"z": 1.0}, 0.3)
@@ -90,7 +89,9 @@ def test_silence_stops_the_robot(teleop: Callable[..., Teleop], nothing: None) -
     client.take()
     client.drive({"y": 1.0}, 0.5)
     client.until("state", lambda state: state == "silent")
-    stopped = client.until("time")
+    # At 0.5 m/s² it takes 0.2 s from full speed.
+    at = client.until("time")["time"]
+    stopped = client.until("time", lambda now: now > at + 0.25)
     # Words with the key held do not wake it; a key that was let go and pressed again does.
     client.drive({"y": 1.0}, 0.3)
     again = client.until("time", lambda now: now > stopped["time"] + 0.2)
@@ -178,7 +179,7 @@ def test_a_drive_leaves_its_record_and_a_script_that_repeats_it(
     ]
     record, again = Record.load(one.folder / "record.h5"), simulate(load_scenario(one.folder / "scenario.yaml"))
     assert record.complete
-    assert list(record) == list(again)
+    assert set(record) == set(again)
     for name in record:
         assert np.array_equal(record[name], again[name], equal_nan=True), name
 
@@ -188,7 +189,7 @@ def test_nobody_left_ends_a_drive_that_is_told_so(teleop: Callable[..., Teleop],
     client = one.connect()
     client.take()
     client.drive({"x": 1.0}, 0.2)
-    client.socket.close()
+    client.close()
     assert one.finish() == 0
     assert "the last browser was closed" in one.said
     assert one.group_is_gone()
@@ -198,7 +199,7 @@ def test_a_port_that_is_taken_is_an_error(teleop: Callable[..., Teleop], nothing
     one = teleop(*SNAKE)
     command = [sys.executable, "-m", "dynsim", "teleop", *SNAKE, "--no-open", "--http-port", str(one.port)]
     other = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=one.folder.parent, check=False)
-    assert other.returncode == 1
+    assert other.returncode == 2
     assert "choose another --http-port" in " ".join(other.stderr.split())
     begun = time.monotonic()
     assert one.interrupt() == 0
