@@ -76,6 +76,11 @@ def teleop(
         if open_:
             open_address(address)
         account = session.run(until_closed=until_closed)
+    except KeyboardInterrupt:
+        # Before the first tick.
+        interruption.answered()
+        account = session.account
+        account.ended = "interrupted"
     finally:
         session.close()
     if driven.ticks == 0:

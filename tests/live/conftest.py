@@ -25,3 +25,5 @@ def teleop(tmp_path: Path) -> Iterator[Callable[..., Teleop]]:
         if one.process.poll() is None:
             one.process.kill()
             one.process.wait()
+        if one.process.stdout is not None:
+            one.process.stdout.close()
