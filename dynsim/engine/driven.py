@@ -6,6 +6,7 @@ as it took. What the commands are is the plant's: :mod:`dynsim.engine.driven_sna
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.engine import named
+from dynsim.engine.stepped import Touch
 from dynsim.errors import ScenarioError
 from dynsim.record import Record
 from dynsim.scenario import Scenario, require_scenario, scenario_from_resolved
@@ -61,7 +63,8 @@ class Shown:
     ----------
     time : [s]; poses : (bodies, 7) position [m], quaternion w, x, y, z; hand : (3,) [m]
     waiting : what was asked for could not be done
-    extra : by the names of a frame of the page: wheels, contacts, gripper; ``mode`` of a snake
+    extra : by the names of a frame of the page: wheels, gripper; ``mode`` of a snake
+    touching : what contact points do, by their names
     """
 
     time: float
@@ -69,6 +72,7 @@ class Shown:
     hand: Array
     waiting: bool
     extra: dict[str, Any]
+    touching: Mapping[str, Touch]
 
 
 class Driven(Protocol):

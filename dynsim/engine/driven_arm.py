@@ -113,6 +113,7 @@ class DrivenArm:
             hand=operator.target.copy(),
             waiting=operator.waiting,
             extra={},
+            touching=simulation.touching,
         )
 
     def still(self) -> Record:

@@ -106,6 +106,7 @@ class DrivenSnake:
                 "gripper": int(self._last.closed),
                 "mode": run.controller.modes.numbers[row],
             },
+            touching={},
         )
 
     def still(self) -> Record:

@@ -22,7 +22,7 @@ from dynsim.engine.operator import Operator
 from dynsim.engine.outcome import mark_stopped, raise_stopped
 from dynsim.engine.prepare import prepare, sample_times
 from dynsim.engine.recording import make_record
-from dynsim.engine.stepped import GUARDS, Snapshot, State, event_name, own_guards, take_log
+from dynsim.engine.stepped import GUARDS, Snapshot, State, Touch, event_name, own_guards, take_log
 from dynsim.engine.stopping import stopped
 from dynsim.engine.trace import Trace
 from dynsim.errors import ModelError, ScenarioError, shown
@@ -30,7 +30,7 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import driver
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.dense import state_within
-from dynsim.kernels.state import JOINT, block
+from dynsim.kernels.state import JOINT, OUT_FORCE, OUT_MODE, OUT_VECTOR, block
 from dynsim.kernels.tree import loads as kl
 from dynsim.measures import TIP_OVER
 from dynsim.model.arrays import check_couplings
@@ -162,6 +162,25 @@ class Simulation:
     def model(self) -> Model:
         """Its rigid-body model; ``armature`` is very large where a brake is closed."""
         return self._prepared.model
+
+    @property
+    def touching(self) -> dict[str, Touch]:
+        """What each contact point did at the last sample; empty before the first."""
+        run = self._prepared.run
+        outputs = run.output[: int(run.count[ki.SAMPLE])]
+        last = outputs[-1] if len(outputs) else self._trace.last_output()
+        if last is None or not self._prepared.contacts:
+            return {}
+        found = last[block(run.columns, "contact")].reshape(len(self._prepared.contacts), -1)
+        real = self._prepared.system.unilateral is not None
+        return {
+            contact.name: Touch(
+                force=float(row[OUT_FORCE]),
+                vector=row[OUT_VECTOR : OUT_VECTOR + 3].copy(),
+                mode=int(row[OUT_MODE]) if real else None,
+            )
+            for contact, row in zip(self._prepared.contacts, found, strict=True)
+        }
 
     @property
     def operator(self) -> Operator | None:

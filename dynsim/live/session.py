@@ -12,11 +12,14 @@ from typing import Any
 import numpy as np
 
 from dynsim import interruption
-from dynsim.engine.driven import Driven
+from dynsim.engine.driven import Driven, Shown
 from dynsim.errors import DynsimError, SimulationStopped
 from dynsim.live.helm import Helm
 from dynsim.live.pace import Pace
 from dynsim.live.server import FRAMES, Server
+from dynsim.record.quaternion import rotated
+from dynsim.record.scene import WORLD
+from dynsim.record.surface_points import normals
 from dynsim.view import page
 
 
@@ -59,6 +62,7 @@ class Session:
         }
         self.server = Server(self.helm, hello, len(driven.axes), driven.modes, self._page, self._end)
         self.account = Account()
+        self._scene = driven.still().scene
 
     def open(self, port: int = 0) -> str:
         """Listen, and give the address to open in a browser."""
@@ -122,8 +126,31 @@ class Session:
             "n": count,
             "late": round(1e3 * pace.late, 1),
             "lost": round(pace.lost, 2),
+            "contacts": self._contacts(shown),
             **shown.extra,
         }
+
+    def _contacts(self, shown: Shown) -> dict[str, Any]:
+        """Forces as the page takes them: the normal, and what is left beside it."""
+        scene, found = self._scene, dict[str, Any]()
+        if scene is None:
+            return found
+        for point in scene.contacts:
+            touch, surface = shown.touching.get(point.name), scene.surface(point.surface)
+            if touch is None or surface is None:
+                continue
+            at = np.array(point.position)
+            if point.body != WORLD:
+                place, turn = shown.poses[point.body, :3], shown.poses[point.body, 3:]
+                at = place + rotated(turn, at)
+            normal = normals(surface, at[None])[0]
+            found[point.name] = {
+                "force": round(touch.force, 3),
+                "normal": np.round(normal, 5).tolist(),
+                "tangent": np.round(touch.vector - touch.force * normal, 3).tolist(),
+                "mode": touch.mode,
+            }
+        return found
 
     def _page(self, socket: str) -> str:
         own = resources.files("dynsim.live").joinpath("page")

@@ -71,6 +71,23 @@ def test_drive_of_a_snake_is_replayed_bit_for_bit(name: str, variant: str | None
     assert_same(record, replayed(record))
 
 
+def test_contacts_that_are_shown_are_those_of_the_record() -> None:
+    driven = drive(load_scenario("elbow_comparison_floor", "two_elbows"))
+    for _ in range(40):
+        driven.tick(Order((0.05, 0.0, 0.0)))
+    shown, record = driven.shown(), driven.record()
+    assert list(shown.touching) == list(record.labels["contact_normal_force"])
+    # At one of the last samples before that instant: steps are longer than the time between samples.
+    forces, vectors = record["contact_normal_force"], record["contact_force"]
+    (k,) = np.flatnonzero(forces[:, 1] == shown.touching["elbow_7"].force)
+    assert shown.time - 0.05 < record.time[k] <= shown.time
+    for c, touch in enumerate(shown.touching.values()):
+        assert touch.force == forces[k, c]
+        assert np.array_equal(touch.vector, vectors[k, c])
+        assert touch.mode == record["contact_mode"][k, c]
+    assert any(touch.force > 0.0 for touch in shown.touching.values())
+
+
 def test_hand_goes_as_fast_as_it_is_asked_to() -> None:
     """The target exactly, the hand as well as the controller follows it."""
     driven = drive(load_scenario("six_axis_arm"))

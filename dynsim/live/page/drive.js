@@ -19,6 +19,8 @@ const PAD_BASE = { ahead: { axis: 1, sign: -1 }, turn: { axis: 0, sign: -1 }, x:
   z: { forth: 7, back: 6 } };
 const PAD_HOLD = [4, 5], PAD_GRIP = 0;
 
+const NOTHING = { force: NaN, normal: [0, 0, 1], tangent: [0, 0, 0], mode: null };
+
 class Drive {
   constructor() {
     this.keys = new Set();
@@ -204,7 +206,7 @@ class Drive {
     this.newest = null;
     this.frames++;
     dynsim.frame({ time: frame.time, poses: frame.poses, pressure: null, ...(frame.wheels ? { wheels: frame.wheels } : {}),
-      ...(frame.contacts ? { contacts: frame.contacts } : {}), ...(frame.gripper === undefined ? {} : { gripper: frame.gripper }) });
+      contacts: dynsim.app.actors[0].contacts.map((c) => frame.contacts[c.contact.name] ?? NOTHING), ...(frame.gripper === undefined ? {} : { gripper: frame.gripper }) });
     this.last = frame;
     if (!this.ended) this.state = frame.state;
     this.tell();
