@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
 from functools import cache
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -26,3 +28,18 @@ def _simulated(name: str, variant: str | None) -> Record:
 def simulated() -> Callable[[str, str | None], Record]:
     """Record of a shipped scenario and variant, simulated once per session."""
     return _simulated
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """Chromium of the system; Playwright drives it and downloads nothing."""
+    executable = shutil.which("chromium")
+    if executable is None:
+        pytest.skip("no chromium here: apt-get install chromium")
+    playwright = pytest.importorskip("playwright.sync_api", reason="no Playwright here: pip install playwright")
+    with playwright.sync_playwright() as driver:
+        started = driver.chromium.launch(
+            executable_path=executable, args=["--no-sandbox", "--enable-unsafe-swiftshader"], timeout=180_000
+        )
+        yield started
+        started.close()

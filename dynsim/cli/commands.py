@@ -25,6 +25,7 @@ from dynsim.cli.app import (
 from dynsim.cli.display import console, errors, labelled, progress, record_files
 from dynsim.cli.drawing import Figures, draw, draw_all
 from dynsim.cli.sweep import sweep
+from dynsim.cli.teleop import teleop
 from dynsim.cli.view import open_page, view, write_view
 from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
 from dynsim.hardware.cli import export, hw
@@ -226,6 +227,7 @@ def plot(
         draw(Figures(named, out or Path("figures"), format_, together=True), quiet=False)
 
 
+app.command(epilog="Example: dynsim teleop snake_operator --speed 0.2")(teleop)
 app.command(epilog="Example: dynsim view results/elbow_comparison/*/record.h5 --ghost")(view)
 app.command(epilog="Example: dynsim animate results/elbow_comparison/two_elbows --out film.gif --view side")(animate)
 

@@ -63,9 +63,14 @@ def write_view(records: Mapping[str, Record], folder: Path, quiet: bool) -> Path
 
 def open_page(page: Path) -> None:
     """Open a page in the user's browser, or say that there is no display to open one on."""
+    open_address(page.absolute().as_uri(), escaped(page))
+
+
+def open_address(address: str, name: str = "") -> None:
+    """Open an address in the user's browser, or say that there is no display to open one on."""
     import webbrowser
 
     # Without a display some systems start a browser within the terminal.
     display = sys.platform in ("win32", "darwin") or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")))
-    if not display or not webbrowser.open(page.absolute().as_uri()):
-        console.print(f"No browser opened; open {escaped(page)} in one", highlight=False, soft_wrap=True)
+    if not display or not webbrowser.open(address):
+        console.print(f"No browser opened; open {name or address} in one", highlight=False, soft_wrap=True)

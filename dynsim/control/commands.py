@@ -1,6 +1,7 @@
 """Where the target comes from: the operator's velocity commands and generated target paths ([T] IV.C).
 
-A script is a :class:`dynsim.model.snake.CommandSource` that knows its future; a joystick is one that does not.
+A script is a :class:`dynsim.model.snake.CommandSource` that knows its future; a joystick is one that does not, and a
+script that a live operator has left is told as it was.
 """
 
 from __future__ import annotations
@@ -169,3 +170,18 @@ class ScriptedSource:
             block.velocity[part] += velocity
             block.gripper[part] = closed
         return block
+
+
+@dataclass
+class Timed:
+    """A script whose commands keep their times: told period by period, as a live operator tells them."""
+
+    script: ScriptedSource
+    _all: CommandBlock | None = None
+
+    def read(self, first: int, count: int, period: float, feedback: Feedback | None = None) -> CommandBlock:
+        """The commands of one period."""
+        if self._all is None:
+            self._all = self.script.read(0, first + count, period)
+        here = slice(first, first + 1)
+        return CommandBlock(self._all.velocity[here], self._all.request[here], self._all.gripper[here])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +11,11 @@ from numpy.typing import NDArray
 from dynsim.errors import UnreachableReference
 from dynsim.kernels import inverse_kinematics as ki
 from dynsim.kernels.arrays import workspace
-from dynsim.kernels.jit import integers, reals
-from dynsim.model.arrays import compile_contacts
+from dynsim.kernels.jit import reals
 from dynsim.model.description import Contact
 from dynsim.model.mobile_base import base_row
 from dynsim.model.model import Model
-from dynsim.model.shapes import compile_shapes
+from dynsim.model.reaching import path_arrays
 
 Array = NDArray[np.float64]
 
@@ -65,25 +63,8 @@ def follow(
     UnreachableReference
         With the first time at which the hand cannot reach its target, and the distance that is left.
     """
-    columns = [model.joint_names.index(name) for name in joints]
-    link, point = model.robot.attach(*model.robot.hand)
-    points = [replace(contact, tip=None) for contact in braces]
-    rows = 3 + len(braces)
-    path = ki.PathArrays(
-        link=link,
-        point=reals(point),
-        braces=compile_contacts(model.robot, points),
-        shapes=compile_shapes(model.robot, points),
-        column=integers(columns),
-        place=integers([model.robot.position_index[column] for column in columns]),
-        jacobian=np.zeros((3, model.n)),
-        rates=np.zeros((rows, len(columns))),
-        system=np.zeros((rows, rows)),
-        error=np.zeros(rows),
-        change=np.zeros(len(columns)),
-        position=np.zeros(3),
-    )
-    ws, result, wanted = workspace(model.n, 0, 0), np.zeros((len(times), len(columns))), reals(targets)
+    path = path_arrays(model, joints, braces)
+    ws, result, wanted = workspace(model.n, 0, 0), np.zeros((len(times), len(joints))), reals(targets)
     carried = np.zeros((len(times), 0)) if base is None else reals(base)
     first = 0 if base is None else base_row(model.robot)[0]
     q, k, due = reals(q), 0, clock.perf_counter() + QUIET_S

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -13,13 +14,15 @@ from dynsim import families
 from dynsim.config import NonNegative, Positive, StrictConfig, check_waypoints, error_at
 from dynsim.control.feed_forward import planned_voltages
 from dynsim.control.inverse_kinematics import follow
+from dynsim.control.operator import Operator
 from dynsim.errors import ModelError
 from dynsim.model.bracing import MIN_N
-from dynsim.model.control import BasePath, HandPath, JointControl
+from dynsim.model.control import PLANNED, BasePath, HandPath, JointControl
 from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Motor, Servo, TorqueSource
 from dynsim.model.mobile_base import base_row
 from dynsim.model.model import Model
+from dynsim.model.operated import Operated
 from dynsim.model.protocols import BuildContext
 from dynsim.model.rolling import rolled, wheel_angles
 from dynsim.model.splines import clamped_cubic, quintic_coefficients
@@ -85,6 +88,7 @@ class Config(StrictConfig):
     k_d_V_s_per_rad: NonNegative | list[NonNegative] = Field(default=20.0, description="V s/m at a prismatic joint")
     hand: HandReference | None = Field(default=None, description="a path for the hand")
     base: BaseReference | None = Field(default=None, description="a path for the mobile base; none: it holds")
+    operator: Operator | None = Field(default=None, description="velocities for hand and mobile base, instead of paths")
     joints: dict[str, JointPath] = Field(default={}, description="waypoints by joint name")
     torques: dict[str, TorquePath] = Field(default={}, description="torques of motors of type torque by joint name")
     feed_forward: Literal["none", "gravity", "dynamics"] = Field(
@@ -119,6 +123,11 @@ class Config(StrictConfig):
         both = [name for name in self.joints if self.hand is not None and name in self.hand.joints]
         if both:
             raise ValueError(f"{both[0]} cannot follow both the hand path and waypoints of its own")
+        if self.operator is not None:
+            planned = [name for name in PLANNED if name in self.model_fields_set and getattr(self, name)]
+            planned = [name for name in planned if getattr(self, name) != "none"]
+            if planned:
+                raise error_at(planned[0], f"an operator rewrites references on the way; remove {planned[0]}")
         if self.brace is not None and self.feed_forward != "none":
             raise error_at("feed_forward", "brace plans the whole dynamics; leave feed_forward away")
         if self.min_N != MIN_N and self.brace != "optimal":
@@ -161,7 +170,7 @@ def build(config: Config, context: BuildContext) -> JointControl:
                 model, times, targets, hand.joints, robot.initial, hand.tolerance_m, context.progress, base, braces
             )
             positions |= dict(zip(hand.joints, followed.T, strict=True))
-    return JointControl.following(
+    control = JointControl.following(
         robot,
         k_p=_gains(config, robot, "k_p"),
         k_d=_gains(config, robot, "k_d"),
@@ -170,6 +179,23 @@ def build(config: Config, context: BuildContext) -> JointControl:
         path=path,
         sample_time=config.sample_time_s,
         voltages=_planned(config, context, times, positions) if planned else None,
+    )
+    return control if config.operator is None else replace(control, operated=_operated(config.operator, context))
+
+
+def _operated(operator: Operator, context: BuildContext) -> Operated:
+    robot = context.model.robot
+    if any(command.base is not None for command in operator.commands):
+        _check_base(robot, ("controller", "operator"))
+    return Operated(
+        rate=operator.rate_hz,
+        joints=tuple(operator.joints),
+        braces=tuple(_contact(context, name, "operator.braces") for name in operator.braces),
+        rate_limit=operator.rate_limit_rad_s,
+        hand_acceleration=operator.hand_acceleration_m_s2,
+        base_acceleration=(operator.base_acceleration_m_s2, operator.base_acceleration_rad_s2),
+        tolerance=operator.tolerance_m,
+        script=operator.script(),
     )
 
 
@@ -195,7 +221,7 @@ def _check_names(config: Config, model: Model) -> None:
     """Refuse references of what is no joint, has no motor, or one of another kind."""
     robot = model.robot
     driven = [motor.joint for motor in robot.motors]
-    in_hand = config.hand.joints if config.hand else []
+    in_hand = config.hand.joints if config.hand else config.operator.joints if config.operator else []
     for name in [*config.joints, *config.torques, *in_hand]:
         if name not in driven:
             raise ModelError(f"controller: {name!r} is no joint with a motor; those are: {', '.join(driven) or 'none'}")
@@ -215,16 +241,22 @@ def _check_names(config: Config, model: Model) -> None:
             raise ModelError(f"controller: {wheel!r} is a wheel; the hand's path is for joints of the arm")
     if config.base is None:
         return
-    keys = ("controller", "base")
-    if not wheels:
-        raise ModelError("controller.base: the plant has no mobile base; pws_arm has one", keys=keys)
+    _check_base(robot, ("controller", "base"))
     for wheel in wheels:
-        if wheel not in driven:
-            raise ModelError(f"controller.base: {wheel!r} has no motor; set plant.base.wheel.motor", keys=keys)
-        if wheel in sources:
-            raise ModelError(f"controller.base: {wheel!r} has a motor of type torque, which follows no path", keys=keys)
         if wheel in config.joints:
             raise ModelError(f"controller: {wheel!r} cannot follow both the base's path and waypoints of its own")
+
+
+def _check_base(robot: Robot, keys: tuple[str, ...]) -> None:
+    """Refuse to move a base that there is not, or whose wheels follow no reference."""
+    key, motors = ".".join(keys), {motor.joint: motor for motor in robot.motors}
+    if robot.base is None:
+        raise ModelError(f"{key}: the plant has no mobile base; pws_arm has one", keys=keys)
+    for wheel in robot.base.wheels:
+        if wheel not in motors:
+            raise ModelError(f"{key}: {wheel!r} has no motor; set plant.base.wheel.motor", keys=keys)
+        if isinstance(motors[wheel], TorqueSource):
+            raise ModelError(f"{key}: {wheel!r} has a motor of type torque, which follows no path", keys=keys)
 
 
 def _knots(spacing: float, duration: float) -> NDArray[np.float64]:

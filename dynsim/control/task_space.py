@@ -14,7 +14,7 @@ from pydantic import Field, StrictInt, field_validator, model_validator
 
 from dynsim.config import NonNegative, Positive, error_at
 from dynsim.control.commands import STATES as MODE_STATES
-from dynsim.control.commands import Script, ScriptedSource
+from dynsim.control.commands import Script, ScriptedSource, Timed
 from dynsim.control.modes import TABLE_II, Switching
 from dynsim.errors import ModelError
 from dynsim.kernels.jit import integers, reals
@@ -94,6 +94,11 @@ class Config(Script):
     )
     modes: dict[int, list[int]] | None = Field(None, description="mode number -> lifted wheel pairs; default Table II")
     fixing_mode: StrictInt = 1
+    commands_wait: bool = Field(
+        True,
+        description="commands wait while the target waits; false: they keep their times, and what the target cannot "
+        "follow is lost, as of a live operator",
+    )
     switching: Switching = Field(default_factory=Switching)
 
     @field_validator("cost", mode="before")
@@ -168,6 +173,7 @@ def build(config: Config, context: BuildContext) -> TaskSpaceController:
     scale = reference_sigma(model, law, fixing_row, plant)
     law = law._replace(damping_sigma=config.damping_sigma * scale, damping_factor=config.damping_factor * scale)
 
+    script = ScriptedSource(config.commands, config.paths)
     switch_ticks = max(1, round(config.switching.period_s / config.period_s))
     prediction_ticks = max(1, round(config.switching.period_s / config.switching.prediction_step_s))
     schedule = Schedule(
@@ -190,7 +196,7 @@ def build(config: Config, context: BuildContext) -> TaskSpaceController:
         least_margin=config.switching.least_margin_m,
         when_blocked=config.switching.when_blocked,
         release_fraction=config.switching.release_fraction,
-        source=ScriptedSource(config.commands, config.paths),
+        source=script if config.commands_wait else Timed(script),
     )
 
 

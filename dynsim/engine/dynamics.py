@@ -36,6 +36,10 @@ def start(prepared: Prepared) -> Start:
 def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:
     """See :func:`dynsim.engine.simulate`."""
     prepared = prepare(scenario, progress)
+    if prepared.control.operated is not None:
+        from dynsim.engine import operated
+
+        return operated.simulate(scenario, progress, pictured=pictured)
     run = prepared.run
     # Loading or compiling the kernels is no integration time.
     with kernels_logged(log):

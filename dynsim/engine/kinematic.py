@@ -89,7 +89,7 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> Run:
         trace=new_trace(model, rows),
         stride=stride,
     )
-    _read_commands(run, waiting=False)
+    read_commands(run, waiting=False)
     return run
 
 
@@ -111,18 +111,9 @@ def simulate(
     with what the robot has done; to run in real time it waits in ``read`` until the period has come.
     """
     run = prepare(scenario, source)
-    controller = run.controller
-    switcher = ModeSwitcher(
-        policy=controller.policy,
-        modes=controller.modes,
-        fixing_row=controller.fixing_row,
-        order=controller.order,
-        period_ticks=controller.switch_ticks,
-        least_margin=controller.least_margin,
-        predict=lambda row: _predict(run, row),
-    )
+    controller, switcher = run.controller, mode_switcher(run)
     with kernels_logged(log):
-        _load_kernels(run)
+        load_kernels(run)
     stop: SimulationStopped | None = None
     started = clock.perf_counter()
     try:
@@ -147,11 +138,25 @@ def simulate(
     return record
 
 
+def mode_switcher(run: Run) -> ModeSwitcher:
+    """Who chooses the modes of a run."""
+    controller = run.controller
+    return ModeSwitcher(
+        policy=controller.policy,
+        modes=controller.modes,
+        fixing_row=controller.fixing_row,
+        order=controller.order,
+        period_ticks=controller.switch_ticks,
+        least_margin=controller.least_margin,
+        predict=lambda row: _predict(run, row),
+    )
+
+
 def _named(state: State) -> dict[str, list[float]]:
     return {"base_pose": state.base.tolist(), "phi": state.phi.tolist(), "rho": state.rho.tolist()}
 
 
-def _load_kernels(run: Run) -> None:
+def load_kernels(run: Run) -> None:
     """Compile or load the kernels: that is no simulation time."""
     trial, trace = _copy(run.state), new_trace(run.model, 1)
     run_ticks(
@@ -171,7 +176,7 @@ def _stride(rate_hz: float, period: float) -> int:
     return stride
 
 
-def _read_commands(run: Run, waiting: bool) -> None:
+def read_commands(run: Run, waiting: bool) -> None:
     """Ask the source for the commands from the present tick on; it answers as far as it knows them.
 
     Velocities that had to wait in the block before this one and were not carried out there are dropped: a script is
@@ -233,50 +238,62 @@ def _checked(run: Run, block: CommandBlock, left: int) -> CommandBlock:
 
 def _advance(run: Run, switcher: ModeSwitcher, progress: Progress | None) -> None:
     """Run to the end in pieces that no mode request, no switching time and no end of known commands divides."""
-    state, controller, period = run.state, run.controller, run.controller.schedule.period
-    recovering = blocked = False
-    while (now := int(state.counts[TICKS])) < run.ticks:
-        if now == run.block_start + len(run.block.request):
-            _read_commands(run, waiting=blocked or recovering)
-        ahead = run.block.request[now - run.block_start :]
-        request = int(ahead[0])
-        # At the ends of switching periods only, so that every recovery has at least one.
-        if recovering and now >= (switcher.next_event() or 0) and _is_released(run):
-            recovering, request = False, FIXING
-        state.counts[MODE] = switcher.at_tick(now, request)
-        later = 1 + np.flatnonzero(ahead[1:] != NO_REQUEST)
-        ends = [now + len(ahead), now + CHUNK, *(now + later[:1])]
-        if (event := switcher.next_event()) is not None:
-            ends.append(event)
-        count = int(min(ends)) - now
-        done, blocked = run_ticks(
-            run.model,
-            controller.law,
-            controller.schedule,
-            state,
-            run.block.velocity,
-            count,
-            int(not recovering),
-            int(controller.when_blocked),
-            run.stride,
-            run.rig,
-            run.trace,
-        )
-        if done < 0:
-            time = float(state.counts[TICKS] * period)
-            raise SimulationStopped(
-                f"the state is no longer finite at t = {time:g} s: a singular posture, or a gain too high "
-                "for the control period",
-                time=time,
-                state={"base_pose": state.base.tolist(), "phi": state.phi.tolist()},
-            )
-        if blocked and not recovering and controller.when_blocked and not switcher.switching:
-            recovering = True
-            if state.counts[TICKS] < run.ticks:
-                state.counts[MODE] = switcher.at_tick(int(state.counts[TICKS]), SWITCHING)
+    while run.state.counts[TICKS] < run.ticks:
+        advance_piece(run, switcher)
         if progress is not None:
-            progress(float(state.counts[TICKS] * period))
+            progress(float(run.state.counts[TICKS] * run.controller.schedule.period))
         interruption.check()
+
+
+def advance_piece(run: Run, switcher: ModeSwitcher) -> None:
+    """Run the control periods up to the next one in which something may change: one, of a source that knows one.
+
+    Raises
+    ------
+    SimulationStopped
+        The state is no longer finite, or the source failed.
+    """
+    state, controller, period = run.state, run.controller, run.controller.schedule.period
+    now = int(state.counts[TICKS])
+    if run.switch_due:
+        run.switch_due = False
+        state.counts[MODE] = switcher.at_tick(now, SWITCHING)
+    if now == run.block_start + len(run.block.request):
+        read_commands(run, waiting=run.blocked or run.recovering)
+    ahead = run.block.request[now - run.block_start :]
+    request = int(ahead[0])
+    # At the ends of switching periods only, so that every recovery has at least one.
+    if run.recovering and now >= (switcher.next_event() or 0) and _is_released(run):
+        run.recovering, request = False, FIXING
+    state.counts[MODE] = switcher.at_tick(now, request)
+    later = 1 + np.flatnonzero(ahead[1:] != NO_REQUEST)
+    ends = [now + len(ahead), now + CHUNK, *(now + later[:1])]
+    if (event := switcher.next_event()) is not None:
+        ends.append(event)
+    count = int(min(ends)) - now
+    done, run.blocked = run_ticks(
+        run.model,
+        controller.law,
+        controller.schedule,
+        state,
+        run.block.velocity,
+        count,
+        int(not run.recovering),
+        int(controller.when_blocked),
+        run.stride,
+        run.rig,
+        run.trace,
+    )
+    if done < 0:
+        time = float(state.counts[TICKS] * period)
+        raise SimulationStopped(
+            f"the state is no longer finite at t = {time:g} s: a singular posture, or a gain too high "
+            "for the control period",
+            time=time,
+            state={"base_pose": state.base.tolist(), "phi": state.phi.tolist()},
+        )
+    if run.blocked and not run.recovering and controller.when_blocked and not switcher.switching:
+        run.recovering = run.switch_due = True
 
 
 def _is_released(run: Run) -> bool:

@@ -100,7 +100,7 @@ def make_record(
     posture_points(
         model, reals(trace.base), reals(trace.phi), run.rig.work.frame, new_chain(model), np.zeros(6), points
     )
-    gripper = run.gripper[np.minimum(np.rint(time / period).astype(int), run.ticks - 1)]
+    gripper = run.gripper[np.minimum(np.rint(time / period).astype(int), max(ticks - 1, 0))]
 
     names, wheels = description.joint_names, description.wheel_names
     pairs = tuple(f"pair{i + 1}" for i in range(description.pairs))

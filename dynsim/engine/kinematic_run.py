@@ -28,3 +28,6 @@ class Run:
     rig: Rig
     trace: Trace
     stride: int
+    blocked: bool = False  # the last command was not carried out
+    recovering: bool = False  # switching modes until the base joints are released
+    switch_due: bool = False  # and begins to at the next tick

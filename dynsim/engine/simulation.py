@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dynsim.engine.operator import Operator
 from dynsim.engine.outcome import mark_stopped, raise_stopped
 from dynsim.engine.prepare import prepare, sample_times
 from dynsim.engine.recording import make_record
-from dynsim.engine.stepped import GUARDS, Snapshot, State, event_name, own_guards, take_log
+from dynsim.engine.stepped import GUARDS, Snapshot, State, Touch, event_name, own_guards, take_log
 from dynsim.engine.stopping import stopped
 from dynsim.engine.trace import Trace
 from dynsim.errors import ModelError, ScenarioError, shown
@@ -29,12 +30,13 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import driver
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.dense import state_within
-from dynsim.kernels.state import JOINT, block
+from dynsim.kernels.state import JOINT, OUT_FORCE, OUT_MODE, OUT_VECTOR, block
 from dynsim.kernels.tree import loads as kl
 from dynsim.measures import TIP_OVER
 from dynsim.model.arrays import check_couplings
 from dynsim.model.drives import Drive
 from dynsim.model.model import Model
+from dynsim.model.operated import VelocitySource
 from dynsim.record import Event, Record
 from dynsim.scenario import Scenario, require_scenario
 from dynsim.scenario.build import check_start
@@ -72,6 +74,7 @@ class Simulation:
     duration : end of the run [s], ``math.inf`` for none; default: the scenario's. References hold where they end.
     trace : samples that are kept: all (None), the last so many, or none (0)
     motors : instead of those of the plant, see :mod:`dynsim.model.description`; records still show the scenario's
+    operator : instead of the script of a scenario that has ``controller.operator``
 
     Raises
     ------
@@ -87,6 +90,7 @@ class Simulation:
         duration: float | None = None,
         trace: int | None = None,
         motors: Sequence[Drive] | None = None,
+        operator: VelocitySource | None = None,
     ) -> None:
         require_scenario(scenario)
         if scenario.engine != "dynamics":
@@ -137,6 +141,12 @@ class Simulation:
         run.clock[ki.TIME] = start
         run.tick[:, [ki.TICK_NEXT, ki.TICK_PHASE]] = start
         self._refill()
+        operated = self._prepared.control.operated
+        self._operator = None if operated is None else Operator(self.model, operated, operator)
+        if operated is not None and self._operator is not None:
+            self.every(1.0 / operated.rate, self._operator)
+        elif operator is not None:
+            raise ScenarioError("an operator needs a scenario with controller.operator, which says what it moves")
 
     @property
     def scenario(self) -> Scenario:
@@ -152,6 +162,30 @@ class Simulation:
     def model(self) -> Model:
         """Its rigid-body model; ``armature`` is very large where a brake is closed."""
         return self._prepared.model
+
+    @property
+    def touching(self) -> dict[str, Touch]:
+        """What each contact point did at the last sample; empty before the first."""
+        run = self._prepared.run
+        outputs = run.output[: int(run.count[ki.SAMPLE])]
+        last = outputs[-1] if len(outputs) else self._trace.last_output()
+        if last is None or not self._prepared.contacts:
+            return {}
+        found = last[block(run.columns, "contact")].reshape(len(self._prepared.contacts), -1)
+        real = self._prepared.system.unilateral is not None
+        return {
+            contact.name: Touch(
+                force=float(row[OUT_FORCE]),
+                vector=row[OUT_VECTOR : OUT_VECTOR + 3].copy(),
+                mode=int(row[OUT_MODE]) if real else None,
+            )
+            for contact, row in zip(self._prepared.contacts, found, strict=True)
+        }
+
+    @property
+    def operator(self) -> Operator | None:
+        """Who rewrites the references of hand and base, where the scenario has ``controller.operator``."""
+        return self._operator
 
     @property
     def time(self) -> float:
@@ -404,7 +438,9 @@ class Simulation:
     def snapshot(self) -> Snapshot:
         """What :meth:`restore` needs to go on from here."""
         arrays = {name: array.copy() for name, array in self._arrays().items()}
-        return Snapshot(self._token, arrays, self._time, self._trace.snapshot(), tuple(self._happened), self._frozen)
+        operator = None if self._operator is None else self._operator.state()
+        trace, happened = self._trace.snapshot(), tuple(self._happened)
+        return Snapshot(self._token, arrays, self._time, trace, happened, self._frozen, operator)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Go back to a snapshot of this simulation: the same future, bit for bit.
@@ -428,11 +464,18 @@ class Simulation:
             array[...] = snapshot.arrays[name]
         self._trace.restore(snapshot.trace)
         self._time, self._frozen, self._happened = snapshot.time, snapshot.frozen, list(snapshot.happened)
+        if self._operator is not None and snapshot.operator is not None:
+            self._operator.restore(snapshot.operator)
 
-    def record(self) -> Record:
+    def record(self, scenario: Scenario | None = None, *, pictured: bool = True) -> Record:
         """Record of the trace so far; of a ring, energies and losses count from its first sample on.
 
         ``complete`` is True for a run that has come to its end.
+
+        Parameters
+        ----------
+        scenario : that the record is said to be of, where it was found on the way; default: what is simulated
+        pictured : with scene and poses of bodies
         """
         if self._prepared.run.count[ki.PENDING] == 1 and not self.finished:
             # Samples up to the present time lie in the step that is kept back: end it here, and take that back.
@@ -450,13 +493,17 @@ class Simulation:
         count = run.count.copy()
         count[ki.SAMPLE] = len(times)
         whole = run._replace(sample_time=times, sample=states, output=outputs, count=count)
+        planned = self._planned
+        if self._operator is not None and self._operator.path is not None:
+            planned = replace(planned, path=self._operator.path)
         record = make_record(
-            self._scenario,
-            replace(self._prepared, run=whole, control=self._planned),
+            self._scenario if scenario is None else scenario,
+            replace(self._prepared, run=whole, control=planned),
             self._wall,
             pushed=sorted(self._pushed),
             happened=self._happened,
             base_as_planned=self._base_as_planned,
+            pictured=pictured,
         )
         record.complete = self.finished
         if self._overturned():

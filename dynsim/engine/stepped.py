@@ -99,6 +99,21 @@ class State:
 
 
 @dataclass(frozen=True)
+class Touch:
+    """What a contact point does.
+
+    Attributes
+    ----------
+    force : normal [N], negative: it pulls; vector : (3,) with friction, in the world [N]
+    mode : 0 off its surface, 1 sliding, 2 sticking; None under the bilateral law
+    """
+
+    force: float
+    vector: Array
+    mode: int | None
+
+
+@dataclass(frozen=True)
 class Snapshot:
     """Everything that the future of a simulation depends on; made by :meth:`Simulation.snapshot`."""
 
@@ -108,3 +123,4 @@ class Snapshot:
     trace: tuple[tuple[Rows, ...], int]
     happened: tuple[Event, ...]
     frozen: bool
+    operator: dict[str, Any] | None = None

@@ -121,7 +121,7 @@ def finish(scenario: Scenario, prepared: Prepared, wall: float, pictured: bool) 
 
 
 def shareable(prepared: Prepared) -> bool:
-    """True where nothing but steps happens: no events, ticks, breaks or ground that carries a base."""
+    """True where nothing but steps happens: no events, ticks, breaks, operator or ground that carries a base."""
     run = prepared.run
     return (
         has_forms(prepared.system)
@@ -129,6 +129,7 @@ def shareable(prepared: Prepared) -> bool:
         and run.support is None
         and not (len(run.event) or len(run.tick) or len(run.breaks))
         and run.newton is None
+        and prepared.control.operated is None
     )
 
 

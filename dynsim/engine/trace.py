@@ -55,6 +55,10 @@ class Trace:
         first = 0 if self._keep is None else max(len(times) - self._keep, 0)
         return times[first:], states[first:], outputs[first:]
 
+    def last_output(self) -> Array | None:
+        """Outputs of the last sample that is kept."""
+        return self._rows[-1][2][-1] if self._rows else None
+
     def snapshot(self) -> tuple[tuple[Rows, ...], int]:
         """What :meth:`restore` goes back to; rows are never written again, so they are shared."""
         return tuple(self._rows), self._next

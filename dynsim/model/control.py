@@ -15,6 +15,7 @@ from dynsim.kernels.jit import integers, reals
 from dynsim.model.description import Robot
 from dynsim.model.drives import TorqueSource
 from dynsim.model.mobile_base import base_pose, base_row
+from dynsim.model.operated import Operated
 from dynsim.model.rolling import coordinates, rolled
 from dynsim.model.splines import quintic_coefficients
 
@@ -23,6 +24,9 @@ _PER_SEGMENT = 4
 _PIECE = 4096
 # Knots that the longest steps of an implicit method straddle (of 20 ms; 55 ms in the published arm).
 _STRADDLED = 3.0
+
+# Keys of a controller that plan for a whole run, which an operator does not know.
+PLANNED = ("hand", "base", "joints", "torques", "feed_forward", "brace")
 
 # Positions of a joint: samples, (T,) [rad or m], or a function of times, (T,) [s], that gives them.
 JointMotion = ArrayLike | Callable[[NDArray[np.float64]], ArrayLike]
@@ -56,7 +60,7 @@ class JointControl:
 
     Only DC motors take the gains; ``k_p`` of a servo says whether it follows its position. References of a torque
     source are its torques [N m]. ``sample_time`` is the period [s] at which commands are taken, to be held in between;
-    None: they follow the state continuously.
+    None: they follow the state continuously. Where there is ``operated``, an operator rewrites references on the way.
     """
 
     k_p: NDArray[np.float64]
@@ -64,6 +68,7 @@ class JointControl:
     reference: ReferenceArrays
     path: HandPath | None
     sample_time: float | None = None
+    operated: Operated | None = None
 
     @classmethod
     def absent(cls, robot: Robot) -> JointControl:

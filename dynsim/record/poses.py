@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.record.content import TIME
 from dynsim.record.quaternion import Array, continuous, of_turn, product, rotated
 from dynsim.record.record import Record
-from dynsim.record.scene import HERE, WORLD, Body, Joint, Point
+from dynsim.record.scene import HERE, WORLD, Body, Joint, Point, Scene
 
 POSITION, ORIENTATION = "body_position", "body_orientation"
 
@@ -45,6 +48,57 @@ def add_body_poses(record: Record) -> bool:
     record.add(POSITION, data[0], "m", labels=names, description="origins of the bodies' frames")
     record.add(ORIENTATION, data[1], "1", labels=names, description="quaternions w, x, y, z of the bodies' frames")
     return True
+
+
+def poses_at(scene: Scene, positions: Mapping[str, Mapping[str, float]]) -> Array:
+    """Poses of all bodies at one instant, (bodies, 7) [m, 1]: position, quaternion w, x, y, z.
+
+    For live views: in plain numbers, because arrays of one sample would take twenty times as long. ``positions`` are
+    those of the joints [rad or m], by signal and label.
+    """
+    found: list[tuple[float, ...]] = []
+    for body in scene.bodies:
+        joint = body.joint
+        x, y, z, *turn = (0.0, 0.0, 0.0, *HERE) if body.parent == WORLD else found[body.parent]
+        moved = [positions[joint.signal][label] for label in joint.labels]
+        x, y, z = _beside((x, y, z), turn, joint.position)
+        if joint.orientation != HERE:
+            turn = _turned(turn, joint.orientation)
+        if joint.kind == "ball":
+            size = math.hypot(*moved)
+            turn = _turned(turn, [value / size for value in moved])
+        elif joint.kind == "prismatic":
+            x, y, z = _beside((x, y, z), turn, [moved[0] * a for a in joint.axis])
+        elif joint.kind == "planar":
+            x, y, z = _beside((x, y, z), turn, (moved[0], moved[1], 0.0))
+            turn = _turned(turn, (math.cos(0.5 * moved[2]), 0.0, 0.0, math.sin(0.5 * moved[2])))
+        elif joint.kind != "fixed":
+            s = math.sin(0.5 * moved[0])
+            turn = _turned(turn, (math.cos(0.5 * moved[0]), *(s * a for a in joint.axis)))
+        found.append((x, y, z, *turn))
+    return np.array(found)
+
+
+def _turned(a: Sequence[float], b: Sequence[float]) -> list[float]:
+    """The turn b, then the turn a; see :func:`dynsim.record.quaternion.product`."""
+    (aw, ax, ay, az), (bw, bx, by, bz) = a, b
+    return [
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    ]
+
+
+def _beside(place: Sequence[float], turn: Sequence[float], vector: Sequence[float]) -> tuple[float, float, float]:
+    """A place and a vector in axes that are turned; see :func:`dynsim.record.quaternion.rotated`."""
+    (w, i, j, k), (x, y, z) = turn, vector
+    a, b, c = 2.0 * (j * z - k * y), 2.0 * (k * x - i * z), 2.0 * (i * y - j * x)
+    return (
+        place[0] + x + w * a + j * c - k * b,
+        place[1] + y + w * b + k * a - i * c,
+        place[2] + z + w * c + i * b - j * a,
+    )
 
 
 def pose_columns(bodies: int) -> int:

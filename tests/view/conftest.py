@@ -1,8 +1,7 @@
-"""A real browser without a network, and pages opened in it."""
+"""Pages opened in a real browser without a network."""
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -45,21 +44,6 @@ class Opened:
     def state(self) -> dict[str, Any]:
         """What the page shows."""
         return dict(self.js("dynsim.state()"))
-
-
-@pytest.fixture(scope="session")
-def browser() -> Iterator[Any]:
-    """Chromium of the system; Playwright drives it and downloads nothing."""
-    executable = shutil.which("chromium")
-    if executable is None:
-        pytest.skip("no chromium here: apt-get install chromium")
-    playwright = pytest.importorskip("playwright.sync_api", reason="no Playwright here: pip install playwright")
-    with playwright.sync_playwright() as driver:
-        started = driver.chromium.launch(
-            executable_path=executable, args=["--no-sandbox", "--enable-unsafe-swiftshader"], timeout=PATIENCE_MS
-        )
-        yield started
-        started.close()
 
 
 @pytest.fixture

@@ -1,0 +1,113 @@
+"""``dynsim teleop``: a scenario driven in real time from a browser."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from dynsim import completion, interruption
+from dynsim.cli.app import QuietOption, ScenarioArgument, SetOption, parsed_overrides
+from dynsim.cli.display import console, errors
+from dynsim.cli.view import open_address, write_view
+from dynsim.errors import DynsimError
+from dynsim.terminal import escaped
+
+if TYPE_CHECKING:
+    from dynsim.live.session import Account
+
+# Ticks later than this are told of at the end [s].
+LATE = 0.05
+
+
+def teleop(
+    scenario: ScenarioArgument,
+    variant: Annotated[
+        str | None,
+        typer.Option(
+            metavar="VARIANT", help="Variant to drive; default: the first.", autocompletion=completion.variants
+        ),
+    ] = None,
+    overrides: SetOption = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="For the files; default: results/SCENARIO/drive_N, a new one.")
+    ] = None,
+    speed: Annotated[float, typer.Option(metavar="M/S", min=1e-3, max=10.0, help="Fastest hand or head.")] = 0.1,
+    turn: Annotated[float, typer.Option(metavar="RAD/S", min=1e-3, max=20.0, help="Fastest turn.")] = 0.5,
+    base_speed: Annotated[float, typer.Option(metavar="M/S", min=1e-3, max=10.0, help="Fastest mobile base.")] = 0.3,
+    longest: Annotated[float, typer.Option(metavar="S", min=1.0, max=36000.0, help="Longest drive.")] = 600.0,
+    http_port: Annotated[
+        int, typer.Option(metavar="N", min=0, max=65535, help="Of the page on this machine; 0: a free one.")
+    ] = 0,
+    until_closed: Annotated[
+        bool, typer.Option("--until-closed", help="End when the last browser is closed, not only by button or Ctrl-C.")
+    ] = False,
+    open_: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = True,
+    quiet: QuietOption = False,
+) -> None:
+    """Drive a scenario from a browser: keyboard, gamepad or sticks on the screen.
+
+    Velocities count only while the dead-man's key is held: space, a shoulder button, or a finger on a stick. The drive
+    is saved with a scenario that repeats it: `dynsim run FOLDER/scenario.yaml` gives the same record, bit for bit.
+    """
+    try:
+        import websockets  # noqa: F401
+    except ModuleNotFoundError:
+        raise DynsimError("a live drive needs websockets: pip install 'dynsim[live]'") from None
+    from dynsim.engine.driven import Pace, drive
+    from dynsim.files import check_writable
+    from dynsim.live.session import Session
+    from dynsim.results import RUN_FILES, save_run
+    from dynsim.scenario import load_scenario
+
+    loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
+    folder = out or _new_folder(Path("results", loaded.name))
+    check_writable(folder, RUN_FILES)
+    with console.status("loading the kernels; the first time they are compiled, which takes half a minute"):
+        driven = drive(loaded, pace=Pace(speed, turn, base_speed), limit=longest)
+    session = Session(driven, loaded.variant or loaded.name)
+    try:
+        address = session.open(http_port)
+        # Also with --quiet: nobody could drive without it.
+        console.print(f"To be driven in a browser on this machine: {address}", highlight=False, soft_wrap=True)
+        console.print("Ctrl-C ends the drive and saves it", highlight=False)
+        if open_:
+            open_address(address)
+        account = session.run(until_closed=until_closed)
+    except KeyboardInterrupt:
+        # Before the first tick.
+        interruption.answered()
+        account = session.account
+        account.ended = "interrupted"
+    finally:
+        session.close()
+    if driven.ticks == 0:
+        console.print(f"The drive is over ({escaped(account.ended)}) before it began; nothing is saved", soft_wrap=True)
+        return
+    record = driven.record() if account.stop is None or account.stop.record is None else account.stop.record
+    save_run(record, folder)
+    interruption.heed()
+    if not quiet:
+        _tell(account, driven.ticks * driven.period)
+        console.print(f"Written to {escaped(folder)}", highlight=False, soft_wrap=True)
+        script = escaped(folder / "scenario.yaml")
+        console.print(f"The same drive again: dynsim run {script}", highlight=False, soft_wrap=True)
+    write_view({loaded.variant or loaded.name: record}, folder, quiet)
+    if account.stop is not None:
+        errors.print(f"what was simulated until then is in {escaped(folder)}, marked incomplete")
+        raise account.stop
+
+
+def _new_folder(place: Path) -> Path:
+    """The first of ``drive_1``, ``drive_2``, … that is not there: a drive cannot be made again by driving."""
+    return next(folder for k in itertools.count(1) if not (folder := place / f"drive_{k}").exists())
+
+
+def _tell(account: Account, driven: float) -> None:
+    late = sorted(account.late)
+    middle, most = 1e3 * late[len(late) // 2], 1e3 * late[-1 - len(late) // 100]
+    text = f"Driven for {driven:.1f} s ({escaped(account.ended)}); ticks late by {middle:.1f} ms, 99 % by {most:.1f} ms"
+    behind = f"; {account.lost:.1f} s behind real time" if account.lost > LATE else ""
+    console.print(text + behind, highlight=False, soft_wrap=True)

@@ -1,0 +1,150 @@
+"""A scenario in the hands of a pilot: tick by tick, with a script of what was asked that gives the same run again.
+
+A script is part of a scenario, so a drive leaves a scenario: that of which it was made, with its commands and as long
+as it took. What the commands are is the plant's: :mod:`dynsim.engine.driven_snake`, :mod:`dynsim.engine.driven_arm`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.engine import named
+from dynsim.engine.stepped import Touch
+from dynsim.errors import ScenarioError
+from dynsim.record import Record
+from dynsim.scenario import Scenario, require_scenario, scenario_from_resolved
+
+Array = NDArray[np.float64]
+NO_REQUEST = 0
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One velocity that a pilot gives.
+
+    Attributes
+    ----------
+    name : ``x``, ``yaw``; group : what moves, ``hand``, ``head``, ``gripper`` or ``base``
+    limit : fastest rate, in ``unit``
+    """
+
+    name: str
+    group: str
+    unit: str
+    limit: float
+
+
+@dataclass(frozen=True)
+class Order:
+    """What a pilot asks for in one tick.
+
+    Attributes
+    ----------
+    velocity : of each axis [m/s, rad/s]
+    request : a mode to go to: its number, or one of :mod:`dynsim.model.snake`; ``NO_REQUEST``: none
+    closed : the gripper
+    """
+
+    velocity: tuple[float, ...]
+    request: int = NO_REQUEST
+    closed: bool = False
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a pilot sees after a tick.
+
+    Attributes
+    ----------
+    time : [s]; poses : (bodies, 7) position [m], quaternion w, x, y, z; hand : (3,) [m]
+    waiting : what was asked for could not be done
+    extra : by the names of a frame of the page: wheels, gripper; ``mode`` of a snake
+    touching : what contact points do, by their names
+    """
+
+    time: float
+    poses: Array
+    hand: Array
+    waiting: bool
+    extra: dict[str, Any]
+    touching: Mapping[str, Touch]
+
+
+class Driven(Protocol):
+    """A simulation that is driven."""
+
+    axes: tuple[Axis, ...]
+    modes: tuple[int, ...]
+    has_gripper: bool
+    period: float
+
+    @property
+    def ticks(self) -> int:
+        """Periods so far."""
+
+    @property
+    def finished(self) -> bool:
+        """The longest drive is over, or the run has ended by itself."""
+
+    def tick(self, order: Order) -> None:
+        """Advance by one period; SimulationStopped where there is no going on."""
+
+    def shown(self) -> Shown:
+        """What there is to see now."""
+
+    def still(self) -> Record:
+        """A moment of the same robot at its start, for a page to be made of."""
+
+    def record(self) -> Record:
+        """What was driven so far, with a scenario that drives it again."""
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Fastest rates that a pilot can ask for.
+
+    Attributes
+    ----------
+    speed : of a hand or head [m/s]; turn : of a head or base [rad/s]; base : of a mobile base [m/s]
+    """
+
+    speed: float = 0.1
+    turn: float = 0.5
+    base: float = 0.3
+
+
+def drive(scenario: Scenario, *, pace: Pace | None = None, limit: float = 600.0) -> Driven:
+    """A scenario to be driven: plant, surfaces, contacts and loads are its own, what moved its references is left out.
+
+    Parameters
+    ----------
+    pace : fastest rates
+    limit : longest drive [s]
+
+    Raises
+    ------
+    ScenarioError
+        The scenario has no controller that a pilot could take the place of.
+    """
+    require_scenario(scenario)
+    with named(scenario):
+        if scenario.controller is None:
+            raise ScenarioError("it has no controller, so there is nothing to drive: a pilot gives its references")
+        if scenario.engine == "kinematic":
+            from dynsim.engine.driven_snake import DrivenSnake
+
+            return DrivenSnake(scenario, pace or Pace(), limit)
+        from dynsim.engine.driven_arm import DrivenArm
+
+        return DrivenArm(scenario, pace or Pace(), limit)
+
+
+def changed(scenario: Scenario, duration: float, controller: dict[str, Any]) -> Scenario:
+    """The scenario with another duration [s] and controller."""
+    resolved = scenario.resolved
+    return scenario_from_resolved({**resolved, "duration_s": duration, "controller": controller})

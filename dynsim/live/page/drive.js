@@ -1,0 +1,281 @@
+"use strict";
+// The pilot's side of a live drive. DRIVE has the address of the socket; `dynsim` is the page that shows the robot.
+// `dynsim.drive` is what a test may look at: role, state, axes now, round trip, frames seen.
+
+const PERIOD_MS = 20, DEAD_ZONE = 0.12;
+// Words later than this show that drawing takes too long [ms]: fewer points are drawn then, and fewer frames, because a
+// page that is busy hears no key let go. No longer silence is allowed for it.
+const BUSY_MS = 60, LEAST_RATIO = 0.35;
+// Keys by the name of an axis: forth and back.
+const AXIS_KEYS = {
+  x: ["KeyW", "KeyS"], y: ["KeyA", "KeyD"], z: ["KeyR", "KeyF"],
+  alpha: ["KeyO", "KeyU"], beta: ["KeyK", "KeyI"], gamma: ["KeyJ", "KeyL"],
+  ahead: ["ArrowUp", "ArrowDown"], turn: ["ArrowLeft", "ArrowRight"],
+};
+// Where an axis is on a gamepad of the standard layout: [axis, sign] or [button forth, button back].
+const PAD_ARM = { x: { axis: 1, sign: -1 }, y: { axis: 0, sign: -1 }, z: { axis: 3, sign: -1 }, gamma: { axis: 2, sign: -1 },
+  beta: { forth: 13, back: 12 }, alpha: { forth: 15, back: 14 } };
+const PAD_BASE = { ahead: { axis: 1, sign: -1 }, turn: { axis: 0, sign: -1 }, x: { axis: 3, sign: -1 }, y: { axis: 2, sign: -1 },
+  z: { forth: 7, back: 6 } };
+const PAD_HOLD = [4, 5], PAD_GRIP = 0;
+
+const NOTHING = { force: NaN, normal: [0, 0, 1], tangent: [0, 0, 0], mode: null };
+
+class Drive {
+  constructor() {
+    this.keys = new Set();
+    this.sticks = new Map();
+    Object.assign(this, { role: "watching", free: true, state: "connecting", count: 0, frames: 0, trip: NaN, closed: false, scale: 1,
+      request: null, slow: 0, drawnAt: 0, eased: 0, ratio: 1, sent: new Map(), newest: null, ended: false, refused: [], wish: null, grip: false });
+    document.head.append(D.element("style", { textContent: DRIVE.style }));
+    this.socket = new WebSocket(DRIVE.socket);
+    this.socket.onmessage = (event) => this.hear(JSON.parse(event.data));
+    this.socket.onclose = () => { this.ended = true; this.state = "connection closed: the drive is over"; this.tell(); };
+  }
+
+  hear(message) {
+    if (message.hello) { this.begin(message.hello); return; }
+    if (message.role) { this.role = message.role; this.free = message.free; this.tell(); return; }
+    if (message.refused) { this.refused.push(message.refused); console.warn(message.refused); return; }
+    this.newest = message;
+    const at = this.sent.get(message.n);
+    if (at !== undefined) {
+      const trip = performance.now() - at;
+      this.trip = Number.isNaN(this.trip) ? trip : 0.9 * this.trip + 0.1 * trip;
+      for (const n of this.sent.keys()) if (n <= message.n) this.sent.delete(n);
+    }
+  }
+
+  begin(hello) {
+    this.axes = hello.axes;
+    this.modes = hello.modes;
+    this.names = hello.axes.map((axis) => axis.name);
+    this.pad = this.names.includes("ahead") ? PAD_BASE : PAD_ARM;
+    this.build(hello);
+    this.listen();
+    this.say({ do: "take" });
+    setInterval(() => this.beat(), PERIOD_MS);
+    const draw = () => { this.draw(); requestAnimationFrame(draw); };
+    requestAnimationFrame(draw);
+  }
+
+  say(message) {
+    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
+  }
+
+  // What is asked for, 50 times a second: each device counts while its own key is held.
+  beat() {
+    const now = performance.now(), gap = now - (this.beatAt ?? now);
+    this.beatAt = now;
+    this.slow = Math.max(0.97 * this.slow, gap);
+    if (this.role !== "pilot") return;
+    const axes = this.names.map(() => 0), add = (values) => values.forEach((v, k) => { axes[k] += v; });
+    let held = false;
+    const away = document.hidden || !document.hasFocus();
+    if (!away && (this.keys.has("Space") || this.button)) held = true, add(this.fromKeys());
+    if (!away && [...this.sticks.values()].some((s) => s.held)) held = true, add(this.fromSticks());
+    const pad = away ? null : this.fromPad();
+    if (pad) held = true, add(pad);
+    this.send(axes.map((v) => this.scale * Math.min(Math.max(v, -1), 1)), held);
+  }
+
+  send(axes, held) {
+    const message = { n: ++this.count, axes, held, closed: this.closed };
+    if (this.request !== null && held) { message.mode = this.request; this.request = null; }
+    this.sent.set(this.count, performance.now());
+    if (this.sent.size > 200) this.sent.delete(this.sent.keys().next().value);
+    this.wish = message;
+    this.say(message);
+  }
+
+  // Focus lost, tab hidden, page left: everything is let go at once, not only after the silence.
+  letGo() {
+    this.keys.clear();
+    this.button = false;
+    for (const stick of this.sticks.values()) stick.release();
+    this.request = null;
+    if (this.role === "pilot" && this.names) this.send(this.names.map(() => 0), false);
+  }
+
+  fromKeys() {
+    return this.names.map((name) => {
+      const [forth, back] = AXIS_KEYS[name];
+      return Number(this.keys.has(forth)) - Number(this.keys.has(back));
+    });
+  }
+
+  fromSticks() {
+    return this.names.map((name) => [...this.sticks.values()].reduce((sum, s) => sum + (s.held ? s.values[name] ?? 0 : 0), 0));
+  }
+
+  fromPad() {
+    const pad = [...(navigator.getGamepads?.() ?? [])].find((p) => p && p.connected);
+    if (!pad) return null;
+    const pressed = (k) => Boolean(pad.buttons[k]?.pressed), value = (k) => pad.buttons[k]?.value ?? 0;
+    const grip = pressed(PAD_GRIP);
+    const held = PAD_HOLD.some(pressed);
+    if (grip && !this.grip && held && this.gripper) this.toggleGripper();
+    this.grip = grip;
+    if (!held) return null;
+    return this.names.map((name) => {
+      const where = this.pad[name];
+      if (!where) return 0;
+      if (where.axis === undefined) return value(where.forth) - value(where.back);
+      const x = pad.axes[where.axis] ?? 0;
+      return Math.abs(x) < DEAD_ZONE ? 0 : where.sign * Math.sign(x) * (Math.abs(x) - DEAD_ZONE) / (1 - DEAD_ZONE);
+    });
+  }
+
+  listen() {
+    const known = new Set(["Space", ...this.names.flatMap((name) => AXIS_KEYS[name])]);
+    const acts = { KeyG: () => this.gripper && this.toggleGripper(), KeyM: () => this.ask("switching"), KeyN: () => this.ask("fixing") };
+    // Before the page's own keys, which some of these are.
+    window.addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.metaKey || event.altKey || event.target.tagName === "SELECT") return;
+      const act = this.role === "pilot" && (known.has(event.code) || (acts[event.code] && (event.code !== "KeyG" || this.gripper)));
+      if (!act && !known.has(event.code)) return;
+      event.preventDefault();
+      event.stopImmediatePropagation();
+      if (known.has(event.code)) this.keys.add(event.code);
+      else if (!event.repeat) acts[event.code]();
+    }, true);
+    window.addEventListener("keyup", (event) => this.keys.delete(event.code), true);
+    window.addEventListener("blur", () => this.letGo());
+    window.addEventListener("pagehide", () => this.letGo());
+    document.addEventListener("visibilitychange", () => { if (document.hidden) this.letGo(); });
+  }
+
+  toggleGripper() {
+    this.closed = !this.closed;
+    this.tell();
+  }
+
+  // A mode is asked for with the next word that is said with the key held.
+  ask(mode) {
+    if (this.modes.length) this.request = mode;
+  }
+
+  build(hello) {
+    const button = (text, title, act) => D.element("button", { textContent: text, title, onclick: act });
+    this.gripper = hello.gripper;
+    this.box = D.element("div", { id: "drive" });
+    this.stateBox = D.element("span", { className: "state" });
+    this.timing = D.element("span", { className: "timing" });
+    this.lateBox = D.element("span", { className: "late" });
+    this.roleButton = button("", "", () => this.say({ do: this.role === "pilot" ? "leave" : "take" }));
+    this.roleButton.id = "role";
+    const hold = button("hold to drive", "dead-man's key, as the space bar: with the keys of the axes");
+    hold.id = "hold";
+    hold.onpointerdown = (event) => { hold.setPointerCapture(event.pointerId); this.button = true; };
+    hold.onpointerup = hold.onpointercancel = hold.onlostpointercapture = () => { this.button = false; };
+    const speed = D.element("input", { type: "range", min: "0.1", max: "1", step: "0.1", value: "1", title: "part of full speed", id: "part" });
+    speed.oninput = () => { this.scale = Number(speed.value); };
+    this.grips = button("", "gripper (g)", () => this.toggleGripper());
+    const modes = hello.modes.length ? D.element("select", { id: "mode", title: "mode, taken when the key is held" },
+      ...["mode …", "switching", "fixing", ...hello.modes].map((m) => D.element("option", { value: m, textContent: m }))) : null;
+    if (modes) modes.onchange = () => {
+      if (modes.selectedIndex > 0) this.ask(modes.selectedIndex < 3 ? modes.value : Number(modes.value));
+      modes.selectedIndex = 0;
+      modes.blur();
+    };
+    const end = button("end the drive", "end and save", () => { if (this.role === "pilot") this.say({ do: "end" }); });
+    end.id = "end";
+    const acts = D.element("span", { className: "acts" }, hold, D.element("label", {}, " speed ", speed), ...(hello.gripper ? [this.grips] : []), ...(modes ? [modes] : []), end);
+    const keys = D.element("dl", {}, ...this.axes.map((axis) => D.element("span", { title: `${axis.group} ${axis.name}, up to ${axis.limit} ${axis.unit}` },
+      ...AXIS_KEYS[axis.name].map((key) => D.element("kbd", { textContent: label(key) })), ` ${axis.group} ${axis.name}`)));
+    const sticks = D.element("div", { className: "sticks" });
+    for (const [a, b] of this.names.includes("ahead") ? [["turn", "ahead"], ["y", "x"]] : [["y", "x"], [this.names.includes("gamma") ? "gamma" : null, "z"]]) {
+      if (!this.names.includes(a) && !this.names.includes(b)) continue;
+      const stick = new Stick(this.names.includes(a) ? a : null, this.names.includes(b) ? b : null);
+      this.sticks.set(b, stick);
+      sticks.append(stick.box);
+    }
+    this.bar = D.element("div", { className: "bar" }, this.stateBox, this.roleButton, acts, this.timing, this.lateBox, keys);
+    this.box.append(sticks, this.bar);
+    document.getElementById("view").append(this.box);
+    // What drives away is followed.
+    dynsim.set("follow", ["ahead", "gamma"].some((name) => this.names.includes(name)));
+    this.tell();
+  }
+
+  draw() {
+    const frame = this.newest, now = performance.now();
+    if (!frame || (this.slow > BUSY_MS && now - this.drawnAt < 2 * this.slow)) return;
+    this.ease(now);
+    this.drawnAt = now;
+    this.newest = null;
+    this.frames++;
+    dynsim.frame({ time: frame.time, poses: frame.poses, pressure: null, ...(frame.wheels ? { wheels: frame.wheels } : {}),
+      contacts: dynsim.app.actors[0].contacts.map((c) => frame.contacts[c.contact.name] ?? NOTHING), ...(frame.gripper === undefined ? {} : { gripper: frame.gripper }) });
+    this.last = frame;
+    if (!this.ended) this.state = frame.state;
+    this.tell();
+  }
+
+  ease(now) {
+    if (this.slow < BUSY_MS || this.ratio <= LEAST_RATIO || now - this.eased < 1000) return;
+    this.eased = now;
+    this.ratio *= 0.7;
+    const stage = dynsim.app.stage;
+    stage.shadows(false);
+    stage.renderer.setPixelRatio(this.ratio);
+    stage.renderer.setSize(...stage.size, false);
+    stage.touch();
+  }
+
+  tell() {
+    if (!this.box) return;
+    const f = this.last, driving = this.state === "driving";
+    this.bar.classList.toggle("watching", this.role !== "pilot");
+    this.box.classList.toggle("watching", this.role !== "pilot");
+    this.stateBox.textContent = f?.waiting && driving ? "driving, but it cannot go there" : this.role === "pilot" && this.state === "key released" ? "hold space to drive" : this.state;
+    this.stateBox.className = `state ${this.state}`;
+    this.roleButton.textContent = this.role === "pilot" ? "leave the wheel" : this.free ? "take the wheel" : "somebody else drives";
+    this.roleButton.disabled = this.ended || (this.role !== "pilot" && !this.free);
+    this.grips.textContent = this.closed ? "open gripper" : "close gripper";
+    if (!f) return;
+    this.timing.textContent = `${f.time.toFixed(1)} s` + (f.mode === undefined ? "" : ` · mode ${f.mode}`)
+      + (Number.isNaN(this.trip) || this.role !== "pilot" ? "" : ` · round trip ${this.trip.toFixed(0)} ms`);
+    this.lateBox.textContent = f.lost > 0.1 || f.late > 50 ? `late ${f.late.toFixed(0)} ms · ${f.lost.toFixed(1)} s behind real time` : "";
+  }
+}
+
+// A stick under a finger; the finger is its dead-man's key.
+class Stick {
+  constructor(across, up) {
+    this.held = false;
+    this.values = {};
+    this.across = across;
+    this.up = up;
+    this.knob = D.element("i");
+    this.box = D.element("div", { className: "stick" }, this.knob, D.element("span", { textContent: [up, across].filter(Boolean).join(", ") }));
+    this.box.dataset.name = up ?? across;
+    this.box.onpointerdown = (event) => { this.box.setPointerCapture(event.pointerId); this.held = true; this.move(event); };
+    this.box.onpointermove = (event) => { if (this.held) this.move(event); };
+    this.box.onpointerup = this.box.onpointercancel = this.box.onlostpointercapture = () => this.release();
+  }
+
+  move(event) {
+    const area = this.box.getBoundingClientRect();
+    let x = (event.clientX - area.left - area.width / 2) / (area.width / 2 - 20), y = (event.clientY - area.top - area.height / 2) / (area.height / 2 - 20);
+    const r = Math.max(Math.hypot(x, y), 1);
+    x /= r;
+    y /= r;
+    this.knob.style.transform = `translate(${40 * x}px, ${40 * y}px)`;
+    this.values = {};
+    if (this.across) this.values[this.across] = -x;
+    if (this.up) this.values[this.up] = -y;
+  }
+
+  release() {
+    this.held = false;
+    this.values = {};
+    this.knob.style.transform = "";
+  }
+}
+
+function label(code) {
+  return { ArrowUp: "↑", ArrowDown: "↓", ArrowLeft: "←", ArrowRight: "→" }[code] ?? code.replace("Key", "");
+}
+
+dynsim.ready.then(() => { dynsim.drive = new Drive(); });

@@ -1,0 +1,160 @@
+"""A live drive: the simulation in the thread that asks for it, the server in another, frames in between."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time as clock
+from dataclasses import dataclass, field
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+from dynsim import interruption
+from dynsim.engine.driven import Driven, Shown
+from dynsim.errors import DynsimError, SimulationStopped
+from dynsim.live.helm import Helm
+from dynsim.live.pace import Pace
+from dynsim.live.server import FRAMES, Server
+from dynsim.record.quaternion import rotated
+from dynsim.record.scene import WORLD
+from dynsim.record.surface_points import normals
+from dynsim.view import page
+
+
+@dataclass
+class Account:
+    """How a drive went.
+
+    Attributes
+    ----------
+    late : lateness of each tick [s]; lost : wall time that the simulation did not follow [s]
+    ended : why it ended
+    stop : what ended the simulation by itself, None otherwise
+    """
+
+    late: list[float] = field(default_factory=list)
+    lost: float = 0.0
+    ended: str = ""
+    stop: SimulationStopped | None = None
+
+
+class Session:
+    """A drive that is open to browsers from :meth:`open` to :meth:`close`.
+
+    Parameters
+    ----------
+    driven : the simulation
+    name : shown in the page
+    """
+
+    def __init__(self, driven: Driven, name: str) -> None:
+        self.driven, self.name = driven, name
+        self._over = threading.Event()
+        self._ended = ""
+        self.helm = Helm(driven.axes, clock.monotonic)
+        hello = {
+            "axes": [{"name": a.name, "group": a.group, "unit": a.unit, "limit": a.limit} for a in driven.axes],
+            "modes": list(driven.modes),
+            "gripper": driven.has_gripper,
+            "period": driven.period,
+        }
+        self.server = Server(self.helm, hello, len(driven.axes), driven.modes, self._page, self._end)
+        self.account = Account()
+        self._scene = driven.still().scene
+
+    def open(self, port: int = 0) -> str:
+        """Listen, and give the address to open in a browser."""
+        self.server.start(port)
+        return self.server.address
+
+    def close(self) -> None:
+        """Stop listening; nothing is left running."""
+        self.server.stop()
+
+    def run(self, *, until_closed: bool = False) -> Account:
+        """Drive until the pilot ends it, Ctrl-C, the longest time, or with ``until_closed`` nobody is left.
+
+        Signals are heeded between ticks only, so that each one is driven and written down, or neither.
+        """
+        driven, account = self.driven, self.account
+        pace = Pace(driven.period, clock.monotonic, self._over.wait)
+        shown = -1.0
+        try:
+            while True:
+                interruption.heed()
+                interruption.check()
+                pace.next()
+                interruption.keep()
+                if self._over.is_set() or driven.finished:
+                    account.ended = self._ended or "the longest time is over"
+                    break
+                if until_closed and self.server.came and not self.server.clients:
+                    account.ended = "the last browser was closed"
+                    break
+                if self.server.failure is not None:
+                    raise DynsimError(f"the server ended: {self.server.failure!r}")
+                order, state, count = self.helm.order()
+                driven.tick(order)
+                account.late.append(pace.late)
+                account.lost = pace.lost
+                now = clock.monotonic()
+                if now - shown >= 1.0 / FRAMES and self.server.clients:
+                    shown = now
+                    self.server.show(self._frame(state, count, pace))
+        except KeyboardInterrupt:
+            interruption.answered()
+            account.ended = "interrupted"
+        except SimulationStopped as stop:
+            account.ended, account.stop = str(stop), stop
+        interruption.keep()
+        return account
+
+    def _end(self) -> None:
+        self._ended = "ended by the pilot"
+        self._over.set()
+
+    def _frame(self, state: str, count: int, pace: Pace) -> dict[str, Any]:
+        shown = self.driven.shown()
+        return {
+            "time": round(shown.time, 4),
+            "poses": np.round(shown.poses, 5).ravel().tolist(),
+            "hand": np.round(shown.hand, 4).tolist(),
+            "waiting": shown.waiting,
+            "state": state,
+            "n": count,
+            "late": round(1e3 * pace.late, 1),
+            "lost": round(pace.lost, 2),
+            "contacts": self._contacts(shown),
+            **shown.extra,
+        }
+
+    def _contacts(self, shown: Shown) -> dict[str, Any]:
+        """Forces as the page takes them: the normal, and what is left beside it."""
+        scene, found = self._scene, dict[str, Any]()
+        if scene is None:
+            return found
+        for point in scene.contacts:
+            touch, surface = shown.touching.get(point.name), scene.surface(point.surface)
+            if touch is None or surface is None:
+                continue
+            at = np.array(point.position)
+            if point.body != WORLD:
+                place, turn = shown.poses[point.body, :3], shown.poses[point.body, 3:]
+                at = place + rotated(turn, at)
+            normal = normals(surface, at[None])[0]
+            found[point.name] = {
+                "force": round(touch.force, 3),
+                "normal": np.round(normal, 5).tolist(),
+                "tangent": np.round(touch.vector - touch.force * normal, 3).tolist(),
+                "mode": touch.mode,
+            }
+        return found
+
+    def _page(self, socket: str) -> str:
+        own = resources.files("dynsim.live").joinpath("page")
+        style = own.joinpath("drive.css").read_text(encoding="utf-8")
+        program = own.joinpath("drive.js").read_text(encoding="utf-8")
+        given = f"const DRIVE = {json.dumps({'socket': socket, 'style': style})};"
+        return page({self.name: self.driven.still()}, scripts=[f"{given}\n{program}"], connect=socket)

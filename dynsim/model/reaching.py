@@ -1,0 +1,37 @@
+"""What the inverse kinematics of a hand work on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from dynsim.kernels.inverse_kinematics import PathArrays
+from dynsim.kernels.jit import integers, reals
+from dynsim.model.arrays import compile_contacts
+from dynsim.model.description import Contact
+from dynsim.model.model import Model
+from dynsim.model.shapes import compile_shapes
+
+
+def path_arrays(model: Model, joints: Sequence[str], braces: Sequence[Contact] = ()) -> PathArrays:
+    """Joints that take the hand of a robot along a path and keep points on their surfaces meanwhile."""
+    columns = [model.joint_names.index(name) for name in joints]
+    link, point = model.robot.attach(*model.robot.hand)
+    points = [replace(contact, tip=None) for contact in braces]
+    rows = 3 + len(braces)
+    return PathArrays(
+        link=link,
+        point=reals(point),
+        braces=compile_contacts(model.robot, points),
+        shapes=compile_shapes(model.robot, points),
+        column=integers(columns),
+        place=integers([model.robot.position_index[column] for column in columns]),
+        jacobian=np.zeros((3, model.n)),
+        rates=np.zeros((rows, len(columns))),
+        system=np.zeros((rows, rows)),
+        error=np.zeros(rows),
+        change=np.zeros(len(columns)),
+        position=np.zeros(3),
+    )

@@ -1,0 +1,215 @@
+"""A drive and its script are the same run, bit for bit; references do what velocities ask for."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+import dynsim
+from dynsim import Record, Scenario, load_scenario, simulate
+from dynsim.engine.driven import Order, drive
+from dynsim.engine.together import simulate_together
+from dynsim.errors import DynsimError, ScenarioError
+from dynsim.model.snake import FIXING, SWITCHING
+from dynsim.record.poses import ORIENTATION, POSITION, poses_at
+from dynsim.scenario import scenario_from_resolved
+
+
+def assert_same(a: Record, b: Record) -> None:
+    assert list(a) == list(b)
+    for name in a:
+        assert np.array_equal(a[name], b[name], equal_nan=True), name
+    assert a.events == b.events
+    assert a.complete == b.complete
+
+
+def replayed(record: Record) -> Record:
+    return simulate(scenario_from_resolved(record.provenance["scenario"]))
+
+
+def driven_at_random(scenario: Scenario, ticks: int, size: float, requests: dict[int, int] | None = None) -> Record:
+    """A drive with new velocities every eighth tick, all of them zero now and then."""
+    driven, random = drive(scenario), np.random.default_rng(1)
+    velocity = (0.0,) * len(driven.axes)
+    for k in range(ticks):
+        if k % 8 == 3:
+            velocity = tuple((size * random.uniform(-1.0, 1.0, len(driven.axes)) * (k % 32 != 27)).tolist())
+        driven.tick(Order(velocity, (requests or {}).get(k, 0), closed=20 < k < 50))
+    return driven.record()
+
+
+ARMS = [
+    ("elbow_comparison", "two_elbows"),
+    ("elbow_comparison_floor", "two_elbows"),
+    ("six_axis_arm", None),
+    ("mobile_path", None),
+]
+
+
+@pytest.mark.parametrize(("name", "variant"), ARMS)
+def test_drive_of_an_arm_is_replayed_bit_for_bit(name: str, variant: str | None) -> None:
+    record = driven_at_random(load_scenario(name, variant), 60, 0.1)
+    assert record.provenance["scenario"]["controller"]["operator"]["commands"]
+    assert record.time[-1] == pytest.approx(0.6)
+    assert np.ptp(record["hand_position"], axis=0).max() > 1e-3
+    assert_same(record, replayed(record))
+
+
+@pytest.mark.parametrize(
+    ("name", "variant", "size"), [("snake_operator", None, 0.6), ("snake_circle", "backward_switching", 0.6)]
+)
+def test_drive_of_a_snake_is_replayed_bit_for_bit(name: str, variant: str | None, size: float) -> None:
+    """Also where the target waits, which a script would wait for too, and with modes."""
+    requests = {40: SWITCHING, 600: FIXING, 700: 3}
+    record = driven_at_random(load_scenario(name, variant), 900, size, requests)
+    assert record.summary["mode_switches"] > 2
+    assert record.summary["waiting_s"] > 0.0
+    assert record["gripper"].max() == 1
+    assert_same(record, replayed(record))
+
+
+def test_contacts_that_are_shown_are_those_of_the_record() -> None:
+    driven = drive(load_scenario("elbow_comparison_floor", "two_elbows"))
+    for _ in range(40):
+        driven.tick(Order((0.05, 0.0, 0.0)))
+    shown, record = driven.shown(), driven.record()
+    assert list(shown.touching) == list(record.labels["contact_normal_force"])
+    # At one of the last samples before that instant: steps are longer than the time between samples.
+    forces, vectors = record["contact_normal_force"], record["contact_force"]
+    (k,) = np.flatnonzero(forces[:, 1] == shown.touching["elbow_7"].force)
+    assert shown.time - 0.05 < record.time[k] <= shown.time
+    for c, touch in enumerate(shown.touching.values()):
+        assert touch.force == forces[k, c]
+        assert np.array_equal(touch.vector, vectors[k, c])
+        assert touch.mode == record["contact_mode"][k, c]
+    assert any(touch.force > 0.0 for touch in shown.touching.values())
+
+
+def test_hand_goes_as_fast_as_it_is_asked_to() -> None:
+    """The target exactly, the hand as well as the controller follows it."""
+    driven = drive(load_scenario("six_axis_arm"))
+    start = driven.shown().hand.copy()
+    velocity, still = np.array([0.05, -0.03, 0.02]), (0.0, 0.0, 0.0)
+    for k in range(100):
+        driven.tick(Order(tuple(velocity.tolist()) if k < 50 else still))
+    # What it loses while it speeds up it makes up for while it slows down; sums of ticks, so to rounding.
+    way = 0.5 * velocity
+    assert driven.shown().hand - start == pytest.approx(way, abs=1e-3 * 0.025)
+    record = driven.record()
+    assert record["target_position"][-1] == pytest.approx(driven.shown().hand, abs=1e-12)
+    speed = np.linalg.norm(np.diff(record["target_position"], axis=0), axis=1) / np.diff(record.time)
+    assert speed.max() == pytest.approx(np.linalg.norm(velocity))
+    # By ticks of 10 ms, seen in samples of 5 ms.
+    assert np.abs(speed[2:] - speed[:-2]).max() == pytest.approx(0.5 * 0.01, rel=1e-6)
+    assert record.summary["hand_error_max_m"] < 2e-3
+
+
+def test_base_goes_along_its_arc() -> None:
+    """V = 0.2 m/s and ω = 0.4 rad/s for 1 s: an arc of radius 0.5 m; the hand is carried along."""
+    driven = drive(load_scenario("mobile_path"))
+    names = [axis.name for axis in driven.axes]
+    order = Order(tuple({"ahead": 0.2, "turn": 0.4}.get(name, 0.0) for name in names))
+    still = Order((0.0,) * len(names))
+    for k in range(200):
+        driven.tick(order if k < 100 else still)
+    record = driven.record()
+    x, y, heading = record["base_pose"][-1]
+    # A little different where it speeds up and slows down: there the radius is another one.
+    assert (x, y, heading) == pytest.approx((0.5 * math.sin(0.4), 0.5 * (1.0 - math.cos(0.4)), 0.4), abs=8e-3)
+    assert record["tip_margin"].min() > 0.2
+    arm = record["q"][:, [k for k, name in enumerate(record.labels["q"]) if name.startswith("joint")]]
+    assert np.abs(arm[-1] - arm[0]).max() < 5e-3
+
+
+def test_hand_waits_where_it_cannot_go() -> None:
+    """Pulled straight up for ten times the arm's length: it stops at its reach, and comes back when asked to."""
+    driven = drive(load_scenario("six_axis_arm"))
+    for _ in range(1000):
+        driven.tick(Order((0.0, 0.0, 0.5)))
+    top, waiting = driven.shown().hand.copy(), driven.shown().waiting
+    assert waiting
+    assert top[2] < 3.0
+    rates = np.abs(driven.record()["v"])
+    assert rates.max() < 2.5
+    for _ in range(20):
+        driven.tick(Order((0.0, 0.0, -0.05)))
+    assert driven.shown().hand[2] < top[2] - 0.005
+
+
+def test_stepper_follows_the_script_and_goes_back() -> None:
+    commands = [{"at_s": 0.1, "hand": [0.05, 0.0, 0.0]}, {"at_s": 0.3, "hand": [0.0, 0.0, 0.05]}]
+    operator = {"joints": ["base_yaw", "shoulder_pitch", "elbow_pitch"], "commands": commands}
+    resolved: dict[str, Any] = load_scenario("six_axis_arm").resolved
+    del resolved["controller"]["hand"]
+    resolved["controller"]["operator"] = operator
+    resolved["duration_s"] = 0.5
+    scenario = scenario_from_resolved(resolved)
+    simulation = dynsim.Simulation(scenario)
+    simulation.advance(0.2)
+    before = simulation.snapshot()
+    first = simulation.advance(0.5).q
+    simulation.restore(before)
+    assert np.array_equal(simulation.advance(0.5).q, first)
+    assert simulate(scenario)["q"][-1] == pytest.approx(first, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "reason"),
+    [
+        ("single_pendulum", {}, "nothing to drive|no controller"),
+        ("elbow_comparison", {"controller.operator": {"joints": ["joint_9"]}}, "remove hand"),
+        ("six_axis_arm", {"controller.hand": None, "controller.operator": {"joints": ["knee"]}}, "no joint"),
+        (
+            "six_axis_arm",
+            {"controller.hand": None, "controller.operator": {"commands": [{"at_s": 0, "base": [1, 0]}]}},
+            "no mobile base",
+        ),
+        (
+            "six_axis_arm",
+            {"controller.hand": None, "controller.operator": {"commands": [{"at_s": 1}, {"at_s": 0}]}},
+            "order of their at_s",
+        ),
+    ],
+)
+def test_what_cannot_be_driven_is_refused(name: str, change: dict[str, Any], reason: str) -> None:
+    with pytest.raises(DynsimError, match=reason):  # noqa: PT012 (whichever of them finds it)
+        scenario = load_scenario(name, None, change)
+        if "commands" in change.get("controller.operator", {}):
+            simulate(scenario)
+        drive(scenario)
+
+
+def test_an_operator_needs_something_to_move() -> None:
+    with pytest.raises(ScenarioError, match=r"controller\.operator"):
+        dynsim.Simulation(load_scenario("six_axis_arm"), operator=object())  # type: ignore[arg-type]
+
+
+def test_runs_together_follow_their_operators() -> None:
+    """They share no lanes: nothing would be rewritten there."""
+    operator = {
+        "joints": ["base_yaw", "shoulder_pitch", "elbow_pitch"],
+        "commands": [{"at_s": 0, "hand": [0.05, 0, 0]}],
+    }
+    change = {"controller.hand": None, "controller.operator": operator, "duration_s": 0.2}
+    scenario = load_scenario("six_axis_arm", None, change | {"integrator.method": "rk4", "integrator.step_s": 1e-4})
+    record, again = simulate_together([scenario, scenario])
+    assert isinstance(record, Record)
+    assert isinstance(again, Record)
+    assert np.ptp(record["hand_position"][:, 0]) > 1e-3
+    assert_same(record, simulate(scenario))
+
+
+@pytest.mark.parametrize("name", ["snake_operator", "mobile_path", "six_axis_arm"])
+def test_poses_of_an_instant_are_those_of_the_record(name: str) -> None:
+    record = simulate(load_scenario(name, None, {"duration_s": 0.5}))
+    assert record.scene is not None
+    signals = {body.joint.signal for body in record.scene.bodies}
+    for k in (0, -1):
+        here = {s: dict(zip(record.labels[s], record[s][k].tolist(), strict=True)) for s in signals if s}
+        poses = poses_at(record.scene, here)
+        assert poses[:, :3] == pytest.approx(record[POSITION][k], abs=1e-6)
+        turn = np.abs((poses[:, 3:] * record[ORIENTATION][k]).sum(axis=1))
+        assert turn == pytest.approx(np.ones(len(poses)), abs=1e-6)

@@ -1,0 +1,152 @@
+"""A pilot in a real browser: keys, a faked gamepad, a finger on a stick, and focus that is lost."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from teleop_clients import PATIENCE_S, Teleop
+
+# A gamepad of the standard layout, whose axes and buttons a test sets.
+GAMEPAD = """
+window.pad = { connected: true, mapping: "standard", axes: [0, 0, 0, 0],
+  buttons: Array.from({ length: 17 }, () => ({ pressed: false, value: 0 })) };
+navigator.getGamepads = () => [window.pad, null, null, null];
+"""
+
+
+class Pilot:
+    """The page of a drive in a browser."""
+
+    def __init__(self, page: Any, teleop: Teleop) -> None:
+        self.page, self.requests, self.complaints = page, [], []
+        page.on("request", lambda request: self.requests.append(request.url))
+        page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        page.on("console", lambda said: self.complaints.append(said.text) if said.type == "error" else None)
+        page.add_init_script(GAMEPAD)
+        page.goto(teleop.address)
+        page.evaluate("dynsim.ready")
+        self.until("dynsim.drive?.role === 'pilot' && dynsim.drive.frames > 0")
+
+    def js(self, program: str) -> Any:
+        return self.page.evaluate(program)
+
+    def until(self, program: str) -> None:
+        end = time.monotonic() + PATIENCE_S
+        while not self.js(program):
+            assert time.monotonic() < end, (program, self.js("dynsim.drive?.state"), self.complaints)
+            self.page.wait_for_timeout(20)
+
+    def hand(self) -> list[float]:
+        return list(self.js("dynsim.drive.last.hand"))
+
+    def moved(self, axis: int, way: float) -> None:
+        """Wait until the hand has moved along an axis."""
+        before = self.hand()[axis]
+        sign = 1 if way > 0 else -1
+        self.until(f"{sign} * (dynsim.drive.last.hand[{axis}] - {before}) > {abs(way)}")
+
+    def rests(self) -> None:
+        """Wait until nothing is asked for, and the hand has come to rest."""
+        self.until("dynsim.drive.last.state !== 'driving'")
+        begun = self.js("dynsim.drive.last.time")
+        self.until(f"dynsim.drive.last.time > {begun} + 0.3")
+        before = self.hand()
+        self.until(f"dynsim.drive.last.time > {begun} + 0.6")
+        assert self.hand() == pytest.approx(before, abs=1e-4)
+
+
+@pytest.fixture
+def pilot(browser: Any) -> Iterator[Callable[[Teleop], Pilot]]:
+    """Opens the page of a drive; at the end it has asked for nothing else and complained of nothing."""
+    found: list[tuple[Pilot, Teleop]] = []
+    contexts: list[Any] = []
+
+    def opens(teleop: Teleop) -> Pilot:
+        context = browser.new_context(viewport={"width": 700, "height": 500})
+        context.set_default_timeout(1e3 * PATIENCE_S)
+        contexts.append(context)
+        one = Pilot(context.new_page(), teleop)
+        found.append((one, teleop))
+        return one
+
+    yield opens
+    for one, teleop in found:
+        asked = [url for url in one.requests if not url.startswith(("data:", "blob:", "ws:"))]
+        assert [url for url in asked if not url.endswith("/favicon.ico")] == [teleop.address]
+        assert one.complaints == []
+    for context in contexts:
+        context.close()
+
+
+def test_keys_gamepad_and_sticks_drive_a_snake(teleop: Callable[..., Teleop], pilot: Callable[[Teleop], Pilot]) -> None:
+    drive = teleop("snake_operator", "--speed", "0.2")
+    one = pilot(drive)
+    keyboard = one.page.keyboard
+    # Keys of axes alone do nothing, with space they drive.
+    keyboard.down("w")
+    before = one.hand()
+    one.page.wait_for_timeout(500)
+    assert one.hand() == pytest.approx(before, abs=1e-6)
+    keyboard.down(" ")
+    one.moved(0, 0.02)
+    keyboard.up(" ")
+    one.rests()
+    keyboard.up("w")
+    # The page's own keys are still: w drives, and space plays nothing.
+    assert one.js("dynsim.state().playing") is False
+
+    one.js("pad.axes[3] = 1")
+    one.page.wait_for_timeout(300)
+    one.rests()
+    one.js("pad.buttons[5].pressed = true")
+    one.moved(2, -0.01)
+    one.js("pad.buttons[0].pressed = true")
+    one.until("dynsim.drive.last.gripper === 1")
+    one.js("pad.buttons[5].pressed = false; pad.buttons[0].pressed = false; pad.axes[3] = 0")
+    one.rests()
+
+    box = one.page.locator(".stick").first.bounding_box()
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    one.page.mouse.move(*middle)
+    one.page.mouse.down()
+    one.page.mouse.move(middle[0] - 40, middle[1])
+    one.moved(1, 0.01)
+    one.page.mouse.up()
+    one.rests()
+
+    # A mode is taken with the key held.
+    one.page.select_option("#mode", "3")
+    one.page.wait_for_timeout(200)
+    assert one.js("dynsim.drive.last.mode") == 1
+    keyboard.down(" ")
+    one.until("dynsim.drive.last.mode === 3")
+    keyboard.up(" ")
+    one.page.click("#end")
+    assert drive.finish() == 0
+    assert "ended by the pilot" in drive.said
+    one.until("dynsim.drive.ended")
+
+
+def test_focus_that_is_lost_lets_everything_go(teleop: Callable[..., Teleop], pilot: Callable[[Teleop], Pilot]) -> None:
+    drive = teleop("mobile_path")
+    one = pilot(drive)
+    keyboard = one.page.keyboard
+    keyboard.down(" ")
+    keyboard.down("ArrowUp")
+    one.until("dynsim.drive.last.state === 'driving' && dynsim.drive.wish.axes[3] === 1")
+    begun = one.js("dynsim.drive.last.poses[0]")
+    one.until(f"dynsim.drive.last.poses[0] > {begun} + 0.02")
+    one.js("window.dispatchEvent(new Event('blur'))")
+    # Keys are still down: they count only when they are pressed anew.
+    one.until("dynsim.drive.wish.held === false")
+    one.rests()
+    # What is drawn is what the simulation has.
+    drawn = one.js("Object.values(dynsim.state().records[0].bodies).flatMap((body) => [...body.p, ...body.q])")
+    assert drawn == pytest.approx(one.js("dynsim.drive.last.poses"), abs=1e-4)
+    keyboard.up("ArrowUp")
+    keyboard.up(" ")
+    assert drive.interrupt() == 0
+    assert drive.group_is_gone()

@@ -1,0 +1,206 @@
+"""Who gets in, who drives, what stops the robot, and what is left of a drive."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from teleop_clients import Client, Teleop
+
+from dynsim import Record, load_scenario, simulate
+
+SNAKE, ARM = ("snake_operator",), ("six_axis_arm",)
+
+
+@pytest.fixture(scope="module")
+def nothing() -> None:
+    """The kernels of these drives are compiled before anyone waits for them."""
+    simulate(load_scenario("snake_operator", None, {"duration_s": 0.1}))
+
+
+def test_only_the_page_gets_in(teleop: Callable[..., Teleop], nothing: None) -> None:
+    one = teleop(*SNAKE)
+    host = {"Host": f"127.0.0.1:{one.port}"}
+    drive, wrong = f"{one.path}drive", f"/{'x' * 32}/"
+    status, body = one.ask(one.path, host)
+    assert (status, b"<!DOCTYPE html>" in body) == (200, True)
+    assert one.ask(one.path, {"Host": f"localhost:{one.port}"})[0] == 200
+    refused = [
+        (wrong, host),
+        ("/", host),
+        (one.path[:-1] + "x/", host),
+        (one.path, {"Host": f"example.org:{one.port}"}),
+        (one.path, {"Host": "127.0.0.1"}),
+        (one.path, {}),
+        (f"{wrong}drive", one.upgrade()),
+        (drive, one.upgrade(Origin="http://example.org")),
+        (drive, one.upgrade(Origin=f"https://127.0.0.1:{one.port}")),
+        (drive, one.upgrade(Origin="null")),
+        (drive, one.upgrade(Origin=None)),
+        (drive, one.upgrade(Host=f"example.org:{one.port}")),
+        (drive, one.upgrade(Host=f"example.org:{one.port}", Origin=f"http://example.org:{one.port}")),
+    ]
+    for path, headers in refused:
+        status, body = one.ask(path, headers)
+        # What has no Host is no request at all.
+        assert status == 403 or (status == 400 and not headers), (path, headers)
+        assert b"dynsim" not in body
+    assert one.ask(drive, one.upgrade())[0] == 101
+    assert one.interrupt() == 0
+
+
+def test_it_listens_on_loopback_only(teleop: Callable[..., Teleop], nothing: None) -> None:
+    one = teleop(*SNAKE)
+    with open("/proc/net/tcp", encoding="utf-8") as table:
+        listening = [line.split()[1] for line in table if line.split()[3] == "0A"]
+    assert [entry for entry in listening if int(entry.split(":")[1], 16) == one.port] == [f"0100007F:{one.port:04X}"]
+    assert one.interrupt() == 0
+
+
+def test_one_drives_and_others_watch(teleop: Callable[..., Teleop], nothing: None) -> None:
+    one = teleop(*SNAKE)
+    first, second = one.connect(), one.connect()
+    first.take()
+    second.say(do="take")
+    second.wish({}, held=False)
+    second.drive({"x": -1.0}, 0.5)
+    assert second.until("time")["state"] in ("key released", "silent")
+    first.wish({}, held=False)
+    first.drive({"x": 1.0}, 0.8)
+    first.until("hand", lambda hand: hand[0] > 0.36)
+    first.close()
+    second.until("free", bool)
+    second.take()
+    second.drive({"z": 1.0}, 0.3)
+    second.until("state", lambda state: state == "driving")
+    second.say(do="end")
+    assert one.finish() == 0
+    record = Record.load(one.folder / "record.h5")
+    assert (np.diff(record["w_target"][:, 0]) >= 0.0).all(), "who watches moves nothing"
+
+
+def test_silence_stops_the_robot(teleop: Callable[..., Teleop], nothing: None) -> None:
+    one = teleop(*ARM)
+    client = one.connect()
+    client.take()
+    client.drive({"y": 1.0}, 0.5)
+    client.until("state", lambda state: state == "silent")
+    # At 0.5 m/s² it takes 0.2 s from full speed.
+    at = client.until("time")["time"]
+    stopped = client.until("time", lambda now: now > at + 0.25)
+    # Words with the key held do not wake it; a key that was let go and pressed again does.
+    client.drive({"y": 1.0}, 0.3)
+    again = client.until("time", lambda now: now > stopped["time"] + 0.2)
+    assert again["state"] == "silent"
+    assert again["hand"] == stopped["hand"]
+    client.wish({}, held=False)
+    client.drive({"y": 1.0}, 0.3)
+    client.until("state", lambda state: state == "driving")
+    assert one.interrupt() == 0
+    commands = load_scenario(one.folder / "scenario.yaml").controller.operator.commands
+    begin, end = commands[0], commands[1]
+    assert begin.hand == [0.0, 0.1, 0.0]
+    assert end.hand == [0.0, 0.0, 0.0]
+    # It drove for as long as it was told to, and for a quarter of a second more; ticks do not hurry.
+    assert end.at_s - begin.at_s < 0.5 + 0.25 + 0.15
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("{", "no JSON"),
+        ('{"n": 1, "axes": [NaN, 0, 0], "held": true}', "NaN is no number"),
+        ('{"n": 1, "axes": [0, 0], "held": true}', "axes: must be a list of 3"),
+        ('{"n": 1, "axes": [0, 0, 0], "held": true, "mode": 3}', "mode: no such mode"),
+    ],
+)
+def test_what_is_no_wish_is_refused_by_name(
+    teleop: Callable[..., Teleop], nothing: None, text: str, reason: str
+) -> None:
+    one = teleop(*ARM)
+    client = one.connect()
+    client.take()
+    client.socket.send(text)
+    assert reason in client.until("refused")["refused"]
+    client.drive({"x": 1.0}, 0.2)
+    client.until("state", lambda state: state == "driving")
+    assert one.interrupt() == 0
+
+
+def test_long_many_and_senseless_messages_end_a_connection(teleop: Callable[..., Teleop], nothing: None) -> None:
+    from websockets.exceptions import ConnectionClosed
+
+    one = teleop(*ARM)
+
+    def code_after(send: Callable[[Client], None]) -> int:
+        client = one.connect()
+        with pytest.raises(ConnectionClosed) as closed:  # noqa: PT012 (whichever of them meets it)
+            send(client)
+            while True:
+                client.hear()
+        assert closed.value.rcvd is not None
+        return int(closed.value.rcvd.code)
+
+    assert code_after(lambda client: client.socket.send('{"n": 1' + " " * 4100 + "}")) == 1009
+    assert code_after(lambda client: [client.socket.send("{") for _ in range(30)] and None) == 1008
+    assert code_after(lambda client: [client.wish({}) for _ in range(1000)] and None) == 1008
+    # Others drive on.
+    client = one.connect()
+    client.take()
+    client.drive({"x": 1.0}, 0.2)
+    client.until("state", lambda state: state == "driving")
+    assert one.interrupt() == 0
+
+
+@pytest.mark.parametrize("scenario", [SNAKE, ("mobile_path",), ("elbow_comparison_floor",)])
+def test_a_drive_leaves_its_record_and_a_script_that_repeats_it(
+    teleop: Callable[..., Teleop], scenario: tuple[str, ...], nothing: None
+) -> None:
+    one = teleop(*scenario)
+    client = one.connect()
+    client.take()
+    names = [axis["name"] for axis in client.hello["axes"]]
+    client.drive(dict.fromkeys(names, 0.5), 0.6)
+    client.drive({names[0]: -0.33}, 0.4, closed=True)
+    client.until("state", lambda state: state == "driving")
+    assert one.interrupt() == 0
+    assert "Written to" in one.said
+    assert "dynsim run" in one.said
+    assert one.group_is_gone()
+    assert sorted(file.name for file in one.folder.iterdir()) == [
+        "record.h5",
+        "scenario.yaml",
+        "summary.json",
+        "view.html",
+    ]
+    record, again = Record.load(one.folder / "record.h5"), simulate(load_scenario(one.folder / "scenario.yaml"))
+    assert record.complete
+    assert set(record) == set(again)
+    for name in record:
+        assert np.array_equal(record[name], again[name], equal_nan=True), name
+
+
+def test_nobody_left_ends_a_drive_that_is_told_so(teleop: Callable[..., Teleop], nothing: None) -> None:
+    one = teleop(*SNAKE, "--until-closed")
+    client = one.connect()
+    client.take()
+    client.drive({"x": 1.0}, 0.2)
+    client.close()
+    assert one.finish() == 0
+    assert "the last browser was closed" in one.said
+    assert one.group_is_gone()
+
+
+def test_a_port_that_is_taken_is_an_error(teleop: Callable[..., Teleop], nothing: None) -> None:
+    one = teleop(*SNAKE)
+    command = [sys.executable, "-m", "dynsim", "teleop", *SNAKE, "--no-open", "--http-port", str(one.port)]
+    other = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=one.folder.parent, check=False)
+    assert other.returncode == 2
+    assert "choose another --http-port" in " ".join(other.stderr.split())
+    begun = time.monotonic()
+    assert one.interrupt() == 0
+    assert time.monotonic() - begun < 60

@@ -1,0 +1,153 @@
+"""Drives in processes of their own, and raw clients of their servers."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+PATIENCE_S = 180.0
+
+
+def prepare_child() -> None:
+    """Where the tests run in the background, SIGINT is ignored and would be in their children too."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+class Teleop:
+    """A process of ``dynsim teleop``, and the address that it tells."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        self.folder = folder
+        command = [sys.executable, "-m", "dynsim", "teleop", *arguments, "--no-open", "--out", str(folder)]
+        self.process = subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            preexec_fn=prepare_child,
+            start_new_session=True,
+            cwd=folder.parent,
+        )
+        assert self.process.stdout is not None
+        self.said = ""
+        while not (found := re.search(r"http://\S+", self.said)):
+            line = self.process.stdout.readline()
+            assert line, self.said
+            self.said += line
+        self.address = found[0]
+        parts = urlsplit(self.address)
+        assert parts.hostname == "127.0.0.1"
+        self.port, self.path = int(parts.port or 0), parts.path
+
+    def finish(self) -> int:
+        """Wait for the end; the exit code."""
+        out, _ = self.process.communicate(timeout=PATIENCE_S)
+        self.said += out
+        return self.process.returncode
+
+    def interrupt(self) -> int:
+        """Ctrl-C, and what comes of it."""
+        self.process.send_signal(signal.SIGINT)
+        return self.finish()
+
+    def group_is_gone(self) -> bool:
+        """No process of its session is left."""
+        try:
+            os.killpg(self.process.pid, 0)
+        except ProcessLookupError:
+            return True
+        return False
+
+    def connect(self) -> Client:
+        """A pilot's socket, as the page opens it."""
+        return Client(self)
+
+    def ask(self, path: str, headers: Mapping[str, str | None]) -> tuple[int, bytes]:
+        """Status and rest of the answer to a request with these headers."""
+        lines = [f"GET {path} HTTP/1.1", *(f"{name}: {value}" for name, value in headers.items() if value is not None)]
+        with socket.create_connection(("127.0.0.1", self.port), timeout=30) as raw:
+            raw.sendall(("\r\n".join(lines) + "\r\n\r\n").encode())
+            answer = b""
+            while chunk := raw.recv(65536):
+                answer += chunk
+                if b"101 Switching" in answer:
+                    break
+        head, _, body = answer.partition(b"\r\n\r\n")
+        return int(head.split()[1]), body
+
+    def upgrade(self, **changes: str | None) -> dict[str, str | None]:
+        """Headers of a web socket from the page."""
+        headers: dict[str, str | None] = {
+            "Host": f"127.0.0.1:{self.port}",
+            "Origin": f"http://127.0.0.1:{self.port}",
+            "Upgrade": "websocket",
+            "Connection": "Upgrade",
+            "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==",
+            "Sec-WebSocket-Version": "13",
+        }
+        return headers | changes
+
+
+class Client:
+    """A raw client: says and hears JSON."""
+
+    def __init__(self, teleop: Teleop) -> None:
+        from websockets.sync.client import connect
+
+        origin = f"http://127.0.0.1:{teleop.port}"
+        address = f"ws://127.0.0.1:{teleop.port}{teleop.path}drive"
+        self._open = ExitStack()
+        self.socket = self._open.enter_context(connect(address, origin=origin, compression=None, ping_interval=None))
+        self.count = 0
+        self.hello: dict[str, Any] = self.until("hello")["hello"]
+
+    def close(self) -> None:
+        """Leave."""
+        self._open.close()
+
+    def say(self, **message: Any) -> None:
+        """One message."""
+        self.socket.send(json.dumps(message))
+
+    def wish(self, axes: Mapping[str, float], held: bool = True, **more: Any) -> None:
+        """What is wanted of each axis by name, others zero."""
+        self.count += 1
+        names = [axis["name"] for axis in self.hello["axes"]]
+        self.say(n=self.count, axes=[axes.get(name, 0.0) for name in names], held=held, **more)
+
+    def hear(self) -> dict[str, Any]:
+        """The next message."""
+        return dict(json.loads(self.socket.recv(timeout=60)))
+
+    def until(self, key: str, test: Callable[[Any], bool] = lambda value: True) -> dict[str, Any]:
+        """The next message with a key, and a value that passes a test."""
+        end = time.monotonic() + 60
+        while time.monotonic() < end:
+            message = self.hear()
+            if key in message and test(message[key]):
+                return message
+        raise AssertionError(f"no {key}")
+
+    def take(self) -> None:
+        """Become the pilot, with the key released."""
+        self.say(do="take")
+        self.until("role", lambda role: role == "pilot")
+        self.wish({}, held=False)
+
+    def drive(self, axes: Mapping[str, float], seconds: float, **more: Any) -> None:
+        """Hold the key and the axes for a time, as a browser does."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.wish(axes, **more)
+            time.sleep(0.02)
