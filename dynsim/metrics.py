@@ -29,6 +29,7 @@ from dynsim.model.drives import Drive, Servo, TorqueSource
 from dynsim.model.mobile_base import MobileBase
 from dynsim.model.unilateral import JointStop, told
 from dynsim.record import Record
+from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario, build
 
 # Integrals that the integrator carries, in the order of the state (dynsim.kernels.ledger).
@@ -153,9 +154,14 @@ def residual_floor(record: Record, robot: Robot, tolerance: float, real: bool = 
 
 
 def summarise(
-    record: Record, scenario: Scenario, contacts: Sequence[Contact], robot: Robot, counts: Counts
+    record: Record,
+    scenario: Scenario,
+    contacts: Sequence[Contact],
+    robot: Robot,
+    counts: Counts,
+    reuse: Reuse | None = None,
 ) -> dict[str, Any]:
-    """The content of ``summary.json``."""
+    """The content of ``summary.json``; ``reuse``: what other runs have computed."""
     duration = float(record.time[-1] - record.time[0]) if len(record) else 0.0
 
     def final(name: str) -> float:
@@ -164,7 +170,7 @@ def summarise(
     turnover = energy_turnover(record)
     residual = float(np.abs(record["energy_residual"]).max(initial=0.0))
     denominator = max(turnover, residual_floor(record, robot, scenario.integrator.rtol, counts.unilateral is not None))
-    sunk = sinking(robot, build.surfaces(scenario), record["q"])
+    sunk = sinking(robot, build.surfaces(scenario, reuse), record["q"], reuse)
     summary: dict[str, Any] = {
         "scenario": scenario.name,
         "variant": scenario.variant,

@@ -16,6 +16,7 @@ from dynsim.errors import SimulationInterrupted, SimulationStopped
 from dynsim.kernels.integrate import driver
 from dynsim.kernels.integrate import run as ki
 from dynsim.record import Event, Record
+from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario
 
 __all__ = ["Prepared", "prepare", "simulate", "start"]
@@ -33,9 +34,11 @@ def start(prepared: Prepared) -> Start:
     return Start(model.point_position(*model.robot.hand, q), contacts)
 
 
-def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:
+def simulate(
+    scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True, reuse: Reuse | None = None
+) -> Record:
     """See :func:`dynsim.engine.simulate`."""
-    prepared = prepare(scenario, progress)
+    prepared = prepare(scenario, progress, reuse=reuse)
     run = prepared.run
     # Loading or compiling the kernels is no integration time.
     with kernels_logged(log):
