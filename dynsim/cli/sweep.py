@@ -71,14 +71,17 @@ def sweep(
     quiet: QuietOption = False,
 ) -> None:
     """Simulate a scenario over a grid, and with samples, of its values; write a table of all runs and figures."""
-    from dynsim.files import check_writable
-    from dynsim.scenario import read_scenario
-    from dynsim.studies.plan import Axis, Law, Plan
-    from dynsim.studies.processes import cores
-    from dynsim.studies.sweep import JOURNAL, OK, PLAN, STATISTICS, TABLES, has_parquet, run_sweep
+    from dynsim.studies.processes import begin_early, cores
 
     if jobs is not None and scheduler is not None:
         raise ScenarioError("--jobs are processes of this machine, --scheduler has its own workers: give one of them")
+    if scheduler is None and (jobs or cores()) > 1:
+        begin_early("dynsim.studies.batch", "dynsim.studies.plan", "dynsim.engine.dynamics")
+    from dynsim.files import check_writable
+    from dynsim.scenario import read_scenario
+    from dynsim.studies.plan import Axis, Law, Plan
+    from dynsim.studies.sweep import JOURNAL, OK, PLAN, STATISTICS, TABLES, has_parquet, run_sweep
+
     file = read_scenario(scenario)
     axes, laws = tuple(map(Axis.parse, grid or ())), tuple(map(Law.parse, sample or ()))
     plan = Plan(file, _variants(file.variants, variants), parsed_overrides(overrides), axes, laws, count, seed)
