@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -87,6 +88,9 @@ def sweep(
     plan = Plan(file, _variants(file.variants, variants), parsed_overrides(overrides), axes, laws, count, seed)
     folder = out or Path("results", file.path.stem, "sweep")
     check_writable(folder, (PLAN, JOURNAL, *TABLES, STATISTICS))
+    if scheduler is not None or min(jobs or cores(), plan.runs) > 1:
+        # Meanwhile others simulate.
+        Thread(target=_load_for_the_end, args=(bool(laws), not no_figures), name="imports").start()
     with sweep_progress(plan.runs, quiet) as report:
         rows = run_sweep(
             plan,
@@ -122,6 +126,20 @@ def _variants(known: Sequence[str], wanted: str | None) -> tuple[str | None, ...
     if wanted is None:
         return (known[0],)
     return tuple(known) if wanted == "all" else tuple(name.strip() for name in wanted.split(","))
+
+
+def _load_for_the_end(samples: bool, figures: bool) -> None:
+    """Import what tables, statistics and figures need, half a second in all; what is missing is said there."""
+    from dynsim.studies.sweep import has_parquet
+
+    if has_parquet():
+        import pyarrow
+
+        pyarrow.array([0.0])  # looks whether there is pandas
+    if samples:
+        import scipy.special  # noqa: F401
+    if figures:
+        import dynsim.figures.sweep  # noqa: F401
 
 
 def _draw(rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool, format_: str) -> None:
