@@ -29,6 +29,7 @@ from dynsim.model.drives import Drive, Servo, TorqueSource
 from dynsim.model.mobile_base import MobileBase
 from dynsim.model.unilateral import JointStop, told
 from dynsim.record import Record
+from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario, build
 
 # Integrals that the integrator carries, in the order of the state (dynsim.kernels.ledger).
@@ -132,15 +133,23 @@ def energy_residual(record: Record) -> NDArray[np.float64]:
     return residual
 
 
-def residual_floor(record: Record, robot: Robot, tolerance: float, real: bool = False) -> float:
+def residual_floor(
+    record: Record, robot: Robot, tolerance: float, real: bool = False, lever: tuple[float, float] | None = None
+) -> float:
     """Least denominator of the relative residual [J]: ``tolerance`` times the energy that the arm can have about it.
 
-    That is the largest of kinetic energy, magnetic energy, change of potential energy, and gravity's lever: the sum
-    over all bodies of weight times the length of the arm from the first joint to their centre of mass. Below it the
-    integration resolves nothing: an arm that hangs at rest would report the ratio of two roundings. Under the
+    That is the largest of kinetic energy, magnetic energy, change of potential energy, and gravity's ``lever``. Below
+    it the integration resolves nothing: an arm that hangs at rest would report the ratio of two roundings. Under the
     unilateral law (``real``) it is at least the whole weight times :data:`RESOLVED_M`.
     """
+    leverage, weight = gravity_lever(robot) if lever is None else lever
     stores = [record[name] - (record[name][:1] if name == "energy_potential" else 0.0) for name in STORES]
+    floor = tolerance * max(leverage, *(float(np.abs(store).max(initial=0.0)) for store in stores))
+    return max(floor, weight * RESOLVED_M) if real else floor
+
+
+def gravity_lever(robot: Robot) -> tuple[float, float]:
+    """Sum over all bodies of weight times the length of arm from the first joint to their centre [J]; weight [N]."""
     reach: dict[str, float] = {}
     lever, mass = 0.0, 0.0
     for link in robot.links:
@@ -148,14 +157,18 @@ def residual_floor(record: Record, robot: Robot, tolerance: float, real: bool = 
         reach[link.name] = 0.0 if link.parent is None else reach[link.parent] + float(np.linalg.norm(link.p_PJ))
         lever += link.inertia.mass * (reach[link.name] + float(np.linalg.norm(link.inertia.com)))
     gravity = float(np.linalg.norm(robot.gravity))
-    floor = tolerance * max(lever * gravity, *(float(np.abs(store).max(initial=0.0)) for store in stores))
-    return max(floor, mass * gravity * RESOLVED_M) if real else floor
+    return lever * gravity, mass * gravity
 
 
 def summarise(
-    record: Record, scenario: Scenario, contacts: Sequence[Contact], robot: Robot, counts: Counts
+    record: Record,
+    scenario: Scenario,
+    contacts: Sequence[Contact],
+    robot: Robot,
+    counts: Counts,
+    reuse: Reuse | None = None,
 ) -> dict[str, Any]:
-    """The content of ``summary.json``."""
+    """The content of ``summary.json``; ``reuse``: what other runs have computed."""
     duration = float(record.time[-1] - record.time[0]) if len(record) else 0.0
 
     def final(name: str) -> float:
@@ -163,8 +176,10 @@ def summarise(
 
     turnover = energy_turnover(record)
     residual = float(np.abs(record["energy_residual"]).max(initial=0.0))
-    denominator = max(turnover, residual_floor(record, robot, scenario.integrator.rtol, counts.unilateral is not None))
-    sunk = sinking(robot, build.surfaces(scenario), record["q"])
+    lever = (reuse or Reuse()).of("lever", lambda: gravity_lever(robot), robot)
+    floor = residual_floor(record, robot, scenario.integrator.rtol, counts.unilateral is not None, lever)
+    denominator = max(turnover, floor)
+    sunk = sinking(robot, build.surfaces(scenario, reuse), record["q"], reuse)
     summary: dict[str, Any] = {
         "scenario": scenario.name,
         "variant": scenario.variant,
@@ -281,8 +296,11 @@ def _warnings(
         else:
             put += "an error of the integration; shorten integrator.step_s or tighten integrator.rtol"
         found.append(put)
-    for a, motor in enumerate(robot.motors):
-        for what, signal, limit, unit in _limits_of(motor):
+    limited = [(a, motor, limits) for a, motor in enumerate(robot.motors) for limits in _limits_of(motor)]
+    peaks = {name: np.abs(record[name]).max(axis=0, initial=0.0) for name in {limits[1] for *_, limits in limited}}
+    for a, motor, (what, signal, limit, unit) in limited:
+        # A run that diverged may have NaN, which hides a peak.
+        if not peaks[signal][a] < limit:
             saturated = np.abs(record[signal][:, a]) >= limit
             if isinstance(motor, Servo):
                 # Without a current its voltage is the back-EMF.

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
 
 Array = NDArray[np.float64]
 
@@ -35,10 +34,17 @@ class Spread:
     high: float
 
 
+def student(freedom: int) -> float:
+    """Half width of the interval at ``LEVEL`` of Student's t."""
+    from scipy.special import stdtrit  # here: it takes as long to import as ten runs of a sweep
+
+    return float(stdtrit(freedom, 0.5 + 0.5 * LEVEL))
+
+
 def spread(values: Array) -> Spread:
     """Mean and spread of samples, (N,) with N ≥ 2: x̄ ± t(N − 1) s/√N."""
     count, mean, deviation = len(values), float(values.mean()), float(values.std(ddof=1))
-    half = float(stdtrit(count - 1, 0.5 + 0.5 * LEVEL)) * deviation / np.sqrt(count)
+    half = student(count - 1) * deviation / np.sqrt(count)
     low, high = np.quantile(values, [0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL])
     return Spread(count, mean, mean - half, mean + half, deviation, float(low), float(high))
 
@@ -77,5 +83,5 @@ def sensitivities(parameters: Array, values: Array) -> Sensitivities | None:
     inverse = np.linalg.inv(normal)
     found = inverse @ (scaled.T @ values)
     rest = float(((values - scaled @ found) ** 2).sum())
-    half = float(stdtrit(free, 0.5 + 0.5 * LEVEL)) * np.sqrt(np.diag(inverse) * rest / free)
+    half = student(free) * np.sqrt(np.diag(inverse) * rest / free)
     return Sensitivities(found[1:], half[1:], 1.0 - rest / total)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -71,19 +72,25 @@ def sweep(
     quiet: QuietOption = False,
 ) -> None:
     """Simulate a scenario over a grid, and with samples, of its values; write a table of all runs and figures."""
-    from dynsim.files import check_writable
-    from dynsim.scenario import read_scenario
-    from dynsim.studies.plan import Axis, Law, Plan
-    from dynsim.studies.processes import cores
-    from dynsim.studies.sweep import JOURNAL, OK, PLAN, STATISTICS, TABLES, has_parquet, run_sweep
+    from dynsim.studies.processes import begin_early, cores
 
     if jobs is not None and scheduler is not None:
         raise ScenarioError("--jobs are processes of this machine, --scheduler has its own workers: give one of them")
+    if scheduler is None and (jobs or cores()) > 1:
+        begin_early("dynsim.studies.batch", "dynsim.studies.plan", "dynsim.engine.dynamics")
+    from dynsim.files import check_writable
+    from dynsim.scenario import read_scenario
+    from dynsim.studies.plan import Axis, Law, Plan
+    from dynsim.studies.sweep import JOURNAL, OK, PLAN, STATISTICS, TABLES, has_parquet, run_sweep
+
     file = read_scenario(scenario)
     axes, laws = tuple(map(Axis.parse, grid or ())), tuple(map(Law.parse, sample or ()))
     plan = Plan(file, _variants(file.variants, variants), parsed_overrides(overrides), axes, laws, count, seed)
     folder = out or Path("results", file.path.stem, "sweep")
     check_writable(folder, (PLAN, JOURNAL, *TABLES, STATISTICS))
+    if scheduler is not None or min(jobs or cores(), plan.runs) > 1:
+        # Meanwhile others simulate.
+        Thread(target=_load_for_the_end, args=(bool(laws), not no_figures), name="imports").start()
     with sweep_progress(plan.runs, quiet) as report:
         rows = run_sweep(
             plan,
@@ -119,6 +126,20 @@ def _variants(known: Sequence[str], wanted: str | None) -> tuple[str | None, ...
     if wanted is None:
         return (known[0],)
     return tuple(known) if wanted == "all" else tuple(name.strip() for name in wanted.split(","))
+
+
+def _load_for_the_end(samples: bool, figures: bool) -> None:
+    """Import what tables, statistics and figures need, half a second in all; what is missing is said there."""
+    from dynsim.studies.sweep import has_parquet
+
+    if has_parquet():
+        import pyarrow
+
+        pyarrow.array([0.0])  # looks whether there is pandas
+    if samples:
+        import scipy.special  # noqa: F401
+    if figures:
+        import dynsim.figures.sweep  # noqa: F401
 
 
 def _draw(rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool, format_: str) -> None:

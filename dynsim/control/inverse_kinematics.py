@@ -16,6 +16,7 @@ from dynsim.model.description import Contact
 from dynsim.model.mobile_base import base_row
 from dynsim.model.model import Model
 from dynsim.model.reaching import path_arrays
+from dynsim.reuse import Reuse
 
 Array = NDArray[np.float64]
 
@@ -35,6 +36,7 @@ def follow(
     progress: Callable[[float], None] | None = None,
     base: Array | None = None,
     braces: Sequence[Contact] = (),
+    reuse: Reuse | None = None,
 ) -> Array:
     """Positions of ``joints`` that put the hand on ``targets`` at ``times``; the others stay as in ``q``.
 
@@ -53,6 +55,7 @@ def follow(
     progress : called now and then with the time on the path [s], when it takes longer than a second
     braces : points that stay on their surfaces on the way, as exactly as the hand is on its path
     base : (T, 4) coordinates of the mobile base at ``times``: its wheels [rad], x and y [m]; None: it stays
+    reuse : what other runs have computed; masses are not asked for
 
     Returns
     -------
@@ -63,22 +66,29 @@ def follow(
     UnreachableReference
         With the first time at which the hand cannot reach its target, and the distance that is left.
     """
-    path = path_arrays(model, joints, braces)
-    ws, result, wanted = workspace(model.n, 0, 0), np.zeros((len(times), len(joints))), reals(targets)
+    path, wanted = path_arrays(model, joints, braces), reals(targets)
     carried = np.zeros((len(times), 0)) if base is None else reals(base)
     first = 0 if base is None else base_row(model.robot)[0]
-    q, k, due = reals(q), 0, clock.perf_counter() + QUIET_S
-    while k < len(times):
-        if progress is not None and clock.perf_counter() >= due:
-            progress(float(times[k]))
-            due = clock.perf_counter() + REPORT_S
-        end = min(k + PIECE, len(times))
-        k, left = ki.follow_path(model.arrays, ws, path, wanted, carried, first, k, end, tolerance, q, result)
-        if k < end:
-            target = wanted[k]
-            raise UnreachableReference(
-                f"the hand cannot follow its path with {', '.join(joints)}: at t = {times[k]:.3f} s it stays "
-                f"{left:.4g} m from ({target[0]:.4g}, {target[1]:.4g}, {target[2]:.4g}) m; "
-                "move the path, or let more joints follow it"
-            )
-    return result
+    geometry = model.geometry
+
+    def solved() -> Array:
+        ws, result = workspace(model.n, 0, 0), np.zeros((len(times), len(joints)))
+        there, k, due = reals(q), 0, clock.perf_counter() + QUIET_S
+        while k < len(times):
+            if progress is not None and clock.perf_counter() >= due:
+                progress(float(times[k]))
+                due = clock.perf_counter() + REPORT_S
+            end = min(k + PIECE, len(times))
+            k, left = ki.follow_path(geometry, ws, path, wanted, carried, first, k, end, tolerance, there, result)
+            if k < end:
+                target = wanted[k]
+                raise UnreachableReference(
+                    f"the hand cannot follow its path with {', '.join(joints)}: at t = {times[k]:.3f} s it stays "
+                    f"{left:.4g} m from ({target[0]:.4g}, {target[1]:.4g}, {target[2]:.4g}) m; "
+                    "move the path, or let more joints follow it"
+                )
+        return result
+
+    inputs = geometry, path, wanted, carried, first, tolerance, np.asarray(q)
+    # The path has room for one step in it, which holds anything afterwards.
+    return (reuse or Reuse()).of("inverse kinematics", solved, *inputs)

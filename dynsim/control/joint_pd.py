@@ -17,7 +17,7 @@ from dynsim.control.inverse_kinematics import follow
 from dynsim.control.operator import Operator
 from dynsim.errors import ModelError
 from dynsim.model.bracing import MIN_N
-from dynsim.model.control import PLANNED, BasePath, HandPath, JointControl
+from dynsim.model.control import PLANNED, BasePath, HandPath, JointControl, targets_on
 from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Motor, Servo, TorqueSource
 from dynsim.model.mobile_base import base_row
@@ -148,9 +148,12 @@ def build(config: Config, context: BuildContext) -> JointControl:
     model = context.model
     robot = model.robot
     _check_names(config, model)
-    path = None
+    path, reuse = None, context.reuse
     if config.hand is not None:
-        path = families.build("path", config.hand.path, context, HandPath)
+        path_config = config.hand.path
+        path = reuse.of(
+            "path", lambda: families.build("path", path_config, context, HandPath), path_config, context.duration
+        )
     base_path = None if config.base is None else _base_path(config.base, context)
     times, positions = np.zeros(0), dict[str, NDArray[np.float64]]()
     planned = config.brace is not None or config.feed_forward != "none"
@@ -163,11 +166,12 @@ def build(config: Config, context: BuildContext) -> JointControl:
         if base_path is not None:
             positions |= _wheel_angles(robot, base_path, times)
         if config.hand is not None and path is not None:
-            hand, targets = config.hand, path.position(times)
+            hand, targets = config.hand, targets_on(path, times, reuse)
             base = _base_coordinates(robot, positions, times)
             braces = [_contact(context, name, "hand.braces") for name in hand.braces]
+            start, tolerance = robot.initial, hand.tolerance_m
             followed = follow(
-                model, times, targets, hand.joints, robot.initial, hand.tolerance_m, context.progress, base, braces
+                model, times, targets, hand.joints, start, tolerance, context.progress, base, braces, reuse
             )
             positions |= dict(zip(hand.joints, followed.T, strict=True))
     control = JointControl.following(
@@ -179,6 +183,7 @@ def build(config: Config, context: BuildContext) -> JointControl:
         path=path,
         sample_time=config.sample_time_s,
         voltages=_planned(config, context, times, positions) if planned else None,
+        reuse=reuse,
     )
     return control if config.operator is None else replace(control, operated=_operated(config.operator, context))
 

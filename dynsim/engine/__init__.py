@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from dynsim import interruption
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped, UnreachableReference
 from dynsim.record import Record
+from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario, require_scenario
 
 # A library says nothing unless it is asked to. Here, not in dynsim/__init__.py: everything that logs imports this.
@@ -49,14 +50,17 @@ class Start:
     contacts: Mapping[str, NDArray[np.float64]]
 
 
-def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:
+def simulate(
+    scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True, reuse: Reuse | None = None
+) -> Record:
     """Simulate a scenario.
 
     Parameters
     ----------
     scenario : Scenario
     progress : called with time [s] and stage, see :class:`Progress`
-    pictured : with scene and poses of bodies, which only figures and viewers need
+    pictured : with scene, poses of bodies and provenance, which only figures, viewers and files need
+    reuse : what other runs have computed, for this one to take over; its numbers are the same with and without
 
     Returns
     -------
@@ -76,7 +80,7 @@ def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: 
         interruption.heed()
         interruption.check()
         try:
-            record: Record = _module(scenario).simulate(scenario, progress, pictured=pictured)
+            record: Record = _module(scenario).simulate(scenario, progress, pictured=pictured, reuse=reuse)
         except SimulationStopped as stop:
             note_warnings(scenario, stop.record)
             raise

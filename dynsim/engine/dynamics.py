@@ -16,6 +16,7 @@ from dynsim.errors import SimulationInterrupted, SimulationStopped
 from dynsim.kernels.integrate import driver
 from dynsim.kernels.integrate import run as ki
 from dynsim.record import Event, Record
+from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario
 
 __all__ = ["Prepared", "prepare", "simulate", "start"]
@@ -26,6 +27,24 @@ log = logging.getLogger(__name__)
 CHUNK_S = 0.1
 
 
+class _Pace:
+    """How many steps systems of one size and method take between two looks at progress and Ctrl-C."""
+
+    def __init__(self) -> None:
+        self.limit, self.known = 1, False
+
+    def took(self, steps: int, seconds: float) -> None:
+        """So many steps have taken so long."""
+        self.known = True
+        if steps > 0:
+            self.limit = int(min(max(min(steps * CHUNK_S / max(seconds, 1e-9), 10.0 * self.limit), 1), 1_000_000))
+
+
+def _tried(run: ki.Run) -> int:
+    """Steps accepted and refused."""
+    return int(run.count[ki.STEPS] + run.count[ki.REJECTED])
+
+
 def start(prepared: Prepared) -> Start:
     """Positions of the hand and of the contact points at t = 0."""
     model, q = prepared.model, prepared.model.robot.initial
@@ -33,30 +52,35 @@ def start(prepared: Prepared) -> Start:
     return Start(model.point_position(*model.robot.hand, q), contacts)
 
 
-def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:
+def simulate(
+    scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True, reuse: Reuse | None = None
+) -> Record:
     """See :func:`dynsim.engine.simulate`."""
-    prepared = prepare(scenario, progress)
+    prepared = prepare(scenario, progress, reuse=reuse)
     if prepared.control.operated is not None:
         from dynsim.engine import operated
 
         return operated.simulate(scenario, progress, pictured=pictured)
     run = prepared.run
-    # Loading or compiling the kernels is no integration time.
-    with kernels_logged(log):
-        driver.advance(prepared.system, prepared.workspace, run, 0)
+    size = prepared.model.n, len(prepared.contacts), len(prepared.stops)
+    pace = prepared.reuse.of("pace", _Pace, prepared.choice.method, *size)
+    if not pace.known:
+        # Loading or compiling the kernels is no integration time.
+        with kernels_logged(log):
+            driver.advance(prepared.system, prepared.workspace, run, 0)
     if progress is not None:
         progress(0.0, SIMULATION)
     own = own_guards(prepared)
     happened: list[Event] = []
-    started, limit, interrupted = clock.perf_counter(), 1, False
+    started, interrupted = clock.perf_counter(), False
     try:
         log.info("%s: integrating %g s by %s", scenario.title, scenario.duration_s, prepared.choice.method)
         while run.count[ki.STATUS] == ki.RUNNING:
-            before = clock.perf_counter()
-            driver.advance(prepared.system, prepared.workspace, run, limit)
+            before, steps = clock.perf_counter(), _tried(run)
+            driver.advance(prepared.system, prepared.workspace, run, pace.limit)
             taken = clock.perf_counter() - before
             happened += [Event(time, *(event_name(prepared, e) or own[e])) for time, e in take_log(run)]
-            limit = int(min(max(limit * min(CHUNK_S / max(taken, 1e-9), 10.0), 1), 1_000_000))
+            pace.took(_tried(run) - steps, taken)
             if progress is not None:
                 progress(float(run.clock[ki.TIME]), SIMULATION)
             interruption.check()

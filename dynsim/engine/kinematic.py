@@ -29,6 +29,7 @@ from dynsim.model.snake import (
 )
 from dynsim.record import Record
 from dynsim.record.poses import pose_columns
+from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario, build
 from dynsim.snake.kinematics import pose_of_point
 from dynsim.snake.state import DONE, MODE, PLACE, TICKS, State, new_rig, new_state, new_trace
@@ -104,8 +105,9 @@ def simulate(
     source: CommandSource | None = None,
     *,
     pictured: bool = True,
+    reuse: Reuse | None = None,
 ) -> Record:
-    """See :func:`dynsim.engine.simulate`; also raises what :func:`prepare` raises.
+    """See :func:`dynsim.engine.simulate`; also raises what :func:`prepare` raises. Nothing is reused.
 
     A live ``source`` (joystick) replaces the commands and paths of the scenario. It is asked in every control period,
     with what the robot has done; to run in real time it waits in ``read`` until the period has come.

@@ -38,6 +38,7 @@ from dynsim.model.model import Model
 from dynsim.model.shapes import compile_shapes
 from dynsim.model.unilateral import JointStop, compile_grips, compile_unilateral, joint_stops
 from dynsim.record.poses import pose_columns
+from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario, build
 from dynsim.scenario.schema import Integrator
 
@@ -60,6 +61,7 @@ class Prepared:
     loads: list[Load]
     stops: list[JointStop]
     choice: Choice
+    reuse: Reuse
 
 
 def prepare(
@@ -70,6 +72,7 @@ def prepare(
     times: np.ndarray | None = None,
     end: float | None = None,
     motors: Sequence[Drive] | None = None,
+    reuse: Reuse | None = None,
 ) -> Prepared:
     """Compile a scenario; references that take long report to ``progress``.
 
@@ -79,6 +82,7 @@ def prepare(
     times : of samples [s]; default: those of the whole record
     end : of the run [s]; default: the scenario's duration
     motors : instead of those of the plant
+    reuse : what other runs have computed; whoever changes tables of a run must not share it
 
     Raises
     ------
@@ -87,10 +91,14 @@ def prepare(
     ScenarioError
         The record would be larger than ``record.size_limit_GB``, or the explicit method would need too many steps.
     """
-    described, contacts = build.robot_and_contacts(scenario)
-    model = Model(described if motors is None else replace(described, motors=tuple(motors)))
-    robot = model.robot
-    build.check_start(scenario, model, contacts)
+    reuse = reuse or Reuse()
+    described, contacts = build.robot_and_contacts(scenario, reuse)
+    if motors is not None:
+        described = replace(described, motors=tuple(motors))
+    model = reuse.of("model", lambda: Model(described), described)
+    robot, places = model.robot, [contact.geometry for contact in contacts]
+    law = scenario.config.contacts.law
+    reuse.of("start", lambda: build.check_start(scenario, model, contacts), model, law, places)
     loads = build.loads(scenario, robot)
     if pushable:
         loads = [*loads, *(_push(body) for body in robot.bodies)]
@@ -110,13 +118,15 @@ def prepare(
         )
     joint_rows = len(robot.couplings) + len(stops)
     _check_work(scenario, n, c + joint_rows, scenario.integrator.method)
-    control = _control(scenario, model, contacts, progress)
+    control = _control(scenario, model, contacts, progress, reuse)
     if not real:
-        _check_references(scenario, model, contacts, control)
+        _check_references(scenario, model, contacts, control, reuse)
     options, size = scenario.integrator, n + ka.row_limit(c, joint_rows) + robot.circuits
     sampled = control.sample_time is not None
     drives = compile_drives(robot, k_p=list(control.k_p), k_d=list(control.k_d), sampled=sampled)
-    choice = choose(options, model, contacts, control, drives)
+    choice = reuse.of(
+        "choice", lambda: choose(options, model, contacts, control, drives), options, model, control, places, *drives
+    )
     _check_work(scenario, n, c + joint_rows, choice.method)
     _check_stiffness(choice.method, scenario.duration_s, robot)
     method = ki.METHODS[choice.method]
@@ -162,7 +172,7 @@ def prepare(
         stepping=stepping,
         lanes=has_forms(system),
     )
-    return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops, choice)
+    return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops, choice, reuse)
 
 
 def _ticks(control: JointControl) -> tuple[np.ndarray, np.ndarray] | None:
@@ -270,13 +280,15 @@ def _check_work(scenario: Scenario, n: int, p: int, method: str) -> None:
         )
 
 
-def _control(scenario: Scenario, model: Model, contacts: Sequence[Contact], progress: Progress | None) -> JointControl:
+def _control(
+    scenario: Scenario, model: Model, contacts: Sequence[Contact], progress: Progress | None, reuse: Reuse
+) -> JointControl:
     if scenario.controller is None:
         return JointControl.absent(model.robot)
     log.info("%s: planning references over %g s", scenario.title, scenario.duration_s)
     started = clock.perf_counter()
     control = build.controller(
-        scenario, model, None if progress is None else partial(progress, stage=REFERENCES), contacts
+        scenario, model, None if progress is None else partial(progress, stage=REFERENCES), contacts, reuse
     )
     log.info("%s: planned references in %.3f s", scenario.title, clock.perf_counter() - started)
     if not isinstance(control, JointControl):
@@ -284,8 +296,28 @@ def _control(scenario: Scenario, model: Model, contacts: Sequence[Contact], prog
     return control
 
 
-def _check_references(scenario: Scenario, model: Model, contacts: Sequence[Contact], control: JointControl) -> None:
+def _check_references(
+    scenario: Scenario, model: Model, contacts: Sequence[Contact], control: JointControl, reuse: Reuse
+) -> None:
     """Refuse references that, followed exactly, would take a contact point off the surface that holds it."""
+    robot, tolerance = model.robot, scenario.config.contacts.reference_tolerance_m
+    places = [contact.geometry for contact in contacts]
+
+    def check() -> None:
+        _check_held(model, contacts, control, tolerance)
+
+    def check_anew() -> None:
+        driven = [motor.joint for motor in robot.motors]
+        names = [(link.name, link.joint, link.parent) for link in robot.links]
+        bits = model.geometry, robot.initial, names, robot.frames, driven, control.reference, control.k_p, robot.base
+        reuse.of("held places", check, *bits, places, tolerance)
+
+    # Of the same objects first, which are quickly told.
+    reuse.of("held contacts", check_anew, model, control, places, tolerance)
+
+
+def _check_held(model: Model, contacts: Sequence[Contact], control: JointControl, tolerance: float) -> None:
+    """See :func:`_check_references`."""
     robot = model.robot
     links = {link.name: link for link in robot.links}
     motor_of = {motor.joint: a for a, motor in enumerate(robot.motors)}
@@ -307,7 +339,6 @@ def _check_references(scenario: Scenario, model: Model, contacts: Sequence[Conta
             held.setdefault(carrier, []).append((contact, point))
     if not held:
         return
-    tolerance = scenario.config.contacts.reference_tolerance_m
     worst: dict[str, tuple[float, float, np.ndarray]] = {}
     first: dict[str, float] = {}
     points = {body: [(contact.surface, point) for contact, point in pairs] for body, pairs in held.items()}

@@ -41,14 +41,14 @@ def make_record(
     ``pushed`` : which of the bodies' own wrenches, the last of the loads, have been set; None: there are none
     ``happened`` : events of the run
     ``base_as_planned`` : whether the wheels of a base follow what ``prepared.control`` says, and from its start
-    ``pictured`` : with the scene and the poses of its bodies
+    ``pictured`` : with the scene, the poses of its bodies, and provenance
     """
     model, run, contacts = prepared.model, prepared.run, prepared.contacts
     robot = model.robot
     rows = int(run.count[ki.SAMPLE])
     joints, driven = robot.joint_names, tuple(motor.joint for motor in robot.motors)
     names = tuple(contact.name for contact in contacts)
-    record = Record(run.sample_time[:rows], provenance=provenance(scenario))
+    record = Record(run.sample_time[:rows], provenance=provenance(scenario) if pictured else None)
     angle, rate, acceleration, _ = _joint_units(robot.links)
     with_motor = set(driven)
     *_, force = _joint_units([link for link in robot.links if link.joint in with_motor] or robot.links)
@@ -65,7 +65,7 @@ def make_record(
     record.add("torque", run.outputs("torque"), force, labels=driven, description="shaft torques, [WM] eq 25")
     record.add("power", current * voltage, "W", labels=driven, description="electrical power u i")
     record.add("hand_position", run.outputs("hand"), "m", labels=("x", "y", "z"))
-    target = prepared.control.target(record.time)
+    target = prepared.control.target(record.time, prepared.reuse)
     if target is not None:
         record.add("target_position", target, "m", labels=("x", "y", "z"))
     for integral, (name, text) in zip(run.states("ledger").T, metrics.INTEGRALS.items(), strict=True):
@@ -97,7 +97,7 @@ def make_record(
     for event in happened:
         record.add_event(event.time, event.kind, event.name)
     if pictured:
-        record.scene = robot_scene(robot, contacts, build.surfaces(scenario))
+        record.scene = robot_scene(robot, contacts, build.surfaces(scenario, prepared.reuse))
         add_body_poses(record)
     deficient, spread = int(prepared.workspace.counts[ka.DEPENDENT]), None
     shared: list[str] = []
@@ -128,7 +128,7 @@ def make_record(
         stops=tuple(prepared.stops),
         stepping=None if run.stepping is None else _stepping(run),
     )
-    record.summary = metrics.summarise(record, scenario, contacts, robot, counts)
+    record.summary = metrics.summarise(record, scenario, contacts, robot, counts, prepared.reuse)
     record.summary["warnings"] += beyond_stops(robot, prepared.stops, prepared.control)
     return record
 

@@ -27,6 +27,7 @@ from dynsim.kernels.lanes.fixed_step import LaneRuns, advance_lanes, lane_runs
 from dynsim.kernels.lanes.system import COMPILED, EIGHT, has_forms
 from dynsim.kernels.lanes.tables import AXES, stack_tables
 from dynsim.record import Record
+from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario
 
 log = logging.getLogger(__name__)
@@ -46,7 +47,9 @@ def can_share(scenario: Scenario) -> bool:
     )
 
 
-def simulate_together(scenarios: Sequence[Scenario], *, pictured: bool = True) -> list[Record | DynsimError]:
+def simulate_together(
+    scenarios: Sequence[Scenario], *, pictured: bool = True, reuse: Reuse | None = None
+) -> list[Record | DynsimError]:
     """Simulate scenarios, those that can on shared lanes: what :func:`dynsim.simulate` gives of each, or raises.
 
     A record does not depend on the runs beside it; from that of ``simulate`` it differs by rounding, 1e-15 of the
@@ -56,7 +59,7 @@ def simulate_together(scenarios: Sequence[Scenario], *, pictured: bool = True) -
     Parameters
     ----------
     scenarios : of any plants and methods
-    pictured : see :func:`dynsim.engine.simulate`
+    pictured, reuse : see :func:`dynsim.engine.simulate`
 
     Returns
     -------
@@ -72,11 +75,11 @@ def simulate_together(scenarios: Sequence[Scenario], *, pictured: bool = True) -
     groups: dict[bytes, list[tuple[int, Prepared]]] = {}
     for k, scenario in enumerate(scenarios):
         if not can_share(scenario):
-            results[k] = alone(scenario, pictured)
+            results[k] = alone(scenario, pictured, reuse)
             continue
         try:
             with named(scenario):
-                prepared = prepare(scenario)
+                prepared = prepare(scenario, reuse=reuse)
         except SimulationInterrupted:
             raise
         except DynsimError as error:
@@ -85,7 +88,7 @@ def simulate_together(scenarios: Sequence[Scenario], *, pictured: bool = True) -
         if shareable(prepared):
             groups.setdefault(structure(prepared), []).append((k, prepared))
         else:
-            results[k] = alone(scenario, pictured)
+            results[k] = alone(scenario, pictured, reuse)
     for group in groups.values():
         for start in range(0, len(group), LANES):
             members = group[start : start + LANES]
@@ -93,14 +96,15 @@ def simulate_together(scenarios: Sequence[Scenario], *, pictured: bool = True) -
             ended = integrate([prepared for _, prepared in members])
             wall = (clock.perf_counter() - started) / len(members)
             for (k, prepared), done in zip(members, ended, strict=True):
-                results[k] = finish(scenarios[k], prepared, wall, pictured) if done else alone(scenarios[k], pictured)
+                scenario = scenarios[k]
+                results[k] = finish(scenario, prepared, wall, pictured) if done else alone(scenario, pictured, reuse)
     return [results[k] for k in range(len(scenarios))]
 
 
-def alone(scenario: Scenario, pictured: bool = True) -> Record | DynsimError:
+def alone(scenario: Scenario, pictured: bool = True, reuse: Reuse | None = None) -> Record | DynsimError:
     """As :func:`dynsim.simulate`, its errors as results."""
     try:
-        return simulate(scenario, pictured=pictured)
+        return simulate(scenario, pictured=pictured, reuse=reuse)
     except SimulationInterrupted:
         raise
     except DynsimError as error:

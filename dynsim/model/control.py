@@ -18,6 +18,7 @@ from dynsim.model.mobile_base import base_pose, base_row
 from dynsim.model.operated import Operated
 from dynsim.model.rolling import coordinates, rolled
 from dynsim.model.splines import quintic_coefficients
+from dynsim.reuse import Reuse
 
 # Samples in a segment of the reference splines, and segments that are looked at together.
 _PER_SEGMENT = 4
@@ -87,6 +88,7 @@ class JointControl:
         path: HandPath | None = None,
         sample_time: float | None = None,
         voltages: ArrayLike | None = None,
+        reuse: Reuse | None = None,
     ) -> JointControl:
         """The voltage PD u = k_p (q_d − q) + k_d (v_d − v) on joint positions that are given as samples or functions.
 
@@ -101,6 +103,7 @@ class JointControl:
         path : what the hand is to follow, for tracking errors in summary and figures
         sample_time : period of a zero-order hold of the voltages [s]; None: continuous
         voltages : (T, na), planned ones that are added to those of DC motors [V]; None: none
+        reuse : what other runs have computed
 
         Raises
         ------
@@ -133,7 +136,10 @@ class JointControl:
         spacing = float(grid[1]) - float(grid[0])
         coefficients = np.zeros((len(grid) - 1, 0, 6))
         if columns:
-            coefficients = quintic_coefficients(spacing, np.stack(columns, axis=1))
+            samples = np.stack(columns, axis=1)
+            coefficients = (reuse or Reuse()).of(
+                "splines", lambda: quintic_coefficients(spacing, samples), spacing, samples
+            )
         reference = _reference(held, spline, (float(grid[0]), spacing), coefficients)
         if voltages is not None:
             planned = np.asarray(voltages, dtype=np.float64)
@@ -225,9 +231,14 @@ class JointControl:
         q[:, k : k + 4] = coordinates(robot.base, robot.initial[k + 2 : k + 4], wheels, spacing, t - begin)
         return base_pose(robot, q)
 
-    def target(self, t: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    def target(self, t: NDArray[np.float64], reuse: Reuse | None = None) -> NDArray[np.float64] | None:
         """Target of the hand at times t, (T, 3) [m]; None without a path."""
-        return None if self.path is None else self.path.position(t)
+        return None if self.path is None else targets_on(self.path, t, reuse or Reuse())
+
+
+def targets_on(path: HandPath, t: NDArray[np.float64], reuse: Reuse) -> NDArray[np.float64]:
+    """Positions on a path at times t [s], (T,) → (T, 3) [m], unless they are known."""
+    return reuse.of("targets", lambda: path.position(t), path, t)
 
 
 def _gains(name: str, value: ArrayLike, motors: int) -> NDArray[np.float64]:

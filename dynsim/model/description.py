@@ -156,6 +156,11 @@ class Link:
         return rows()[self.kind]
 
     @property
+    def geometry(self) -> tuple[str, str | None, str, Array, Array, Array, float, Array | None]:
+        """What says where the body is and how far it reaches, without its mass."""
+        return self.name, self.parent, self.kind, self.axis, self.R_PJ, self.p_PJ, self.radius, self.tip
+
+    @property
     def units(self) -> tuple[str, str, str, str]:
         """Units of position, velocity, acceleration and force of the joint."""
         return self.row.units
@@ -242,6 +247,11 @@ class Contact:
     grip_axis: Array | None = None
     radius: float = 0.0
     tip: Array | None = None
+
+    @property
+    def geometry(self) -> tuple[str, str, Array, Surface, float, Array | None]:
+        """What says where it is and what it can touch, without its law."""
+        return self.name, self.body, self.point, self.surface, self.radius, self.tip
 
 
 @dataclass(frozen=True)

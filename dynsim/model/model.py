@@ -121,6 +121,13 @@ class Model:
         return self.robot.joint_names
 
     @property
+    def geometry(self) -> ka.ModelArrays:
+        """The tables without masses, inertias and losses: what poses of bodies follow from, beside q."""
+        body = self.arrays.body.copy()
+        body[:, ka.MASS : ka.PARAMETER] = 0.0
+        return self.arrays._replace(body=body, gravity=np.zeros(3))
+
+    @property
     def armature(self) -> Array:
         """What only turns with each joint: reflected rotor inertia J_m, spin of a wheel [kg m²], (n,)."""
         return self.arrays.body[:, ka.ARMATURE].copy()

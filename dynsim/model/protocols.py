@@ -17,6 +17,7 @@ from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Drive
 from dynsim.model.model import Model
 from dynsim.model.surfaces import Box, HeightField, Quadric
+from dynsim.reuse import Reuse
 
 if TYPE_CHECKING:
     from dynsim.model.snake import SnakeDescription, TaskSpaceController
@@ -33,6 +34,7 @@ class BuildContext:
     joint : the joint of a motor, "" for the other families
     contacts : contacts of the scenario by name; declared : those that are points of it, not other candidates
     progress : to be called with the time [s] that references have come to, when they take long; None: nobody listens
+    reuse : what other runs have computed from the same bits
     """
 
     duration: float
@@ -41,6 +43,7 @@ class BuildContext:
     progress: Callable[[float], None] | None = None
     contacts: Mapping[str, Contact] = field(default_factory=dict)
     declared: Sequence[str] = ()
+    reuse: Reuse = field(default_factory=Reuse)
 
     def at_joint(self, joint: str) -> BuildContext:
         """The context of a motor on that joint."""

@@ -19,7 +19,8 @@ def path_arrays(model: Model, joints: Sequence[str], braces: Sequence[Contact] =
     """Joints that take the hand of a robot along a path and keep points on their surfaces meanwhile."""
     columns = [model.joint_names.index(name) for name in joints]
     link, point = model.robot.attach(*model.robot.hand)
-    points = [replace(contact, tip=None) for contact in braces]
+    # Friction moves nothing here: sweeps over it have the same path.
+    points = [replace(contact, tip=None, friction=0.0) for contact in braces]
     rows = 3 + len(braces)
     return PathArrays(
         link=link,

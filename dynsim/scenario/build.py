@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, overload
 
@@ -20,6 +20,7 @@ from dynsim.model.protocols import BuildContext
 from dynsim.model.shapes import gap_at
 from dynsim.model.surfaces import SURFACES, Surface
 from dynsim.problems import dotted, suggest
+from dynsim.reuse import Reuse
 from dynsim.scenario.candidates import candidates
 from dynsim.scenario.loads import Payload
 from dynsim.scenario.schema import ContactPoint, Contacts, Scenario
@@ -54,11 +55,19 @@ def robot(scenario: Scenario) -> Robot:
     return built if scenario.config.initial is None else _posed(scenario, built, contacts(scenario, built))
 
 
-def robot_and_contacts(scenario: Scenario) -> tuple[Robot, list[Contact]]:
-    """:func:`robot` and all enabled contacts, each built once."""
-    built = _loaded(scenario)
-    touching = contacts(scenario, built)
-    return _posed(scenario, built, touching), touching
+def robot_and_contacts(scenario: Scenario, reuse: Reuse | None = None) -> tuple[Robot, list[Contact]]:
+    """:func:`robot` and all enabled contacts, each built once.
+
+    ``reuse`` : what other runs have computed; the robot is theirs where plant, payloads and posture are
+    """
+    reuse = reuse or Reuse()
+    config = scenario.config
+    built = reuse.of("plant", lambda: _loaded(scenario), config.plant, config.duration_s, config.loads)
+    touching = contacts(scenario, built, reuse)
+    if config.initial is None:
+        return built, touching
+    places = [contact.geometry for contact in touching]
+    return reuse.of("posture", lambda: _posed(scenario, built, touching), built, config.initial, places), touching
 
 
 def _loaded(scenario: Scenario) -> Robot:
@@ -109,6 +118,7 @@ def controller(
     machine: Model,
     progress: Callable[[float], None] | None = None,
     touching: Sequence[Contact] | None = None,
+    reuse: Reuse | None = None,
 ) -> JointControl: ...
 @overload
 def controller(
@@ -119,6 +129,7 @@ def controller(
     machine: Model | SnakeDescription,
     progress: Callable[[float], None] | None = None,
     touching: Sequence[Contact] | None = None,
+    reuse: Reuse | None = None,
 ) -> JointControl | TaskSpaceController:
     """The controller for a machine.
 
@@ -126,6 +137,7 @@ def controller(
     ----------
     progress : called with the time [s] that the references have come to
     touching : the contacts of the scenario, when they are built already
+    reuse : what other runs have computed; a controller that looks at no contact is theirs where machine and section are
 
     Raises
     ------
@@ -143,9 +155,22 @@ def controller(
         touching = contacts(scenario, machine.robot) if isinstance(machine, Model) else ()
     points = {contact.name: contact for contact in touching}
     declared = [name for name in points if name in scenario.config.contacts.points]
-    context = BuildContext(scenario.duration_s, machine, progress=progress, contacts=points, declared=declared)
+    reuse, looked = reuse or Reuse(), _Looked(points)
+    context = BuildContext(
+        scenario.duration_s, machine, progress=progress, contacts=looked, declared=declared, reuse=reuse
+    )
     if isinstance(machine, Model):
-        control = families.build("controller", config, context, JointControl)
+
+        def built() -> JointControl:
+            return families.build("controller", config, context, JointControl)
+
+        def blind() -> JointControl | None:
+            made.append(built())
+            return None if looked.at else made[0]
+
+        made: list[JointControl] = []
+        known = reuse.of("controller", blind, config, scenario.duration_s, machine, [*points], declared)
+        control = known or (made[0] if made else built())
         # The kernels would follow the last polynomial on.
         if control.end < scenario.duration_s * (1.0 - 1e-6):
             ends = f"end at {control.end:g} s, the run at {scenario.duration_s:g} s"
@@ -156,18 +181,42 @@ def controller(
     return families.build("controller", config, context, TaskSpaceController)
 
 
-def surfaces(scenario: Scenario) -> dict[str, Surface]:
+class _Looked(Mapping[str, Contact]):
+    """Contacts by name, and whether anyone has looked at one."""
+
+    def __init__(self, contacts: Mapping[str, Contact]) -> None:
+        self._contacts, self.at = contacts, False
+
+    def __getitem__(self, name: str) -> Contact:
+        self.at = True
+        return self._contacts[name]
+
+    # Names are known without a look at what they name.
+    def __contains__(self, name: object) -> bool:
+        return name in self._contacts
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._contacts)
+
+    def __len__(self) -> int:
+        return len(self._contacts)
+
+
+def surfaces(scenario: Scenario, reuse: Reuse | None = None) -> dict[str, Surface]:
     """All surfaces by name, whether anything touches them or not."""
-    context = BuildContext(scenario.duration_s)
-    return {
-        name: families.build("surface", config, context, SURFACES) for name, config in scenario.config.surfaces.items()
-    }
+    context, configs = BuildContext(scenario.duration_s), scenario.config.surfaces
+
+    def built() -> dict[str, Surface]:
+        return {name: families.build("surface", config, context, SURFACES) for name, config in configs.items()}
+
+    return (reuse or Reuse()).of("surfaces", built, scenario.duration_s, configs)
 
 
-def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact]:
+def contacts(scenario: Scenario, described: Robot | None = None, reuse: Reuse | None = None) -> list[Contact]:
     """All enabled contact points with their surfaces, then the other candidates.
 
     ``described`` : the robot of the scenario, when it is known already; candidates that are not points are its parts
+    ``reuse`` : what other runs have computed
 
     Raises
     ------
@@ -175,7 +224,7 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
         A point on a surface that the scenario does not have.
     """
     options = scenario.config.contacts
-    known = surfaces(scenario)
+    known = surfaces(scenario, reuse)
     result = []
     for name, point in options.points.items():
         if not point.enabled:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, Generic, Literal, TypeVar, get_args
 
 from dynsim import interruption
 from dynsim.engine import SIMULATION, Progress, simulate
 from dynsim.errors import DynsimError, ScenarioError, SimulationInterrupted, SimulationStopped, shown
 from dynsim.record import Record
+from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario, require_scenario
 from dynsim.studies.processes import WorkerLost, run_in_processes
 
@@ -97,17 +97,45 @@ def simulate_batch(
             finished(task[0], result)
 
     lanes = any(map(shares_lanes, runs))
-    if run_all(partial(_numbered, keep_records), list(enumerate(runs)), take, lanes, jobs=jobs, scheduler=scheduler):
+    if run_all(Work(_numbered, keep_records), list(enumerate(runs)), take, lanes, jobs=jobs, scheduler=scheduler):
         raise SimulationInterrupted(f"interrupted when {len(results)} of {len(runs)} runs were done")
     return [results[k] for k in range(len(runs))]
 
 
-def _numbered(keep: Keep, tasks: Sequence[tuple[int, Scenario]], look: Progress) -> list[RunResult]:
-    return run_some([partial(_same, scenario) for _, scenario in tasks], keep, look)
+def _numbered(task: tuple[int, Scenario], reuse: Reuse) -> Scenario:
+    return task[1]
 
 
-def _same(scenario: Scenario) -> Scenario:
-    return scenario
+class Work(Generic[Task]):
+    """What is done for tasks, in a process of its own too: what their runs have in common stays there with it.
+
+    Parameters
+    ----------
+    load : a task's scenario, sharing what can be shared; of a module, or bound to what can be sent to processes
+    keep : whose records are kept, see :func:`simulate_batch`
+    """
+
+    def __init__(self, load: Callable[[Task, Reuse], Scenario], keep: Keep) -> None:
+        self._load, self._keep, self._reuse = load, keep, Reuse()
+
+    def __call__(self, tasks: Sequence[Task], look: Progress | None) -> list[RunResult]:
+        """Load and simulate some tasks, those that can together; see :func:`run_one`."""
+        results: dict[int, RunResult] = {}
+        together: dict[int, Scenario] = {}
+        for k, task in enumerate(tasks):
+            try:
+                scenario = self._load(task, self._reuse)
+            except Exception as error:
+                results[k] = _failed(error)
+                continue
+            if shares_lanes(scenario):
+                together[k] = scenario
+            else:
+                results[k] = run_one(scenario, self._keep, look, self._reuse)
+        return [one for _, one in sorted((results | _run_together(together, self._keep, look, self._reuse)).items())]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self._load, self._keep)
 
 
 def shares_lanes(scenario: Scenario) -> bool:
@@ -120,42 +148,27 @@ def shares_lanes(scenario: Scenario) -> bool:
     return can_share(scenario)
 
 
-def run_some(loads: Sequence[Callable[[], Scenario]], keep: Keep, look: Progress | None) -> list[RunResult]:
-    """Load some scenarios and simulate them, those that can together; see :func:`run_one`."""
-    results: dict[int, RunResult] = {}
-    together: dict[int, Scenario] = {}
-    for k, load in enumerate(loads):
-        try:
-            scenario = load()
-        except Exception as error:
-            results[k] = _failed(error)
-            continue
-        if shares_lanes(scenario):
-            together[k] = scenario
-        else:
-            results[k] = run_one(scenario, keep, look)
-    return [one for _, one in sorted((results | _run_together(together, keep, look)).items())]
-
-
-def _run_together(scenarios: dict[int, Scenario], keep: Keep, look: Progress | None) -> dict[int, RunResult]:
+def _run_together(
+    scenarios: dict[int, Scenario], keep: Keep, look: Progress | None, reuse: Reuse
+) -> dict[int, RunResult]:
     if not scenarios:
         return {}
     from dynsim.engine.together import simulate_together
 
     started = clock.perf_counter()
     try:
-        ended = simulate_together(list(scenarios.values()), pictured=keep != "none")
+        ended = simulate_together(list(scenarios.values()), pictured=keep != "none", reuse=reuse)
     except SimulationInterrupted:
         raise
     except Exception:
         # A fault of dynsim in one of them: each by itself, as it would have been found alone.
-        return {k: run_one(scenario, keep, look) for k, scenario in scenarios.items()}
+        return {k: run_one(scenario, keep, look, reuse) for k, scenario in scenarios.items()}
     wall = (clock.perf_counter() - started) / len(scenarios)
     return {k: _ended(one, keep, wall) for k, one in zip(scenarios, ended, strict=True)}
 
 
-def run_one(scenario: Scenario, keep: Keep, look: Progress | None) -> RunResult:
-    """Simulate a scenario, whatever becomes of it.
+def run_one(scenario: Scenario, keep: Keep, look: Progress | None, reuse: Reuse | None = None) -> RunResult:
+    """Simulate a scenario, whatever becomes of it; ``reuse``: what other runs have computed.
 
     Raises
     ------
@@ -164,7 +177,7 @@ def run_one(scenario: Scenario, keep: Keep, look: Progress | None) -> RunResult:
     """
     started = clock.perf_counter()
     try:
-        ended: Record | DynsimError = simulate(scenario, look, pictured=keep != "none")
+        ended: Record | DynsimError = simulate(scenario, look, pictured=keep != "none", reuse=reuse)
     except SimulationInterrupted:
         raise
     except DynsimError as error:

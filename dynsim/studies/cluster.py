@@ -21,9 +21,10 @@ Task = TypeVar("Task")
 
 # Until the scheduler answers [s].
 _CONNECT_S = 10.0
-# Of one piece of work [s]: long beside what the scheduler needs for it (1 ms), short for a cluster to be even.
-_PIECE_S = 1.0
-_PIECE_MOST = 64
+# Of one piece of work [s]: short for a cluster to be even, but so long that scheduler and client, which need some
+# milliseconds for each (docs/sweeps.md), are done with those of all threads meanwhile.
+_PIECE_S, _PIECE_S_EACH = 1.0, 0.015
+_PIECE_MOST = 2048
 # Pieces that are out at a time: some for each thread of the cluster, and enough for it to grow by.
 _OUT_EACH, _OUT_LEAST = 3, 64
 
@@ -70,7 +71,9 @@ def run_on_cluster(
 
     def hand_out() -> list[Any]:
         threads = sum(worker["nthreads"] for worker in client.scheduler_info(n_workers=-1)["workers"].values())
-        size = min(max(round(_PIECE_S / max(wall, 1e-9)), 1), _PIECE_MOST)
+        size = min(max(round(max(_PIECE_S, _PIECE_S_EACH * threads) / max(wall, 1e-9)), 1), _PIECE_MOST)
+        # The last ones are smaller, for all to end together.
+        size = min(size, max(len(waiting) // (2 * max(threads, 1)), 1))
         futures = []
         while waiting and len(out) < max(_OUT_LEAST, _OUT_EACH * threads):
             futures.append(submit([waiting.popleft() for _ in range(min(size, len(waiting)))]))

@@ -15,6 +15,7 @@ import numpy as np
 
 from dynsim.errors import ScenarioError
 from dynsim.inputs import parse_yaml
+from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario, ScenarioFile
 
 # More runs than this are a slip of the keyboard.
@@ -168,18 +169,16 @@ class Plan:
             given = {axis.key: value for axis, value in zip(self.grid, values, strict=True)}
             yield Point(run, variant, given | {key: draws[k] for key, draws in drawn.items()})
 
-    def scenario(self, point: Point) -> Scenario:
-        """What one run simulates.
+    def scenario(self, point: Point, reuse: Reuse | None = None) -> Scenario:
+        """What one run simulates; ``reuse``: what other runs have in common with it.
 
         Raises
         ------
         ScenarioError
             Its values do not make a scenario.
         """
-        values = dict(self.overrides)
-        for key, value in point.values.items():
-            values.update(dict.fromkeys(self._entries(key), value))
-        return self.file.load(point.variant, values)
+        near = (reuse or Reuse()).of("near", lambda: self.file.near(point.variant, self.overrides), self, point.variant)
+        return near.load({entry: value for key, value in point.values.items() for entry in self._entries(key)})
 
     def _entries(self, key: str) -> list[str]:
         """Keys that one with ``*`` stands for, by what the file has before its variants; the key itself without.

@@ -7,17 +7,21 @@ from __future__ import annotations
 import ctypes
 import itertools
 import logging
+import math
 import os
 import platform
 import signal
 import threading
+import time as clock
 import traceback
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, partial
 from multiprocessing import connection, get_context, parent_process
 from multiprocessing.connection import Connection
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from dynsim import interruption
@@ -31,11 +35,33 @@ Result = TypeVar("Result")
 
 # Between two looks for a signal that was lost [s].
 _LOOK_S = 0.5
+# Of a task, to be sent before the worker has time for it: with longer ones another worker may have time sooner [s].
+_QUICK_S = 0.5
+# How processes begin. Spawned, not forked: the parent may hold threads and an open progress display.
+_SPAWN, _FORK_SERVER = "spawn", "forkserver"
+_method = _SPAWN
 
 
 def cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def begin_early(*modules: str) -> None:
+    """Load modules in a process of their own, while this one does other things: workers will be copies of that.
+
+    For commands, at their beginning: workers get the environment that there was then. Only Linux has what it takes;
+    elsewhere every worker loads for itself.
+    """
+    global _method
+    if platform.system() != "Linux":
+        return
+    from multiprocessing import forkserver
+
+    _method = _FORK_SERVER
+    forkserver.set_forkserver_preload(list(modules))
+    with _signals_held():
+        forkserver.ensure_running()
 
 
 class WorkerLost(Exception):
@@ -44,13 +70,25 @@ class WorkerLost(Exception):
 
 @dataclass
 class _Worker:
-    """A process, this end of its pipe, and what it has in hand: a task, and how many processes have lost that."""
+    """A process and this end of its pipe.
+
+    Attributes
+    ----------
+    tasks : what it has, each with how many processes have lost it: the first in hand, the others wait in the pipe
+    since : when it began with the first
+    took : how long the last one took [s]
+    """
 
     process: Any
     pipe: Connection
-    task: Any = None
-    losses: int = 0
-    busy: bool = False
+    tasks: deque[tuple[Any, int]] = field(default_factory=deque)
+    since: float = 0.0
+    took: float = math.inf
+
+    @property
+    def room(self) -> int:
+        """For how many more tasks: quick ones are there when it has time, so that it need not wait for them."""
+        return (2 if self.took < _QUICK_S else 1) - len(self.tasks)
 
 
 def run_in_processes(
@@ -66,7 +104,7 @@ def run_in_processes(
     Parameters
     ----------
     work : of a module; it calls ``look`` often, which raises KeyboardInterrupt when it shall stop
-    tasks : sent to the processes one by one, as they come to have time
+    tasks : sent to the processes one by one, as they come to have time; of quick ones, one before that
     jobs : processes
     take : called here with every task and a function that returns the result or raises what the work raised, or
         :class:`WorkerLost`; None for a task that Ctrl-C came before, and no call for those that nobody had then
@@ -77,8 +115,7 @@ def run_in_processes(
     bool
         True if Ctrl-C made the workers stop early.
     """
-    # Spawned, not forked: the parent may hold threads and an open progress display.
-    context = get_context("spawn")
+    context: Any = get_context(_method)
     waiting = zip(tasks, itertools.repeat(0))
     workers: list[_Worker] = []
     # Tasks whose process was lost, and how often: they come before those that nobody has had.
@@ -98,19 +135,22 @@ def run_in_processes(
 
     def hand_out(sender: Connection) -> None:
         while True:
-            worker = next((worker for worker in workers if not worker.busy), None)
-            if worker is None and len(workers) == jobs:
+            worker = min(workers, key=lambda worker: len(worker.tasks), default=None)
+            full = worker is None or worker.tasks
+            if len(workers) == jobs and (worker is None or worker.room < 1):
                 return
             task = again.pop() if again else next(waiting, None)
             if task is None:
                 return
-            if worker is None:
+            if worker is None or (full and len(workers) < jobs):
                 worker = start(sender)
                 workers.append(worker)
-            (worker.task, worker.losses), worker.busy = task, True
+            if not worker.tasks:
+                worker.since = clock.monotonic()
+            worker.tasks.append(task)
             # A process that is gone shows when its answer is read.
             with suppress(OSError):
-                worker.pipe.send(worker.task)
+                worker.pipe.send(task[0])
 
     def collect(sender: Connection | None) -> None:
         """Take results until there are none to come; new tasks are only handed out with a ``sender``."""
@@ -119,24 +159,27 @@ def run_in_processes(
                 interruption.keep()
                 hand_out(sender)
                 interruption.heed()
-            busy = {worker.pipe: worker for worker in workers if worker.busy}
+            busy = {worker.pipe: worker for worker in workers if worker.tasks}
             if not busy:
                 return
             for pipe in connection.wait(busy, timeout=_LOOK_S):
                 interruption.keep()
                 worker = busy[pipe]  # type: ignore[index]
-                task = worker.task
+                task, losses = worker.tasks.popleft()
                 try:
                     good, value = worker.pipe.recv()
                 except (EOFError, OSError):
                     workers.remove(worker)
                     worker.process.join()
-                    if sender is not None and worker.losses + 1 < attempts:
-                        again.append((task, worker.losses + 1))
+                    # What waited in its pipe nobody has begun with.
+                    again.extend(worker.tasks)
+                    if sender is not None and losses + 1 < attempts:
+                        again.append((task, losses + 1))
                     else:
                         take(task, _raise_lost)
                 else:
-                    worker.task, worker.busy = None, False
+                    now = clock.monotonic()
+                    worker.since, worker.took = now, now - worker.since
                     take(task, partial(_result, good, value))
                 interruption.heed()
             interruption.check()
@@ -189,16 +232,28 @@ def _serve(work: Callable[[Any, Progress], Any], pipe: Connection, stop: Any, se
         if stop.value:
             raise KeyboardInterrupt
 
-    with suppress(EOFError, OSError):
-        while True:
-            task = pipe.recv()
+    tasks: SimpleQueue[tuple[Any] | None] = SimpleQueue()
+    # Read at once: else the parent could wait to send a task, and this process to send an answer, both for ever.
+    threading.Thread(target=_read, args=(pipe, tasks), daemon=True).start()
+    with suppress(OSError):
+        while (got := tasks.get()) is not None:
             answer: tuple[bool, Any]
             try:
-                answer = (True, None if stop.value else work(task, look))
+                answer = (True, None if stop.value else work(got[0], look))
             except Exception as error:
                 error.add_note("".join(traceback.format_exception(error)))
                 answer = (False, error)
             pipe.send(answer)
+
+
+def _read(pipe: Connection, tasks: SimpleQueue[tuple[Any] | None]) -> None:
+    """Tasks as they come, None when there are no more."""
+    try:
+        with suppress(EOFError, OSError):
+            while True:
+                tasks.put((pipe.recv(),))
+    finally:
+        tasks.put(None)
 
 
 @cache

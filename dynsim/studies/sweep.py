@@ -8,17 +8,15 @@ import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from dynsim._version import __version__
-from dynsim.engine import Progress
 from dynsim.engine.provenance import commit
 from dynsim.errors import RecordError, ScenarioError, SimulationInterrupted
 from dynsim.files import json_text, replacing, write_text
 from dynsim.results import save_run
-from dynsim.studies.batch import Keep, RunResult, run_all, run_some, shares_lanes
+from dynsim.studies.batch import Keep, RunResult, Work, run_all, shares_lanes
 from dynsim.studies.columns import numbers
 from dynsim.studies.plan import Plan, Point
 from dynsim.studies.sweep_statistics import statistics
@@ -125,8 +123,7 @@ def run_sweep(
 
         if progress is not None:
             progress(len(rows), failed)
-        work = partial(_run, plan, keep_records)
-        interrupted = run_all(work, left, take, lanes, jobs=jobs, scheduler=scheduler)
+        interrupted = run_all(Work(plan.scenario, keep_records), left, take, lanes, jobs=jobs, scheduler=scheduler)
     done = [rows[run] for run in sorted(rows)]
     write_tables(done, plan, folder)
     if plan.laws:
@@ -134,11 +131,6 @@ def run_sweep(
     if interrupted:
         raise SimulationInterrupted(f"interrupted when {len(done)} of {len(points)} runs were done; --resume goes on")
     return done
-
-
-def _run(plan: Plan, keep: Keep, points: Sequence[Point], look: Progress) -> list[RunResult]:
-    """In a worker, too."""
-    return run_some([partial(plan.scenario, point) for point in points], keep, look)
 
 
 def _header(plan: Plan) -> dict[str, Any]:

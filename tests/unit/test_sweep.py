@@ -274,12 +274,13 @@ def test_resuming_runs_what_is_not_there(tmp_path: Path, monkeypatch: pytest.Mon
     lost = json.dumps(json.loads(lines[1]) | {"status": module.LOST}) + "\n"
     journal.write_text(lines[0] + lost + lines[2][:40])
     ran: list[int] = []
-    run = module._run
-    monkeypatch.setattr(
-        module,
-        "_run",
-        lambda plan, keep, points, look: ran.extend(point.run for point in points) or run(plan, keep, points, look),
-    )
+
+    class Watched(module.Work):
+        def __call__(self, points: Any, look: Any) -> Any:
+            ran.extend(point.run for point in points)
+            return super().__call__(points, look)
+
+    monkeypatch.setattr(module, "Work", Watched)
     assert run_sweep(swept, tmp_path, resume=True) == whole
     assert ran == [1, 2, 3, 4]
     assert (tmp_path / "sweep.csv").read_bytes() == table
@@ -393,9 +394,14 @@ def test_a_killed_worker_costs_nothing_but_time(tmp_path: Path, whole: bytes):
 
 
 def workers_of(pid: int) -> list[int]:
-    """Worker processes of a parent."""
-    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    return [int(child) for child in children if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text()]
+    """Worker processes of a parent: its own, or copies of the process that has loaded everything."""
+
+    def children(of: int, kind: str) -> list[int]:
+        found = map(int, Path(f"/proc/{of}/task/{of}/children").read_text().split())
+        return [child for child in found if kind in Path(f"/proc/{child}/cmdline").read_text()]
+
+    servers = children(pid, "forkserver")
+    return children(servers[0], "forkserver") if servers else children(pid, "spawn_main")
 
 
 def _hears() -> None:

@@ -1,0 +1,63 @@
+"""What runs of a sweep have in common is computed once: results by the bits of what they were computed from."""
+
+from __future__ import annotations
+
+import struct
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from typing import Any, TypeVar, cast
+
+import numpy as np
+
+T = TypeVar("T")
+
+# Results of each kind that are kept: neighbours in a sweep differ in what comes last.
+KEPT = 4
+
+
+class Reuse:
+    """Results of pure functions, each known by what it was computed from.
+
+    Numbers, texts and arrays are the same where their bits are (−0.0 is not 0.0, 1 is not 1.0), and so are tuples,
+    lists and dicts of such; anything else only where it is the same object, which must not be changed. Whoever takes a
+    result must not change it either. A function that raises is called again next time.
+    """
+
+    def __init__(self) -> None:
+        self._kept: dict[str, OrderedDict[Hashable, tuple[Any, Any]]] = {}
+
+    def of(self, what: str, make: Callable[[], T], *inputs: Any) -> T:
+        """What ``make`` gives, or gave for the same inputs.
+
+        Parameters
+        ----------
+        what : kind of result; each keeps the last :data:`KEPT`
+        inputs : all that the result depends on
+        """
+        kept, key = self._kept.setdefault(what, OrderedDict()), _bits(inputs)
+        if key in kept:
+            kept.move_to_end(key)
+            return cast(T, kept[key][1])
+        result = make()
+        # With the inputs, so that no other object gets the identity of one that is gone.
+        kept[key] = inputs, result
+        if len(kept) > KEPT:
+            kept.popitem(last=False)
+        return result
+
+
+def _bits(value: Any) -> Hashable:
+    kind = type(value)
+    if kind is np.ndarray:
+        if value.dtype == object:
+            return kind, id(value)
+        return value.shape, value.dtype.str, value.tobytes()
+    if kind is float:
+        return kind, struct.pack("d", value)
+    if kind is list or isinstance(value, tuple):
+        return kind, tuple(map(_bits, value))
+    if kind is dict:
+        return kind, tuple((name, _bits(one)) for name, one in value.items())
+    if value is None or kind in (int, bool, str, bytes):
+        return kind, value
+    return kind, id(value)

@@ -1,0 +1,138 @@
+"""What runs of a sweep take over from each other: never anything else than what they would have computed."""
+
+import itertools
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+import dynsim
+from dynsim.model.clearance import _Clear, gaps, sinking
+from dynsim.reuse import KEPT, Reuse
+from dynsim.scenario import build, read_scenario, shipped_scenarios
+from dynsim.studies.batch import Work
+from dynsim.studies.columns import numbers
+from dynsim.studies.plan import Axis, Plan
+
+ELBOWS = read_scenario("elbow_comparison")
+
+
+def test_results_are_known_by_the_bits_of_their_inputs():
+    reuse, made = Reuse(), itertools.count()
+
+    def of(*inputs: Any) -> int:
+        return reuse.of("count", lambda: next(made), *inputs)
+
+    array = np.array([1.0, 0.0])
+    first = of(array, [1.0, {"a": (2, None)}])
+    assert of(array.copy(), [1.0, {"a": (2, None)}]) == first
+    others = [
+        (-array, [1.0, {"a": (2, None)}]),
+        (array * -0.0, []),
+        (array * 0.0, []),
+        (array.astype(np.float32), []),
+        (array[None], []),
+        (1,),
+        (1.0,),
+        (True,),
+        ("1",),
+    ]
+    assert len({of(*inputs) for inputs in others}) == len(others)
+    # Of what cannot be told from its bits only the same object is the same.
+    one, other = object(), object()
+    assert of(one) == of(one) != of(other)
+
+
+def test_only_the_last_results_are_kept_and_no_errors():
+    reuse, made = Reuse(), []
+    for k in [*range(KEPT + 1), 0, KEPT]:
+        reuse.of("k", lambda k=k: made.append(k), k)
+    assert made == [*range(KEPT + 1), 0]
+    for _ in range(2):
+        with pytest.raises(ZeroDivisionError):
+            reuse.of("broken", lambda: 1 / 0)
+
+
+def outcome(run: Callable[[], Any]) -> tuple[str, Any]:
+    """What is said of it, "" if it ends well, and what it gives."""
+    try:
+        return "", run()
+    except dynsim.DynsimError as error:
+        return str(error), None
+
+
+GRIDS = [
+    ("two_elbows", {}, ["contacts.friction=0,0.3,0.05"]),
+    ("elbow_4", {"duration_s": 3}, ["contacts.points.elbow_4.friction=0.1,0.2", "metrics.settle_s=0.1,0.05"]),
+    ("no_elbow", {"duration_s": 2.5}, ["plant.link.motor.voltage_limit_V=2,4"]),
+    ("two_elbows", {}, ["plant.link.mass_kg=0.1,0.2", "controller.hand.path.radius_m=0.1,0.2"]),
+    (
+        "two_elbows",
+        {},
+        ["plant.initial_deg.2=90,91", "contacts.friction=0.1,-1", "surfaces.floor.point_m=[0,0,0],[0,0,1]"],
+    ),
+    (
+        "two_elbows",
+        {"controller.brace": {"elbow_4": 2.0, "elbow_7": 2.0}},
+        ["contacts.friction=0,0.4", "controller.min_N=0.1,0.2"],
+    ),
+]
+
+
+@pytest.mark.parametrize(("variant", "overrides", "grid"), GRIDS)
+def test_runs_that_share_are_those_that_do_not(variant: str, overrides: dict[str, Any], grid: list[str]):
+    fixed = {"integrator.method": "radau5", "duration_s": 0.3, "metrics.settle_s": 0.1} | overrides
+    plan = Plan(ELBOWS, (variant,), fixed, tuple(map(Axis.parse, grid)))
+    points = list(plan.points())
+    work = Work(plan.scenario, "none")
+    # Twice, the second time from the end: whatever was before.
+    for point in points + points[::-1]:
+        (result,) = work([point], None)
+        scenario_of = partial(ELBOWS.load, variant, fixed | dict(point.values))
+        reason, summary = outcome(lambda of=scenario_of: dynsim.simulate(of()).summary)
+        assert result.reason == " ".join(reason.split())
+        if summary is not None:
+            assert numbers(result.summary) == numbers(summary)
+            assert result.summary["warnings"] == summary["warnings"]
+
+
+@pytest.mark.parametrize("path", shipped_scenarios(), ids=lambda path: path.stem)
+def test_a_scenario_near_another_is_as_read_from_the_file(path: Any):
+    file = read_scenario(path)
+    variant = file.variants[-1] if file.variants else None
+    near = file.near(variant, {"record.rate_hz": 100})
+    fields = ["duration_s=1.5", "integrator.rtol=1e-7", "contacts.friction=0.2", "plant.name=x", "record.rate_hz=50"]
+    fields += ["duration_s=-1", "contacts=3", "description=other", "name=x", "integrator.method=rodas4", "metrics={}"]
+    for text in fields:
+        values = {text.split("=")[0]: Axis.parse(text).values[0]}
+        wanted = outcome(lambda of=values: file.load(variant, {"record.rate_hz": 100} | of))
+        found = outcome(lambda of=values: near.load(of))
+        assert found[0] == wanted[0]
+        if found[1] is not None and wanted[1] is not None:
+            assert found[1].resolved == wanted[1].resolved
+            assert found[1].config.model_fields_set == wanted[1].config.model_fields_set
+            for name in ("name", "variant", "source", "origin"):
+                assert getattr(found[1], name) == getattr(wanted[1], name)
+
+
+def test_what_is_near_a_clear_run_is_clear():
+    scenario = dynsim.load_scenario("elbow_comparison", "no_elbow", {"surfaces.floor.point_m": [0, 0, -0.02]})
+    robot, surfaces = build.robot(scenario), build.surfaces(scenario)
+    generator = np.random.default_rng(5)
+    start = np.tile(robot.initial, (40, 1))
+    points = {link.name: [(surfaces["floor"], tip) for tip in (np.zeros(3), link.tip)] for link in robot.links}
+    room = min(float(gap.min()) + link.radius for link, each in gaps(robot, start, points) for gap in each)
+    clear = _Clear()
+    clear.remember(robot, surfaces, start, room)
+    held = 0
+    for size in np.geomspace(1e-4, 1e-1, 200):
+        q = start + size * generator.uniform(-1.0, 1.0, start.shape)
+        sunk = sinking(robot, surfaces, q)
+        if clear.holds(q):
+            held += 1
+            assert not sunk
+    assert 20 < held < 180
+    assert not clear.holds(start[:-1])
+    assert not clear.holds(np.full_like(start, np.nan))
