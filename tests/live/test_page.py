@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 from teleop_clients import PATIENCE_S, Teleop
 
+# Until what is held is let go and held again, where it drives nothing [s].
+ANEW_S = 2.0
 # A gamepad of the standard layout, whose axes and buttons a test sets.
 GAMEPAD = """
 window.pad = { connected: true, mapping: "standard", axes: [0, 0, 0, 0],
@@ -33,20 +35,36 @@ class Pilot:
     def js(self, program: str) -> Any:
         return self.page.evaluate(program)
 
-    def until(self, program: str) -> None:
-        end = time.monotonic() + PATIENCE_S
+    def until(self, program: str, anew: Callable[[], None] | None = None) -> None:
+        """Wait; ``anew`` lets go and holds again, where a busy machine was silent for too long and all was let go."""
+        end, due = time.monotonic() + PATIENCE_S, time.monotonic() + ANEW_S
         while not self.js(program):
+            if anew is not None and time.monotonic() > due and self.js("dynsim.drive.last.state !== 'driving'"):
+                anew()
+                due = time.monotonic() + ANEW_S
             assert time.monotonic() < end, (program, self.js("dynsim.drive?.state"), self.complaints)
             self.page.wait_for_timeout(20)
 
     def hand(self) -> list[float]:
         return list(self.js("dynsim.drive.last.hand"))
 
-    def moved(self, axis: int, way: float) -> None:
+    def space(self) -> None:
+        """Hold the dead-man's key, after letting it go."""
+        self.page.keyboard.up(" ")
+        self.page.wait_for_timeout(100)
+        self.page.keyboard.down(" ")
+
+    def button(self) -> None:
+        """The same on the gamepad."""
+        self.js("pad.buttons[5].pressed = false")
+        self.page.wait_for_timeout(100)
+        self.js("pad.buttons[5].pressed = true")
+
+    def moved(self, axis: int, way: float, anew: Callable[[], None]) -> None:
         """Wait until the hand has moved along an axis."""
         before = self.hand()[axis]
         sign = 1 if way > 0 else -1
-        self.until(f"{sign} * (dynsim.drive.last.hand[{axis}] - {before}) > {abs(way)}")
+        self.until(f"{sign} * (dynsim.drive.last.hand[{axis}] - {before}) > {abs(way)}", anew)
 
     def rests(self) -> None:
         """Wait until nothing is asked for, and the hand has come to rest."""
@@ -90,8 +108,8 @@ def test_keys_gamepad_and_sticks_drive_a_snake(teleop: Callable[..., Teleop], pi
     before = one.hand()
     one.page.wait_for_timeout(500)
     assert one.hand() == pytest.approx(before, abs=1e-6)
-    keyboard.down(" ")
-    one.moved(0, 0.02)
+    one.space()
+    one.moved(0, 0.02, one.space)
     keyboard.up(" ")
     one.rests()
     keyboard.up("w")
@@ -101,19 +119,24 @@ def test_keys_gamepad_and_sticks_drive_a_snake(teleop: Callable[..., Teleop], pi
     one.js("pad.axes[3] = 1")
     one.page.wait_for_timeout(300)
     one.rests()
-    one.js("pad.buttons[5].pressed = true")
-    one.moved(2, -0.01)
+    one.button()
+    one.moved(2, -0.01, one.button)
     one.js("pad.buttons[0].pressed = true")
-    one.until("dynsim.drive.last.gripper === 1")
+    one.until("dynsim.drive.last.gripper === 1", one.button)
     one.js("pad.buttons[5].pressed = false; pad.buttons[0].pressed = false; pad.axes[3] = 0")
     one.rests()
 
     box = one.page.locator(".stick").first.bounding_box()
     middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    one.page.mouse.move(*middle)
-    one.page.mouse.down()
-    one.page.mouse.move(middle[0] - 40, middle[1])
-    one.moved(1, 0.01)
+
+    def stick() -> None:
+        one.page.mouse.up()
+        one.page.mouse.move(*middle)
+        one.page.mouse.down()
+        one.page.mouse.move(middle[0] - 40, middle[1])
+
+    stick()
+    one.moved(1, 0.01, stick)
     one.page.mouse.up()
     one.rests()
 
@@ -121,8 +144,8 @@ def test_keys_gamepad_and_sticks_drive_a_snake(teleop: Callable[..., Teleop], pi
     one.page.select_option("#mode", "3")
     one.page.wait_for_timeout(200)
     assert one.js("dynsim.drive.last.mode") == 1
-    keyboard.down(" ")
-    one.until("dynsim.drive.last.mode === 3")
+    one.space()
+    one.until("dynsim.drive.last.mode === 3", one.space)
     keyboard.up(" ")
     one.page.click("#end")
     assert drive.finish() == 0
@@ -134,11 +157,11 @@ def test_focus_that_is_lost_lets_everything_go(teleop: Callable[..., Teleop], pi
     drive = teleop("mobile_path")
     one = pilot(drive)
     keyboard = one.page.keyboard
-    keyboard.down(" ")
+    one.space()
     keyboard.down("ArrowUp")
-    one.until("dynsim.drive.last.state === 'driving' && dynsim.drive.wish.axes[3] === 1")
+    one.until("dynsim.drive.last.state === 'driving' && dynsim.drive.wish.axes[3] === 1", one.space)
     begun = one.js("dynsim.drive.last.poses[0]")
-    one.until(f"dynsim.drive.last.poses[0] > {begun} + 0.02")
+    one.until(f"dynsim.drive.last.poses[0] > {begun} + 0.02", one.space)
     one.js("window.dispatchEvent(new Event('blur'))")
     # Keys are still down: they count only when they are pressed anew.
     one.until("dynsim.drive.wish.held === false")
