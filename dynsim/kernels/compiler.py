@@ -20,7 +20,7 @@ from numba.core.compiler import Compiler
 from numba.core.compiler_machinery import PassManager
 from numba.core.typing.templates import infer, infer_global, make_overload_template
 
-from dynsim.kernels import numba_habits  # noqa: F401
+from dynsim.kernels import by_reference, numba_habits  # noqa: F401
 from dynsim.kernels.alongside import Need, needed_by, provide
 
 _NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
