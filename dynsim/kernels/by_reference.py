@@ -41,8 +41,8 @@ class Tables(types.NamedTuple):  # type: ignore[misc]
         self.count = len(self.types)
         self.fields = tuple(cls._fields)  # type: ignore[attr-defined]
         self.instance_class = cls
-        self._hash = hash((cls, self.types))
-        digest = hashlib.sha256(repr([str(kind) for kind in self.types]).encode()).hexdigest()[:16]
+        digest = hashlib.sha256(repr([str(kind) for kind in self.types]).encode()).hexdigest()[:15]
+        self._hash = int(digest, 16)  # the same in every process: types are kept on disk with the kernels
         types.Type.__init__(self, f"{cls.__name__}.{digest}")
 
     def __hash__(self) -> int:
