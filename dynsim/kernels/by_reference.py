@@ -5,8 +5,8 @@ hundred numbers, so that more than half of what it wrote for a kernel took tuple
 Here a tuple lies in memory, the tuples in it within it, and what passes is one address; a field is one load.
 
 A tuple is never changed, so the address is declared to be the only way to what it holds (``noalias``), and loads are
-moved out of loops. A tuple that compiled code makes lives in the frame of the function that makes it, one for each place
-in the source: in a loop it holds until the same place makes the next one. Returned tuples are copied.
+moved out of loops. A tuple that compiled code makes lives in the frame of the function that makes it, one for each
+place in the source: in a loop it holds until the same place makes the next one. Returned tuples are copied.
 """
 
 from __future__ import annotations
@@ -118,9 +118,7 @@ class _TablesModel(models.DataModel):  # type: ignore[misc]
         return builder.bitcast(ptr, _ADDRESS)
 
     def traverse(self, builder: Any) -> list[tuple[Any, Any]]:
-        return [
-            (kind, lambda value, k=k: self.part(builder, value, k)) for k, kind in enumerate(self.fe_type)
-        ]
+        return [(kind, lambda value, k=k: self.part(builder, value, k)) for k, kind in enumerate(self.fe_type)]
 
     def inner_models(self) -> list[Any]:
         return self.parts
