@@ -23,10 +23,10 @@ from dynsim.cli.app import (
     parsed_overrides,
 )
 from dynsim.cli.display import console, errors, labelled, progress, record_files
-from dynsim.cli.drawing import Figures, draw, draw_all
+from dynsim.cli.drawing import Figures, Page, begin_drawing, draw, draw_all
 from dynsim.cli.sweep import sweep
 from dynsim.cli.teleop import teleop
-from dynsim.cli.view import open_page, view, write_view
+from dynsim.cli.view import open_page, tell_of_view, view, write_view
 from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
 from dynsim.hardware.cli import export, hw
 from dynsim.terminal import escaped
@@ -99,6 +99,8 @@ def compare(
     quiet: QuietOption = False,
 ) -> None:
     """Simulate all variants of a scenario and compare them in a table and in figures."""
+    if not no_figures:
+        begin_drawing()
     from dynsim.files import check_writable, discard
     from dynsim.results import COMPARISON_FILES, RUN_FILES, save_run
     from dynsim.scenario import load_scenario, variant_names
@@ -142,14 +144,15 @@ def compare(
         interruption.check()
         if not no_figures:
             wanted = [Figures({name: one}, folder / name / "figures", format_) for name, one in records.items()]
-            draw_all([*wanted, Figures(records, folder, format_, together=True)], folder, quiet)
+            together = Figures(records, folder, format_, together=True)
+            page = draw_all([together, *wanted], Page(records, folder), quiet)
         if not quiet:
             from dynsim.tables import print_comparison
 
             print_comparison(console, {name: record.summary for name, record in records.items()})
             console.print(f"Written to {escaped(folder)}", highlight=False, soft_wrap=True)
         if not no_figures:
-            write_view(records, folder, quiet)
+            tell_of_view(page, quiet)
     if failure is not None:
         raise failure
 
