@@ -10,10 +10,12 @@ from typing import Any, TypeVar
 
 import matplotlib
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
 from dynsim.figures.canvas import Canvas, heed_fonts
@@ -105,10 +107,26 @@ def save(figure: Figure, path: Path) -> Path:
         The file cannot be written; an older one is left as it was.
     """
     # Names from files: no font has a picture for a control character.
-    for text in figure.findobj(Text):
+    for text in _texts(figure):
         text.set_text(plain(text.get_text()))
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            if not axis.label.get_text():
+                # Else matplotlib measures all numbers again, several times, for the place of nothing.
+                axis.set_label_coords(0.5, 0.0)
     figure.set_dpi(DPI)
     return write(figure, path)
+
+
+def _texts(artist: Artist) -> Iterator[Text]:
+    """All texts but numbers at axes: to ask for those would make all ticks, for one more time."""
+    if isinstance(artist, Text):
+        yield artist
+    elif isinstance(artist, Axis) and not isinstance(artist.get_major_locator(), FixedLocator):
+        yield artist.label
+    else:
+        for child in artist.get_children():
+            yield from _texts(child)
 
 
 def save_all(
@@ -227,7 +245,7 @@ def legend_above(axes: Axes, columns: int = 3) -> None:
     legend = axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.0)
     # It may reach over the panel to its left; the empty title keeps the room above.
     legend.set_in_layout(False)
-    axes.set_title(" ", pad=6.0 + LEGEND_ROW * max(rows - 1, 0))
+    axes.set_title(" ", y=1.0, pad=6.0 + LEGEND_ROW * max(rows - 1, 0))
 
 
 def settle_time(record: Record) -> float:
