@@ -49,7 +49,7 @@ def view(
 
 
 def write_view(records: Mapping[str, Record], folder: Path, quiet: bool) -> Path | None:
-    """The page of records in a folder; None where they have nothing to be seen."""
+    """The page of records in a folder, and say where; None where they have nothing to be seen."""
     page = Page(dict(records), folder).draw()
     tell_of_view(page, quiet)
     return page

@@ -127,14 +127,15 @@ class Canvas(FigureCanvasAgg):
 
 
 def png(pixels: NDArray[np.uint8], dpi: float) -> bytes:
-    """A PNG of pixels, (height, width, 4), with their number per inch.
+    """A PNG of opaque pixels, (height, width, 4), with their number per inch.
 
     Rows are not filtered: figures are flat areas, which shrink as well without, and to try all filters on each row, as
     Pillow does, takes twice as long as all the rest.
     """
     height, width, _ = pixels.shape
     rows = np.zeros((height, 1 + 3 * width), np.uint8)  # the first byte says: no filter
-    rows[:, 1:].reshape(height, width, 3)[...] = pixels[..., :3]
+    for k in range(3):  # three copies take a third of the time of one that has the colours innermost
+        rows[:, 1 + k :: 3] = pixels[..., k]
     per_metre = round(dpi / 0.0254)
     chunks = (
         (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)),
