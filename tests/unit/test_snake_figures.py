@@ -54,6 +54,15 @@ def test_geometry_of_the_scene_is_that_of_records_of_version_0_1(record):
         snake_geometry(Record(record.time))
 
 
+def test_parts_are_all_figures_and_none_twice(record, tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "FRAMES", 2)
+    parts = [figures.draw(record, tmp_path, "svg", (k, 4)) for k in range(4)]
+    names = ["postures.svg", "overview.svg", "tracking.svg", "joints.svg", "redundancy.svg", "animation.gif"]
+    assert sorted(path.name for paths in parts for path in paths) == sorted(names)
+    parts = [figures.draw_comparison({"a": record, "b": record}, tmp_path, part=(k, 2)) for k in range(2)]
+    assert [path.name for paths in parts for path in paths] == ["comparison.png", "postures.png"]
+
+
 def test_figures_as_svg(record, tmp_path, monkeypatch):
     monkeypatch.setattr(figures, "FRAMES", 2)
     written = figures.draw(record, tmp_path, "svg")
