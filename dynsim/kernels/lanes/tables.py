@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -35,9 +36,9 @@ AXES: dict[type, dict[str, int]] = {
 
 def aligned(*shape: int) -> np.ndarray:
     """Zeros of this shape that begin at a cache line, as whole vectors load fastest."""
-    size = int(np.prod(shape))
+    size = math.prod(shape)
     room = np.zeros(size + 8)
-    start = (-room.ctypes.data % 64) // 8
+    start = (-room.__array_interface__["data"][0] % 64) // 8
     return room[start : start + size].reshape(shape)
 
 
