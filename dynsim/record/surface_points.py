@@ -99,18 +99,19 @@ def round_patch(surface: Surface, low: Array, high: Array) -> Array:
     towards = away / size
     turn = np.linspace(-1.0, 1.0, PATCH)
     if axis is None:
-        edge = np.diag(high - low)[np.argsort(low - high)]
-        # Along the box, which may be much longer than wide; its longest edge may point at the centre.
-        along = next(one for one in edge if abs(one @ towards) < 0.9 * np.linalg.norm(one))
+        # Along the box, which may be much longer than wide, unless its longest edge points at the centre.
+        edges = np.eye(3)[np.argsort(low - high)]
+        along = next(edge for edge in edges if abs(edge @ towards) < 0.9)
         along = along - towards * (along @ towards)
         first = along / np.linalg.norm(along)
         sides = np.array([first, np.cross(towards, first)])
         share, round_about = np.meshgrid(0.5 * (turn + 1.0), np.pi * turn, indexing="ij")
-        if widest == np.pi:
+        if not 0.0 < widest < np.pi:
             polar = share * widest
         else:
             reaches = 0.6 * np.abs(sides) @ (high - low) / radius
-            a, b = np.minimum(np.maximum(reaches, 0.5 * reaches.max()), np.pi)
+            # A box may have no width at all, and stand on the sphere.
+            a, b = np.minimum(np.maximum(reaches, max(0.5 * reaches.max(), 0.2 * widest)), np.pi)
             polar = share / np.hypot(np.cos(round_about) / a, np.sin(round_about) / b)
         across = np.cos(round_about)[..., None] * sides[0] + np.sin(round_about)[..., None] * sides[1]
         return np.asarray(centre + radius * (np.cos(polar)[..., None] * towards + np.sin(polar)[..., None] * across))

@@ -150,6 +150,14 @@ def test_a_round_patch_lies_on_its_surface_and_has_no_holes(kind, size, whole):
     assert away.max() == pytest.approx(2.0 * size if whole else reach, rel=0.02)
 
 
+@pytest.mark.parametrize("high", [(0.0, 0.0, 43.0), (0.0, 0.0, 40.0), (1.0, 0.0, 40.0)])
+def test_a_round_patch_next_to_what_has_no_width(high):
+    """A hanging pendulum over a sphere, and a point."""
+    quadric = sphere.build(sphere.Config(type="sphere", center_m=(0.0, 0.0, 0.0), radius_m=39.0), CONTEXT)
+    grid = round_patch(surface(quadric), np.array([0.0, 0.0, 40.0]), np.array(high))
+    np.testing.assert_allclose(np.linalg.norm(grid, axis=-1), 39.0, rtol=1e-12)
+
+
 def test_the_radius_of_a_body_is_that_of_its_thickest_round_shape():
     shapes = (Shape("box", (1.0, 1.0, 1.0)), Shape("cylinder", (0.02, 1.0)), Shape("capsule", (0.03, 1.0)))
     assert Body("b", -1, HINGE, shapes).radius == 0.03
