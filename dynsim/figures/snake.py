@@ -41,6 +41,7 @@ from dynsim.figures.snake_view import (
     posture_grid,
     posture_strip,
     relax,
+    turns,
 )
 from dynsim.files import replacing
 from dynsim.record import Record
@@ -50,8 +51,6 @@ from dynsim.studies.published.tanaka2019 import used_limit
 T = TypeVar("T")
 # Postures of an animation, in a row, and over each other in one picture.
 FRAMES, IN_A_ROW, IN_A_PICTURE = 50, 6, 7
-# Parts of a run of which range and lowest value are drawn where a line would fill the panel.
-TURNS = 160
 # Postures over time in grey: the lines beside them have the colours.
 SHADES = LinearSegmentedColormap.from_list("shades", ["#CFCFCF", "#000000"])
 
@@ -201,7 +200,8 @@ def tracking(record: Record) -> Figure:
                 record.time, 0, 1, where=record["gripper"] > 0, transform=closed, color="#EEEEEE", lw=0, zorder=0,
                 label="gripper closed",
             )  # fmt: skip
-    axes[0, 0].legend(frameon=False)
+    # In a white box: what is grey shows on panels that are grey all over.
+    axes[0, 0].legend(facecolor="white", edgecolor="none")
     tiny = 1e-16  # an error of exactly zero has no place on a logarithmic axis
     axes[3, 0].semilogy(record.time, np.maximum(record["position_error"], tiny), color=BODY)
     axes[3, 0].set_ylabel("position error [m]")
@@ -267,7 +267,7 @@ def _over_time(axis: Axes, record: Record, values: NDArray[np.float64], many: bo
     if not many:
         axis.plot(record.time, values, color=GROUND)
         return
-    starts = np.unique(np.linspace(0, len(values), TURNS + 1).astype(int))[:-1]
+    starts = turns(len(values))
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     time = np.append(record.time[starts], record.time[-1])
     axis.stairs(high, time, baseline=low, fill=True, color=GROUND, alpha=0.25, lw=0, label="range")
