@@ -144,9 +144,9 @@ def _print_check(motion: Any) -> None:
     console.print(table)
     for warning in motion.warnings:
         console.print(f"warning: {warning}")
-    plan, path = motion.plan, motion.path
+    plan = motion.plan
     console.print(
-        f"check passed: {(path.end - path.start) / motion.speed:.2f} s at {plan.rate:g} Hz, "
+        f"check passed: {motion.duration:.2f} s at {plan.rate:g} Hz, "
         f"{plan.cycle_time * 1e3:.2f} of {1e3 / plan.rate:.2f} ms a cycle on the bus"
     )
 
@@ -221,7 +221,7 @@ def replay(
 def _plant(scenario: str, variant: str | None, servo_map: Any, motion: Any) -> Any:
     from dynsim.hardware.virtual.simulated_plant import simulated_arm
 
-    posture = dict(zip((servo.label for servo in servo_map.servos), motion.path.position[0], strict=True))
+    posture = dict(zip((servo.label for servo in servo_map.servos), motion.start, strict=True))
     return simulated_arm(scenario, variant, servo_map, posture)
 
 

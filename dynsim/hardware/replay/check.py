@@ -14,6 +14,7 @@ import numpy as np
 
 from dynsim.hardware.bus.control_table import HEALTH_BLOCK, STATE_BLOCK, TICKS_PER_TURN
 from dynsim.hardware.errors import CheckRefused
+from dynsim.hardware.replay.motion import Array, Course, Needs, Planned
 from dynsim.hardware.replay.trajectory import (
     COMMON,
     JERK_WINDOW,
@@ -136,6 +137,27 @@ class CheckedMotion:
     margins: tuple[Margin, ...]
     warnings: tuple[str, ...]
     scene: Scene | None = None
+
+    @property
+    def start(self) -> Array:
+        """Posture in which it begins [rad], shape (N,)."""
+        return self.path.position[0]
+
+    @property
+    def duration(self) -> float:
+        """[s]."""
+        return (self.path.end - self.path.start) / self.speed
+
+    def needs(self) -> list[Needs]:
+        """What it asks of every joint, in the order of the map."""
+        extremes = self.path.extremes()
+        low, high = extremes.position.min(axis=(0, 1)), extremes.position.max(axis=(0, 1))
+        fastest = self.speed * np.abs(extremes.velocity).max(axis=(0, 1))
+        return [Needs(float(a), float(b), float(v)) for a, b, v in zip(low, high, fastest, strict=True)]
+
+    def course(self) -> Course:
+        """How to go along the path, from its beginning."""
+        return Planned(self.path, self.path.start, self.path.end, speed=self.speed)
 
 
 def check_motion(
