@@ -25,7 +25,8 @@ import numpy as np
 from dynsim.engine.driven import Array, Driven, Pace, drive
 from dynsim.errors import DynsimError, RecordError
 from dynsim.hardware.errors import CheckRefused
-from dynsim.hardware.replay.drive import Sample, lead
+from dynsim.hardware.replay.drive import lead
+from dynsim.hardware.replay.growing import Sample
 from dynsim.hardware.replay.signals import ignore_stops
 from dynsim.hardware.replay.trajectory import column_of
 from dynsim.hardware.servo_map import ServoMap
@@ -36,6 +37,7 @@ from dynsim.scenario import Scenario
 
 NOT_YET = -math.inf
 """Time that the servos tell before they are where the simulation begins."""
+NICENESS = 5
 REGULAR, BROKEN = 0.0, 1.0
 """What is said behind a time that is no number: that the drive has ended, and how."""
 
@@ -172,6 +174,9 @@ def simulate(wanted: Wanted, control: Connection, samples: Connection, heard: An
     """
     # A terminal sends these to all processes of a group; only the one with the servos heeds them.
     ignore_stops()
+    # On a busy computer the servos come first.
+    with suppress(AttributeError, OSError):
+        os.nice(NICENESS)
     ending = _Ending(control)
     try:
         driven = drive(wanted.scenario, pace=wanted.pace, limit=wanted.longest)

@@ -14,7 +14,7 @@ import numpy as np
 
 from dynsim import interruption
 from dynsim.errors import DynsimError
-from dynsim.hardware.replay.drive import Sample
+from dynsim.hardware.replay.growing import Sample
 from dynsim.live.follower import BROKEN, NOT_YET, Done, Ready, Wanted, frame_of, simulate
 from dynsim.studies.processes import signals_held
 

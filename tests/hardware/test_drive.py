@@ -20,7 +20,8 @@ from dynsim.hardware.errors import CheckRefused, OutputsFailed, PortError, Repla
 from dynsim.hardware.fault_table import CASES, Case
 from dynsim.hardware.replay.check import motion_margins
 from dynsim.hardware.replay.display import displayed
-from dynsim.hardware.replay.drive import SILENCE, DrivenMotion, GrowingPath, Sample, check_drive, lead
+from dynsim.hardware.replay.drive import SILENCE, DrivenMotion, check_drive, lead
+from dynsim.hardware.replay.growing import GrowingPath, Sample
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.session import run_replay, shown_by
 from dynsim.hardware.replay.states import Progress, State, StopRequest

@@ -15,24 +15,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from dynsim.hardware.errors import CheckRefused
-from dynsim.hardware.replay.check import (
-    ROUNDING,
-    CyclePlan,
-    motion_margins,
-    plan_cycle,
-    position_bounds,
-    velocity_limit,
-)
+from dynsim.hardware.replay.check import ROUNDING, CyclePlan, motion_margins, plan_cycle
+from dynsim.hardware.replay.growing import GrowingPath, Sample
 from dynsim.hardware.replay.motion import Array, Course, Needs
 from dynsim.hardware.replay.registers import needs_of_map
 from dynsim.hardware.replay.rules import Cause, Fault
 from dynsim.hardware.replay.states import Stopped
-from dynsim.hardware.replay.trajectory import HOLE, JERK_WINDOW, SHAKING_WINDOW, Path
+from dynsim.hardware.replay.trajectory import HOLE, Path
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record.scene import Scene
 
@@ -42,17 +36,8 @@ SILENCE = 5.0
 """After so long without a posture the drive is over [s]; the robot has been at rest for most of it."""
 MOST_BROKEN = 4
 """Violations that a fault names."""
-KNOTS = 1024
 REST = 1e-9
 """Closer to its end [s] a path is over."""
-
-
-class Sample(NamedTuple):
-    """One posture: time [s], joint angles [rad] and rates [rad/s], shape (N,), in the order of the map."""
-
-    time: float
-    position: Array
-    velocity: Array
 
 
 class Feed(Protocol):
@@ -216,97 +201,3 @@ class DrivenCourse:
             raise Stopped(Fault(Cause.SIMULATION, self._feed.fault))
         if self._silent > SILENCE and not self._feed.over:
             raise Stopped(Fault(Cause.SIMULATION, f"no posture came for {SILENCE:g} s"))
-
-
-class GrowingPath:
-    """Knots of a path as they come, as far back as goals and limits need them.
-
-    Parameters
-    ----------
-    start : array, shape (N,)
-        Where it rests at time 0 [rad].
-    servo_map : ServoMap
-    """
-
-    def __init__(self, start: Array, servo_map: ServoMap) -> None:
-        servos, count = servo_map.servos, len(start)
-        self._map = servo_map
-        self._held = np.array([servo.kind.follows.rates == "held" for servo in servos])
-        self._time, self._position = np.zeros(KNOTS), np.zeros((KNOTS, count))
-        # Of the interval that ends at a knot.
-        self._after, self._before = np.zeros((KNOTS, count)), np.zeros((KNOTS, count))
-        self._position[0], self._count = start, 1
-        self._rate = np.zeros(count)
-        limits = [servo.kind.limits for servo in servos]
-        bounds = np.array([position_bounds(s) if s.in_position_mode else s.position_limits for s in servos])
-        self._low, self._high = bounds[:, 0] - ROUNDING, bounds[:, 1] + ROUNDING
-        self._velocity = np.array([velocity_limit(servo) for servo in servos]) + ROUNDING
-        self._acceleration = np.array([one.acceleration for one in limits]) + ROUNDING
-        self._jerk = np.array([one.jerk for one in limits]) + ROUNDING
-        self._shaking = np.array([one.shaking for one in limits]) + ROUNDING
-
-    @property
-    def end(self) -> float:
-        """Time of the last knot [s]."""
-        return float(self._time[self._count - 1])
-
-    def at(self, time: float) -> tuple[Array, Array]:
-        """Joint angles [rad] and rates [rad/s] at a time [s]."""
-        return self._since(time, 1).at(time)
-
-    def append(self, sample: Sample, *, keep: float) -> list[str]:
-        """One more knot, unless it breaks limits; which ones, in words.
-
-        What is before ``keep`` [s], and before the windows of the limits, may be dropped.
-        """
-        if self._count == len(self._time):
-            self._make_room(min(keep, self.end - SHAKING_WINDOW))
-        k = self._count
-        self._time[k], self._position[k] = sample.time, sample.position
-        straight = (sample.position - self._position[k - 1]) / (sample.time - self._time[k - 1])
-        self._after[k] = np.where(self._held, straight, self._rate)
-        self._before[k] = np.where(self._held, straight, sample.velocity)
-        self._count += 1
-        if broken := self._broken():
-            self._count -= 1
-            return broken
-        self._rate = sample.velocity
-        return []
-
-    def _broken(self) -> list[str]:
-        """Limits that the last interval breaks, in words; jerk and shaking as if the path ended with it."""
-        last = self._path(max(0, self._count - 3))
-        # Truncated windows lie before it.
-        windows, since = self._since(self.end - SHAKING_WINDOW, 2), float(last.time[-2])
-        extremes = last.extremes()
-        with np.errstate(invalid="ignore"):
-            held = (
-                np.all((extremes.position >= self._low) & (extremes.position <= self._high))
-                and np.all(np.abs(extremes.velocity) <= self._velocity)
-                and np.all(np.abs(extremes.acceleration) <= self._acceleration)
-                and np.all(windows.jerk(JERK_WINDOW, since)[0] <= self._jerk)
-                and np.all(windows.shaking(SHAKING_WINDOW, since)[0] <= self._shaking)
-            )
-        if held:
-            return []
-        return [str(one) for one in motion_margins(windows, self._map, 1.0, since) if not one.holds]
-
-    def _since(self, time: float, more: int) -> Path:
-        """From the knot at or before a time on [s], and ``more`` before that."""
-        first = int(np.searchsorted(self._time[: self._count], time, side="right")) - 1
-        return self._path(max(0, first - more))
-
-    def _path(self, first: int) -> Path:
-        knots, intervals = slice(first, self._count), slice(first + 1, self._count)
-        return Path(self._time[knots], self._position[knots], self._after[intervals], self._before[intervals], self.end)
-
-    def _make_room(self, oldest: float) -> None:
-        """Drop knots from before a time [s], but for some; where that gives no room, take more."""
-        arrays = (self._time, self._position, self._after, self._before)
-        first = max(0, int(np.searchsorted(self._time, oldest)) - 4)
-        size = len(self._time) if 2 * first > len(self._time) else 2 * len(self._time)
-        fresh = [np.zeros((size, *array.shape[1:])) for array in arrays]
-        self._count -= first
-        for new, old in zip(fresh, arrays, strict=True):
-            new[: self._count] = old[first:]
-        self._time, self._position, self._after, self._before = fresh
