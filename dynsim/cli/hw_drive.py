@@ -150,7 +150,13 @@ def hw_drive(
             error, result = stopped, getattr(stopped, "result", None)
         # What was driven is saved, whatever else the user asks for.
         interruption.keep()
-        done = process.finish("ended" if error is None else "the servos have stopped")
+        try:
+            done = process.finish("ended" if error is None else "the servos have stopped")
+        except DynsimError as lost_drive:
+            if error is None:
+                raise
+            errors.print(f"[red]error:[/] {escaped(str(lost_drive))}")
+            raise error from None
         interruption.heed()
     if result is not None and not quiet:
         print_timing(result)
