@@ -123,18 +123,21 @@ def followed(record: Record) -> tuple[np.ndarray, np.ndarray]:
     time, goals = record["record_time"][rows], record["q_goal"][rows]
     period = 1.0 / 50.0
     assert np.diff(time).min() >= 0.0
-    # Whatever was late: from goal to goal never more than a period of the simulation.
-    assert np.diff(time).max() <= period * (1.0 + 1e-9)
+    # Whatever was late: from goal to goal never more than a period of the simulation. A cycle in which the port failed
+    # has sent its goals and left no row.
+    struck = record["state"][rows][1:] == State.FAULT
+    assert (np.diff(time) <= np.where(struck, 2.0, 1.0) * period * (1.0 + 1e-9)).all()
     return time, goals
 
 
-def check_against_the_simulation(one: Drive, *, but: int | None = None) -> Record:
-    """The goals are where the simulation was, ``but`` for a servo in trouble; its script gives it again."""
+def check_against_the_simulation(one: Drive, *, in_trouble: bool = False) -> Record:
+    """The goals are where the simulation was, until servos are in trouble; its script gives it again."""
     simulated, (measured, _) = Record.load(one.folder / "record.h5"), one.measured()
     time, goals = followed(measured)
     expected = np.column_stack([np.interp(time, simulated.time, column) for column in simulated["q"].T])
-    if but is not None:
-        goals, expected = np.delete(goals, but, axis=1), np.delete(expected, but, axis=1)
+    if in_trouble:
+        well = measured["state"][np.isfinite(measured["record_time"])] == State.REPLAY
+        goals, expected = goals[well], expected[well]
     # Of a chord over 5 ms at the 6.5 rad/s² with which the arm sags at first: 2.0e-5 rad; a tick is 1.5e-3.
     assert goals == pytest.approx(expected, abs=5e-5)
     again = simulate(load_scenario(one.folder / "scenario.yaml"))
@@ -300,7 +303,7 @@ def test_a_fault_of_a_servo_ends_the_drive_by_the_policy(
     assert summary["fault"] == "hardware alert"
     assert summary["end_state"].startswith(end)
     assert all(servo["torque"] == (policy != "off" and servo["id"] != 3) for servo in summary["servos"])
-    check_against_the_simulation(one, but=2)
+    check_against_the_simulation(one, in_trouble=True)
 
 
 def test_hw_stop_releases_a_robot_that_is_driven(drives: Callable[..., Drive], tmp_path: Path) -> None:
@@ -331,7 +334,7 @@ def test_hw_stop_releases_a_robot_that_is_driven(drives: Callable[..., Drive], t
             virtual.kill()
     # By which rule it was noticed depends on who got whose answers.
     assert one.measured()[1]["end_state"] == "off"
-    check_against_the_simulation(one)
+    check_against_the_simulation(one, in_trouble=True)
 
 
 def test_a_real_port_is_a_dry_run_without_live(drives: Callable[..., Drive], tmp_path: Path) -> None:
