@@ -135,8 +135,9 @@ class DrivenArm:
         """The record of the drive; its scenario is the script."""
         before = self.simulation.snapshot()
         if not self.simulation.finished:
-            self.simulation.advance(self.ticks / self._rate)
-        duration = max(self.ticks, 1) / self._rate
+            self.simulation.advance(self.ticks * self.period)
+        # As ticks are counted: a step that ends a rounding before one would not be that of a run which ends there.
+        duration = max(self.ticks, 1) * self.period
         script = changed(
             self._scenario, duration, {**self._controller, "operator": {**self._operator, "commands": self._commands}}
         )
