@@ -60,7 +60,7 @@ def begin_early(*modules: str) -> None:
 
     _method = _FORK_SERVER
     forkserver.set_forkserver_preload(list(modules))
-    with _signals_held():
+    with signals_held():
         forkserver.ensure_running()
 
 
@@ -120,14 +120,14 @@ def run_in_processes(
     workers: list[_Worker] = []
     # Tasks whose process was lost, and how often: they come before those that nobody has had.
     again: list[tuple[Task, int]] = []
-    with _signals_held():
+    with signals_held():
         # Without a lock, which a killed worker would leave closed.
         stop = context.RawValue("b", 0)
 
     def start(sender: Connection) -> _Worker:
         here, there = context.Pipe()
         arguments = (work, there, stop, sender, _heard_from())
-        with _signals_held():
+        with signals_held():
             process = context.Process(target=_serve, args=arguments)
             process.start()
         there.close()
@@ -315,7 +315,7 @@ def _logged_here(context: Any) -> Iterator[Connection]:
 
 
 @contextmanager
-def _signals_held() -> Iterator[None]:
+def signals_held() -> Iterator[None]:
     """Processes started here do not get the Ctrl-C of the terminal, not even while they start; this one gets it after.
 
     Only the parent reacts to it, wherever it was sent, and tells the workers. So with the other ``STOP_SIGNALS``.
