@@ -10,7 +10,7 @@ import sys
 import pytest
 from rich.console import Console
 
-from dynsim.studies.bench import job, precision, programs, run, together
+from dynsim.studies.bench import job, precision, programs, run, together, variants
 from dynsim.studies.bench.table import format_table
 
 
@@ -56,8 +56,12 @@ def test_quick_run(small: None) -> None:
         (together.RUN, programs.EIGHT_LANES),
     }
     assert all(map(math.isfinite, ratios))
-    # Runs have no four lanes.
-    assert text(result).count("–") == 1
+    # Runs have no four lanes, and no explicit method follows the smallest inductance.
+    assert text(result).count("–") == 2
+    assert [row["failed"] for row in result["sweeps"]] == [0] * len(result["sweeps"])
+    tasks = {(row["task"], row["peer"]) for row in result["ratios"]}
+    assert {("all variants, dynsim radau5", variants.REAL), ("two_elbows, dynsim radau5", variants.SMALL)} <= tasks
+    assert ("sweep, processes: 1", "100 runs") in tasks
 
 
 def test_without_mujoco(small: None, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from dynsim._version import __version__
-from dynsim.studies.bench import job, precision, right_hand_side, together
+from dynsim.studies.bench import job, precision, right_hand_side, sweeps, together, variants
 from dynsim.studies.bench.programs import (
     ABA,
     CONSTRAINT_DYNAMICS,
@@ -50,7 +50,8 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
     dict, ready for JSON
         ``machine``, ``versions``, ``method`` (how it was measured), ``right_hand_side`` (per size: microseconds by
         contender, medians and minima), ``job`` (per case and program: wall time and errors), ``together`` (per state
-        and per step of a run: microseconds alone and on lanes), ``precision`` (per shipped scenario, method and
+        and per step of a run: microseconds alone and on lanes), ``variants`` (per variant, contacts and method: time),
+        ``sweeps`` (per number of runs and processes: wall time), ``precision`` (per shipped scenario, method and
         tolerance: time, error, ledger), ``ratios`` (how many times longer the other program
         takes, or dynsim otherwise), ``unavailable`` (what is missing and why).
     """
@@ -76,10 +77,14 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
         jobs += job.measure_job(case, 3 if quick else 21, with_mujoco=not mujoco_missing)
     report("runs that share lanes", 0.6)
     shared = together.measure(rounds, share)
+    report("variants, on a real floor too", 0.63)
+    elbows = variants.measure(3 if quick else 9)
+    report("sweeps", 0.65)
+    swept = sweeps.measure(quick)
     exact: list[dict[str, Any]] = []
     names = [SCENARIO] if quick else list(precision.scenarios())
     for k, name in enumerate(names):
-        report(f"work and precision, {name}", 0.65 + 0.35 * k / len(names))
+        report(f"work and precision, {name}", 0.7 + 0.3 * k / len(names))
         exact += precision.measure(name, 1 if quick else precision.ROUNDS)
     report("done", 1.0)
     result: dict[str, Any] = {
@@ -102,11 +107,77 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
         "right_hand_side": sizes,
         "job": jobs,
         "together": shared,
+        "variants": elbows,
+        "sweeps": swept,
         "precision": exact,
         "unavailable": {"mujoco": mujoco_missing} if mujoco_missing else {},
     }
     result["ratios"] = [*_ratios(sizes, jobs), *_own_ratios(jobs, shared), *_at_equal_error(exact)]
+    result["ratios"] += [*_ratios_of_variants(elbows), *_growth(swept)]
     return result
+
+
+def _ratios_of_variants(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """How many times longer rk43 takes than radau5; all variants on a real floor than glued; and a small inductance."""
+
+    def total(contacts: str, method: str, variant: str | None = None) -> float:
+        return sum(
+            row["cpu_minimum_s"]
+            for row in rows
+            if row["contacts"] == contacts and row["method"] == method and variant in (None, row["variant"])
+        )
+
+    first, explicit, implicit = rows[0]["variant"], *variants.METHODS
+    found = [
+        {
+            "task": f"10 s job, {first}, {variants.GLUED}, least time",
+            "peer": f"dynsim {explicit}",
+            "dynsim": f"dynsim {implicit}",
+            "time": total(variants.GLUED, explicit, first) / total(variants.GLUED, implicit, first),
+        }
+    ]
+    for method in variants.METHODS:
+        found.append(
+            {
+                "task": f"all variants, dynsim {method}",
+                "peer": variants.REAL,
+                "dynsim": variants.GLUED,
+                "time": total(variants.REAL, method) / total(variants.GLUED, method),
+            }
+        )
+    small = total(variants.SMALL, implicit, first) / total(variants.GLUED, implicit, first)
+    found.append(
+        {"task": f"{first}, dynsim {implicit}", "peer": variants.SMALL, "dynsim": variants.GLUED, "time": small}
+    )
+    return found
+
+
+def _growth(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """How many times longer sweeps take in one process than in several, and with more runs."""
+    wall = {(row["runs"], row["jobs"]): row["wall_s"] for row in rows}
+    least, most = min(row["runs"] for row in rows), max(row["runs"] for row in rows)
+    jobs = sorted({row["jobs"] for row in rows})
+    found = []
+    for runs in sorted({row["runs"] for row in rows}):
+        if len(jobs) > 1:
+            found.append(
+                {
+                    "task": f"sweep of {runs} runs",
+                    "peer": "1 process",
+                    "dynsim": f"{jobs[-1]} processes",
+                    "time": wall[runs, 1] / wall[runs, jobs[-1]],
+                }
+            )
+    found += [
+        {
+            "task": f"sweep, processes: {count}",
+            "peer": f"{most} runs",
+            "dynsim": f"{least} runs",
+            "time": wall[most, count] / wall[least, count],
+        }
+        for count in jobs
+    ]
+    return found
 
 
 def _own_ratios(jobs: list[dict[str, Any]], shared: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ from typing import Any
 from rich import box
 from rich.table import Table
 
-from dynsim.studies.bench import job, precision
+from dynsim.studies.bench import job, precision, variants
 from dynsim.studies.bench.programs import (
     CONTENDERS,
     DYNSIM_RADAU5,
@@ -86,7 +86,22 @@ def format_table(result: dict[str, Any]) -> list[Table]:
         ]
         equal = precision.work_at_equal_error(rows, "radau5", "rk43", precision.EQUAL_ERROR)
         work.add_row(scenario, *cells, _number(equal))
-    return [times, whole, ratios, together, work]
+    many = _table("Sweeps of 10 s of two elbows, wall s", "runs")
+    jobs = sorted({row["jobs"] for row in result["sweeps"]})
+    for count in jobs:
+        many.add_column(f"{count} process{'es' if count > 1 else ''}", justify="right")
+    for runs in dict.fromkeys(row["runs"] for row in result["sweeps"]):
+        wall = {row["jobs"]: row["wall_s"] for row in result["sweeps"] if row["runs"] == runs}
+        many.add_row(str(runs), *(_number(wall[count]) for count in jobs))
+
+    elbows = _table("10 s jobs of all variants, least CPU ms", "")
+    for method in variants.METHODS:
+        elbows.add_column(method, justify="right")
+    times_of = {(row["contacts"], row["variant"], row["method"]): row["cpu_minimum_s"] for row in result["variants"]}
+    for contacts, variant in dict.fromkeys((row["contacts"], row["variant"]) for row in result["variants"]):
+        least = (times_of.get((contacts, variant, method)) for method in variants.METHODS)
+        elbows.add_row(f"{contacts}, {variant}", *(_number(seconds, 1e3) for seconds in least))
+    return [times, whole, ratios, together, elbows, many, work]
 
 
 def _table(title: str, first: str) -> Table:

@@ -1,0 +1,33 @@
+"""Sweeps of the published arm with two elbows: how their time grows with runs, and falls with cores."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from dynsim.scenario import read_scenario
+from dynsim.studies.bench.programs import SCENARIO
+from dynsim.studies.plan import Law, Plan
+from dynsim.studies.processes import cores
+from dynsim.studies.sweep import run_sweep
+
+RUNS = (250, 500, 1000)
+
+
+def measure(quick: bool) -> list[dict[str, Any]]:
+    """Wall seconds of sweeps of 10 s runs over friction, by one process and by as many as there are cores."""
+    file = read_scenario(SCENARIO)
+    law = Law.parse("contacts.friction=normal(0.1,0.005)")
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for runs in (count // 10 if quick else count for count in RUNS):
+            for jobs in dict.fromkeys((1, cores())):
+                plan = Plan(file, (file.variants[0],), laws=(law,), count=runs)
+                started = time.perf_counter()
+                rows_of = run_sweep(plan, Path(folder, f"{runs}-{jobs}"), jobs=jobs)
+                wall = time.perf_counter() - started
+                failed = sum(row.status != "ok" for row in rows_of)
+                rows.append({"runs": runs, "jobs": jobs, "wall_s": wall, "failed": failed})
+    return rows
