@@ -124,7 +124,7 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
 
 def _height(named: int) -> float:
     """Of a figure of three square panels and a legend of so many names [inch]: without room above and below."""
-    return 2.62 + style.LEGEND_ROW * -(-named // 4) / 72.0
+    return 2.7 + style.LEGEND_ROW * -(-named // 4) / 72.0
 
 
 def _planes(figure: Figure, records: list[Record]) -> list[Axes]:
