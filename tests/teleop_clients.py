@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -25,11 +25,11 @@ def prepare_child() -> None:
 
 
 class Teleop:
-    """A process of ``dynsim teleop``, and the address that it tells."""
+    """A process of ``dynsim teleop``, or of another command with its page, and the address that it tells."""
 
-    def __init__(self, folder: Path, *arguments: str) -> None:
+    def __init__(self, folder: Path, *arguments: str, command: Sequence[str] = ("teleop",)) -> None:
         self.folder = folder
-        command = [sys.executable, "-m", "dynsim", "teleop", *arguments, "--no-open", "--out", str(folder)]
+        command = [sys.executable, "-m", "dynsim", *command, *arguments, "--no-open", "--out", str(folder)]
         self.process = subprocess.Popen(
             command,
             stdout=subprocess.PIPE,

@@ -24,6 +24,7 @@ from dynsim.cli.app import (
 )
 from dynsim.cli.display import console, errors, labelled, progress, record_files
 from dynsim.cli.drawing import Figures, Page, begin_drawing, draw, draw_all
+from dynsim.cli.hw_drive import EXAMPLE, hw_drive
 from dynsim.cli.sweep import sweep
 from dynsim.cli.teleop import teleop
 from dynsim.cli.view import open_page, tell_of_view, view
@@ -272,6 +273,7 @@ def schema() -> None:
 
 app.command(epilog="Example: dynsim sweep elbow_comparison --variants all --grid contacts.friction=0:1:5")(sweep)
 # These load serial ports and servos only when called.
+hw.command("drive", epilog=EXAMPLE)(hw_drive)
 app.add_typer(hw, name="hw")
 app.command(
     epilog="Example: dynsim export results/elbow_comparison/two_elbows/record.h5 --format joint-trajectory --rate 100"

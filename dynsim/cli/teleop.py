@@ -18,33 +18,40 @@ from dynsim.terminal import escaped
 if TYPE_CHECKING:
     from dynsim.live.session import Account
 
+VariantOption = Annotated[
+    str | None,
+    typer.Option(metavar="VARIANT", help="Variant to drive; default: the first.", autocompletion=completion.variants),
+]
+SpeedOption = Annotated[float, typer.Option(metavar="M/S", min=1e-3, max=10.0, help="Fastest hand or head.")]
+TurnOption = Annotated[float, typer.Option(metavar="RAD/S", min=1e-3, max=20.0, help="Fastest turn.")]
+BaseSpeedOption = Annotated[float, typer.Option(metavar="M/S", min=1e-3, max=10.0, help="Fastest mobile base.")]
+LongestOption = Annotated[float, typer.Option(metavar="S", min=1.0, max=36000.0, help="Longest drive.")]
+HttpPortOption = Annotated[
+    int, typer.Option(metavar="N", min=0, max=65535, help="Of the page on this machine; 0: a free one.")
+]
+UntilClosedOption = Annotated[
+    bool, typer.Option("--until-closed", help="End when the last browser is closed, not only by button or Ctrl-C.")
+]
+OpenOption = Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")]
+
 # Ticks later than this are told of at the end [s].
 LATE = 0.05
 
 
 def teleop(
     scenario: ScenarioArgument,
-    variant: Annotated[
-        str | None,
-        typer.Option(
-            metavar="VARIANT", help="Variant to drive; default: the first.", autocompletion=completion.variants
-        ),
-    ] = None,
+    variant: VariantOption = None,
     overrides: SetOption = None,
     out: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="For the files; default: results/SCENARIO/drive_N, a new one.")
     ] = None,
-    speed: Annotated[float, typer.Option(metavar="M/S", min=1e-3, max=10.0, help="Fastest hand or head.")] = 0.1,
-    turn: Annotated[float, typer.Option(metavar="RAD/S", min=1e-3, max=20.0, help="Fastest turn.")] = 0.5,
-    base_speed: Annotated[float, typer.Option(metavar="M/S", min=1e-3, max=10.0, help="Fastest mobile base.")] = 0.3,
-    longest: Annotated[float, typer.Option(metavar="S", min=1.0, max=36000.0, help="Longest drive.")] = 600.0,
-    http_port: Annotated[
-        int, typer.Option(metavar="N", min=0, max=65535, help="Of the page on this machine; 0: a free one.")
-    ] = 0,
-    until_closed: Annotated[
-        bool, typer.Option("--until-closed", help="End when the last browser is closed, not only by button or Ctrl-C.")
-    ] = False,
-    open_: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser.")] = True,
+    speed: SpeedOption = 0.1,
+    turn: TurnOption = 0.5,
+    base_speed: BaseSpeedOption = 0.3,
+    longest: LongestOption = 600.0,
+    http_port: HttpPortOption = 0,
+    until_closed: UntilClosedOption = False,
+    open_: OpenOption = True,
     quiet: QuietOption = False,
 ) -> None:
     """Drive a scenario from a browser: keyboard, gamepad or sticks on the screen.
@@ -52,10 +59,7 @@ def teleop(
     Velocities count only while the dead-man's key is held: space, a shoulder button, or a finger on a stick. The drive
     is saved with a scenario that repeats it: `dynsim run FOLDER/scenario.yaml` gives the same record, bit for bit.
     """
-    try:
-        import websockets  # noqa: F401
-    except ModuleNotFoundError:
-        raise DynsimError("a live drive needs websockets: pip install 'dynsim[live]'") from None
+    require_websockets()
     from dynsim.engine.driven import Pace, drive
     from dynsim.files import check_writable
     from dynsim.live.session import Session
@@ -63,18 +67,14 @@ def teleop(
     from dynsim.scenario import load_scenario
 
     loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
-    folder = out or _new_folder(Path("results", loaded.name))
+    folder = out or new_folder(Path("results", loaded.name))
     check_writable(folder, RUN_FILES)
     with console.status("loading the kernels; the first time they are compiled, which takes half a minute"):
         driven = drive(loaded, pace=Pace(speed, turn, base_speed), limit=longest)
     session = Session(driven, loaded.variant or loaded.name)
     try:
         address = session.open(http_port)
-        # Also with --quiet: nobody could drive without it.
-        console.print(f"To be driven in a browser on this machine: {address}", highlight=False, soft_wrap=True)
-        console.print("Ctrl-C ends the drive and saves it", highlight=False)
-        if open_:
-            open_address(address)
+        tell_address(address, "Ctrl-C ends the drive and saves it", open_=open_)
         account = session.run(until_closed=until_closed)
     except KeyboardInterrupt:
         # Before the first tick.
@@ -90,24 +90,41 @@ def teleop(
     save_run(record, folder)
     interruption.heed()
     if not quiet:
-        _tell(account, driven.ticks * driven.period)
-        console.print(f"Written to {escaped(folder)}", highlight=False, soft_wrap=True)
-        script = escaped(folder / "scenario.yaml")
-        console.print(f"The same drive again: dynsim run {script}", highlight=False, soft_wrap=True)
+        tell_drive(account, driven.ticks * driven.period, folder)
     write_view({loaded.variant or loaded.name: record}, folder, quiet)
     if account.stop is not None:
         errors.print(f"what was simulated until then is in {escaped(folder)}, marked incomplete")
         raise account.stop
 
 
-def _new_folder(place: Path) -> Path:
+def require_websockets() -> None:
+    """Raises DynsimError where the package is not installed."""
+    try:
+        import websockets  # noqa: F401
+    except ModuleNotFoundError:
+        raise DynsimError("a live drive needs websockets: pip install 'dynsim[live]'") from None
+
+
+def tell_address(address: str, ending: str, *, open_: bool) -> None:
+    """Say where to drive; also with --quiet: nobody could drive without it."""
+    console.print(f"To be driven in a browser on this machine: {address}", highlight=False, soft_wrap=True)
+    console.print(ending, highlight=False)
+    if open_:
+        open_address(address)
+
+
+def new_folder(place: Path) -> Path:
     """The first of ``drive_1``, ``drive_2``, … that is not there: a drive cannot be made again by driving."""
     return next(folder for k in itertools.count(1) if not (folder := place / f"drive_{k}").exists())
 
 
-def _tell(account: Account, driven: float) -> None:
+def tell_drive(account: Account, driven: float, folder: Path) -> None:
+    """How a drive of so many seconds went, where it is, and how it is repeated."""
     late = sorted(account.late)
     middle, most = 1e3 * late[len(late) // 2], 1e3 * late[-1 - len(late) // 100]
     text = f"Driven for {driven:.1f} s ({escaped(account.ended)}); ticks late by {middle:.1f} ms, 99 % by {most:.1f} ms"
     behind = f"; {account.lost:.1f} s behind real time" if account.lost > LATE else ""
     console.print(text + behind, highlight=False, soft_wrap=True)
+    console.print(f"Written to {escaped(folder)}", highlight=False, soft_wrap=True)
+    script = escaped(folder / "scenario.yaml")
+    console.print(f"The same drive again: dynsim run {script}", highlight=False, soft_wrap=True)

@@ -88,6 +88,10 @@ class Driven(Protocol):
         """Periods so far."""
 
     @property
+    def time(self) -> float:
+        """Of the simulation [s]: with its ticks, or half a tick behind them."""
+
+    @property
     def finished(self) -> bool:
         """The longest drive is over, or the run has ended by itself."""
 
@@ -96,6 +100,12 @@ class Driven(Protocol):
 
     def shown(self) -> Shown:
         """What there is to see now."""
+
+    def joints(self) -> Mapping[str, Array]:
+        """Angles [rad] of what has a motor or turns with one, and rates [rad/s] where they are known, now.
+
+        By the names of the record's signals, in the order of their labels.
+        """
 
     def still(self) -> Record:
         """A moment of the same robot at its start, for a page to be made of."""

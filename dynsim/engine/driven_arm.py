@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -78,6 +79,11 @@ class DrivenArm:
         )
 
     @property
+    def time(self) -> float:
+        """Half a tick behind the last one, whose order is yet to come [s]."""
+        return self.simulation.time
+
+    @property
     def finished(self) -> bool:
         """The longest drive is over, or the run ended by itself."""
         return self.simulation.finished or self.ticks >= self._limit * self._rate
@@ -116,6 +122,11 @@ class DrivenArm:
             touching=simulation.touching,
         )
 
+    def joints(self) -> Mapping[str, Array]:
+        """Of all rows of the tree."""
+        state = self.simulation.state
+        return {"q": state.q, "v": state.v}
+
     def still(self) -> Record:
         """A moment of the same robot at its start, for a page to be made of."""
         return self._still
@@ -124,8 +135,9 @@ class DrivenArm:
         """The record of the drive; its scenario is the script."""
         before = self.simulation.snapshot()
         if not self.simulation.finished:
-            self.simulation.advance(self.ticks / self._rate)
-        duration = max(self.ticks, 1) / self._rate
+            self.simulation.advance(self.ticks * self.period)
+        # As ticks are counted: a step that ends a rounding before one would not be that of a run which ends there.
+        duration = max(self.ticks, 1) * self.period
         script = changed(
             self._scenario, duration, {**self._controller, "operator": {**self._operator, "commands": self._commands}}
         )

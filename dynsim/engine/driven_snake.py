@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from dynsim.engine.driven import NO_REQUEST, Axis, Order, Pace, Shown, changed
+from dynsim.engine.driven import NO_REQUEST, Array, Axis, Order, Pace, Shown, changed
 from dynsim.engine.kinematic import advance_piece, load_kernels, mode_switcher, prepare, read_commands
 from dynsim.engine.kinematic_record import COORDINATES, make_record
 from dynsim.engine.provenance import provenance
@@ -65,6 +66,11 @@ class DrivenSnake:
         return int(self._run.state.counts[TICKS])
 
     @property
+    def time(self) -> float:
+        """[s]."""
+        return self.ticks * self.period
+
+    @property
     def finished(self) -> bool:
         """The longest drive is over."""
         return self.ticks >= self._run.ticks
@@ -97,7 +103,7 @@ class DrivenSnake:
         }
         row = int(state.counts[MODE])
         return Shown(
-            time=self.ticks * self.period,
+            time=self.time,
             poses=poses_at(self._scene, signals),
             hand=state.w_target[:3].copy(),
             waiting=run.blocked or run.recovering,
@@ -108,6 +114,12 @@ class DrivenSnake:
             },
             touching={},
         )
+
+    def joints(self) -> Mapping[str, Array]:
+        """Joints and wheels; rates are held from period to period, so that they are differences of these."""
+        run, state = self._run, self._run.state
+        grounded = run.controller.law.grounded[int(state.counts[MODE])]
+        return {"phi": state.phi.copy(), "rho": state.rho.copy(), "grounded": grounded}
 
     def still(self) -> Record:
         """A moment of the same robot at its start, for a page to be made of."""

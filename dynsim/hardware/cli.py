@@ -41,6 +41,12 @@ MapFile = Annotated[Path, typer.Option("--map", help="servo map: a file, or the 
 Port = Annotated[str, typer.Option("--port", help="serial device, e.g. /dev/ttyUSB0")]
 Rate = Annotated[float | None, typer.Option("--rate", help="goals per second [Hz]; the map's if not given")]
 Speed = Annotated[float, typer.Option("--speed", help="1 is the record's own time, 0.5 half as fast")]
+ReplayPort = Annotated[str, typer.Option("--port", help="serial device, or 'virtual' for servos in memory")]
+PolicyOption = Annotated[Policy | None, typer.Option("--policy", help="on a fault; the map's if not given")]
+Live = Annotated[bool, typer.Option("--live", help="really move; a real port is a dry run without")]
+Yes = Annotated[bool, typer.Option("--yes", help="do not ask before moving")]
+Configure = Annotated[bool, typer.Option("--configure", help="write differing EEPROM settings")]
+Faults = Annotated[Path | None, typer.Option("--faults", help="fault script for virtual servos")]
 
 
 class MissingClientLibrary(DynsimError):
@@ -48,7 +54,8 @@ class MissingClientLibrary(DynsimError):
 
 
 @contextmanager
-def _client_library() -> Iterator[None]:
+def client_library() -> Iterator[None]:
+    """Raises MissingClientLibrary where the packages for servos are not installed."""
     try:
         import dynamixel_sdk  # noqa: F401
         import serial  # noqa: F401
@@ -64,7 +71,7 @@ def scan(
     baud: Annotated[int | None, typer.Option("--baud", help="only this bit rate [bit/s]")] = None,
 ) -> None:
     """List the servos that answer, at every usual bit rate. Reads only."""
-    with _client_library():
+    with client_library():
         from dynsim.hardware.bus import scan as survey
         from dynsim.hardware.errors import VerificationFailed
         from dynsim.hardware.servo_map import load_servo_map
@@ -144,9 +151,9 @@ def _print_check(motion: Any) -> None:
     console.print(table)
     for warning in motion.warnings:
         console.print(f"warning: {warning}")
-    plan, path = motion.plan, motion.path
+    plan = motion.plan
     console.print(
-        f"check passed: {(path.end - path.start) / motion.speed:.2f} s at {plan.rate:g} Hz, "
+        f"check passed: {motion.duration:.2f} s at {plan.rate:g} Hz, "
         f"{plan.cycle_time * 1e3:.2f} of {1e3 / plan.rate:.2f} ms a cycle on the bus"
     )
 
@@ -155,15 +162,15 @@ def _print_check(motion: Any) -> None:
 def replay(
     record: RecordFile,
     map_file: MapFile,
-    port: Annotated[str, typer.Option("--port", help="serial device, or 'virtual' for servos in memory")],
+    port: ReplayPort,
     rate: Rate = None,
     speed: Speed = 1.0,
-    policy: Annotated[Policy | None, typer.Option("--policy", help="on a fault; the map's if not given")] = None,
+    policy: PolicyOption = None,
     out: Annotated[Path | None, typer.Option("--out", help="folder [results/ROBOT_replay]")] = None,
-    live: Annotated[bool, typer.Option("--live", help="really move; a real port is a dry run without")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="do not ask before moving")] = False,
-    configure: Annotated[bool, typer.Option("--configure", help="write differing EEPROM settings")] = False,
-    faults: Annotated[Path | None, typer.Option("--faults", help="fault script for virtual servos")] = None,
+    live: Live = False,
+    yes: Yes = False,
+    configure: Configure = False,
+    faults: Faults = None,
     plant: Annotated[str | None, typer.Option("--plant", help="scenario whose robot the virtual servos move")] = None,
     variant: Annotated[str | None, typer.Option("--variant", help="variant of that scenario")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="no progress bar")] = False,
@@ -172,7 +179,7 @@ def replay(
 
     Ctrl-C once: controlled stop. Twice: torque off.
     """
-    with _client_library():
+    with client_library():
         from dynsim.hardware.dialog import confirm_replay, print_limits
         from dynsim.hardware.errors import ServoMapError
         from dynsim.hardware.ports import VIRTUAL, bus_on
@@ -208,7 +215,7 @@ def replay(
                     observer=observer,
                     provenance={"port": port, "record": str(record), "simulated": simulated.provenance},
                 )
-            _print_timing(result)
+            print_timing(result)
             if not moves:
                 print_limits(console, result.limits)
                 console.print("dry run: servos verified and the bus timed, nothing was moved; --live moves")
@@ -221,11 +228,12 @@ def replay(
 def _plant(scenario: str, variant: str | None, servo_map: Any, motion: Any) -> Any:
     from dynsim.hardware.virtual.simulated_plant import simulated_arm
 
-    posture = dict(zip((servo.label for servo in servo_map.servos), motion.path.position[0], strict=True))
+    posture = dict(zip((servo.label for servo in servo_map.servos), motion.start, strict=True))
     return simulated_arm(scenario, variant, servo_map, posture)
 
 
-def _print_timing(result: Any) -> None:
+def print_timing(result: Any) -> None:
+    """How well the loop kept its deadlines, in a line."""
     timing = result.timing
     if timing is None:
         return
@@ -308,7 +316,7 @@ def virtual(
     variant: Annotated[str | None, typer.Option("--variant", help="variant of that scenario")] = None,
 ) -> None:
     """Virtual servos behind a pseudo-terminal, for any Dynamixel tool. Ctrl-C ends it."""
-    with _client_library():
+    with client_library():
         from dynsim.hardware.replay.signals import stop_on_signals
         from dynsim.hardware.replay.states import StopRequest
         from dynsim.hardware.servo_map import load_servo_map
@@ -341,7 +349,7 @@ def stop_servos(
     baud: Annotated[int | None, typer.Option("--baud", help="only this bit rate [bit/s]")] = None,
 ) -> None:
     """Torque off for every servo at every usual bit rate, beside a replay too; no substitute for a power cut."""
-    with _client_library():
+    with client_library():
         from dynsim.hardware.bus import scan as survey
         from dynsim.hardware.errors import VerificationFailed
         from dynsim.hardware.servo_map import load_servo_map
@@ -381,7 +389,7 @@ def calibrate(
 
     With --nudge: find swapped senses instead, joint by joint.
     """
-    with _client_library():
+    with client_library():
         from dynsim.hardware.calibrate import read_zero_ticks, write_into_map
         from dynsim.hardware.dialog import find_senses, may_write
         from dynsim.hardware.errors import ServoMapError, VerificationFailed

@@ -14,7 +14,7 @@ from dynsim.hardware.bus.protocol import Bus
 from dynsim.hardware.errors import ReplayInterrupted
 from dynsim.hardware.nudge import ANGLE, Nudge, nudge, swapped
 from dynsim.hardware.ports import VIRTUAL, bus_on
-from dynsim.hardware.replay.check import CheckedMotion
+from dynsim.hardware.replay.motion import Task
 from dynsim.hardware.replay.registers import QUANTITIES, LimitRow, differences
 from dynsim.hardware.replay.signals import stop_on_signals
 from dynsim.hardware.replay.start import way_to_start
@@ -25,8 +25,12 @@ ANSWERS = ("y", "n", "again")
 CLEAR = "Is everybody clear of the robot, and the power cut within reach?"
 
 
-def confirm_replay(console: Console, servo_map: ServoMap, motion: CheckedMotion, port: str, *, asked: bool) -> None:
+def confirm_replay(
+    console: Console, servo_map: ServoMap, motion: Task, port: str, *, asked: bool, at_most: bool = False
+) -> None:
     """Say how far the start is, and ask; about a start beyond ``safety.start_distance`` also where not ``asked``.
+
+    ``at_most``: the motion may end sooner.
 
     Raises
     ------
@@ -36,10 +40,10 @@ def confirm_replay(console: Console, servo_map: ServoMap, motion: CheckedMotion,
         The posture cannot be read.
     """
     with bus_on(port, servo_map) as (bus, _):
-        way = way_to_start(bus, servo_map, motion.path.position[0])
-    duration = (motion.path.end - motion.path.start) / motion.speed
+        way = way_to_start(bus, servo_map, motion.start)
     console.print(
-        f"{servo_map.robot}: {len(servo_map.servos)} servos will move for {duration:.1f} s, "
+        f"{servo_map.robot}: {len(servo_map.servos)} servos will move for {motion.duration:.1f} s"
+        f"{' at most' if at_most else ''}, "
         f"after {way.duration:.1f} s to the start."
     )
     for distance in way.distances[:1]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,9 +23,17 @@ PSEUDO_TERMINAL_LATENCY = 0.05
 
 @contextmanager
 def bus_on(
-    port: str, servo_map: ServoMap, *, script: FaultScript | None = None, plant: Any = None
+    port: str,
+    servo_map: ServoMap,
+    *,
+    script: FaultScript | None = None,
+    plant: Any = None,
+    posture: Mapping[str, float] | None = None,
+    in_wall_time: bool = False,
 ) -> Iterator[tuple[DynamixelBus, Clock]]:
-    """The bus behind a port name, "virtual" being servos in memory on a virtual clock.
+    """The bus behind a port name, "virtual" being servos in memory on a virtual clock, or ``in_wall_time``.
+
+    ``script`` and ``plant`` are for virtual servos, and so is ``posture``, in which they stand at first [rad by joint].
 
     Raises
     ------
@@ -35,8 +44,8 @@ def bus_on(
     """
     clock: Clock
     if port == VIRTUAL:
-        clock = VirtualClock()
-        line = line_for_map(servo_map, script=script, plant=plant)
+        line = line_for_map(servo_map, script=script, plant=plant, posture=posture or {})
+        clock = WallClock(time.monotonic()) if in_wall_time else VirtualClock()
         handler: Any = VirtualPort(line, clock, baud=servo_map.bus.baud)
     else:
         clock = WallClock()

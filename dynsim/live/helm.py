@@ -50,6 +50,11 @@ class Helm:
         with self._lock:
             self._wish, self._armed, self._request, self._silent = None, False, NO_REQUEST, False
 
+    def disarm(self) -> None:
+        """The key must be let go once before it counts."""
+        with self._lock:
+            self._armed, self._request = False, NO_REQUEST
+
     def order(self) -> tuple[Order, str, int]:
         """What holds from now on, why, and the count of the wish that it comes from."""
         with self._lock:

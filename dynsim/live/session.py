@@ -7,7 +7,7 @@ import threading
 import time as clock
 from dataclasses import dataclass, field
 from importlib import resources
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -40,6 +40,26 @@ class Account:
     stop: SimulationStopped | None = None
 
 
+WAIT = 1e-3
+"""Between two looks whether a follower is ready [s]."""
+NOT_READY = "the robot is not ready yet"
+
+
+class Follower(Protocol):
+    """What goes where the simulation does; the simulation waits for it."""
+
+    @property
+    def begun(self) -> bool:
+        """It is where the simulation begins."""
+
+    @property
+    def ready(self) -> bool:
+        """It is near enough for another tick."""
+
+    def hear(self) -> None:
+        """There was a tick."""
+
+
 class Session:
     """A drive that is open to browsers from :meth:`open` to :meth:`close`.
 
@@ -47,10 +67,13 @@ class Session:
     ----------
     driven : the simulation
     name : shown in the page
+    follower : for whom it waits before each tick; what is lost by that counts as behind real time
     """
 
-    def __init__(self, driven: Driven, name: str) -> None:
+    def __init__(self, driven: Driven, name: str, follower: Follower | None = None) -> None:
         self.driven, self.name = driven, name
+        self._follower = follower
+        self._shown = -1.0
         self._over = threading.Event()
         self._ended = ""
         self.helm = Helm(driven.axes, clock.monotonic)
@@ -60,7 +83,7 @@ class Session:
             "gripper": driven.has_gripper,
             "period": driven.period,
         }
-        self.server = Server(self.helm, hello, len(driven.axes), driven.modes, self._page, self._end)
+        self.server = Server(self.helm, hello, len(driven.axes), driven.modes, self._page, self.end)
         self.account = Account()
         self._scene = driven.still().scene
 
@@ -80,29 +103,22 @@ class Session:
         """
         driven, account = self.driven, self.account
         pace = Pace(driven.period, clock.monotonic, self._over.wait)
-        shown = -1.0
         try:
             while True:
                 interruption.heed()
                 interruption.check()
+                self._wait_for_follower(pace, until_closed)
                 pace.next()
                 interruption.keep()
-                if self._over.is_set() or driven.finished:
-                    account.ended = self._ended or "the longest time is over"
+                if self._is_over(until_closed):
                     break
-                if until_closed and self.server.came and not self.server.clients:
-                    account.ended = "the last browser was closed"
-                    break
-                if self.server.failure is not None:
-                    raise DynsimError(f"the server ended: {self.server.failure!r}")
                 order, state, count = self.helm.order()
                 driven.tick(order)
+                if self._follower is not None:
+                    self._follower.hear()
                 account.late.append(pace.late)
                 account.lost = pace.lost
-                now = clock.monotonic()
-                if now - shown >= 1.0 / FRAMES and self.server.clients:
-                    shown = now
-                    self.server.show(self._frame(state, count, pace))
+                self._show(state, count, pace)
         except KeyboardInterrupt:
             interruption.answered()
             account.ended = "interrupted"
@@ -111,9 +127,36 @@ class Session:
         interruption.keep()
         return account
 
-    def _end(self) -> None:
-        self._ended = "ended by the pilot"
+    def end(self, why: str = "ended by the pilot") -> None:
+        """Let the drive be over before its next tick; from any thread."""
+        self._ended = self._ended or why
         self._over.set()
+
+    def _is_over(self, until_closed: bool) -> bool:
+        if self._over.is_set() or self.driven.finished:
+            self.account.ended = self._ended or "the longest time is over"
+        elif until_closed and self.server.came and not self.server.clients:
+            self.account.ended = "the last browser was closed"
+        elif self.server.failure is not None:
+            raise DynsimError(f"the server ended: {self.server.failure!r}")
+        else:
+            return False
+        return True
+
+    def _wait_for_follower(self, pace: Pace, until_closed: bool) -> None:
+        """Whoever holds the key when a robot has come to its start must let it go first."""
+        follower = self._follower
+        while follower is not None and not follower.ready and not self._is_over(until_closed):
+            if not follower.begun:
+                self.helm.disarm()
+                self._show(NOT_READY, self.helm.order()[2], pace)
+            self._over.wait(WAIT)
+
+    def _show(self, state: str, count: int, pace: Pace) -> None:
+        now = clock.monotonic()
+        if now - self._shown >= 1.0 / FRAMES and self.server.clients:
+            self._shown = now
+            self.server.show(self._frame(state, count, pace))
 
     def _frame(self, state: str, count: int, pace: Pace) -> dict[str, Any]:
         shown = self.driven.shown()

@@ -60,7 +60,7 @@ def begin_early(*modules: str) -> None:
 
     _method = _FORK_SERVER
     forkserver.set_forkserver_preload(list(modules))
-    with _signals_held():
+    with signals_held():
         forkserver.ensure_running()
 
 
@@ -120,14 +120,14 @@ def run_in_processes(
     workers: list[_Worker] = []
     # Tasks whose process was lost, and how often: they come before those that nobody has had.
     again: list[tuple[Task, int]] = []
-    with _signals_held():
+    with signals_held():
         # Without a lock, which a killed worker would leave closed.
         stop = context.RawValue("b", 0)
 
     def start(sender: Connection) -> _Worker:
         here, there = context.Pipe()
-        arguments = (work, there, stop, sender, logging.getLogger("dynsim").getEffectiveLevel())
-        with _signals_held():
+        arguments = (work, there, stop, sender, _heard_from())
+        with signals_held():
             process = context.Process(target=_serve, args=arguments)
             process.start()
         there.close()
@@ -268,6 +268,17 @@ def keep_memory() -> None:
         library.mallopt(-1, 512 << 20)
 
 
+def _heard_from() -> int:
+    """Level from which on anybody hears what is logged here: workers need not even make other messages."""
+    library = logging.getLogger("dynsim")
+    asked: logging.Logger | None = library
+    while asked is not None:
+        if any(not isinstance(handler, logging.NullHandler) for handler in asked.handlers):
+            return library.getEffectiveLevel()
+        asked = asked.parent if asked.propagate else None
+    return logging.CRITICAL + 1
+
+
 class _ToParent(logging.Handler):
     """In a worker: hands what is logged to the parent by one write to a pipe. A killed worker leaves no lock behind."""
 
@@ -304,7 +315,7 @@ def _logged_here(context: Any) -> Iterator[Connection]:
 
 
 @contextmanager
-def _signals_held() -> Iterator[None]:
+def signals_held() -> Iterator[None]:
     """Processes started here do not get the Ctrl-C of the terminal, not even while they start; this one gets it after.
 
     Only the parent reacts to it, wherever it was sent, and tells the workers. So with the other ``STOP_SIGNALS``.

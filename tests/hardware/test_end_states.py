@@ -278,7 +278,7 @@ def test_an_error_within_the_policy_falls_back_to_holding(rig) -> None:
     after_fault = run.replay._ending.after_fault
 
     def broken(*arguments: Any, **options: Any) -> None:
-        run.replay.loop.following = type("Broken", (), {"at": staticmethod(at)})()
+        run.replay.loop.course.at = at
         after_fault(*arguments, **options)
 
     run.replay._ending.after_fault = broken

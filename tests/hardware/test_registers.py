@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from dynsim.hardware.replay.registers import compare_limits, difference_lines, needs_of, needs_of_map
+from dynsim.hardware.replay.registers import compare_limits, difference_lines, needs_of_map
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.verify import snapshot
 from dynsim.hardware.servo_map import load_servo_map
@@ -90,7 +90,7 @@ def test_servos_as_delivered_differ_in_nothing_and_are_shown(rig) -> None:
 
 
 def test_needs_are_those_of_the_speed_and_of_the_extremes_between_samples(rig) -> None:
-    shoulder, _, wheel = needs_of(rig.motion(speed=0.5))
+    shoulder, _, wheel = rig.motion(speed=0.5).needs()
     assert (shoulder.low, shoulder.high) == pytest.approx((-0.6, 0.6), abs=1e-6)
     assert shoulder.fastest == pytest.approx(1.2, abs=1e-3)
     assert wheel.fastest == pytest.approx(1.5, abs=1e-3)

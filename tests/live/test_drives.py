@@ -58,6 +58,13 @@ def test_drive_of_an_arm_is_replayed_bit_for_bit(name: str, variant: str | None)
     assert_same(record, replayed(record))
 
 
+@pytest.mark.parametrize("ticks", [69, 70, 71])
+def test_a_drive_may_end_at_any_tick(ticks: int) -> None:
+    """Also where ticks times their period are a rounding beside ticks divided by their rate: 70 * 0.01 > 70 / 100."""
+    record = driven_at_random(load_scenario("six_axis_arm"), ticks, 0.1)
+    assert_same(record, replayed(record))
+
+
 @pytest.mark.parametrize(
     ("name", "variant", "size"), [("snake_operator", None, 0.6), ("snake_circle", "backward_switching", 0.6)]
 )

@@ -19,13 +19,16 @@ class Clock(Protocol):
 
 
 class WallClock:
-    """The computer's monotonic clock."""
+    """The computer's monotonic clock, from an ``origin`` of it on [s]."""
+
+    def __init__(self, origin: float = 0.0) -> None:
+        self._origin = origin
 
     def now(self) -> float:
-        return time.monotonic()
+        return time.monotonic() - self._origin
 
     def sleep_until(self, deadline: float) -> None:
-        remaining = deadline - time.monotonic()
+        remaining = deadline - self.now()
         if remaining > 0:
             time.sleep(remaining)
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from dynsim.hardware.bus.control_table import HEALTH_BLOCK, STATE_BLOCK, TICKS_PER_TURN
 from dynsim.hardware.errors import CheckRefused
+from dynsim.hardware.replay.motion import Array, Course, Needs, Planned
 from dynsim.hardware.replay.trajectory import (
     COMMON,
     JERK_WINDOW,
@@ -83,6 +84,11 @@ class Margin:
     def unit(self) -> str:
         return UNITS[self.quantity]
 
+    @property
+    def holds(self) -> bool:
+        # What overflows to no number at all is no motion either.
+        return self.margin >= -ROUNDING
+
     def __str__(self) -> str:
         unit = self.unit
         return (
@@ -137,6 +143,27 @@ class CheckedMotion:
     warnings: tuple[str, ...]
     scene: Scene | None = None
 
+    @property
+    def start(self) -> Array:
+        """Posture in which it begins [rad], shape (N,)."""
+        return self.path.position[0]
+
+    @property
+    def duration(self) -> float:
+        """[s]."""
+        return (self.path.end - self.path.start) / self.speed
+
+    def needs(self) -> list[Needs]:
+        """What it asks of every joint, in the order of the map."""
+        extremes = self.path.extremes()
+        low, high = extremes.position.min(axis=(0, 1)), extremes.position.max(axis=(0, 1))
+        fastest = self.speed * np.abs(extremes.velocity).max(axis=(0, 1))
+        return [Needs(float(a), float(b), float(v)) for a, b, v in zip(low, high, fastest, strict=True)]
+
+    def course(self) -> Course:
+        """How to go along the path, from its beginning."""
+        return Planned(self.path, self.path.start, self.path.end, speed=self.speed)
+
 
 def check_motion(
     record: Record, servo_map: ServoMap, *, rate: float | None = None, speed: float = 1.0
@@ -162,9 +189,8 @@ def check_motion(
     plan = plan_cycle(servo_map, rate if rate is not None else servo_map.bus.rate)
     _check_duration(record, speed)
     path = path_of_record(record, servo_map)
-    margins = _motion_margins(path, servo_map, speed) + _torque_margins(record, servo_map)
-    # What overflows to no number at all is no motion either.
-    violations = [margin for margin in margins if not margin.margin >= -ROUNDING]
+    margins = motion_margins(path, servo_map, speed) + _torque_margins(record, servo_map)
+    violations = [margin for margin in margins if not margin.holds]
     if violations:
         lines = [f"{len(violations)} limit(s) violated, nothing was sent:", *(f"  {entry}" for entry in violations)]
         if all(entry.quantity in SLOWED for entry in violations):
@@ -226,11 +252,14 @@ def plan_cycle(servo_map: ServoMap, rate: float) -> CyclePlan:
     return CyclePlan(rate, cycle_time, health_time, max(1, math.ceil(health_time / available)))
 
 
-def _motion_margins(path: Path, servo_map: ServoMap, speed: float) -> list[Margin]:
+def motion_margins(path: Path, servo_map: ServoMap, speed: float, since: float = -math.inf) -> list[Margin]:
+    """The tightest place of every joint against each limit of its motion; of jerk and shaking in windows that end after
+    ``since`` [s].
+    """
     extremes = path.extremes()
     # The windows are of the robot's time, of which `speed` seconds of the path pass in a second.
-    jerk, jerk_time = path.jerk(JERK_WINDOW * speed)
-    shaking, shaking_time = path.shaking(SHAKING_WINDOW * speed)
+    jerk, jerk_time = path.jerk(JERK_WINDOW * speed, since)
+    shaking, shaking_time = path.shaking(SHAKING_WINDOW * speed, since)
     with np.errstate(over="ignore"):
         velocity = speed * extremes.velocity
         acceleration = speed * (speed * extremes.acceleration)
@@ -239,7 +268,7 @@ def _motion_margins(path: Path, servo_map: ServoMap, speed: float) -> list[Margi
     for column, servo in enumerate(servo_map.servos):
         if servo.in_position_mode:
             position, at = extremes.position[..., column].ravel(), extremes.position_time[..., column].ravel()
-            low, high = _position_limits(servo)
+            low, high = position_bounds(servo)
             below, above = int(position.argmin()), int(position.argmax())
             if position[below] - low < high - position[above]:
                 margins.append(_margin(servo, "position", position[below], low, position[below] - low, at[below]))
@@ -270,7 +299,7 @@ def _margin(
     return Margin(servo.joint, quantity, float(value), float(limit), float(margin), float(at))
 
 
-def _position_limits(servo: Servo) -> tuple[float, float]:
+def position_bounds(servo: Servo) -> tuple[float, float]:
     """Limits of the map, narrowed to the single turn position mode knows [rad]."""
     turn = sorted((servo.to_angle(0), servo.to_angle(TICKS_PER_TURN - 1)))
     return max(servo.position_limits[0], turn[0]), min(servo.position_limits[1], turn[1])

@@ -186,12 +186,12 @@ class Ending:
             # They have stopped by themselves, and take no goals.
             return self._hold()
         self._hold_measured(self._known_as([id_ for fault in faults for id_ in fault.ids]))
-        if loop.following is None:
+        course = loop.course
+        if course is None:
             return None
-        start, end, speed = loop.following_time, loop.following_end, loop.following_speed
-        if self._at_rest:
-            speed = 0.0
-        stop_time = loop.map.safety.stop_time
+        start, end = course.time, course.end
+        speed = 0.0 if self._at_rest else course.speed
+        stop_time = course.braking_time(loop.map.safety.stop_time)
         elapsed, goals = 0.0, 0
         while elapsed < stop_time and not loop.stop.for_release and not self._held:
             lateness, skipped = loop.wait_for_deadline()
@@ -201,8 +201,8 @@ class Ending:
                 return self._hold()
             goals += 1
             elapsed = min(stop_time, goals * loop.period)
-            loop.following_time = min(end, start + speed * (elapsed - elapsed**2 / (2 * stop_time)))
-            position, rate = loop.following.at(loop.following_time)
+            course.time = min(end, start + speed * (elapsed - elapsed**2 / (2 * stop_time)))
+            position, rate = course.at(course.time)
             velocity = rate * speed * (1 - elapsed / stop_time)
             self._send(position, velocity)
             self._watch(lateness, skipped)

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.bus.control_table import HEALTH_BLOCK, MX_106, RAD_PER_TICK, STATE_BLOCK
 from dynsim.hardware.bus.protocol import Bus
-from dynsim.hardware.replay.check import CheckedMotion, velocity_limit
+from dynsim.hardware.replay.check import velocity_limit
 from dynsim.hardware.replay.journal import Journal
-from dynsim.hardware.replay.motion import Motion
+from dynsim.hardware.replay.motion import Course, Task
 from dynsim.hardware.replay.rules import AbortRules, Cause, Cycle, Fault, decode_health
 from dynsim.hardware.replay.run_log import Recorder
 from dynsim.hardware.replay.states import State, Stopped, StopRequest
@@ -47,8 +47,8 @@ class Loop:
         Where every joint was seen last [rad].
     origin, tick :
         Clock time [s] of the first deadline, and the number of the last one.
-    following, following_time, following_end, following_speed :
-        The motion that is followed, its time reached and its last [s], and how much of it passes per second.
+    course : Course or None
+        What is followed, or was last.
     path_started : float or None
         Clock time [s] of path time 0, once the replay of the path began.
     policy_goals : list
@@ -57,7 +57,7 @@ class Loop:
 
     def __init__(
         self,
-        motion: CheckedMotion,
+        motion: Task,
         servo_map: ServoMap,
         bus: Bus,
         clock: Clock,
@@ -75,8 +75,7 @@ class Loop:
         self.measured = np.zeros(count)
         self.origin = clock.now()
         self.tick = 0
-        self.following: Motion | None = None
-        self.following_time = self.following_end = self.following_speed = 0.0
+        self.course: Course | None = None
         self.path_started: float | None = None
         self.policy_goals: list[tuple[float, int, int]] = []
         self._clock = clock
@@ -132,23 +131,18 @@ class Loop:
         self._clock.sleep_until(self.deadline_of(self.tick))
         return self._clock.now() - self.deadline_of(self.tick) + skipped * self.period, skipped
 
-    def follow(self, motion: Motion, start: float, end: float, *, speed: float) -> None:
-        """Run along a motion from its time ``start`` to ``end`` [s], ``speed`` of it per second.
+    def follow(self, course: Course) -> None:
+        """Go along a course to its end.
 
         From goal to goal one period of it passes, also where cycles in between were skipped: made up for at once they
         would be one great step.
         """
-        goals = 0
-        self.following, self.following_end, self.following_speed = motion, end, speed
-        self.following_time = start
-        while self.following_time < end:
+        self.course = course
+        while not course.over:
             lateness, skipped = self.wait_for_deadline()
             self.stop.check()
-            goals += 1
-            # Scheduled, not actual time: jitter of the loop must not enter the goals.
-            self.following_time = min(end, start + speed * self.period * goals)
-            position, rate = motion.at(self.following_time)
-            self._cycle(position, speed * rate, lateness, skipped)
+            position, velocity = course.advance(self.period)
+            self._cycle(position, velocity, lateness, skipped)
 
     def stay(self, position: Array) -> Cycle:
         """One cycle at rest."""
@@ -217,7 +211,7 @@ class Loop:
             "record",
             self._recorder.add,
             time=began,
-            path_time=self.following_time if self.path_started is not None else math.nan,
+            path_time=self.course.time if self.course and self.path_started is not None else math.nan,
             origin=math.nan if self.path_started is None else self.path_started,
             state=int(self._journal.state),
             exchange=exchange,
@@ -231,8 +225,7 @@ class Loop:
     def _report(self, cycle: Cycle) -> None:
         error = self.rules.following_error(cycle)[self._in_position_mode]
         worst = float(np.nanmax(np.abs(error))) if np.isfinite(error).any() else 0.0
-        span = self.following_end or 1.0
-        self._journal.report(worst, min(1.0, max(0.0, self.following_time / span)))
+        self._journal.report(worst, self.course.fraction if self.course else 0.0)
 
     def _send(self, position: Array, velocity: Array) -> None:
         """The only place goals of a motion leave through. Refuses what no checked motion can ask for."""

@@ -20,20 +20,19 @@ from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.bus.control_table import RAD_S2_PER_UNIT, RAD_S_PER_UNIT, WATCHDOG_SECONDS_PER_UNIT
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused
 from dynsim.hardware.errors import PortError
-from dynsim.hardware.replay.check import CheckedMotion, velocity_limit
+from dynsim.hardware.replay.check import velocity_limit
 from dynsim.hardware.replay.end_state import AT_REST, read_health
 from dynsim.hardware.replay.ending import Ending
 from dynsim.hardware.replay.folder import REGISTERS, REGISTERS_AFTER_FAULT
 from dynsim.hardware.replay.journal import Journal
 from dynsim.hardware.replay.loop import FIELDS, Loop
 from dynsim.hardware.replay.measured import describe
-from dynsim.hardware.replay.motion import QUINTIC_PEAK, Approach
+from dynsim.hardware.replay.motion import QUINTIC_PEAK, Approach, Planned, Task
 from dynsim.hardware.replay.registers import difference_lines
 from dynsim.hardware.replay.rows import Layout, measured_record, timing_of
 from dynsim.hardware.replay.rules import Cause, Fault, watchdog_units
 from dynsim.hardware.replay.run_log import Recorder, RunLog
 from dynsim.hardware.replay.states import UNARMED, Progress, ReplayResult, State, Stopped, StopRequest
-from dynsim.hardware.replay.trajectory import Path
 from dynsim.hardware.replay.verify import Registers, all_registers, configure, verify
 from dynsim.hardware.safety import FaultPolicy
 from dynsim.hardware.servo_map import Servo, ServoMap
@@ -54,7 +53,7 @@ class Replay:
 
     Parameters
     ----------
-    motion : CheckedMotion
+    motion : Task
     servo_map : ServoMap
     bus : Bus
     clock : Clock
@@ -82,7 +81,7 @@ class Replay:
 
     def __init__(
         self,
-        motion: CheckedMotion,
+        motion: Task,
         servo_map: ServoMap,
         bus: Bus,
         clock: Clock,
@@ -213,13 +212,13 @@ class Replay:
     def _move_to_start(self) -> None:
         here = self.loop.goal.copy()
         in_position_mode = np.array([servo.in_position_mode for servo in self._servos])
-        goal = np.where(in_position_mode, self.motion.path.position[0], here)
+        goal = np.where(in_position_mode, self.motion.start, here)
         distance = float(np.abs(goal - here).max())
         duration = max(QUINTIC_PEAK * distance / self.map.safety.approach_velocity, self.loop.period)
         self.journal.enter(State.MOVE_TO_START)
         self.journal.say(f"{distance:.3f} rad in {duration:.1f} s")
         self.loop.begin()
-        self.loop.follow(Approach(here, goal, duration), 0.0, duration, speed=1.0)
+        self.loop.follow(Planned(Approach(here, goal, duration), 0.0, duration, speed=1.0))
         self._settle()
 
     def _settle(self) -> None:
@@ -240,13 +239,13 @@ class Replay:
                 raise Stopped(Fault(Cause.NOT_SETTLED, text, tuple(servo.id for servo in moving)))
 
     def _replay_path(self) -> None:
-        path: Path = self.motion.path
         for name in ("profile_velocity", "profile_acceleration"):
             values = {servo.id: self._profile(servo, approaching=False)[name] for servo in self._servos}
             self.bus.sync_write(FIELDS[name], values)
         self.journal.enter(State.REPLAY)
-        self.loop.path_started = self.loop.deadline_of(self.loop.tick + 1) - path.start / self.motion.speed
-        self.loop.follow(path, path.start, path.end, speed=self.motion.speed)
+        course = self.motion.course()
+        self.loop.path_started = self.loop.deadline_of(self.loop.tick + 1) - course.time / self.motion.speed
+        self.loop.follow(course)
         self._settle()
 
     def _disarm(self) -> None:

@@ -1,12 +1,16 @@
-"""What a robot can be led along: anything with a posture at every time, and the move to where a path begins."""
+"""What a robot can be led along, a posture at every time, and how the loop goes along it, goal by goal."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from dynsim.hardware.replay.check import CyclePlan
+    from dynsim.record.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -20,6 +24,121 @@ class Motion(Protocol):
     def at(self, time: float) -> tuple[Array, Array]:
         """Joint angles [rad] and their derivatives with respect to ``time``, shape (N,)."""
         ...
+
+
+class Course(Motion, Protocol):
+    """How the loop goes along a motion: a period further from goal to goal, whatever the clock says.
+
+    Attributes
+    ----------
+    time : float
+        Of the motion, reached [s].
+    """
+
+    time: float
+
+    @property
+    def speed(self) -> float:
+        """How much of the motion passes per second."""
+
+    @property
+    def end(self) -> float:
+        """How far the motion is known [s]."""
+
+    @property
+    def over(self) -> bool:
+        """There are no more goals."""
+
+    @property
+    def fraction(self) -> float:
+        """How much of it is done, 0 to 1."""
+
+    def advance(self, period: float) -> tuple[Array, Array]:
+        """The goal after a period [s]: joint angles [rad] and their rates [rad/s], shape (N,).
+
+        May raise :class:`~dynsim.hardware.replay.states.Stopped`.
+        """
+        ...
+
+    def braking_time(self, stop_time: float) -> float:
+        """Of a stop along the motion at constant deceleration that should take ``stop_time`` [s]."""
+        ...
+
+
+class Planned:
+    """A motion that is known from its time ``start`` to ``end`` [s], ``speed`` of it per second."""
+
+    def __init__(self, motion: Motion, start: float, end: float, *, speed: float) -> None:
+        self.motion, self.start, self.end, self.speed = motion, start, end, speed
+        self.time = start
+        self._goals = 0
+
+    @property
+    def over(self) -> bool:
+        return self.time >= self.end
+
+    @property
+    def fraction(self) -> float:
+        return min(1.0, max(0.0, self.time / (self.end or 1.0)))
+
+    def at(self, time: float) -> tuple[Array, Array]:
+        return self.motion.at(time)
+
+    def advance(self, period: float) -> tuple[Array, Array]:
+        self._goals += 1
+        # Scheduled, not actual time: jitter of the loop must not enter the goals.
+        self.time = min(self.end, self.start + self.speed * period * self._goals)
+        position, rate = self.motion.at(self.time)
+        return position, self.speed * rate
+
+    def braking_time(self, stop_time: float) -> float:
+        # Where the motion ends before, it ends at rest.
+        return stop_time
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a motion asks of one joint: lowest and highest angle [rad], highest speed [rad/s]."""
+
+    low: float
+    high: float
+    fastest: float
+
+
+class Task(Protocol):
+    """What a replay is to do: a checked record, or what a pilot will ask for.
+
+    Attributes
+    ----------
+    plan : CyclePlan
+    speed : float
+        Seconds of the motion per second.
+    scene : Scene or None
+        What is known of the robot's looks; the measured record takes it over.
+    """
+
+    @property
+    def plan(self) -> CyclePlan: ...
+
+    @property
+    def speed(self) -> float: ...
+
+    @property
+    def scene(self) -> Scene | None: ...
+
+    @property
+    def start(self) -> Array:
+        """Posture in which the motion begins [rad], shape (N,)."""
+
+    @property
+    def duration(self) -> float:
+        """Longest time that it takes [s]."""
+
+    def needs(self) -> list[Needs]:
+        """What it may ask of every joint, in the order of the map."""
+
+    def course(self) -> Course:
+        """How to go along it, from its beginning."""
 
 
 @dataclass(frozen=True)

@@ -12,22 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from dynsim.hardware.bus.control_table import HARDWARE_ERRORS, RAD_S_PER_UNIT, VOLT_PER_UNIT
-from dynsim.hardware.replay.check import CheckedMotion
+from dynsim.hardware.replay.motion import Needs
 from dynsim.hardware.safety import Safety
 from dynsim.hardware.servo_map import Servo
 
 QUANTITIES = ("position °", "velocity rad/s", "torque N m", "temperature °C", "supply V")
 NOT_LIMITED = "-"
 VOLTAGE_SHUTDOWN = 1 << next(bit for bit, name in HARDWARE_ERRORS.items() if name == "input voltage")
-
-
-@dataclass(frozen=True)
-class Needs:
-    """What a motion asks of one joint: lowest and highest angle [rad], highest speed [rad/s]."""
-
-    low: float
-    high: float
-    fastest: float
 
 
 @dataclass(frozen=True)
@@ -51,14 +42,6 @@ class LimitRow:
     cells: tuple[tuple[str, str], ...]
     refused: tuple[str, ...]
     differs: tuple[str, ...]
-
-
-def needs_of(motion: CheckedMotion) -> list[Needs]:
-    """What a motion asks of every joint, in the order of the map."""
-    extremes = motion.path.extremes()
-    low, high = extremes.position.min(axis=(0, 1)), extremes.position.max(axis=(0, 1))
-    fastest = motion.speed * np.abs(extremes.velocity).max(axis=(0, 1))
-    return [Needs(float(a), float(b), float(v)) for a, b, v in zip(low, high, fastest, strict=True)]
 
 
 def needs_of_map(servo: Servo) -> Needs:

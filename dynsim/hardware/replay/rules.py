@@ -44,6 +44,8 @@ class Cause(StrEnum):
     NOT_SETTLED = "not settled"
     GOAL_GUARD = "goal guard"
     END_STATE = "end state"
+    LIMIT = "limit"
+    SIMULATION = "simulation"
     PROGRAM = "program error"
 
 

@@ -15,9 +15,9 @@ from dynsim.files import json_text, replace_together, write_json
 from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.bus.protocol import Bus
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted, ReplayInterrupted, VerificationFailed
-from dynsim.hardware.replay.check import CheckedMotion
 from dynsim.hardware.replay.folder import LOG, MEASURED, SUMMARY, move_away
 from dynsim.hardware.replay.machine import RECORD, Replay
+from dynsim.hardware.replay.motion import Task
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.run_log import RunLog
 from dynsim.hardware.replay.states import Progress, ReplayResult, StopRequest
@@ -29,7 +29,7 @@ Failures = dict[str, BaseException]
 
 
 def run_replay(
-    motion: CheckedMotion,
+    motion: Task,
     servo_map: ServoMap,
     connection: AbstractContextManager[tuple[Bus, Clock]],
     folder: Path,

@@ -50,3 +50,9 @@ def stop_on_signals(stop: StopRequest) -> Iterator[None]:
             # None: set by C code, which Python cannot give back.
             if handler is not None:
                 signal.signal(number, handler)
+
+
+def ignore_stops() -> None:
+    """Of a process that ends when another one says so: the signals that ask that one for a stop mean nothing here."""
+    for number in (signal.SIGINT, *_ONCE):
+        signal.signal(number, signal.SIG_IGN)

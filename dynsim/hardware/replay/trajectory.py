@@ -8,6 +8,7 @@ ends at rest without a jump in velocity.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,13 +113,13 @@ class Path:
         steps[1:] = (self.rate_after[1:] - self.rate_before[:-1]) / (0.5 * (h[1:] + h[:-1]))
         return steps
 
-    def jerk(self, window: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def jerk(self, window: float, since: float = -math.inf) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Change of acceleration per time, averaged in magnitude over ``window`` [s] of path time.
 
         j(t) = (1/window) Σ |a_{k+1} − a_k| over the knots between t − window and t, in which a_k is the mean of what
         the interpolant has on both sides of knot k, plus the step in rate there. It is the mean of |d³q/dt³| for a
         smooth path, 4 |a| f for one that is thrown to and fro f times a second, whatever the window, and Δa/window for
-        a single jump. Between knots a is taken as straight.
+        a single jump. Between knots a is taken as straight. Only windows that end after ``since`` [s] count.
 
         Returns
         -------
@@ -132,20 +133,18 @@ class Path:
             at_knots = np.concatenate([first[:1], 0.5 * (last[:-1] + first[1:]) + self._steps()[1:], last[-1:]])
             variation = np.cumsum(np.abs(np.diff(at_knots, axis=0)), axis=0)
         variation = np.concatenate([np.zeros_like(first[:1]), variation])
-        jerk, where = np.empty(self.position.shape[1]), np.empty(self.position.shape[1])
-        for joint in range(len(jerk)):
-            ends, within = self._within(variation[:, joint], window)
-            worst = int(within.argmax())
-            jerk[joint], where[joint] = within[worst] / window, min(ends[worst], self.end)
-        return jerk, where
+        ends, within = self._within(variation, window, since)
+        jerk, where = self._worst(ends, within)
+        return jerk / window, where
 
-    def shaking(self, window: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def shaking(self, window: float, since: float = -math.inf) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Velocity that is gained and lost again, or lost and gained again, within ``window`` [s] of path time.
 
         min(P, N), in which P = ∫ max(q'', 0) dt and N = ∫ max(−q'', 0) dt over the window, steps in rate included. It
         does not depend on a velocity the joint has besides. A zigzag of d every h has d · window/h² where the window
         holds many teeth, a spike of d within 2h (out in h, back in h) 2d/h with held rates; a move that goes one way
-        gains and loses its top speed once, which counts where it takes no longer than the window.
+        gains and loses its top speed once, which counts where it takes no longer than the window. Only windows that end
+        after ``since`` [s] count.
 
         Returns
         -------
@@ -167,13 +166,8 @@ class Path:
                 np.concatenate([np.zeros_like(first[:1]), np.cumsum(np.maximum(part, 0.0).sum(axis=0), axis=0)])
                 for part in (changes, -changes)
             )
-        shaking, where = np.empty(self.position.shape[1]), np.empty(self.position.shape[1])
-        for joint in range(len(shaking)):
-            ends, up = self._within(gained[:, joint], window)
-            both = np.minimum(up, self._within(lost[:, joint], window)[1])
-            worst = int(both.argmax())
-            shaking[joint], where[joint] = both[worst], min(ends[worst], self.end)
-        return shaking, where
+        ends, up = self._within(gained, window, since)
+        return self._worst(ends, np.minimum(up, self._within(lost, window, since)[1]))
 
     def _accelerations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Acceleration of the interpolant at the beginning and the end of every interval [rad/s²], shape (T-1, N)."""
@@ -181,14 +175,30 @@ class Path:
         m0, m1, rise = h * self.rate_after, h * self.rate_before, np.diff(self.position, axis=0)
         return (6 * rise - 4 * m0 - 2 * m1) / h / h, (-6 * rise + 2 * m0 + 4 * m1) / h / h
 
-    def _within(self, total: NDArray[np.float64], window: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What ``total``, a running sum at the knots, grows by within windows: their ends [s], and the growth.
+    def _within(
+        self, total: NDArray[np.float64], window: float, since: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What ``total``, a running sum at the knots, grows by within windows: their ends (M,) [s], growth (M, N).
 
         The growth is straight between windows that begin or end at a knot.
         """
         ends = np.concatenate([self.time, self.time + window])
+        ends = ends[ends > since]
         with np.errstate(over="ignore", invalid="ignore"):
-            return ends, np.interp(ends, self.time, total) - np.interp(ends - window, self.time, total)
+            return ends, self._interpolated(total, ends) - self._interpolated(total, ends - window)
+
+    def _interpolated(self, values: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values at the knots (T, N), straight between them and constant outside, at other times: (M, N)."""
+        left = np.clip(np.searchsorted(self.time, times, side="right") - 1, 0, len(self.time) - 2)
+        fraction = np.clip((times - self.time[left]) / (self.time[left + 1] - self.time[left]), 0.0, 1.0)[:, None]
+        return values[left] + fraction * (values[left + 1] - values[left])
+
+    def _worst(
+        self, ends: NDArray[np.float64], values: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Of each joint the largest value, and the end of its window."""
+        worst = values.argmax(axis=0)
+        return values[worst, np.arange(values.shape[1])], np.minimum(ends[worst], self.end)
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from dynsim.hardware.bus.control_table import (
     describe_hardware_error,
 )
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused
-from dynsim.hardware.replay.check import CheckedMotion
-from dynsim.hardware.replay.registers import LimitRow, compare_limits, needs_of
+from dynsim.hardware.replay.motion import Task
+from dynsim.hardware.replay.registers import LimitRow, compare_limits
 from dynsim.hardware.servo_map import Servo, ServoMap
 
 EEPROM_BLOCK = (0, 64)
@@ -74,7 +74,7 @@ def _wanted_eeprom(servo: Servo, servo_map: ServoMap) -> Registers:
 
 
 def verify(
-    bus: Bus, servo_map: ServoMap, motion: CheckedMotion, *, poll: Callable[[], None]
+    bus: Bus, servo_map: ServoMap, motion: Task, *, poll: Callable[[], None]
 ) -> tuple[list[str], list[LimitRow]]:
     """Everything that is wrong with the servos on the bus, one line each; empty when the robot may move.
 
@@ -93,7 +93,7 @@ def verify(
         if id_ not in servo_map.ids:
             name = MODEL_BY_NUMBER[model].name if model in MODEL_BY_NUMBER else f"model {model}"
             problems.append(f"ID {id_}: {name} (firmware {firmware}) is on the bus but not in the map")
-    for servo, needs in zip(servo_map.servos, needs_of(motion), strict=True):
+    for servo, needs in zip(servo_map.servos, motion.needs(), strict=True):
         poll()
         try:
             registers = snapshot(bus, servo)

@@ -8,19 +8,20 @@ from typing import Any
 import serial
 from dynamixel_sdk import PortHandler
 
-from dynsim.hardware.bus.clock import VirtualClock
+from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.virtual.line import VirtualLine
 
 
 class VirtualPort(PortHandler):
-    """The client library's port on a :class:`VirtualLine` and a :class:`VirtualClock`.
+    """The client library's port on a :class:`VirtualLine` and a clock that begins at 0.
 
-    Nothing here waits: reading with nothing to read lets virtual time pass until the next byte or the time-out.
+    On a virtual clock nothing here waits: reading with nothing to read lets time pass until the next byte or the
+    time-out.
     """
 
     POLL = 1e-5
 
-    def __init__(self, line: VirtualLine, clock: VirtualClock, *, baud: int) -> None:
+    def __init__(self, line: VirtualLine, clock: Clock, *, baud: int) -> None:
         super().__init__("virtual")
         self.line = line
         self.clock = clock

@@ -1,0 +1,190 @@
+"""``dynsim hw drive``: a live drive that servos follow."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from dynsim import interruption
+from dynsim.cli.app import QuietOption, ScenarioArgument, SetOption, parsed_overrides
+from dynsim.cli.display import errors
+from dynsim.cli.teleop import (
+    BaseSpeedOption,
+    HttpPortOption,
+    LongestOption,
+    OpenOption,
+    SpeedOption,
+    TurnOption,
+    UntilClosedOption,
+    VariantOption,
+    new_folder,
+    require_websockets,
+    tell_address,
+    tell_drive,
+)
+from dynsim.cli.view import write_view
+from dynsim.errors import DynsimError
+from dynsim.hardware.cli import (
+    Configure,
+    Faults,
+    Live,
+    MapFile,
+    PolicyOption,
+    Rate,
+    ReplayPort,
+    Yes,
+    client_library,
+    console,
+    print_timing,
+)
+from dynsim.terminal import escaped
+
+EXAMPLE = "Example: dynsim hw drive elbow_comparison --variant two_elbows --map arm --port virtual"
+SERVOS = "servos"
+"""Folder of the measured run, in that of the drive."""
+
+
+def hw_drive(
+    scenario: ScenarioArgument,
+    map_file: MapFile,
+    port: ReplayPort,
+    variant: VariantOption = None,
+    overrides: SetOption = None,
+    rate: Rate = None,
+    policy: PolicyOption = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FOLDER", help="[results/SCENARIO/drive_N, a new one]")
+    ] = None,
+    speed: SpeedOption = 0.1,
+    turn: TurnOption = 0.5,
+    base_speed: BaseSpeedOption = 0.3,
+    longest: LongestOption = 600.0,
+    http_port: HttpPortOption = 0,
+    until_closed: UntilClosedOption = False,
+    open_: OpenOption = True,
+    live: Live = False,
+    yes: Yes = False,
+    configure: Configure = False,
+    faults: Faults = None,
+    quiet: QuietOption = False,
+) -> None:
+    """Drive a scenario from a browser as `dynsim teleop` does, with servos that follow the simulated joints.
+
+    Verify, arm and move to the start as a replay does; every posture is checked against the map before it is followed.
+    Ctrl-C once: controlled stop. Twice: torque off. The button of the page ends the drive regularly.
+    """
+    require_websockets()
+    with client_library():
+        from dynsim.engine.driven import Pace
+        from dynsim.files import check_writable
+        from dynsim.hardware.dialog import confirm_replay, print_limits
+        from dynsim.hardware.errors import ServoMapError
+        from dynsim.hardware.ports import VIRTUAL, bus_on
+        from dynsim.hardware.replay.display import displayed
+        from dynsim.hardware.replay.drive import check_drive
+        from dynsim.hardware.replay.session import run_replay, shown_by
+        from dynsim.hardware.replay.signals import stop_on_signals
+        from dynsim.hardware.replay.states import StopRequest
+        from dynsim.hardware.servo_map import load_servo_map
+        from dynsim.hardware.virtual.faults import load_fault_script
+        from dynsim.live.follower import Wanted
+        from dynsim.live.servos import SimulationProcess
+        from dynsim.results import RUN_FILES
+        from dynsim.scenario import load_scenario
+
+    if faults and port != VIRTUAL:
+        raise ServoMapError("--faults is for virtual servos: --port virtual")
+    loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
+    servo_map = load_servo_map(map_file)
+    script = load_fault_script(faults, servo_map.ids) if faults else None
+    folder = out or new_folder(Path("results", loaded.name))
+    check_writable(folder, RUN_FILES)
+    wanted = Wanted(loaded, servo_map, Pace(speed, turn, base_speed), longest, http_port, until_closed, folder)
+    moves, stop = live or port == VIRTUAL, StopRequest()
+    result: Any = None
+    with SimulationProcess(wanted) as process:
+        with console.status("loading the kernels; the first time they are compiled, which takes half a minute"):
+            ready = process.ready()
+        motion = check_drive(
+            ready.first,
+            servo_map,
+            process.feed,
+            step=ready.step,
+            longest=longest,
+            rate=rate,
+            scene=ready.still.scene,
+        )
+        if live and port != VIRTUAL:
+            confirm_replay(console, servo_map, motion, port, asked=not yes, at_most=True)
+        if moves:
+            tell_address(ready.address, "Ctrl-C stops the robot, a second one releases it", open_=open_)
+        posture = dict(zip(servo_map.joints, motion.start.tolist(), strict=True))
+        error: DynsimError | None = None
+        try:
+            with (
+                shown_by({"standard output": sys.stdout}, folder / SERVOS) as lost,
+                stop_on_signals(stop),
+                nullcontext() if quiet else displayed(console, lost) as observer,
+            ):
+                result = run_replay(
+                    motion,
+                    servo_map,
+                    bus_on(port, servo_map, script=script, posture=posture, in_wall_time=True),
+                    folder / SERVOS,
+                    policy=policy.value if policy else None,
+                    live=moves,
+                    write_eeprom=configure,
+                    stop=stop,
+                    observer=observer,
+                    provenance={
+                        "port": port,
+                        "record": str(folder / "record.h5"),
+                        "simulated": ready.still.provenance,
+                    },
+                )
+        except DynsimError as stopped:
+            error, result = stopped, getattr(stopped, "result", None)
+        # What was driven is saved, whatever else the user asks for.
+        interruption.keep()
+        try:
+            done = process.finish("ended" if error is None else "the servos have stopped")
+        except DynsimError as lost_drive:
+            if error is None:
+                raise
+            errors.print(f"[red]error:[/] {escaped(str(lost_drive))}")
+            raise error from None
+        interruption.heed()
+    if result is not None and not quiet:
+        print_timing(result)
+    if not moves and error is None:
+        print_limits(console, result.limits)
+        console.print("dry run: servos verified and the bus timed, nothing was moved; --live moves")
+        return
+    if done.saved:
+        _tell_files(loaded.variant or loaded.name, folder, result, quiet=quiet)
+        if not quiet:
+            tell_drive(done.account, done.driven, folder)
+    if error is None and not quiet:
+        left = "ON, holding" if result.end_state == "holding" else "off"
+        console.print(f"driven; torque {left}; {folder / SERVOS / 'measured.h5'}")
+        console.print(f"compare: dynsim hw compare {folder / 'record.h5'} {folder / SERVOS / 'measured.h5'}")
+    if error is not None:
+        if done.failure is not None:
+            errors.print(f"[red]error:[/] the simulation: {escaped(str(done.failure))}")
+        raise error
+    if done.failure is not None:
+        raise done.failure
+
+
+def _tell_files(name: str, folder: Path, result: Any, *, quiet: bool) -> None:
+    """The page with the measured robot beside the simulated one."""
+    from dynsim.record import Record
+
+    records = {name: Record.load(folder / "record.h5")}
+    if result is not None and len(result.record):
+        records["measured"] = result.record
+    write_view(records, folder, quiet)
