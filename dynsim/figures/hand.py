@@ -139,7 +139,7 @@ def _planes(figure: Figure, records: list[Record]) -> list[Axes]:
     middle = 0.5 * (low + high)
     panels = list(figure.subplots(1, 3))
     for axes, (i, j) in zip(panels, PLANES, strict=True):
-        axes.set_aspect("equal")
+        axes.set_aspect("equal", anchor="N")  # room that is left is above the legend
         axes.set_xlim(middle[i] - half, middle[i] + half)
         axes.set_ylim(middle[j] - half, middle[j] + half)
         axes.set_xlabel(f"{'xyz'[i]} [m]")
