@@ -374,7 +374,7 @@ def test_snakes_are_refused(tmp_path: Path) -> None:
         assert refused.returncode == 2
         assert "lifts wheel pairs" in refused.stderr
         assert "dynsim hw replay" in " ".join(refused.stderr.split())
-    assert not out.exists()
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
