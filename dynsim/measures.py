@@ -49,14 +49,14 @@ def hand_error(record: Record, settle: float) -> dict[str, float | None]:
     Counted from t = ``settle`` on; None without a target or when the run is shorter.
     """
     names = ("hand_error_rms_m", "hand_error_max_m", "hand_error_z_rms_m")
-    window = record.time >= settle
+    first = int(np.searchsorted(record.time, settle))
     target = hand_target(record)
-    if target is None or window.sum() < 2:
+    if target is None or len(record) - first < 2:
         return dict.fromkeys(names)
-    error = (record["hand_position"] - target)[window]
-    time = record.time[window]
-    square = (error**2).sum(axis=1)
-    values = (_mean(square, time) ** 0.5, square.max() ** 0.5, _mean(error[:, 2] ** 2, time) ** 0.5)
+    error, time = record["hand_position"][first:] - target[first:], record.time[first:]
+    x, y, z = error.T**2
+    square = x + y + z
+    values = (_mean(square, time) ** 0.5, square.max() ** 0.5, _mean(z, time) ** 0.5)
     return dict(zip(names, map(float, values), strict=True))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -297,7 +298,8 @@ def _warnings(
             put += "an error of the integration; shorten integrator.step_s or tighten integrator.rtol"
         found.append(put)
     limited = [(a, motor, limits) for a, motor in enumerate(robot.motors) for limits in _limits_of(motor)]
-    peaks = {name: np.abs(record[name]).max(axis=0, initial=0.0) for name in {limits[1] for *_, limits in limited}}
+    # Along the samples of a row at once: across rows of a few columns it takes three times as long.
+    peaks = {name: np.abs(record[name].T.copy()).max(axis=1, initial=0.0) for name in {one[1] for *_, one in limited}}
     for a, motor, (what, signal, limit, unit) in limited:
         # A run that diverged may have NaN, which hides a peak.
         if not peaks[signal][a] < limit:
@@ -418,7 +420,7 @@ def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
     torque = dict(zip(record.labels["torque"], record["torque"].T, strict=True))
     found = []
     for link, k, v in zip(robot.links, robot.position_index, record["v"].T, strict=True):
-        if np.isinf((link.lower, link.upper, link.velocity_limit, link.effort_limit)).all():
+        if all(map(math.isinf, (link.lower, link.upper, link.velocity_limit, link.effort_limit))):
             continue
         q = record["q"][:, k]
         position, velocity, _, force = link.units

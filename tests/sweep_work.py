@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 from pathlib import Path
@@ -26,6 +27,13 @@ def once_deadly(task: tuple[int, str], look: Progress) -> int:
         seen.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return number**2
+
+
+def warned(number: int, look: Progress) -> bool:
+    """Logs a warning; whether it would have been made."""
+    log = logging.getLogger("dynsim.work")
+    log.warning("number %d", number)
+    return log.isEnabledFor(logging.WARNING)
 
 
 DEADLY, REFUSED = 5, 7

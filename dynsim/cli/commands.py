@@ -23,11 +23,11 @@ from dynsim.cli.app import (
     parsed_overrides,
 )
 from dynsim.cli.display import console, errors, labelled, progress, record_files
-from dynsim.cli.drawing import Figures, draw, draw_all
+from dynsim.cli.drawing import Figures, Page, begin_drawing, draw, draw_all
 from dynsim.cli.hw_drive import EXAMPLE, hw_drive
 from dynsim.cli.sweep import sweep
 from dynsim.cli.teleop import teleop
-from dynsim.cli.view import open_page, view, write_view
+from dynsim.cli.view import open_page, tell_of_view, view
 from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
 from dynsim.hardware.cli import export, hw
 from dynsim.terminal import escaped
@@ -56,7 +56,6 @@ def run(
 
     The method of integration follows from the system, integrator.method auto; the summary says which it is and why.
     """
-    from dynsim.engine import simulate
     from dynsim.files import check_writable
     from dynsim.results import RUN_FILES, save_run
     from dynsim.scenario import load_scenario
@@ -64,6 +63,10 @@ def run(
     loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
     folder = out or Path("results", loaded.name, loaded.variant)
     check_writable(folder, RUN_FILES)
+    if not no_figures:
+        begin_drawing()
+    from dynsim.engine import simulate
+
     try:
         with progress([loaded], quiet) as report:
             record = simulate(loaded, partial(report, loaded.variant))
@@ -75,14 +78,18 @@ def run(
     save_run(record, folder)
     interruption.heed()
     interruption.check()
+    shown = Page({loaded.variant or loaded.name: record}, folder)
+    page = None
     if not no_figures:
-        draw(Figures({loaded.variant: record}, folder / "figures", format_), quiet)
+        page = draw_all([Figures({loaded.variant: record}, folder / "figures", format_)], shown, quiet)
+    elif view:
+        page = shown.draw()
     if not quiet:
         from dynsim.tables import print_summary
 
         print_summary(console, record.summary)
         console.print(f"Written to {escaped(folder)}", highlight=False, soft_wrap=True)
-    page = write_view({loaded.variant or loaded.name: record}, folder, quiet) if view or not no_figures else None
+    tell_of_view(page, quiet)
     if view and page is not None:
         open_page(page)
 
@@ -103,8 +110,6 @@ def compare(
     from dynsim.files import check_writable, discard
     from dynsim.results import COMPARISON_FILES, RUN_FILES, save_run
     from dynsim.scenario import load_scenario, variant_names
-    from dynsim.studies.compare import compare as compare_variants
-    from dynsim.studies.compare import save_comparison
 
     given = parsed_overrides(overrides)
     loaded = [load_scenario(scenario, name, given) for name in variant_names(scenario)]
@@ -112,6 +117,11 @@ def compare(
     check_writable(folder, COMPARISON_FILES[:2])
     for one in loaded:
         check_writable(folder / one.variant, RUN_FILES)
+    if not no_figures:
+        begin_drawing()
+    from dynsim.studies.compare import compare as compare_variants
+    from dynsim.studies.compare import save_comparison
+
     records: dict[str, Record] = {}
 
     def finished(name: str, record: Record) -> None:
@@ -143,14 +153,15 @@ def compare(
         interruption.check()
         if not no_figures:
             wanted = [Figures({name: one}, folder / name / "figures", format_) for name, one in records.items()]
-            draw_all([*wanted, Figures(records, folder, format_, together=True)], folder, quiet)
+            together = Figures(records, folder, format_, together=True)
+            page = draw_all([together, *wanted], Page(records, folder), quiet)
         if not quiet:
             from dynsim.tables import print_comparison
 
             print_comparison(console, {name: record.summary for name, record in records.items()})
             console.print(f"Written to {escaped(folder)}", highlight=False, soft_wrap=True)
         if not no_figures:
-            write_view(records, folder, quiet)
+            tell_of_view(page, quiet)
     if failure is not None:
         raise failure
 

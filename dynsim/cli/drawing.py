@@ -1,10 +1,11 @@
-"""Figures of runs: here, or of several runs by as many processes as there are cores."""
+"""Figures and pages of runs: here, or of several runs by as many processes as there are cores."""
 
 from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,24 +20,48 @@ if TYPE_CHECKING:
 GARBAGE = 200_000
 
 
+# Tasks that the figures of a run become, and those of all over each other: all processes are busy until the end.
+PARTS = 2
+
+
 @dataclass(frozen=True)
 class Figures:
-    """The figures of one record, or of several over each other, as files of a kind in a folder."""
+    """Figures of one record, or of several over each other, as files of a kind in a folder.
+
+    ``part``: which of them, see :func:`dynsim.figures.draw`.
+    """
 
     records: dict[str, Record]
     folder: Path
     kind: str
     together: bool = False
+    part: tuple[int, int] = (0, 1)
 
     def draw(self) -> None:
         """See :func:`dynsim.figures.draw`."""
         from dynsim import figures
 
         if self.together:
-            figures.draw_comparison(self.records, self.folder, self.kind)
+            figures.draw_comparison(self.records, self.folder, self.kind, self.part)
         else:
             for record in self.records.values():
-                figures.draw(record, self.folder, self.kind)
+                figures.draw(record, self.folder, self.kind, self.part)
+
+
+@dataclass(frozen=True)
+class Page:
+    """The page that shows records in 3D."""
+
+    records: dict[str, Record]
+    folder: Path
+
+    def draw(self) -> Path | None:
+        """Write it; None where the records have nothing to be seen."""
+        from dynsim.results import VIEW
+        from dynsim.view import viewable, write
+
+        shown = {name: record for name, record in self.records.items() if viewable(record)}
+        return write(shown, self.folder / VIEW) if shown else None
 
 
 def draw(figures: Figures, quiet: bool) -> None:
@@ -45,8 +70,16 @@ def draw(figures: Figures, quiet: bool) -> None:
         figures.draw()
 
 
-def draw_all(wanted: Sequence[Figures], folder: Path, quiet: bool) -> None:
-    """Draw in several processes, if there are several cores; ``folder`` is what is said to be drawn.
+def begin_drawing() -> None:
+    """Load what :func:`draw_all` needs in a process of its own, meanwhile: its workers are copies of that."""
+    from dynsim.studies.processes import begin_early, cores
+
+    if cores() > 1:
+        begin_early("dynsim.cli.drawing", "dynsim.figures.arm", "dynsim.view")
+
+
+def draw_all(wanted: Sequence[Figures], page: Page, quiet: bool) -> Path | None:
+    """Draw, and write a page, in several processes if there are several cores; returns the file of the page.
 
     Raises
     ------
@@ -55,22 +88,38 @@ def draw_all(wanted: Sequence[Figures], folder: Path, quiet: bool) -> None:
     """
     from dynsim.studies.processes import WorkerLost, cores, run_in_processes
 
-    def take(figures: Figures, result: Callable[[], None]) -> None:
-        try:
-            result()
-        except WorkerLost as lost:
-            raise RecordError(f"{figures.folder}: the process that drew there was ended from outside") from lost
+    pages: list[Path | None] = []
 
-    workers = min(cores(), len(wanted))
-    with drawing(folder, quiet):
+    def take(task: Figures | Page, result: Callable[[], Path | None]) -> None:
+        try:
+            done = result()
+        except WorkerLost as lost:
+            raise RecordError(f"{task.folder}: the process that drew there was ended from outside") from lost
+        if isinstance(task, Page):
+            pages.append(done)
+
+    # The longest first, the shortest last.
+    tasks: list[Figures | Page] = [replace(figures, part=(k, PARTS)) for figures in wanted for k in range(PARTS)]
+    tasks.append(page)
+    workers = min(cores(), len(tasks))
+    with drawing(page.folder, quiet):
         if workers == 1:
             for figures in wanted:
                 figures.draw()
-        elif run_in_processes(_draw, wanted, workers, take):
+            return page.draw()
+        if run_in_processes(_draw, tasks, workers, take):
             raise KeyboardInterrupt
+    return pages[0] if pages else None
 
 
-def _draw(figures: Figures, _: Any) -> None:
+def _draw(task: Figures | Page, _: Any) -> Path | None:
     """In a worker."""
+    _settle()
+    return task.draw()
+
+
+@cache
+def _settle() -> None:
+    """What was loaded until now is no garbage: not to be looked through again."""
+    gc.freeze()
     gc.set_threshold(GARBAGE)
-    figures.draw()

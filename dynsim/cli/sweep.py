@@ -72,7 +72,7 @@ def sweep(
     quiet: QuietOption = False,
 ) -> None:
     """Simulate a scenario over a grid, and with samples, of its values; write a table of all runs and figures."""
-    from dynsim.studies.processes import begin_early, cores
+    from dynsim.studies.processes import begin_early, cores, keep_memory
 
     if jobs is not None and scheduler is not None:
         raise ScenarioError("--jobs are processes of this machine, --scheduler has its own workers: give one of them")
@@ -91,6 +91,8 @@ def sweep(
     if scheduler is not None or min(jobs or cores(), plan.runs) > 1:
         # Meanwhile others simulate.
         Thread(target=_load_for_the_end, args=(bool(laws), not no_figures), name="imports").start()
+    else:
+        keep_memory()
     with sweep_progress(plan.runs, quiet) as report:
         rows = run_sweep(
             plan,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dynsim.cli.display import console, labelled, record_files
+from dynsim.cli.drawing import Page
 from dynsim.terminal import escaped
 
 if TYPE_CHECKING:
@@ -48,17 +49,16 @@ def view(
 
 
 def write_view(records: Mapping[str, Record], folder: Path, quiet: bool) -> Path | None:
-    """The page of records in a folder; None where they have nothing to be seen."""
-    from dynsim.results import VIEW
-    from dynsim.view import viewable, write
-
-    shown = {name: record for name, record in records.items() if viewable(record)}
-    if not shown:
-        return None
-    page = write(shown, folder / VIEW)
-    if not quiet:
-        console.print(f"To be seen in a browser: {escaped(page)}", highlight=False, soft_wrap=True)
+    """The page of records in a folder, and say where; None where they have nothing to be seen."""
+    page = Page(dict(records), folder).draw()
+    tell_of_view(page, quiet)
     return page
+
+
+def tell_of_view(page: Path | None, quiet: bool) -> None:
+    """Say where a page is that was written."""
+    if page is not None and not quiet:
+        console.print(f"To be seen in a browser: {escaped(page)}", highlight=False, soft_wrap=True)
 
 
 def open_page(page: Path) -> None:

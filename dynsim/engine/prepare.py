@@ -166,7 +166,7 @@ def prepare(
         rtol=options.rtol,
         atol=options.atol,
         ticks=_ticks(control),
-        breaks=_breaks(loads, control, method, options),
+        breaks=_breaks(loads, control, method, options, reuse),
         events=guards(robot, contacts if real else (), stops),
         support=compile_support(robot),
         stepping=stepping,
@@ -210,14 +210,15 @@ def slow_slip(atol: float) -> float:
     return max(1000.0 * atol, 1e-9)
 
 
-def _breaks(loads: Sequence[Load], control: JointControl, method: int, options: Integrator) -> np.ndarray:
+def _breaks(loads: Sequence[Load], control: JointControl, method: int, options: Integrator, reuse: Reuse) -> np.ndarray:
     """Times at which loads jump or bend [s]: a step that passed over them would not see a short push at all.
 
     Of an implicit method also those at which references do, whose knots are nearer than its steps are long.
     """
     times = [load.knots for load in loads if len(load.coefficients) and (not load.hold or len(load.coefficients) > 1)]
     if method == ki.RADAU5:
-        times.append(control.bends(options.rtol, options.atol))
+        tolerances = options.rtol, options.atol
+        times.append(reuse.of("bends", lambda: control.bends(*tolerances), control, *tolerances))
     return np.unique(np.concatenate(times)) if times else np.zeros(0)
 
 

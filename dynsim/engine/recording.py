@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynsim import metrics
 from dynsim.contact_metrics import beyond_stops
@@ -68,10 +69,10 @@ def make_record(
     target = prepared.control.target(record.time, prepared.reuse)
     if target is not None:
         record.add("target_position", target, "m", labels=("x", "y", "z"))
-    for integral, (name, text) in zip(run.states("ledger").T, metrics.INTEGRALS.items(), strict=True):
+    for integral, (name, text) in zip(_by_column(run.states("ledger")), metrics.INTEGRALS.items(), strict=True):
         record.add(name, integral, "J", description=text)
     if prepared.system.unilateral is not None:
-        for integral, (name, text) in zip(run.states("loss").T, metrics.LOSSES.items(), strict=True):
+        for integral, (name, text) in zip(_by_column(run.states("loss")), metrics.LOSSES.items(), strict=True):
             record.add(name, integral, "J", description=text)
     if run.stepping is not None:
         record.add("loss_scheme", run.states("scheme")[:, 0], "J", description=metrics.SCHEME)
@@ -80,7 +81,7 @@ def make_record(
     if shown:
         labels = tuple(prepared.loads[k].name for k in shown)
         record.add("work_loads", run.states("load")[:, shown], "J", labels=labels, description="∫ W·V dt of each load")
-    for store, name in zip(run.outputs("energy").T, metrics.STORES, strict=True):
+    for store, name in zip(_by_column(run.outputs("energy")), metrics.STORES, strict=True):
         record.add(name, store, "J", description=f"{name.removeprefix('energy_')} energy")
     record.add("energy_residual", metrics.energy_residual(record), "J", description="what the ledger does not explain")
     touch = run.outputs("contact")
@@ -131,6 +132,11 @@ def make_record(
     record.summary = metrics.summarise(record, scenario, contacts, robot, counts, prepared.reuse)
     record.summary["warnings"] += beyond_stops(robot, prepared.stops, prepared.control)
     return record
+
+
+def _by_column(table: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Columns beside each other in memory: the ledger is summed up from them again and again."""
+    return np.ascontiguousarray(table.T)
 
 
 def _stepping(run: ki.Run) -> dict[str, Any]:

@@ -24,8 +24,10 @@ MODULES: dict[str, tuple[set[str], ...]] = {
 }
 
 
-def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
+def draw(record: Record, folder: Path, kind: str = "png", part: tuple[int, int] = (0, 1)) -> list[Path]:
     """Draw every figure that the record has data for, as files of a kind: "png", "pdf" or "svg".
+
+    ``part`` (first, many): only every ``many``-th figure from ``first`` on, for whoever shares the work.
 
     Returns
     -------
@@ -40,10 +42,12 @@ def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
     if not len(record):
         return []
     with _drawable():
-        return list(_module(record).draw(record, Path(folder), kind))
+        return list(_module(record).draw(record, Path(folder), kind, part))
 
 
-def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
+def draw_comparison(
+    records: Mapping[str, Record], folder: Path, kind: str = "png", part: tuple[int, int] = (0, 1)
+) -> list[Path]:
     """Draw variants over each other, in the order of ``records``; those without samples are left out.
 
     Raises
@@ -62,7 +66,7 @@ def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "pn
     if len(modules) > 1:
         raise RecordError("records of different kinds cannot be drawn over each other")
     with _drawable():
-        return list(modules.pop().draw_comparison(drawn, Path(folder), kind))
+        return list(modules.pop().draw_comparison(drawn, Path(folder), kind, part))
 
 
 @contextmanager

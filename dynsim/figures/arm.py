@@ -33,11 +33,13 @@ COMPARISONS: dict[str, Callable[[Mapping[str, Record]], Figure | None]] = {
 }
 
 
-def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
+def draw(record: Record, folder: Path, kind: str = "png", part: style.Part = style.ALL) -> list[Path]:
     """See :func:`dynsim.figures.draw`."""
-    return style.save_all(FIGURES, record, folder, kind)
+    return style.save_all(FIGURES, record, folder, kind, part)
 
 
-def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
+def draw_comparison(
+    records: Mapping[str, Record], folder: Path, kind: str = "png", part: style.Part = style.ALL
+) -> list[Path]:
     """See :func:`dynsim.figures.draw_comparison`."""
-    return style.save_all(COMPARISONS, records, folder, kind)
+    return style.save_all(COMPARISONS, records, folder, kind, part)

@@ -91,7 +91,7 @@ def mark_variants(
             for row, (name, found) in enumerate(having.items()):
                 mark(axes, found, colours[name], row=-1 - row, lines=len(everything) <= LINES)
             # The empty title keeps the room.
-            axes.set_title(" ", fontsize=1.0, pad=ROW * len(having))
+            axes.set_title(" ", fontsize=1.0, y=1.0, pad=ROW * len(having))
     return everything
 
 

@@ -35,7 +35,7 @@ def path(record: Record) -> Figure | None:
     """Hand path and target in xy, xz and yz at one scale; None without a hand."""
     if "hand_position" not in record:
         return None
-    figure = style.new_figure(2.85, style.title(record, "hand path"))
+    figure = style.new_figure(_height(4), style.title(record, "hand path"))
     panels = _planes(figure, [record])
     for axes, plane in zip(panels, PLANES, strict=True):
         _draw_target(axes, record, plane)
@@ -49,7 +49,7 @@ def path_comparison(records: Mapping[str, Record]) -> Figure | None:
     shown = {name: record for name, record in records.items() if "hand_position" in record}
     if not shown:
         return None
-    figure = style.new_figure(3.2, style.comparison_title(list(shown.values()), "hand paths"))
+    figure = style.new_figure(_height(3 + len(shown)), style.comparison_title(list(shown.values()), "hand paths"))
     panels = _planes(figure, list(shown.values()))
     styles = style.told_apart(
         style.variant_styles(list(records)),
@@ -72,8 +72,12 @@ def error(record: Record) -> Figure | None:
     norm = np.linalg.norm(deviation, axis=1)
     figure = style.new_figure(4.1, style.title(record, "tracking error"))
     top, bottom = figure.subplots(2, 1, sharex=True)
+    looks = style.told_apart(
+        {name: {"color": colour} for name, colour in style.AXIS_COLOURS.items()},
+        {name: (record.time, deviation[:, k]) for k, name in enumerate("xyz")},
+    )
     for k, name in enumerate("xyz"):
-        style.line(top, record.time, deviation[:, k], label=name, color=style.AXIS_COLOURS[name])
+        style.line(top, record.time, deviation[:, k], label=name, **looks[name])
     top.set_ylabel(f"hand − {target_name(record)} [mm]")
     style.line(bottom, record.time, norm, label=_error_label("|e|", record), color=style.BLACK)
     bottom.set_ylabel(f"distance from {target_name(record)} [mm]")
@@ -116,6 +120,11 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
     events.explain(bottom, events.mark_variants([(top,), (bottom,)], shown, colours))
     figure.legend(loc="outside lower center", ncols=2)
     return figure
+
+
+def _height(named: int) -> float:
+    """Of a figure of three square panels and a legend of so many names [inch]: without room above and below."""
+    return 2.62 + style.LEGEND_ROW * -(-named // 4) / 72.0
 
 
 def _planes(figure: Figure, records: list[Record]) -> list[Axes]:

@@ -21,14 +21,16 @@ LINES = 12
 MILLI = 1e3
 
 
-def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
+def draw(record: Record, folder: Path, kind: str = "png", part: style.Part = style.ALL) -> list[Path]:
     """See :func:`dynsim.figures.draw`."""
-    return style.save_all(FIGURES, record, folder, kind)
+    return style.save_all(FIGURES, record, folder, kind, part)
 
 
-def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
+def draw_comparison(
+    records: Mapping[str, Record], folder: Path, kind: str = "png", part: style.Part = style.ALL
+) -> list[Path]:
     """See :func:`dynsim.figures.draw_comparison`: measured runs beside each other, and beside simulated ones."""
-    return arm.draw_comparison(records, folder, kind)
+    return arm.draw_comparison(records, folder, kind, part)
 
 
 def joints(record: Record) -> Figure | None:

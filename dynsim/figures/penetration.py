@@ -8,13 +8,11 @@ import numpy as np
 
 from dynsim.figures.skeleton import Skeleton
 from dynsim.figures.style import Array
-from dynsim.record.scene import Body
+from dynsim.record.scene import NOT_BELOW
 
 COLOUR = "#882255"
 # Parts into which a segment is cut to find what of it lies below a surface.
 PARTS = 24
-# Depth that does not count: what contacts and single precision of body poses leave [m].
-SLACK = 1e-4
 
 
 @dataclass(frozen=True)
@@ -45,9 +43,9 @@ def below_surfaces(body: Skeleton, row: int) -> Below:
             inside = np.flatnonzero(surface.value(points) < 0.0)
             depth = np.zeros(len(points))
             depth[inside] = [-surface.gap(points[k]) for k in inside]
-            if not depth.max() > radius + SLACK:
+            if not depth.max() > radius + NOT_BELOW:
                 continue
-            below = depth > SLACK
+            below = depth > NOT_BELOW
             # A piece is drawn where both of its ends lie below.
             pieces.append(np.stack([points[:-1], points[1:]], axis=1)[below[:-1] & below[1:]])
             if depth.max() > deepest:
@@ -57,9 +55,4 @@ def below_surfaces(body: Skeleton, row: int) -> Below:
 
 def _radii(body: Skeleton) -> list[float]:
     """Radius of the body that each segment belongs to [m]; 0 where it is not known."""
-    return [_radius(None if k is None else body.scene.bodies[k]) for k in body.carriers()]
-
-
-def _radius(body: Body | None) -> float:
-    round_ones = () if body is None else [one for one in body.shapes if one.kind in ("cylinder", "capsule")]
-    return max((float(shape.size[0]) for shape in round_ones), default=0.0)
+    return [0.0 if k is None else body.scene.bodies[k].radius for k in body.carriers()]

@@ -42,6 +42,12 @@ ARM_COLOUR = "#444444"
 BASE_COLOUR = "#D5D5D5"
 # Text at faint postures, and how far such a one is from the last at least, to be told from it [point].
 TIME_SIZE, APART = 6.0, 3.0
+# Points of hand path and target that times keep away from.
+WAY = 80
+# Where else than ahead of the hand they may stand.
+AROUND = np.array(
+    [[0.0, 1.0], [1.0, 0.0], [0.0, -1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0], [-1.0, 0.0]]
+)
 # Width of a side view in a figure of one column, and of two [point].
 FULL, HALF = 440.0, 205.0
 
@@ -198,7 +204,10 @@ def _side_view(
     for _, _, position, force in () if body is None else body.contacts():
         axes.plot(*plane.project(position), zorder=6, linestyle="none", **_contact_mark(force))
     if body is not None:
-        _write_times(axes, [float(record.time[row]) for row in body.shown()], [plane.project(s) for s in drawn], scale)
+        curves = [record["hand_position"], *([] if wanted is None else [wanted])]
+        ways = [plane.project(curve[np.linspace(0, len(curve) - 1, WAY).astype(int)]) for curve in curves]
+        times = [float(record.time[row]) for row in body.shown()]
+        _write_times(axes, times, [plane.project(s) for s in drawn], np.concatenate(ways), scale)
     if (deepest := max(sunk, key=lambda one: one.depth, default=None)) is not None and deepest.depth > 0.0:
         text = f"below {deepest.surface}, up to {style.number(1e3 * deepest.depth, 3)} mm"
         axes.plot([], [], label=text if named else "below a surface", color=penetration.COLOUR, lw=4.0)
@@ -222,26 +231,30 @@ def _sunk_look(last: bool) -> dict[str, Any]:
     return {"colors": penetration.COLOUR, "linewidths": 4.0 if last else 2.2, "alpha": 1.0 if last else 0.5}
 
 
-def _write_times(axes: Axes, times: Sequence[float], drawn: Sequence[Array], scale: float) -> None:
-    """The times of the faint postures at their ends, as far as there is room: the earliest first."""
+def _write_times(axes: Axes, times: Sequence[float], drawn: Sequence[Array], ways: Array, scale: float) -> None:
+    """The times of the faint postures at their ends, as far as there is room: the earliest first.
+
+    ``ways``: points of other curves that nothing is written over, (n, 2).
+    """
     half = 0.5 * TIME_SIZE * 0.62 * np.array([5.5, 1.9])
     # The last posture is the picture itself: nothing is written over its segments.
     middles = np.linspace(drawn[-1][:, 0], drawn[-1][:, 1], 5).reshape(-1, 2) if drawn else np.zeros((0, 2))
     taken = [(scale * point, np.array([1.0, 1.0])) for point in middles]
+    taken += [(scale * point, np.zeros(2)) for point in ways]
     for time, flat in zip(times[:-1], drawn[:-1], strict=False):
         if not len(flat) or not np.isfinite(flat[-1]).all() or scale * np.abs(flat - drawn[-1]).max() < APART:
             continue
         along = flat[-1, 1] - flat[-1, 0]
         size = float(np.linalg.norm(along))
         ahead = along / size if size > 0.0 else np.array([1.0, 0.0])
-        for direction in (ahead, np.array([0.0, 1.0]), np.array([1.0, 0.0]), np.array([0.0, -1.0])):
-            place = scale * flat[-1, 1] + direction * (half + 2.0)
+        for offset in (away * direction * (half + 2.0) for away in (1.0, 1.8) for direction in (ahead, *AROUND)):
+            place = scale * flat[-1, 1] + offset
             if all((np.abs(place - other) > half + room).any() for other, room in taken):
                 taken.append((place, half))
                 axes.annotate(
                     f"{time:{'.2g' if time < 100.0 else '.0f'}} s",
                     flat[-1, 1],
-                    xytext=tuple(direction * (half + 2.0)),
+                    xytext=tuple(offset),
                     textcoords="offset points",
                     ha="center",
                     va="center",

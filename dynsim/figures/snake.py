@@ -7,7 +7,9 @@ target; joint angles with their limits; cost, smallest singular value, support m
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -39,24 +41,23 @@ from dynsim.figures.snake_view import (
     posture_grid,
     posture_strip,
     relax,
+    turns,
 )
 from dynsim.files import replacing
 from dynsim.record import Record
 from dynsim.snake_geometry import snake_geometry
 from dynsim.studies.published.tanaka2019 import used_limit
 
+T = TypeVar("T")
 # Postures of an animation, in a row, and over each other in one picture.
 FRAMES, IN_A_ROW, IN_A_PICTURE = 50, 6, 7
-# Parts of a run of which range and lowest value are drawn where a line would fill the panel.
-TURNS = 160
 # Postures over time in grey: the lines beside them have the colours.
 SHADES = LinearSegmentedColormap.from_list("shades", ["#CFCFCF", "#000000"])
 
 
-def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
+def draw(record: Record, folder: Path, kind: str = "png", part: style.Part = style.ALL) -> list[Path]:
     """Write all figures of one run and the animation into ``folder``; returns the files."""
     folder = Path(folder)
-    written = []
     with plt.rc_context(STYLE):
         makers: dict[str, Callable[[Record], Figure]] = {
             "postures": postures,
@@ -65,13 +66,17 @@ def draw(record: Record, folder: Path, kind: str = "png") -> list[Path]:
             "joints": joints,
             "redundancy": redundancy,
         }
-        for name, make in (makers | tanaka2019.figures_of_run(record)).items():
-            written.append(_save(make(record), folder / f"{name}.{kind}"))
-        written.append(animate(record, folder / "animation.gif"))
-    return written
+        works = [
+            partial(_save, make, record, folder / f"{name}.{kind}")
+            for name, make in (makers | tanaka2019.figures_of_run(record)).items()
+        ]
+        works.append(partial(animate, record, folder / "animation.gif"))
+        return [work() for work in style.part_of(works, part)]
 
 
-def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "png") -> list[Path]:
+def draw_comparison(
+    records: Mapping[str, Record], folder: Path, kind: str = "png", part: style.Part = style.ALL
+) -> list[Path]:
     """Variants over each other, and figures and tables beside [T] where its experiments were run; returns the files."""
     folder = Path(folder)
     makers: dict[str, Callable[[Mapping[str, Record]], Figure]] = {
@@ -82,14 +87,16 @@ def draw_comparison(records: Mapping[str, Record], folder: Path, kind: str = "pn
     if len(names := {record.summary["scenario"] for record in records.values()}) == 1:
         scenario = names.pop()
         makers |= tanaka2019.figures(scenario, records)
-        written += tanaka2019.write_tables(scenario, records, folder)
+        if part[0] == 0:
+            written += tanaka2019.write_tables(scenario, records, folder)
     with plt.rc_context(STYLE):
-        for name, make in makers.items():
-            written.append(_save(make(records), folder / f"{name}.{kind}"))
+        for name, make in style.part_of(list(makers.items()), part):
+            written.append(_save(make, records, folder / f"{name}.{kind}"))
     return written
 
 
-def _save(figure: Figure, path: Path) -> Path:
+def _save(make: Callable[[T], Figure], of: T, path: Path) -> Path:
+    figure = make(of)
     figure.set_dpi(plt.rcParams["savefig.dpi"])
     style.write(figure, path)
     plt.close(figure)
@@ -193,7 +200,8 @@ def tracking(record: Record) -> Figure:
                 record.time, 0, 1, where=record["gripper"] > 0, transform=closed, color="#EEEEEE", lw=0, zorder=0,
                 label="gripper closed",
             )  # fmt: skip
-    axes[0, 0].legend(frameon=False)
+    # In a white box: what is grey shows on panels that are grey all over.
+    axes[0, 0].legend(facecolor="white", edgecolor="none")
     tiny = 1e-16  # an error of exactly zero has no place on a logarithmic axis
     axes[3, 0].semilogy(record.time, np.maximum(record["position_error"], tiny), color=BODY)
     axes[3, 0].set_ylabel("position error [m]")
@@ -259,7 +267,7 @@ def _over_time(axis: Axes, record: Record, values: NDArray[np.float64], many: bo
     if not many:
         axis.plot(record.time, values, color=GROUND)
         return
-    starts = np.unique(np.linspace(0, len(values), TURNS + 1).astype(int))[:-1]
+    starts = turns(len(values))
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     time = np.append(record.time[starts], record.time[-1])
     axis.stairs(high, time, baseline=low, fill=True, color=GROUND, alpha=0.25, lw=0, label="range")

@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection, PolyCollection
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
@@ -45,6 +46,10 @@ SYMBOLS = {"alpha": "α", "beta": "β", "gamma": "γ"}
 
 # Beyond this many modes their numbers do not fit above the bars of a chart.
 NUMBERED = 30
+# Parts of a run, of which shares and ranges are drawn where lines and bars would fill the panel: more modes than that.
+TURNS = 160
+# From never to always.
+SHARES = LinearSegmentedColormap.from_list("shares", [LIFT, GROUND])
 # A top view is at least this high, in parts of its width: a straight robot is a thin line.
 LEAST_HEIGHT = 0.3
 
@@ -221,8 +226,10 @@ def mode_chart(axis: Axes, record: Record, title: str = "mode") -> None:
     """Grounded (filled) and lifted (white) wheel pairs over time, with the mode numbers where these have room."""
     grounded, time, mode = record["grounded"], record.time, record["mode"]
     starts, last, pairs = mode_starts(record), len(time) - 1, grounded.shape[1]
-    numbered = len(starts) <= NUMBERED
-    for i in range(pairs):
+    numbered, dense = len(starts) <= NUMBERED, len(starts) > TURNS
+    if dense:
+        _shares(axis, record, grounded, np.arange(1.0, pairs + 1.0))
+    for i in range(0 if dense else pairs):
         # A bar ends where the pair is lifted, and at every change of mode while these can be told apart.
         begins = starts if numbered else np.flatnonzero(np.diff(grounded[:, i], prepend=grounded[0, i] - 1))
         ends = np.append(begins[1:], last)
@@ -238,16 +245,37 @@ def mode_chart(axis: Axes, record: Record, title: str = "mode") -> None:
     axis.set_ylabel("wheel pair")
     # without numbers above the bars the title does not promise them
     title = f"{title}, and the " if numbered else title.removesuffix("mode")
-    axis.set_title(f"{title}wheel pairs on the ground (blue) or lifted (white)", loc="left")
+    length = (time[-1] - time[0]) / TURNS
+    lifted = f"share of each {length:.2g} s, white: lifted" if dense else "blue) or lifted (white"
+    axis.set_title(f"{title}wheel pairs on the ground ({lifted})", loc="left")
 
 
 def mode_steps(axis: Axes, record: Record) -> None:
-    """Mode numbers over time as steps."""
-    axis.step(record.time, record["mode"], where="post", color=GROUND, lw=0.7)
+    """Mode numbers over time as steps, or as shares of time where these would fill the panel."""
     shown = np.unique(record["mode"])
+    if len(mode_starts(record)) > TURNS:
+        _shares(axis, record, record["mode"][:, None] == shown, shown.astype(float))
+    else:
+        axis.step(record.time, record["mode"], where="post", color=GROUND, lw=0.7)
     axis.set(ylabel="mode", ylim=(shown[0] - 0.5, shown[-1] + 0.5))
     if len(shown) <= 12:
         axis.set_yticks(shown)
+
+
+def turns(samples: int) -> NDArray[np.int64]:
+    """Rows at which parts of a run begin, see ``TURNS``."""
+    return np.unique(np.linspace(0, samples, TURNS + 1).astype(np.int64))[:-1]
+
+
+def _shares(axis: Axes, record: Record, holds: NDArray[Any], places: NDArray[np.float64]) -> None:
+    """The part of each turn for which something holds, (T, k), as bars of such shades at (k,) places."""
+    starts = turns(len(record.time))
+    many = np.diff(starts, append=len(record.time))[:, None]
+    shares = np.add.reduceat(holds.astype(float), starts, axis=0) / many
+    edges = np.append(record.time[starts], record.time[-1])
+    for place, share in zip(places, shares.T, strict=True):
+        bar = [place - 0.4, place + 0.4]
+        axis.pcolormesh(edges, bar, share[None], cmap=SHARES, vmin=0.0, vmax=1.0)
 
 
 def error_axis(axis: Axes, *errors: NDArray[np.float64]) -> None:

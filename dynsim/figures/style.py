@@ -10,10 +10,12 @@ from typing import Any, TypeVar
 
 import matplotlib
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
 from dynsim.figures.canvas import Canvas, heed_fonts
@@ -26,6 +28,9 @@ Name = TypeVar("Name", str, int)
 Array = NDArray[np.float64]
 # A quantity over time, (T,) and (T,) or (T, k).
 Series = tuple[Array, Array]
+# Which figures of a record are drawn: every ``many``-th from ``first`` on, (first, many).
+Part = tuple[int, int]
+ALL: Part = (0, 1)
 
 # Okabe and Ito's colours, which colour-blind readers tell apart; yellow is too faint on white.
 BLUE, ORANGE, GREEN, PURPLE, SKY, BLACK = "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#000000"
@@ -102,18 +107,44 @@ def save(figure: Figure, path: Path) -> Path:
         The file cannot be written; an older one is left as it was.
     """
     # Names from files: no font has a picture for a control character.
-    for text in figure.findobj(Text):
+    for text in _texts(figure):
         text.set_text(plain(text.get_text()))
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            if not axis.label.get_text():
+                # Else matplotlib measures all numbers again, several times, for the place of nothing.
+                axis.set_label_coords(0.5, 0.0)
     figure.set_dpi(DPI)
     return write(figure, path)
 
 
-def save_all(makers: Mapping[str, Callable[[T], Figure | None]], of: T, folder: Path, kind: str) -> list[Path]:
+def _texts(artist: Artist) -> Iterator[Text]:
+    """All texts but numbers at axes: to ask for those would make all ticks, for one more time."""
+    if isinstance(artist, Text):
+        yield artist
+    elif isinstance(artist, Axis) and not isinstance(artist.get_major_locator(), FixedLocator):
+        yield artist.label
+    else:
+        for child in artist.get_children():
+            yield from _texts(child)
+
+
+def save_all(
+    makers: Mapping[str, Callable[[T], Figure | None]], of: T, folder: Path, kind: str, part: Part = ALL
+) -> list[Path]:
     """Every figure, by its name, that the record or records have data for, in dynsim's look; returns the files."""
     with look():
         return [
-            save(figure, folder / f"{name}.{kind}") for name, make in makers.items() if (figure := make(of)) is not None
+            save(figure, folder / f"{name}.{kind}")
+            for name, make in part_of(list(makers.items()), part)
+            if (figure := make(of)) is not None
         ]
+
+
+def part_of(of: Sequence[T], part: Part) -> Sequence[T]:
+    """What one of several processes draws."""
+    first, many = part
+    return of[first::many]
 
 
 def write(figure: Figure, path: Path) -> Path:
@@ -214,7 +245,7 @@ def legend_above(axes: Axes, columns: int = 3) -> None:
     legend = axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.0)
     # It may reach over the panel to its left; the empty title keeps the room above.
     legend.set_in_layout(False)
-    axes.set_title(" ", pad=6.0 + LEGEND_ROW * max(rows - 1, 0))
+    axes.set_title(" ", y=1.0, pad=6.0 + LEGEND_ROW * max(rows - 1, 0))
 
 
 def settle_time(record: Record) -> float:

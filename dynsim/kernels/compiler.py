@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, TypeVar
 
 import numba
@@ -20,7 +20,7 @@ from numba.core.compiler import Compiler
 from numba.core.compiler_machinery import PassManager
 from numba.core.typing.templates import infer, infer_global, make_overload_template
 
-from dynsim.kernels import numba_habits  # noqa: F401
+from dynsim.kernels import by_reference, numba_habits  # noqa: F401
 from dynsim.kernels.alongside import Need, needed_by, provide
 
 _NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
@@ -39,6 +39,10 @@ class _OwnCallees(JITCodeLibrary):
     def _optimize_functions(self, ll_module: Any) -> None:
         """Nothing yet: all of it is optimised in the end."""
         ll_module.data_layout = self._codegen._data_layout
+
+    def finalize(self) -> None:
+        self._linking_libraries = list(_with_callees(self._linking_libraries))
+        super().finalize()
 
     def _optimize_final_module(self) -> None:
         for function in self._final_module.functions:
@@ -118,12 +122,23 @@ class KernelCompiler(_LeanCompiler):
 class _ToLink(JITCodeLibrary):
     """Code that is only linked into other libraries and optimised there; it never becomes machine code of its own."""
 
-    def _optimize_final_module(self) -> None:
-        pass
-
-    def _finalize_final_module(self) -> None:
+    def finalize(self) -> None:
+        """Nothing is linked in yet: the kernel links each part once."""
+        for library in self._linking_libraries:
+            self._reload_init.update(library._reload_init)
         self._finalize_dynamic_globals()
         self._finalized = True
+
+
+def _with_callees(libraries: Iterable[Any], seen: set[Any] | None = None) -> Iterator[Any]:
+    """Libraries, and those that parts among them call, each once."""
+    seen = set() if seen is None else seen
+    for library in libraries:
+        if library not in seen:
+            seen.add(library)
+            yield library
+            if isinstance(library, _ToLink):
+                yield from _with_callees(library._linking_libraries, seen)
 
 
 class _ToCall(_ToLink):

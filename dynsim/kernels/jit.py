@@ -190,16 +190,8 @@ def apart_kernel(function: F) -> F:
     return register_part(function, ApartCompiler, _OPTIONS)
 
 
-def inlined_kernel(function: F) -> F:
-    """As :func:`internal_kernel`, for the parts of one right-hand side: merged into their caller by LLVM.
-
-    Passing the tables of a model costs about as much as a whole sweep over ten links.
-    """
-    return register_part(function, PartCompiler, {**_OPTIONS, "forceinline": True})
-
-
 def exact_kernel(function: F) -> F:
-    """As :func:`inlined_kernel`, with every product rounded: for what is merged into several places.
+    """As :func:`internal_kernel`, with every product rounded: for what is merged into several places.
 
     Which products of a sum are contracted depends on the place, and so would the last bits of what it computes.
     """

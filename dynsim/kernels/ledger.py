@@ -38,7 +38,7 @@ from dynsim.kernels.arrays import (
     Workspace,
 )
 from dynsim.kernels.constraint.rows import joint_rate
-from dynsim.kernels.jit import inlined_kernel, internal_kernel, kernel
+from dynsim.kernels.jit import internal_kernel, kernel
 from dynsim.kernels.state import (
     CONSTRAINT,
     CONTACT_SIZE,
@@ -56,7 +56,7 @@ from dynsim.kernels.state import (
 from dynsim.kernels.tree.sweep import body_inertia
 
 
-@inlined_kernel
+@internal_kernel
 def drive_powers(drives: DriveArrays, ws: Workspace):
     """Electrical, drawn, Joule and mechanical power of all drives, and that of their drag [W]; see `ledger_rates`."""
     joints, motors, motor = ws.joints, ws.motors, drives.motor
@@ -74,7 +74,7 @@ def drive_powers(drives: DriveArrays, ws: Workspace):
     return electrical, drawn, joule, mechanical, drag
 
 
-@inlined_kernel
+@internal_kernel
 def ledger_rates(model: ModelArrays, drives: DriveArrays, ws: Workspace, out, layout):
     """Rates of all integrals, into the blocks ledger and contact of ``out`` [W; N, m/s], and the normal forces.
 

@@ -41,7 +41,7 @@ from dynsim.kernels.constraint.splits import admissible_forces
 from dynsim.kernels.constraint.surface import contact_rows, sign_changed
 from dynsim.kernels.constraint.unilateral import UnilateralArrays
 from dynsim.kernels.drive.law import drive
-from dynsim.kernels.jit import inlined_kernel, integers, internal_kernel, kernel, reals
+from dynsim.kernels.jit import integers, internal_kernel, kernel, reals
 from dynsim.kernels.ledger import ledger_rates
 from dynsim.kernels.state import StateLayout
 from dynsim.kernels.tree.articulated import accelerate, add_row_forces, factor, row_system
@@ -78,7 +78,7 @@ def new_workspace(system: System) -> Workspace:
     return ws
 
 
-@inlined_kernel
+@internal_kernel
 def constrained_acceleration(model: ModelArrays, ws: Workspace):
     """vdot and row forces of the applied forces, by the articulated solve, into ``ws.joints`` and ``ws.rows``."""
     factor(model, ws)

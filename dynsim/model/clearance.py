@@ -182,7 +182,7 @@ class _Clear:
     """
 
     def __init__(self) -> None:
-        self._room, self._q, self._reach = 0.0, np.zeros((0, 0)), np.zeros(0)
+        self._room, self._q, self._reach = 0.0, np.zeros((0, 0)), np.zeros(0)  # _q: (n, T)
 
     def remember(self, robot: Robot, surfaces: Mapping[str, Surface], q: Array, room: float) -> None:
         """Take the samples q, (T, n), whose axes kept ``room`` [m] above their radii."""
@@ -195,13 +195,14 @@ class _Clear:
             if link.parent is not None:
                 reach[link.parent] = max(reach[link.parent], float(np.linalg.norm(link.p_PJ)) + reach[link.name])
         # Rounding is far below the slack.
-        self._room, self._q, self._reach = room - SLACK, q.copy(), np.array([reach[link.name] for link in robot.links])
+        self._room, self._q = room - SLACK, q.T.copy()
+        self._reach = np.array([reach[link.name] for link in robot.links])
 
     def holds(self, q: Array) -> bool:
         """Whether samples, (T, n), are clear for certain."""
-        if self._room <= 0.0 or q.shape != self._q.shape:
+        if self._room <= 0.0 or q.T.shape != self._q.shape:
             return False
-        return bool((np.abs(q - self._q).max(axis=0) * self._reach).sum() < self._room)
+        return bool((np.abs(q.T - self._q).max(axis=1) * self._reach).sum() < self._room)
 
 
 def _axis_gaps(robot: Robot, surfaces: Mapping[str, Surface], q: Array) -> Iterator[tuple[Link, str, Array]]:

@@ -28,6 +28,8 @@ Matrix3 = tuple[Vector3, Vector3, Vector3]
 
 WORLD = -1
 """Index of the world among the bodies."""
+# What lies below a surface by less than this is on it [m]: contacts leave that, and so does single precision of poses.
+NOT_BELOW = 1e-4
 HERE: Quaternion = (1.0, 0.0, 0.0, 0.0)
 """The orientation of what is not turned."""
 _FIELD = ("position", "spacing", "heights")
@@ -115,6 +117,12 @@ class Body:
     parent: int
     joint: Joint
     shapes: tuple[Shape, ...] = ()
+
+    @property
+    def radius(self) -> float:
+        """Of its thickest cylinder or capsule [m]; 0 where it has none. So far its axis may reach below a surface."""
+        round_ones = (shape for shape in self.shapes if shape.kind in ("cylinder", "capsule"))
+        return max((float(shape.size[0]) for shape in round_ones), default=0.0)
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,8 @@ def quadric_patch(surface: Surface, low: Array, high: Array) -> Array:
 def round_patch(surface: Surface, low: Array, high: Array) -> Array:
     """Points of a sphere or cylinder, (n, n, 3) [m]: all of a small one, else the part around the point next to a box.
 
-    Its meridians or generators start there, so that the part ends in a smooth edge.
+    Its meridians or generators start there, so that the part ends in a smooth edge: an ellipse on a sphere, as long and
+    as wide as the box, or half as wide as long.
     """
     centre, radius = np.array(surface.position), abs(float(surface.radius or 0.0))
     middle, reach = 0.5 * (low + high), 0.6 * float(np.linalg.norm(high - low))
@@ -98,8 +99,20 @@ def round_patch(surface: Surface, low: Array, high: Array) -> Array:
     towards = away / size
     turn = np.linspace(-1.0, 1.0, PATCH)
     if axis is None:
-        sides = np.linalg.svd(towards[None])[2][1:]
-        polar, round_about = np.meshgrid(0.5 * (turn + 1.0) * widest, np.pi * turn, indexing="ij")
+        # Along the box, which may be much longer than wide, unless its longest edge points at the centre.
+        edges = np.eye(3)[np.argsort(low - high)]
+        along = next(edge for edge in edges if abs(edge @ towards) < 0.9)
+        along = along - towards * (along @ towards)
+        first = along / np.linalg.norm(along)
+        sides = np.array([first, np.cross(towards, first)])
+        share, round_about = np.meshgrid(0.5 * (turn + 1.0), np.pi * turn, indexing="ij")
+        if not 0.0 < widest < np.pi:
+            polar = share * widest
+        else:
+            reaches = 0.6 * np.abs(sides) @ (high - low) / radius
+            # A box may have no width at all, and stand on the sphere.
+            a, b = np.minimum(np.maximum(reaches, max(0.5 * reaches.max(), 0.2 * widest)), np.pi)
+            polar = share / np.hypot(np.cos(round_about) / a, np.sin(round_about) / b)
         across = np.cos(round_about)[..., None] * sides[0] + np.sin(round_about)[..., None] * sides[1]
         return np.asarray(centre + radius * (np.cos(polar)[..., None] * towards + np.sin(polar)[..., None] * across))
     length = float(np.abs(axis) @ (high - low))

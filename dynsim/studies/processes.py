@@ -126,7 +126,7 @@ def run_in_processes(
 
     def start(sender: Connection) -> _Worker:
         here, there = context.Pipe()
-        arguments = (work, there, stop, sender, logging.getLogger("dynsim").getEffectiveLevel())
+        arguments = (work, there, stop, sender, _heard_from())
         with signals_held():
             process = context.Process(target=_serve, args=arguments)
             process.start()
@@ -266,6 +266,17 @@ def keep_memory() -> None:
         library = ctypes.CDLL(None)
         library.mallopt(-3, 32 << 20)
         library.mallopt(-1, 512 << 20)
+
+
+def _heard_from() -> int:
+    """Level from which on anybody hears what is logged here: workers need not even make other messages."""
+    library = logging.getLogger("dynsim")
+    asked: logging.Logger | None = library
+    while asked is not None:
+        if any(not isinstance(handler, logging.NullHandler) for handler in asked.handlers):
+            return library.getEffectiveLevel()
+        asked = asked.parent if asked.propagate else None
+    return logging.CRITICAL + 1
 
 
 class _ToParent(logging.Handler):

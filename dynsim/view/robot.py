@@ -13,7 +13,7 @@ from dynsim.errors import RecordError
 from dynsim.measures import hand_target
 from dynsim.record import Record
 from dynsim.record.poses import ORIENTATION, POSITION, point_positions
-from dynsim.record.scene import WORLD, Point, Scene, Surface, Vector3
+from dynsim.record.scene import NOT_BELOW, WORLD, Point, Scene, Surface, Vector3
 from dynsim.record.surface_points import normals
 
 Array = NDArray[np.float64]
@@ -21,8 +21,6 @@ Array = NDArray[np.float64]
 POSE_ERROR = 4e-5
 # Frames of a longer run are thinned though poses between them be off by more.
 FRAMES = 20_000
-# What lies below a surface by less than this is on it [m]: poses are in single precision.
-SUNK = 1e-4
 HERE_POINT: Vector3 = (0.0, 0.0, 0.0)
 
 
@@ -234,13 +232,12 @@ def sunk(robot: Robot, rows: NDArray[np.intp] | slice = slice(None)) -> list[Sun
     found = []
     for name, k, position in points:
         place = np.asarray(point_positions(record, Point(name, "hand", k, position), rows), dtype=np.float64)
-        shapes = scene.bodies[k].shapes[:1]
-        radius = max((shape.size[0] for shape in shapes if shape.kind in ("cylinder", "capsule")), default=0.0)
+        allowed = scene.bodies[k].radius + NOT_BELOW
         for surface in scene.surfaces:
             with np.errstate(all="ignore"):
                 depth = -distance(surface, place)
-            if (depth > radius + SUNK).any():
-                found.append(Sunk(name, surface.name, k, position, radius + SUNK, depth))
+            if (depth > allowed).any():
+                found.append(Sunk(name, surface.name, k, position, allowed, depth))
     return found
 
 

@@ -59,6 +59,14 @@ def test_check_replay_compare_on_virtual_servos(call, files: Path) -> None:
     assert code == 0
     assert (files / "out" / "comparison.png").exists()
     assert json.loads((files / "out" / "comparison.json").read_text(encoding="utf-8"))["delay_s"] > 0
+    worst = (files / "out" / "comparison.png").read_bytes()
+    names = Record.load(record).labels["q"]
+    code, _, _ = call("hw", "compare", record, files / "out" / "measured.h5", "--joint", names[-1])
+    assert code == 0
+    assert (files / "out" / "comparison.png").read_bytes() != worst
+    code, _, error = call("hw", "compare", record, files / "out" / "measured.h5", "--joint", "knee")
+    assert code == 2
+    assert error.startswith(f"error: no joint 'knee' was compared; there are: {', '.join(names)}")
     (files / "gate.yaml").write_text("rms_rad: 0.001\n", encoding="utf-8")
     code, _, error = call("hw", "compare", record, files / "out" / "measured.h5", "--gate", files / "gate.yaml")
     assert code == 5

@@ -11,7 +11,7 @@ from dynsim.errors import RecordError
 from dynsim.model.description import Quadric
 from dynsim.model.protocols import BuildContext
 from dynsim.record.scene import Body, Joint, Point, Scene, Shape, Surface, quaternion
-from dynsim.record.surface_points import normals, surface_grids
+from dynsim.record.surface_points import normals, round_patch, surface_grids
 from dynsim.surfaces import cylinder, plane, sphere
 
 CONTEXT = BuildContext(1.0)
@@ -119,6 +119,49 @@ def test_points_of_quadrics_are_on_them(drawn: Surface):
     assert grid.shape[:2] == ((2, 2) if drawn.kind == "plane" else (41, 41))
     slopes = np.array([drawn.gradient(point) for point in points])
     np.testing.assert_allclose(normals(drawn, points), slopes / np.linalg.norm(slopes, axis=1)[:, None], atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["sphere", "cylinder"])
+@pytest.mark.parametrize(("size", "whole"), [(0.2, True), (40.0, False)])
+def test_a_round_patch_lies_on_its_surface_and_has_no_holes(kind, size, whole):
+    """Around the point next to a box: the box stands aside of the surface, aslant."""
+    low, high = np.array([0.8 * size, 0.1, -0.3]), np.array([0.8 * size + 1.0, 0.7, 0.4])
+    if kind == "sphere":
+        quadric = sphere.build(sphere.Config(type="sphere", center_m=(0.0, 0.0, 0.0), radius_m=size), CONTEXT)
+    else:
+        config = cylinder.Config(type="cylinder", point_m=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0), radius_m=size)
+        quadric = cylinder.build(config, CONTEXT)
+    drawn = surface(quadric)
+    assert drawn.kind == kind
+    grid = round_patch(drawn, low, high)
+    assert np.isfinite(grid).all()
+    across = grid if kind == "sphere" else grid * [1.0, 0.0, 1.0]
+    np.testing.assert_allclose(np.linalg.norm(across, axis=-1), size, rtol=1e-12)
+    # Neighbours are near each other: a torn mesh would reach over what lies between.
+    # Of a large sphere somewhat more than what the box covers of it, whose depth does not count.
+    reach = np.pi * size if whole else 0.6 * (0.7 if kind == "sphere" else float(np.linalg.norm(high - low)))
+    steps = [np.linalg.norm(np.diff(across, axis=axis), axis=-1).max() for axis in (0, 1)]
+    assert max(steps) < 0.2 * reach
+    # Next to the box is the middle of the patch; small ones are drawn all round.
+    middle = 0.5 * (low + high) * ([1.0, 1.0, 1.0] if kind == "sphere" else [1.0, 0.0, 1.0])
+    nearest = size * middle / np.linalg.norm(middle)
+    away = np.linalg.norm(across - nearest, axis=-1)
+    assert away.min() < 0.05 * size
+    assert away.max() == pytest.approx(2.0 * size if whole else reach, rel=0.02)
+
+
+@pytest.mark.parametrize("high", [(0.0, 0.0, 43.0), (0.0, 0.0, 40.0), (1.0, 0.0, 40.0)])
+def test_a_round_patch_next_to_what_has_no_width(high):
+    """A hanging pendulum over a sphere, and a point."""
+    quadric = sphere.build(sphere.Config(type="sphere", center_m=(0.0, 0.0, 0.0), radius_m=39.0), CONTEXT)
+    grid = round_patch(surface(quadric), np.array([0.0, 0.0, 40.0]), np.array(high))
+    np.testing.assert_allclose(np.linalg.norm(grid, axis=-1), 39.0, rtol=1e-12)
+
+
+def test_the_radius_of_a_body_is_that_of_its_thickest_round_shape():
+    shapes = (Shape("box", (1.0, 1.0, 1.0)), Shape("cylinder", (0.02, 1.0)), Shape("capsule", (0.03, 1.0)))
+    assert Body("b", -1, HINGE, shapes).radius == 0.03
+    assert Body("b", -1, HINGE, shapes[:1]).radius == 0.0
 
 
 def test_a_surface_without_points_has_none_to_draw():

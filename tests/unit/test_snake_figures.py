@@ -10,7 +10,7 @@ from PIL import Image
 from dynsim.engine import simulate
 from dynsim.errors import RecordError
 from dynsim.figures import snake as figures
-from dynsim.figures import tanaka2019
+from dynsim.figures import snake_view, tanaka2019
 from dynsim.record import Record
 from dynsim.scenario import load_scenario
 from dynsim.snake_geometry import snake_geometry
@@ -52,6 +52,15 @@ def test_geometry_of_the_scene_is_that_of_records_of_version_0_1(record):
         np.testing.assert_allclose(getattr(geometry, name), getattr(expected, name), atol=1e-15)
     with pytest.raises(RecordError, match="'snake'"):
         snake_geometry(Record(record.time))
+
+
+def test_parts_are_all_figures_and_none_twice(record, tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "FRAMES", 2)
+    parts = [figures.draw(record, tmp_path, "svg", (k, 4)) for k in range(4)]
+    names = ["postures.svg", "overview.svg", "tracking.svg", "joints.svg", "redundancy.svg", "animation.gif"]
+    assert sorted(path.name for paths in parts for path in paths) == sorted(names)
+    parts = [figures.draw_comparison({"a": record, "b": record}, tmp_path, part=(k, 2)) for k in range(2)]
+    assert [path.name for paths in parts for path in paths] == ["comparison.png", "postures.png"]
 
 
 def test_figures_as_svg(record, tmp_path, monkeypatch):
@@ -106,6 +115,48 @@ def test_modes_are_numbers_above_the_chart_or_steps_below_it(every, numbered):
         np.testing.assert_array_equal(axis.lines[0].get_ydata(), record["mode"])
     widths = {float(w) for bars in chart.collections for w in np.atleast_1d(bars.get_linewidth())}
     assert widths == ({0.4} if numbered else {0.0})
+    plt.close(figure)
+
+
+def test_modes_that_would_fill_the_chart_are_shares_of_time(monkeypatch):
+    monkeypatch.setattr(snake_view, "TURNS", 20)
+    record = switching_all_the_time(0.06)
+    figure = figures.redundancy(record)
+    chart, steps = figure.axes[:2]
+    assert "share of each 0.15 s" in chart.get_title(loc="left")
+    starts = snake_view.turns(len(record))
+    assert len(starts) == 20
+    parts = np.split(np.arange(len(record)), starts[1:])
+    pairs = np.array([mesh.get_array().ravel() for mesh in chart.collections])
+    np.testing.assert_allclose(pairs.T, [record["grounded"][rows].mean(axis=0) for rows in parts], atol=1e-12)
+    modes = np.array([mesh.get_array().ravel() for mesh in steps.collections])
+    assert not steps.lines
+    assert len(modes) == len(np.unique(record["mode"]))
+    np.testing.assert_allclose(modes.sum(axis=0), 1.0, atol=1e-12)
+    # Below them range and lowest value of each part.
+    for name, signal, scale in (("σ_min of B̃", "sigma_min", 1.0), ("support margin [mm]", "support_margin", 1e3)):
+        (axis,) = [axis for axis in figure.axes if axis.get_ylabel() == name]
+        values = [scale * record[signal][rows] for rows in parts]
+        stairs = axis.patches[0].get_data()
+        np.testing.assert_allclose(stairs.values, [part.max() for part in values])
+        np.testing.assert_allclose(stairs.baseline, [part.min() for part in values])
+        np.testing.assert_allclose(axis.lines[0].get_ydata(), stairs.baseline)
+    plt.close(figure)
+
+
+def test_the_overview_of_a_robot_that_stays_has_a_side_view(record):
+    """One that works with its head alone has its heights shown; one that lies bent needs only the top view."""
+    stays = simulate(load_scenario("snake_positioning", "z", {"duration_s": 4.0, "record.rate_hz": 10}))
+    figure = figures.overview(stays)
+    side = [axis for axis in figure.axes if axis.get_ylabel() == "height [m]"]
+    assert len(side) == 1
+    heads = [line.get_ydata()[-1] for line in side[0].lines if line.get_marker() == "o"]
+    rows = snake_view.moments(stays, figures.IN_A_PICTURE)
+    np.testing.assert_allclose(heads, stays["posture"][rows][:, 0, 2], atol=1e-9)
+    assert np.ptp(heads) > 0.01
+    plt.close(figure)
+    figure = figures.overview(record)
+    assert "height [m]" not in {axis.get_ylabel() for axis in figure.axes}
     plt.close(figure)
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import logging
 import os
 import signal
 import subprocess
@@ -16,7 +17,7 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 from processes import started, wait_for
-from sweep_work import DEADLY, REFUSED, once_deadly, square
+from sweep_work import DEADLY, REFUSED, once_deadly, square, warned
 
 import dynsim
 from dynsim.errors import DynsimError, ScenarioError
@@ -204,6 +205,24 @@ def test_a_task_outlives_the_process_that_it_had_first(tmp_path: Path):
     run_in_processes(once_deadly, tasks, 2, lambda task, result: taken.update({task[0]: result()}), attempts=2)
     assert (tmp_path / "seen").exists()
     assert taken == {number: number**2 for number in range(8)}
+
+
+@pytest.mark.parametrize("listens", [True, False])
+def test_workers_make_messages_only_for_who_listens(listens: bool, monkeypatch: pytest.MonkeyPatch):
+    heard: list[str] = []
+
+    class Ear(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            heard.append(record.getMessage())
+
+    library = logging.getLogger("dynsim")
+    # Those of pytest are at the root.
+    monkeypatch.setattr(library, "propagate", False)
+    monkeypatch.setattr(library, "handlers", [logging.NullHandler(), *([Ear()] if listens else [])])
+    made: dict[int, bool] = {}
+    run_in_processes(warned, range(3), 1, lambda number, result: made.update({number: result()}))
+    assert made == dict.fromkeys(range(3), listens)
+    assert sorted(heard) == ([f"number {number}" for number in range(3)] if listens else [])
 
 
 FIXED = SHORT | {"integrator.method": "rk4", "integrator.step_s": 1e-3}

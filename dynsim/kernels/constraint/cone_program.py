@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.jit import inlined_kernel, integers, internal_kernel, kernel, reals
+from dynsim.kernels.jit import integers, internal_kernel, kernel, reals
 
 ITERATIONS = 60
 # Of what must vanish, in units of a program whose numbers are near 1: the rounding of some dozen operations.
@@ -74,7 +74,7 @@ def program_size(n: int, m: int, cones: int, rows: int) -> int:
     return n * n + n + m * n + m + 3 * rows + n + m + (n + m) ** 2 + n + m + 2 * rows * n + 10 * rows + cones + n + m
 
 
-@inlined_kernel
+@internal_kernel
 def laid_out(flat, first, n, m, cones, rows):
     """A :class:`ConeProgram` in one array: a table with many arrays would be handed through every function.
 
@@ -204,7 +204,7 @@ def start(program: ConeProgram, n, m, cones):
             z[i] = s[i] / square * (1.0 if i == first[c] else -1.0)
 
 
-@inlined_kernel
+@internal_kernel
 def slope(program: ConeProgram, n, m, k):
     """(H x + g + Aᵀ y)_k."""
     total = program.g[k]
@@ -215,7 +215,7 @@ def slope(program: ConeProgram, n, m, k):
     return total
 
 
-@inlined_kernel
+@internal_kernel
 def equation(program: ConeProgram, n, e):
     """(A x − b)_e."""
     total = -program.b[e]

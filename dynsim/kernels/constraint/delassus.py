@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 from dynsim.kernels.arrays import FORCE, ORDER, RHS
-from dynsim.kernels.jit import apart_kernel, inlined_kernel, internal_kernel
+from dynsim.kernels.jit import apart_kernel, internal_kernel
 
 # A pivot below this fraction of the largest entry counts as a dependent row: far above rounding (1e-16 times a few
 # dozen operations), far below what independent elbows give (> 1e-6).
@@ -20,7 +20,7 @@ RANK_TOLERANCE = 1e-11
 POOR_PIVOT = 1e-4
 
 
-@inlined_kernel
+@internal_kernel
 def solve_small(small, state, active, p):
     """Solve the leading p×p of ``small[0]`` f = RHS for the constraint forces f, into the FORCE column of ``state``.
 

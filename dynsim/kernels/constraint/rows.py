@@ -71,7 +71,7 @@ from dynsim.kernels.constraint.unilateral import (
     STOP_ROW,
     UnilateralArrays,
 )
-from dynsim.kernels.jit import apart_kernel, inlined_kernel, internal_kernel
+from dynsim.kernels.jit import apart_kernel, internal_kernel
 
 
 @internal_kernel
@@ -185,7 +185,7 @@ def tangents(ws: Workspace, k):
     state[k, SECOND_TANGENT + 2] = x * ty - y * tx
 
 
-@inlined_kernel
+@internal_kernel
 def point_row(rows, r, x, y, z, dx, dy, dz):
     """Motion of a body's point at (x, y, z) along (dx, dy, dz), as row r."""
     rows[r, ROW], rows[r, ROW + 1], rows[r, ROW + 2] = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx

@@ -21,7 +21,7 @@ from dynsim.kernels.constraint.unilateral import (
     UnilateralArrays,
     note_stop_forces,
 )
-from dynsim.kernels.jit import apart_kernel, inlined_kernel, internal_kernel
+from dynsim.kernels.jit import apart_kernel, internal_kernel
 
 # A pivot below this fraction of the largest is a row that depends on the others.
 NULL_TOLERANCE = 1e-10
@@ -35,7 +35,7 @@ def margin(unilateral: UnilateralArrays, ws: Workspace, k):
     return unilateral.law[k, STATIC] * rows[r, FORCE] - math.sqrt(a * a + b * b)
 
 
-@inlined_kernel
+@internal_kernel
 def admissible_forces(unilateral: UnilateralArrays | None, ws: Workspace):
     """Replace the forces of dependent rows that stick where they do not lie in their cones; note those of stops.
 

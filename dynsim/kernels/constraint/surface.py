@@ -40,7 +40,7 @@ from dynsim.kernels.arrays import (
 )
 from dynsim.kernels.constraint.rows import point_row, sticking_rows
 from dynsim.kernels.constraint.unilateral import UnilateralArrays, slide_direction
-from dynsim.kernels.jit import exact_kernel, inlined_kernel, internal_kernel
+from dynsim.kernels.jit import exact_kernel, internal_kernel
 
 # Tries, beyond two per contact, to find signs of dissipative contacts that agree with their forces.
 SIGN_PASSES = 64
@@ -62,7 +62,7 @@ def surface_distance(value, slope, curvature):
     return 2.0 * value / (slope * (1.0 + math.sqrt(inner)))
 
 
-@inlined_kernel
+@internal_kernel
 def hessian_product(point, k, x, y, z):
     """(x, y, z)·Q (x, y, z) of the surface of contact k; point: (c, POINT_SIZE)."""
     return (
@@ -72,7 +72,7 @@ def hessian_product(point, k, x, y, z):
     )
 
 
-@inlined_kernel
+@internal_kernel
 def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: UnilateralArrays | None, ws: Workspace):
     """Position, gap, slip, constraint row and force direction of every candidate, after ``forward_sweep``.
 
@@ -141,7 +141,7 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: Unilat
             sticking_rows(model, ws, k, contacts.link[k, LINK])
 
 
-@inlined_kernel
+@internal_kernel
 def signed_friction(ws: Workspace, m):
     """σ μ of row m."""
     mu = ws.rows[m, ROW_MU]
@@ -164,7 +164,7 @@ def unit_force(rows, m, mu, x, y, z, nx, ny, nz, tx, ty, tz):
     rows[m, DIRECTION + 3], rows[m, DIRECTION + 4], rows[m, DIRECTION + 5] = fx, fy, fz
 
 
-@inlined_kernel
+@internal_kernel
 def turn_direction(ws: Workspace, m):
     """DIRECTION of row m for its present SIGN."""
     state, k = ws.contacts, ws.active[m, OWNER]
@@ -174,7 +174,7 @@ def turn_direction(ws: Workspace, m):
     unit_force(ws.rows, m, signed_friction(ws, m), x, y, z, nx, ny, nz, tx, ty, tz)
 
 
-@inlined_kernel
+@internal_kernel
 def sign_changed(ws: Workspace, passes):
     """True when dissipative contacts' solved forces contradict their assumed signs; turns those directions around.
 

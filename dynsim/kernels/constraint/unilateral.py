@@ -14,7 +14,7 @@ import numpy as np
 
 from dynsim.kernels.arrays import FORCE, MU, ContactArrays, Q, Workspace
 from dynsim.kernels.constraint.cone import CONE_ROOM
-from dynsim.kernels.jit import inlined_kernel
+from dynsim.kernels.jit import internal_kernel
 
 # UnilateralArrays.law; the kinetic coefficient is ContactArrays.point[:, MU].
 STATIC = 0  # static coefficient μ_s ≥ μ_k
@@ -95,7 +95,7 @@ class UnilateralArrays(NamedTuple):
     number: np.ndarray  # (NUMBERS,)
 
 
-@inlined_kernel
+@internal_kernel
 def slide_direction(unilateral: UnilateralArrays, contacts: ContactArrays, k, x, y, z):
     """Direction of slip of candidate k at tangential velocity (x, y, z), and its coefficient of friction there.
 
@@ -116,14 +116,14 @@ def slide_direction(unilateral: UnilateralArrays, contacts: ContactArrays, k, x,
     return a, b, c, sliding_friction(law, k, contacts.point[k, MU], speed)
 
 
-@inlined_kernel
+@internal_kernel
 def stop_gap(unilateral: UnilateralArrays, ws: Workspace, k):
     """What joint stop k leaves its joint to go, ≥ 0 [rad or m]."""
     stop = unilateral.stop
     return stop[k, SIDE] * ws.joints[unilateral.stop_table[k, STOP_JOINT], Q] - stop[k, LIMIT]
 
 
-@inlined_kernel
+@internal_kernel
 def note_stop_forces(unilateral: UnilateralArrays, ws: Workspace):
     """Forces of the joint stops from their rows; none where they are open."""
     table = unilateral.stop_table
@@ -132,7 +132,7 @@ def note_stop_forces(unilateral: UnilateralArrays, ws: Workspace):
         unilateral.stop[k, STOP_FORCE] = ws.rows[table[k, STOP_ROW], FORCE] if closed else 0.0
 
 
-@inlined_kernel
+@internal_kernel
 def sliding_friction(law, k, mu, speed):
     """Coefficient of friction of candidate k that slides at this speed, mu being the kinetic one."""
     if law[k, STRIBECK] > 0.0:

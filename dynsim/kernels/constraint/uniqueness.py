@@ -26,7 +26,7 @@ from dynsim.kernels.arrays import (
 )
 from dynsim.kernels.constraint.delassus import RANK_TOLERANCE
 from dynsim.kernels.constraint.surface import SIGNS_LIMIT
-from dynsim.kernels.jit import inlined_kernel, internal_kernel
+from dynsim.kernels.jit import internal_kernel
 
 UNIQUE, REVERSED, SEVERAL = 0, 1, 2
 
@@ -42,7 +42,7 @@ DIAGONAL_TOLERANCE = 1e-12
 FORCE_TOLERANCE = 1e-9
 
 
-@inlined_kernel
+@internal_kernel
 def clearly_unique(ws: Workspace):
     """True for no row, and for one or two without dissipative friction whose determinant is positive by far.
 

@@ -46,16 +46,16 @@ from dynsim.kernels.drive.dc import dc_balance, dc_block, dc_command, dc_torque
 from dynsim.kernels.drive.limit import clipped
 from dynsim.kernels.drive.servo import servo_block, servo_circuit, servo_command, servo_drag, servo_torque
 from dynsim.kernels.drive.torque import open_torque
-from dynsim.kernels.jit import inlined_kernel, internal_kernel
+from dynsim.kernels.jit import internal_kernel
 from dynsim.kernels.state import StateLayout
 
 for _law in (clipped, dc_balance, dc_block, dc_command, dc_torque, open_torque):
-    inlined_kernel(_law)
+    internal_kernel(_law)
 for _law in (servo_block, servo_circuit, servo_command, servo_drag, servo_torque):
-    inlined_kernel(_law)
+    internal_kernel(_law)
 
 
-@inlined_kernel
+@internal_kernel
 def evaluate_reference(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace):
     """References q_d and rates v_d of all drives at time t, into ``ws.motors`` [rad, rad/s; N m of an open torque]."""
     motors, c, line = ws.motors, reference.coefficients, drives.input
@@ -78,7 +78,7 @@ def evaluate_reference(drives: DriveArrays, reference: ReferenceArrays, t, ws: W
             motors[a, V_REF] = c1 + x * (2.0 * c2 + x * (3.0 * c3 + x * (4.0 * c4 + x * 5.0 * c5)))
 
 
-@inlined_kernel
+@internal_kernel
 def command(drives: DriveArrays, ws: Workspace, a):
     """What drive a is told to do, by its law at the present state, before limits [V; N m for an open torque]."""
     motor, i, kind = drives.motor, drives.table[a, DRIVEN], drives.table[a, DRIVE_KIND]
@@ -90,7 +90,7 @@ def command(drives: DriveArrays, ws: Workspace, a):
     return q_ref
 
 
-@inlined_kernel
+@internal_kernel
 def fed_forward(voltage, grid, t, a, asked):
     """The command of a drive with its planned voltage, where there are any."""
     if voltage is None:  # known to the compiler
@@ -104,7 +104,7 @@ def fed_forward(voltage, grid, t, a, asked):
     return asked + total
 
 
-@inlined_kernel
+@internal_kernel
 def drive_dc(drives: DriveArrays, asked, i, ws: Workspace, a):
     """The DC motor a at a command [V] and a current [A]."""
     motors, motor, j = ws.motors, drives.motor, drives.table[a, DRIVEN]
@@ -114,7 +114,7 @@ def drive_dc(drives: DriveArrays, asked, i, ws: Workspace, a):
     ws.joints[j, APPLIED] += dc_torque(motor, a, i)
 
 
-@inlined_kernel
+@internal_kernel
 def drive(drives: DriveArrays, reference: ReferenceArrays, t, y, layout: StateLayout, ws: Workspace):
     """Currents, voltages and rates of current of all drives into ``ws.motors``; their torques onto ``ws.joints``.
 

@@ -82,7 +82,7 @@ from dynsim.kernels.integrate.run import (
     TIME,
     Run,
 )
-from dynsim.kernels.jit import inlined_kernel, internal_kernel
+from dynsim.kernels.jit import internal_kernel
 from dynsim.kernels.state import IMPACT_LOSS
 from dynsim.kernels.system import System
 
@@ -275,14 +275,14 @@ def begin_slip(system: System, ws: Workspace, k, fx, fy):
     slide[k, NEXT_SPEED] = 0.0
 
 
-@inlined_kernel
+@internal_kernel
 def drops(system: System, k):
     """True for a candidate whose friction falls from a static coefficient to a smaller kinetic one when it slips."""
     law = system.unilateral.law
     return law[k, STRIBECK] == 0.0 and law[k, STATIC] > system.contacts.point[k, MU]
 
 
-@inlined_kernel
+@internal_kernel
 def friction_at_rest(system: System, k):
     """Coefficient of the cone of candidate k, which is at rest along its surface."""
     gives_way = system.unilateral.mode[k, GIVES_WAY] == 1

@@ -44,7 +44,7 @@ from dynsim.kernels.integrate.run import (
     VALUE,
     Run,
 )
-from dynsim.kernels.jit import inlined_kernel, internal_kernel
+from dynsim.kernels.jit import internal_kernel
 from dynsim.kernels.system import System
 from dynsim.kernels.tree.points import point_position
 from dynsim.kernels.tree.support import tip_margin
@@ -60,7 +60,7 @@ TIP_MARGIN = 9
 SEARCH_LIMIT, FALSI_LIMIT = 60, 16
 
 
-@inlined_kernel
+@internal_kernel
 def guard(system: System, t, ws: Workspace, run: Run, e):
     """Value of event e, zero where it happens, right after ``derivative`` at time t."""
     kind, k, value = run.event_table[e, EVENT_KIND], run.event_table[e, EVENT_INDEX], 0.0
@@ -100,14 +100,14 @@ def arm_events(system: System, ws: Workspace, run: Run):
     note_gaps(ws, run.gaps)
 
 
-@inlined_kernel
+@internal_kernel
 def happened(run: Run, e, value):
     """True when the guard of event e has passed zero in its direction once it has this value."""
     side, direction = run.event[e, SIDE], run.event_table[e, DIRECTION]
     return side != 0.0 and value * side <= 0.0 and (direction == 0 or direction * side < 0.0)
 
 
-@inlined_kernel
+@internal_kernel
 def event_tolerance(t):
     """Bracket of a root that is narrow enough [s]: some roundings of the time."""
     return 1e-13 + 1e-15 * abs(t)

@@ -13,7 +13,7 @@ from dynsim.kernels.arrays import CIRCUIT, DRIVEN, RATE_I, RATE_Q, RATE_V, Works
 from dynsim.kernels.compiler import form_of
 from dynsim.kernels.integrate.newton import NewtonArrays
 from dynsim.kernels.integrate.tableaux import ALPHA_RADAU, BETA_RADAU, GAMMA_RADAU
-from dynsim.kernels.jit import inlined_kernel, internal_kernel
+from dynsim.kernels.jit import internal_kernel
 from dynsim.kernels.lanes.number import four, turned
 from dynsim.kernels.lanes.system import FOUR
 from dynsim.kernels.lanes.tables import as_lanes, lane
@@ -115,7 +115,7 @@ def _compiled(*_: Any) -> bool:
     return True
 
 
-@inlined_kernel
+@internal_kernel
 def pair(real, z):
     """What x ∘ (p, m) multiplies by: a real number and a complex one."""
     return four(real, z.real, z.real, real), four(0.0, -z.imag, z.imag, 0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
 
 from dynsim.kernels.arrays import ContactArrays, DriveArrays, ModelArrays, ReferenceArrays, Workspace
+from dynsim.kernels.by_reference import Tables, parts_of
 from dynsim.kernels.lanes.number import INT32, Lanes, lanes_of
 
 # Axes of the float tables that may have lanes: one more, and the last one is the lanes. The others are shared by all.
@@ -34,9 +36,9 @@ AXES: dict[type, dict[str, int]] = {
 
 def aligned(*shape: int) -> np.ndarray:
     """Zeros of this shape that begin at a cache line, as whole vectors load fastest."""
-    size = int(np.prod(shape))
+    size = math.prod(shape)
     room = np.zeros(size + 8)
-    start = (-room.ctypes.data % 64) // 8
+    start = (-room.__array_interface__["data"][0] % 64) // 8
     return room[start : start + size].reshape(shape)
 
 
@@ -110,8 +112,8 @@ def _lane_type(kind: Any) -> Any:
         return types.float64
     if isinstance(kind, types.Array) and isinstance(kind.dtype, Lanes):
         return types.Array(types.float64, kind.ndim, "A", aligned=False)
-    if isinstance(kind, types.BaseNamedTuple):
-        return types.NamedTuple([_lane_type(part) for part in kind], kind.instance_class)
+    if isinstance(kind, Tables):
+        return Tables([_lane_type(part) for part in kind], kind.instance_class)
     return kind
 
 
@@ -121,8 +123,8 @@ def _lane(context: Any, builder: Any, value: Any, kind: Any, index: Any) -> Any:
         return value
     if isinstance(kind, Lanes):
         return builder.extract_element(value, builder.trunc(index, INT32))
-    if isinstance(kind, types.BaseNamedTuple):
-        parts = cgutils.unpack_tuple(builder, value, len(kind))
+    if isinstance(kind, Tables):
+        parts = parts_of(context, builder, kind, value)
         return context.make_tuple(
             builder, result, [_lane(context, builder, x, part, index) for x, part in zip(parts, kind, strict=True)]
         )
@@ -187,13 +189,13 @@ def tables_as_lanes(typingctx: Any, tables: Any, width: Any) -> Any:
 def _tables_type(kind: Any, count: int) -> Any:
     axes, parts = AXES.get(kind.instance_class, {}), []
     for name, part in zip(kind.fields, kind, strict=True):
-        if isinstance(part, types.BaseNamedTuple):
+        if isinstance(part, Tables):
             parts.append(_tables_type(part, count))
         elif isinstance(part, types.Array) and part.ndim == axes.get(name, part.ndim) + 1:
             parts.append(types.Array(Lanes(count), part.ndim - 1, "C", aligned=False))
         else:
             parts.append(part)
-    return types.NamedTuple(parts, kind.instance_class)
+    return Tables(parts, kind.instance_class)
 
 
 def _tables(context: Any, builder: Any, value: Any, kind: Any, result: Any) -> Any:
@@ -201,7 +203,7 @@ def _tables(context: Any, builder: Any, value: Any, kind: Any, result: Any) -> A
         return value
     if isinstance(kind, types.Array):
         return _as_lanes(context, builder, value, kind, result)
-    parts = cgutils.unpack_tuple(builder, value, len(kind))
+    parts = parts_of(context, builder, kind, value)
     return context.make_tuple(
         builder,
         result,

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from dynsim.kernels.arrays import Q
-from dynsim.kernels.jit import inlined_kernel
+from dynsim.kernels.jit import internal_kernel
 
 TWO_OVER_PI = 2.0 / math.pi
 HALF_PI_HIGH, HALF_PI_MIDDLE = 1.57079632673412561417, 6.07710050630396597660e-11
@@ -18,7 +18,7 @@ COS4, COS6, COS8 = 4.16666666666666019037e-02, -1.38888888888741095749e-03, 2.48
 COS10, COS12, COS14 = -2.75573143513906633035e-07, 2.08757232129817482790e-09, -1.13596475577881948265e-11
 
 
-@inlined_kernel
+@internal_kernel
 def sine_cosine_of(q):
     """Sine and cosine of one q; within one unit in the last place of libm's.
 
@@ -38,7 +38,7 @@ def sine_cosine_of(q):
     return sign * (s + odd * (c - s)), sign * (c - odd * (c + s))
 
 
-@inlined_kernel
+@internal_kernel
 def sine_cosine(joints, trig):
     """Sine and cosine of every q, into trig: (3, ≥ n), in vectors of several q."""
     for i in range(joints.shape[0]):

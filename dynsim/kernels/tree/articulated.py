@@ -35,11 +35,11 @@ from dynsim.kernels.arrays import (
     S,
     Workspace,
 )
-from dynsim.kernels.jit import apart_kernel, inlined_kernel, kernel
+from dynsim.kernels.jit import apart_kernel, internal_kernel, kernel
 from dynsim.kernels.tree.sweep import body_inertia, forward_sweep, inertial_wrench
 
 
-@inlined_kernel
+@internal_kernel
 def factor(model: ModelArrays, ws: Workspace):
     """Tips to root, after ``forward_sweep``: articulated inertias, and what the applied forces leave at each joint.
 
@@ -123,7 +123,7 @@ def factor(model: ModelArrays, ws: Workspace):
             f0, f1, f2, f3, f4, f5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
 
 
-@inlined_kernel
+@internal_kernel
 def row_system(model: ModelArrays, ws: Workspace):
     """The p×p system J M⁻¹ F f = target − J M⁻¹ applied, into ``ws.small[0]`` and the RHS column, after :func:`factor`.
 
@@ -304,7 +304,7 @@ def two_ended_row(model: ModelArrays, ws: Workspace, k):
     state[k, RHS] = total
 
 
-@inlined_kernel
+@internal_kernel
 def add_row_forces(model: ModelArrays, ws: Workspace):
     """Add the solved forces of all rows to the eliminated applied forces in ``ws.column[:, 0]``."""
     tree, column, state = model.tree, ws.column, ws.rows
@@ -321,7 +321,7 @@ def add_row_forces(model: ModelArrays, ws: Workspace):
             i = tree[i, PARENT]
 
 
-@inlined_kernel
+@internal_kernel
 def accelerate(model: ModelArrays, ws: Workspace):
     """Forward sweep: vdot = (M + J_m)⁻¹ b from the eliminated b in ``ws.column[:, 0]``. Uses F as scratch.
 

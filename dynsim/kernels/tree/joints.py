@@ -54,11 +54,11 @@ from dynsim.kernels.arrays import (
     V,
     Workspace,
 )
-from dynsim.kernels.jit import apart_kernel, inlined_kernel, internal_kernel, kernel
+from dynsim.kernels.jit import apart_kernel, internal_kernel, kernel
 from dynsim.kernels.tree.angles import sine_cosine_of
 
 
-@inlined_kernel
+@internal_kernel
 def row_motion(model: ModelArrays, ws: Workspace, i, b0, b1, b2, b3, b4, b5, b6, b7, b8, px, py, pz):
     """Pose and motion axis of row i of a joint with several rows.
 
@@ -117,7 +117,7 @@ def row_motion(model: ModelArrays, ws: Workspace, i, b0, b1, b2, b3, b4, b5, b6,
     return b0, b1, b2, b3, b4, b5, b6, b7, b8, px, py, pz, sx, sy, sz, lx, ly, lz
 
 
-@inlined_kernel
+@internal_kernel
 def row_rates(compound, model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
     """V and A of link i from its axis S, for every kind of joint: V = V_p + S v, A = A_p + V_b × S v + S vdot.
 
@@ -197,14 +197,14 @@ def read_positions(compound, model: ModelArrays, y, start, ws: Workspace):
             joints[i, EXTRA] = y[k + 2]
 
 
-@inlined_kernel
+@internal_kernel
 def quaternion_rate(w, x, y, z, a, b, c):
     """q̇ = ½ q ∘ (0, ω) of q = (w, x, y, z), from the angular velocity ω = (a, b, c) in the body."""
     a, b, c = 0.5 * a, 0.5 * b, 0.5 * c
     return -(x * a + y * b + z * c), w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a
 
 
-@inlined_kernel
+@internal_kernel
 def quaternion_turn(w, x, y, z, dw, dx, dy, dz):
     """vec(q̄ ∘ δq) of q = (w, x, y, z): half the turn, in the body, that changes a unit quaternion q by δq."""
     return w * dx - x * dw - y * dz + z * dy, w * dy - y * dw - z * dx + x * dz, w * dz - z * dw - x * dy + y * dx

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dynsim.kernels.arrays import APPLIED, PARENT, ModelArrays, P, R, S, V, Workspace
-from dynsim.kernels.jit import apart_kernel, inlined_kernel
+from dynsim.kernels.jit import apart_kernel, internal_kernel
 
 # LoadArrays.table, int
 LINK, IN_BODY, HOLDS, DATA, SEGMENTS = 0, 1, 2, 3, 4
@@ -26,7 +26,7 @@ class LoadArrays(NamedTuple):
     data: np.ndarray  # (…,) see POINT, WRENCH, FIRST_SEGMENT
 
 
-@inlined_kernel
+@internal_kernel
 def segment_start(loads: LoadArrays, k, t):
     """Place in ``loads.data`` of the segment of load k that t lies in, and the time to evaluate it at; −1 for none.
 
@@ -52,7 +52,7 @@ def segment_start(loads: LoadArrays, k, t):
     return first + low * SEGMENT_SIZE, t
 
 
-@inlined_kernel
+@internal_kernel
 def load_wrench(loads: LoadArrays, k, t, ws: Workspace):
     """Moment about the world origin and force of load k at time t in W [N m, N], after ``forward_sweep``."""
     links, table, data = ws.links, loads.table, loads.data

@@ -29,12 +29,12 @@ from dynsim.kernels.arrays import (
     V,
     Workspace,
 )
-from dynsim.kernels.jit import inlined_kernel, kernel
+from dynsim.kernels.jit import internal_kernel, kernel
 from dynsim.kernels.tree.angles import sine_cosine
 from dynsim.kernels.tree.joints import sweep_row
 
 
-@inlined_kernel
+@internal_kernel
 def forward_sweep(model: ModelArrays, ws: Workspace, velocity, acceleration, gravity):
     """Root to tips: pose, axis, velocity and acceleration of every link ([WM] eqs 36–41).
 
@@ -183,7 +183,7 @@ def forward_sweep(model: ModelArrays, ws: Workspace, velocity, acceleration, gra
             sweep_row(model.compound, model, ws, i, vi, ai, gx, gy, gz)
 
 
-@inlined_kernel
+@internal_kernel
 def body_inertia(model: ModelArrays, ws: Workspace, i):
     """Mass, centre of mass c in W, and inertia I_c about it in the axes of W (xx xy xz yy yz zz), after a sweep."""
     body, links = model.body, ws.links
@@ -204,7 +204,7 @@ def body_inertia(model: ModelArrays, ws: Workspace, i):
     return body[i, MASS], cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz
 
 
-@inlined_kernel
+@internal_kernel
 def inertial_wrench(ws: Workspace, i, m, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz):
     """Wrench about the world origin that moves body i as the sweep says: (I_c α + ω × I_c ω + c × m a_c, m a_c)."""
     links = ws.links

@@ -1,0 +1,208 @@
+"""Named tuples of dynsim in compiled code: a block of memory, passed by its address.
+
+numba flattens a tuple wherever a function is called: the tables of a model, a workspace and a run are some seven
+hundred numbers, so that more than half of what it wrote for a kernel took tuples apart and put them together again.
+Here a tuple lies in memory, the tuples in it within it, and what passes is one address; a field is one load.
+
+A tuple is never changed, so the address is declared to be the only way to what it holds (``noalias``), and loads are
+moved out of loops. A tuple that compiled code makes lives in the frame of the function that makes it, one for each
+place in the source: in a loop it holds until the same place makes the next one. Returned tuples are copied.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from llvmlite import ir
+from numba.core import cgutils, debuginfo, types
+from numba.core.base import BaseContext
+from numba.core.boxing import box_namedtuple
+from numba.core.datamodel import models, registry
+from numba.core.imputils import lower_getattr_generic
+from numba.core.pythonapi import NativeValue, box, unbox
+from numba.core.registry import cpu_target
+from numba.core.types.containers import BaseTuple
+
+_BYTE, _WORD = ir.IntType(8), ir.IntType(64)
+_ADDRESS = _BYTE.as_pointer()
+
+
+class Tables(types.NamedTuple):  # type: ignore[misc]
+    """Type of a named tuple that is passed by its address.
+
+    Its name says which, not what is in it: numba's name of a run is ten thousand letters long, and part of the name of
+    each function that is given one.
+    """
+
+    def __init__(self, kinds: Iterable[Any], cls: type) -> None:
+        self.types = tuple(kinds)
+        self.count = len(self.types)
+        self.fields = tuple(cls._fields)  # type: ignore[attr-defined]
+        self.instance_class = cls
+        digest = hashlib.sha256(repr([str(kind) for kind in self.types]).encode()).hexdigest()[:15]
+        self._hash = int(digest, 16)  # the same in every process: types are kept on disk with the kernels
+        types.Type.__init__(self, f"{cls.__name__}.{digest}")
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __eq__(self, other: object) -> bool:
+        return self is other or (isinstance(other, Tables) and self.key == other.key)
+
+
+_from_types = BaseTuple.from_types.__func__  # type: ignore[attr-defined]
+
+
+def _kind_of_tuple(cls: Any, kinds: Sequence[Any], pyclass: Any = None) -> Any:
+    """numba's choice of a type for a tuple, with dynsim's named tuples as :class:`Tables`."""
+    if pyclass is not None and hasattr(pyclass, "_asdict") and pyclass.__module__.startswith("dynsim."):
+        return Tables([types.unliteral(kind) for kind in kinds], pyclass)
+    return _from_types(cls, kinds, pyclass)
+
+
+BaseTuple.from_types = classmethod(_kind_of_tuple)
+
+
+@registry.register_default(Tables)
+class _TablesModel(models.DataModel):  # type: ignore[misc]
+    """The value is the address of the block; as data it is the block itself, in whole words."""
+
+    def __init__(self, dmm: Any, fe_type: Tables) -> None:
+        super().__init__(dmm, fe_type)
+        self.parts = [dmm.lookup(kind) for kind in fe_type]
+        target, end, self.starts, self.alignment = cpu_target.target_context.target_data, 0, [], 8
+        for part in self.parts:
+            kind = part.get_data_type()
+            inner = isinstance(part, _TablesModel)
+            alignment = part.alignment if inner else kind.get_abi_alignment(target)
+            end = -(-end // alignment) * alignment
+            self.starts.append(end)
+            end += part.size if inner else kind.get_abi_size(target)
+            self.alignment = max(self.alignment, alignment)
+        self.size = -(-end // self.alignment) * self.alignment
+
+    def get_value_type(self) -> Any:
+        return _ADDRESS
+
+    def get_data_type(self) -> Any:
+        return ir.ArrayType(_WORD, self.size // 8)
+
+    def get_argument_type(self) -> Any:
+        return _ADDRESS
+
+    def get_return_type(self) -> Any:
+        return self.get_data_type()
+
+    def as_argument(self, builder: Any, value: Any) -> Any:
+        return value
+
+    def from_argument(self, builder: Any, value: Any) -> Any:
+        if isinstance(value, ir.Argument):
+            for attribute in ("noalias", "captures(none)"):
+                value.add_attribute(attribute)
+        return value
+
+    def as_data(self, builder: Any, value: Any) -> Any:
+        return builder.load(builder.bitcast(value, self.get_data_type().as_pointer()))
+
+    def from_data(self, builder: Any, value: Any) -> Any:
+        block = self.room(builder)
+        builder.store(value, builder.bitcast(block, value.type.as_pointer()))
+        return block
+
+    as_return, from_return = as_data, from_data
+
+    def load_from_data_pointer(self, builder: Any, ptr: Any, align: int | None = None) -> Any:
+        return builder.bitcast(ptr, _ADDRESS)
+
+    def traverse(self, builder: Any) -> list[tuple[Any, Any]]:
+        return [(kind, lambda value, k=k: self.part(builder, value, k)) for k, kind in enumerate(self.fe_type)]
+
+    def inner_models(self) -> list[Any]:
+        return self.parts
+
+    def room(self, builder: Any) -> Any:
+        """A block in the frame of the function."""
+        with debuginfo.suspend_emission(builder), builder.goto_entry_block():
+            block = builder.alloca(ir.ArrayType(_BYTE, self.size))
+            block.align = self.alignment
+            return builder.bitcast(block, _ADDRESS)
+
+    def start(self, builder: Any, value: Any, k: int) -> Any:
+        """Address of part k."""
+        return builder.gep(value, [_WORD(self.starts[k])], inbounds=True) if self.starts[k] else value
+
+    def part(self, builder: Any, value: Any, k: int) -> Any:
+        """Part k of the tuple: of a tuple in it the address."""
+        model, start = self.parts[k], self.start(builder, value, k)
+        if isinstance(model, _TablesModel):
+            return start
+        kind = model.get_data_type()
+        start = builder.bitcast(start, kind.as_pointer())
+        if kind == model.get_value_type():
+            return builder.load(start)  # in one, and LLVM's to take apart
+        return model.load_from_data_pointer(builder, start)
+
+    def put(self, builder: Any, block: Any, k: int, value: Any) -> None:
+        """Part k of a block that is being made."""
+        model, start = self.parts[k], self.start(builder, block, k)
+        if isinstance(model, _TablesModel):
+            cgutils.raw_memcpy(builder, start, value, _WORD(model.size), 1)
+        else:
+            data = model.as_data(builder, value)
+            builder.store(data, builder.bitcast(start, data.type.as_pointer()))
+
+
+def parts_of(context: Any, builder: Any, kind: Any, value: Any) -> list[Any]:
+    """The parts of a named tuple in compiled code."""
+    model = context.data_model_manager[kind]
+    return [model.part(builder, value, k) for k in range(len(kind))]
+
+
+_make_tuple = BaseContext.make_tuple
+
+
+def _made(self: Any, builder: Any, typ: Any, values: Sequence[Any]) -> Any:
+    """numba's ``make_tuple``, into a block for :class:`Tables`."""
+    if not isinstance(typ, Tables):
+        return _make_tuple(self, builder, typ, values)
+    model = self.data_model_manager[typ]
+    block = model.room(builder)
+    for k, value in enumerate(values):
+        model.put(builder, block, k, value)
+    return block
+
+
+BaseContext.make_tuple = _made
+
+
+@lower_getattr_generic(Tables)
+def _field(context: Any, builder: Any, typ: Any, value: Any, attr: str) -> Any:
+    return context.data_model_manager[typ].part(builder, value, typ.fields.index(attr))
+
+
+@unbox(Tables)
+def _unboxed(typ: Any, obj: Any, c: Any) -> Any:
+    """numba's ``unbox_tuple``, part by part into a block. The number of parts is that of the class."""
+    model, cleanups = c.context.data_model_manager[typ], []
+    block, is_error = model.room(c.builder), cgutils.alloca_once_value(c.builder, cgutils.false_bit)
+    for k, kind in enumerate(typ):
+        native = c.unbox(kind, c.pyapi.tuple_getitem(obj, k))
+        model.put(c.builder, block, k, native.value)
+        with c.builder.if_then(native.is_error, likely=False):
+            c.builder.store(cgutils.true_bit, is_error)
+        if native.cleanup is not None:
+            cleanups.append(native.cleanup)
+
+    def cleanup() -> None:
+        for one in reversed(cleanups):
+            one()
+
+    return NativeValue(block, cleanup=cleanup if cleanups else None, is_error=c.builder.load(is_error))
+
+
+@box(Tables)
+def _boxed(typ: Any, value: Any, c: Any) -> Any:
+    return box_namedtuple(typ, cgutils.pack_struct(c.builder, parts_of(c.context, c.builder, typ, value)), c)
