@@ -102,7 +102,7 @@ class Driven(Protocol):
         """What there is to see now."""
 
     def joints(self) -> Mapping[str, Array]:
-        """Angles [rad] of what has a motor or turns with one, and rates [rad/s] where they are known, now.
+        """Angles of joints [rad], rates [rad/s] unless they are held from tick to tick, and which wheels are grounded.
 
         By the names of the record's signals, in the order of their labels.
         """

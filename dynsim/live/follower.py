@@ -27,6 +27,7 @@ from dynsim.errors import DynsimError, RecordError
 from dynsim.hardware.errors import CheckRefused
 from dynsim.hardware.replay.drive import lead
 from dynsim.hardware.replay.growing import Sample
+from dynsim.hardware.replay.lifting import SIGNAL as LIFTED
 from dynsim.hardware.replay.signals import ignore_stops
 from dynsim.hardware.replay.trajectory import column_of
 from dynsim.hardware.servo_map import ServoMap
@@ -86,11 +87,16 @@ class Columns:
     Raises
     ------
     CheckRefused
-        There is no such signal or column, or what it lacks a live drive does not have.
+        There is no such signal or column, a live drive does not have it, or the robot lifts wheels.
     """
 
     def __init__(self, still: Record, servo_map: ServoMap, driven: Driven) -> None:
         known = driven.joints()
+        if servo_map.lifts is not None or LIFTED in known:
+            raise CheckRefused(
+                "a robot that lifts wheel pairs cannot be driven on servos: they rise and sink by what comes later. "
+                "Drive it with `dynsim teleop`, and replay the record with `dynsim hw replay`"
+            )
         self._driven = driven
         self._position = np.array([servo.hold_at or 0.0 for servo in servo_map.servos])
         self._velocity = np.zeros(len(self._position))

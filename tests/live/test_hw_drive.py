@@ -365,6 +365,18 @@ def test_a_real_port_is_a_dry_run_without_live(drives: Callable[..., Drive], tmp
             virtual.kill()
 
 
+def test_snakes_are_refused(tmp_path: Path) -> None:
+    """With their wheels on the ground they would be dragged over it."""
+    for table in ("snake", "arm"):
+        refused = dynsim(
+            "hw", "drive", "snake_operator", "--map", table, "--port", "virtual", "--out", tmp_path / "out"
+        )
+        assert refused.returncode == 2
+        assert "lifts wheel pairs" in refused.stderr
+        assert "dynsim hw replay" in " ".join(refused.stderr.split())
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "text", "reason"),
     [
