@@ -273,6 +273,9 @@ def compare(
 
     bounds = load_gate(gate) if gate else None
     comparison = compare_records(Record.load(record), Record.load(measured))
+    folder = out or measured.parent
+    # First, because it refuses joints that are not there.
+    figure = draw_comparison(comparison, folder / "comparison.png", joints or ())
     table = Table("joint", "rms [rad]", "max [rad]", "at [s]", "rms, delay removed [rad]", "delay [ms]")
     for joint in comparison.joints:
         table.add_row(
@@ -300,9 +303,8 @@ def compare(
             )
         console.print(wheels)
     console.print(f"delay {comparison.delay * 1e3:.1f} ms, worst joint {comparison.worst.joint}")
-    folder = out or measured.parent
     write_json(folder / "comparison.json", comparison.summary())
-    console.print(f"figure: {draw_comparison(comparison, folder / 'comparison.png', joints or ())}")
+    console.print(f"figure: {figure}")
     if bounds:
         check_gate(comparison, bounds)
 
