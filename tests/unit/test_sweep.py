@@ -23,7 +23,7 @@ import dynsim
 from dynsim.errors import DynsimError, ScenarioError
 from dynsim.figures import sweep as pictures
 from dynsim.record import Record
-from dynsim.scenario import read_scenario
+from dynsim.scenario import SetOptions, read_scenario
 from dynsim.sensitivity import sensitivities, spread
 from dynsim.studies import sweep as module
 from dynsim.studies.columns import numbers
@@ -68,7 +68,10 @@ def test_values_of_a_grid(text: str, values: tuple[Any, ...]):
         (lambda: Law.parse("a=normal(1,0)"), "spread that is positive"),
         (lambda: Law.parse("a=uniform(2,1)"), "spread that is positive"),
         (lambda: plan(), "nothing to sweep"),
-        (lambda: plan(MASSES, MASSES), "varied twice"),
+        (
+            lambda: plan(MASSES, MASSES),
+            "--grid plant.chain.0.mass_kg: replaces what --grid plant.chain.0.mass_kg gives",
+        ),
         (lambda: plan(MASSES, count=3), "all runs would be the same"),
         (lambda: list(plan(laws=(Law.parse("loads.*.mass_kg=uniform(1,2)"),)).points()), "no entries"),
     ],
@@ -76,6 +79,44 @@ def test_values_of_a_grid(text: str, values: tuple[Any, ...]):
 def test_what_is_no_sweep_is_refused(make: Callable[[], Any], message: str):
     with pytest.raises(ScenarioError, match=message):
         make()
+
+
+CHAIN = read_scenario("link_tolerance")
+FIFTH, ANY_LINK = "plant.chain.5.mass_kg", "plant.chain.*.mass_kg"
+
+
+@pytest.mark.parametrize(
+    ("fixed", "grid", "drawn", "replacing", "replaced"),
+    [
+        ({}, [FIFTH], [ANY_LINK], f"--sample {ANY_LINK}", f"--grid {FIFTH}"),
+        ({}, [ANY_LINK], [FIFTH], f"--sample {FIFTH}", f"--grid {ANY_LINK}"),
+        ({}, [FIFTH, ANY_LINK], [], f"--grid {ANY_LINK}", f"--grid {FIFTH}"),
+        ({}, [], [FIFTH, ANY_LINK], f"--sample {ANY_LINK}", f"--sample {FIFTH}"),
+        ({}, ["plant.chain.05.mass_kg"], [ANY_LINK], f"--sample {ANY_LINK}", "--grid plant.chain.05.mass_kg"),
+        ({}, [FIFTH, "plant.chain.5"], [], "--grid plant.chain.5", f"--grid {FIFTH}"),
+        ({FIFTH: 0.1}, [ANY_LINK], [], f"--grid {ANY_LINK}", f"--set {FIFTH}"),
+        ({FIFTH: 0.1}, [], [FIFTH], f"--sample {FIFTH}", f"--set {FIFTH}"),
+    ],
+)
+def test_a_key_that_replaces_another_is_refused(
+    fixed: dict[str, Any], grid: list[str], drawn: list[str], replacing: str, replaced: str
+):
+    axes = tuple(Axis(key, (0.1, 0.2)) for key in grid)
+    laws = tuple(Law(key, "normal", (0.1, 0.01)) for key in drawn)
+    with pytest.raises(ScenarioError) as refused:
+        Plan(CHAIN, (None,), SetOptions(fixed), axes, laws)
+    message = str(refused.value)
+    assert message.startswith(f"{replacing}: replaces what {replaced} gives ")
+    assert "take one of the two away" in message
+    assert ("write out the entries" in message) == ("*" in message)
+
+
+def test_a_part_of_what_was_given_may_be_varied():
+    whole, law = (
+        Axis("plant.link", ({"length_m": 0.1}, {"length_m": 0.2})),
+        Law("plant.link.mass_kg", "normal", (1.0, 0.1)),
+    )
+    assert Plan(CHAIN, (None,), SetOptions({"plant": {}}), (whole,), (law,)).runs == 2
 
 
 def test_runs_are_variants_by_grid_by_samples():
