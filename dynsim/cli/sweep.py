@@ -86,7 +86,9 @@ def sweep(
     file = read_scenario(scenario)
     axes, laws = tuple(map(Axis.parse, grid or ())), tuple(map(Law.parse, sample or ()))
     plan = Plan(file, _variants(file.variants, variants), parsed_overrides(overrides), axes, laws, count, seed)
-    folder = out or Path("results", file.path.stem, "sweep")
+    # Which values make no scenario is known here, before processes and threads have work.
+    name = plan.scenario(next(plan.points())).name
+    folder = out or Path("results", name, "sweep")
     check_writable(folder, (PLAN, JOURNAL, *TABLES, STATISTICS))
     if scheduler is not None or min(jobs or cores(), plan.runs) > 1:
         # Meanwhile others simulate.
@@ -109,7 +111,7 @@ def sweep(
     if len(failed) > _SHOWN:
         errors.print(f"… and {len(failed) - _SHOWN} more; the table has all reasons")
     if not no_figures:
-        _draw(rows, plan, folder, quiet, format_)
+        _draw(name, rows, plan, folder, quiet, format_)
     if not quiet:
         if not has_parquet():
             console.print(escaped("No Parquet: it needs pyarrow (pip install 'dynsim[tables]')."), highlight=False)
@@ -144,11 +146,11 @@ def _load_for_the_end(samples: bool, figures: bool) -> None:
         import dynsim.figures.sweep  # noqa: F401
 
 
-def _draw(rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool, format_: str) -> None:
+def _draw(name: str, rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool, format_: str) -> None:
     from dynsim.figures.sweep import Sweep, draw
 
     table = Sweep(
-        plan.file.path.stem,
+        name,
         [row.cells() for row in rows if row.numbers],
         [axis.key for axis in plan.grid],
         plan.sampled,
