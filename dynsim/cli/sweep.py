@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from enum import StrEnum
 from pathlib import Path
 from threading import Thread
@@ -90,12 +91,16 @@ def sweep(
     name = plan.scenario(next(plan.points())).name
     folder = out or Path("results", name, "sweep")
     check_writable(folder, (PLAN, JOURNAL, *TABLES, STATISTICS))
-    if scheduler is not None or min(jobs or cores(), plan.runs) > 1:
-        # Meanwhile others simulate.
-        Thread(target=_load_for_the_end, args=(bool(laws), not no_figures), name="imports").start()
-    else:
+    others = scheduler is not None or min(jobs or cores(), plan.runs) > 1
+    if not others:
         keep_memory()
-    with sweep_progress(plan.runs, quiet) as report:
+    with sweep_progress(plan.runs, quiet) as told, _loading(bool(laws), not no_figures) as load:
+
+        def report(done: int, failed: int) -> None:
+            if others:
+                load()
+            told(done, failed)
+
         rows = run_sweep(
             plan,
             folder,
@@ -132,18 +137,39 @@ def _variants(known: Sequence[str], wanted: str | None) -> tuple[str | None, ...
     return tuple(known) if wanted == "all" else tuple(name.strip() for name in wanted.split(","))
 
 
+@contextmanager
+def _loading(samples: bool, figures: bool) -> Iterator[Callable[[], None]]:
+    """What tables, statistics and figures need is imported beside the runs, from the first call of what is yielded on.
+
+    Only then, and awaited at the end: modules cannot be imported any more when the command has ended.
+    """
+    thread = Thread(target=_load_for_the_end, args=(samples, figures), name="imports")
+
+    def load() -> None:
+        if thread.ident is None:
+            thread.start()
+
+    try:
+        yield load
+    finally:
+        if thread.ident is not None:
+            thread.join()
+
+
 def _load_for_the_end(samples: bool, figures: bool) -> None:
-    """Import what tables, statistics and figures need, half a second in all; what is missing is said there."""
-    from dynsim.studies.sweep import has_parquet
+    """Import what is needed there, half a second in all; what is missing, or broken, is said there too."""
+    # Also what a second Ctrl-C does, which ends the command before this.
+    with suppress(Exception):
+        from dynsim.studies.sweep import has_parquet
 
-    if has_parquet():
-        import pyarrow
+        if has_parquet():
+            import pyarrow
 
-        pyarrow.array([0.0])  # looks whether there is pandas
-    if samples:
-        import scipy.special  # noqa: F401
-    if figures:
-        import dynsim.figures.sweep  # noqa: F401
+            pyarrow.array([0.0])  # looks whether there is pandas
+        if samples:
+            import scipy.special  # noqa: F401
+        if figures:
+            import dynsim.figures.sweep  # noqa: F401
 
 
 def _draw(name: str, rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool, format_: str) -> None:

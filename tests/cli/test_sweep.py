@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from dynsim.scenario import find_scenario
 
 SHORT = ["--set", "duration_s=0.2", "--set", "metrics.settle_s=0.05"]
@@ -23,3 +25,22 @@ def test_a_sweep_is_named_by_its_scenario(tmp_path: Path):
     folder = tmp_path / "results" / "swinging" / "sweep"
     assert (folder / "sweep.csv").is_file()
     assert not (tmp_path / "results" / "scenario").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--grid", "plant.chain.0.lenght_m=0.5,1"], "lenght_m"),
+        (["--grid", f"{LENGTH}=0.5,1", "--out", "there"], "there holds a sweep"),
+    ],
+)
+def test_a_sweep_that_is_refused_says_one_line(tmp_path: Path, arguments: list[str], said: str):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "runs.jsonl").touch()
+    result = sweep("single_pendulum", "--jobs", "2", *arguments, folder=tmp_path)
+    assert result.returncode == 2
+    assert result.stdout.strip() == ""
+    assert result.stderr.startswith("error: ")
+    assert said in result.stderr.replace("\n", " ")
+    assert "Exception in thread" not in result.stderr
+    assert "Traceback" not in result.stderr
