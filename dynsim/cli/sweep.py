@@ -21,7 +21,7 @@ from dynsim.cli.app import (
     parsed_overrides,
 )
 from dynsim.cli.display import console, drawing, errors, sweep_progress
-from dynsim.errors import ScenarioError
+from dynsim.errors import ScenarioError, SimulationStopped
 from dynsim.terminal import escaped
 
 if TYPE_CHECKING:
@@ -72,7 +72,10 @@ def sweep(
     format_: FormatOption = FigureFormat.png,
     quiet: QuietOption = False,
 ) -> None:
-    """Simulate a scenario over a grid, and with samples, of its values; write a table of all runs and figures."""
+    """Simulate a scenario over a grid, and with samples, of its values; write a table of all runs and figures.
+
+    A run that fails is a row with its reason. Exit codes: 0 some run ended well, 2 bad input, 3 none did, 130 Ctrl-C.
+    """
     from dynsim.studies.processes import begin_early, cores, keep_memory
 
     if jobs is not None and scheduler is not None:
@@ -125,6 +128,8 @@ def sweep(
             highlight=False,
             soft_wrap=True,
         )
+    if len(failed) == len(rows):
+        raise SimulationStopped(f"none of the {len(rows)} runs ended well; {folder / TABLES[0]} has their reasons")
 
 
 def _variants(known: Sequence[str], wanted: str | None) -> tuple[str | None, ...]:

@@ -44,3 +44,13 @@ def test_a_sweep_that_is_refused_says_one_line(tmp_path: Path, arguments: list[s
     assert said in result.stderr.replace("\n", " ")
     assert "Exception in thread" not in result.stderr
     assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(("limits", "well", "code"), [("1,1e-9", 1, 0), ("1e-9,2e-9", 0, 3)])
+def test_a_sweep_without_a_good_run_has_failed(tmp_path: Path, limits: str, well: int, code: int):
+    grid = f"integrator.time_limit_h={limits}"
+    result = sweep("single_pendulum", "--grid", grid, *SHORT, "--jobs", "1", folder=tmp_path)
+    assert f"{well} of 2 runs ended well" in result.stdout
+    assert "run 1 failed: " in result.stderr
+    assert ("none of the 2 runs ended well" in result.stderr) == (well == 0)
+    assert result.returncode == code
