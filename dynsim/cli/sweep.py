@@ -185,6 +185,7 @@ def _draw(name: str, rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool,
         [row.cells() for row in rows if row.numbers],
         [axis.key for axis in plan.grid],
         plan.sampled,
+        plan.file.variants,
     )
     with drawing(folder, quiet):
         draw(table, folder, format_)
