@@ -106,9 +106,7 @@ class Columns:
             )
         self._lifts = servo_map.lifts
         if self._lifts is not None and self._lifts.signal not in known:
-            raise CheckRefused(
-                f"lifts.signal: a live drive has no {self._lifts.signal!r}; it has {', '.join(known)}"
-            )
+            raise CheckRefused(f"lifts.signal: a live drive has no {self._lifts.signal!r}; it has {', '.join(known)}")
         self._driven = driven
         self._position = np.array([servo.hold_at or 0.0 for servo in servo_map.servos])
         self._velocity = np.zeros(len(self._position))

@@ -172,8 +172,9 @@ class HeldBack:
 
     def _fold(self, held: _Held) -> Sample:
         sample = held.sample
-        height = np.where(np.isnan(held.up), 0.0, height_of(sample.time, held.up, held.down, self._lifts))[None]
-        fold = folded(self._part, held.yaw[None], height, self._lifts, np.array([sample.time]))
+        time = np.array([sample.time])
+        height = np.where(np.isnan(held.up), 0.0, height_of(time, held.up, held.down, self._lifts))[None]
+        fold = folded(self._part, held.yaw[None], height, self._lifts, time)
         lift = np.zeros(len(sample.position))
         lift[self._joints] = fold.hinge[0]
         return sample._replace(lift=lift)

@@ -170,7 +170,7 @@ def refuse_short_lift(lifts: Lifts, name: str, up: float, down: float, blends: i
         )
 
 
-def height_of(time: Array | float, up: Array | float, down: Array | float, lifts: Lifts) -> Array:
+def height_of(time: Array, up: Array | float, down: Array | float, lifts: Lifts) -> Array:
     """Height [m] at a time of what is lifted from ``up`` to ``down`` [s]; infinite ones are for ever."""
     since, until = (time - up) / lifts.blend_s, (down - time) / lifts.blend_s
     return 1e-3 * lifts.clearance_mm * _smooth(since) * _smooth(until)
