@@ -189,7 +189,10 @@ def _times(records: Mapping[str, Record], speed: float, fps: int) -> Array:
     """Instants of the frames, the last one that of the last sample."""
     start = min((float(record.time[0]) for record in records.values() if len(record)), default=0.0)
     end = max((float(record.time[-1]) for record in records.values() if len(record)), default=0.0)
-    steps = math.ceil(round((end - start) * fps / speed, 6))
+    frames = (end - start) * fps / speed
+    if not frames < encode.FRAMES_MAX:  # before there is a table of them
+        raise RecordError(f"{frames:.3g} frames are no film; take a higher --speed or a lower --fps")
+    steps = math.ceil(round(frames, 6))
     return np.minimum(start + np.arange(steps + 1) * (speed / fps), end)
 
 

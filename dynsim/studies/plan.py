@@ -49,7 +49,9 @@ class Axis:
         if found := _RANGE.fullmatch(value):
             start, stop, count = float(found[1]), float(found[2]), int(found[3])
             if not 2 <= count <= RUNS_MOST:
-                raise ScenarioError(f"--grid {text}: the count must be 2 or more, as both ends are included")
+                raise ScenarioError(
+                    f"--grid {text}: the count must be 2 or more, as both ends are included, and at most {RUNS_MOST}"
+                )
             # Twelve digits: 0.3 and not 0.30000000000000004.
             return cls(key, tuple(float(f"{x:.12g}") for x in np.linspace(start, stop, count)))
         values = parse_yaml(f"[{value}]", ScenarioError, f"--grid {key}", line_numbers=False)
@@ -85,6 +87,8 @@ class Law:
         a, b = float(found[2]), float(found[3])
         if not (b > 0.0 if found[1] == "normal" else b > a):
             raise ScenarioError(f"--sample {text}: {found[1]}({LAWS[found[1]]}) needs a spread that is positive")
+        if not (math.isfinite(a) and math.isfinite(b) and math.isfinite(b - a)):
+            raise ScenarioError(f"--sample {text}: numbers of that size cannot be drawn")
         return cls(key, found[1], (a, b))
 
     def draw(self, key: str, seed: int, count: int) -> list[float]:

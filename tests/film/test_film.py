@@ -316,6 +316,7 @@ def test_a_run_that_diverged_and_one_of_a_single_sample(braced: Record, tmp_path
         ({"speed": 0.0}, "speed"),
         ({"speed": float("nan")}, "speed"),
         ({"speed": 1e-5}, "frames are no film"),
+        ({"speed": 1e-300}, "frames are no film"),
         ({"speed": 0.001, "size": (960, 540)}, "too much memory"),
         ({"fps": 0}, "frames a second"),
         ({"plot": "no_such"}, "no signal 'no_such'"),

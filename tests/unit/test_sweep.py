@@ -76,6 +76,8 @@ def test_values_of_a_grid(text: str, values: tuple[Any, ...]):
         ),
         (lambda: plan(MASSES, count=3), "all runs would be the same"),
         (lambda: list(plan(laws=(Law.parse("loads.*.mass_kg=uniform(1,2)"),)).points()), "no entries"),
+        (lambda: Law.parse("k=uniform(-1e308,1e308)"), "numbers of that size"),
+        (lambda: Axis.parse("k=0:1:999999999999"), "at most"),
     ],
 )
 def test_what_is_no_sweep_is_refused(make: Callable[[], Any], message: str):
