@@ -27,19 +27,20 @@ from dynsim.errors import DynsimError, RecordError
 from dynsim.hardware.errors import CheckRefused
 from dynsim.hardware.replay.drive import lead
 from dynsim.hardware.replay.growing import Sample
+from dynsim.hardware.replay.held_back import HeldBack
 from dynsim.hardware.replay.lifting import SIGNAL as LIFTED
 from dynsim.hardware.replay.signals import ignore_stops
 from dynsim.hardware.replay.trajectory import column_of
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.live.session import Account, Session
 from dynsim.record import Record
-from dynsim.results import save_run
+from dynsim.results import save_drive
 from dynsim.scenario import Scenario
 
 NOT_YET = -math.inf
 """Time that the servos tell before they are where the simulation begins."""
 NICENESS = 5
-REGULAR, BROKEN = 0.0, 1.0
+REGULAR, BROKEN, NOT_LIFTED = 0.0, 1.0, 2.0
 """What is said behind a time that is no number: that the drive has ended, and how."""
 
 
@@ -76,9 +77,14 @@ class Done:
     failure: DynsimError | None
 
 
-def frame_of(servos: int) -> struct.Struct:
-    """A sample in the pipe: time, angles, rates. Shorter than what a pipe takes in one piece."""
-    return struct.Struct(f"={1 + 2 * servos}d")
+def frame_of(servos: int, lifting: int) -> struct.Struct:
+    """A sample in the pipe: time, angles, rates, and what lifting adds to both at the joints that lift wheels."""
+    return struct.Struct(f"={1 + 2 * (servos + lifting)}d")
+
+
+def lifting_columns(servo_map: ServoMap) -> list[int]:
+    """Joints that lift wheel pairs, by their place in the map."""
+    return [servo_map.joints.index(joint) for joint in servo_map.lifts.joints] if servo_map.lifts else []
 
 
 class Columns:
@@ -87,16 +93,20 @@ class Columns:
     Raises
     ------
     CheckRefused
-        There is no such signal or column, a live drive does not have it, or the robot lifts wheels.
+        There is no such signal or column, a live drive does not have it, or the robot lifts wheels and the map does
+        not say how.
     """
 
     def __init__(self, still: Record, servo_map: ServoMap, driven: Driven) -> None:
         known = driven.joints()
-        if servo_map.lifts is not None or LIFTED in known:
+        if servo_map.lifts is None and LIFTED in known:
             raise CheckRefused(
-                "a robot that lifts wheel pairs cannot be driven on servos: they rise and sink by what comes later. "
-                "Drive it with `dynsim teleop`, and replay the record with `dynsim hw replay`"
+                "the robot lifts wheel pairs and the servo map does not say how: without it they would drag over the "
+                "floor. Add an entry `lifts` to the map"
             )
+        self._lifts = servo_map.lifts
+        if self._lifts is not None and self._lifts.signal not in known:
+            raise CheckRefused(f"lifts.signal: a live drive has no {self._lifts.signal!r}; it has {', '.join(known)}")
         self._driven = driven
         self._position = np.array([servo.hold_at or 0.0 for servo in servo_map.servos])
         self._velocity = np.zeros(len(self._position))
@@ -130,6 +140,18 @@ class Columns:
                 self._velocity[index] = joints[rates][of_rates]
         return self._position, self._velocity
 
+    def sample(self) -> Sample:
+        """The same, at the time of the simulation."""
+        position, velocity = self.now()
+        return Sample(self._driven.time, position.copy(), velocity.copy())
+
+    def base(self, yaw: tuple[str, list[int]]) -> tuple[Array, Array]:
+        """Yaw angles of the base part, from columns of a signal [rad], and which wheel pairs are on the ground."""
+        assert self._lifts is not None
+        joints = self._driven.joints()
+        signal, columns = yaw
+        return joints[signal][columns], joints[self._lifts.signal]
+
 
 class ServoFollower:
     """A :class:`~dynsim.live.session.Follower` behind a pipe.
@@ -138,17 +160,31 @@ class ServoFollower:
     ----------
     driven : the simulation
     columns : what of it the servos follow
-    ahead : by how much it may be ahead of them [s]
+    ahead : by how much it may be ahead of them [s], besides what is held back
     samples : the pipe
     heard : shared memory with the time of the servos [s]
+    lifting : which of the servos lift wheel pairs
+    held_back : where they do
     """
 
-    def __init__(self, driven: Driven, columns: Columns, ahead: float, samples: Connection, heard: Any) -> None:
-        self._driven, self._columns, self._ahead = driven, columns, ahead
+    def __init__(
+        self,
+        driven: Driven,
+        columns: Columns,
+        ahead: float,
+        samples: Connection,
+        heard: Any,
+        lifting: list[int],
+        held_back: HeldBack | None,
+    ) -> None:
+        self._driven, self._columns = driven, columns
+        self._ahead = ahead + (held_back.delay if held_back is not None else 0.0)
         self._samples, self._heard = samples, heard
-        position, velocity = columns.now()
-        self._frame = frame_of(len(position))
-        self.first = Sample(0.0, position.copy(), velocity.copy())
+        self._lifting, self._held_back = lifting, held_back
+        self.first = columns.sample()
+        self._frame = frame_of(len(self.first.position), len(lifting))
+        if held_back is not None:
+            self.first = held_back.begin(self.first, *columns.base(held_back.yaw))
 
     @property
     def begun(self) -> bool:
@@ -158,14 +194,33 @@ class ServoFollower:
     def ready(self) -> bool:
         return (self._driven.ticks + 1) * self._driven.period <= self._heard[0] + self._ahead
 
+    @property
+    def steady(self) -> bool:
+        return self._held_back is None or self._held_back.steady(self._driven.time)
+
     def hear(self) -> None:
-        position, velocity = self._columns.now()
-        self._write(self._driven.time, *position, *velocity)
+        sample = self._columns.sample()
+        if self._held_back is None:
+            self._tell(sample)
+            return
+        for whole in self._held_back.add(sample, *self._columns.base(self._held_back.yaw)):
+            self._tell(whole)
+
+    def finish(self) -> None:
+        """There was no tick that is not to be followed: what is held back goes on."""
+        for sample in self._held_back.rest() if self._held_back is not None else []:
+            self._tell(sample)
 
     def end(self, how: float) -> None:
         """There are no more samples."""
-        self._write(math.nan, how, *[0.0] * (len(self._columns.now()[0]) * 2 - 1))
+        self._write(math.nan, how, *[0.0] * (self._frame.size // 8 - 2))
         self._samples.close()
+
+    def _tell(self, sample: Sample) -> None:
+        added: list[float] = []
+        for one in (sample.lift, sample.lift_rate) if self._lifting else ():
+            added += np.asarray(one)[self._lifting].tolist()
+        self._write(sample.time, *sample.position, *sample.velocity, *added)
 
     def _write(self, *numbers: float) -> None:
         # Servos that are gone are told of elsewhere.
@@ -188,35 +243,43 @@ def simulate(wanted: Wanted, control: Connection, samples: Connection, heard: An
         driven = drive(wanted.scenario, pace=wanted.pace, limit=wanted.longest)
         still = driven.still()
         columns = Columns(still, wanted.servo_map, driven)
-        follower = ServoFollower(driven, columns, lead(wanted.servo_map), samples, heard)
+        held_back = HeldBack(still, wanted.servo_map, driven.period) if wanted.servo_map.lifts else None
+        lifting = lifting_columns(wanted.servo_map)
+        follower = ServoFollower(driven, columns, lead(wanted.servo_map), samples, heard, lifting, held_back)
         session = Session(driven, wanted.scenario.variant or wanted.scenario.name, follower)
         address = session.open(wanted.http_port)
     except Exception as error:
         _say(control, error if isinstance(error, DynsimError) else DynsimError(f"the simulation failed: {error!r}"))
         return
     how = BROKEN
+    refused: CheckRefused | None = None
     try:
         ending.of(session)
         _say(control, Ready(address, still, follower.first, driven.period))
         account = session.run(until_closed=wanted.until_closed)
-        how = BROKEN if account.stop is not None else REGULAR
+        if account.stop is None:
+            follower.finish()
+            how = REGULAR
+    except CheckRefused as error:
+        how, refused, account = NOT_LIFTED, error, session.account
+        account.ended = str(error)
     except DynsimError as error:
         account = session.account
         account.ended = str(error)
     finally:
         follower.end(how)
         session.close()
-    _say(control, _saved(driven, account, wanted.folder))
+    _say(control, _saved(driven, account, wanted.folder, refused))
 
 
-def _saved(driven: Driven, account: Account, folder: Path) -> Done:
+def _saved(driven: Driven, account: Account, folder: Path, refused: CheckRefused | None) -> Done:
     time = driven.ticks * driven.period
     stop, account.stop = account.stop, None  # it holds a record, which need not go through the pipe
     if driven.ticks == 0:
         return Done(account, time, saved=False, failure=stop)
-    failure: DynsimError | None = None if stop is None else type(stop)(str(stop))
+    failure: DynsimError | None = refused if stop is None else type(stop)(str(stop))
     try:
-        save_run(driven.record() if stop is None or stop.record is None else stop.record, folder)
+        save_drive(driven.record() if stop is None or stop.record is None else stop.record, folder)
     except DynsimError as error:
         return Done(account, time, saved=False, failure=error)
     except Exception as error:
@@ -244,7 +307,7 @@ class _Ending:
         with self._lock:
             self._session = session
             if self._why:
-                session.end(self._why)
+                session.end(self._why, at_once=True)
 
     def _listen(self) -> None:
         try:
@@ -257,4 +320,4 @@ class _Ending:
         with self._lock:
             self._why = why
             if self._session is not None:
-                self._session.end(why)
+                self._session.end(why, at_once=True)

@@ -15,10 +15,26 @@ import numpy as np
 from dynsim import interruption
 from dynsim.errors import DynsimError
 from dynsim.hardware.replay.growing import Sample
-from dynsim.live.follower import BROKEN, NOT_YET, Done, Ready, Wanted, frame_of, simulate
+from dynsim.hardware.replay.motion import Array
+from dynsim.hardware.servo_map import ServoMap
+from dynsim.live.follower import (
+    BROKEN,
+    NOT_LIFTED,
+    NOT_YET,
+    Done,
+    Ready,
+    Wanted,
+    frame_of,
+    lifting_columns,
+    simulate,
+)
 from dynsim.studies.processes import signals_held
 
 PIECE = 1 << 16
+FAULTS = {
+    BROKEN: "the simulation has ended by itself",
+    NOT_LIFTED: "wheel pairs cannot be lifted as the pilot's robot has them",
+}
 LOOK = 0.2
 """Between two looks for a Ctrl-C while the simulation is waited for [s]."""
 PATIENCE = 5.0
@@ -34,12 +50,13 @@ class PipeFeed:
     fault : str
     """
 
-    def __init__(self, samples: Connection, heard: Any, servos: int) -> None:
+    def __init__(self, samples: Connection, heard: Any, servo_map: ServoMap) -> None:
         self.over, self.fault = False, ""
         self._descriptor = samples.fileno()
         os.set_blocking(self._descriptor, False)
         self._samples, self._heard = samples, heard
-        self._servos, self._frame = servos, frame_of(servos)
+        self._servos, self._lifting = len(servo_map.servos), lifting_columns(servo_map)
+        self._frame = frame_of(self._servos, len(self._lifting))
         self._bytes = b""
         self._gone = False
 
@@ -52,9 +69,9 @@ class PipeFeed:
             self._bytes = self._bytes[size:]
             time, values = float(numbers[0]), numbers[1:]
             if time == time:
-                found.append(Sample(time, values[: self._servos], values[self._servos :]))
-            elif values[0] == BROKEN:
-                self.fault = "the simulation has ended by itself"
+                found.append(self._sample(time, values))
+            elif values[0] in FAULTS:
+                self.fault = FAULTS[values[0]]
             else:
                 self.over = True
         if self._gone and len(self._bytes) < size and not self.over and not self.fault:
@@ -67,6 +84,15 @@ class PipeFeed:
     def close(self) -> None:
         """Nothing more is wanted."""
         self._samples.close()
+
+    def _sample(self, time: float, values: Array) -> Sample:
+        count, joints = self._servos, self._lifting
+        position, velocity, added = values[:count], values[count : 2 * count], values[2 * count :]
+        if not joints:
+            return Sample(time, position, velocity)
+        lift = np.zeros((2, count))
+        lift[:, joints] = added.reshape(2, -1)
+        return Sample(time, position, velocity, lift[0], lift[1])
 
     def _read(self) -> None:
         with suppress(BlockingIOError):
@@ -98,7 +124,7 @@ class SimulationProcess:
         # Their ends here would hide the end of the process.
         control.close()
         there.close()
-        self.feed = PipeFeed(samples, heard, len(wanted.servo_map.servos))
+        self.feed = PipeFeed(samples, heard, wanted.servo_map)
 
     def __enter__(self) -> SimulationProcess:
         return self

@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 import threading
 import time as clock
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from typing import Any, Protocol
 
 import numpy as np
 
 from dynsim import interruption
-from dynsim.engine.driven import Driven, Shown
+from dynsim.engine.driven import NO_REQUEST, Driven, Order, Shown
 from dynsim.errors import DynsimError, SimulationStopped
-from dynsim.live.helm import Helm
+from dynsim.live.helm import DRIVING, Helm
 from dynsim.live.pace import Pace
 from dynsim.live.server import FRAMES, Server
 from dynsim.record.quaternion import rotated
@@ -56,6 +56,10 @@ class Follower(Protocol):
     def ready(self) -> bool:
         """It is near enough for another tick."""
 
+    @property
+    def steady(self) -> bool:
+        """The robot may change its mode now, and the drive may end."""
+
     def hear(self) -> None:
         """There was a tick."""
 
@@ -75,7 +79,8 @@ class Session:
         self._follower = follower
         self._shown = -1.0
         self._over = threading.Event()
-        self._ended = ""
+        self._ended, self._at_once = "", False
+        self._asked = NO_REQUEST
         self.helm = Helm(driven.axes, clock.monotonic)
         hello = {
             "axes": [{"name": a.name, "group": a.group, "unit": a.unit, "limit": a.limit} for a in driven.axes],
@@ -113,7 +118,7 @@ class Session:
                 if self._is_over(until_closed):
                     break
                 order, state, count = self.helm.order()
-                driven.tick(order)
+                driven.tick(self._followed(order, state))
                 if self._follower is not None:
                     self._follower.hear()
                 account.late.append(pace.late)
@@ -127,21 +132,37 @@ class Session:
         interruption.keep()
         return account
 
-    def end(self, why: str = "ended by the pilot") -> None:
-        """Let the drive be over before its next tick; from any thread."""
+    def end(self, why: str = "ended by the pilot", *, at_once: bool = False) -> None:
+        """Let the drive be over before its next tick, or once its follower is steady; from any thread."""
         self._ended = self._ended or why
+        self._at_once = self._at_once or at_once
         self._over.set()
 
+    def _followed(self, order: Order, state: str) -> Order:
+        """An order of which the follower can do all: a request waits for it, for as long as the key is held."""
+        if self._follower is None:
+            return order
+        if self._over.is_set() or state != DRIVING:
+            self._asked = NO_REQUEST
+            return order if not self._over.is_set() else Order((0.0,) * len(order.velocity), closed=order.closed)
+        self._asked = order.request if order.request != NO_REQUEST else self._asked
+        request = self._asked if self._follower.steady else NO_REQUEST
+        self._asked = NO_REQUEST if request == self._asked else self._asked
+        return replace(order, request=request)
+
     def _is_over(self, until_closed: bool) -> bool:
-        if self._over.is_set() or self.driven.finished:
+        if until_closed and self.server.came and not self.server.clients:
+            self.end("the last browser was closed")
+        if self.driven.finished or (self._over.is_set() and self._may_end()):
             self.account.ended = self._ended or "the longest time is over"
-        elif until_closed and self.server.came and not self.server.clients:
-            self.account.ended = "the last browser was closed"
         elif self.server.failure is not None:
             raise DynsimError(f"the server ended: {self.server.failure!r}")
         else:
             return False
         return True
+
+    def _may_end(self) -> bool:
+        return self._at_once or self._follower is None or self._follower.steady or self.driven.ticks == 0
 
     def _wait_for_follower(self, pace: Pace, until_closed: bool) -> None:
         """Whoever holds the key when a robot has come to its start must let it go first."""
@@ -150,7 +171,8 @@ class Session:
             if not follower.begun:
                 self.helm.disarm()
                 self._show(NOT_READY, self.helm.order()[2], pace)
-            self._over.wait(WAIT)
+            # Not on the event: it is set where a drive goes on until its follower is steady.
+            clock.sleep(WAIT)
 
     def _show(self, state: str, count: int, pace: Pace) -> None:
         now = clock.monotonic()
@@ -164,7 +186,7 @@ class Session:
             "time": round(shown.time, 4),
             "poses": np.round(shown.poses, 5).ravel().tolist(),
             "hand": np.round(shown.hand, 4).tolist(),
-            "waiting": shown.waiting,
+            "hindrance": shown.hindrance,
             "state": state,
             "n": count,
             "late": round(1e3 * pace.late, 1),

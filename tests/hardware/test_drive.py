@@ -382,7 +382,7 @@ def test_what_cannot_begin_is_refused(rig: Rig) -> None:
     def begin(position: Array, velocity: Array, **options: Any) -> DrivenMotion:
         return check_drive(Sample(0.0, position, velocity), rig.map, feed, step=STEP, longest=10.0, **options)
 
-    assert begin(zero, zero).start is zero
+    assert np.array_equal(begin(zero, zero).start, zero)
     with pytest.raises(CheckRefused, match=r"would begin beyond 1 limit.*\n.*elbow: position"):
         begin(np.array([0.0, 1.2, 0.0]), zero)
     with pytest.raises(CheckRefused, match=r"begins in motion \(shoulder\)"):
@@ -420,7 +420,7 @@ def test_sample_by_sample_the_limits_are_those_of_the_check(
     causes: set[str] = set()
     for seed in range(40):
         time, angle, rate = noisy(seed, 0.03 * (seed / 40) ** 4)
-        growing = GrowingPath(angle[0], servo_map)
+        growing = GrowingPath(Sample(0.0, angle[0], np.zeros(3)), servo_map)
         growing._held[:] = held
         broken = [
             words
@@ -444,7 +444,7 @@ def test_sample_by_sample_the_limits_are_those_of_the_check(
 
 
 def test_a_path_that_grows_forgets_only_what_nobody_asks_for(rig: Rig) -> None:
-    growing = GrowingPath(swinging(0.0)[0], rig.map)
+    growing = GrowingPath(Sample(0.0, *swinging(0.0)), rig.map)
     times = STEP * np.arange(1, 8000)
     for time in times:
         assert growing.append(Sample(time, *swinging(time)), keep=time - 0.5) == []

@@ -109,8 +109,8 @@ class BasePart:
             reach = np.column_stack([-self.before[j] - self.behind[j] * cos, -self.behind[j] * sin, zero])
             axle = np.column_stack([-sin, cos, zero])
             rise, slope, half = _turned(up, reach), _turned(up, axle), self.half_track[j + 1]
-            needed = [self._angle(z - height[:, j + 1], rise, slope, side * half) for side in (1, -1)]
-            hinge[:, j] = psi = np.maximum(*needed)
+            needed = self._angle(z - height[:, j + 1], rise, slope, np.array([[half], [-half]]))
+            hinge[:, j] = psi = needed.max(axis=0)
             if not np.isfinite(psi).all():
                 raise ArithmeticError(int(np.flatnonzero(~np.isfinite(psi))[0]), j + 1)
             z = z + _at(rise, psi)
@@ -122,9 +122,12 @@ class BasePart:
             up = np.column_stack([cos * x + sin * y, cos * y - sin * x, up_z])  # Rz(theta)^T
         return Fold(hinge, lower, tilt)
 
-    def _angle(self, above: Array, rise: tuple[Array, ...], slope: tuple[Array, ...], lever: float) -> Array:
-        """psi where above + rise + lever slope - r sqrt(1 - slope^2) = 0, by Newton's method; NaN where it is lost."""
-        psi = np.zeros_like(above)
+    def _angle(self, above: Array, rise: tuple[Array, ...], slope: tuple[Array, ...], lever: Array) -> Array:
+        """psi where above + rise + lever slope - r sqrt(1 - slope^2) = 0, by Newton's method; NaN where it is lost.
+
+        For several levers, shape (M, 1): shape (M, T).
+        """
+        psi = np.zeros((len(lever), len(above)))
         with np.errstate(all="ignore"):
             for _ in range(NEWTON_STEPS):
                 incline, rate = _at(slope, psi), _rate(slope, psi)
@@ -132,6 +135,9 @@ class BasePart:
                 value = above + _at(rise, psi) + lever * incline - self.radius * disc
                 step = value / (_rate(rise, psi) + lever * rate + self.radius * incline * rate / disc)
                 psi = psi - step
+                # The next one would be of its square.
+                if (np.abs(step) < CONVERGED).all():
+                    break
         return np.where(np.abs(step) < CONVERGED, psi, np.nan)
 
 

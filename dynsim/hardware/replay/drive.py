@@ -62,7 +62,10 @@ class Feed(Protocol):
         ...
 
     def tell(self, time: float) -> None:
-        """The servos are at this time of the simulation [s]; it may go on to :func:`lead` beyond."""
+        """The servos are at this time of the simulation [s]; it may go on to :func:`lead` beyond.
+
+        By more where its postures are held back (:mod:`dynsim.hardware.replay.held_back`).
+        """
         ...
 
 
@@ -79,8 +82,8 @@ class DrivenMotion:
     ----------
     servo_map : ServoMap
     feed : Feed
-    start : array, shape (N,)
-        Posture at time 0 [rad].
+    first : Sample
+        Where it begins.
     step : float
         Between two samples [s].
     plan : CyclePlan
@@ -91,12 +94,17 @@ class DrivenMotion:
 
     servo_map: ServoMap
     feed: Feed
-    start: Array
+    first: Sample
     step: float
     plan: CyclePlan
     duration: float
     scene: Scene | None = None
     speed: float = 1.0
+
+    @property
+    def start(self) -> Array:
+        """Posture in which it begins [rad], shape (N,)."""
+        return self.first.posture
 
     def needs(self) -> list[Needs]:
         """Where it will go is not known: all that the map allows."""
@@ -125,7 +133,7 @@ def check_drive(
     """
     plan = plan_cycle(servo_map, rate if rate is not None else servo_map.bus.rate)
     still = np.zeros((1, len(first.position)))
-    start = Path(np.array([0.0, step]), np.stack([first.position, first.position]), still, still, step)
+    start = Path(np.array([0.0, step]), np.stack([first.posture, first.posture]), still, still, step)
     broken = [margin for margin in motion_margins(start, servo_map, 1.0) if not margin.holds]
     if broken:
         lines = "\n".join(f"  {margin}" for margin in broken)
@@ -136,7 +144,7 @@ def check_drive(
         raise CheckRefused(
             f"the simulation begins in motion ({names}); servos begin at rest: let its rates begin at zero"
         )
-    return DrivenMotion(servo_map, feed, first.position, step, plan, longest, scene)
+    return DrivenMotion(servo_map, feed, first, step, plan, longest, scene)
 
 
 class DrivenCourse:
@@ -150,7 +158,7 @@ class DrivenCourse:
         self.time, self.speed = 0.0, 0.0
         self._motion, self._feed = motion, motion.feed
         self._stop_time = motion.servo_map.safety.stop_time
-        self._path = GrowingPath(motion.start, motion.servo_map)
+        self._path = GrowingPath(motion.first, motion.servo_map)
         self._silent = 0.0
 
     @property

@@ -21,11 +21,22 @@ KNOTS = 1024
 
 
 class Sample(NamedTuple):
-    """One posture: time [s], joint angles [rad] and rates [rad/s], shape (N,), in the order of the map."""
+    """One posture: time [s], joint angles [rad] and rates [rad/s], shape (N,), in the order of the map.
+
+    ``lift`` and ``lift_rate`` are what lifting wheel pairs adds to them, as in
+    :func:`~dynsim.hardware.replay.trajectory.path_of_record`.
+    """
 
     time: float
     position: Array
     velocity: Array
+    lift: Array | float = 0.0
+    lift_rate: Array | float = 0.0
+
+    @property
+    def posture(self) -> Array:
+        """Where the joints are to be [rad], shape (N,)."""
+        return self.position + self.lift
 
 
 class Interval(NamedTuple):
@@ -54,22 +65,22 @@ class GrowingPath:
 
     Parameters
     ----------
-    start : array, shape (N,)
-        Where it rests at time 0 [rad].
+    first : Sample
+        Where it rests.
     servo_map : ServoMap
     """
 
-    def __init__(self, start: Array, servo_map: ServoMap) -> None:
-        servos, count = servo_map.servos, len(start)
+    def __init__(self, first: Sample, servo_map: ServoMap) -> None:
+        servos, count = servo_map.servos, len(first.position)
         self._map = servo_map
         self._held = np.array([servo.kind.follows.rates == "held" for servo in servos])
         self._time, self._position = np.zeros(KNOTS), np.zeros((KNOTS, count))
         # Of the interval that ends at a knot.
         self._after, self._before = np.zeros((KNOTS, count)), np.zeros((KNOTS, count))
-        self._position[0], self._count = start, 1
+        self._time[0], self._position[0], self._count = first.time, first.posture, 1
         # Of acceleration, of velocity that is gained and that is lost, summed up to every knot.
         self._varied, self._gained, self._lost = (np.zeros((KNOTS, count)) for _ in range(3))
-        self._rate = np.zeros(count)
+        self._last = first
         self._interval_before: Interval | None = None
         limits = [servo.kind.limits for servo in servos]
         bounds = np.array([position_bounds(s) if s.in_position_mode else s.position_limits for s in servos])
@@ -96,7 +107,7 @@ class GrowingPath:
         if self._count == len(self._time):
             self._make_room(min(keep, self.end - SHAKING_WINDOW))
         k = self._count
-        self._time[k], self._position[k] = sample.time, sample.position
+        self._time[k], self._position[k] = sample.time, sample.posture
         with np.errstate(all="ignore"):  # what is no number holds no bound
             interval = self._interval(sample)
             self._after[k], self._before[k] = interval.after, interval.before
@@ -105,15 +116,18 @@ class GrowingPath:
         if not surely and (broken := self._broken()):
             self._count -= 1
             return broken
-        self._interval_before, self._rate = interval, sample.velocity
+        self._interval_before, self._last = interval, sample
         return []
 
     def _interval(self, sample: Sample) -> Interval:
         """That ends at the sample."""
-        k, held, before = self._count, self._held, self._interval_before
-        h, rise = sample.time - self._time[k - 1], sample.position - self._position[k - 1]
-        straight = rise / h
-        left, right = np.where(held, straight, self._rate), np.where(held, straight, sample.velocity)
+        k, held, last_one, before = self._count, self._held, self._last, self._interval_before
+        h = sample.time - last_one.time
+        straight, held_rate = (self._position[k] - self._position[k - 1]) / h, (sample.position - last_one.position) / h
+        # Before the first posture nothing is known: there the rate of the lift is that of the first interval.
+        lift_rate = (sample.lift - last_one.lift) / h if before is None else last_one.lift_rate
+        left = np.where(held, held_rate, last_one.velocity) + lift_rate
+        right = np.where(held, held_rate, sample.velocity) + sample.lift_rate
         first, last = (6.0 * straight - 4.0 * left - 2.0 * right) / h, (-6.0 * straight + 2.0 * left + 4.0 * right) / h
         if before is None:
             return Interval(h, left, right, first, last, np.zeros_like(first), first)

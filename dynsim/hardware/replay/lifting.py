@@ -15,13 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.hardware.errors import CheckRefused
-from dynsim.hardware.replay.base_part import Fold, base_part
+from dynsim.hardware.replay.base_part import BasePart, Fold, base_part
 from dynsim.hardware.servo_map import Lifts, ServoMap
 from dynsim.record import TIME, Record
 
 Array = NDArray[np.float64]
 SAMPLES_PER_BLEND = 20
 """Fewer of them, and the path between two samples is no longer at the heights of the samples."""
+ROUNDING = 1e-9
+"""By so much less a time may be than it must [s]."""
 SIGNAL = "grounded"
 """Where dynsim's own records say which wheel pairs are on the ground; looked at when the map has no ``lifts``."""
 
@@ -51,34 +53,61 @@ def lifted(record: Record, lifts: Lifts) -> Fold:
     """
     grounded = _grounded(record, lifts.signal)
     pairs = record.labels[lifts.signal]
-    if len(lifts.joints) != len(pairs) - 1:
-        raise CheckRefused(
-            f"lifts.joints names {len(lifts.joints)} pitch joints; the record has {len(pairs)} wheel pairs, with one "
-            "on the axle of each but the last"
-        )
+    refuse_other_joints(lifts, pairs)
     time = record.time - record.time[0]
-    _refuse_what_cannot_stand(grounded, pairs, time)
+    refuse_what_cannot_stand(grounded, pairs, time)
     height = np.column_stack(
         [_height(column, time, lifts, name) for column, name in zip(grounded.T, pairs, strict=True)]
     )
     if not height.any():
         return Fold(np.zeros_like(height[:, 1:]), height, np.zeros_like(height))
-    if (step := float(np.diff(time).max())) * SAMPLES_PER_BLEND > lifts.blend_s:
+    refuse_long_steps(lifts, float(np.diff(time).max()))
+    part = base_part(record, pairs)
+    return folded(part, part.yaw_angles(record), height, lifts, time)
+
+
+def folded(part: BasePart, yaw: Array, height: Array, lifts: Lifts, time: Array) -> Fold:
+    """The base part with its pairs at heights above the floor.
+
+    Parameters
+    ----------
+    yaw : (T, pairs - 1) [rad]
+    height : (T, pairs) [m]
+    time : (T,) [s], for what is refused
+
+    Raises
+    ------
+    CheckRefused
+        No pitch angles do that, or a pair would stand on one wheel; with pair and time.
+    """
+    try:
+        fold = part.fold(yaw, height)
+    except ArithmeticError as lost:
+        row, pair = lost.args
+        raise CheckRefused(
+            f"no pitch angle brings {part.pairs[pair]} to {1e3 * height[row, pair]:g} mm above the floor at "
+            f"t = {time[row]:.3f} s"
+        ) from None
+    _refuse_twist(np.where(height == 0.0, fold.tilt, 0.0), lifts, part.pairs, time)
+    return fold
+
+
+def refuse_other_joints(lifts: Lifts, pairs: tuple[str, ...]) -> None:
+    """CheckRefused unless every pair but the last has its pitch joint."""
+    if len(lifts.joints) != len(pairs) - 1:
+        raise CheckRefused(
+            f"lifts.joints names {len(lifts.joints)} pitch joints; the record has {len(pairs)} wheel pairs, with one "
+            "on the axle of each but the last"
+        )
+
+
+def refuse_long_steps(lifts: Lifts, step: float) -> None:
+    """CheckRefused where samples are too far apart [s] for the path between them."""
+    if step * SAMPLES_PER_BLEND > lifts.blend_s:
         raise CheckRefused(
             f"wheels are lifted in blend_s = {lifts.blend_s:g} s, and the record has a sample every {step:g} s: record "
             f"at {SAMPLES_PER_BLEND / lifts.blend_s:.0f} Hz or more, or lift them slower"
         )
-    part = base_part(record, pairs)
-    try:
-        fold = part.fold(part.yaw_angles(record), height)
-    except ArithmeticError as lost:
-        row, pair = lost.args
-        raise CheckRefused(
-            f"no pitch angle brings {pairs[pair]} to {1e3 * height[row, pair]:g} mm above the floor at "
-            f"t = {time[row]:.3f} s"
-        ) from None
-    _refuse_twist(np.where(height == 0.0, fold.tilt, 0.0), lifts, pairs, time)
-    return fold
 
 
 def _refuse_lifted_wheels(record: Record) -> None:
@@ -104,7 +133,8 @@ def _grounded(record: Record, name: str) -> Array:
     return data.astype(np.float64)
 
 
-def _refuse_what_cannot_stand(grounded: Array, pairs: tuple[str, ...], time: Array) -> None:
+def refuse_what_cannot_stand(grounded: Array, pairs: tuple[str, ...], time: Array) -> None:
+    """CheckRefused where pair 1 is lifted, or all others are; ``grounded`` has the shape (T, pairs)."""
     if not (grounded[:, 0] == 1).all():
         row = int(np.argmin(grounded[:, 0]))
         raise CheckRefused(
@@ -124,15 +154,26 @@ def _height(grounded: Array, time: Array, lifts: Lifts, name: str) -> Array:
         up, down = time[first], time[min(end, len(time) - 1)]
         # What is lifted from the beginning is lifted in the start posture, what is at the end stays so.
         blends = int(first > 0) + int(end < len(time))
-        if down - up < blends * lifts.blend_s - 1e-9:
-            raise CheckRefused(
-                f"{name} is lifted for {down - up:.3f} s only, from t = {up:.3f} s on; up and down take "
-                f"{blends * lifts.blend_s:g} s (lifts.blend_s)"
-            )
-        since = (time[first:end] - up) / lifts.blend_s if first > 0 else np.ones(end - first)
-        until = (down - time[first:end]) / lifts.blend_s if end < len(time) else np.ones(end - first)
-        height[first:end] = 1e-3 * lifts.clearance_mm * _smooth(since) * _smooth(until)
+        refuse_short_lift(lifts, name, up, down, blends)
+        height[first:end] = height_of(
+            time[first:end], up if first > 0 else -np.inf, down if end < len(time) else np.inf, lifts
+        )
     return height
+
+
+def refuse_short_lift(lifts: Lifts, name: str, up: float, down: float, blends: int) -> None:
+    """CheckRefused where a pair is not lifted for as long as so many blends take; times in [s]."""
+    if down - up < blends * lifts.blend_s - ROUNDING:
+        raise CheckRefused(
+            f"{name} is lifted for {down - up:.3f} s only, from t = {up:.3f} s on; up and down take "
+            f"{blends * lifts.blend_s:g} s (lifts.blend_s)"
+        )
+
+
+def height_of(time: Array, up: Array | float, down: Array | float, lifts: Lifts) -> Array:
+    """Height [m] at a time of what is lifted from ``up`` to ``down`` [s]; infinite ones are for ever."""
+    since, until = (time - up) / lifts.blend_s, (down - time) / lifts.blend_s
+    return 1e-3 * lifts.clearance_mm * _smooth(since) * _smooth(until)
 
 
 def _smooth(u: Array) -> Array:
