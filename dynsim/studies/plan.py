@@ -152,15 +152,16 @@ class Plan:
 
         A part of what an earlier key gave may well be varied: ``plant.link`` by a grid, one of its numbers by a sample.
         """
-        overriding = "--set" if isinstance(self.overrides, SetOptions) else "override"
-        given = [(overriding, key, [key]) for key in self.overrides]
+        # In Python they are a base, of values that may well be varied; who writes --set wants that value.
+        overrides = self.overrides if isinstance(self.overrides, SetOptions) else {}
+        given = [("--set", key, [key]) for key in overrides]
         given += [("--grid", axis.key, self._entries(axis.key)) for axis in self.grid]
         given += [("--sample", law.key, self._entries(law.key)) for law in self.laws]
         # What was given, by itself and by all that it is a part of.
         inside: dict[str, str] = {}
         for option, key, entries in given:
             # Later overrides replace earlier ones, as in every command.
-            for entry in entries if option != overriding else []:
+            for entry in entries if option != "--set" else []:
                 if (place := _plain(entry)) in inside:
                     other = inside[place]
                     fix = f", or write out the entries of {ANY} that the other leaves" if ANY in key + other else ""

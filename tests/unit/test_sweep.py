@@ -121,6 +121,8 @@ def test_a_part_of_what_was_given_may_be_varied():
         Law("plant.link.mass_kg", "normal", (1.0, 0.1)),
     )
     assert Plan(CHAIN, (None,), SetOptions({"plant": {}}), (whole,), (law,)).runs == 2
+    # The base of a sweep from Python.
+    assert Plan(CHAIN, (None,), {FIFTH: 0.1}, (Axis(FIFTH, (0.1, 0.2)),)).runs == 2
 
 
 def test_runs_are_variants_by_grid_by_samples():
