@@ -16,19 +16,20 @@ from dynsim.figures.style import title as titled
 from dynsim.files import replacing
 from dynsim.film import encode
 from dynsim.film.camera import FROM, Camera, View, view_axes
-from dynsim.film.painter import FINER, PAPER, Painter, font
+from dynsim.film.painter import FINER, PAPER, Painter
 from dynsim.film.strip import Strip
+from dynsim.film.strokes import font
 from dynsim.record import Record
 from dynsim.record.surface_points import box_corners
 from dynsim.terminal import plain
-from dynsim.view.robot import Array, azimuth, bounds, robots
+from dynsim.view.robot import Array, azimuth, bounds, moving, robots
 
 # Heights of the title, and of the plot as a part of the picture.
 HEAD, PLOT = 26, 0.24
 # Least height of the plot, and least size of a film that has one [pixel].
 PLOT_MIN, WITH_PLOT = 84, (240, 220)
-# Around a robot [pixel].
-ROOM = 14
+# Around a robot at most [pixel], and as a part of a small picture.
+ROOM, ROOM_SHARE = 14, 0.05
 # Least width and height of what shows one robot [pixel].
 CELL_MIN = 60
 SIZE_MIN, SIZE_MAX = 160, 4096
@@ -74,10 +75,10 @@ class Film:
         kept = {name: records[name] for name in shown}
         width, height = size
         strip = (width, max(round(PLOT * height), PLOT_MIN))
-        room = width >= WITH_PLOT[0] and height >= WITH_PLOT[1]
-        if plot and not room:
+        has_room = width >= WITH_PLOT[0] and height >= WITH_PLOT[1]
+        if plot and not has_room:
             raise RecordError(f"a film with a plot is at least {WITH_PLOT[0]}x{WITH_PLOT[1]}, not {width}x{height}")
-        self._strip = Strip(kept, strip, plot) if plot != "" and room else None
+        self._strip = Strip(kept, strip, plot) if plot != "" and has_room else None
         has_plot = self._strip is not None and self._strip.signal is not None
         self._area = (0, HEAD, width, height - (strip[1] if has_plot else 0))
         some = list(shown.values())
@@ -86,10 +87,14 @@ class Film:
         low, high = bounds(some, turn)
         c, s = math.cos(turn), math.sin(turn)
         corners = box_corners(low, high) @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-        self._places, cell = _layout(len(some), self._area, corners @ view_axes(view, turn).T)
+        axes = view_axes(view, turn)
+        if view == "iso":
+            corners = _tight(corners, moving(some), axes)
+        self._places, cell = _layout(len(some), self._area, corners @ axes.T)
         if min(cell) < CELL_MIN:
             raise RecordError(f"{len(some)} robots need a larger --size than {width}x{height}, or fewer records")
-        area = [ROOM * FINER, ROOM * FINER, (cell[0] - ROOM) * FINER, (cell[1] - ROOM) * FINER]
+        room = min(ROOM, round(ROOM_SHARE * min(cell)))
+        area = [room * FINER, room * FINER, (cell[0] - room) * FINER, (cell[1] - room) * FINER]
         if len(some) > 1:
             area[1] += 14 * FINER
         camera = Camera.fitted(view, turn, corners, (area[0], area[1], area[2], area[3]))
@@ -194,6 +199,24 @@ def _times(records: Mapping[str, Record], speed: float, fps: int) -> Array:
         raise RecordError(f"{frames:.3g} frames are no film; take a higher --speed or a lower --fps")
     steps = math.ceil(round(frames, 6))
     return np.minimum(start + np.arange(steps + 1) * (speed / fps), end)
+
+
+def _tight(corners: Array, points: Array, axes: Array) -> Array:
+    """Corners of what is seen of a box, (8, 3) → (8, 3) [m]: seen obliquely most of a box is empty.
+
+    Parameters
+    ----------
+    points : (n, 3) what moves in it; around them is room for thickness and arrows
+    axes : of the view
+    """
+    box, seen = corners @ axes.T, points @ axes.T
+    room = 0.06 * float(np.ptp(seen, axis=0)[:2].max()) if len(seen) else np.inf
+    low = np.maximum(box.min(axis=0), seen.min(axis=0) - room)
+    high = np.minimum(box.max(axis=0), seen.max(axis=0) + room)
+    # What hardly moves has all the box around it.
+    if (high - low)[:2].max() < 0.5 * np.ptp(box, axis=0)[:2].max():
+        return corners
+    return box_corners(low, high) @ axes
 
 
 def _layout(count: int, area: tuple[int, int, int, int], flat: Array) -> tuple[list[tuple[int, int]], tuple[int, int]]:

@@ -6,28 +6,25 @@ middle: bodies that are small beside their distances need no more, and no graphi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageColor, ImageDraw, ImageFont
+from PIL import Image, ImageColor, ImageDraw
 
 from dynsim.figures.solids import outline
 from dynsim.figures.style import BLACK, BLUE, GREEN, GREY, ORANGE, PULLING, SKY
 from dynsim.film.camera import Camera
 from dynsim.film.solids import grid_faces, solid
+from dynsim.film.strokes import Box, arrow, dashes, font, labels, line, ring
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import rotated
 from dynsim.record.scene import HERE, WORLD, Surface
 from dynsim.record.surface_points import round_patch, surface_grids
 from dynsim.view.meshes import Meshes
 from dynsim.view.robot import Contact, Robot, Sunk, contacts, largest_force, paths, sunk
-from dynsim.view.solids import body_shapes, drawn_shape, drawn_surface
+from dynsim.view.solids import body_shapes, drawn_shape, drawn_surface, gripper
 from dynsim.view.wheels import cop_of, supports, wheel_groups
 
 Array = NDArray[np.float64]
@@ -43,19 +40,25 @@ DEEP = "#882255"
 MODES = {0: GREY, 1: ORANGE, 2: GREEN}
 # Towards the light, seen by the viewer: right, up, near.
 LIGHT = np.array([-0.35, 0.75, 0.56]) / np.linalg.norm([-0.35, 0.75, 0.56])
+# A lower picture [pixel] has smaller texts.
+LOW = 200
 # Points of a path at most.
 WAY = 600
 
 
 @dataclass(frozen=True)
 class _Solids:
-    """Faces of everything that moves: corners in the frames of their bodies, faces of four corners, colours."""
+    """Faces of everything that moves: corners in the frames of their bodies, faces of four corners, colours.
+
+    ``aside``: how far the corners are moved by an open and a closed gripper, (2, n, 3) [m].
+    """
 
     corners: Array
     body: NDArray[np.int64]
     faces: NDArray[np.int64]
     colour: Array
     wheel: NDArray[np.int64]
+    aside: Array
 
 
 class Painter:
@@ -88,6 +91,9 @@ class Painter:
         self._meshes = Meshes(TRIANGLES)
         self._meshes.of_robot(record)
         self._wheels = wheel_groups(record, robot.scene)
+        # The body that has a gripper.
+        hand = robot.scene.hand
+        self._gripped = hand.body if hand is not None and "gripper" in record else WORLD
         self._solids = self._moving()
         self._contacts = contacts(robot)
         self._sunk = sunk(robot)
@@ -95,7 +101,9 @@ class Painter:
         self._ways = dict(paths(record, robot.scene))
         self._supports = supports(robot.scene, self._wheels)
         self._pressure = cop_of(record)
-        self._font = font(13 * FINER)
+        # Of one robot among several it is as small as its part of the film.
+        self._font = font((13 if size[1] >= LOW else 11) * FINER)
+        self.labels: list[Box] = []
         self._still = self._background(*bounds)
 
     def frame(self, time: float) -> Image.Image:
@@ -115,9 +123,10 @@ class Painter:
             self._paint_way(draw, time, row)
             for one in self._sunk:
                 self._paint_sunk(draw, one, place, turn, row, share)
-            for contact in self._contacts:
-                self._paint_contact(draw, contact, place, turn, row, share)
+            forces = [self._paint_contact(draw, contact, place, turn, row, share) for contact in self._contacts]
             self._paint_hand(draw, place, turn)
+            # Last, so that nothing lies over a sign.
+            self.labels = labels(draw, [one for one in forces if one], self._font, image.size, PAPER)
         return image.reduce(FINER)
 
     def hand(self, time: float) -> tuple[float, float] | None:
@@ -145,7 +154,7 @@ class Painter:
         shapes = body_shapes(scene, self.robot.reach, self._meshes)
         group = {place: k for k, places in enumerate(self._wheels.places) for place in places}
         corners, bodies, faces, colours, wheels = [np.zeros((0, 3))], [np.zeros(0, int)], [], [], []
-        count = 0
+        aside, count = [np.zeros((2, 0, 3))], 0
         for k, own in enumerate(shapes):
             for j, shape in enumerate(own):
                 points, cells = solid(shape, self._meshes.found)
@@ -156,7 +165,17 @@ class Painter:
                 faces.append(cells + count)
                 colours.append(self._colours(shape, len(cells), plain))
                 wheels.append(np.full(len(cells), wheel))
+                aside.append(np.zeros((2, len(points), 3)))
                 count += len(points)
+        for shape, moved in self._fingers(shapes):
+            points, cells = solid(shape, [])
+            corners.append(points)
+            bodies.append(np.full(len(points), self._gripped))
+            faces.append(cells + count)
+            colours.append(self._colours(shape, len(cells), self.tint))
+            wheels.append(np.full(len(cells), -1))
+            aside.append(np.broadcast_to(moved[:, None, :], (2, len(points), 3)))
+            count += len(points)
         if not faces:
             faces, colours, wheels = [np.zeros((0, 4), int)], [np.zeros((0, 3))], [np.zeros(0, int)]
         return _Solids(
@@ -165,7 +184,18 @@ class Painter:
             np.concatenate(faces),
             np.concatenate(colours),
             np.concatenate(wheels),
+            np.concatenate(aside, axis=1),
         )
+
+    def _fingers(self, shapes: list[list[dict[str, Any]]]) -> list[tuple[dict[str, Any], Array]]:
+        """Fingers of a gripper between open and closed, and where those states move them, (2, 3) [m]."""
+        hand = self.robot.scene.hand
+        if hand is None or self._gripped == WORLD:
+            return []
+        both = gripper(shapes, self.robot.reach)
+        place = np.array(hand.position) + np.array([both["ahead"], 0.0, 0.0])
+        shape = {"kind": "box", "size": both["size"], "p": place.tolist(), "q": list(HERE)}
+        return [(shape, side * np.outer(both["aside"], [0.0, 1.0, 0.0])) for side in (-1.0, 1.0)]
 
     def _colours(self, shape: dict[str, Any], faces: int, plain: str) -> Array:
         """Colours of a shape's faces, (n, 3): its own, those of its mesh's file, or a plain one."""
@@ -193,10 +223,10 @@ class Painter:
                 points, cells = solid(shown, self._meshes.found)
                 self._paint_faces(draw, points, cells, self._colours(shown, len(cells), HUB))
         if (target := self._ways.get("target")) is not None:
-            _dashes(draw, _apart(self.camera.project(target)[:, :2]), 6.0 * FINER, BLACK, FINER)
+            dashes(draw, _apart(self.camera.project(target)[:, :2]), 6.0 * FINER, BLACK, FINER)
         if (way := self._ways.get("hand")) is not None:
             faint = tuple(int(0.65 * 255 + 0.35 * part) for part in _rgb(self.tint))
-            _line(draw, _apart(self.camera.project(way)[:, :2]), faint, FINER)
+            line(draw, _apart(self.camera.project(way)[:, :2]), faint, FINER)
         if self.title:
             draw.text((10 * FINER, 8 * FINER), self.title, fill=self.tint, font=self._font)
         return image
@@ -238,14 +268,17 @@ class Painter:
         if real:
             draw.rectangle([0, 0, width, height], fill=GROUND)
         ends = [([a, y[0], z], [a, y[-1], z]) for a in x] + [([x[0], b, z], [x[-1], b, z]) for b in y]
-        for line in self.camera.project(np.array(ends))[..., :2]:
-            draw.line(line.ravel().tolist(), fill=LINES if real else FAINT, width=FINER)
+        for row in self.camera.project(np.array(ends))[..., :2]:
+            draw.line(row.ravel().tolist(), fill=LINES if real else FAINT, width=FINER)
 
     def _paint_bodies(self, draw: ImageDraw.ImageDraw, place: Array, turn: Array, row: int) -> None:
         solids = self._solids
         if not len(solids.faces):
             return
-        corners = place[solids.body] + rotated(turn[solids.body].T, solids.corners.T).T
+        own = solids.corners
+        if self._gripped != WORLD:
+            own = own + solids.aside[int(self.robot.record["gripper"][row] > 0)]
+        corners = place[solids.body] + rotated(turn[solids.body].T, own.T).T
         colour = solids.colour
         if self._wheels.down is not None:
             lifted = (solids.wheel >= 0) & (self._wheels.down[row][solids.wheel] == 0.0)
@@ -301,21 +334,24 @@ class Painter:
             ahead, beside = np.roll(hull, -1, axis=0) - hull, at - hull
             inside = bool((ahead[:, 0] * beside[:, 1] - ahead[:, 1] * beside[:, 0] >= 0.0).all())
         x, y, _ = self.camera.project(np.array([*at, 0.0]))
-        _ring(draw, x, y, 5.0 * FINER, BLACK if inside else PULLING)
+        ring(draw, x, y, 5.0 * FINER, BLACK if inside else PULLING, 2 * FINER)
 
     def _paint_way(self, draw: ImageDraw.ImageDraw, time: float, row: int) -> None:
         way = self._ways.get("hand")
         if way is None or row < 1:
             return
-        _line(draw, _apart(self.camera.project(way[: row + 1])[:, :2]), _rgb(self.tint), 2 * FINER)
+        line(draw, _apart(self.camera.project(way[: row + 1])[:, :2]), _rgb(self.tint), 2 * FINER)
 
     def _paint_contact(
         self, draw: ImageDraw.ImageDraw, contact: Contact, place: Array, turn: Array, row: int, share: float
-    ) -> None:
-        """Arrows of the normal force, and of all of it with friction: away from the surface for a push, else to it."""
+    ) -> tuple[str, Array, str] | None:
+        """Arrows of the normal force, and of all of it with friction: away from the surface for a push, else to it.
+
+        Returns the force in words, where to write it [pixel], and its colour; None where there is none.
+        """
         at = _on(contact.point.body, np.array(contact.point.position), place, turn)
         force = float(_between(contact.force, row, share))
-        mode = None if contact.mode is None else int(contact.mode[row])
+        mode, text = None if contact.mode is None else int(contact.mode[row]), None
         x, y, _ = self.camera.project(at)
         colour = arrow_colour(force)
         dot = colour if mode is None else MODES.get(mode, GREY)
@@ -325,17 +361,10 @@ class Painter:
             if friction is not None and np.linalg.norm(friction) > FRICTION_SHOWN * self._full:
                 self._paint_force(draw, at, normal + friction, force < 0.0, FRICTION, 2 * FINER)
             end = self._paint_force(draw, at, normal, force < 0.0, colour, 3 * FINER)
-            draw.text(
-                (end[0], end[1] - 3 * FINER),
-                f"{force:+.3g} N".replace("-", "−"),
-                fill=colour,
-                font=self._font,
-                anchor="mb",
-                stroke_width=FINER,
-                stroke_fill=PAPER,
-            )
+            text = f"{force:+.3g} N".replace("-", "−"), end - [0.0, 2.0 * FINER], colour
         radius = 3.0 * FINER
         draw.ellipse([x - radius, y - radius, x + radius, y + radius], fill=dot, outline=PAPER)
+        return text
 
     def _paint_sunk(
         self, draw: ImageDraw.ImageDraw, one: Sunk, place: Array, turn: Array, row: int, share: float
@@ -345,7 +374,7 @@ class Painter:
         if not depth > one.least:
             return
         x, y, _ = self.camera.project(_on(one.body, np.array(one.position), place, turn))
-        _ring(draw, x, y, 6.0 * FINER, DEEP)
+        ring(draw, x, y, 6.0 * FINER, DEEP, 2 * FINER)
         text = f"{1e3 * depth:.0f} mm" if depth >= 1e-3 else ""
         draw.text((x, y + 8 * FINER), text, fill=DEEP, font=font(11 * FINER), anchor="mt")
 
@@ -357,12 +386,12 @@ class Painter:
         long = max(0.13 * self.robot.reach * min((size / self._full) ** 0.5, 1.6), 14.0 * FINER / self.camera.scale)
         here = self.camera.project(at)[:2]
         there = self.camera.project(at + (-long if pulls else long) / size * force)[:2]
-        _arrow(draw, *((there, here) if pulls else (here, there)), colour, width)
+        arrow(draw, *((there, here) if pulls else (here, there)), colour, width)
         return np.asarray(there)
 
     def _paint_hand(self, draw: ImageDraw.ImageDraw, place: Array, turn: Array) -> None:
         hand = self.robot.scene.hand
-        if hand is None:
+        if hand is None or self._gripped != WORLD:
             return
         x, y, _ = self.camera.project(_on(hand.body, np.array(hand.position), place, turn))
         radius = 4.0 * FINER
@@ -372,12 +401,6 @@ class Painter:
 def arrow_colour(force: float) -> str:
     """Of a normal force: blue where the surface pushes, orange where it pulls."""
     return PULLING if force < 0.0 else BLUE
-
-
-@cache
-def font(size: int) -> ImageFont.FreeTypeFont:
-    """The font that matplotlib brings, so that films look the same everywhere."""
-    return ImageFont.truetype(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf"), size)
 
 
 def _rgb(colour: str) -> tuple[int, int, int]:
@@ -400,41 +423,6 @@ def _apart(points: Array) -> Array:
     """Points of a path as they are known, at most ``WAY`` of them."""
     points = points[np.isfinite(points).all(axis=1)]
     return points[np.linspace(0, len(points) - 1, min(len(points), WAY)).astype(int)] if len(points) else points
-
-
-def _line(draw: ImageDraw.ImageDraw, points: Array, colour: tuple[int, ...], width: int) -> None:
-    if len(points) > 1:
-        draw.line(points.ravel().tolist(), fill=colour, width=width, joint="curve")
-
-
-def _dashes(draw: ImageDraw.ImageDraw, points: Array, length: float, colour: str, width: int) -> None:
-    """A path as dashes that are as long as their gaps [pixel]."""
-    if len(points) < 2:
-        return
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    for start in np.arange(0.0, way[-1], 2.0 * length):
-        ends = np.linspace(start, min(start + length, way[-1]), 5)
-        dash = np.stack([np.interp(ends, way, points[:, k]) for k in (0, 1)], axis=1)
-        draw.line(dash.ravel().tolist(), fill=colour, width=width)
-
-
-def _arrow(draw: ImageDraw.ImageDraw, tail: Array, head: Array, colour: str, width: int) -> None:
-    along = head - tail
-    size = float(np.linalg.norm(along))
-    if size < 1e-6:
-        return
-    along = along / size
-    across = np.array([-along[1], along[0]])
-    long = min(3.4 * width, size)
-    neck = head - long * along
-    draw.line([*tail.tolist(), *neck.tolist()], fill=colour, width=width)
-    corners: Sequence[Array] = (head, neck + 0.45 * long * across, neck - 0.45 * long * across)
-    draw.polygon([tuple(one.tolist()) for one in corners], fill=colour)
-
-
-def _ring(draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, colour: str) -> None:
-    draw.ellipse([x - radius, y - radius, x + radius, y + radius], outline=colour, width=2 * FINER)
-    draw.ellipse([x - 2, y - 2, x + 2, y + 2], fill=colour)
 
 
 def _round(x: float) -> float:

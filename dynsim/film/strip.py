@@ -19,7 +19,7 @@ ONE = ("contact_normal_force", "wheel_load", "hand_error", "support_margin", "po
 SEVERAL = ("energy_electrical", "hand_error", "position_error", "tip_margin", "support_margin", "q", "phi")
 DPI = 100
 CURSOR = "#202428"
-# Columns of a signal that have names of their own in the legend.
+# Columns of a signal that have lines of their own: the largest ones. All others are in the range of all.
 NAMED = 4
 # A narrower plot has no room for a legend beside it [pixel], and a name no more letters.
 LEGEND_MIN, LETTERS = 400, 16
@@ -44,6 +44,7 @@ class Strip:
         self._size = size
         self.signal = chosen(records, signal)
         self._image: Image.Image | None = None
+        self.legend: tuple[str, ...] = ()
         if self.signal is not None:
             with style.look():
                 self._draw(records, self.signal)
@@ -71,17 +72,25 @@ class Strip:
                 continue
             values = record[name].reshape(len(record), -1)
             names = record.labels[name] or (name,) * values.shape[1]
-            for k, column in enumerate(values.T):
-                many = values.shape[1] > 1
-                colour = style.VARIANT_COLOURS[k % 7] if len(records) == 1 and many else colours[label]["color"]
-                text = plain(label if len(records) > 1 else names[k])
-                text = text if len(text) <= LETTERS else text[: LETTERS - 1] + "…"
-                known = k < NAMED if len(records) == 1 else k == 0
-                style.line(axes, record.time, column, color=colour, label=text if known else None)
+            several, many = len(records) > 1, values.shape[1] > 1
+            shown = largest(values, 1 if several else NAMED)
+            if len(shown) < values.shape[1]:
+                colour, opacity = (colours[label]["color"], 0.2) if several else ("#CFCFCF", 1.0)
+                low, high = np.fmin.reduce(values, axis=1), np.fmax.reduce(values, axis=1)
+                text = None if several else f"all {values.shape[1]}"
+                axes.fill_between(record.time, low, high, color=colour, alpha=opacity, linewidth=0, label=text)
+            for place, k in enumerate(shown):
+                colour = style.VARIANT_COLOURS[place] if many and not several else colours[label]["color"]
+                text = _cut(plain(label), LETTERS) if several else _cut(plain(names[k]), LETTERS)
+                text += f": {_cut(plain(names[k]), LETTERS)}" if several and many else ""
+                style.line(axes, record.time, values[:, k], color=colour, label=text)
         some = next(record for record in records.values() if name in record)
         unit = some.units[name]
-        shown = f"{name.replace('_', ' ')}{f' [{unit}]' if unit not in ('', '1') else ''}"
-        axes.set_title(shown, fontsize=7.5, loc="left", pad=3)
+        title = f"{name.replace('_', ' ')}{f' [{unit}]' if unit not in ('', '1') else ''}"
+        some_hidden = any(record[name][0].size > 1 for record in records.values() if name in record and len(record))
+        if len(records) > 1 and some_hidden:
+            title += ": largest by rms, and range of all"
+        axes.set_title(title, fontsize=7.5, loc="left", pad=3)
         axes.set_xlabel("time [s]", fontsize=7, labelpad=0)
         axes.tick_params(labelsize=7)
         start = min(float(record.time[0]) for record in records.values())
@@ -90,7 +99,9 @@ class Strip:
         axes.set_ylim(*_limits([record[name] for record in records.values() if name in record]))
         if len(records) > 1 or len(axes.lines) > 1:
             handles, labels = axes.get_legend_handles_labels()
+            # The range of all first: it lies behind the others.
             most = max((self._size[1] - 20) // LEGEND_ROW, 1)
+            self.legend = tuple(labels[:most])
             axes.legend(
                 handles[:most],
                 labels[:most],
@@ -105,6 +116,16 @@ class Strip:
         low, high = axes.get_xlim()
         self._scale = (low, float(box.x0)), (high, float(box.x1))
         self._top, self._bottom = self._size[1] - float(box.y1), self._size[1] - float(box.y0)
+
+
+def largest(values: style.Array, count: int) -> list[int]:
+    """Columns with the largest root mean square over time, at most so many, in their order; (T, n)."""
+    effort = np.nan_to_num(values.astype(float) ** 2).sum(axis=0)
+    return sorted(np.argsort(-effort, kind="stable")[:count].tolist())
+
+
+def _cut(name: str, letters: int) -> str:
+    return name if len(name) <= letters else name[: letters - 1] + "…"
 
 
 def chosen(records: Mapping[str, Record], signal: str | None) -> str | None:

@@ -18,7 +18,7 @@ from dynsim.view.blocks import Blocks
 from dynsim.view.meshes import Meshes
 from dynsim.view.meshes import packed as packed_mesh
 from dynsim.view.robot import POSE_ERROR, Robot, azimuth, bounds, contacts, paths, robot_of, robots, sunk
-from dynsim.view.solids import body_shapes, drawn_shape, drawn_surface
+from dynsim.view.solids import body_shapes, drawn_shape, drawn_surface, gripper, thinnest
 from dynsim.view.wheels import cop_of, supports, wheel_groups
 
 Array = NDArray[np.float64]
@@ -80,7 +80,7 @@ def _record(name: str, robot: Robot, blocks: Blocks, meshes: Meshes, low: Array,
         "title": _title(record),
         "measured": "scenario" not in record.provenance or "q_goal" in record,
         "complete": bool(record.complete),
-        "radius": min((s["size"][0] for one in shapes for s in one if s["kind"] in ("cylinder", "capsule")), default=0),
+        "radius": thinnest(shapes),
         "reach": robot.reach,
         "bodies": bodies,
         "fixed": [one for shape in scene.fixed if (one := drawn_shape(shape, meshes)) is not None],
@@ -106,6 +106,7 @@ def _record(name: str, robot: Robot, blocks: Blocks, meshes: Meshes, low: Array,
         part["pressure"] = {"name": pressure[0], "at": blocks.add(pressure[1][rows], 1e-4)}
     if "gripper" in record and scene.hand is not None:
         part["gripper"] = blocks.add(record["gripper"][rows])
+        part["fingers"] = gripper(shapes, robot.reach)
     if scene.hand is not None:
         part["hand"] = {"body": scene.hand.body, "p": list(scene.hand.position), "name": scene.hand.name}
     part["signals"], part["axes"] = _signals(record, blocks)

@@ -94,6 +94,19 @@ def _every(count: int, stride: int) -> NDArray[np.intp]:
 
 def bounds(robots: Sequence[Robot], turn: float = 0.0) -> tuple[Array, Array]:
     """The box, turned about z by ``turn`` [rad], in which everything moves, with some room, (3,) and (3,) [m]."""
+    pooled = moving(robots)
+    c, s = math.cos(turn), math.sin(turn)
+    pooled = pooled @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    low, high = pooled.min(axis=0), pooled.max(axis=0)
+    # What hardly moves is not blown up to fill the window, and what is flat has some depth to stand in.
+    span, reach = float((high - low).max()), max(robot.reach for robot in robots)
+    least = max(0.24 * span, 0.6 * reach if span < 0.6 * reach else 0.0)
+    room = np.maximum(0.5 * (least - (high - low)), 0.0) + 0.03 * least + max(map(_thickness, robots))
+    return low - room, high + room
+
+
+def moving(robots: Sequence[Robot]) -> Array:
+    """Places of all bodies and the hand, its target, and ends of what stands still, (n, 3) [m]."""
     points = []
     for robot in robots:
         record = robot.record
@@ -104,15 +117,7 @@ def bounds(robots: Sequence[Robot], turn: float = 0.0) -> tuple[Array, Array]:
             middle, half = np.array(shape.position), 0.5 * max(shape.size) if shape.kind != "mesh" else 0.0
             points += [np.stack([middle - half, middle + half])]
     pooled = np.concatenate(points)
-    pooled = pooled[np.isfinite(pooled).all(axis=1)]
-    c, s = math.cos(turn), math.sin(turn)
-    pooled = pooled @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    low, high = pooled.min(axis=0), pooled.max(axis=0)
-    # What hardly moves is not blown up to fill the window, and what is flat has some depth to stand in.
-    span, reach = float((high - low).max()), max(robot.reach for robot in robots)
-    least = max(0.24 * span, 0.6 * reach if span < 0.6 * reach else 0.0)
-    room = np.maximum(0.5 * (least - (high - low)), 0.0) + 0.03 * least + max(map(_thickness, robots))
-    return low - room, high + room
+    return np.asarray(pooled[np.isfinite(pooled).all(axis=1)])
 
 
 def _without_ends(points: Array) -> Array:

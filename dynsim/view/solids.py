@@ -51,6 +51,8 @@ def body_shapes(scene: Scene, reach: float, meshes: Meshes) -> list[list[dict[st
             ends = [np.array(child.joint.position) for child in wanted if not child.joint.part_of]
             ends += [np.array(point.position) for point in scene.points if point.role == "hand" and point.body == k]
             shapes = [_rod(end, radius) for end in ends if np.linalg.norm(end) > 2.0 * radius]
+        elif _is_tube(body):
+            shapes += _stems(scene, k)
         if body.joint.kind == "revolute" and not body.joint.part_of and k not in base and bare:
             shapes.append(_hub(body, 1.45 * radius))
         found.append(shapes)
@@ -59,6 +61,26 @@ def body_shapes(scene: Scene, reach: float, meshes: Meshes) -> list[list[dict[st
         for k in hands & set(range(len(scene.bodies))):
             found[k] = [{"kind": "box", "size": 3 * [0.06 * reach], "p": [0.0, 0.0, 0.03 * reach], "q": list(HERE)}]
     return found
+
+
+def _stems(scene: Scene, k: int) -> list[dict[str, Any]]:
+    """A thin rod to the hand of a body whose own one ends before it."""
+    tube = scene.bodies[k].shapes[0]
+    far = float(np.linalg.norm(tube.position)) + 0.5 * tube.size[1] + tube.size[0]
+    ends = [np.array(point.position) for point in scene.points if point.role == "hand" and point.body == k]
+    return [_rod(end, 0.5 * tube.size[0]) | {"role": "stem"} for end in ends if np.linalg.norm(end) > far]
+
+
+def thinnest(shapes: list[list[dict[str, Any]]]) -> float:
+    """The least radius of what is round [m], but for stems; 0 where nothing is."""
+    round_ones = (s for one in shapes for s in one if s["kind"] in ("cylinder", "capsule") and s.get("role") != "stem")
+    return min((shape["size"][0] for shape in round_ones), default=0.0)
+
+
+def gripper(shapes: list[list[dict[str, Any]]], reach: float) -> dict[str, Any]:
+    """Two fingers at the hand, boxes in its body's axes [m]: how far ahead, and aside when open and when closed."""
+    size = max(1.7 * thinnest(shapes), 0.012 * reach)
+    return {"size": [1.6 * size, 0.4 * size, 0.8 * size], "ahead": 0.5 * size, "aside": [0.8 * size, 0.28 * size]}
 
 
 def _radius(scene: Scene, default: float) -> float:

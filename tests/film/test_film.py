@@ -25,12 +25,15 @@ from dynsim.film import Film, write
 from dynsim.film.camera import view_axes
 from dynsim.film.painter import DEEP, FINER, FRICTION, Painter
 from dynsim.film.solids import solid
+from dynsim.film.strip import Strip, largest
+from dynsim.film.strokes import font, labels
 from dynsim.record import Record
 from dynsim.record.poses import ORIENTATION, POSITION, point_positions
 from dynsim.record.scene import Surface
 from dynsim.scenario import build_model, load_scenario
+from dynsim.view.meshes import Meshes
 from dynsim.view.robot import bounds
-from dynsim.view.solids import from_z
+from dynsim.view.solids import body_shapes, from_z
 
 MARK = "#FF00FF"
 
@@ -166,6 +169,87 @@ def test_a_hub_is_not_covered_by_a_rod_that_leans_to_the_viewer(braced: Record) 
         assert (red > blue) == hidden
 
 
+def test_a_snake_has_fingers_that_close(robots: dict[str, Record]) -> None:
+    """Two blocks about the hand, nearer to each other when closed, and a stem where its link ends before it."""
+    snake = robots["snake"]
+    film = Film({"one": snake}, view="top", plot="", size=(640, 480))
+    robot, camera = film.painters["one"].robot, film.painters["one"].camera
+    apart = []
+    for closed in (0.0, 1.0):
+        record = Record(snake.time[:1], provenance=snake.provenance)
+        for name in (POSITION, ORIENTATION, "grounded"):
+            record.add(name, snake[name][:1], snake.units[name], labels=snake.labels[name])
+        record.add("gripper", np.array([closed]), "1")
+        record.scene = snake.scene
+        painter = Painter(replace(robot, record=record), camera, (640, 480), (np.zeros(3), np.ones(3)), tint=MARK)
+        painter._ways.clear()
+        solids = painter._solids
+        fingers = solids.body == robot.scene.hand.body
+        fingers &= np.abs(solids.aside).max(axis=(0, 2)) > 0.0
+        assert fingers.sum() == 16
+        place = (solids.corners + solids.aside[int(closed)])[fingers] - robot.scene.hand.position
+        apart.append(2.0 * np.abs(place[:, 1]).min())
+        assert place[:, 0].min() < 0.0 < place[:, 0].max()
+        # They are lit: the tint is darkened.
+        shown = np.asarray(painter.frame(0.0)).astype(int)
+        tinted = np.argwhere((shown[..., 0] - shown[..., 1] > 60) & (shown[..., 2] - shown[..., 1] > 60))[:, ::-1]
+        assert len(tinted) > 20
+        np.testing.assert_allclose(tinted.mean(axis=0), painter.hand(0.0), atol=0.05 * camera.scale / FINER)
+    assert apart[0] > 2.0 * apart[1] > 0.0
+    for ahead, count in ((0.0905, 0), (0.1805, 1)):
+        hand = replace(snake.scene.hand, position=(ahead, 0.0, 0.0))
+        shapes = body_shapes(replace(snake.scene, points=(hand,)), 1.0, Meshes())
+        stems = [shape["p"][0] for own in shapes for shape in own if shape.get("role") == "stem"]
+        assert stems == count * [0.5 * ahead]
+
+
+def test_labels_lie_on_paper_beside_each_other_and_within_the_picture() -> None:
+    """Each sign is seen: no two overlap, though all are wanted at one place, on an image that has their colour."""
+    image = Image.new("RGB", (300, 200), "#D55E00")
+    places = np.array([[150.0, 100.0], [152.0, 98.0], [2.0, 4.0], [299.0, 200.0]])
+    texts = [("−1.23 N", place, "#D55E00") for place in places]
+    found = labels(ImageDraw.Draw(image), texts, font(26), image.size, "#FFFFFF")
+    for k, (left, top, right, bottom) in enumerate(found):
+        assert 0.0 <= left < right <= 300.0
+        assert 0.0 <= top < bottom <= 200.0
+        assert all(left >= b[2] or right <= b[0] or top >= b[3] or bottom <= b[1] for b in found[:k])
+        part = np.asarray(image)[round(top) + 1 : round(bottom), round(left) + 1 : round(right)]
+        minus = pixels(Image.fromarray(part[:, : round(0.25 * (right - left))]), "#D55E00")
+        # A bar: wider than high, with white about it.
+        middle = minus[(minus[:, 1] > 8) & (minus[:, 1] < part.shape[0] - 8)]
+        assert np.ptp(middle[:, 0]) > 2 * np.ptp(middle[:, 1]) > 0
+
+
+def test_films_of_several_fill_their_parts(braced: Record) -> None:
+    """Seen from a corner the arm takes most of the width or of the height."""
+    film = Film({str(k): braced for k in range(4)}, view="iso", size=(640, 360))
+    painter = film.painters["0"]
+    seen = painter.camera.project(braced[POSITION][-1].astype(float))[:, :2] / FINER
+    assert (np.ptp(seen, axis=0) / painter.size).max() > 0.5
+
+
+def test_the_plot_names_the_largest_columns(braced: Record) -> None:
+    """Of several records the largest motor of each and the range of all, of one the largest four."""
+    values = np.tile([1.0, -3.0, 0.5, 2.0, 4.0, 0.1], (10, 1))
+    assert largest(values, 1) == [4]
+    assert largest(values, 4) == [0, 1, 3, 4]
+    power = braced["power"]
+    (k,) = largest(power, 1)
+    assert np.sqrt((power**2).mean(axis=0)).argmax() == k
+    name = braced.labels["power"][k]
+    assert texts_of({"one": braced, "two": braced}) == [f"one: {name}", f"two: {name}"]
+    assert texts_of({"one": braced}) == [
+        f"all {power.shape[1]}",
+        *(braced.labels["power"][k] for k in largest(power, 4)),
+    ]
+
+
+def texts_of(records: dict[str, Record]) -> list[str]:
+    """Names in the legend of the plot of power."""
+    strip = Strip(records, (640, 160), "power")
+    return list(strip.legend)
+
+
 def test_views_are_right_handed_and_show_up_as_up() -> None:
     for view in ("side", "top", "iso"):
         axes = view_axes(view, 0.7)
@@ -259,8 +343,6 @@ def test_a_mesh_is_painted_with_its_faces(robots: dict[str, Record]) -> None:
 
 def test_faces_turn_outwards() -> None:
     """A solid's volume by the divergence theorem is positive, and that of the shape."""
-    from dynsim.film.solids import solid
-
     shapes = {
         "box": ([0.1, 0.2, 0.3], 0.006),
         "cylinder": ([0.1, 0.4], np.pi * 0.004),

@@ -104,8 +104,8 @@ class Actor {
     }
     // Two fingers ahead of the controlled point, which close.
     this.fingers = [-1, 1].map((side) => {
-      const finger = new THREE.Mesh(new THREE.BoxGeometry(1.6 * size, 0.4 * size, 0.8 * size), this.handMaterial);
-      finger.userData = { side, size };
+      const finger = new THREE.Mesh(new THREE.BoxGeometry(...this.data.fingers.size), this.handMaterial);
+      finger.userData = { side };
       this.hand.add(finger);
       return finger;
     });
@@ -169,7 +169,7 @@ class Actor {
     }
     if (this.support) this.support.show(this.supportPoints(sample), this.pressure(sample), layers.support, colours);
     if (this.fingers)
-      for (const f of this.fingers) f.position.set(0.5 * f.userData.size, f.userData.side * f.userData.size * (sample.gripper ? 0.28 : 0.8), 0);
+      for (const f of this.fingers) f.position.set(this.data.fingers.ahead, f.userData.side * this.data.fingers.aside[sample.gripper ? 1 : 0], 0);
     for (const one of this.paths) {
       if (one.line) one.line.visible = layers.target;
       else one.path.shown = layers.trace && !this.live, one.path.show(sample.time);
