@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ MORE_SINKS = ("loss_impact", "loss_stop", "loss_scheme")
 STORES = ("energy_kinetic", "energy_potential", "energy_magnetic")
 
 RESIDUAL_LIMIT = 1e-6
+# A smaller share of a run is rounding of sums of times.
+ROUNDED = 1e-9
 
 # Kind of the event of a mobile base that tips; found between samples, where the margin is zero.
 TIP_OVER = "tip_over"
@@ -24,6 +27,13 @@ TIP_OVER = "tip_over"
 def sinks(record: Record) -> tuple[str, ...]:
     """The sinks of energy that a record has."""
     return SINKS + tuple(name for name in MORE_SINKS if name in record)
+
+
+def percent(share: float) -> str:
+    """A share of a run with one decimal, and more where it takes them to tell it from none or all of it."""
+    least = min(share, 1.0 - share)
+    decimals = 1 if least < ROUNDED else max(1, -math.floor(math.log10(100.0 * least)))
+    return f"{100.0 * share:.{decimals}f} %"
 
 
 def energy_turnover(record: Record) -> float:

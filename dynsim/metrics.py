@@ -21,6 +21,7 @@ from dynsim.measures import (
     energy_turnover,
     hand_error,
     least_loads,
+    percent,
     sinks,
 )
 from dynsim.model.clearance import Sinking, sinking
@@ -276,7 +277,7 @@ def _warnings(
         if contact["normal_force_min_N"] < 0.0:
             found.append(
                 f"{contact['name']}: the {contact['surface']} pulls on this brace for "
-                f"{100 * contact['pulling_fraction']:.1f} % of the run, with up to "
+                f"{percent(contact['pulling_fraction'])} of the run, with up to "
                 f"{-contact['normal_force_min_N']:.3g} N; a real arm would lift off"
             )
     for contact, since in zip(contacts, counts.extremes[:, LOCAL_SINCE], strict=True):

@@ -183,8 +183,10 @@ def print_starts(console: Console, starts: Mapping[str, Start]) -> None:
 
 
 def _pulling(contact: Summary) -> str:
-    pulling = 100.0 * contact["pulling_fraction"]
-    return f"[bold red]{pulling:.1f}[/]" if pulling > 0.0 else "0"
+    from dynsim.measures import percent
+
+    pulling = contact["pulling_fraction"]
+    return f"[bold red]{percent(pulling).removesuffix(' %')}[/]" if pulling > 0.0 else "0"
 
 
 def _percent(key: str) -> Callable[[Summary], str]:

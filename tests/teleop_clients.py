@@ -109,7 +109,7 @@ class Client:
         address = f"ws://127.0.0.1:{teleop.port}{teleop.path}drive"
         self._open = ExitStack()
         self.socket = self._open.enter_context(connect(address, origin=origin, compression=None, ping_interval=None))
-        self.count = 0
+        self.count, self.over = 0, ""
         self.hello: dict[str, Any] = self.until("hello")["hello"]
 
     def close(self) -> None:
@@ -128,7 +128,9 @@ class Client:
 
     def hear(self) -> dict[str, Any]:
         """The next message."""
-        return dict(json.loads(self.socket.recv(timeout=60)))
+        message = dict(json.loads(self.socket.recv(timeout=60)))
+        self.over = message.get("over", self.over)
+        return message
 
     def until(self, key: str, test: Callable[[Any], bool] = lambda value: True) -> dict[str, Any]:
         """The next message with a key, and a value that passes a test."""

@@ -151,7 +151,7 @@ def hw_drive(
         # What was driven is saved, whatever else the user asks for.
         interruption.keep()
         try:
-            done = process.finish("ended" if error is None else "the servos have stopped")
+            done = process.finish("ended" if error is None else f"the servos have stopped: {error}")
         except DynsimError as lost_drive:
             if error is None:
                 raise

@@ -6,7 +6,6 @@ there is a mode at each instant instead: bands show when a contact is open, slid
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,14 +16,13 @@ from matplotlib.figure import Figure
 from dynsim.figures import events, style
 from dynsim.figures.insets import inset_rows
 from dynsim.figures.style import Array
+from dynsim.measures import percent
 from dynsim.record import Record
 
 # More rows than this do not fit a page; height of one [inch].
 ROWS, ROW = 8, 1.75
 # More samples than this are not drawn as dots.
 DOTS = 150
-# A smaller share of a run is rounding of sums of times.
-ROUNDED = 1e-9
 # Modes by their number: what a contact does, the colour of its bands, and what of the summary says for how long.
 MODE = "contact_mode"
 MODES = (
@@ -133,14 +131,7 @@ def force_label(record: Record, name: str) -> str:
 def _share(record: Record, name: str) -> str:
     what, key = ("closed", "closed_fraction") if is_real(record) else ("pulling", "pulling_fraction")
     contact = _summary(record, name)
-    return f"{what} {_percent(contact[key])}" if contact else f"{what} unknown part"
-
-
-def _percent(share: float) -> str:
-    """With one decimal, and more where it takes them to tell it from none or all of the run."""
-    least = min(share, 1.0 - share)
-    decimals = 1 if least < ROUNDED else max(1, -math.floor(math.log10(100.0 * least)))
-    return f"{100.0 * share:.{decimals}f} %"
+    return f"{what} {percent(contact[key])}" if contact else f"{what} unknown part"
 
 
 def _within(record: Record, name: str) -> str:
@@ -240,7 +231,7 @@ def _draw_modes(axes: Axes, record: Record, name: str) -> None:
         share = None if not contact else contact[key] if mode else 1.0 - contact[key]
         if not spans and not share:
             continue
-        label = text if share is None else f"{text} {_percent(share)}"
+        label = text if share is None else f"{text} {percent(share)}"
         axes.broken_barh(
             spans, (0.0, 1.0), transform=axes.get_xaxis_transform(), color=colour, linewidth=0, zorder=0.2, label=label
         )

@@ -13,6 +13,7 @@ import json
 import secrets
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -34,6 +35,8 @@ MOST_WORDS = 400
 """Messages of a client in a second, which a browser at 50 Hz does not come near."""
 MOST_REFUSED = 20
 """Messages of a client that are none, after which it is closed."""
+GOODBYE = 1.0
+"""For a last word to all clients [s]."""
 _HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
@@ -85,6 +88,7 @@ class Server:
         self._thread: threading.Thread | None = None
         self._ready = threading.Event()
         self._quit: asyncio.Event | None = None
+        self._why = ""
         self.failure: BaseException | None = None
         self.port = 0
         self._page = b""
@@ -120,8 +124,9 @@ class Server:
             self._thread.join()
             raise DynsimError(f"cannot listen on {HERE}, port {port}: {self.failure}; choose another --http-port")
 
-    def stop(self) -> None:
-        """Say goodbye to all clients and end the thread."""
+    def stop(self, why: str = "") -> None:
+        """Tell all clients why the drive is over, say goodbye and end the thread."""
+        self._why = why
         if self._loop is not None and self._quit is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._quit.set)
         if self._thread is not None:
@@ -162,6 +167,10 @@ class Server:
             self._page = self._make_page(self.socket).encode()
             self._ready.set()
             await self._quit.wait()
+            told = (client.socket.send(json.dumps({"over": self._why})) for client in self._clients.values())
+            # A browser that takes nothing more is not waited for.
+            with suppress(TimeoutError):
+                await asyncio.wait_for(asyncio.gather(*told, return_exceptions=True), GOODBYE)
 
     def _guard(self, connection: ServerConnection, request: Request) -> Response | None:
         """None for the pilot's own socket; the page, or a refusal that says nothing."""

@@ -98,8 +98,8 @@ class Session:
         return self.server.address
 
     def close(self) -> None:
-        """Stop listening; nothing is left running."""
-        self.server.stop()
+        """Tell the browsers why it is over, and stop listening; nothing is left running."""
+        self.server.stop(self.account.ended)
 
     def run(self, *, until_closed: bool = False) -> Account:
         """Drive until the pilot ends it, Ctrl-C, the longest time, or with ``until_closed`` nobody is left.

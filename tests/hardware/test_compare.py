@@ -43,6 +43,20 @@ def test_half_speed_halves_the_error_in_angle_not_the_delay(rig, clean_run) -> N
     assert half.worst.rms == pytest.approx(full.worst.rms / 2, rel=0.2)
 
 
+def test_joints_that_nearly_stand_tell_no_delay() -> None:
+    """Two encoder steps of motion, and a joint that moves but is off by something else than delay."""
+    t, random = np.linspace(0, 4, 2001), np.random.default_rng(1)
+    simulated, measured = Record(t), Record(t)
+    still, moved = 1.5e-3 * np.sin(t), 0.5 * np.sin(t)
+    shaken = moved + 0.02 * np.sin(31.0 * t) + 1e-3 * random.normal(size=len(t))
+    late = 1.5e-3 * np.sin(t - 0.129)
+    simulated.add("q", np.stack([still, moved], axis=1), "rad", labels=("still", "moved"))
+    measured.add("q", np.stack([late, shaken], axis=1), "rad", labels=("still", "moved"))
+    comparison = compare_records(simulated, measured)
+    assert all(np.isnan(joint.delay) for joint in comparison.joints)
+    assert comparison.delay == 0.0
+
+
 def test_a_known_delay_and_error_are_found() -> None:
     t = np.linspace(0, 4, 2001)
     simulated, measured = Record(t), Record(t)

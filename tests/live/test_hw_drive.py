@@ -221,6 +221,9 @@ def test_a_pilot_cannot_leave_the_limits_of_the_map(drives: Callable[..., Drive]
     client = one.begin()
     with pytest.raises(ConnectionClosed):
         pull(client, {"y": 1.0}, np.inf)
+    # The pilot looks at the page, not at the terminal.
+    assert "the servos have stopped: limit" in client.over
+    assert "base_yaw: position" in client.over
     one.ended(4)
     assert "base_yaw: position" in " ".join(one.said.split())
     record, summary = one.measured()

@@ -103,6 +103,7 @@ def test_keys_gamepad_and_sticks_drive_a_snake(teleop: Callable[..., Teleop], pi
     drive = teleop("snake_operator", "--speed", "0.2")
     one = pilot(drive)
     keyboard = one.page.keyboard
+    assert [one.page.locator(f"kbd:text-is('{key}')").count() for key in "GMN"] == [1, 1, 1]
     # Keys of axes alone do nothing, with space they drive.
     keyboard.down("w")
     before = one.hand()
@@ -151,6 +152,22 @@ def test_keys_gamepad_and_sticks_drive_a_snake(teleop: Callable[..., Teleop], pi
     assert drive.finish() == 0
     assert "ended by the pilot" in drive.said
     one.until("dynsim.drive.ended")
+    assert one.page.inner_text(".state") == "the drive is over: ended by the pilot"
+    assert not any(one.page.locator(part).is_visible() for part in ("#end", "#hold", "#role", ".stick >> nth=0"))
+
+
+def test_the_page_says_what_is_in_the_way(teleop: Callable[..., Teleop], pilot: Callable[[Teleop], Pilot]) -> None:
+    """The edge of reach, which is not driving as usual; silence, until the key is let go; the end."""
+    drive = teleop("elbow_comparison", "--variant", "two_elbows")
+    one = pilot(drive)
+    one.page.keyboard.down("r")
+    one.space()
+    one.until("document.querySelector('.state.hindered')?.textContent.includes('joint_10 would speed up')", one.space)
+    # The page is too busy to say a word.
+    one.js("dynsim.drive.say = (said) => { dynsim.drive.unsaid = said; }")
+    one.until("document.querySelector('.state.silent')?.textContent.includes('let the key go once')")
+    assert drive.interrupt() == 0
+    one.until("document.querySelector('.state.over')?.textContent.includes('interrupted')")
 
 
 def test_focus_that_is_lost_lets_everything_go(teleop: Callable[..., Teleop], pilot: Callable[[Teleop], Pilot]) -> None:

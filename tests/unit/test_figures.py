@@ -504,7 +504,7 @@ def test_the_marks_are_explained_beside_nothing_else(real: Record) -> None:
 
 def test_shares_near_none_and_all_are_told_from_them() -> None:
     shares = (0.0, 3e-4, 2e-6, 0.0314, 0.5, 0.9996, 1.0 - 1e-6, 1.0)
-    told = [contacts._percent(share) for share in shares]
+    told = [measures.percent(share) for share in shares]
     assert told == ["0.0 %", "0.03 %", "0.0002 %", "3.1 %", "50.0 %", "99.96 %", "99.9999 %", "100.0 %"]
 
 

@@ -34,6 +34,18 @@ def test_a_terminal_shows_texts_as_they_are_written(colours: bool):
     assert all(c == "\n" or c.isprintable() for c in shown)
 
 
+def test_a_brace_that_pulls_for_a_moment_is_not_said_to_pull_never():
+    contact = {
+        "name": "elbow", "normal_force_mean_N": 1.0, "normal_force_min_N": -9.26, "normal_force_max_N": 1.0,
+        "pulling_fraction": 2e-4, "closed_fraction": 1.0,
+    }  # fmt: skip
+    output = io.StringIO()
+    summary = {"scenario": "a", "variant": "", "electrical_energy_J": 1.0, "warnings": [], "contacts": [contact]}
+    print_summary(Terminal(file=output, width=300), summary)
+    (line,) = [line for line in output.getvalue().splitlines() if "pulling" in line]
+    assert "0.02" in line
+
+
 def test_tables_show_names_as_they_are_written():
     contact = {
         "name": EVIL, "normal_force_mean_N": 1.0, "normal_force_min_N": 1.0, "normal_force_max_N": 1.0,

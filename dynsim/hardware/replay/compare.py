@@ -14,6 +14,7 @@ from scipy.optimize import minimize_scalar
 
 from dynsim.config import StrictModel
 from dynsim.errors import RecordError, shown
+from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.errors import ComparisonGateFailed
 from dynsim.hardware.replay.lifting import lifted
 from dynsim.hardware.replay.states import State
@@ -26,8 +27,8 @@ MAX_DELAY = 0.5
 """Longest delay looked for [s]."""
 STRONG = 4
 """Joints that the figure draws in colour where none are named: those with the largest rms."""
-MOVING = 1e-3
-"""A joint that moves less than this [rad] says nothing about delay."""
+MOVING = 3 * RAD_PER_TICK
+"""A joint that moves less than this [rad], three steps of a servo's encoder, says nothing about delay."""
 WHEEL_ANGLE, WHEEL_RATE = "rho", "rho_dot"
 """Signals of what turns on and on: where it stands says nothing, how far it has turned and how fast it turns does."""
 Bound = Annotated[float, Field(gt=0)]
@@ -317,9 +318,8 @@ def _delay(at: Any, time: Array, actual: Array, columns: NDArray[np.bool_]) -> f
     if nearest in (0, len(grid) - 1):
         return float("nan")
     best, step = grid[nearest], grid[1] - grid[0]
-    return float(
-        minimize_scalar(misfit, bounds=(best - step, best + step), method="bounded", options={"xatol": 1e-5}).x
-    )
+    found = minimize_scalar(misfit, bounds=(best - step, best + step), method="bounded", options={"xatol": 1e-5})
+    return float(found.x) if found.fun <= 0.5 * misfit(0.0) else float("nan")
 
 
 def load_gate(path: str | Path) -> Gate:

@@ -266,7 +266,10 @@ class AbortRules:
     def _deadline(self, cycle: Cycle) -> list[Fault]:
         if self._late < self._safety.late_cycles or not self._new(Cause.DEADLINE):
             return []
-        text = f"{self._late} cycles in a row started late, the last by {cycle.lateness * 1e3:.1f} ms"
+        text = (
+            f"{self._late} cycles in a row started late, the last by {cycle.lateness * 1e3:.1f} ms: "
+            "the computer is too slow or too busy; close other programs, or give it more time by a lower --rate"
+        )
         return [Fault(Cause.DEADLINE, text)]
 
 

@@ -26,16 +26,17 @@ class Drive {
     this.keys = new Set();
     this.sticks = new Map();
     Object.assign(this, { role: "watching", free: true, state: "connecting", count: 0, frames: 0, trip: NaN, closed: false, scale: 1,
-      request: null, slow: 0, drawnAt: 0, eased: 0, ratio: 1, sent: new Map(), newest: null, ended: false, refused: [], wish: null, grip: false });
+      request: null, slow: 0, drawnAt: 0, eased: 0, ratio: 1, sent: new Map(), newest: null, ended: false, over: "", refused: [], wish: null, grip: false });
     document.head.append(D.element("style", { textContent: DRIVE.style }));
     this.socket = new WebSocket(DRIVE.socket);
     this.socket.onmessage = (event) => this.hear(JSON.parse(event.data));
-    this.socket.onclose = () => { this.ended = true; this.state = "connection closed: the drive is over"; this.tell(); };
+    this.socket.onclose = () => { this.ended = true; this.tell(); };
   }
 
   hear(message) {
     if (message.hello) { this.begin(message.hello); return; }
     if (message.role) { this.role = message.role; this.free = message.free; this.tell(); return; }
+    if (message.over !== undefined) { this.over = message.over; return; }
     if (message.refused) { this.refused.push(message.refused); console.warn(message.refused); return; }
     this.newest = message;
     const at = this.sent.get(message.n);
@@ -82,6 +83,7 @@ class Drive {
   send(axes, held) {
     const message = { n: ++this.count, axes, held, closed: this.closed };
     if (this.request !== null && held) { message.mode = this.request; this.request = null; }
+    if (held && !this.wish?.held) this.heldFrom = this.count;
     this.sent.set(this.count, performance.now());
     if (this.sent.size > 200) this.sent.delete(this.sent.keys().next().value);
     this.wish = message;
@@ -182,7 +184,9 @@ class Drive {
     end.id = "end";
     const acts = D.element("span", { className: "acts" }, hold, D.element("label", {}, " speed ", speed), ...(hello.gripper ? [this.grips] : []), ...(modes ? [modes] : []), end);
     const keys = D.element("dl", {}, ...this.axes.map((axis) => D.element("span", { title: `${axis.group} ${axis.name}, up to ${axis.limit} ${axis.unit}` },
-      ...AXIS_KEYS[axis.name].map((key) => D.element("kbd", { textContent: label(key) })), ` ${axis.group} ${axis.name}`)));
+      ...AXIS_KEYS[axis.name].map((key) => D.element("kbd", { textContent: label(key) })), ` ${axis.group} ${axis.name}`)),
+      ...(hello.gripper ? [D.element("span", { title: "close or open the gripper" }, D.element("kbd", { textContent: "G" }), " gripper")] : []),
+      ...(hello.modes.length ? [D.element("span", { title: "modes, taken when the key is held" }, D.element("kbd", { textContent: "M" }), D.element("kbd", { textContent: "N" }), " switching, fixing")] : []));
     const sticks = D.element("div", { className: "sticks" });
     for (const [a, b] of this.names.includes("ahead") ? [["turn", "ahead"], ["y", "x"]] : [["y", "x"], [this.names.includes("gamma") ? "gamma" : null, "z"]]) {
       if (!this.names.includes(a) && !this.names.includes(b)) continue;
@@ -208,7 +212,7 @@ class Drive {
     dynsim.frame({ time: frame.time, poses: frame.poses, pressure: null, ...(frame.wheels ? { wheels: frame.wheels } : {}),
       contacts: dynsim.app.actors[0].contacts.map((c) => frame.contacts[c.contact.name] ?? NOTHING), ...(frame.gripper === undefined ? {} : { gripper: frame.gripper }) });
     this.last = frame;
-    if (!this.ended) this.state = frame.state;
+    this.state = frame.state;
     this.tell();
   }
 
@@ -223,13 +227,25 @@ class Drive {
     stage.touch();
   }
 
+  // How it stands, as a class of the style sheet, and in words.
+  status() {
+    if (this.ended) return ["over", `the drive is over: ${this.over || "connection closed"}`];
+    if (this.state === "driving") return this.last?.hindrance ? ["hindered", `driving, held back: ${this.last.hindrance}`] : ["driving", "driving"];
+    if (this.state === "silent") return ["silent", "silent: the connection or the page paused; let the key go once, then hold it again"];
+    if (this.state === "the robot is not ready yet") return ["silent", this.state];
+    // It has heard of the key, and does not count it: held since before the robot was ready, or by a new pilot.
+    if (this.role === "pilot" && this.wish?.held && this.last?.n >= this.heldFrom && this.state === "key released") return ["silent", "let the key go once, then hold it again"];
+    return ["", this.role === "pilot" && this.state === "key released" ? "hold space to drive" : this.state];
+  }
+
   tell() {
     if (!this.box) return;
-    const f = this.last, driving = this.state === "driving";
+    const f = this.last, [kind, text] = this.status();
+    this.box.classList.toggle("ended", this.ended);
     this.bar.classList.toggle("watching", this.role !== "pilot");
     this.box.classList.toggle("watching", this.role !== "pilot");
-    this.stateBox.textContent = f?.hindrance && driving ? `driving, held back: ${f.hindrance}` : this.role === "pilot" && this.state === "key released" ? "hold space to drive" : this.state;
-    this.stateBox.className = `state ${this.state}`;
+    this.stateBox.textContent = text;
+    this.stateBox.className = `state ${kind}`;
     this.roleButton.textContent = this.role === "pilot" ? "leave the wheel" : this.free ? "take the wheel" : "somebody else drives";
     this.roleButton.disabled = this.ended || (this.role !== "pilot" && !this.free);
     this.grips.textContent = this.closed ? "open gripper" : "close gripper";
