@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -420,7 +419,7 @@ def _passed_limits(record: Record, robot: Robot, real: bool) -> list[str]:
     torque = dict(zip(record.labels["torque"], record["torque"].T, strict=True))
     found = []
     for link, k, v in zip(robot.links, robot.position_index, record["v"].T, strict=True):
-        if all(map(math.isinf, (link.lower, link.upper, link.velocity_limit, link.effort_limit))):
+        if all(abs(one) == np.inf for one in (link.lower, link.upper, link.velocity_limit, link.effort_limit)):
             continue
         q = record["q"][:, k]
         position, velocity, _, force = link.units

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dynsim.files import discard, json_text, replace_together
+from dynsim.errors import RecordError
+from dynsim.files import discard, json_text, replace_together, write_text
 from dynsim.record import Record
 from dynsim.scenario import to_yaml
 
@@ -34,3 +35,22 @@ def save_run(record: Record, folder: Path) -> None:
     # Figures of another record must not lie beside this one.
     discard(folder, FIGURES)
     replace_together(folder, contents)
+
+
+def save_drive(record: Record, folder: Path) -> None:
+    """:func:`save_run` of what nobody can do again: where the record has no room, the script that repeats it is kept.
+
+    Raises
+    ------
+    RecordError
+        Not all of it could be written; says whether the script was.
+    """
+    try:
+        save_run(record, folder)
+    except RecordError as error:
+        script = folder / "scenario.yaml"
+        try:
+            write_text(script, to_yaml(record.provenance["scenario"]))
+        except RecordError:
+            raise error from None
+        raise RecordError(f"{error}; the script is kept, and makes the record again: dynsim run {script}") from None

@@ -22,6 +22,10 @@ Summary = Mapping[str, Any]
 _HEADING_WIDTH = 30
 
 
+# Energies of no more than this share of the turnover are rounding.
+ROUNDING = 1e-12
+
+
 def _number(value: Any, scale: float = 1.0, digits: int = 4) -> str:
     return "–" if value is None else f"{value * scale:.{digits}g}"
 
@@ -46,6 +50,12 @@ def _least_load(summary: Summary) -> float | None:
     return None if loads is None else min(loads.values())
 
 
+def _impact_loss(summary: Summary) -> float | None:
+    """What impacts took [J], 0 where that is rounding beside the energy turned over."""
+    loss: float | None = summary.get("impact_loss_J")
+    return 0.0 if loss and abs(loss) <= ROUNDING * summary.get("energy_turnover_J", 0.0) else loss
+
+
 # Heading, and how to take it from a summary. A row is left out when no run has it.
 _ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = (
     ("electrical energy [J]", lambda s: s.get("electrical_energy_J"), _number),
@@ -54,7 +64,7 @@ _ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = 
     ("mechanical work [J]", lambda s: s.get("mechanical_work_J"), _number),
     ("Joule heat [J]", lambda s: s.get("joule_heat_J"), _number),
     ("friction heat [J]", lambda s: s.get("friction_heat_J"), _number),
-    ("impact loss [J]", lambda s: s.get("impact_loss_J"), _number),
+    ("impact loss, all contacts [J]", _impact_loss, _number),
     ("stop loss [J]", lambda s: s.get("stop_loss_J") or None, _number),
     ("taken by time steps [J]", lambda s: s.get("scheme_loss_J"), _number),
     ("hand error, rms [mm]", lambda s: s.get("hand_error_rms_m"), lambda v: _number(v, 1e3)),
@@ -196,7 +206,7 @@ _CONTACT_ROWS: tuple[tuple[str, Callable[[Summary], str], bool | None], ...] = (
     ("  sticking [% of time]", _percent("sticking_fraction"), True),
     ("  lift-offs, landings", lambda c: f"{c['lift_offs']}, {c['landings']}", True),
     ("  bounces, slip starts", lambda c: f"{c['bounces']}, {c['slip_starts']}", True),
-    ("  impact loss [J]", lambda c: _number(c["impact_loss_J"], digits=3), True),
+    ("  loss at its impacts [J]", lambda c: _number(c["impact_loss_J"], digits=3), True),
 )
 
 
@@ -216,7 +226,7 @@ _STOP_ROWS: tuple[tuple[str, Callable[[Summary], str]], ...] = (
     ("hits", lambda s: str(s["hits"])),
     ("  force, max [{force_unit}]", lambda s: _number(s["force_max"], digits=3)),
     ("  closed [% of time]", _percent("closed_fraction")),
-    ("  impact loss [J]", lambda s: _number(s["impact_loss_J"], digits=3)),
+    ("  loss at its impacts [J]", lambda s: _number(s["impact_loss_J"], digits=3)),
 )
 
 

@@ -109,10 +109,9 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
     from rich.progress import BarColumn, Progress, TextColumn
 
     from dynsim.engine import REFERENCES, SIMULATION
-    from dynsim.kernels.jit import is_cached
+    from dynsim.engine.outcome import COMPILING
+    from dynsim.kernels.jit import told_of_compilation
 
-    if not is_cached():
-        console.print("Compiling the kernels: once after an installation or an edit, up to a minute.")
     # In 80 columns all fits up to 9999 s: the bar gives way, the times do not.
     columns = (
         TextColumn("{task.description}"),
@@ -120,7 +119,10 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
         TextColumn("{task.completed:.2f} / {task.total:g} s {task.fields[what]}"),
         *_times(),
     )
-    with Progress(*columns, console=console, transient=not console.is_terminal) as bars:
+    with (
+        Progress(*columns, console=console, transient=not console.is_terminal) as bars,
+        told_of_compilation(lambda: console.print(f"{COMPILING[0].upper()}{COMPILING[1:]}.")),
+    ):
 
         def add(scenario: Scenario, what: str, visible: bool) -> TaskID:
             title = scenario.variant or scenario.name

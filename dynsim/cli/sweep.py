@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from enum import StrEnum
 from pathlib import Path
 from threading import Thread
@@ -20,7 +21,7 @@ from dynsim.cli.app import (
     parsed_overrides,
 )
 from dynsim.cli.display import console, drawing, errors, sweep_progress
-from dynsim.errors import ScenarioError
+from dynsim.errors import ScenarioError, SimulationStopped
 from dynsim.terminal import escaped
 
 if TYPE_CHECKING:
@@ -71,7 +72,10 @@ def sweep(
     format_: FormatOption = FigureFormat.png,
     quiet: QuietOption = False,
 ) -> None:
-    """Simulate a scenario over a grid, and with samples, of its values; write a table of all runs and figures."""
+    """Simulate a scenario over a grid, and with samples, of its values; write a table of all runs and figures.
+
+    A run that fails is a row with its reason. Exit codes: 0 some run ended well, 2 bad input, 3 none did, 130 Ctrl-C.
+    """
     from dynsim.studies.processes import begin_early, cores, keep_memory
 
     if jobs is not None and scheduler is not None:
@@ -86,14 +90,20 @@ def sweep(
     file = read_scenario(scenario)
     axes, laws = tuple(map(Axis.parse, grid or ())), tuple(map(Law.parse, sample or ()))
     plan = Plan(file, _variants(file.variants, variants), parsed_overrides(overrides), axes, laws, count, seed)
-    folder = out or Path("results", file.path.stem, "sweep")
+    # Which values make no scenario is known here, before processes and threads have work.
+    name = plan.scenario(next(plan.points())).name
+    folder = out or Path("results", name, "sweep")
     check_writable(folder, (PLAN, JOURNAL, *TABLES, STATISTICS))
-    if scheduler is not None or min(jobs or cores(), plan.runs) > 1:
-        # Meanwhile others simulate.
-        Thread(target=_load_for_the_end, args=(bool(laws), not no_figures), name="imports").start()
-    else:
+    others = scheduler is not None or min(jobs or cores(), plan.runs) > 1
+    if not others:
         keep_memory()
-    with sweep_progress(plan.runs, quiet) as report:
+    with sweep_progress(plan.runs, quiet) as told, _loading(bool(laws), not no_figures) as load:
+
+        def report(done: int, failed: int) -> None:
+            if others:
+                load()
+            told(done, failed)
+
         rows = run_sweep(
             plan,
             folder,
@@ -109,7 +119,7 @@ def sweep(
     if len(failed) > _SHOWN:
         errors.print(f"… and {len(failed) - _SHOWN} more; the table has all reasons")
     if not no_figures:
-        _draw(rows, plan, folder, quiet, format_)
+        _draw(name, rows, plan, folder, quiet, format_)
     if not quiet:
         if not has_parquet():
             console.print(escaped("No Parquet: it needs pyarrow (pip install 'dynsim[tables]')."), highlight=False)
@@ -118,6 +128,8 @@ def sweep(
             highlight=False,
             soft_wrap=True,
         )
+    if len(failed) == len(rows):
+        raise SimulationStopped(f"none of the {len(rows)} runs ended well; {folder / TABLES[0]} has their reasons")
 
 
 def _variants(known: Sequence[str], wanted: str | None) -> tuple[str | None, ...]:
@@ -130,28 +142,50 @@ def _variants(known: Sequence[str], wanted: str | None) -> tuple[str | None, ...
     return tuple(known) if wanted == "all" else tuple(name.strip() for name in wanted.split(","))
 
 
+@contextmanager
+def _loading(samples: bool, figures: bool) -> Iterator[Callable[[], None]]:
+    """What tables, statistics and figures need is imported beside the runs, from the first call of what is yielded on.
+
+    Only then, and awaited at the end: modules cannot be imported any more when the command has ended.
+    """
+    thread = Thread(target=_load_for_the_end, args=(samples, figures), name="imports")
+
+    def load() -> None:
+        if thread.ident is None:
+            thread.start()
+
+    try:
+        yield load
+    finally:
+        if thread.ident is not None:
+            thread.join()
+
+
 def _load_for_the_end(samples: bool, figures: bool) -> None:
-    """Import what tables, statistics and figures need, half a second in all; what is missing is said there."""
-    from dynsim.studies.sweep import has_parquet
+    """Import what is needed there, half a second in all; what is missing, or broken, is said there too."""
+    # Also what a second Ctrl-C does, which ends the command before this.
+    with suppress(Exception):
+        from dynsim.studies.sweep import has_parquet
 
-    if has_parquet():
-        import pyarrow
+        if has_parquet():
+            import pyarrow
 
-        pyarrow.array([0.0])  # looks whether there is pandas
-    if samples:
-        import scipy.special  # noqa: F401
-    if figures:
-        import dynsim.figures.sweep  # noqa: F401
+            pyarrow.array([0.0])  # looks whether there is pandas
+        if samples:
+            import scipy.special  # noqa: F401
+        if figures:
+            import dynsim.figures.sweep  # noqa: F401
 
 
-def _draw(rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool, format_: str) -> None:
+def _draw(name: str, rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool, format_: str) -> None:
     from dynsim.figures.sweep import Sweep, draw
 
     table = Sweep(
-        plan.file.path.stem,
+        name,
         [row.cells() for row in rows if row.numbers],
         [axis.key for axis in plan.grid],
         plan.sampled,
+        plan.file.variants,
     )
     with drawing(folder, quiet):
         draw(table, folder, format_)

@@ -63,7 +63,7 @@ def teleop(
     from dynsim.engine.driven import Pace, drive
     from dynsim.files import check_writable
     from dynsim.live.session import Session
-    from dynsim.results import RUN_FILES, save_run
+    from dynsim.results import RUN_FILES, save_drive
     from dynsim.scenario import load_scenario
 
     loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
@@ -87,7 +87,7 @@ def teleop(
         console.print(f"The drive is over ({escaped(account.ended)}) before it began; nothing is saved", soft_wrap=True)
         return
     record = driven.record() if account.stop is None or account.stop.record is None else account.stop.record
-    save_run(record, folder)
+    save_drive(record, folder)
     interruption.heed()
     if not quiet:
         tell_drive(account, driven.ticks * driven.period, folder)

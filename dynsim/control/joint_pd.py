@@ -197,6 +197,7 @@ def _operated(operator: Operator, context: BuildContext) -> Operated:
         joints=tuple(operator.joints),
         braces=tuple(_contact(context, name, "operator.braces") for name in operator.braces),
         rate_limit=operator.rate_limit_rad_s,
+        acceleration_limit=operator.acceleration_limit_rad_s2,
         hand_acceleration=operator.hand_acceleration_m_s2,
         base_acceleration=(operator.base_acceleration_m_s2, operator.base_acceleration_rad_s2),
         tolerance=operator.tolerance_m,

@@ -33,6 +33,9 @@ class Operator(StrictConfig):
     rate_limit_rad_s: Positive = Field(
         default=2.0, description="fastest joint rate, m/s of a prismatic joint: a hand that needs more is slower"
     )
+    acceleration_limit_rad_s2: Positive = Field(
+        default=10.0, description="in which joint rates change, m/s² of a prismatic joint: it ends a way to the edge"
+    )
     hand_acceleration_m_s2: Positive = Field(default=0.5, description="in which velocities of the hand change")
     base_acceleration_m_s2: Positive = Field(default=0.5, description="of the base ahead; more may tip it")
     base_acceleration_rad_s2: Positive = Field(default=2.0, description="of its turns")

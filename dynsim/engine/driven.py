@@ -62,7 +62,7 @@ class Shown:
     Attributes
     ----------
     time : [s]; poses : (bodies, 7) position [m], quaternion w, x, y, z; hand : (3,) [m]
-    waiting : what was asked for could not be done
+    hindrance : why not all of what was asked for is done; empty where it is
     extra : by the names of a frame of the page: wheels, gripper; ``mode`` of a snake
     touching : what contact points do, by their names
     """
@@ -70,7 +70,7 @@ class Shown:
     time: float
     poses: Array
     hand: Array
-    waiting: bool
+    hindrance: str
     extra: dict[str, Any]
     touching: Mapping[str, Touch]
 

@@ -117,7 +117,7 @@ class DrivenArm:
             time=simulation.time,
             poses=poses_at(self._scene, positions),
             hand=operator.target.copy(),
-            waiting=operator.waiting,
+            hindrance=operator.hindrance,
             extra={},
             touching=simulation.touching,
         )

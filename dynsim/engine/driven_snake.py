@@ -9,14 +9,14 @@ import numpy as np
 
 from dynsim.engine.driven import NO_REQUEST, Array, Axis, Order, Pace, Shown, changed
 from dynsim.engine.kinematic import advance_piece, load_kernels, mode_switcher, prepare, read_commands
-from dynsim.engine.kinematic_record import COORDINATES, make_record
+from dynsim.engine.kinematic_record import COORDINATES, OBSTACLES, make_record
 from dynsim.engine.provenance import provenance
 from dynsim.model.scene import snake_scene
 from dynsim.model.snake import FIXING, SWITCHING, CommandBlock, Feedback
 from dynsim.record import Record
 from dynsim.record.poses import poses_at
 from dynsim.scenario import Scenario
-from dynsim.snake.state import MODE, TICKS
+from dynsim.snake.state import MODE, STILL_FOR, TICKS
 
 REQUESTS = {SWITCHING: "switching", FIXING: "fixing"}
 
@@ -106,7 +106,7 @@ class DrivenSnake:
             time=self.time,
             poses=poses_at(self._scene, signals),
             hand=state.w_target[:3].copy(),
-            waiting=run.blocked or run.recovering,
+            hindrance=self._hindrance(),
             extra={
                 "wheels": run.controller.law.grounded[row].tolist(),
                 "gripper": int(self._last.closed),
@@ -114,6 +114,13 @@ class DrivenSnake:
             },
             touching={},
         )
+
+    def _hindrance(self) -> str:
+        """What the target waits for."""
+        run = self._run
+        if run.recovering:
+            return OBSTACLES[-1]
+        return OBSTACLES[int(run.state.counts[STILL_FOR]) - 1] if run.blocked else ""
 
     def joints(self) -> Mapping[str, Array]:
         """Joints and wheels; rates are held from period to period, so that they are differences of these."""

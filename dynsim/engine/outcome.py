@@ -9,19 +9,26 @@ from contextlib import contextmanager
 from typing import NoReturn
 
 from dynsim.errors import ScenarioError, SimulationStopped
-from dynsim.kernels.jit import is_cached
+from dynsim.kernels.jit import told_of_compilation
 from dynsim.record import Record
 from dynsim.scenario import Scenario
+
+COMPILING = "compiling the kernels: once for each kind of system after an installation or an edit, up to a minute"
 
 
 @contextmanager
 def kernels_logged(log: logging.Logger) -> Iterator[None]:
     """Log the time in which the kernels are loaded, or compiled, which takes up to a minute."""
-    cached, started = is_cached(), clock.perf_counter()
-    if not cached:
-        log.info("compiling the kernels: once after an installation or an edit, up to a minute")
-    yield
-    log.info("%s the kernels in %.1f s", "loaded" if cached else "compiled", clock.perf_counter() - started)
+    started, done = clock.perf_counter(), "loaded"
+
+    def tell() -> None:
+        nonlocal done
+        done = "compiled"
+        log.info(COMPILING)
+
+    with told_of_compilation(tell):
+        yield
+    log.info("%s the kernels in %.1f s", done, clock.perf_counter() - started)
 
 
 def check_size(scenario: Scenario, rows: int, columns: int) -> None:

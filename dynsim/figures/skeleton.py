@@ -146,8 +146,9 @@ class SidePlane:
     @property
     def label(self) -> str:
         """Label of the plane's horizontal axis."""
-        azimuth = np.degrees(np.arctan2(self.direction[1], self.direction[0]))
-        return f"distance from {self.where}, azimuth {azimuth:.0f}° [m]"
+        # Rounded first, and without the sign of a zero.
+        azimuth = round(float(np.degrees(np.arctan2(self.direction[1], self.direction[0])))) + 0
+        return f"distance from {self.where}, azimuth {azimuth}° [m]"
 
 
 def side_plane(record: Record, drawn: Sequence[Array]) -> SidePlane:

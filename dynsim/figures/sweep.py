@@ -31,10 +31,13 @@ ERRORS = {
 _BARS, _BINS = 12, 40
 # Values whose ratio is larger are of very different size.
 _WIDE = 8.0
-# Height of a panel, of a bar of a tornado, and of what is about them [inch].
+# Height of a panel, of a bar of a tornado, of what is about them, and of a bar of colours [inch].
 _PANEL, _BAR, _ROOM = 2.1, 0.22, 0.9
-# A label of an axis is not longer [characters].
-_LABEL = 34
+_COLOURS = 0.5
+# A label of an axis, the title of a panel and a part of the figure's are not longer [characters].
+_LABEL, _HEAD, _PART = 34, 58, 70
+# Rows of distributions.
+_ROWS = 6
 
 
 @dataclass(frozen=True)
@@ -46,17 +49,24 @@ class Sweep:
     name : of the scenario
     rows : numbers and values by column, of the runs that have some
     grid, sampled : columns that were varied
+    known : all variants of the scenario, in its order: their colours do not depend on which of them were run
     """
 
     name: str
     rows: Sequence[Mapping[str, Any]]
     grid: Sequence[str]
     sampled: Sequence[str]
+    known: Sequence[str] = ()
 
     @property
     def variants(self) -> list[str]:
         """In the order of the table; one without a name where there are none."""
         return list(dict.fromkeys(str(row.get("variant", "")) for row in self.rows))
+
+    @property
+    def looks(self) -> dict[str, dict[str, Any]]:
+        """Colour and width of every variant."""
+        return style.variant_styles(list(dict.fromkeys([*self.known, *self.variants])))
 
     @property
     def metrics(self) -> dict[str, tuple[str, float]]:
@@ -96,7 +106,7 @@ def lines(sweep: Sweep) -> Figure | None:
     if len(sweep.grid) != 1:
         return None
     (key,) = sweep.grid
-    styles, metrics = style.variant_styles(sweep.variants), sweep.metrics
+    styles, metrics = sweep.looks, sweep.metrics
     figure = style.new_figure(_PANEL * len(metrics) + _ROOM, f"{sweep.name}: over {key}")
     panels = figure.subplots(len(metrics), 1, sharex=True, squeeze=False)[:, 0]
     levels = _levels(sweep.rows, key)
@@ -127,8 +137,8 @@ def heat_map(sweep: Sweep) -> Figure | None:
     x, y = sweep.grid[:2]
     metrics, variants = sweep.metrics, sweep.variants
     others = [*sweep.grid[2:], *sweep.sampled]
-    note = f" (mean over {_short(', '.join(others))})" if others else ""
-    figure = style.new_figure(_PANEL * len(variants) + _ROOM, f"{sweep.name}: over {x} and {y}{note}")
+    note = f" (mean over {_short(', '.join(others), _PART)})" if others else ""
+    figure = style.new_figure(_PANEL * len(variants) + _ROOM + _COLOURS, f"{sweep.name}: over {x} and {y}{note}")
     panels = figure.subplots(len(variants), len(metrics), squeeze=False, sharex=True, sharey=True)
     xs, ys = _levels(sweep.rows, x), _levels(sweep.rows, y)
     for column, (metric, (label, scale)) in zip(panels.T, metrics.items(), strict=True):
@@ -147,9 +157,10 @@ def heat_map(sweep: Sweep) -> Figure | None:
             axes.set_title(variant)
             _name_cells(axes, "y", y, ys)
             _name_cells(axes, "x", x, xs)
-        bar = figure.colorbar(image, ax=list(column), label=label)
+        # Below its column: beside it, its label would stand at the next one.
+        bar = figure.colorbar(image, ax=list(column), label=label, location="bottom", aspect=30, pad=0.02)
         if isinstance(norm, LogNorm):
-            style.log_axis(bar.ax)
+            style.log_axis(bar.ax, "x")
     for axes in panels[:, 1:].flat:
         axes.set_ylabel("")
     for axes in panels[:-1].flat:
@@ -164,13 +175,15 @@ def pareto(sweep: Sweep) -> Figure | None:
     (energy, (energy_label, _)), (error, (error_label, scale)) = sweep.metrics.items()
     figure = style.new_figure(3.6, f"{sweep.name}: energy against error, {len(sweep.rows)} runs")
     axes = figure.subplots()
-    styles = style.variant_styles(sweep.variants)
-    for variant in sweep.variants:
+    styles, last = sweep.looks, max(len(sweep.variants) - 1, 1)
+    for k, variant in enumerate(sweep.variants):
         found = [
             (row[error], row[energy]) for row in sweep.of(variant) if None not in (row.get(error), row.get(energy))
         ]
         xs, ys = np.array(found, dtype=float).reshape(-1, 2).T
-        size = 14 if len(sweep.rows) < 500 else 4
+        # Earlier ones are larger: equal runs of several variants are rings about each other.
+        larger = 1.0 + 1.8 * (len(sweep.variants) - 1 - k) / last
+        size = (14 if len(sweep.rows) < 500 else 4) * larger**2
         axes.scatter(
             scale * xs, ys, s=size, color=styles[variant]["color"], label=variant or None, linewidths=0, zorder=3
         )
@@ -186,6 +199,7 @@ def pareto(sweep: Sweep) -> Figure | None:
         markersize=5,
         markerfacecolor="none",
         label="no run is better in both",
+        zorder=4,
     )
     axes.margins(0.05)
     axes.set(xlabel=error_label, ylabel=energy_label)
@@ -205,37 +219,60 @@ def best(points: Sequence[tuple[float, float]]) -> Array:
 
 
 def samples(sweep: Sweep) -> Figure | None:
-    """Distribution of energy and error over the samples, a row for each variant; None without samples."""
+    """Distribution of energy and error over the samples; None without samples.
+
+    A row for each variant and place of the grid: what the grid does is no law of the samples, and all places have the
+    same draws. Of many places, some that lie evenly among them.
+    """
     if not sweep.sampled:
         return None
-    metrics, variants = sweep.metrics, sweep.variants
-    note = f"; mean over {_short(', '.join(sweep.grid))}" if sweep.grid else ""
-    figure = style.new_figure(
-        _PANEL * len(variants) + _ROOM, f"{sweep.name}: {len(sweep.rows)} runs by the law of their parameters{note}"
+    metrics, variants, places = sweep.metrics, sweep.variants, _grid_places(sweep)
+    room = max(_ROWS // len(variants), 1)
+    shown = [places[k] for k in np.linspace(0, len(places) - 1, min(room, len(places))).round().astype(int)]
+    note = (
+        f"; {len(shown)} of {len(places)} places of the grid, all in statistics.json"
+        if len(shown) < len(places)
+        else ""
     )
-    panels = figure.subplots(len(variants), len(metrics), squeeze=False)
-    styles = style.variant_styles(variants)
-    for row, variant in zip(panels, variants, strict=True):
+    figure = style.new_figure(
+        _PANEL * len(variants) * len(shown) + _ROOM,
+        f"{sweep.name}: {len(sweep.rows)} runs by the law of their parameters{note}",
+    )
+    rows = [(variant, place) for variant in variants for place in shown]
+    ends = [key.split(".")[-1] for key in sweep.grid]
+    names = {key: end if ends.count(end) == 1 else key for key, end in zip(sweep.grid, ends, strict=True)}
+    panels = figure.subplots(len(rows), len(metrics), squeeze=False)
+    for row, (variant, place) in zip(panels, rows, strict=True):
+        here = list(_at(sweep.of(variant), place))
+        # Where there is one place, it goes without saying.
+        where = [f"{names[key]} = {_level(value)}" for key, value in place.items()] if len(places) > 1 else []
+        texts = [variant] * bool(variant) + [_short(", ".join(where), _HEAD - len(variant))] * bool(where)
+        head = f"{', '.join(texts)}\n" if texts else ""
         for axes, (metric, (label, scale)) in zip(row, metrics.items(), strict=True):
-            values = _values(sweep.of(variant), metric) * scale
+            _distribution(axes, _values(here, metric) * scale, head, sweep.looks[variant]["color"])
             axes.set_xlabel(label)
             axes.set_ylabel("runs")
-            if len(values) < 2:
-                continue
-            # Freedman and Diaconis: as narrow as the number of samples allows.
-            bins = min(_BINS, len(np.histogram_bin_edges(values, "fd")) - 1)
-            axes.hist(values, bins=bins, color=styles[variant]["color"], alpha=0.7)
-            one = spread(values)
-            axes.axvline(one.mean, color=style.BLACK, linewidth=1.0)
-            for limit in (one.low, one.high):
-                axes.axvline(limit, color=style.BLACK, linewidth=0.8, linestyle=(0, (4, 2)))
-            axes.set_title(
-                f"{variant + ': ' if variant else ''}mean {_with_interval(one.mean, one.mean_high - one.mean)}, "
-                f"{100 * LEVEL:g} % in {style.number(one.low)} … {style.number(one.high)}",
-                fontsize=7.5,
-            )
-            axes.margins(x=0.03)
     return figure
+
+
+def _distribution(axes: Axes, values: Array, head: str, colour: str) -> None:
+    """Histogram of the draws at one place, with their mean and its interval, and that of the draws themselves."""
+    if len(values) < 2:
+        axes.set_title(f"{head}too few runs with numbers: {len(values)}", fontsize=7.5)
+        return
+    # Freedman and Diaconis: as narrow as the number of samples allows.
+    bins = min(_BINS, len(np.histogram_bin_edges(values, "fd")) - 1)
+    axes.hist(values, bins=bins, color=colour, alpha=0.7)
+    one = spread(values)
+    axes.axvline(one.mean, color=style.BLACK, linewidth=1.0)
+    for limit in (one.low, one.high):
+        axes.axvline(limit, color=style.BLACK, linewidth=0.8, linestyle=(0, (4, 2)))
+    of_all = (
+        f"{one.count} runs: mean {_with_interval(one.mean, one.mean_high - one.mean)}, "
+        f"{100 * LEVEL:g} % in {style.number(one.low)} … {style.number(one.high)}"
+    )
+    axes.set_title(f"{head}{of_all}", fontsize=7.5)
+    axes.margins(x=0.03)
 
 
 def tornado(sweep: Sweep) -> Figure | None:
@@ -270,7 +307,7 @@ def tornado(sweep: Sweep) -> Figure | None:
             axes.grid(visible=False, axis="y")
             axes.margins(x=0.05)
             explained = f"a line explains {100.0 * fit.explained:.3g} % of the variance"
-            axes.set_title(f"{variant + ': ' if variant else ''}{explained}", fontsize=7.5)
+            axes.set_title("\n".join([variant] * bool(variant) + [explained]), fontsize=7.5)
     return figure
 
 
@@ -278,13 +315,28 @@ def _fit(sweep: Sweep, variant: str, metric: str) -> Any:
     rows = [row for row in sweep.of(variant) if row.get(metric) is not None]
     if not rows or not sweep.sampled:
         return None
-    parameters = np.array([[row[key] for key in sweep.sampled] for row in rows], dtype=float)
     values = np.array([row[metric] for row in rows], dtype=float)
     # What the grid does is not what the samples do.
-    for place in {tuple(map(str, (row[key] for key in sweep.grid))) for row in rows}:
-        here = np.array([tuple(map(str, (row[key] for key in sweep.grid))) == place for row in rows])
+    for here in _together(rows, sweep.grid).values():
         values[here] -= values[here].mean()
-    return sensitivities(parameters, values)
+    # All places have the same draws: each counts once, or the intervals would be those of more than there are.
+    draws = list(_together(rows, sweep.sampled).values())
+    parameters = np.array([[rows[draw[0]][key] for key in sweep.sampled] for draw in draws], dtype=float)
+    return sensitivities(parameters, np.array([values[draw].mean() for draw in draws]))
+
+
+def _together(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> dict[tuple[str, ...], list[int]]:
+    """Which rows share the values of some keys, by those."""
+    found: dict[tuple[str, ...], list[int]] = {}
+    for k, row in enumerate(rows):
+        found.setdefault(tuple(str(row[key]) for key in keys), []).append(k)
+    return found
+
+
+def _grid_places(sweep: Sweep) -> list[dict[str, Any]]:
+    """Values of the grid's keys, each set of them once, in the order of the table."""
+    firsts = [found[0] for found in _together(sweep.rows, sweep.grid).values()]
+    return [{key: sweep.rows[k][key] for key in sweep.grid} for k in firsts]
 
 
 def _levels(rows: Sequence[Mapping[str, Any]], key: str) -> list[Any]:
@@ -343,5 +395,9 @@ def _is_wide(low: float, high: float) -> bool:
     return bool(low > 0.0 and high > _WIDE * low)
 
 
-def _short(text: str) -> str:
-    return text if len(text) <= _LABEL else f"…{text[1 - _LABEL :]}"
+def _level(value: Any) -> str:
+    return style.number(value) if _numeric([value]) else str(value)
+
+
+def _short(text: str, long: int = _LABEL) -> str:
+    return text if len(text) <= long else f"…{text[1 - long :]}"

@@ -23,11 +23,11 @@ from dynsim.film.camera import Camera
 from dynsim.film.solids import grid_faces, solid
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import rotated
-from dynsim.record.scene import WORLD
-from dynsim.record.surface_points import surface_grids
+from dynsim.record.scene import HERE, WORLD, Surface
+from dynsim.record.surface_points import round_patch, surface_grids
 from dynsim.view.meshes import Meshes
 from dynsim.view.robot import Contact, Robot, Sunk, contacts, largest_force, paths, sunk
-from dynsim.view.solids import body_shapes, drawn_shape
+from dynsim.view.solids import body_shapes, drawn_shape, drawn_surface
 from dynsim.view.wheels import cop_of, supports, wheel_groups
 
 Array = NDArray[np.float64]
@@ -187,8 +187,7 @@ class Painter:
             if plane and abs((surface.direction or (0, 0, 1))[2]) > 1.0 - 1e-9:
                 self._paint_floor(draw, low, high, (surface.position or (0, 0, 0))[2])
             else:
-                for grid in surface_grids(surface, low, high):
-                    self._paint_faces(draw, *grid_faces(grid), np.array(_rgb(SURFACE)), both=True)
+                self._paint_surface(draw, surface, low, high)
         for shape in self.robot.scene.fixed:
             if (shown := drawn_shape(shape, self._meshes)) is not None:
                 points, cells = solid(shown, self._meshes.found)
@@ -201,6 +200,21 @@ class Painter:
         if self.title:
             draw.text((10 * FINER, 8 * FINER), self.title, fill=self.tint, font=self._font)
         return image
+
+    def _paint_surface(self, draw: ImageDraw.ImageDraw, surface: Surface, low: Array, high: Array) -> None:
+        """A sphere or cylinder as a closed solid, or, if it is large, as the others: the part next to the robot."""
+        colour = np.array(_rgb(SURFACE))
+        round_one = surface.kind in ("sphere", "cylinder")
+        drawn = drawn_surface(surface, low, high) if round_one else {"kind": surface.kind}
+        if drawn["kind"] not in ("sphere", "cylinder"):
+            for grid in [round_patch(surface, low, high)] if round_one else surface_grids(surface, low, high):
+                self._paint_faces(draw, *grid_faces(grid), colour, both=True)
+            return
+        radius = float(drawn["radius"])
+        shape = {"q": HERE, **drawn, "size": [abs(radius), drawn.get("length", 0.0)]}
+        corners, faces = solid(shape, [], finer=3)
+        # Of one that holds the robot the far wall is seen.
+        self._paint_faces(draw, corners, faces if radius > 0.0 else faces[:, ::-1], colour)
 
     def _paint_floor(self, draw: ImageDraw.ImageDraw, low: Array, high: Array, z: float, *, real: bool = True) -> None:
         """A horizontal plane with a grid; from the side all below its line. What is not ``real`` is only a grid."""

@@ -14,10 +14,15 @@ Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 # Faces around what is round, and between the equator and a pole.
 AROUND, RINGS = 28, 4
+# Pieces that are as long as thick, at either end of a long rod.
+ENDS = 3
 
 
-def solid(shape: dict[str, Any], meshes: list[Mesh]) -> tuple[Array, Faces]:
-    """Corners, (n, 3) [m], and faces, (m, 4), of a shape of :mod:`dynsim.view.solids`; a triangle repeats a corner."""
+def solid(shape: dict[str, Any], meshes: list[Mesh], finer: int = 1) -> tuple[Array, Faces]:
+    """Corners, (n, 3) [m], and faces, (m, 4), of a shape of :mod:`dynsim.view.solids`; a triangle repeats a corner.
+
+    What is round has ``finer`` times as many faces around it.
+    """
     size = shape["size"]
     if shape["kind"] == "mesh":
         mesh = meshes[shape["mesh"]]
@@ -28,19 +33,33 @@ def solid(shape: dict[str, Any], meshes: list[Mesh]) -> tuple[Array, Faces]:
         corners, faces = _box(np.array(size))
     else:
         # Radius and height of rings, from below.
-        angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 2 * RINGS + 1)
+        rings_each = RINGS * finer
+        angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 2 * rings_each + 1)
         radius = size[0]
         if shape["kind"] == "cylinder":
-            rings = [(0.0, -0.5 * size[1]), (radius, -0.5 * size[1]), (radius, 0.5 * size[1]), (0.0, 0.5 * size[1])]
+            half = 0.5 * size[1]
+            rings = [(0.0, -half), *((radius, z) for z in _cuts(radius, half)), (0.0, half)]
         else:
             half = 0.5 * size[1] if shape["kind"] == "capsule" else 0.0
             ball = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
             apart = np.array([0.0, half])
-            low, high = ball[: RINGS + 1] - apart, ball[RINGS:] + apart
-            rings = [*low, *(high if half else high[1:])]
-        corners, faces = _turned(np.array(rings))
+            low, high = ball[: rings_each + 1] - apart, ball[rings_each:] + apart
+            rings = [*low, *((radius, z) for z in _cuts(radius, half)[1:-1]), *(high if half else high[1:])]
+        corners, faces = _turned(np.array(rings), AROUND * finer)
     turned = rotated(np.array(shape["q"]), corners.T).T
     return np.array(shape["p"]) + turned, faces
+
+
+def _cuts(radius: float, half: float) -> Array:
+    """Heights from −half to half at which a round side is cut: into pieces as long as its radius, at most three an end.
+
+    Faces are painted in the order of their middles: those of a whole rod that leans to the viewer are nearer than a
+    hub at its end, which they would cover.
+    """
+    if 2.0 * half <= 2.0 * ENDS * radius:
+        return np.linspace(-half, half, max(int(np.ceil(2.0 * half / max(radius, 1e-12))), 1) + 1)
+    end = radius * np.arange(ENDS + 1)
+    return np.concatenate([end - half, half - end[::-1]])
 
 
 def _box(size: Array) -> tuple[Array, Faces]:
@@ -49,16 +68,16 @@ def _box(size: Array) -> tuple[Array, Faces]:
     return signs * size, np.array(faces)
 
 
-def _turned(rings: Array) -> tuple[Array, Faces]:
+def _turned(rings: Array, sides: int) -> tuple[Array, Faces]:
     """The solid that rings (radius, height) about z enclose."""
-    angle = 2.0 * np.pi * np.arange(AROUND) / AROUND
+    angle = 2.0 * np.pi * np.arange(sides) / sides
     around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    corners = np.concatenate([np.column_stack([radius * around, np.full(AROUND, z)]) for radius, z in rings])
-    k = np.arange(AROUND)
-    after = (k + 1) % AROUND
+    corners = np.concatenate([np.column_stack([radius * around, np.full(sides, z)]) for radius, z in rings])
+    k = np.arange(sides)
+    after = (k + 1) % sides
     faces = [
-        np.stack([a + k, a + after, a + AROUND + after, a + AROUND + k], axis=1)
-        for a in AROUND * np.arange(len(rings) - 1)
+        np.stack([a + k, a + after, a + sides + after, a + sides + k], axis=1)
+        for a in sides * np.arange(len(rings) - 1)
     ]
     return corners, np.concatenate(faces)
 

@@ -6,21 +6,26 @@ Here a tuple lies in memory, the tuples in it within it, and what passes is one 
 
 A tuple is never changed, so the address is declared to be the only way to what it holds (``noalias``), and loads are
 moved out of loops. A tuple that compiled code makes lives in the frame of the function that makes it, one for each
-place in the source: in a loop it holds until the same place makes the next one. Returned tuples are copied.
+place in the source; returned tuples, and those in variables that are assigned in several places, are copied, so that
+what is kept from one turn of a loop to the next stays what it was. Fields are reached by their names.
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import Any
 
 from llvmlite import ir
 from numba.core import cgutils, debuginfo, types
+from numba.core import ir as numba_ir
 from numba.core.base import BaseContext
 from numba.core.boxing import box_namedtuple
 from numba.core.datamodel import models, registry
-from numba.core.imputils import lower_getattr_generic
+from numba.core.imputils import impl_ret_borrowed, lower_builtin, lower_getattr_generic
+from numba.core.lowering import Lower
 from numba.core.pythonapi import NativeValue, box, unbox
 from numba.core.registry import cpu_target
 from numba.core.types.containers import BaseTuple
@@ -118,7 +123,14 @@ class _TablesModel(models.DataModel):  # type: ignore[misc]
         return builder.bitcast(ptr, _ADDRESS)
 
     def traverse(self, builder: Any) -> list[tuple[Any, Any]]:
-        return [(kind, lambda value, k=k: self.part(builder, value, k)) for k, kind in enumerate(self.fe_type)]
+        """What numba counts references to; the address of a variable that has not been assigned yet is null."""
+
+        def getter(value: Any, k: int) -> Any:
+            nothing = cgutils.alloca_once(builder, ir.ArrayType(_BYTE, self.size), zfill=True)
+            missing = cgutils.is_null(builder, value)
+            return self.part(builder, builder.select(missing, builder.bitcast(nothing, _ADDRESS), value), k)
+
+        return [(kind, partial(getter, k=k)) for k, kind in enumerate(self.fe_type)]
 
     def inner_models(self) -> list[Any]:
         return self.parts
@@ -129,6 +141,13 @@ class _TablesModel(models.DataModel):  # type: ignore[misc]
             block = builder.alloca(ir.ArrayType(_BYTE, self.size))
             block.align = self.alignment
             return builder.bitcast(block, _ADDRESS)
+
+    def copied(self, builder: Any, value: Any) -> Any:
+        """The block once more; nothing of nothing."""
+        block = self.room(builder)
+        with builder.if_then(cgutils.is_not_null(builder, value)):
+            cgutils.raw_memcpy(builder, block, value, _WORD(self.size), 1)
+        return builder.select(cgutils.is_null(builder, value), value, block)
 
     def start(self, builder: Any, value: Any, k: int) -> Any:
         """Address of part k."""
@@ -178,9 +197,53 @@ def _made(self: Any, builder: Any, typ: Any, values: Sequence[Any]) -> Any:
 BaseContext.make_tuple = _made
 
 
+_load, _store = Lower.loadvar, Lower.storevar
+
+
+def _assigned_again(self: Any, name: str) -> bool:
+    """Whether a variable is a tuple that is assigned in several places."""
+    if not isinstance(self.typeof(name), Tables):
+        return False
+    again = self.__dict__.get("_again")
+    if again is None:
+        assigned = (one.target.name for block in self.blocks.values() for one in block.find_insts(numba_ir.Assign))
+        again = self._again = {target for target, times in Counter(assigned).items() if times > 1}
+    return name in again
+
+
+def _loaded(self: Any, name: str) -> Any:
+    """numba's ``loadvar``; the tuple outlives the next assignment."""
+    value = _load(self, name)
+    if not _assigned_again(self, name):
+        return value
+    return self.context.data_model_manager[self.typeof(name)].copied(self.builder, value)
+
+
+def _stored(self: Any, value: Any, name: str, argidx: int | None = None) -> None:
+    """numba's ``storevar``; the variable outlives the next tuple that is made where this one was."""
+    if _assigned_again(self, name):
+        value = self.context.data_model_manager[self.typeof(name)].copied(self.builder, value)
+    _store(self, value, name, argidx)
+
+
+Lower.loadvar, Lower.storevar = _loaded, _stored
+
+
+@lower_builtin("static_getitem", Tables, types.IntegerLiteral)
+def _numbered(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    kind, (value, number) = sig.args[0], args
+    return _borrowed(context, builder, kind, value, number % len(kind))
+
+
 @lower_getattr_generic(Tables)
 def _field(context: Any, builder: Any, typ: Any, value: Any, attr: str) -> Any:
-    return context.data_model_manager[typ].part(builder, value, typ.fields.index(attr))
+    return _borrowed(context, builder, typ, value, typ.fields.index(attr))
+
+
+def _borrowed(context: Any, builder: Any, kind: Any, value: Any, k: int) -> Any:
+    """Part k, whose references numba counts where it counts any."""
+    part = context.data_model_manager[kind].part(builder, value, k)
+    return impl_ret_borrowed(context, builder, kind[k], part)
 
 
 @unbox(Tables)

@@ -13,7 +13,8 @@ import pickle
 import stat
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -60,6 +61,8 @@ class _KernelCache(_Cache):
         try:
             content = path.read_bytes()
         except FileNotFoundError:
+            for tell in list(_listeners):
+                tell()
             return None
         except OSError as error:
             _warn(f"{path}: cannot be read ({error.strerror}); compiling it anew")
@@ -150,9 +153,23 @@ def cache_folder() -> Path:
     return Path(tempfile.mkdtemp(prefix="dynsim-"))
 
 
-def is_cached() -> bool:
-    """True when compiled kernels of these sources are on disk (a first run compiles them)."""
-    return any(cache_folder().glob(f"*{_SUFFIX}"))
+@contextmanager
+def told_of_compilation(tell: Callable[[], None]) -> Iterator[None]:
+    """Call ``tell`` once when a kernel is not on disk, before it is compiled in this process: that takes long."""
+
+    def once() -> None:
+        _listeners.remove(once)
+        tell()
+
+    _listeners.append(once)
+    try:
+        yield
+    finally:
+        with suppress(ValueError):
+            _listeners.remove(once)
+
+
+_listeners: list[Callable[[], None]] = []
 
 
 def kernel(function: F) -> F:

@@ -34,7 +34,7 @@ from dynsim.hardware.replay.trajectory import column_of
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.live.session import Account, Session
 from dynsim.record import Record
-from dynsim.results import save_run
+from dynsim.results import save_drive
 from dynsim.scenario import Scenario
 
 NOT_YET = -math.inf
@@ -279,7 +279,7 @@ def _saved(driven: Driven, account: Account, folder: Path, refused: CheckRefused
         return Done(account, time, saved=False, failure=stop)
     failure: DynsimError | None = refused if stop is None else type(stop)(str(stop))
     try:
-        save_run(driven.record() if stop is None or stop.record is None else stop.record, folder)
+        save_drive(driven.record() if stop is None or stop.record is None else stop.record, folder)
     except DynsimError as error:
         return Done(account, time, saved=False, failure=error)
     except Exception as error:

@@ -186,7 +186,7 @@ class Session:
             "time": round(shown.time, 4),
             "poses": np.round(shown.poses, 5).ravel().tolist(),
             "hand": np.round(shown.hand, 4).tolist(),
-            "waiting": shown.waiting,
+            "hindrance": shown.hindrance,
             "state": state,
             "n": count,
             "late": round(1e3 * pace.late, 1),

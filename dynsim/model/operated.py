@@ -52,7 +52,7 @@ class Operated:
     ----------
     rate : of the ticks [1/s]
     joints : names of those that follow the hand's velocity; braces : contact points that they keep on their surfaces
-    rate_limit : fastest joint rate [rad/s or m/s]
+    rate_limit : fastest joint rate [rad/s or m/s]; acceleration_limit : fastest change of it [rad/s² or m/s²]
     hand_acceleration : of the hand [m/s²]; base_acceleration : of the base ahead and about z [m/s², rad/s²]
     tolerance : distance from its target at which the hand counts as there [m]
     script : velocities of the scenario
@@ -62,6 +62,7 @@ class Operated:
     joints: Sequence[str]
     braces: Sequence[Contact]
     rate_limit: float
+    acceleration_limit: float
     hand_acceleration: float
     base_acceleration: tuple[float, float]
     tolerance: float

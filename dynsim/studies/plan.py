@@ -16,7 +16,7 @@ import numpy as np
 from dynsim.errors import ScenarioError
 from dynsim.inputs import parse_yaml
 from dynsim.reuse import Reuse
-from dynsim.scenario import Scenario, ScenarioFile
+from dynsim.scenario import Scenario, ScenarioFile, SetOptions
 
 # More runs than this are a slip of the keyboard.
 RUNS_MOST = 10_000_000
@@ -133,18 +133,40 @@ class Plan:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        keys = [axis.key for axis in self.grid] + [law.key for law in self.laws]
-        twice = next((key for key in keys if keys.count(key) > 1), None)
-        if twice is not None:
-            raise ScenarioError(f"{twice}: is varied twice; one --grid or --sample is enough")
-        if not keys and len(self.variants) < 2:
+        if not self.grid and not self.laws and len(self.variants) < 2:
             raise ScenarioError("nothing to sweep: give --grid, --sample or --variants")
+        self._check_overlap()
         if self.count < 1:
             raise ScenarioError(f"--count {self.count}: must be 1 or more")
         if self.count > 1 and not self.laws:
             raise ScenarioError("--count is how often --sample draws; without one all runs would be the same")
         if self.runs > RUNS_MOST:
             raise ScenarioError(f"{self.runs} runs: more than {RUNS_MOST}; take fewer values")
+
+    def _check_overlap(self) -> None:
+        """Refuse a key that replaces in every run what an earlier one gave, the same or a part of it.
+
+        A part of what an earlier key gave may well be varied: ``plant.link`` by a grid, one of its numbers by a sample.
+        """
+        overriding = "--set" if isinstance(self.overrides, SetOptions) else "override"
+        given = [(overriding, key, [key]) for key in self.overrides]
+        given += [("--grid", axis.key, self._entries(axis.key)) for axis in self.grid]
+        given += [("--sample", law.key, self._entries(law.key)) for law in self.laws]
+        # What was given, by itself and by all that it is a part of.
+        inside: dict[str, str] = {}
+        for option, key, entries in given:
+            # Later overrides replace earlier ones, as in every command.
+            for entry in entries if option != overriding else []:
+                if (place := _plain(entry)) in inside:
+                    other = inside[place]
+                    fix = f", or write out the entries of {ANY} that the other leaves" if ANY in key + other else ""
+                    raise ScenarioError(
+                        f"{option} {key}: replaces what {other} gives {entry}, in every run; "
+                        f"take one of the two away{fix}"
+                    )
+            for place in map(_plain, entries):
+                parts = place.split(".")
+                inside |= {".".join(parts[:many]): f"{option} {key}" for many in range(1, len(parts) + 1)}
 
     @property
     def runs(self) -> int:
@@ -202,6 +224,11 @@ class Plan:
         if not found:
             raise ScenarioError(f"{key}: {self.file.path} has no entries that {ANY} could stand for")
         return [".".join(names) for names, _ in found]
+
+
+def _plain(key: str) -> str:
+    """A key with numbers of entries as they are counted: 5 for 05."""
+    return ".".join(part.lstrip("0") or "0" if part.isdecimal() else part for part in key.split("."))
 
 
 def _children(node: Any) -> dict[str, Any]:

@@ -7,12 +7,13 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from meshed_robot import meshed_robot
-from PIL import Image, ImageColor
+from PIL import Image, ImageColor, ImageDraw
 
 import dynsim
 from dynsim import cli
@@ -23,9 +24,13 @@ from dynsim.figures.style import BLUE, PULLING
 from dynsim.film import Film, write
 from dynsim.film.camera import view_axes
 from dynsim.film.painter import DEEP, FINER, FRICTION, Painter
+from dynsim.film.solids import solid
 from dynsim.record import Record
 from dynsim.record.poses import ORIENTATION, POSITION, point_positions
+from dynsim.record.scene import Surface
 from dynsim.scenario import build_model, load_scenario
+from dynsim.view.robot import bounds
+from dynsim.view.solids import from_z
 
 MARK = "#FF00FF"
 
@@ -115,6 +120,50 @@ def test_the_hand_is_where_the_model_has_it(braced: Record, view: str) -> None:
         assert len(found) > 15
         np.testing.assert_allclose(found.mean(axis=0), expected, atol=2.0)
         assert painter.hand(float(instant)) == pytest.approx(tuple(expected), abs=0.1)
+
+
+@pytest.mark.parametrize("view", ["side", "top", "iso"])
+@pytest.mark.parametrize(("curved", "size"), [((1, 0, 1), 0.1), ((1, 1, 1), 0.1), ((1, 0, 1), -0.3)])
+def test_round_surfaces_are_whole(braced: Record, view: str, curved: tuple[int, ...], size: float) -> None:
+    """Every point of a pipe, a sphere and a tunnel that the picture shows is painted."""
+    known = Film({"one": braced}, view=view, plot="", size=(640, 480)).painters["one"]
+    low, high = bounds([known.robot])
+    radius = size * float((high - low).max())
+    centre = 0.5 * (low + high) - [0.0, 0.0, max(radius, 0.0)]
+    Q = np.sign(size) * np.diag(curved).astype(float)
+    surface = Surface.of_quadric("round", Q, -Q @ centre, 0.5 * (centre @ Q @ centre - np.sign(size) * radius**2))
+    assert surface.radius == pytest.approx(radius)
+    painter = Painter(known.robot, known.camera, known.size, (low, high))
+    painter._ways.clear()
+    painter.robot = replace(known.robot, scene=replace(known.robot.scene, surfaces=(surface,)))
+    shown = np.asarray(painter._background(low, high)).astype(int)
+    rng = np.random.default_rng(3)
+    away = rng.normal(size=(4000, 3)) * np.array(curved)
+    points = centre + 0.98 * abs(radius) * away / np.linalg.norm(away, axis=1)[:, None]
+    if not curved[1]:
+        points[:, 1] = rng.uniform(low[1], high[1], len(points))
+    x, y = np.round(known.camera.project(points)[:, :2]).astype(int).T
+    inside = (x >= 0) & (y >= 0) & (x < shown.shape[1]) & (y < shown.shape[0])
+    assert inside.sum() > 500
+    assert (np.abs(shown[y[inside], x[inside]] - 255).max(axis=1) > 20).all()
+
+
+def test_a_hub_is_not_covered_by_a_rod_that_leans_to_the_viewer(braced: Record) -> None:
+    """A hub about x of radius 1.45 r hides the beginning of a rod of radius r, seen along y, but not the rest of it."""
+    painter = Film({"one": braced}, view="side", plot="", size=(640, 480)).painters["one"]
+    r, right, near = 0.02, painter.camera.axes[0], painter.camera.axes[2]
+    along = np.cos(np.pi / 6) * right + np.sin(np.pi / 6) * near
+    hub = {"kind": "cylinder", "size": [1.45 * r, 3.6 * r], "p": [0.0] * 3, "q": from_z(right).tolist()}
+    rod = {"kind": "capsule", "size": [r, 20.0 * r], "p": (10.0 * r * along).tolist(), "q": from_z(along).tolist()}
+    (corners, faces), (more, other) = solid(hub, []), solid(rod, [])
+    colours = np.array(len(faces) * [[255.0, 0.0, 0.0]] + len(other) * [[0.0, 0.0, 255.0]])
+    image = Image.new("RGB", (1280, 960))
+    every = np.concatenate([faces, other + len(corners)])
+    painter._paint_faces(ImageDraw.Draw(image), np.concatenate([corners, more]), every, colours)
+    for place, hidden in ((-1.0, True), (-0.5, True), (0.1, True), (1.0, False), (3.0, False)):
+        x, y, _ = painter.camera.project(place * r * right)
+        red, _, blue = image.getpixel((round(x), round(y)))
+        assert (red > blue) == hidden
 
 
 def test_views_are_right_handed_and_show_up_as_up() -> None:

@@ -13,6 +13,8 @@ from dynsim import Record, Scenario, load_scenario, simulate
 from dynsim.engine.driven import Order, drive
 from dynsim.engine.together import simulate_together
 from dynsim.errors import DynsimError, ScenarioError
+from dynsim.hardware.replay.check import check_motion
+from dynsim.hardware.servo_map import load_servo_map
 from dynsim.model.snake import FIXING, SWITCHING
 from dynsim.record.poses import ORIENTATION, POSITION, poses_at
 from dynsim.scenario import scenario_from_resolved
@@ -136,14 +138,77 @@ def test_hand_waits_where_it_cannot_go() -> None:
     driven = drive(load_scenario("six_axis_arm"))
     for _ in range(1000):
         driven.tick(Order((0.0, 0.0, 0.5)))
-    top, waiting = driven.shown().hand.copy(), driven.shown().waiting
-    assert waiting
+    top = driven.shown().hand.copy()
+    assert "would speed up too fast" in driven.shown().hindrance
     assert top[2] < 3.0
     rates = np.abs(driven.record()["v"])
     assert rates.max() < 2.5
     for _ in range(20):
         driven.tick(Order((0.0, 0.0, -0.05)))
     assert driven.shown().hand[2] < top[2] - 0.005
+
+
+HALF = math.sqrt(0.5)
+WAYS = [
+    (0, 0, 1),
+    (1, 0, 0),
+    (0, 1, 0),
+    (0, 0, -1),
+    (-1, 0, 0),
+    (0, -1, 0),
+    (HALF, HALF, 0),
+    (0, HALF, HALF),
+    (-HALF, 0, HALF),
+]
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_hand_eases_to_rest_at_its_edge(way: tuple[float, float, float]) -> None:
+    """At 0.1 m/s for 3 s: its target speeds up and slows down at 0.5 m/s² at most, and servos may follow the drive."""
+    driven = drive(load_scenario("elbow_comparison", "two_elbows"))
+    operator = driven.simulation.operator
+    targets, hindered = [operator.target.copy()], set()
+    for _ in range(300):
+        driven.tick(Order(tuple(0.1 * part for part in way)))
+        targets.append(operator.target.copy())
+        hindered.add(driven.shown().hindrance)
+    velocity = np.diff(np.array([targets[0], *targets]), axis=0) / driven.period
+    acceleration = np.linalg.norm(np.diff(velocity, axis=0), axis=1) / driven.period
+    assert acceleration.max() == pytest.approx(0.5, rel=1e-6)
+    speed = np.linalg.norm(velocity, axis=1)
+    if hindered == {""}:
+        assert speed[-1] == pytest.approx(0.1)
+    else:
+        # It comes to rest once, and rests.
+        rests = int(np.flatnonzero(speed[20:] == 0.0)[0]) + 20
+        assert not speed[rests:].any()
+        assert np.diff(speed[rests - 15 : rests]).max() < 1e-9
+    check_motion(driven.record(), load_servo_map("arm"))
+
+
+def test_a_hand_at_its_edge_comes_back() -> None:
+    """For a second in one of twenty directions at random, to the edge and along it, then back to where it began."""
+    driven = drive(load_scenario("elbow_comparison", "two_elbows"))
+    operator, random = driven.simulation.operator, np.random.default_rng(3)
+    targets, hindered = [operator.target.copy()], 0
+
+    def goes(way: np.ndarray[Any, Any]) -> None:
+        driven.tick(Order(tuple(way.tolist())))
+        targets.append(operator.target.copy())
+
+    for _ in range(20):
+        way = random.normal(size=3)
+        for _ in range(100):
+            goes(0.2 * way / np.linalg.norm(way))
+        hindered += bool(driven.shown().hindrance)
+        before = np.linalg.norm(targets[0] - targets[-1])
+        for _ in range(150):
+            left = targets[0] - targets[-1]
+            goes(0.2 * left / max(float(np.linalg.norm(left)), 0.1))
+        assert np.linalg.norm(targets[0] - targets[-1]) < max(0.5 * before, 0.02)
+    assert hindered > 3
+    acceleration = np.diff(np.array(targets), n=2, axis=0) / driven.period**2
+    assert np.linalg.norm(acceleration, axis=1).max() < 0.5 + 1e-6
 
 
 def test_stepper_follows_the_script_and_goes_back() -> None:

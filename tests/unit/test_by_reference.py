@@ -97,11 +97,47 @@ def test_tuples_that_are_made() -> None:
     assert made_and_told(example(), table) == tuple(look(one, table) for one in (first, second, example()))
 
 
+@kernel
+def kept(outer, table):
+    """One of the turns of a loop, and two that change places in each."""
+    chosen, last, other = outer, outer, changed(outer, table)
+    for k in range(5):
+        one = Outer(k, False, outer.inner, outer.nothing, outer.pair, outer.matrix)
+        if k == 1:
+            chosen = one
+        last, other = other, last
+        if k == 3:
+            last = one
+    return chosen.count, last.count, other.count
+
+
+def test_what_is_kept_stays_what_it_was() -> None:
+    table = np.zeros(2)
+    python = getattr(kept, "py_func", kept)
+    assert kept(example(), table) == python(example(), table)
+    assert kept(example(), table)[0] == 1
+
+
+@pytest.mark.parametrize("upper", [0.0, 5.0])
+def test_in_functions_that_count_references(upper: float) -> None:
+    """numba looks into what a variable held before, which at first is nothing."""
+
+    @numba.njit
+    def chosen(outer, upper):
+        if outer.pair[0] > upper:
+            found = Outer(1, True, outer.inner, outer.nothing, outer.pair, outer.matrix)
+        else:
+            found = Outer(2, True, outer.inner, outer.nothing, outer.pair, outer.matrix)
+        return found.count, found[0], found[-1][1, 0]
+
+    assert chosen(example(), upper) == ((1, 1, 7e5) if upper == 0.0 else (2, 2, 7e5))
+
+
 def test_back_to_python() -> None:
     table = np.array([0.0625, 8.0])
     found, wanted = given_back(example(), table), changed(example(), table)
-    assert isinstance(found, Outer)
-    assert isinstance(found.inner, Inner)
+    # From the cache it is a copy of the class, because pytest's modules cannot be imported by name.
+    assert (type(found).__name__, type(found.inner).__name__) == ("Outer", "Inner")
     assert found.inner.table is table
     assert (found.count, found.flag, found.nothing, found.pair) == (wanted.count, wanted.flag, None, wanted.pair)
     assert found.inner[1:] == wanted.inner[1:]

@@ -614,3 +614,10 @@ def test_what_lies_below_a_surface_is_marked(braced: Record) -> None:
     assert (found.pieces[..., 2] < 0.0).all()
     assert "below floor, up to" in texts(drawn(posture.posture(sunk)))
     assert "below" not in texts(drawn(posture.posture(braced)))
+
+
+@pytest.mark.parametrize(("angle", "read"), [(-1e-9, "0"), (-0.4, "0"), (-30.2, "-30"), (180.0, "180")])
+def test_the_azimuth_of_the_side_plane_has_no_minus_zero(angle: float, read: str) -> None:
+    turn = np.radians(angle)
+    plane = skeleton.SidePlane(np.zeros(3), np.array([np.cos(turn), np.sin(turn), 0.0]))
+    assert f"azimuth {read}°" in plane.label

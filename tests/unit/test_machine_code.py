@@ -152,6 +152,20 @@ def test_damaged_machine_code_is_compiled_anew(kernel_files: Path, damage: str) 
     assert _double() == 6  # a warning would be an error
 
 
+def test_who_asks_is_told_once_that_a_kernel_is_compiled(kernel_files: Path) -> None:
+    told: list[str] = []
+    with jit.told_of_compilation(lambda: told.append("before")):
+        _double()
+    assert told == ["before"]
+    with jit.told_of_compilation(lambda: told.append("from the cache")):
+        _double()
+    assert told == ["before"]
+    (file,) = kernel_files.iterdir()
+    file.unlink()
+    _double()
+    assert told == ["before"]
+
+
 def test_machine_code_that_cannot_be_kept_costs_no_run(kernel_files: Path, monkeypatch) -> None:
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
@@ -213,7 +227,7 @@ def test_an_edit_of_any_compiled_source_names_another_folder(tmp_path: Path, mon
 
 def test_every_file_with_kernels_is_in_a_package_that_names_the_folder() -> None:
     """Or holds none that another file compiles in: the benchmark's loop, whose file names its machine code."""
-    decorators = re.compile(r"^@((merged|internal|inlined|exact|apart|separate)_)?kernel$", re.MULTILINE)
+    decorators = re.compile(r"^@((merged|internal|exact|apart|separate)_)?kernel$", re.MULTILINE)
     package = Path(dynsim.__file__).parent
     elsewhere = {
         str(source.relative_to(package))

@@ -9,7 +9,7 @@ import pytest
 from dynsim.errors import RecordError
 from dynsim.files import INCOMPLETE
 from dynsim.record import Record
-from dynsim.results import save_run
+from dynsim.results import save_drive, save_run
 from dynsim.scenario import load_scenario
 
 
@@ -236,3 +236,19 @@ def test_a_missing_package_is_one_line_with_the_way_out(
     with pytest.raises(RecordError) as error:
         getattr(record, method)()
     assert str(error.value) == f"{package} is not installed: pip install {package}"
+
+
+def test_a_drive_that_has_no_room_leaves_its_script(tmp_path: Path, simulated, monkeypatch: pytest.MonkeyPatch) -> None:
+    record = simulated("single_pendulum", None)
+
+    def full(*_: object) -> None:
+        raise RecordError("record.h5: No space left on device")
+
+    monkeypatch.setattr("dynsim.results.replace_together", full)
+    with pytest.raises(RecordError, match=r"No space left.*the script is kept.*dynsim run .*scenario\.yaml"):
+        save_drive(record, tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["scenario.yaml"]
+    assert load_scenario(tmp_path / "scenario.yaml").name == record.provenance["scenario"]["name"]
+    monkeypatch.setattr("dynsim.results.write_text", full)
+    with pytest.raises(RecordError, match=r"^record\.h5: No space left on device$"):
+        save_drive(record, tmp_path)

@@ -16,14 +16,16 @@ import pytest
 import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.colors import to_rgb
 from processes import started, wait_for
 from sweep_work import DEADLY, REFUSED, once_deadly, square, warned
 
 import dynsim
 from dynsim.errors import DynsimError, ScenarioError
+from dynsim.figures import style
 from dynsim.figures import sweep as pictures
 from dynsim.record import Record
-from dynsim.scenario import read_scenario
+from dynsim.scenario import SetOptions, read_scenario
 from dynsim.sensitivity import sensitivities, spread
 from dynsim.studies import sweep as module
 from dynsim.studies.columns import numbers
@@ -68,7 +70,10 @@ def test_values_of_a_grid(text: str, values: tuple[Any, ...]):
         (lambda: Law.parse("a=normal(1,0)"), "spread that is positive"),
         (lambda: Law.parse("a=uniform(2,1)"), "spread that is positive"),
         (lambda: plan(), "nothing to sweep"),
-        (lambda: plan(MASSES, MASSES), "varied twice"),
+        (
+            lambda: plan(MASSES, MASSES),
+            "--grid plant.chain.0.mass_kg: replaces what --grid plant.chain.0.mass_kg gives",
+        ),
         (lambda: plan(MASSES, count=3), "all runs would be the same"),
         (lambda: list(plan(laws=(Law.parse("loads.*.mass_kg=uniform(1,2)"),)).points()), "no entries"),
     ],
@@ -76,6 +81,44 @@ def test_values_of_a_grid(text: str, values: tuple[Any, ...]):
 def test_what_is_no_sweep_is_refused(make: Callable[[], Any], message: str):
     with pytest.raises(ScenarioError, match=message):
         make()
+
+
+CHAIN = read_scenario("link_tolerance")
+FIFTH, ANY_LINK = "plant.chain.5.mass_kg", "plant.chain.*.mass_kg"
+
+
+@pytest.mark.parametrize(
+    ("fixed", "grid", "drawn", "replacing", "replaced"),
+    [
+        ({}, [FIFTH], [ANY_LINK], f"--sample {ANY_LINK}", f"--grid {FIFTH}"),
+        ({}, [ANY_LINK], [FIFTH], f"--sample {FIFTH}", f"--grid {ANY_LINK}"),
+        ({}, [FIFTH, ANY_LINK], [], f"--grid {ANY_LINK}", f"--grid {FIFTH}"),
+        ({}, [], [FIFTH, ANY_LINK], f"--sample {ANY_LINK}", f"--sample {FIFTH}"),
+        ({}, ["plant.chain.05.mass_kg"], [ANY_LINK], f"--sample {ANY_LINK}", "--grid plant.chain.05.mass_kg"),
+        ({}, [FIFTH, "plant.chain.5"], [], "--grid plant.chain.5", f"--grid {FIFTH}"),
+        ({FIFTH: 0.1}, [ANY_LINK], [], f"--grid {ANY_LINK}", f"--set {FIFTH}"),
+        ({FIFTH: 0.1}, [], [FIFTH], f"--sample {FIFTH}", f"--set {FIFTH}"),
+    ],
+)
+def test_a_key_that_replaces_another_is_refused(
+    fixed: dict[str, Any], grid: list[str], drawn: list[str], replacing: str, replaced: str
+):
+    axes = tuple(Axis(key, (0.1, 0.2)) for key in grid)
+    laws = tuple(Law(key, "normal", (0.1, 0.01)) for key in drawn)
+    with pytest.raises(ScenarioError) as refused:
+        Plan(CHAIN, (None,), SetOptions(fixed), axes, laws)
+    message = str(refused.value)
+    assert message.startswith(f"{replacing}: replaces what {replaced} gives ")
+    assert "take one of the two away" in message
+    assert ("write out the entries" in message) == ("*" in message)
+
+
+def test_a_part_of_what_was_given_may_be_varied():
+    whole, law = (
+        Axis("plant.link", ({"length_m": 0.1}, {"length_m": 0.2})),
+        Law("plant.link.mass_kg", "normal", (1.0, 0.1)),
+    )
+    assert Plan(CHAIN, (None,), SetOptions({"plant": {}}), (whole,), (law,)).runs == 2
 
 
 def test_runs_are_variants_by_grid_by_samples():
@@ -358,9 +401,87 @@ def test_figures_by_what_was_varied(tmp_path: Path, grid: list[str], sampled: li
 def test_the_tornado_shows_the_effect_of_a_deviation():
     figure = pictures.tornado(pictures.Sweep("test", ROWS, ["a", "b"], ["mass"]))
     assert figure is not None
-    deviation = np.array([row["mass"] for row in ROWS if row["variant"] == "one"]).std(ddof=1)
+    # The draws are three, at each of four places of the grid.
+    deviation = np.array([1.0, 2.0, 4.0]).std(ddof=1)
     widths = [axes.patches[0].get_width() for axes in figure.axes]
     assert widths == pytest.approx([deviation, deviation] * 2)
+
+
+def noisy(places: int, draws: int) -> pictures.Sweep:
+    """A sweep whose places differ more than its draws."""
+    generator = np.random.default_rng(5)
+    drawn = [(mass, generator.normal()) for mass in generator.normal(size=draws)]
+    rows = [
+        {
+            "plant.a": float(a),
+            "m": m,
+            "electrical_energy_J": 100.0 * (a + 1) + m + 0.1 * rest,
+            "hand_error_rms_m": 1e-3 * rest,
+        }
+        for a in range(places)
+        for m, rest in drawn
+    ]
+    return pictures.Sweep("test", rows, ["plant.a"], ["m"])
+
+
+def test_more_places_of_the_grid_are_no_more_draws():
+    few, many = (pictures.tornado(noisy(places, draws=12)) for places in (1, 50))
+    assert few is not None
+    assert many is not None
+    for one, other in zip(few.axes, many.axes, strict=True):
+        assert one.get_title() == other.get_title()
+        bars = [axes.collections[0].get_segments()[0] for axes in (one, other)]
+        np.testing.assert_allclose(bars[0], bars[1], rtol=1e-9)
+
+
+def test_distributions_are_those_of_one_place():
+    sweep = noisy(places=3, draws=20)
+    figure = pictures.samples(sweep)
+    assert figure is not None
+    energies = figure.axes[::2]
+    assert [axes.get_title().split("\n")[0] for axes in energies] == ["a = 0", "a = 1", "a = 2"]
+    for place, axes in enumerate(energies):
+        here = spread(np.array([row["electrical_energy_J"] for row in sweep.rows if row["plant.a"] == place]))
+        assert axes.lines[0].get_xdata()[0] == pytest.approx(here.mean)
+        assert f"20 runs: mean {here.mean:.2f} ± {here.mean - here.mean_low:.2f}" in axes.get_title()
+        assert sum(bar.get_height() for bar in axes.patches) == 20
+
+
+def test_of_many_places_some_are_shown_and_the_title_says_so():
+    figure = pictures.samples(noisy(places=50, draws=3))
+    assert figure is not None
+    heads = [axes.get_title().split("\n")[0] for axes in figure.axes[::2]]
+    assert heads == [f"a = {k}" for k in (0, 10, 20, 29, 39, 49)]
+    assert "6 of 50 places of the grid, all in statistics.json" in figure.get_suptitle()
+
+
+def test_the_colour_of_a_variant_does_not_depend_on_which_were_run():
+    every = ["one", "two"]
+    table = pictures.Sweep("test", [row for row in ROWS if row["variant"] == "two"], [], ["mass"], every)
+    assert table.looks["two"] == pictures.Sweep("test", ROWS, [], ["mass"], every).looks["two"]
+    figure = pictures.samples(table)
+    assert figure is not None
+    assert figure.axes[0].patches[0].get_facecolor()[:3] == to_rgb(style.VARIANT_COLOURS[1])
+
+
+def test_runs_at_the_same_place_do_not_hide_each_other():
+    figure = pictures.pareto(pictures.Sweep("test", ROWS, ["a", "b"], ["mass"]))
+    assert figure is not None
+    axes = figure.axes[0]
+    first, second = (dots.get_sizes()[0] for dots in axes.collections)
+    # Those of the second lie on top.
+    assert first > 2.0 * second
+    assert axes.lines[0].get_zorder() > max(dots.get_zorder() for dots in axes.collections)
+
+
+def test_colour_bars_stand_below_their_column():
+    figure = pictures.heat_map(pictures.Sweep("test", ROWS, ["a", "b"], ["mass"]))
+    assert figure is not None
+    figure.draw_without_rendering()
+    for column, bar in zip(figure.axes[:2], figure.axes[4:], strict=True):
+        above, below = column.get_position(), bar.get_position()
+        assert below.y1 < above.y0
+        assert (below.x0, below.x1) == pytest.approx((above.x0, above.x1), abs=1e-6)
 
 
 # One run takes long enough to be met on its way.

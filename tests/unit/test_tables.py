@@ -95,3 +95,13 @@ def test_tables_that_nobody_looks_at_are_whole(beyond: Record, monkeypatch: pyte
     narrow = shown(dict.fromkeys(names, beyond.summary))
     assert narrow.count("electrical energy [J]") > 1
     assert max(map(len, narrow.splitlines())) <= 100
+
+
+def test_impact_losses_that_are_rounding_are_zero(beyond: Record) -> None:
+    """Beside the energy turned over; a loss that is one stays, and no two rows have the same name."""
+    turnover = beyond.summary["energy_turnover_J"]
+    for share, read in ((1e-15, "0"), (-1e-15, "0"), (0.01, f"{0.01 * turnover:.4g}")):
+        lines = shown({"": {**beyond.summary, "impact_loss_J": share * turnover}}).splitlines()
+        (row,) = (line for line in lines if "impact loss" in line)
+        assert "all contacts" in row
+        assert row.split()[-1] == read

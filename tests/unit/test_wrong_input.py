@@ -186,7 +186,7 @@ def lacking(record: Record, name: str) -> Record:
 def test_a_record_that_lacks_a_signal_is_drawn_without_or_refused(scenario: str, tmp_path: Path, monkeypatch) -> None:
     # What is drawn counts here, not the pictures.
     monkeypatch.setattr(style, "save", lambda figure, path: path)
-    monkeypatch.setattr(snake_figures, "_save", lambda figure, path: plt.close(figure) or path)
+    monkeypatch.setattr(snake_figures, "_save", lambda make, of, path: plt.close(make(of)) or path)
     monkeypatch.setattr(snake_figures, "FRAMES", 1)
     short = {"duration_s": 0.2, "record.rate_hz": 50, "metrics.settle_s": 0.0}
     record = dynsim.simulate(load_scenario(scenario, overrides=short))

@@ -191,6 +191,19 @@ def test_heat_is_in_watts(braced: Record, opened: Opens) -> None:
     assert "W" in page.page.locator("#scale").inner_text()
 
 
+def test_a_measured_record_that_begins_earlier(braced: Record, opened: Opens) -> None:
+    """The page begins where both are; the time before can still be gone to. No chip says the same twice."""
+    earlier = Record(braced.time - 0.11, provenance={"robot": "arm"})
+    for name in ("q", POSITION, ORIENTATION):
+        earlier.add(name, braced[name], braced.units[name], labels=braced.labels[name])
+    earlier.scene = braced.scene
+    page = opened({"simulated": braced, "measured": earlier})
+    assert page.state()["time"] == 0.0
+    assert page.seek(-1.0)["time"] == pytest.approx(-0.11)
+    chips = page.page.locator("#variants .chip").all_inner_texts()
+    assert [chip.split() for chip in chips] == [["simulated"], ["measured"]]
+
+
 def test_wheels_and_support_of_a_snake(snake: Record, opened: Opens) -> None:
     page = opened({"one": snake})
     for row in range(0, len(snake), 60):

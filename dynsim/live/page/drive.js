@@ -228,7 +228,7 @@ class Drive {
     const f = this.last, driving = this.state === "driving";
     this.bar.classList.toggle("watching", this.role !== "pilot");
     this.box.classList.toggle("watching", this.role !== "pilot");
-    this.stateBox.textContent = f?.waiting && driving ? "driving, but it cannot go there" : this.role === "pilot" && this.state === "key released" ? "hold space to drive" : this.state;
+    this.stateBox.textContent = f?.hindrance && driving ? `driving, held back: ${f.hindrance}` : this.role === "pilot" && this.state === "key released" ? "hold space to drive" : this.state;
     this.stateBox.className = `state ${this.state}`;
     this.roleButton.textContent = this.role === "pilot" ? "leave the wheel" : this.free ? "take the wheel" : "somebody else drives";
     this.roleButton.disabled = this.ended || (this.role !== "pilot" && !this.free);

@@ -51,8 +51,8 @@ function wire(app) {
   app.actors.forEach((actor) => {
     const chip = D.element("button", { className: "chip", title: "show or hide", onclick: () => app.toggle(actor) }, D.element("i"), actor.name);
     actor.chip = chip;
-    if (actor.data.measured) chip.append(D.element("em", { textContent: "measured" }));
-    if (!actor.data.complete) chip.append(D.element("em", { textContent: "incomplete" }));
+    if (actor.data.measured && actor.name !== "measured") chip.append(D.element("em", { textContent: "measured" }));
+    if (!actor.data.complete) chip.append(D.element("em", { textContent: "incomplete", title: `ends at ${D.number(actor.span[1])} s, before it was to` }));
     if (app.actors.length > 1 || chip.querySelector("em")) $("variants").append(chip);
   });
 

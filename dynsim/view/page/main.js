@@ -13,9 +13,12 @@ class App {
     const meshes = head.meshes.map((mesh) => S.mesh(bytes, mesh));
     this.actors = head.records.map((record, k) => new Actor(record, bytes, meshes, k));
     this.span = [Math.min(...this.actors.map((a) => a.span[0])), Math.max(...this.actors.map((a) => a.span[1]))];
+    // A measured record may begin before the simulated one: first is shown when all have begun.
+    const begun = Math.max(...this.actors.map((a) => a.span[0]));
+    this.start = begun < this.span[1] ? begun : this.span[0];
     this.stage = new Stage(document.getElementById("scene"), head.azimuth);
     this.layers = { forces: true, cones: true, trace: true, target: true, support: true, depths: true, labels: true };
-    Object.assign(this, { time: this.span[0], playing: false, speed: 1, follow: false, ghost: head.ghost, colouring: "", live: false, cost: 0 });
+    Object.assign(this, { time: this.start, playing: false, speed: 1, follow: false, ghost: head.ghost, colouring: "", live: false, cost: 0 });
     this.theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
     this.point = new THREE.Vector3();
     this.surfaces();
@@ -125,7 +128,7 @@ class App {
   set(name, value) {
     if (name in this.layers) this.layers[name] = value;
     else this[name] = value;
-    if (name === "playing" && value && this.time >= this.span[1]) this.time = this.span[0];
+    if (name === "playing" && value && this.time >= this.span[1]) this.time = this.start;
     if (name === "ghost") this.arrange();
     if (name === "ghost" || name === "theme") this.dress();
     if (name === "colouring") this.rate();

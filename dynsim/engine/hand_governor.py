@@ -1,0 +1,183 @@
+"""What a hand may be asked for without ever having to stop faster than it can: a reference governor.
+
+The state is the target p_d of the hand, its velocity v and the joints that have it there. v is admissible where the
+hand can come to rest from it: the points of a straight way, slowed by a h in each tick of length h,
+
+    p_d + h v,  p_d + h v + h (v − a h v/|v|),  …,  rest
+
+are all within reach, and the joints go there within their ranges, rates and accelerations. From an admissible velocity
+the first tick of that way is always open, and what is left of it is a way to rest again. So each tick takes
+
+    v⁺ = v_rest + λ (v_wish − v_rest),   0 ≤ λ ≤ 1
+
+with v_rest the next velocity of the way to rest, v_wish that which was asked for, eased, and λ the largest found that
+is admissible: 1, or by bisection. Both ends differ from v by at most a h, hence v⁺ does. At the edge of reach, where
+joints would have to be infinitely fast, it is their acceleration that ends the way in time.
+
+Source: E. Gilbert, I. Kolmanovsky, "Nonlinear tracking control in the presence of state and control constraints: a
+generalized reference governor", Automatica 38 (2002); λ and the admissible way to rest are theirs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.kernels import inverse_kinematics as ki
+from dynsim.kernels.arrays import workspace
+from dynsim.kernels.jit import reals
+from dynsim.model.model import Model
+from dynsim.model.operated import Operated
+from dynsim.model.reaching import path_arrays
+
+Array = NDArray[np.float64]
+
+HALVINGS = 6
+"""Of λ; each costs a way to rest."""
+ROUNDING = 1e-9
+"""Of joint rates and accelerations, in parts of their limits."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way to rest: velocities, targets of the hand and joints of each tick, (T, 3), (T, 3) and (T, c)."""
+
+    velocity: Array
+    targets: Array
+    joints: Array
+
+    def rest(self) -> Way:
+        """What is left of it after a tick."""
+        return Way(self.velocity[1:], self.targets[1:], self.joints[1:])
+
+
+class HandGovernor:
+    """Takes a hand along velocities, as far as it can stop in time.
+
+    Attributes
+    ----------
+    target : (3,) of the hand [m]; velocity : (3,) [m/s]; joints : (c,) that have it there [rad or m]
+    rates : (c,) of the joints in the last tick [rad/s or m/s]
+    hindrance : why the hand is slower than it was asked to be; empty where it is not
+    """
+
+    def __init__(self, model: Model, operated: Operated, target: Array, axes: Array) -> None:
+        self._operated, self._model, self._axes = operated, model, axes
+        self._arrays = path_arrays(model, operated.joints, operated.braces)
+        self._workspace = workspace(model.n, 0, 0)
+        self._q = reals(model.robot.initial)
+        links = {link.joint: link for link in model.robot.links}
+        self._low = np.array([links[joint].lower for joint in operated.joints])
+        self._high = np.array([links[joint].upper for joint in operated.joints])
+        self.target, self.velocity = target.copy(), np.zeros(3)
+        self.joints = self._q[self._arrays.place].copy()
+        self.rates, self.hindrance = np.zeros(len(self.joints)), ""
+        self._way = Way(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, len(self.joints))))
+
+    def state(self) -> dict[str, Any]:
+        """What the future depends on."""
+        kept = {name: getattr(self, name).copy() for name in ("target", "velocity", "joints", "rates")}
+        return {**kept, "hindrance": self.hindrance, "_way": self._way}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go back to a state of this governor."""
+        for name, value in state.items():
+            setattr(self, name, value.copy() if isinstance(value, np.ndarray) else value)
+
+    def go(self, wish: Array) -> None:
+        """A tick towards a velocity (3,) [m/s] that differs from the last by no more than a h."""
+        self.hindrance = ""
+        if not (wish.any() or self.velocity.any()):
+            self.rates = np.zeros_like(self.rates)
+            return
+        slower = self._way.velocity[0] if len(self._way.velocity) else np.zeros(3)
+        found, why = self._way_to_rest(wish)
+        if found is None:
+            self.hindrance = why
+            found = self._bisected(slower, wish)
+        self._take(self._way if found is None else found)
+
+    def _bisected(self, slower: Array, wish: Array) -> Way | None:
+        """The way from the fastest admissible velocity between those two; None where it is the slower one."""
+        low, high, best = 0.0, 1.0, None
+        at_rest, least = not self.velocity.any(), self._operated.hand_acceleration / self._operated.rate
+        for _ in range(HALVINGS):
+            part = 0.5 * (low + high)
+            velocity = slower + part * (wish - slower)
+            found, _ = self._way_to_rest(velocity)
+            creeps = at_rest or float(np.linalg.norm(velocity)) < least
+            if found is None or (creeps and not self._gets_easier(velocity)):
+                high = part
+            else:
+                low, best = part, found
+        return best
+
+    def _gets_easier(self, velocity: Array) -> bool:
+        """Joints are slower in the second tick than in the first, as on the way out of a singular posture.
+
+        A hand creeps only then. To an edge it would creep by jerks, and so near that it would creep back, too.
+        """
+        joints, _ = self._followed(np.array([velocity, velocity]))
+        if joints is None:
+            return False
+        first, second = np.abs(np.diff(np.vstack([self.joints, joints]), axis=0)).max(axis=1)
+        return bool(second < first)
+
+    def _take(self, way: Way) -> None:
+        """The first tick of a way, or rest where none is left."""
+        if not len(way.velocity):
+            self.velocity, self.rates = np.zeros(3), np.zeros_like(self.rates)
+            return
+        self.rates = (way.joints[0] - self.joints) * self._operated.rate
+        self.velocity, self.target, self.joints = way.velocity[0].copy(), way.targets[0].copy(), way.joints[0].copy()
+        self._way = way.rest()
+
+    def _way_to_rest(self, velocity: Array) -> tuple[Way | None, str]:
+        """The way to rest that begins with a velocity, or None and what is against it."""
+        operated = self._operated
+        speed, lost = float(np.linalg.norm(velocity)), operated.hand_acceleration / operated.rate
+        if speed == 0.0:
+            return Way(np.zeros((1, 3)), self.target[None].copy(), self.joints[None].copy()), ""
+        parts = np.maximum(1.0 - lost / speed * np.arange(max(1, math.ceil(speed / lost - ROUNDING))), 0.0)
+        velocities = parts[:, None] * velocity
+        joints, targets = self._followed(velocities)
+        if joints is None:
+            return None, "out of reach"
+        rates = np.diff(np.vstack([self.joints, joints]), axis=0) * operated.rate
+        changes = np.diff(np.vstack([self.rates, rates, np.zeros_like(self.rates)]), axis=0) * operated.rate
+        why = (
+            self._first((joints < self._low) | (joints > self._high), "is at its limit")
+            or self._first(np.abs(rates) > operated.rate_limit * (1.0 + ROUNDING), "would be too fast")
+            or self._first(np.abs(changes) > operated.acceleration_limit * (1.0 + ROUNDING), "would speed up too fast")
+        )
+        return (None, why) if why else (Way(velocities, targets, joints), "")
+
+    def _first(self, broken: NDArray[np.bool_], what: str) -> str:
+        """The joint that is the first to break a limit."""
+        ticks, joints = np.nonzero(broken)
+        return f"{self._operated.joints[joints[0]]} {what}" if len(ticks) else ""
+
+    def _followed(self, velocities: Array) -> tuple[Array | None, Array]:
+        """Joints (T, c) with the hand where velocities (T, 3) take it, None out of reach; and the targets (T, 3)."""
+        operated = self._operated
+        targets = self.target + np.cumsum(velocities @ self._axes.T, axis=0) / operated.rate
+        q, joints, count = self._q.copy(), np.zeros((len(targets), len(self.joints))), len(targets)
+        q[self._arrays.place] = self.joints
+        ended, _ = ki.follow_path(
+            self._model.arrays,
+            self._workspace,
+            self._arrays,
+            targets,
+            np.zeros((count, 0)),
+            0,
+            0,
+            count,
+            operated.tolerance,
+            q,
+            joints,
+        )
+        return (joints if ended == count else None), targets

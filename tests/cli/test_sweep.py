@@ -1,0 +1,56 @@
+"""``dynsim sweep`` as a user meets it: where its files go, what it says, how it ends."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dynsim.scenario import find_scenario
+
+SHORT = ["--set", "duration_s=0.2", "--set", "metrics.settle_s=0.05"]
+LENGTH = "plant.chain.0.length_m"
+
+
+def sweep(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "dynsim", "sweep", *arguments]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
+
+
+def test_a_sweep_is_named_by_its_scenario(tmp_path: Path):
+    content, file = find_scenario("single_pendulum").read_text("utf-8"), tmp_path / "scenario.yaml"
+    file.write_text(content.replace("name: single_pendulum", "name: swinging"), encoding="utf-8")
+    result = sweep(str(file), "--grid", f"{LENGTH}=0.5,1", *SHORT, "--no-figures", folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    folder = tmp_path / "results" / "swinging" / "sweep"
+    assert (folder / "sweep.csv").is_file()
+    assert not (tmp_path / "results" / "scenario").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--grid", "plant.chain.0.lenght_m=0.5,1"], "lenght_m"),
+        (["--grid", f"{LENGTH}=0.5,1", "--out", "there"], "there holds a sweep"),
+    ],
+)
+def test_a_sweep_that_is_refused_says_one_line(tmp_path: Path, arguments: list[str], said: str):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "runs.jsonl").touch()
+    result = sweep("single_pendulum", "--jobs", "2", *arguments, folder=tmp_path)
+    assert result.returncode == 2
+    assert result.stdout.strip() == ""
+    assert result.stderr.startswith("error: ")
+    assert said in result.stderr.replace("\n", " ")
+    assert "Exception in thread" not in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(("limits", "well", "code"), [("1,1e-9", 1, 0), ("1e-9,2e-9", 0, 3)])
+def test_a_sweep_without_a_good_run_has_failed(tmp_path: Path, limits: str, well: int, code: int):
+    grid = f"integrator.time_limit_h={limits}"
+    result = sweep("single_pendulum", "--grid", grid, *SHORT, "--jobs", "1", folder=tmp_path)
+    assert f"{well} of 2 runs ended well" in result.stdout
+    assert "run 1 failed: " in result.stderr
+    assert ("none of the 2 runs ended well" in result.stderr) == (well == 0)
+    assert result.returncode == code
