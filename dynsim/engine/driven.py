@@ -102,7 +102,8 @@ class Driven(Protocol):
         """What there is to see now."""
 
     def joints(self) -> Mapping[str, Array]:
-        """Angles of joints [rad], rates [rad/s] unless they are held from tick to tick, and which wheels are grounded.
+        """Angles of joints [rad], rates [rad/s] unless they are held from tick to tick, and which wheels are grounded
+        (since the tick before).
 
         By the names of the record's signals, in the order of their labels.
         """
