@@ -292,13 +292,12 @@ def _warnings(
     if given > FRICTION_ROUNDING * summary["energy_turnover_J"]:
         put = f"friction has put {given:.3g} J into the arm: "
         if counts.unilateral is None:
-            put += "f_t = μ f_n reverses with a pulling normal force "
-            put += "(contacts.pulling_friction: dissipative takes μ |f_n|)"
+            put += "f_t = μ f_n reverses with a pulling normal force (contacts.pulling_friction: dissipative takes μ |f_n|)"
         else:
             put += "an error of the integration; shorten integrator.step_s or tighten integrator.rtol"
         found.append(put)
     limited = [(a, motor, limits) for a, motor in enumerate(robot.motors) for limits in _limits_of(motor)]
-    # Along the samples of a row at once: across rows of a few columns it takes three times as long.
+    # Along samples: a third of the time.
     peaks = {name: np.abs(record[name].T.copy()).max(axis=1, initial=0.0) for name in {one[1] for *_, one in limited}}
     for a, motor, (what, signal, limit, unit) in limited:
         # A run that diverged may have NaN, which hides a peak.

@@ -368,7 +368,7 @@ def test_a_measured_record_beside_the_simulated_one(braced: Record, opened: Open
     measured.add("q", braced["q"][::7] + 0.01, "rad", labels=braced.labels["q"])
     measured.scene = braced.scene
     assert add_body_poses(measured)
-    page = opened({"simulated": braced, "measured": measured}, ghost=True)
+    page = opened({"simulated": braced, "robot": measured}, ghost=True)
     assert "measured" in page.page.locator("#variants .chip").nth(1).locator("em").inner_text()
     row = 30
     _, shown = page.seek(float(measured.time[row]))["records"]
