@@ -270,9 +270,7 @@ def _warnings(
     counts: Counts,
     summary: dict[str, Any],
 ) -> list[str]:
-    found = []
-    if counts.unilateral is not None:
-        found.extend(chattered(contacts, counts.unilateral))
+    found = [] if counts.unilateral is None else [*chattered(contacts, counts.unilateral)]
     for contact in summary["contacts"]:
         if contact["normal_force_min_N"] < 0.0:
             found.append(
@@ -292,7 +290,8 @@ def _warnings(
     if given > FRICTION_ROUNDING * summary["energy_turnover_J"]:
         put = f"friction has put {given:.3g} J into the arm: "
         if counts.unilateral is None:
-            put += "f_t = μ f_n reverses with a pulling normal force (contacts.pulling_friction: dissipative takes μ |f_n|)"
+            put += "f_t = μ f_n reverses with a pulling normal force "
+            put += "(contacts.pulling_friction: dissipative takes μ |f_n|)"
         else:
             put += "an error of the integration; shorten integrator.step_s or tighten integrator.rtol"
         found.append(put)
