@@ -5,6 +5,7 @@ only the task that it had in hand.
 from __future__ import annotations
 
 import ctypes
+import gc
 import itertools
 import logging
 import math
@@ -223,6 +224,7 @@ def _serve(work: Callable[[Any, Progress], Any], pipe: Connection, stop: Any, se
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     keep_memory()
+    gc.freeze()  # what was loaded until now is no garbage
     library = logging.getLogger("dynsim")
     library.setLevel(level)
     library.addHandler(_ToParent(sender))

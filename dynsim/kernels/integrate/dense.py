@@ -9,7 +9,7 @@ from numba.core import types
 from dynsim.kernels.arrays import Workspace
 from dynsim.kernels.compiler import form_of
 from dynsim.kernels.constraint.unilateral import UnilateralArrays
-from dynsim.kernels.integrate.newton import NewtonArrays
+from dynsim.kernels.integrate.newton import WAITING, NewtonArrays, StageLanes
 from dynsim.kernels.integrate.output import fill_output, write_output
 from dynsim.kernels.integrate.project import off_surface, settle
 from dynsim.kernels.integrate.run import DOPRI5, END, EVALUATIONS, RADAU5, SAMPLE, STEP, TIME, TIME_STEPPING, Run
@@ -81,47 +81,62 @@ def sample_step(system: System, ws: Workspace, run: Run):
     Samples are projected like steps are, so that recorded gaps hold the promised tolerance too.
     """
     t, h = run.clock[TIME], run.clock[STEP]
-    last = run.count[SAMPLE]
+    first = run.count[SAMPLE] + waiting_samples(run.newton)
+    last = first
     # A sample at END must not be lost to the rounding of t + h.
     until = run.clock[END] if t + h >= run.clock[END] - 1e-12 * max(1.0, run.clock[END]) else t + h
     if last >= run.sample_time.shape[0] or run.sample_time[last] > until:
         return
     fill_dense(run)
     while last < run.sample_time.shape[0] and run.sample_time[last] <= until:
-        taken = sample_together(run.newton, system, ws, run, last, until)
-        if taken == 0:
-            taken = sample_alone(system, ws, run, last)
-        last += taken
-    run.count[SAMPLE] = last
+        interpolate(run, run.sample_time[last], run.sample[last])
+        if system.layout.extra > 0:
+            normalise(system.model.compound, system.model, run.sample[last], system.layout.q)
+        last += 1
+    write_samples(run.newton, system, ws, run, last - first)
 
 
 @internal_kernel
-def sample_alone(system: System, ws: Workspace, run: Run, s):
-    """Record sample number s; returns 1, how many that is."""
-    between(system, run, s)
+def write_sample(system: System, ws: Workspace, run: Run):
+    """Project the next sample and record it, whose state is there."""
+    s = run.count[SAMPLE]
     settle(system, run.sample_time[s], run.sample[s], ws, run.stage[7], run)
     write_output(system, ws, run, s)
-    return 1
+    run.count[SAMPLE] = s + 1
 
 
 @internal_kernel
-def between(system: System, run: Run, s):
-    """The state of sample number s, not projected."""
-    interpolate(run, run.sample_time[s], run.sample[s])
-    if system.layout.extra > 0:
-        normalise(system.model.compound, system.model, run.sample[s], system.layout.q)
+def write_samples(newton: NewtonArrays | None, system: System, ws: Workspace, run: Run, more):
+    """Record so many ``more`` samples, whose states are there; on lanes up to three of them wait for the next ones."""
+    for _ in range(more):
+        write_sample(system, ws, run)
 
 
 @internal_kernel
-def sample_together(newton: NewtonArrays | None, system: System, ws: Workspace, run: Run, first, until):
-    """Record several samples from number ``first`` on, none beyond ``until`` [s]; returns how many, 0 without lanes."""
-    return 0
+def write_waiting(newton: NewtonArrays | None, system: System, ws: Workspace, run: Run):
+    """Record the samples that wait for others: something else than a step comes next."""
 
 
-def _together(newton: Any, system: Any, ws: Any, run: Any, *_: Any) -> bool:
-    """Where there are lanes; what the ground carries is computed one by one."""
+@internal_kernel
+def waiting_samples(newton: NewtonArrays | None):
+    """Samples whose states are there and that are not recorded yet."""
+    if newton is None:  # known to the compiler
+        return 0
+    return newton.count[WAITING]
+
+
+def samples_on_lanes(newton: Any, system: Any, ws: Any, run: Any, *_: Any) -> bool:
+    """Where there are lanes, by types; what the ground carries is computed one by one."""
     lanes = newton != types.none and newton[newton.fields.index("lanes")] != types.none
     return bool(lanes and run[run.fields.index("support")] == types.none)
+
+
+@internal_kernel
+def may_wait(unilateral: UnilateralArrays | None, run: Run):
+    """True where nothing but steps happens between two samples: modes, commands and loads go on as they are."""
+    if unilateral is None:  # known to the compiler
+        return run.event.shape[0] + run.tick.shape[0] + run.breaks.shape[0] == 0
+    return False
 
 
 @internal_kernel
@@ -132,29 +147,70 @@ def has_stops(unilateral: UnilateralArrays | None):
     return unilateral.stop.shape[0] > 0
 
 
-@form_of(sample_together, _together)
-def sample_on_lanes(newton, system, ws, run, first, until):
-    """Up to four; one is done sooner alone, and so is what has left its surfaces."""
-    lanes, times, count = newton.lanes, run.sample_time, 0
-    while count < 4 and first + count < times.shape[0] and times[first + count] <= until:
-        count += 1
-    if count == 1 or has_stops(system.unilateral):
-        return 0
-    for k in range(4):
-        s = first + min(k, count - 1)
-        if k < count:
-            between(system, run, s)
-        lanes.t[k] = times[s]
+@form_of(write_samples, samples_on_lanes)
+def write_samples_on_lanes(newton, system, ws, run, more):
+    """Four at a time; those that cannot wait by fewer, and one is done sooner alone."""
+    newton.count[WAITING] += more
+    wait, alone = may_wait(system.unilateral, run), has_stops(system.unilateral)
+    while newton.count[WAITING] >= 4 or (newton.count[WAITING] > 0 and not wait):
+        if alone or newton.count[WAITING] == 1:
+            newton.count[WAITING] -= 1
+            write_sample(system, ws, run)
+        else:
+            write_together(newton, system, ws, run)
+
+
+@form_of(write_waiting, samples_on_lanes)
+def write_waiting_on_lanes(newton, system, ws, run):
+    """As lanes, even one: how a sample is computed does not depend on where a caller has looked."""
+    if newton.count[WAITING] > 0:
+        write_together(newton, system, ws, run)
+
+
+@internal_kernel
+def write_together(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
+    """Record up to four samples that wait, as lanes."""
+    count = load_samples(newton, run, 0)
+    fill_lanes(newton.lanes, run, count)
+    evaluate_four(newton.lanes, system)
+    take_samples(newton, system, ws, run, 0, count)
+
+
+@internal_kernel
+def load_samples(newton: NewtonArrays, run: Run, begin):
+    """Samples that wait into the lanes from ``begin`` on; returns how many."""
+    lanes, first, count = newton.lanes, run.count[SAMPLE], min(newton.count[WAITING], 4 - begin)
+    for k in range(count):
+        lanes.t[begin + k] = run.sample_time[first + k]
         for j in range(run.y.shape[0]):
-            lanes.y[j, k] = run.sample[s, j]
-    evaluate_four(lanes, system)
-    run.count[EVALUATIONS] += count
+            lanes.y[j, begin + k] = run.sample[first + k, j]
+    return count
+
+
+@internal_kernel
+def fill_lanes(lanes: StageLanes, run: Run, begin):
+    """The first lane into those from ``begin`` on, for which there is nothing else."""
+    for k in range(begin, 4):
+        lanes.t[k] = lanes.t[0]
+        for j in range(run.y.shape[0]):
+            lanes.y[j, k] = lanes.y[j, 0]
+
+
+@internal_kernel
+def take_samples(newton: NewtonArrays, system: System, ws: Workspace, run: Run, begin, count):
+    """Record so many samples from the lanes, from ``begin`` on; what has left its surfaces is projected, alone."""
+    if count == 0:
+        return
+    lanes = newton.lanes
     tables = tables_as_lanes(lanes.ws, FOUR)
     fill_output(system, tables, run, as_lanes(lanes.output, FOUR))
-    for k in range(count):
+    run.count[EVALUATIONS] += count
+    newton.count[WAITING] -= count
+    for k in range(begin, begin + count):
         if off_surface(lane(tables, k)):
-            sample_alone(system, ws, run, first + k)
+            write_sample(system, ws, run)
         else:
+            row = run.output[run.count[SAMPLE]]
             for j in range(lanes.output.shape[0]):
-                run.output[first + k, j] = lanes.output[j, k]
-    return count
+                row[j] = lanes.output[j, k]
+            run.count[SAMPLE] += 1

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from dynsim.kernels.arrays import CONTRADICTORY, Workspace
 from dynsim.kernels.constraint.unilateral import UnilateralArrays
-from dynsim.kernels.constraint.uniqueness import clearly_unique
 from dynsim.kernels.drive.law import take_commands
 from dynsim.kernels.integrate.contact_events import (
     consistent,
@@ -29,12 +28,13 @@ from dynsim.kernels.integrate.contact_events import (
     take_directions,
     watch_modes,
 )
-from dynsim.kernels.integrate.dense import sample_step
+from dynsim.kernels.integrate.dense import sample_step, write_waiting
+from dynsim.kernels.integrate.ends import end_accepted
 from dynsim.kernels.integrate.events import arm_events, cut_step, fire_events, take_ticks
 from dynsim.kernels.integrate.explicit import step_explicit
 from dynsim.kernels.integrate.moreau import advance_moreau
 from dynsim.kernels.integrate.newton import forget
-from dynsim.kernels.integrate.project import off_surface, settle
+from dynsim.kernels.integrate.project import settle
 from dynsim.kernels.integrate.radau import after_step, step_radau5
 from dynsim.kernels.integrate.run import (
     AT_START,
@@ -107,12 +107,8 @@ def start_contacts(unilateral: UnilateralArrays | None, system: System, ws: Work
 def accept(system: System, ws: Workspace, run: Run):
     """Project y_new, record, and make it the new y. Sets STATUS when contacts cannot be met or forces not be known."""
     t, h = run.clock[TIME], run.clock[STEP]
-    if off_surface(ws) and not settle(system, t + h, run.y_new, ws, run.stage[6], run):
-        run.count[STATUS] = NOT_PROJECTED
+    if not end_accepted(run.newton, system, ws, run):
         return
-    if not (clearly_unique(ws) or forces_unique(system, ws, run, t + h)):
-        return
-    watch(ws, run, h)
     watch_modes(system.unilateral, ws, h, run.gaps)
     # The event of tipping has asked for the ground's reaction at the end of this step.
     if run.event.shape[0] > 0:
@@ -227,13 +223,13 @@ def conclude_apart(system: System, ws: Workspace, run: Run, error, order):
     return conclude(system, ws, run, error, order)
 
 
-@kernel
-def advance_radau5(system: System, ws: Workspace, run: Run, limit):
-    """:func:`advance` of RADAU5."""
+@merged_kernel
+def steps_radau5(system: System, ws: Workspace, run: Run, limit):
+    """Steps of RADAU5; False when there were ``limit`` of them and nothing else ended them."""
     taken, error = 0, 0.0
-    while waiting(system, ws, run):
-        if taken >= limit or finished(run):
-            return
+    while waiting(system, ws, run) and not finished(run):
+        if taken >= limit:
+            return False
         taken += 1
         if run.count[PENDING] == 0:
             propose(run)
@@ -243,7 +239,16 @@ def advance_radau5(system: System, ws: Workspace, run: Run, limit):
         if run.count[STEPS] > steps:
             after_step(run, h)
         if done:
-            return
+            return True
+    return True
+
+
+@kernel
+def advance_radau5(system: System, ws: Workspace, run: Run, limit):
+    """:func:`advance` of RADAU5. Samples wait on, with three others at most, where only ``limit`` has ended it: which
+    ones are computed together must not depend on how fast the machine is."""
+    if steps_radau5(system, ws, run, limit):
+        write_waiting(run.newton, system, ws, run)
 
 
 def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:

@@ -20,6 +20,7 @@ import math
 
 from dynsim.kernels.arrays import Workspace
 from dynsim.kernels.drive.law import drive_block
+from dynsim.kernels.integrate.ends import evaluate_end
 from dynsim.kernels.integrate.newton import (
     CLOSE,
     CONTRACTION,
@@ -230,8 +231,7 @@ def step_radau5(system: System, ws: Workspace, run: Run):
         derivative(system, t, run.stage[6], ws, r.f[0])
         run.count[EVALUATIONS] += 1
         error = estimate(system, ws, run, h, r.f[0])
-    derivative(system, t + h, y_new, ws, run.stage[6])
-    run.count[EVALUATIONS] += 1
+    evaluate_end(r, system, ws, run)
     return max(error, energy_error(system, run, h))
 
 

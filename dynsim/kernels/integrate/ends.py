@@ -1,0 +1,97 @@
+"""The end of a step: its derivative, whether it is on the constraints and forces are unique there.
+
+RADAU5 evaluates it on lanes, together with samples of the steps before: four states take no longer than one alone.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba.core import types
+
+from dynsim.kernels.arrays import CONTRADICTORY, DEPENDENT, Workspace
+from dynsim.kernels.compiler import form_of
+from dynsim.kernels.constraint.uniqueness import clearly_unique
+from dynsim.kernels.integrate.dense import fill_lanes, load_samples, samples_on_lanes, take_samples
+from dynsim.kernels.integrate.newton import ENDED, NewtonArrays
+from dynsim.kernels.integrate.project import off_surface, settle
+from dynsim.kernels.integrate.run import EVALUATIONS, NOT_PROJECTED, STATUS, STEP, TIME, Run
+from dynsim.kernels.integrate.stages import evaluate_four
+from dynsim.kernels.integrate.watch import forces_unique, watch
+from dynsim.kernels.jit import internal_kernel
+from dynsim.kernels.lanes.system import FOUR
+from dynsim.kernels.lanes.tables import lane, tables_as_lanes
+from dynsim.kernels.system import System, derivative
+
+
+@internal_kernel
+def evaluate_end(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
+    """Derivative at y_new into stage[6]."""
+    derivative(system, run.clock[TIME] + run.clock[STEP], run.y_new, ws, run.stage[6])
+    run.count[EVALUATIONS] += 1
+
+
+@internal_kernel
+def end_accepted(newton: NewtonArrays | None, system: System, ws: Workspace, run: Run):
+    """Project y_new where it is off the constraints, and watch the forces; False, and STATUS, when that cannot be."""
+    return end_settled(system, ws, run, off_surface(ws)) and end_watched(system, ws, run)
+
+
+@internal_kernel
+def end_settled(system: System, ws: Workspace, run: Run, off):
+    """True when y_new is on the constraints; where it was ``off`` them ``ws`` is of what it has become."""
+    if not off or settle(system, run.clock[TIME] + run.clock[STEP], run.y_new, ws, run.stage[6], run):
+        return True
+    run.count[STATUS] = NOT_PROJECTED
+    return False
+
+
+@internal_kernel
+def end_watched(system: System, ws: Workspace, run: Run):
+    """True when forces at y_new are unique; ``ws`` right after ``derivative`` there."""
+    h = run.clock[STEP]
+    if not (clearly_unique(ws) or forces_unique(system, ws, run, run.clock[TIME] + h)):
+        return False
+    watch(ws, run, h)
+    return True
+
+
+def _on_lanes(newton: Any, system: Any, ws: Any, run: Any, *_: Any) -> bool:
+    """Where samples are taken on lanes and nothing else asks what the forces at the end are."""
+    return samples_on_lanes(newton, system, ws, run) and bool(system[system.fields.index("unilateral")] == types.none)
+
+
+@form_of(evaluate_end, _on_lanes)
+def evaluate_end_on_lanes(newton, system, ws, run):
+    """On the first lane; on the others samples that wait. Guards of events want the workspace of one state."""
+    lanes, newton.count[ENDED] = newton.lanes, 0
+    if run.event.shape[0] > 0:
+        derivative(system, run.clock[TIME] + run.clock[STEP], run.y_new, ws, run.stage[6])
+        run.count[EVALUATIONS] += 1
+        return
+    lanes.t[0] = run.clock[TIME] + run.clock[STEP]
+    for j in range(run.y.shape[0]):
+        lanes.y[j, 0] = run.y_new[j]
+    count = load_samples(newton, run, 1)
+    fill_lanes(lanes, run, 1 + count)
+    dependent, contradictory = lanes.ws.counts[DEPENDENT], lanes.ws.counts[CONTRADICTORY]
+    evaluate_four(lanes, system)
+    ws.counts[DEPENDENT] += lanes.ws.counts[DEPENDENT] - dependent
+    ws.counts[CONTRADICTORY] += lanes.ws.counts[CONTRADICTORY] - contradictory
+    run.count[EVALUATIONS] += 1
+    newton.count[ENDED] = 1
+    for j in range(run.y.shape[0]):
+        run.stage[6, j] = lanes.f[j, 0]
+    take_samples(newton, system, ws, run, 1, count)
+
+
+@form_of(end_accepted, _on_lanes)
+def end_accepted_on_lanes(newton, system, ws, run):
+    """By what the first lane has left, unless the end must be projected."""
+    if newton.count[ENDED] == 0:
+        return end_settled(system, ws, run, off_surface(ws)) and end_watched(system, ws, run)
+    end = lane(tables_as_lanes(newton.lanes.ws, FOUR), 0)
+    if off_surface(end):
+        newton.count[ENDED] = 0
+        return end_settled(system, ws, run, True) and end_watched(system, ws, run)
+    return end_watched(system, end, run)
