@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from random_robots import bench, random_contacts, random_positions, random_robot
 
-from dynsim.kernels.integrate.run import EVALUATIONS, PROJECTIONS, SAMPLE
+from dynsim.kernels.integrate.run import EVALUATIONS, FINISHED, PROJECTIONS, SAMPLE, STATUS, TIME
 
 STEP = 5e-3
 
@@ -30,3 +30,27 @@ def test_samples_together_are_samples_alone():
     for found, expected in ((together.sample, alone.sample), (together.output, alone.output)):
         scale = np.abs(expected).max(axis=0)
         assert np.all(np.abs(found[3:175:7] - expected[:25]) <= 1e-9 * np.maximum(scale, scale.max() * 1e-3))
+
+
+def test_samples_wait_for_each_other_whatever_ends_a_piece():
+    """Fewer than one to a step: they wait for lanes that are free, and no piece of the run computes them otherwise."""
+    rng = np.random.default_rng(5)
+    robot = random_robot(rng, 7)
+    q = random_positions(rng, robot)
+    b = bench(robot, random_contacts(rng, robot, q, 2), k_p=0.3, k_d=0.01)
+    y = b.state(q, rng.normal(size=len(robot.links)))
+    times = np.linspace(0.0, 25 * STEP, 19)
+    whole = b.advance(b.new_run(y, times, "radau5", step=STEP, fixed=True))
+    pieces = b.new_run(y, times, "radau5", step=STEP, fixed=True)
+    late = []
+    while pieces.count[STATUS] != FINISHED:
+        b.advance(pieces, 1)
+        late.append(np.count_nonzero(times <= pieces.clock[TIME]) - pieces.count[SAMPLE])
+    assert 0 < max(late) <= 3
+    assert late[-1] == 0
+    assert whole.count[SAMPLE] == len(times)
+    np.testing.assert_array_equal(pieces.output, whole.output)
+    np.testing.assert_array_equal(pieces.sample, whole.sample)
+    one = b.advance(b.new_run(y, times[[7, -1]], "radau5", step=STEP, fixed=True))
+    scale = np.abs(whole.output).max(axis=0)
+    assert np.all(np.abs(whole.output[7] - one.output[0]) <= 1e-12 * np.maximum(scale, scale.max() * 1e-3))
