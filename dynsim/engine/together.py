@@ -1,4 +1,4 @@
-"""Runs of fixed steps that share lanes: up to eight scenarios of equal structure are integrated at once.
+"""Runs of fixed steps that share lanes: four or eight scenarios of equal structure are integrated at once.
 
 What may differ from lane to lane is what tables of numbers say, see dynsim.kernels.lanes.tables.AXES: masses,
 dimensions, gains, motor constants, limits, friction, surfaces, gravity, references. Adaptive methods choose their own
@@ -24,7 +24,7 @@ from dynsim.errors import DynsimError, SimulationInterrupted
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.lanes.fixed_step import LaneRuns, advance_lanes, lane_runs
-from dynsim.kernels.lanes.system import COMPILED, EIGHT, has_forms
+from dynsim.kernels.lanes.system import COMPILED, has_forms, lanes_of_runs
 from dynsim.kernels.lanes.tables import AXES, stack_tables
 from dynsim.record import Record
 from dynsim.reuse import Reuse
@@ -32,7 +32,8 @@ from dynsim.scenario import Scenario
 
 log = logging.getLogger(__name__)
 
-LANES = len(EIGHT)
+WIDTH = lanes_of_runs()
+LANES = len(WIDTH)
 
 
 def can_share(scenario: Scenario) -> bool:
@@ -169,12 +170,12 @@ def integrate(group: Sequence[Prepared]) -> list[bool]:
     ws = ws._replace(active=ws.active.copy(), counts=ws.counts.copy())
     runs = lane_runs([one.run for one in filled])
     with kernels_logged(log):
-        advance_lanes(EIGHT, system, ws, runs, 0)
+        advance_lanes(WIDTH, system, ws, runs, 0)
     limit = 1
     try:
         while runs.count[ki.STATUS] == ki.RUNNING:
             before = clock.perf_counter()
-            advance_lanes(EIGHT, system, ws, runs, limit)
+            advance_lanes(WIDTH, system, ws, runs, limit)
             taken = clock.perf_counter() - before
             limit = int(min(max(limit * min(CHUNK_S / max(taken, 1e-9), 10.0), 1), 1_000_000))
             interruption.check()

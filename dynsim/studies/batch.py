@@ -20,7 +20,7 @@ Task = TypeVar("Task")
 
 # Processes that a run may take with it before it is given up: the first may have been ended for another's memory.
 ATTEMPTS = 2
-# Runs of fixed steps that are handed out at once.
+# Runs of fixed steps that are handed out at once: whole lanes.
 LANES = 8
 LOST = "its process was ended from outside"
 

@@ -53,10 +53,10 @@ def test_quick_run(small: None) -> None:
     assert own == {
         (together.RIGHT_HAND_SIDE, programs.FOUR_LANES),
         (together.RIGHT_HAND_SIDE, programs.EIGHT_LANES),
-        (together.RUN, programs.EIGHT_LANES),
+        (together.RUN, together.RUNS_TOGETHER),
     }
     assert all(map(math.isfinite, ratios))
-    # Runs have no four lanes, and no explicit method follows the smallest inductance.
+    # Runs have lanes of one width, and no explicit method follows the smallest inductance.
     assert text(result).count("–") == 2
     assert [row["failed"] for row in result["sweeps"]] == [0] * len(result["sweeps"])
     tasks = {(row["task"], row["peer"]) for row in result["ratios"]}

@@ -18,18 +18,19 @@ from dynsim.studies.bench.programs import EIGHT_LANES, FOUR_LANES, ONE_STATE, SC
 from dynsim.studies.bench.right_hand_side import repeat_derivative, repeat_lanes
 from dynsim.studies.bench.timing import Timed, take_turns
 
+RUNS_TOGETHER = {len(FOUR): FOUR_LANES, len(EIGHT): EIGHT_LANES}[LANES]
 RIGHT_HAND_SIDE, RUN = "right-hand side, 2 contacts", f"RK4 {1e3 * STEP:g} ms, recorded at 200 Hz"
 
 
 def measure(rounds: int, share: float) -> list[dict[str, Any]]:
     """Microseconds of each state, alone and together; on lanes all parameters are each lane's own."""
-    arms = [_arm(friction) for friction in np.linspace(0.0, 0.2, LANES)]
+    arms = [_arm(friction) for friction in np.linspace(0.0, 0.2, len(EIGHT))]
     rates = [
         Timed(ONE_STATE, _alone(arms[0])),
         Timed(FOUR_LANES, _lanes(arms[:4], FOUR)),
         Timed(EIGHT_LANES, _lanes(arms, EIGHT)),
     ]
-    runs = [Timed(ONE_STATE, _run_alone(arms[0])), Timed(EIGHT_LANES, _run_together(arms))]
+    runs = [Timed(ONE_STATE, _run_alone(arms[0])), Timed(RUNS_TOGETHER, _run_together(arms[:LANES]))]
     rows = []
     for task, timed in ((RIGHT_HAND_SIDE, rates), (RUN, runs)):
         samples = take_turns(timed, rounds, share)
