@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,11 +12,6 @@ from dynsim.errors import RecordError
 
 if TYPE_CHECKING:
     from dynsim.record import Record
-
-# New objects after which a command looks for garbage. What it imports stays: to look through it as often as Python does
-# takes a tenth of a run.
-GARBAGE = 200_000
-
 
 # Tasks that the figures of a run become, and those of all over each other: all processes are busy until the end.
 PARTS = 2
@@ -114,12 +107,4 @@ def draw_all(wanted: Sequence[Figures], page: Page, quiet: bool) -> Path | None:
 
 def _draw(task: Figures | Page, _: Any) -> Path | None:
     """In a worker."""
-    _settle()
     return task.draw()
-
-
-@cache
-def _settle() -> None:
-    """What was loaded until now is no garbage: not to be looked through again."""
-    gc.freeze()
-    gc.set_threshold(GARBAGE)

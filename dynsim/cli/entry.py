@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import gc
 import os
 import signal
 import sys
@@ -14,10 +13,9 @@ from typing import Any
 
 import typer
 
-from dynsim import interruption
+from dynsim import garbage, interruption
 from dynsim.cli.commands import app
 from dynsim.cli.display import errors
-from dynsim.cli.drawing import GARBAGE
 from dynsim.errors import DynsimError, SimulationInterrupted
 from dynsim.standard_streams import lenient_streams
 from dynsim.terminal import escaped
@@ -30,15 +28,14 @@ def main() -> None:
     """Entry point: errors become one line and an exit code. Ctrl-C where nothing can be saved is typer's: 130."""
     # Before numpy: dynsim's matrices are small, and threads that wait for work take a tenth of a run's processor time.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    gc.set_threshold(GARBAGE)
+    garbage.look_rarely()
     with interruption.heeded() as received, lenient_streams() as output, _plain_warnings():
         code = _exit_code()
         if output is not None:
             output.flush()
             if code == 0 and output.failure is not None:
                 code = _explain_lost_output(output.failure)
-    # Else the interpreter looks through all of it as it ends, 0.2 s.
-    gc.freeze()
+    garbage.keep_all()
     sys.exit(_SIGNAL_EXIT + received[0] if received and code == SimulationInterrupted.exit_code else code)
 
 

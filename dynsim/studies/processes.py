@@ -5,7 +5,6 @@ only the task that it had in hand.
 from __future__ import annotations
 
 import ctypes
-import gc
 import itertools
 import logging
 import math
@@ -25,7 +24,7 @@ from multiprocessing.connection import Connection
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
-from dynsim import interruption
+from dynsim import garbage, interruption
 from dynsim.interruption import STOP_SIGNALS
 
 if TYPE_CHECKING:
@@ -224,7 +223,8 @@ def _serve(work: Callable[[Any, Progress], Any], pipe: Connection, stop: Any, se
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     keep_memory()
-    gc.freeze()  # what was loaded until now is no garbage
+    garbage.look_rarely()
+    garbage.keep_all()
     library = logging.getLogger("dynsim")
     library.setLevel(level)
     library.addHandler(_ToParent(sender))
