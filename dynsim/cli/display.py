@@ -155,13 +155,19 @@ def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None
         TextColumn("{task.fields[failed]}"),
         *_times(),
     )
-    with Progress(*columns, console=console, transient=not console.is_terminal) as bar:
-        task = bar.add_task("", total=runs, failed="")
+    bar = Progress(*columns, console=console, transient=not console.is_terminal)
+    task = bar.add_task("", total=runs, failed="")
 
-        def report(done: int, failed: int) -> None:
-            bar.update(task, completed=done, failed=f"{failed} failed" if failed else "")
+    def report(done: int, failed: int) -> None:
+        # Not before: what refuses the sweep then stands alone.
+        bar.start()
+        bar.update(task, completed=done, failed=f"{failed} failed" if failed else "")
 
+    try:
         yield report
+    finally:
+        if bar.live.is_started:
+            bar.stop()
 
 
 @contextmanager

@@ -57,7 +57,7 @@ def hw_drive(
     rate: Rate = None,
     policy: PolicyOption = None,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FOLDER", help="[results/SCENARIO/drive_N, a new one]")
+        Path | None, typer.Option("--out", metavar="FOLDER", help="Default: results/SCENARIO/drive_N, a new one.")
     ] = None,
     speed: SpeedOption = 0.1,
     turn: TurnOption = 0.5,

@@ -36,17 +36,17 @@ class ExportFormat(StrEnum):
     urdf_log = "urdf-log"
 
 
-RecordFile = Annotated[Path, typer.Argument(metavar="RECORD", help="record.h5 of a run")]
-MapFile = Annotated[Path, typer.Option("--map", help="servo map: a file, or the name of a shipped one (arm, snake)")]
-Port = Annotated[str, typer.Option("--port", help="serial device, e.g. /dev/ttyUSB0")]
-Rate = Annotated[float | None, typer.Option("--rate", help="goals per second [Hz]; the map's if not given")]
-Speed = Annotated[float, typer.Option("--speed", help="1 is the record's own time, 0.5 half as fast")]
-ReplayPort = Annotated[str, typer.Option("--port", help="serial device, or 'virtual' for servos in memory")]
-PolicyOption = Annotated[Policy | None, typer.Option("--policy", help="on a fault; the map's if not given")]
-Live = Annotated[bool, typer.Option("--live", help="really move; a real port is a dry run without")]
-Yes = Annotated[bool, typer.Option("--yes", help="do not ask before moving")]
-Configure = Annotated[bool, typer.Option("--configure", help="write differing EEPROM settings")]
-Faults = Annotated[Path | None, typer.Option("--faults", help="fault script for virtual servos")]
+RecordFile = Annotated[Path, typer.Argument(metavar="RECORD", help="record.h5 of a run.")]
+MapFile = Annotated[Path, typer.Option("--map", help="Servo map: a file, or the name of a shipped one (arm, snake).")]
+Port = Annotated[str, typer.Option("--port", help="Serial device, e.g. /dev/ttyUSB0.")]
+Rate = Annotated[float | None, typer.Option("--rate", help="Goals per second [Hz]; default: the map's.")]
+Speed = Annotated[float, typer.Option("--speed", help="1 is the record's own time, 0.5 half as fast.")]
+ReplayPort = Annotated[str, typer.Option("--port", help="Serial device, or 'virtual' for servos in memory.")]
+PolicyOption = Annotated[Policy | None, typer.Option("--policy", help="On a fault; default: the map's.")]
+Live = Annotated[bool, typer.Option("--live", help="Really move; a real port is a dry run without.")]
+Yes = Annotated[bool, typer.Option("--yes", help="Do not ask before moving.")]
+Configure = Annotated[bool, typer.Option("--configure", help="Write differing EEPROM settings.")]
+Faults = Annotated[Path | None, typer.Option("--faults", help="Fault script for virtual servos.")]
 
 
 class MissingClientLibrary(DynsimError):
@@ -67,8 +67,8 @@ def client_library() -> Iterator[None]:
 @hw.command(epilog="Example: dynsim hw scan --port /dev/ttyUSB0 --map arm")
 def scan(
     port: Port,
-    map_file: Annotated[Path | None, typer.Option("--map", help="compare with this servo map")] = None,
-    baud: Annotated[int | None, typer.Option("--baud", help="only this bit rate [bit/s]")] = None,
+    map_file: Annotated[Path | None, typer.Option("--map", help="Compare with this servo map.")] = None,
+    baud: Annotated[int | None, typer.Option("--baud", help="Only this bit rate [bit/s].")] = None,
 ) -> None:
     """List the servos that answer, at every usual bit rate. Reads only."""
     with client_library():
@@ -166,14 +166,14 @@ def replay(
     rate: Rate = None,
     speed: Speed = 1.0,
     policy: PolicyOption = None,
-    out: Annotated[Path | None, typer.Option("--out", help="folder [results/ROBOT_replay]")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder; default: results/ROBOT_replay.")] = None,
     live: Live = False,
     yes: Yes = False,
     configure: Configure = False,
     faults: Faults = None,
-    plant: Annotated[str | None, typer.Option("--plant", help="scenario whose robot the virtual servos move")] = None,
-    variant: Annotated[str | None, typer.Option("--variant", help="variant of that scenario")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="no progress bar")] = False,
+    plant: Annotated[str | None, typer.Option("--plant", help="Scenario whose robot the virtual servos move.")] = None,
+    variant: Annotated[str | None, typer.Option("--variant", help="Variant of that scenario.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
 ) -> None:
     """Check, verify, arm, move to the start, replay, and keep the measured run.
 
@@ -245,7 +245,7 @@ def print_timing(result: Any) -> None:
 
 
 @hw.command(epilog="Example: dynsim hw recover results/arm_replay")
-def recover(folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="of a replay whose process died")]) -> None:
+def recover(folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of a replay whose process died.")]) -> None:
     """Make a measured record, marked incomplete, of the cycles that a replay had written when it died."""
     from dynsim.hardware.replay import recover as recovery
     from dynsim.hardware.replay.folder import MEASURED
@@ -260,11 +260,11 @@ def recover(folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="of a 
 )
 def compare(
     record: RecordFile,
-    measured: Annotated[Path, typer.Argument(metavar="MEASURED", help="measured.h5 of a replay")],
-    gate: Annotated[Path | None, typer.Option("--gate", help="YAML with bounds; exit code 5 beyond them")] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="folder [that of MEASURED]")] = None,
+    measured: Annotated[Path, typer.Argument(metavar="MEASURED", help="measured.h5 of a replay.")],
+    gate: Annotated[Path | None, typer.Option("--gate", help="YAML with bounds; exit code 5 beyond them.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder; default: that of MEASURED.")] = None,
     joints: Annotated[
-        list[str] | None, typer.Option("--joint", help="in colour in the figure; may be repeated [the worst]")
+        list[str] | None, typer.Option("--joint", help="In colour in the figure; may be repeated; default: the worst.")
     ] = None,
 ) -> None:
     """Delay, rms and largest error between a simulated and a measured run, joints and wheels, with a figure."""
@@ -312,10 +312,10 @@ def compare(
 @hw.command(epilog="Example: dynsim hw virtual --map arm --link /tmp/ttyDXL")
 def virtual(
     map_file: MapFile,
-    faults: Annotated[Path | None, typer.Option("--faults", help="fault script")] = None,
-    link: Annotated[Path | None, typer.Option("--link", help="name the device by this symbolic link")] = None,
-    plant: Annotated[str | None, typer.Option("--plant", help="scenario whose robot the servos move")] = None,
-    variant: Annotated[str | None, typer.Option("--variant", help="variant of that scenario")] = None,
+    faults: Annotated[Path | None, typer.Option("--faults", help="Fault script.")] = None,
+    link: Annotated[Path | None, typer.Option("--link", help="Name the device by this symbolic link.")] = None,
+    plant: Annotated[str | None, typer.Option("--plant", help="Scenario whose robot the servos move.")] = None,
+    variant: Annotated[str | None, typer.Option("--variant", help="Variant of that scenario.")] = None,
 ) -> None:
     """Virtual servos behind a pseudo-terminal, for any Dynamixel tool. Ctrl-C ends it."""
     with client_library():
@@ -347,8 +347,8 @@ def virtual(
 @hw.command("stop", epilog="Example: dynsim hw stop --port /dev/ttyUSB0")
 def stop_servos(
     port: Port,
-    map_file: Annotated[Path | None, typer.Option("--map", help="ask the servos of this map")] = None,
-    baud: Annotated[int | None, typer.Option("--baud", help="only this bit rate [bit/s]")] = None,
+    map_file: Annotated[Path | None, typer.Option("--map", help="Ask the servos of this map.")] = None,
+    baud: Annotated[int | None, typer.Option("--baud", help="Only this bit rate [bit/s].")] = None,
 ) -> None:
     """Torque off for every servo at every usual bit rate, beside a replay too; no substitute for a power cut."""
     with client_library():
@@ -380,12 +380,12 @@ def schema() -> None:
 def calibrate(
     map_file: MapFile,
     port: Port,
-    joint: Annotated[list[str] | None, typer.Option("--joint", help="only this joint; may be repeated")] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="write here instead of into the map")] = None,
-    nudge: Annotated[bool, typer.Option("--nudge", help="turn each joint 3° and back, to see its sense")] = False,
-    live: Annotated[bool, typer.Option("--live", help="really move (--nudge)")] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="ask nothing, only report (--nudge)")] = False,
-    write: Annotated[bool, typer.Option("--write", help="write wrong senses into the map (--nudge)")] = False,
+    joint: Annotated[list[str] | None, typer.Option("--joint", help="Only this joint; may be repeated.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Write here instead of into the map.")] = None,
+    nudge: Annotated[bool, typer.Option("--nudge", help="Turn each joint 3° and back, to see its sense.")] = False,
+    live: Annotated[bool, typer.Option("--live", help="Really move (--nudge).")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing, only report (--nudge).")] = False,
+    write: Annotated[bool, typer.Option("--write", help="Write wrong senses into the map (--nudge).")] = False,
 ) -> None:
     """Write the zero ticks: put the robot into its zero posture by hand (torque off), then run this.
 
@@ -431,12 +431,10 @@ def calibrate(
 def export(
     record: RecordFile,
     format_: Annotated[
-        ExportFormat, typer.Option("--format", help="csv, joint-trajectory (ROS), urdf-log (JSON lines)")
+        ExportFormat, typer.Option("--format", help="csv, joint-trajectory (ROS), urdf-log (JSON lines).")
     ],
-    rate: Annotated[
-        float | None, typer.Option("--rate", help="resample [Hz]; the record's samples if not given")
-    ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="file [beside the record]")] = None,
+    rate: Annotated[float | None, typer.Option("--rate", help="Resample [Hz]; default: the record's samples.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="File; default: beside the record.")] = None,
 ) -> None:
     """Write the joint motion of a record for other programs."""
     from dynsim.hardware.export import SUFFIX, export_record

@@ -193,7 +193,10 @@ class AbortRules:
     def stall(self, silence: float) -> Fault:
         """Nobody spoke to the servos for ``silence`` [s]."""
         self._new(Cause.STALL)
-        text = f"stalled for {silence:.2f} s: the servos' bus watchdogs ({self._watchdog:.2f} s) have tripped"
+        text = (
+            f"stalled for {silence:.2f} s: the servos' bus watchdogs ({self._watchdog:.2f} s) have tripped; "
+            "keep other work off this machine, or lower --rate"
+        )
         return Fault(Cause.STALL, text)
 
     def _new(self, cause: Cause, id_: int | None = None) -> bool:
