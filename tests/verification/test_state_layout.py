@@ -15,6 +15,7 @@ from random_robots import CONTINUOUS, Bench, bench, random_contacts, random_robo
 import dynsim
 from dynsim.engine.uniqueness import acceleration_range
 from dynsim.kernels.integrate.run import FINISHED, METHODS, PROJECTIONS, STATUS, STEPS, Run
+from dynsim.kernels.lanes.tables import aligned
 from dynsim.kernels.state import OutputLayout, StateLayout, block
 from dynsim.kernels.system import new_workspace
 
@@ -86,6 +87,9 @@ class Pair:
         two = self.other.new_run(self.moved(y), times, method, **options)
         columns = scattered_outputs(one.columns, self.gap)
         two = two._replace(columns=columns, output=np.zeros((len(times), columns.size)))
+        if two.newton is not None and two.newton.lanes is not None:
+            lanes = two.newton.lanes._replace(output=aligned(columns.size, 4))
+            two = two._replace(newton=two.newton._replace(lanes=lanes))
         return one, self.other.advance(two, limit)
 
     def assert_same_states(self, one: np.ndarray, two: np.ndarray, rtol: float = 0.0) -> None:
