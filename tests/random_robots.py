@@ -325,3 +325,10 @@ def bench(
         unilateral=compile_unilateral(robot, contacts or [], stops, slow) if real else None,
     )
     return Bench(robot, system, new_workspace(system), tuple(contacts or ()) if real else (), tuple(stops))
+
+
+def braced(rng: np.random.Generator) -> tuple[Bench, np.ndarray]:
+    """A tree with gentle motors and two points on their surfaces: what is fast and chatters amplifies rounding."""
+    robot = random_robot(rng, 7)
+    q = random_positions(rng, robot)
+    return bench(robot, random_contacts(rng, robot, q, 2), k_p=0.3, k_d=0.01), q

@@ -44,6 +44,8 @@ LIGHT = np.array([-0.35, 0.75, 0.56]) / np.linalg.norm([-0.35, 0.75, 0.56])
 LOW = 200
 # Points of a path at most.
 WAY = 600
+# By an open and a closed gripper [m].
+_NOT_MOVED = np.zeros((2, 3))
 
 
 @dataclass(frozen=True)
@@ -155,27 +157,24 @@ class Painter:
         group = {place: k for k, places in enumerate(self._wheels.places) for place in places}
         corners, bodies, faces, colours, wheels = [np.zeros((0, 3))], [np.zeros(0, int)], [], [], []
         aside, count = [np.zeros((2, 0, 3))], 0
-        for k, own in enumerate(shapes):
-            for j, shape in enumerate(own):
-                points, cells = solid(shape, self._meshes.found)
-                wheel = group.get((k, j), -1)
-                plain = WHEEL if wheel >= 0 else self._hub if shape.get("role") == "hub" else BODY
-                corners.append(points)
-                bodies.append(np.full(len(points), k))
-                faces.append(cells + count)
-                colours.append(self._colours(shape, len(cells), plain))
-                wheels.append(np.full(len(cells), wheel))
-                aside.append(np.zeros((2, len(points), 3)))
-                count += len(points)
-        for shape, moved in self._fingers(shapes):
-            points, cells = solid(shape, [])
+
+        def add(body: int, shape: dict[str, Any], plain: str, wheel: int = -1, moved: Array = _NOT_MOVED) -> None:
+            nonlocal count
+            points, cells = solid(shape, self._meshes.found)
             corners.append(points)
-            bodies.append(np.full(len(points), self._gripped))
+            bodies.append(np.full(len(points), body))
             faces.append(cells + count)
-            colours.append(self._colours(shape, len(cells), self.tint))
-            wheels.append(np.full(len(cells), -1))
+            colours.append(self._colours(shape, len(cells), plain))
+            wheels.append(np.full(len(cells), wheel))
             aside.append(np.broadcast_to(moved[:, None, :], (2, len(points), 3)))
             count += len(points)
+
+        for k, own in enumerate(shapes):
+            for j, shape in enumerate(own):
+                wheel = group.get((k, j), -1)
+                add(k, shape, WHEEL if wheel >= 0 else self._hub if shape.get("role") == "hub" else BODY, wheel)
+        for shape, moved in self._fingers(shapes):
+            add(self._gripped, shape, self.tint, moved=moved)
         if not faces:
             faces, colours, wheels = [np.zeros((0, 4), int)], [np.zeros((0, 3))], [np.zeros(0, int)]
         return _Solids(

@@ -20,8 +20,8 @@ Task = TypeVar("Task")
 
 # Processes that a run may take with it before it is given up: the first may have been ended for another's memory.
 ATTEMPTS = 2
-# Runs of fixed steps that are handed out at once: whole lanes.
-LANES = 8
+# Runs of fixed steps that are handed out at once: whole lanes of any processor.
+AT_ONCE = 8
 LOST = "its process was ended from outside"
 
 
@@ -231,7 +231,7 @@ def run_all(
     """
     if not isinstance(jobs, int) or jobs < 1:
         raise ScenarioError(f"jobs = {shown(jobs)}: must be a whole number of processes, 1 or more")
-    size = max(min(LANES, -(-len(tasks) // jobs)), 1) if lanes else 1
+    size = max(min(AT_ONCE, -(-len(tasks) // jobs)), 1) if lanes else 1
     if scheduler is not None:
         from dynsim.studies.cluster import run_on_cluster
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from lane_cases import CASES, TIMED, Case, of, plane
 from lanes import copies
-from random_robots import Bench, bench, random_contacts, random_positions, random_robot
+from random_robots import Bench, bench, braced, random_contacts, random_positions, random_robot
 
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.constraint.rows import set_modes
@@ -155,17 +155,9 @@ def of_lane(tables: System, k: int) -> System:
     return tables._replace(**parts)
 
 
-def braced(seed: int = 3) -> tuple[Bench, np.ndarray]:
-    """A tree with gentle motors and two points on their surfaces: what is fast and chatters amplifies rounding."""
-    rng = np.random.default_rng(seed)
-    robot = random_robot(rng, 7)
-    q = random_positions(rng, robot)
-    return bench(robot, random_contacts(rng, robot, q, 2), k_p=0.3, k_d=0.01), q
-
-
 def test_runs_of_their_own_parameters():
     """Runs of RK4 with masses, gains and references of their own, projected and sampled, against each alone."""
-    (b, q), rng, width = braced(), np.random.default_rng(5), lanes_of_runs()
+    (b, q), rng, width = braced(np.random.default_rng(3)), np.random.default_rng(5), lanes_of_runs()
     tables = varied(b.system, len(width), rng)
     y, times, h = b.state(q, np.zeros(len(b.robot.links))), np.linspace(0.0, 0.1, 38), 1e-3
     runs = [b.new_run(y, times, "rk4", step=h) for _ in width]
@@ -191,7 +183,7 @@ def test_runs_of_their_own_parameters():
 
 def short_run() -> np.ndarray:
     """Samples of RADAU5 with everything that it does on lanes."""
-    b, q = braced()
+    b, q = braced(np.random.default_rng(3))
     y = b.state(q, np.zeros(len(b.robot.links)))
     return b.simulate(y, np.linspace(0.0, 0.01, 21), "radau5").sample
 

@@ -223,13 +223,14 @@ def conclude_apart(system: System, ws: Workspace, run: Run, error, order):
     return conclude(system, ws, run, error, order)
 
 
-@merged_kernel
-def steps_radau5(system: System, ws: Workspace, run: Run, limit):
-    """Steps of RADAU5; False when there were ``limit`` of them and nothing else ended them."""
+@kernel
+def advance_radau5(system: System, ws: Workspace, run: Run, limit):
+    """:func:`advance` of RADAU5. Samples wait on, with three others at most, where only ``limit`` has ended it: which
+    ones are computed together must not depend on how fast the machine is."""
     taken, error = 0, 0.0
     while waiting(system, ws, run) and not finished(run):
         if taken >= limit:
-            return False
+            return
         taken += 1
         if run.count[PENDING] == 0:
             propose(run)
@@ -239,16 +240,8 @@ def steps_radau5(system: System, ws: Workspace, run: Run, limit):
         if run.count[STEPS] > steps:
             after_step(run, h)
         if done:
-            return True
-    return True
-
-
-@kernel
-def advance_radau5(system: System, ws: Workspace, run: Run, limit):
-    """:func:`advance` of RADAU5. Samples wait on, with three others at most, where only ``limit`` has ended it: which
-    ones are computed together must not depend on how fast the machine is."""
-    if steps_radau5(system, ws, run, limit):
-        write_waiting(run.newton, system, ws, run)
+            break
+    write_waiting(run.newton, system, ws, run)
 
 
 def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:

@@ -13,7 +13,7 @@ from dynsim.kernels.arrays import CONTRADICTORY, DEPENDENT, Workspace
 from dynsim.kernels.compiler import form_of
 from dynsim.kernels.constraint.uniqueness import clearly_unique
 from dynsim.kernels.integrate.dense import fill_lanes, load_samples, samples_on_lanes, take_samples
-from dynsim.kernels.integrate.newton import ENDED, NewtonArrays
+from dynsim.kernels.integrate.newton import NewtonArrays
 from dynsim.kernels.integrate.project import off_surface, settle
 from dynsim.kernels.integrate.run import EVALUATIONS, NOT_PROJECTED, STATUS, STEP, TIME, Run
 from dynsim.kernels.integrate.stages import evaluate_four
@@ -27,6 +27,12 @@ from dynsim.kernels.system import System, derivative
 @internal_kernel
 def evaluate_end(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
     """Derivative at y_new into stage[6]."""
+    evaluate_end_alone(system, ws, run)
+
+
+@internal_kernel
+def evaluate_end_alone(system: System, ws: Workspace, run: Run):
+    """The same without lanes."""
     derivative(system, run.clock[TIME] + run.clock[STEP], run.y_new, ws, run.stage[6])
     run.count[EVALUATIONS] += 1
 
@@ -64,11 +70,10 @@ def _on_lanes(newton: Any, system: Any, ws: Any, run: Any, *_: Any) -> bool:
 @form_of(evaluate_end, _on_lanes)
 def evaluate_end_on_lanes(newton, system, ws, run):
     """On the first lane; on the others samples that wait. Guards of events want the workspace of one state."""
-    lanes, newton.count[ENDED] = newton.lanes, 0
     if run.event.shape[0] > 0:
-        derivative(system, run.clock[TIME] + run.clock[STEP], run.y_new, ws, run.stage[6])
-        run.count[EVALUATIONS] += 1
+        evaluate_end_alone(system, ws, run)
         return
+    lanes = newton.lanes
     lanes.t[0] = run.clock[TIME] + run.clock[STEP]
     for j in range(run.y.shape[0]):
         lanes.y[j, 0] = run.y_new[j]
@@ -79,7 +84,6 @@ def evaluate_end_on_lanes(newton, system, ws, run):
     ws.counts[DEPENDENT] += lanes.ws.counts[DEPENDENT] - dependent
     ws.counts[CONTRADICTORY] += lanes.ws.counts[CONTRADICTORY] - contradictory
     run.count[EVALUATIONS] += 1
-    newton.count[ENDED] = 1
     for j in range(run.y.shape[0]):
         run.stage[6, j] = lanes.f[j, 0]
     take_samples(newton, system, ws, run, 1, count)
@@ -87,11 +91,8 @@ def evaluate_end_on_lanes(newton, system, ws, run):
 
 @form_of(end_accepted, _on_lanes)
 def end_accepted_on_lanes(newton, system, ws, run):
-    """By what the first lane has left, unless the end must be projected."""
-    if newton.count[ENDED] == 0:
-        return end_settled(system, ws, run, off_surface(ws)) and end_watched(system, ws, run)
-    end = lane(tables_as_lanes(newton.lanes.ws, FOUR), 0)
-    if off_surface(end):
-        newton.count[ENDED] = 0
-        return end_settled(system, ws, run, True) and end_watched(system, ws, run)
-    return end_watched(system, end, run)
+    """By what the first lane has left, where the end was evaluated there, unless it must be projected."""
+    end, on_lanes = lane(tables_as_lanes(newton.lanes.ws, FOUR), 0), run.event.shape[0] == 0
+    if on_lanes and not off_surface(end):
+        return end_watched(system, end, run)
+    return end_settled(system, ws, run, on_lanes or off_surface(ws)) and end_watched(system, ws, run)

@@ -19,11 +19,9 @@ NEWTON_CLOCK_SIZE = 6
 CLOSE_ENOUGH = 0.03
 # NewtonArrays.count, int: the Jacobian must be made anew; accepted steps when it was made, and when the stages were
 # kept for extrapolation; there are such; Jacobians, factorisations, Newton iterations, steps in which they diverged;
-# the
-# end of the step is on the first lane; samples whose states are there and that are not recorded yet.
-STALE, MADE_AT, SEEN, EXTRAPOLATES, JACOBIANS, FACTORS, ITERATIONS, DIVERGED = 0, 1, 2, 3, 4, 5, 6, 7
-ENDED, WAITING = 8, 9
-NEWTON_COUNT_SIZE = 10
+# samples whose states are there and that are not recorded yet.
+STALE, MADE_AT, SEEN, EXTRAPOLATES, JACOBIANS, FACTORS, ITERATIONS, DIVERGED, WAITING = 0, 1, 2, 3, 4, 5, 6, 7, 8
+NEWTON_COUNT_SIZE = 9
 
 
 class StageLanes(NamedTuple):
