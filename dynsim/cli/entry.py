@@ -26,8 +26,6 @@ _SIGNAL_EXIT = 128
 
 def main() -> None:
     """Entry point: errors become one line and an exit code. Ctrl-C where nothing can be saved is typer's: 130."""
-    # Before numpy: dynsim's matrices are small, and threads that wait for work take a tenth of a run's processor time.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     garbage.look_rarely()
     with interruption.heeded() as received, lenient_streams() as output, _plain_warnings():
         code = _exit_code()

@@ -76,12 +76,13 @@ def sweep(
 
     A run that fails is a row with its reason. Exit codes: 0 some run ended well, 2 bad input, 3 none did, 130 Ctrl-C.
     """
-    from dynsim.studies.processes import begin_early, cores, keep_memory
+    from dynsim.cli.workers import load_workers
+    from dynsim.studies.processes import cores, keep_memory
 
     if jobs is not None and scheduler is not None:
         raise ScenarioError("--jobs are processes of this machine, --scheduler has its own workers: give one of them")
     if scheduler is None and (jobs or cores()) > 1:
-        begin_early("dynsim.studies.batch", "dynsim.studies.plan", "dynsim.engine.dynamics")
+        load_workers()
     from dynsim.files import check_writable
     from dynsim.scenario import read_scenario
     from dynsim.studies.plan import Axis, Law, Plan

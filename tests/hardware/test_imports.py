@@ -12,7 +12,7 @@ import pytest
     ("module", "absent"),
     [
         # `dynsim run` mounts the commands: no serial port, no servo.
-        ("dynsim.cli", ("serial", "dynamixel_sdk", "dynsim.hardware.ports", "numba", "matplotlib", "logging")),
+        ("dynsim.cli.entry", ("serial", "dynamixel_sdk", "dynsim.hardware.ports", "numba", "matplotlib", "logging")),
         ("dynsim.hardware.cli", ("serial", "dynamixel_sdk", "dynsim.hardware.ports", "numba", "matplotlib")),
         # Replaying knows nothing of how a record was made, nor of what is on the bus.
         (

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 from random_robots import CONTINUOUS, Bench, bench
 
-from dynsim.kernels.integrate.run import DRIFT_MAX, FINISHED, METHODS, REJECTED, STATUS, STEPS, Run
+from dynsim.kernels.integrate.newton import ITERATIONS
+from dynsim.kernels.integrate.radau import SHORT, guess_stages, keep_stages, missed, slack
+from dynsim.kernels.integrate.run import DRIFT_MAX, FINISHED, METHODS, REJECTED, STATUS, STEP, STEP_MAX, STEPS, Run
+from dynsim.kernels.integrate.tableaux import ERROR_RADAU, GAMMA_RADAU, NODE_RADAU
 from dynsim.kernels.state import CONSTRAINT, ELECTRICAL, FRICTION, GEAR, JOINT, JOULE, OUT_GAP
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.model.drives import Motor
@@ -210,3 +213,47 @@ def test_a_run_in_pieces_is_the_same_run(method):
     while run.count[STATUS] != FINISHED:
         b.advance(run, 7)
     np.testing.assert_array_equal(run.y, whole.y)
+
+
+def test_what_collocation_misses():
+    """Of y' = t³ the collocation polynomial is y less ∫ Π (s − c_i) ds; the error estimate is −1/(10 γ) of h⁴ y⁗/6."""
+    c = NODE_RADAU
+    product = np.poly1d(c, r=True)
+    slope = np.poly1d([1.0, 0.0, 0.0, 0.0]) - product  # interpolates t³ at the nodes
+    collocation, exact = slope.integ(), np.poly1d([0.25, 0.0, 0.0, 0.0, 0.0])
+    for x in np.linspace(0.0, 2.5, 26):
+        assert missed(x) == pytest.approx(exact(x) - collocation(x), abs=1e-14)
+    estimate = ERROR_RADAU @ collocation(c) / GAMMA_RADAU
+    assert estimate == pytest.approx(-1.0 / (10.0 * GAMMA_RADAU), rel=1e-12)
+
+
+@pytest.mark.parametrize("ratio", [0.5, 1.0, 1.6])
+@pytest.mark.parametrize("braced", [False, True])
+def test_the_first_guess_is_right_but_for_the_fifth_power_of_the_step(ratio, braced):
+    b, y = arm(braced=braced)
+    found = []
+    for h in (1e-3, 5e-4, 2.5e-4):
+        run = b.new_run(y, np.array([1.0]), "radau5", step=h, fixed=True)
+        b.advance(run, int(0.02 / h))
+        keep_stages(run)
+        guess_stages(run, ratio * h)
+        guess = run.newton.z[:, : run.newton.kept.shape[1]].copy()
+        run.clock[STEP] = run.clock[STEP_MAX] = ratio * h
+        b.advance(run, 1)
+        solved = run.newton.z[:, : guess.shape[1]]
+        found.append(np.abs(guess - solved).max() / np.abs(solved).max() * h)
+    orders = np.log2(np.array(found[:-1]) / found[1:])
+    # Without the error of the last step they are right but for the fourth.
+    assert orders.min() >= 4.6, (found, orders)
+
+
+def test_most_steps_take_one_iteration():
+    """Where the motion is smooth: 1.2, and 1.6 without the error of the last step."""
+    b, y = arm()
+    run = b.simulate(y, np.array([0.5]), "radau5")
+    assert run.newton.count[ITERATIONS] <= 1.4 * run.count[STEPS]
+
+
+def test_slack_of_short_steps():
+    """Rates may be off by what moves a joint as far as atol does in a step of 5 ms; longer steps are held to atol."""
+    assert [slack(h) for h in (2.0 * SHORT, SHORT, 0.1 * SHORT)] == [1.0, 1.0, pytest.approx(10.0)]

@@ -33,10 +33,10 @@ def weight_rk43(system: System, ws: Workspace, run: Run):
     if system.layout.extra > 0:
         for j in range(system.layout.tracked):
             k[7, j] = h * (k[6, j] - k[3, j])
-        slope = error_norm(system, ws, run, k[7]) ** 2
+        slope = error_norm(system, ws, run, k[7], 1.0) ** 2
         for j in range(system.layout.tracked):
             k[7, j] = y_new[j] - y[j] - h * k[2, j]
-        change = error_norm(system, ws, run, k[7]) ** 2
+        change = error_norm(system, ws, run, k[7], 1.0) ** 2
     else:
         for j in range(system.layout.tracked):
             scale = 1.0 / (atol + rtol * max(abs(y[j]), abs(y_new[j])))
@@ -87,4 +87,4 @@ def step_explicit(system: System, ws: Workspace, run: Run):
         for j in range(y.shape[0]):
             k[7, j] = 0.0
         combine(k[7], h, ERROR_DOPRI5, 7, k, k[7])
-    return error_norm(system, ws, run, k[7])
+    return error_norm(system, ws, run, k[7], 1.0)

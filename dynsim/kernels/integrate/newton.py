@@ -53,7 +53,8 @@ class NewtonArrays(NamedTuple):
     z: np.ndarray  # (3, m) stages of the step tried, from y on
     w: np.ndarray  # (3, s) the same, T⁻¹ z
     f: np.ndarray  # (3, m) derivatives at the stages
-    kept: np.ndarray  # (3, s) coefficients of the accepted stages' polynomial
+    kept: np.ndarray  # (4, s) coefficients of the accepted stages' polynomial, and the error estimate of their step
+    error: np.ndarray  # (s,) that of the step tried
     weight: np.ndarray  # (s,) 1 / tolerance
     one: np.ndarray  # (s,) right side and solution of the real system
     two: np.ndarray  # (s,) complex
@@ -85,7 +86,8 @@ def newton_arrays(n: int, na: int, circuits: int, tracked: int, m: int) -> Newto
         z=np.zeros((3, m)),
         w=np.zeros((3, tracked)),
         f=np.zeros((3, m)),
-        kept=np.zeros((3, tracked)),
+        kept=np.zeros((4, tracked)),
+        error=np.zeros(tracked),
         weight=np.zeros(tracked),
         one=np.zeros(tracked),
         two=np.zeros(tracked, dtype=np.complex128),

@@ -32,24 +32,25 @@ from dynsim.kernels.tree.joints import position_error
 
 
 @internal_kernel
-def error_norm(system: System, ws: Workspace, run: Run, error):
-    """Root mean square of error / (atol + rtol |y|) over positions, rates and currents; quaternions count as angles."""
+def error_norm(system: System, ws: Workspace, run: Run, error, slack):
+    """Root mean square of error / (atol + rtol |y|) over positions, rates and currents; quaternions count as angles.
+
+    The atol of rates and currents is ``slack`` times that of positions.
+    """
     y, y_new, atol, rtol, layout = run.y, run.y_new, run.clock[ATOL], run.clock[RTOL], system.layout
-    total = 0.0
+    total, size = 0.0, layout.tracked
     if layout.extra > 0:
         model = system.model
         total, size = position_error(model.compound, model, y, y_new, error, layout.q, rtol, atol)
-        beyond = layout.q + ws.joints.shape[0] + layout.extra
-        for j in range(layout.tracked):
-            if j < layout.q or j >= beyond:
-                x = error[j] / (atol + rtol * max(abs(y[j]), abs(y_new[j])))
-                total += x * x
-                size += 1
-        return math.sqrt(total / size)
-    for j in range(layout.tracked):
-        x = error[j] / (atol + rtol * max(abs(y[j]), abs(y_new[j])))
+        size += layout.tracked - layout.v
+    else:
+        for j in range(layout.v):
+            x = error[j] / (atol + rtol * max(abs(y[j]), abs(y_new[j])))
+            total += x * x
+    for j in range(layout.v, layout.tracked):
+        x = error[j] / (slack * atol + rtol * max(abs(y[j]), abs(y_new[j])))
         total += x * x
-    return math.sqrt(total / layout.tracked)
+    return math.sqrt(total / size)
 
 
 @kernel
@@ -79,7 +80,7 @@ def first_step(system: System, ws: Workspace, run: Run):
         # A guess that is the same for every attitude: of a quaternion only its rotation counts.
         for j in range(y.shape[0]):
             run.y_new[j] = y[j]
-        size, slope = error_norm(system, ws, run, y) ** 2, error_norm(system, ws, run, k[0]) ** 2
+        size, slope = error_norm(system, ws, run, y, 1.0) ** 2, error_norm(system, ws, run, k[0], 1.0) ** 2
     else:
         for j in range(system.layout.tracked):
             scale = clock[ATOL] + clock[RTOL] * abs(y[j])
