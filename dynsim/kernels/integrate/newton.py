@@ -16,7 +16,8 @@ from dynsim.kernels.lanes.tables import aligned
 # that the last one may have, per tolerance.
 FACTORED, TRIED, KEPT, CONTRACTION, LEVER, CLOSE = 0, 1, 2, 3, 4, 5
 NEWTON_CLOCK_SIZE = 6
-CLOSE_ENOUGH = 0.03
+# Without circuits nothing may damp what is left of it, and it adds up over the steps.
+CLOSE_ENOUGH, CLOSE_UNDAMPED = 0.03, 0.01
 # NewtonArrays.count, int: the Jacobian must be made anew; accepted steps when it was made, and when the stages were
 # kept for extrapolation; there are such; Jacobians, factorisations, Newton iterations, steps in which they diverged;
 # samples whose states are there and that are not recorded yet.
@@ -76,7 +77,7 @@ def newton_arrays(n: int, na: int, circuits: int, tracked: int, m: int) -> Newto
     count = np.zeros(NEWTON_COUNT_SIZE, dtype=np.int64)
     count[STALE] = 1
     clock = np.zeros(NEWTON_CLOCK_SIZE)
-    clock[CLOSE] = CLOSE_ENOUGH
+    clock[CLOSE] = CLOSE_ENOUGH if circuits > 0 else CLOSE_UNDAMPED
     return NewtonArrays(
         along=np.zeros((2 * n + circuits, n)),
         linear=np.zeros((na, BLOCK_SIZE)),

@@ -180,14 +180,14 @@ def solve_stages(system: System, ws: Workspace, run: Run, h):
 
 
 @internal_kernel
-def slack(h):
+def slack(system: System, h):
     """How many atol rates and currents may be off by in a step of length h.
 
     An error e of a rate moves a joint by h e within the step. Circuits that ring after a start do so for milliseconds
-    in steps of 0.1 ms, and a rate that is wrong by 50 atol there moves the joint by no more than one that is wrong by
-    atol in a step of 5 ms.
+    in steps of 0.1 ms: a rate that is wrong by 50 atol there moves its joint no further than one that is wrong by atol
+    in a step of 5 ms, and motors damp it. Where there are none it would stay.
     """
-    return max(1.0, SHORT / h)
+    return max(1.0, SHORT / h) if system.layout.circuits > 0 else 1.0
 
 
 @internal_kernel
@@ -202,7 +202,7 @@ def estimate(system: System, ws: Workspace, run: Run, h, slope):
         error[j] = r.one[j] if j < r.one.shape[0] else 0.0
     for j in range(r.one.shape[0]):
         r.error[j] = r.one[j]
-    return error_norm(system, ws, run, error, slack(h))
+    return error_norm(system, ws, run, error, slack(system, h))
 
 
 @internal_kernel
