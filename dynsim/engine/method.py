@@ -36,7 +36,7 @@ TOUCHING = 1e-6
 SMALL = 36
 """Joints up to which Jacobians of RADAU5 cost less than half of its steps."""
 TIGHT = 1e-8
-"""Relative tolerance from which on fewer steps of order five outweigh their cost, and to which RADAU5 keeps energy."""
+"""Relative tolerance from which on fewer steps of order five outweigh their cost. RADAU5 keeps energy down to it."""
 
 DENSE = 300
 """Size of matrices up to which all eigenvalues are found at once; of larger ones only the largest."""

@@ -63,9 +63,9 @@ def test_what_is_named_is_taken() -> None:
         assert chosen(shipped("elbow_comparison", "no_elbow", **{"integrator.method": method})) == method
 
 
-@pytest.mark.parametrize(("rtol", "within"), [(1e-6, 1.0), (1e-8, 3.0)])
+@pytest.mark.parametrize(("rtol", "within"), [(1e-6, 1.0), (1e-8, 2.0)])
 def test_passive_systems_keep_their_energy_to_the_tolerance(rtol: float, within: float) -> None:
-    """A double pendulum that tumbles for 10 s. Measured in rtol: 0.9 and 2.7; rk43 17 and 10, dopri5 17 and 25."""
+    """A double pendulum that tumbles for 10 s. Measured in rtol: 0.6 and 1.0; rk43 17 and 10, dopri5 17 and 25."""
     integrator = {"rtol": rtol, "atol": 1e-2 * rtol}
     record = simulate(chain(joint={"initial_deg": 120}, integrator=integrator, duration_s=10))
     assert record.summary["method"] == "radau5"
@@ -80,7 +80,7 @@ def test_long_passive_chains_stay_with_rk43() -> None:
 
 
 def test_passive_systems_at_the_tightest_tolerances_stay_with_rk43() -> None:
-    """There the rest that Newton's method leaves costs more energy: 15 rtol at 1e-10 against 6."""
+    """There rk43 is 6 rtol off at 1e-10, by 45 000 right-hand sides; radau5, 0.9 rtol off, takes 75 000."""
     assert chosen(chain(integrator={"rtol": 1e-10, "atol": 1e-12})) == "rk43"
 
 

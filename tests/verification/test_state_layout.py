@@ -174,8 +174,8 @@ def test_runs_at_fixed_steps(seed, method):
     assert one.count[STEPS] >= 100
     assert one.count[STATUS] == two.count[STATUS] == FINISHED
     np.testing.assert_array_equal(one.count[[STEPS, PROJECTIONS]], two.count[[STEPS, PROJECTIONS]])
-    # Rounding: sums over the state are taken in another order.
-    assert_same_runs(pair, one, two, 1e-11)
+    # Rounding: sums over the state are taken in another order. It may also end Newton's method an iteration sooner.
+    assert_same_runs(pair, one, two, 1e-10 if method == "radau5" else 1e-11)
 
 
 @pytest.mark.parametrize("method", [method for method in CONTINUOUS if method != "rk4"])

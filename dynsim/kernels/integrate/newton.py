@@ -17,7 +17,7 @@ from dynsim.kernels.lanes.tables import aligned
 FACTORED, TRIED, KEPT, CONTRACTION, LEVER, CLOSE = 0, 1, 2, 3, 4, 5
 NEWTON_CLOCK_SIZE = 6
 # Without circuits nothing may damp what is left of it, and it adds up over the steps.
-CLOSE_ENOUGH, CLOSE_UNDAMPED = 0.03, 0.01
+CLOSE_ENOUGH, CLOSE_UNDAMPED = 0.03, 0.003
 # NewtonArrays.count, int: the Jacobian must be made anew; accepted steps when it was made, and when the stages were
 # kept for extrapolation; there are such; Jacobians, factorisations, Newton iterations, steps in which they diverged;
 # samples whose states are there and that are not recorded yet.

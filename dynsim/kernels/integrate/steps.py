@@ -39,17 +39,16 @@ def error_norm(system: System, ws: Workspace, run: Run, error, slack):
     """
     y, y_new, atol, rtol, layout = run.y, run.y_new, run.clock[ATOL], run.clock[RTOL], system.layout
     total, size = 0.0, layout.tracked
+    beyond, loose = layout.q + ws.joints.shape[0] + layout.extra, slack * atol
     if layout.extra > 0:
         model = system.model
         total, size = position_error(model.compound, model, y, y_new, error, layout.q, rtol, atol)
-        size += layout.tracked - layout.v
-    else:
-        for j in range(layout.v):
-            x = error[j] / (atol + rtol * max(abs(y[j]), abs(y_new[j])))
+        size += layout.tracked - (beyond - layout.q)
+    for j in range(layout.tracked):
+        position = layout.q <= j < beyond
+        if not (position and layout.extra > 0):
+            x = error[j] / ((atol if position else loose) + rtol * max(abs(y[j]), abs(y_new[j])))
             total += x * x
-    for j in range(layout.v, layout.tracked):
-        x = error[j] / (slack * atol + rtol * max(abs(y[j]), abs(y_new[j])))
-        total += x * x
     return math.sqrt(total / size)
 
 
