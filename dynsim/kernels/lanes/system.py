@@ -31,7 +31,7 @@ FOUR, EIGHT = (0.0,) * 4, (0.0,) * 8
 def lanes_of_runs() -> tuple[float, ...]:
     """Lanes for states that are many: as wide as the registers of the processor that the compiler writes for.
 
-    Eight where it has AVX-512. With AVX2 eight run out of registers and take 5 % more time each than four do.
+    Eight where it has AVX-512. With AVX2 eight run out of registers and each takes no less time than one of four does.
     """
     *_, features = cpu_target.target_context.codegen().magic_tuple()
     return EIGHT if "+avx512f" in features.split(",") else FOUR
