@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from dynsim._version import __version__
+from dynsim.engine.provenance import commit
 from dynsim.studies.bench import job, precision, right_hand_side, sweeps, together, variants
 from dynsim.studies.bench.programs import (
     ABA,
@@ -287,7 +288,7 @@ def _machine() -> dict[str, Any]:
 
 
 def _versions() -> dict[str, str]:
-    found = {"dynsim": __version__, "python": platform.python_version()}
+    found = {"dynsim": __version__, "commit": commit(), "python": platform.python_version()}
     for package in ("numba", "numpy", "pin", "mujoco"):
         try:
             found[package] = importlib.metadata.version(package)
