@@ -9,7 +9,7 @@ between :func:`keep` and :func:`heed`, it waits.
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 
@@ -57,6 +57,11 @@ def heeded() -> Iterator[list[int]]:
         for number, handler in before.items():
             signal.signal(number, handler)
         _pending = _kept = False
+
+
+def exit_code(received: Sequence[int]) -> int:
+    """Of a process that a signal ended: 128 and the number of the first; that of Ctrl-C where none was received."""
+    return 128 + (received[0] if received else signal.SIGINT)
 
 
 def keep() -> None:

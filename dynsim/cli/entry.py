@@ -7,7 +7,7 @@ import os
 import signal
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -20,21 +20,21 @@ from dynsim.errors import DynsimError, SimulationInterrupted
 from dynsim.standard_streams import lenient_streams
 from dynsim.terminal import escaped
 
-# Of a process that a signal ended: this and the number of the signal.
-_SIGNAL_EXIT = 128
 
+def main(received: Sequence[int]) -> None:
+    """Errors become one line and an exit code. Ctrl-C where nothing can be saved is typer's: 130.
 
-def main() -> None:
-    """Entry point: errors become one line and an exit code. Ctrl-C where nothing can be saved is typer's: 130."""
+    ``received`` : what :func:`dynsim.interruption.heeded` gives, within which this runs
+    """
     garbage.look_rarely()
-    with interruption.heeded() as received, lenient_streams() as output, _plain_warnings():
+    with lenient_streams() as output, _plain_warnings():
         code = _exit_code()
         if output is not None:
             output.flush()
             if code == 0 and output.failure is not None:
                 code = _explain_lost_output(output.failure)
     garbage.keep_all()
-    sys.exit(_SIGNAL_EXIT + received[0] if received and code == SimulationInterrupted.exit_code else code)
+    sys.exit(interruption.exit_code(received) if code == SimulationInterrupted.exit_code else code)
 
 
 def _exit_code() -> int:
@@ -83,7 +83,7 @@ def _explain_system(error: OSError) -> str:
 def _explain_lost_output(failure: OSError) -> int:
     """Exit code when not all could be printed; a reader that wants no more (``| head``) is no error to speak of."""
     if failure.errno == errno.EPIPE:
-        return _SIGNAL_EXIT + signal.SIGPIPE if hasattr(signal, "SIGPIPE") else 1
+        return interruption.exit_code([signal.SIGPIPE]) if hasattr(signal, "SIGPIPE") else 1
     errors.print(f"[red]error:[/] standard output cannot be written ({failure.strerror})")
     return DynsimError.exit_code
 

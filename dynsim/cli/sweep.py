@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from threading import Thread
@@ -180,10 +181,12 @@ def _load_for_the_end(samples: bool, figures: bool) -> None:
 
 def _draw(name: str, rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool, format_: str) -> None:
     from dynsim.figures.sweep import Sweep, draw
+    from dynsim.studies.sweep import OK
 
+    # What a run that stopped has until then, or before it was to end, is beside the others like a fine result.
     table = Sweep(
         name,
-        [row.cells() for row in rows if row.numbers],
+        [(row if row.status == OK else replace(row, numbers={})).cells() for row in rows],
         [axis.key for axis in plan.grid],
         plan.sampled,
         plan.file.variants,

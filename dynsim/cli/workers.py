@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
+from itertools import pairwise
 
 from dynsim.studies.processes import begin_early, cores
 
-# With these the command itself knows whether there are processes at all.
-_DECIDED_LATER = ("--help", "--jobs", "--scheduler")
+# With these there are none here.
+_ELSEWHERE = ("--help", "--scheduler")
 
 
 def begin_workers(arguments: Sequence[str]) -> None:
-    """Begin for ``dynsim sweep`` with these arguments, unless they may ask for something else."""
-    if cores() > 1 and not any(argument.startswith(_DECIDED_LATER) for argument in arguments):
-        load_workers()
+    """Begin for ``dynsim sweep`` with these arguments, unless they ask for no processes here."""
+    words = " ".join(arguments).replace("--jobs=", "--jobs ").split()
+    jobs = dict(pairwise(words)).get("--jobs", str(cores()))
+    if jobs != "1" and not any(word.startswith(_ELSEWHERE) for word in words):
+        # What keeps processes from beginning the command says when it needs them, after what is wrong with it.
+        with suppress(OSError):
+            load_workers()
 
 
 def load_workers() -> None:

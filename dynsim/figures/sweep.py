@@ -47,7 +47,7 @@ class Sweep:
     Attributes
     ----------
     name : of the scenario
-    rows : numbers and values by column, of the runs that have some
+    rows : numbers and values by column; of runs that failed only what was varied
     grid, sampled : columns that were varied
     known : all variants of the scenario, in its order: their colours do not depend on which of them were run
     """
@@ -62,6 +62,12 @@ class Sweep:
     def variants(self) -> list[str]:
         """In the order of the table; one without a name where there are none."""
         return list(dict.fromkeys(str(row.get("variant", "")) for row in self.rows))
+
+    @property
+    def failed(self) -> str:
+        """How many have no numbers, for titles; nothing when all have."""
+        bad = sum(all(row.get(key) is None for key in self.metrics) for row in self.rows)
+        return f"; {bad} of {len(self.rows)} failed" if bad else ""
 
     @property
     def looks(self) -> dict[str, dict[str, Any]]:
@@ -107,7 +113,7 @@ def lines(sweep: Sweep) -> Figure | None:
         return None
     (key,) = sweep.grid
     styles, metrics = sweep.looks, sweep.metrics
-    figure = style.new_figure(_PANEL * len(metrics) + _ROOM, f"{sweep.name}: over {key}")
+    figure = style.new_figure(_PANEL * len(metrics) + _ROOM, f"{sweep.name}: over {key}{sweep.failed}")
     panels = figure.subplots(len(metrics), 1, sharex=True, squeeze=False)[:, 0]
     levels = _levels(sweep.rows, key)
     at = _places(levels)
@@ -138,7 +144,8 @@ def heat_map(sweep: Sweep) -> Figure | None:
     metrics, variants = sweep.metrics, sweep.variants
     others = [*sweep.grid[2:], *sweep.sampled]
     note = f" (mean over {_short(', '.join(others), _PART)})" if others else ""
-    figure = style.new_figure(_PANEL * len(variants) + _ROOM + _COLOURS, f"{sweep.name}: over {x} and {y}{note}")
+    title = f"{sweep.name}: over {x} and {y}{note}{sweep.failed}"
+    figure = style.new_figure(_PANEL * len(variants) + _ROOM + _COLOURS, title)
     panels = figure.subplots(len(variants), len(metrics), squeeze=False, sharex=True, sharey=True)
     xs, ys = _levels(sweep.rows, x), _levels(sweep.rows, y)
     for column, (metric, (label, scale)) in zip(panels.T, metrics.items(), strict=True):
@@ -173,7 +180,7 @@ def pareto(sweep: Sweep) -> Figure | None:
     if len(sweep.metrics) < 2:
         return None
     (energy, (energy_label, _)), (error, (error_label, scale)) = sweep.metrics.items()
-    figure = style.new_figure(3.6, f"{sweep.name}: energy against error, {len(sweep.rows)} runs")
+    figure = style.new_figure(3.6, f"{sweep.name}: energy against error, {len(sweep.rows)} runs{sweep.failed}")
     axes = figure.subplots()
     styles, last = sweep.looks, max(len(sweep.variants) - 1, 1)
     for k, variant in enumerate(sweep.variants):
@@ -236,7 +243,7 @@ def samples(sweep: Sweep) -> Figure | None:
     )
     figure = style.new_figure(
         _PANEL * len(variants) * len(shown) + _ROOM,
-        f"{sweep.name}: {len(sweep.rows)} runs by the law of their parameters{note}",
+        f"{sweep.name}: {len(sweep.rows)} runs by the law of their parameters{sweep.failed}{note}",
     )
     rows = [(variant, place) for variant in variants for place in shown]
     ends = [key.split(".")[-1] for key in sweep.grid]
@@ -287,9 +294,8 @@ def tornado(sweep: Sweep) -> Figure | None:
         return None
     variants, metrics = sweep.variants, sweep.metrics
     bars = min(len(sweep.sampled), _BARS)
-    figure = style.new_figure(
-        (_BAR * bars + _ROOM) * len(variants) + 0.5, f"{sweep.name}: what one standard deviation of each does"
-    )
+    title = f"{sweep.name}: what one standard deviation of each does{sweep.failed}"
+    figure = style.new_figure((_BAR * bars + _ROOM) * len(variants) + 0.5, title)
     panels = figure.subplots(len(variants), len(metrics), squeeze=False)
     for row, variant in zip(panels, variants, strict=True):
         for axes, (metric, (label, scale)) in zip(row, metrics.items(), strict=True):

@@ -11,6 +11,7 @@ import math
 import os
 import platform
 import signal
+import sys
 import threading
 import time as clock
 import traceback
@@ -59,9 +60,23 @@ def begin_early(*modules: str) -> None:
     from multiprocessing import forkserver
 
     _method = _FORK_SERVER
-    forkserver.set_forkserver_preload(list(modules))
-    with signals_held():
+    forkserver.set_forkserver_preload(["dynsim.studies.preloaded", *modules])
+    with signals_held(), _own_modules():
         forkserver.ensure_running()
+
+
+@contextmanager
+def _own_modules() -> Iterator[None]:
+    """What is started here finds the modules that this process does, not a ``json.py`` of the working directory."""
+    name = "PYTHONSAFEPATH"
+    if name in os.environ or {"", os.getcwd()} & set(sys.path):
+        yield
+        return
+    os.environ[name] = "1"
+    try:
+        yield
+    finally:
+        del os.environ[name]
 
 
 class WorkerLost(Exception):

@@ -15,6 +15,8 @@ import pytest
 
 from dynsim.record import Record
 
+pytestmark = pytest.mark.long
+
 # Nothing here takes this long; a test that waits for it fails.
 DEADLINE_S = 240.0
 VARIANTS = ("two_elbows", "elbow_7", "elbow_4", "no_elbow")

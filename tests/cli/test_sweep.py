@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from dynsim.cli import workers
 from dynsim.scenario import find_scenario
 
 SHORT = ["--set", "duration_s=0.2", "--set", "metrics.settle_s=0.05"]
@@ -54,3 +55,36 @@ def test_a_sweep_without_a_good_run_has_failed(tmp_path: Path, limits: str, well
     assert "run 1 failed: " in result.stderr
     assert ("none of the 2 runs ended well" in result.stderr) == (well == 0)
     assert result.returncode == code
+
+
+@pytest.mark.parametrize(
+    ("arguments", "begun"),
+    [
+        ("thing", True),
+        ("thing --jobs 2 --count 3", True),
+        ("thing --jobs=2", True),
+        ("thing --jobs 1", False),
+        ("thing --jobs=1", False),
+        ("thing --jobs 1 --jobs 3", True),
+        ("thing --jobs", True),
+        ("thing --scheduler tcp://host:8786", False),
+        ("thing --scheduler=tcp://host:8786", False),
+        ("--help", False),
+    ],
+)
+def test_workers_begin_before_the_arguments_are_read(monkeypatch: pytest.MonkeyPatch, arguments: str, begun: bool):
+    loads: list[None] = []
+    monkeypatch.setattr(workers, "cores", lambda: 2)
+    monkeypatch.setattr(workers, "load_workers", lambda: loads.append(None))
+    workers.begin_workers(arguments.split())
+    assert bool(loads) == begun
+
+
+def test_one_core_has_no_workers_unless_they_are_asked_for(monkeypatch: pytest.MonkeyPatch):
+    loads: list[None] = []
+    monkeypatch.setattr(workers, "cores", lambda: 1)
+    monkeypatch.setattr(workers, "load_workers", lambda: loads.append(None))
+    workers.begin_workers(["thing"])
+    assert not loads
+    workers.begin_workers(["thing", "--jobs", "2"])
+    assert loads

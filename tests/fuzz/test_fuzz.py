@@ -10,6 +10,8 @@ import pytest
 from fuzz import campaign
 from fuzz.case import KINDS, draw
 
+pytestmark = pytest.mark.long
+
 # Damaged records are slower to read than the rest.
 QUICK = {**dict.fromkeys(KINDS, 30), "record": 10}
 ALL = 6000

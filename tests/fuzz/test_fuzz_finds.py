@@ -15,6 +15,8 @@ from fuzz.case import SHIPPED
 from fuzz.readings import missing, record_losses, urdf_losses
 from fuzz.worker import CRASH, FILES, HANG, LOSS, MESSAGE, REFUSED, TRACEBACK
 
+pytestmark = pytest.mark.long
+
 # What becomes of each way in which the loader of records is broken, in the order of ``broken.WAYS``; the place is where
 # dynsim was at that moment.
 LOADING = "hardware/cli.py:_checked"

@@ -19,6 +19,8 @@ from dynsim.hardware.fault_table import (
     rig,
 )
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[2]
 KEPT = json.loads((ROOT / "results/reference/bridge_faults.json").read_text(encoding="utf-8"))["cells"]
 
@@ -27,7 +29,6 @@ def cell_of(fault: str, state: str, policy: str) -> dict:
     return next(cell for cell in KEPT if (cell["fault"], cell["state"], cell["policy"]) == (fault, state, policy))
 
 
-@pytest.mark.slow  # a minute; part of .ci/run
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_three_fresh_runs_of_every_cell(case):
     """Seeds that the kept table does not have."""

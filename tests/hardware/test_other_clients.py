@@ -21,6 +21,8 @@ from processes import started, wait_for
 
 from dynsim.hardware.bus.control_table import BAUD_RATES, MODELS, MX_106, RAD_PER_TICK
 
+pytestmark = pytest.mark.long
+
 F = MX_106.fields
 BAUD = 1_000_000
 FACTORY_BAUD = 57_600

@@ -28,6 +28,8 @@ from dynsim.record import Record
 
 from .conftest import MAP, Rig, swing
 
+pytestmark = pytest.mark.long
+
 F = MX_106.fields
 # A busy machine may not run the servos for a while: patience where a real robot would abort.
 PATIENT = MAP.replace("{baud: 1000000, rate: 100}", "{baud: 1000000, rate: 50, latency: 0.2}").replace(

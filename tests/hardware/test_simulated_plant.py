@@ -20,6 +20,8 @@ from dynsim.hardware.virtual.servos import PHYSICS_STEP
 from dynsim.hardware.virtual.simulated_plant import START_CHANGE, SimulatedArm, simulated_arm
 from dynsim.model.drives import Servo
 
+pytestmark = pytest.mark.long
+
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 ARM = SCENARIOS / "elbow_comparison.yaml"
 ARM_MAP = SCENARIOS / "hardware" / "arm.yaml"

@@ -21,6 +21,8 @@ from dynsim.record import Record
 
 from .test_pseudo_terminal import Servos, command, virtual_servos
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture
 def servos(tmp_path: Path) -> Iterator[Servos]:

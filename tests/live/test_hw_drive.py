@@ -22,6 +22,8 @@ from dynsim.hardware.replay.states import State
 from dynsim.hardware.servo_map import SHIPPED, load_servo_map
 from dynsim.live.session import NOT_READY
 
+pytestmark = pytest.mark.long
+
 # A busy machine may not run the loop for a while: patience where a real robot would abort.
 MAP = """\
 robot: six

@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 from teleop_clients import PATIENCE_S, Teleop
 
+pytestmark = pytest.mark.long
+
 # Until what is held is let go and held again, where it drives nothing [s].
 ANEW_S = 2.0
 # A gamepad of the standard layout, whose axes and buttons a test sets.

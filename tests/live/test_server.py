@@ -13,6 +13,8 @@ from teleop_clients import Client, Teleop
 
 from dynsim import Record, load_scenario, simulate
 
+pytestmark = pytest.mark.long
+
 SNAKE, ARM = ("snake_operator",), ("six_axis_arm",)
 
 

@@ -21,6 +21,8 @@ from ruamel.yaml import YAML
 
 from dynsim.record import Record
 
+pytestmark = pytest.mark.long
+
 HERE = Path(__file__).parent
 DOCS = HERE.parents[1] / "docs" / "extending.md"
 CART = """duration_s: 1

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.long
+
 MODULE = """
 import numpy as np
 from dynsim.kernels.jit import internal_kernel, kernel, separate_kernel

@@ -13,6 +13,8 @@ from rich.console import Console
 from dynsim.studies.bench import job, precision, programs, run, together, variants
 from dynsim.studies.bench.table import format_table
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:

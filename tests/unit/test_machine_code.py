@@ -18,6 +18,8 @@ import dynsim
 from dynsim.kernels import jit
 from dynsim.kernels.tree.sweep import newton_euler
 
+pytestmark = pytest.mark.long
+
 SHORT = {"duration_s": 0.3}
 
 HASH_OF_RUN = """

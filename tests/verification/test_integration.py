@@ -257,6 +257,10 @@ def test_most_steps_take_one_iteration():
 def test_slack_of_short_steps():
     """Rates may be off by what moves a joint as far as atol does in a step of 5 ms, where motors damp them."""
     driven, _ = arm()
-    assert [slack(driven.system, h) for h in (2.0 * SHORT, SHORT, 0.1 * SHORT)] == [1.0, 1.0, pytest.approx(10.0)]
+    steps = (2.0 * SHORT, SHORT, 0.1 * SHORT, 1e-3 * SHORT)
+    assert [slack(driven.system, h, 1e-6) for h in steps] == pytest.approx([1.0, 1.0, 10.0, 1000.0])
+    assert [slack(driven.system, h, 1e-7) for h in steps] == pytest.approx([1.0, 1.0, 1.0, 10.0])
+    assert [slack(driven.system, h, 1e-8) for h in steps] == [1.0] * 4
+    assert slack(driven.system, 0.1 * SHORT, 1e-3) == pytest.approx(10.0)
     free = bench(replace(driven.robot, motors=()))
-    assert slack(free.system, 0.1 * SHORT) == 1.0
+    assert slack(free.system, 0.1 * SHORT, 1e-6) == 1.0

@@ -28,6 +28,8 @@ from dynsim.kernels.lanes.system import derivatives, lane_workspace, lanes_of_ru
 from dynsim.kernels.lanes.tables import AXES, spread_tables
 from dynsim.kernels.system import System, derivative
 
+pytestmark = pytest.mark.long
+
 # Of cases whose matrices are ill-conditioned, where one rounding more or less is seen by as much.
 ROUNDING, FORCES = 1e-15, 1e-11
 AMPLIFIED = {"every joint": 1e-11, "sliding, held, held": 1e-9}

@@ -30,6 +30,8 @@ from dynsim.view.html import three
 from dynsim.view.mesh_files import Mesh, read_mesh
 from dynsim.view.meshes import TRIANGLES, Meshes, packed, thinned
 
+pytestmark = pytest.mark.long
+
 SHORT = {"duration_s": 0.5, "metrics.settle_s": 0.1}
 
 

@@ -19,6 +19,8 @@ from dynsim.record.poses import ORIENTATION, POSITION, add_body_poses
 from dynsim.record.scene import HERE, Body, Joint, Scene, Shape
 from dynsim.scenario import build_model, load_scenario
 
+pytestmark = pytest.mark.long
+
 Opens = Callable[..., Any]
 NEAR = 1e-4
 

@@ -41,6 +41,7 @@ from dynsim.kernels.constraint.unilateral import (
     HEADWAY,
     KINDS,
     LANDS_AT,
+    MOBILITY,
     NEXT,
     NEXT_SPEED,
     OFFSET,
@@ -127,6 +128,8 @@ def choose(system: System, ws: Workspace, run: Run):
         if mode[k, TOUCHING] == 1:
             mode[k, WANTED] = SLIDING if begins_sliding(system, ws, k) else STICKING
             mode[k, GIVES_WAY] = 1 if mode[k, GIVES_WAY] == 1 and drops(system, k) else 0
+            r, W = ws.active[k, FIRST_ROW], ws.small[0]
+            unilateral.slide[k, MOBILITY] = W[r + 1, r + 1] + W[r + 2, r + 2]
     solved = False
     # Where static friction gives way to a smaller kinetic one, the others' forces change.
     for _ in range(1 + mode.shape[0]):
@@ -265,7 +268,7 @@ def slips(system: System, i, size, largest, mu):
 
 @internal_kernel
 def begin_slip(system: System, ws: Workspace, k, fx, fy):
-    """Candidate k begins to slip against its friction force (fx, fy) along its two tangents."""
+    """Candidate k begins to slip against (fx, fy) along its two tangents: its friction force, or its acceleration."""
     slide, state = system.unilateral.slide, ws.contacts
     size = math.sqrt(fx * fx + fy * fy)
     slide[k, FROZEN] = 1.0
@@ -334,5 +337,9 @@ def take_solution(system: System, ws: Workspace, size, largest):
             # It touches without a force, maybe a little below its surface: only if it goes on does it land.
             mode[k, WANTED], unilateral.slide[k, LANDS_AT] = OPEN, DEPTH
         elif mode[k, WANTED] == STICKING and slips(system, i, size, largest, friction_at_rest(system, k)):
-            begin_slip(system, ws, k, f[i + 1], f[i + 2])
+            fx, fy = f[i + 1], f[i + 2]
+            if fx == 0.0 and fy == 0.0:
+                # Kinetic friction of zero: nothing holds it where static friction gives way.
+                fx, fy = -acceleration(unilateral, i + 1, size), -acceleration(unilateral, i + 2, size)
+            begin_slip(system, ws, k, fx, fy)
             mode[k, WANTED] = SLIDING

@@ -23,6 +23,7 @@ from dynsim.kernels.constraint.unilateral import UnilateralArrays
 from dynsim.kernels.drive.law import take_commands
 from dynsim.kernels.integrate.contact_events import (
     consistent,
+    longest_step,
     solve_modes,
     switch_contacts,
     take_directions,
@@ -41,6 +42,7 @@ from dynsim.kernels.integrate.run import (
     DOPRI5,
     ERROR,
     FIRED,
+    GRAZING,
     HOLD,
     MODES_DUE,
     NO_FORCES,
@@ -138,10 +140,14 @@ def take_step(system: System, ws: Workspace, run: Run, error):
 
 
 @internal_kernel
-def propose(run: Run):
+def propose(system: System, ws: Workspace, run: Run):
     """The step to try next; while a root is searched it is given."""
     if run.count[SEARCHING] == 0:
-        run.clock[PROPOSED] = run.clock[STEP]
+        # What was passed over shortens one step of RK4, not all that follow: nothing would make them long again.
+        if run.method != RK4 or run.count[GRAZING] == 0:
+            run.clock[PROPOSED] = run.clock[STEP]
+        if run.method == RK4:
+            run.clock[STEP] = min(run.clock[STEP], longest_step(system.unilateral, ws))
         choose_step(run)
 
 
@@ -210,7 +216,7 @@ def advance_explicit(system: System, ws: Workspace, run: Run, limit):
             return
         taken += 1
         if run.count[PENDING] == 0:
-            propose(run)
+            propose(system, ws, run)
             error = step_explicit(system, ws, run)
         if conclude(system, ws, run, error, order):
             return
@@ -233,7 +239,7 @@ def advance_radau5(system: System, ws: Workspace, run: Run, limit):
             return
         taken += 1
         if run.count[PENDING] == 0:
-            propose(run)
+            propose(system, ws, run)
             error = step_radau5(system, ws, run)
         steps, h = run.count[STEPS], run.clock[STEP]
         done = conclude_apart(system, ws, run, error, 4.0)

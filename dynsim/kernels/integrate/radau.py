@@ -58,7 +58,8 @@ from dynsim.kernels.system import System, derivative
 # Newton's method: most iterations, and the contraction below which the Jacobian stays.
 MOST_ITERATIONS, GOOD_CONTRACTION = 8, 0.05
 # In steps shorter than this errors of rates and currents that are near zero count by what they do until its end [s].
-SHORT = 0.005
+# Less where rtol is smaller than this: there all steps are short.
+SHORT, SLACK_RTOL = 0.005, 1e-6
 # What a step whose Newton's method diverges is said to be in error by: half of it is tried next.
 NO_STAGES = 10.5
 
@@ -180,14 +181,17 @@ def solve_stages(system: System, ws: Workspace, run: Run, h):
 
 
 @internal_kernel
-def slack(system: System, h):
+def slack(system: System, h, rtol):
     """How many atol rates and currents may be off by in a step of length h.
 
     An error e of a rate moves a joint by h e within the step. Circuits that ring after a start do so for milliseconds
     in steps of 0.1 ms: a rate that is wrong by 50 atol there moves its joint no further than one that is wrong by atol
-    in a step of 5 ms, and motors damp it. Where there are none it would stay.
+    in a step of 5 ms, and motors damp it. Where there are none it would stay. So would, for a while, what impacts make
+    of it, after which steps are shorter still: who asks for an rtol below 1e-6 has less slack, at 1e-8 as good as none.
     """
-    return max(1.0, SHORT / h) if system.layout.circuits > 0 else 1.0
+    if system.layout.circuits == 0:
+        return 1.0
+    return max(1.0, SHORT / h * min(rtol / SLACK_RTOL, 1.0) ** 2)
 
 
 @internal_kernel
@@ -202,7 +206,7 @@ def estimate(system: System, ws: Workspace, run: Run, h, slope):
         error[j] = r.one[j] if j < r.one.shape[0] else 0.0
     for j in range(r.one.shape[0]):
         r.error[j] = r.one[j]
-    return error_norm(system, ws, run, error, slack(system, h))
+    return error_norm(system, ws, run, error, slack(system, h, run.clock[RTOL]))
 
 
 @internal_kernel
