@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from itertools import pairwise
 
 from dynsim.studies.processes import begin_early, cores
@@ -17,9 +16,7 @@ def begin_workers(arguments: Sequence[str]) -> None:
     words = " ".join(arguments).replace("--jobs=", "--jobs ").split()
     jobs = dict(pairwise(words)).get("--jobs", str(cores()))
     if jobs != "1" and not any(word.startswith(_ELSEWHERE) for word in words):
-        # What keeps processes from beginning the command says when it needs them, after what is wrong with it.
-        with suppress(OSError):
-            load_workers()
+        load_workers()
 
 
 def load_workers() -> None:

@@ -59,10 +59,12 @@ def begin_early(*modules: str) -> None:
         return
     from multiprocessing import forkserver
 
-    _method = _FORK_SERVER
     forkserver.set_forkserver_preload(["dynsim.studies.preloaded", *modules])
-    with signals_held(), _own_modules():
-        forkserver.ensure_running()
+    # No room for its socket (a long TMPDIR), no working directory, too many open files: workers load for themselves.
+    with suppress(OSError):
+        with signals_held(), _own_modules():
+            forkserver.ensure_running()
+        _method = _FORK_SERVER
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """``dynsim sweep`` as a user meets it: where its files go, what it says, how it ends."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,14 @@ from dynsim.scenario import find_scenario
 
 SHORT = ["--set", "duration_s=0.2", "--set", "metrics.settle_s=0.05"]
 LENGTH = "plant.chain.0.length_m"
+# The command, where what workers load takes two minutes.
+WAITING = """
+from dynsim.studies import processes
+begin = processes.begin_early
+processes.begin_early = lambda *modules: begin("waits")
+from dynsim.cli import main
+main()
+"""
 
 
 def sweep(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
@@ -88,3 +97,36 @@ def test_one_core_has_no_workers_unless_they_are_asked_for(monkeypatch: pytest.M
     assert not loads
     workers.begin_workers(["thing", "--jobs", "2"])
     assert loads
+
+
+def test_workers_load_dynsims_modules_and_not_those_of_the_folder(tmp_path: Path):
+    (tmp_path / "json.py").write_text("raise RuntimeError('not this one')\n")
+    command = [str(Path(sys.executable).with_name("dynsim")), "sweep", "elbow_comparison", *SHORT, "--no-figures"]
+    command += ["--grid", "contacts.friction=0,0.1", "--jobs", "2", "--out", "swept"]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert ended.returncode == 0, ended.stderr
+    assert "2 of 2 runs ended well" in ended.stdout
+    assert "not this one" not in ended.stderr
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no process is begun early")
+def test_workers_load_for_themselves_where_none_can_begin_early(tmp_path: Path):
+    """A socket of the process that workers are copies of has a place for 107 characters."""
+    far = tmp_path / ("d" * 110)
+    far.mkdir()
+    command = [sys.executable, "-m", "dynsim", "sweep", "elbow_comparison", *SHORT, "--no-figures"]
+    command += ["--grid", "contacts.friction=0,0.1", "--jobs", "2", "--out", str(tmp_path / "swept")]
+    ended = subprocess.run(command, env=os.environ | {"TMPDIR": str(far)}, capture_output=True, text=True, timeout=300)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stderr == ""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no process is begun early")
+def test_the_process_that_workers_are_copies_of_ends_with_the_command(tmp_path: Path):
+    """It has the command's output open: who reads that waited until it had loaded everything."""
+    (tmp_path / "waits.py").write_text("import time\ntime.sleep(120)\n")
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+    command = [sys.executable, "-c", WAITING, "sweep", "nosuch", "--jobs", "2"]
+    ended = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 2, ended.stderr
+    assert "nosuch" in ended.stderr
