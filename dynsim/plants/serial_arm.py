@@ -142,8 +142,8 @@ class Config(StrictConfig):
             taken = {key for entry in chain for key in _lay_under(link, entry) if key not in entry}
             for key in link:
                 if key in LinkKeys.model_fields and key not in taken:
-                    places = _places(key, chain)
-                    raise error_at(f"link.{key}", f"has no effect on any entry of plant.chain; set {places} instead")
+                    fix = f"set {_places(key, chain)} instead, or take it away"
+                    raise error_at(f"link.{key}", f"has no effect on any entry of plant.chain; {fix}")
         return data
 
     @field_validator("chain", mode="before")

@@ -237,7 +237,7 @@ def test_shared_keys_of_a_resolved_scenario_are_refused_with_the_keys_to_set(tmp
         load_scenario(path, overrides={"plant.link.mass_kg": 0.5})
     assert str(caught.value) == (
         "overrides: plant.link.mass_kg = 0.5: has no effect on any entry of plant.chain; "
-        "set plant.chain.0.mass_kg, plant.chain.1.mass_kg instead"
+        "set plant.chain.0.mass_kg, plant.chain.1.mass_kg instead, or take it away"
     )
     # What the entries do not have still reaches them.
     com = build_model(load_scenario(path, overrides={"plant.link.com_m": [0, 0, 0.1]})).robot.links[3].inertia.com

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from processes import started, wait_for
 from sweep_work import DEADLY, REFUSED, once_deadly, square, warned
 
 import dynsim
+from dynsim.cli import sweep as sweep_command
 from dynsim.errors import DynsimError, ScenarioError
 from dynsim.figures import style
 from dynsim.figures import sweep as pictures
@@ -571,3 +573,23 @@ def test_a_cluster_gives_the_same_and_outlives_a_worker(tmp_path: Path, whole: b
                 one.process.kill()
                 assert child.end() == 0, child.stderr
     assert (out / "sweep.csv").read_bytes() == whole
+
+
+def test_runs_that_failed_are_counted_and_not_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A base that tips after 5 s has taken a tenth of the energy: beside whole runs it looked like the best of all."""
+    numbers = {pictures.ENERGY: 1.0, "hand_error_rms_m": 0.1}
+    status = ["ok", "failed", "ok"]
+    rows = [module.Row(k, None, {"duration_s": k + 1}, one, "", numbers, "") for k, one in enumerate(status)]
+    seen: list[pictures.Sweep] = []
+    monkeypatch.setattr(pictures, "draw", lambda sweep, *_: seen.append(sweep))
+    sweep_command._draw("tipping", rows, plan(Axis("duration_s", (1, 2, 3))), tmp_path, True, "png")
+    (table,) = seen
+    assert [row["duration_s"] for row in table.rows] == [1, 2, 3]
+    assert [bool(numbers.keys() & row.keys()) for row in table.rows] == [True, False, True]
+    assert table.failed == "; 1 of 3 failed"
+    assert replace(table, rows=[table.rows[0], table.rows[2]]).failed == ""
+    # The place stays, without a point.
+    drawn = pictures.lines(table)
+    assert drawn is not None
+    (line,) = drawn.axes[0].get_lines()
+    assert np.isfinite(np.asarray(line.get_ydata(), dtype=float)).tolist() == [True, False, True]

@@ -48,8 +48,6 @@ from dynsim.kernels.constraint.unilateral import (
     LANDS_AT,
     LAST_CHANGE,
     LIFT_OFFS,
-    LONGEST,
-    MOBILITY,
     NEXT,
     NEXT_SPEED,
     REFERENCE,
@@ -86,6 +84,7 @@ from dynsim.kernels.integrate.run import (
     VALUE,
     Run,
 )
+from dynsim.kernels.integrate.slow_slip import note_turning
 from dynsim.kernels.jit import apart_kernel, internal_kernel
 from dynsim.kernels.system import System
 
@@ -108,8 +107,6 @@ INSTANT = 1e-11
 # A point that slips against its direction at less than this has not stopped yet [m/s]: of what begins to slip with next
 # to no acceleration the speed is rounding.
 BACKWARD = 2e-11
-# Of a step of RK4: h μ f_n/(m v), of which it is stable up to 2.8.
-MOST_TURN = 2.0
 # Forces that contradict their modes by less than this, absolute [N] and of the largest, are rounding.
 FORCE_SLACK = 1e-9
 # Of the largest force: what counts as none where a point that sticks gives way.
@@ -221,27 +218,10 @@ def watch_modes(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
         for s in range(3):
             slide[k, NEXT + s] = state[k, SLIP_VELOCITY + s] / speed if speed > 0.0 else slide[k, REFERENCE + s]
         if ws.active[k, MODE] == SLIDING:
-            turn = unilateral.law[k, STATIC] * abs(ws.rows[ws.active[k, FIRST_ROW], FORCE]) * slide[k, MOBILITY]
-            slide[k, LONGEST] = MOST_TURN * max(speed, unilateral.number[SLOW]) / turn if turn > 0.0 else math.inf
+            note_turning(unilateral, ws, k, speed)
     for k in range(unilateral.stop.shape[0]):
         if unilateral.stop_table[k, STOP_CLOSED] == 1:
             unilateral.stop[k, CLOSED_TIME] += h
-
-
-@internal_kernel
-def longest_step(unilateral: UnilateralArrays | None, ws: Workspace):
-    """The longest step of RK4 that follows what slips [s].
-
-    Friction turns a slip of speed v at the rate μ f_n/(m v). In longer steps what should come to rest goes from side to
-    side and never does, and no error estimate says so.
-    """
-    longest = math.inf
-    if unilateral is None:  # known to the compiler
-        return longest
-    for k in range(ws.active.shape[0]):
-        if ws.active[k, MODE] == SLIDING and unilateral.slide[k, FROZEN] == 0.0:
-            longest = min(longest, unilateral.slide[k, LONGEST])
-    return longest
 
 
 @internal_kernel

@@ -23,7 +23,6 @@ from dynsim.kernels.constraint.unilateral import UnilateralArrays
 from dynsim.kernels.drive.law import take_commands
 from dynsim.kernels.integrate.contact_events import (
     consistent,
-    longest_step,
     solve_modes,
     switch_contacts,
     take_directions,
@@ -65,6 +64,7 @@ from dynsim.kernels.integrate.run import (
     TRIMMED,
     Run,
 )
+from dynsim.kernels.integrate.slow_slip import longest_step
 from dynsim.kernels.integrate.steps import choose_step, finished, finite, first_step, next_step, rejected
 from dynsim.kernels.integrate.watch import forces_unique, watch
 from dynsim.kernels.jit import apart_kernel, internal_kernel, kernel, merged_kernel

@@ -48,7 +48,9 @@ def format_table(result: dict[str, Any]) -> list[Table]:
                 _number(row.get("current_error_max_A")),
             )
 
-    ratios = _table("Time (and hand error) of the peer over that of dynsim, by links and for the job", "peer")
+    ratios = _table(
+        "Time (and hand error) of the peer over that of dynsim, by links and for the job (by radau5)", "peer"
+    )
     for row in sizes:
         ratios.add_column(str(row["links"]), justify="right")
     ratios.add_column("job", justify="right")
@@ -57,7 +59,7 @@ def format_table(result: dict[str, Any]) -> list[Table]:
     for row in result["ratios"]:
         if "time_by_links" in row:
             ratios.add_row(row["peer"], *(_number(ratio) for ratio in row["time_by_links"].values()), "", "")
-        elif row["dynsim"] == DYNSIM_RK43:
+        elif row["dynsim"] == DYNSIM_RADAU5:
             if row["task"] != task:
                 task = row["task"]
                 ratios.add_row(f"[bold]{task.removeprefix('10 s job, ')}[/bold]")
