@@ -16,8 +16,10 @@ from dynsim.model.description import Contact, Robot
 from dynsim.model.unilateral import START_TOLERANCE, JointStop, told
 from dynsim.record import Record
 
-# Time stepping: what its steps may take or make of the turnover, and how deep points may sink, without a warning.
+# Time stepping, without a warning: what its steps may take or make of the turnover, by how much of it the energy may
+# depend on when within a step something happens, and how deep points may sink.
 SCHEME_LIMIT = 1e-2
+HALF_STEP_LIMIT = 2e-2
 PENETRATION_LIMIT_M = 1e-3
 
 
@@ -102,27 +104,34 @@ def chattered(contacts: Sequence[Contact], unilateral: UnilateralArrays) -> list
     return found
 
 
-def coarse(stepping: dict[str, Any], turnover: float) -> list[str]:
-    """Steps so long that they take or make energy, or let points sink in, and the step that would not.
+def coarse(stepping: dict[str, Any], scale: float) -> list[str]:
+    """Steps so long that they take or make energy, blur it, or let points sink in, and the step that would not.
 
-    turnover : [J]
+    scale : turnover of the energy, and no less than what the ledger resolves [J]
     """
-    found, step, worst = [], stepping["step_s"], stepping["scheme_loss_worst_J"]
-    if abs(worst) > SCHEME_LIMIT * turnover:
-        shorter = _shorter(step * SCHEME_LIMIT * turnover / abs(worst))
-        found.append(
+    step, worst, blurred = (stepping[key] for key in ("step_s", "scheme_loss_worst_J", "half_step_energy_J"))
+    warnings: list[str] = []
+    if abs(worst) > SCHEME_LIMIT * scale:
+        warnings.append(
             f"time stepping: the steps themselves {'took' if worst > 0.0 else 'made'} up to {abs(worst):.3g} J, "
-            f"{100 * abs(worst) / turnover:.2g} % of the turnover (limit {100 * SCHEME_LIMIT:g} %); "
-            f"integrator.step_s is {step:g}: take {shorter:g}"
+            f"{100 * abs(worst) / scale:.2g} % of the turnover (limit {100 * SCHEME_LIMIT:g} %); "
+            f"integrator.step_s is {step:g}: take {_shorter(step * SCHEME_LIMIT * scale / abs(worst)):g}"
+        )
+    if blurred > HALF_STEP_LIMIT * scale:
+        warnings.append(
+            f"time stepping: the power changes so fast that the energy is known to {blurred:.3g} J only, "
+            f"{100 * blurred / scale:.2g} % of the turnover (limit {100 * HALF_STEP_LIMIT:g} %), as it "
+            f"would change if all came half a step later; integrator.step_s is {step:g}: take "
+            f"{_shorter(step * HALF_STEP_LIMIT * scale / blurred):g}"
         )
     deepest = stepping["penetration_max_m"]
     if deepest > PENETRATION_LIMIT_M:
-        found.append(
+        warnings.append(
             f"time stepping: points sink up to {1e3 * deepest:.3g} mm into their surfaces as they land (limit "
             f"{1e3 * PENETRATION_LIMIT_M:g} mm); integrator.step_s is {step:g}: take "
             f"{_shorter(step * PENETRATION_LIMIT_M / deepest):g}"
         )
-    return found
+    return warnings
 
 
 def _shorter(step: float) -> float:

@@ -220,7 +220,9 @@ def summarise(
         summary["joint_stops"] = touched_stops(record, robot, counts.stops, counts.unilateral, duration)
     if counts.stepping is not None:
         summary["time_stepping"] = counts.stepping
-    summary["warnings"] = _warnings(record, scenario, contacts, robot, counts, summary) + _sunk(record, sunk)
+    summary["warnings"] = _warnings(record, scenario, contacts, robot, counts, summary, denominator) + _sunk(
+        record, sunk
+    )
     return summary
 
 
@@ -269,6 +271,7 @@ def _warnings(
     robot: Robot,
     counts: Counts,
     summary: dict[str, Any],
+    scale: float,
 ) -> list[str]:
     found = [] if counts.unilateral is None else [*chattered(contacts, counts.unilateral)]
     for contact in summary["contacts"]:
@@ -320,7 +323,7 @@ def _warnings(
         )
     if counts.stepping is not None:
         found.extend(capped(counts.stepping))
-        found.extend(coarse(counts.stepping, summary["energy_turnover_J"]))
+        found.extend(coarse(counts.stepping, scale))
     elif summary["constraint_drift_max_m"] > DRIFT_LIMIT_M:
         found.append(f"contacts drifted by {summary['constraint_drift_max_m']:.1e} m")
     if counts.deficient and counts.unilateral is None:

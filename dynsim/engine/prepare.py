@@ -144,7 +144,7 @@ def prepare(
         unilateral=compile_unilateral(robot, contacts, stops, slow_slip(options.atol)) if real else None,
     )
     stepping = None
-    if method == ki.TIME_STEPPING:
+    if method == ki.TIME_STEPPING and system.unilateral is not None:
         stepping = stepping_arrays(model.arrays, system.contacts, na, joint_rows, options.theta, system.unilateral)
         stepping.law[:, GRIP : GRIP_AXIS + 3] = compile_grips(robot, contacts)
     y = np.zeros(layout.size)

@@ -149,7 +149,9 @@ def _stepping(run: ki.Run) -> dict[str, Any]:
         "long_solves": int(found[time_stepping.LONG_SOLVES]),
         "capped_solves": int(found[time_stepping.CAPPED]),
         "residual_max_m_s": float(found[time_stepping.WORST]),
+        "limits_unsettled": int(found[time_stepping.UNSETTLED]),
         "scheme_loss_worst_J": float(found[time_stepping.TAKEN]),
+        "half_step_energy_J": float(found[time_stepping.HALF_STEP]),
         "penetration_max_m": float(found[time_stepping.PENETRATION]),
     }
 

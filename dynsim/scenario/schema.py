@@ -199,9 +199,8 @@ class ScenarioConfig(StrictConfig):
 
     @model_validator(mode="after")
     def _check_stepped_contacts(self) -> Self:
-        glued = self.contacts.law == "bilateral" and any(point.enabled for point in self.contacts.points.values())
-        if glued and self.integrator.method == "time_stepping":
-            raise error_at("integrator.method", "needs `contacts: {law: unilateral}`")
+        if self.contacts.law == "bilateral" and self.integrator.method == "time_stepping":
+            raise error_at("integrator.method", "needs `contacts: {law: unilateral}`, also where nothing touches")
         return self
 
     @model_validator(mode="after")

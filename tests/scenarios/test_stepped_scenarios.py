@@ -42,8 +42,9 @@ def errors(found: Record, exact: Record) -> np.ndarray:
 
 
 def energy_lost(record: Record) -> float:
-    """By friction and impacts [J]."""
-    return float(record["heat_friction"][-1] + record["loss_impact"][-1])
+    """By friction, impacts and the steps themselves [J]."""
+    steps = record["loss_scheme"][-1] if "loss_scheme" in record else 0.0
+    return float(record["heat_friction"][-1] + record["loss_impact"][-1] + steps)
 
 
 @pytest.mark.parametrize("theta", [0.5, 1.0])
@@ -54,7 +55,7 @@ def test_an_arm_that_falls_on_a_floor_lands_as_events_have_it(falling: Path, the
     for step in (1e-3, 5e-4, 2.5e-4, 1.25e-4):
         found = dynsim.simulate(dynsim.load_scenario(falling, overrides=stepping(step, theta)))
         assert errors(found, exact).max() <= 2.5 * step
-        assert abs(energy_lost(found) - energy_lost(exact)) <= 20.0 * step
+        assert abs(energy_lost(found) - energy_lost(exact)) <= 10.0 * step
         solved = found.summary["time_stepping"]
         assert solved["contact_solves"] > 0.3 / step
         assert solved["capped_solves"] == 0
@@ -103,7 +104,7 @@ def test_what_it_does_not_do_is_refused(falling: Path):
         ({"integrator.solver": "m_star"}, "integrator.solver = 'm_star': is not of integrator.method: time_stepping"),
         ({"contacts.law": "bilateral", "contacts.candidates": "points", "contacts.points.hand.body": "link_2",
           "surfaces.floor.point_m": [0, 0, 0.15]},
-         "integrator.method = 'time_stepping': needs `contacts: {law: unilateral}`"),
+         "integrator.method = 'time_stepping': needs `contacts: {law: unilateral}`, also where nothing touches"),
     ):  # fmt: skip
         with pytest.raises(ScenarioError, match=re.escape(message)):
             dynsim.simulate(dynsim.load_scenario(falling, overrides=stepping(1e-3, 0.5) | more))

@@ -9,7 +9,7 @@ import pytest
 from stepping_benches import snake
 
 import dynsim
-from dynsim.contact_metrics import PENETRATION_LIMIT_M, SCHEME_LIMIT, coarse
+from dynsim.contact_metrics import HALF_STEP_LIMIT, PENETRATION_LIMIT_M, SCHEME_LIMIT, coarse
 from dynsim.errors import ScenarioError
 from dynsim.model.urdf_writer import write_urdf
 
@@ -143,11 +143,22 @@ def test_a_snake_on_wheels(tmp_path: Path):
 
 
 def test_steps_that_are_too_long_are_told():
-    stepping = {"step_s": 1e-3, "scheme_loss_worst_J": -0.05, "penetration_max_m": 3 * PENETRATION_LIMIT_M}
-    scheme, depth = coarse(stepping, 1.0)
+    stepping = {
+        "step_s": 1e-3,
+        "scheme_loss_worst_J": -0.05,
+        "half_step_energy_J": 0.04,
+        "penetration_max_m": 3 * PENETRATION_LIMIT_M,
+    }
+    scheme, blurred, depth = coarse(stepping, 1.0)
     assert "made up to 0.05 J, 5 % of the turnover" in scheme
     assert scheme.endswith("take 0.0002")
+    assert "known to 0.04 J only, 4 % of the turnover" in blurred
+    assert blurred.endswith("take 0.0005")
     assert "3 mm" in depth
     assert depth.endswith("take 0.0003")
-    stepping.update(scheme_loss_worst_J=0.5 * SCHEME_LIMIT, penetration_max_m=0.0)
+    stepping |= {
+        "scheme_loss_worst_J": 0.5 * SCHEME_LIMIT,
+        "half_step_energy_J": 0.5 * HALF_STEP_LIMIT,
+        "penetration_max_m": 0.0,
+    }
     assert coarse(stepping, 1.0) == []

@@ -44,14 +44,25 @@ from dynsim.kernels.arrays import (
 )
 from dynsim.kernels.drive.dc import dc_balance, dc_block, dc_command, dc_torque
 from dynsim.kernels.drive.limit import clipped
-from dynsim.kernels.drive.servo import servo_block, servo_circuit, servo_command, servo_drag, servo_torque
+from dynsim.kernels.drive.servo import (
+    servo_block,
+    servo_block_on,
+    servo_circuit,
+    servo_circuit_on,
+    servo_command,
+    servo_drag,
+    servo_segment,
+    servo_torque,
+)
 from dynsim.kernels.drive.torque import open_torque
 from dynsim.kernels.jit import internal_kernel
 from dynsim.kernels.state import StateLayout
 
 for _law in (clipped, dc_balance, dc_block, dc_command, dc_torque, open_torque):
     internal_kernel(_law)
-for _law in (servo_block, servo_circuit, servo_command, servo_drag, servo_torque):
+for _law in (servo_segment, servo_circuit_on, servo_circuit, servo_block_on, servo_block):
+    internal_kernel(_law)
+for _law in (servo_command, servo_drag, servo_torque):
     internal_kernel(_law)
 
 
@@ -169,10 +180,72 @@ def drive_block(drives: DriveArrays, ws: Workspace, a, block):
         block[s] = 0.0
     if kind == DC_MOTOR:
         follows = 1.0 if not sampled and abs(motors[a, VOLTAGE]) < motor[a, U_MAX] else 0.0
-        found = dc_block(motor, a, follows)
-        block[TORQUE_Q], block[TORQUE_V], block[TORQUE_I] = found[0], found[1], found[2]
-        block[RATE_Q], block[RATE_V], block[RATE_I] = found[3], found[4], found[5]
+        fill_dc_block(motor, a, follows, block)
     elif kind == POSITION_SERVO:
         asked = drives.input[a, COMMAND] if sampled else command(drives, ws, a)
         v = ws.joints[drives.table[a, DRIVEN], QD]
         block[TORQUE_Q], block[TORQUE_V] = servo_block(motor, a, mode, sampled, asked, v)
+
+
+@internal_kernel
+def fill_dc_block(motor, a, follows, block):
+    """:func:`dc_block` into the row ``block``."""
+    slopes = dc_block(motor, a, follows)
+    block[TORQUE_Q], block[TORQUE_V], block[TORQUE_I] = slopes[0], slopes[1], slopes[2]
+    block[RATE_Q], block[RATE_V], block[RATE_I] = slopes[3], slopes[4], slopes[5]
+
+
+@internal_kernel
+def asked_of(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace, a):
+    """What drive a is asked for at the present state and time t, before limits, after ``evaluate_reference``."""
+    if drives.table[a, SAMPLED] != 0:
+        return drives.input[a, COMMAND]
+    asked = command(drives, ws, a)
+    if drives.table[a, DRIVE_KIND] == DC_MOTOR:
+        return fed_forward(reference.voltage, reference.grid, t, a, asked)
+    return asked
+
+
+@internal_kernel
+def segment_of(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace, a):
+    """Which limit holds drive a at the present state: 0 none, ±1 the voltage's, ±2 the current's; as above."""
+    motor, asked = drives.motor, asked_of(drives, reference, t, ws, a)
+    if drives.table[a, DRIVE_KIND] == POSITION_SERVO:
+        v = ws.joints[drives.table[a, DRIVEN], QD]
+        return servo_segment(motor, a, drives.table[a, SERVO_MODE], asked, v)
+    if drives.table[a, DRIVE_KIND] == DC_MOTOR:
+        return 1 if asked > motor[a, U_MAX] else -1 if asked < -motor[a, U_MAX] else 0
+    return 0
+
+
+@internal_kernel
+def drive_on_segments(
+    drives: DriveArrays, reference: ReferenceArrays, t, y, layout: StateLayout, segment, ws: Workspace, linear
+):
+    """:func:`drive` and :func:`drive_block` with given limits holding, (na,), whatever the state says of them.
+
+    linear : (na, BLOCK_SIZE), the blocks
+    """
+    table, motor, motors, joints = drives.table, drives.motor, ws.motors, ws.joints
+    evaluate_reference(drives, reference, t, ws)
+    for a in range(motors.shape[0]):
+        j, kind, mode, limit = table[a, DRIVEN], table[a, DRIVE_KIND], table[a, SERVO_MODE], segment[a]
+        v, asked, sampled = joints[j, QD], asked_of(drives, reference, t, ws, a), table[a, SAMPLED] != 0
+        for s in range(linear.shape[1]):
+            linear[a, s] = 0.0
+        if kind == DC_MOTOR:
+            i, u = y[layout.current + table[a, CIRCUIT]], asked
+            if limit != 0:
+                u = motor[a, U_MAX] if limit > 0 else -motor[a, U_MAX]
+            motors[a, CURRENT], motors[a, VOLTAGE] = i, u
+            motors[a, DIDT] = dc_balance(motor, a, u, v, i) / motor[a, INDUCTANCE]
+            joints[j, APPLIED] += dc_torque(motor, a, i)
+            fill_dc_block(motor, a, 1.0 if limit == 0 and not sampled else 0.0, linear[a])
+        elif kind == POSITION_SERVO:
+            motors[a, VOLTAGE], motors[a, CURRENT] = servo_circuit_on(motor, a, mode, limit, asked, v)
+            motors[a, DRAG] = servo_drag(motor, a, mode, v)
+            joints[j, APPLIED] += motor[a, K_M] * motors[a, CURRENT] - motors[a, DRAG]
+            linear[a, TORQUE_Q], linear[a, TORQUE_V] = servo_block_on(motor, a, mode, limit, sampled, v)
+        else:
+            motors[a, VOLTAGE], motors[a, CURRENT] = v, open_torque(motor, a, asked)
+            joints[j, APPLIED] += motors[a, CURRENT]

@@ -35,6 +35,32 @@ def servo_command(motor, a, mode, q_ref, v_ref, q, v):
     return motor[a, K_P] * (q_ref - q) + motor[a, K_D] * (v_ref - v)
 
 
+def servo_segment(motor, a, mode, command, v):
+    """Which limit holds at a command and a rate: 0 none, ±1 that of the voltage, ±2 that of the current."""
+    if mode == OFF:
+        return 0
+    u = clipped(command, motor[a, U_MAX])
+    wanted = (u - motor[a, K_M] * v) / motor[a, RESISTANCE]
+    if wanted.real > motor[a, I_MAX]:
+        return 2
+    if wanted.real < -motor[a, I_MAX]:
+        return -2
+    if command.real > motor[a, U_MAX]:
+        return 1
+    return -1 if command.real < -motor[a, U_MAX] else 0
+
+
+def servo_circuit_on(motor, a, mode, segment, command, v):
+    """:func:`servo_circuit` with this limit holding, as :func:`servo_segment` tells it, whatever the state says."""
+    if mode == OFF:
+        return motor[a, K_M] * v, 0.0 * v
+    if segment == 2 or segment == -2:
+        i = motor[a, I_MAX] if segment > 0 else -motor[a, I_MAX]
+        return motor[a, RESISTANCE] * i + motor[a, K_M] * v, i
+    u = command if segment == 0 else motor[a, U_MAX] if segment > 0 else -motor[a, U_MAX]
+    return u, (u - motor[a, K_M] * v) / motor[a, RESISTANCE]
+
+
 def servo_circuit(motor, a, mode, command, v):
     """Terminal voltage u [V] and current i [A] of a command, both within their limits."""
     if mode == OFF:
@@ -61,20 +87,24 @@ def servo_torque(motor, a, mode, command, v):
     return motor[a, K_M] * i - servo_drag(motor, a, mode, v)
 
 
-def servo_block(motor, a, mode, sampled, command, v):
-    """∂τ/∂(q, v) at a command; one that is ``sampled`` does not follow the state."""
+def servo_block_on(motor, a, mode, segment, sampled, v):
+    """∂τ/∂(q, v) with this limit holding; a command that is ``sampled`` does not follow the state."""
     smoothing = motor[a, COULOMB_SPEED] ** 2
     by_q, by_v = 0.0, -motor[a, COULOMB] * smoothing / (v * v + smoothing) ** 1.5
     if mode == OFF:
         return by_q, by_v - motor[a, FREE_DRAG]
-    _, i = servo_circuit(motor, a, mode, command, v)
-    if abs(i) < motor[a, I_MAX]:
+    if -2 < segment < 2:
         slope = motor[a, K_M] / motor[a, RESISTANCE]
         by_v -= slope * motor[a, K_M]
-        if not sampled and abs(command) < motor[a, U_MAX]:
+        if not sampled and segment == 0:
             if mode == VELOCITY_MODE:
                 by_v += slope * (motor[a, K_M] - motor[a, K_V])
             else:
                 by_q -= slope * motor[a, K_P]
                 by_v -= slope * motor[a, K_D]
     return by_q, by_v
+
+
+def servo_block(motor, a, mode, sampled, command, v):
+    """∂τ/∂(q, v) at a command; one that is ``sampled`` does not follow the state."""
+    return servo_block_on(motor, a, mode, servo_segment(motor, a, mode, command, v), sampled, v)
