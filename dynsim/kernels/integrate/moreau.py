@@ -55,7 +55,7 @@ def step_moreau(system: System, ws: Workspace, run: Run):
     v0, v_bias, last = s.before[kt.V_START], s.before[kt.V_BIAS], s.before[kt.ACCELERATION]
     model = ModelArrays(system.model.tree, s.body, system.model.gravity, system.model.compound)
     begin_energy(system, ws, run)
-    recall(s, y, layout.v)
+    recall(system, s, ws, y)
     for i in range(ws.joints.shape[0]):
         v0[i] = y[layout.v + i]
         v_bias[i] = v0[i] + s.theta * run.clock[ki.STEP] * last[i]

@@ -27,13 +27,15 @@ from dynsim.kernels.constraint.least_norm import select_least_norm
 from dynsim.kernels.constraint.rows import point_row, set_modes
 from dynsim.kernels.constraint.unilateral import UnilateralArrays, sliding_friction, stop_gap
 from dynsim.kernels.integrate import time_stepping as kt
-from dynsim.kernels.integrate.time_stepping import SteppingArrays
+from dynsim.kernels.integrate.time_stepping import SteppingArrays, geometry, place_joints
 from dynsim.kernels.jit import internal_kernel
 
 # cos of the angle by which a row may turn in a step and still be the same row: more is a kink, an edge, another place.
 SAME_ROW = 0.95
 # A place of contact that has moved by more than this times the way of the body there is another one; rounding [m].
 SAME_PLACE, PLACE_ROUNDING = 4.0, 1e-9
+# What is no further from its surface touches when a run begins, or its rates have jumped [m].
+TOUCHES = 1e-9
 # A gap is closed, and depth taken back, within this time, and no shorter one than so many steps [s]; not faster than
 # this [m/s]. Shorter times bounce.
 RETURN_TIME, RETURN_STEPS, RETURN_SPEED = 0.02, 10.0, 0.02
@@ -42,15 +44,53 @@ SWAY = 2.0
 
 
 @internal_kernel
-def recall(s: SteppingArrays, y, first):
-    """Forget the last step unless its rates are those of y, from ``first`` on: they have jumped since."""
-    same = True
+def recall(system, s: SteppingArrays, ws: Workspace, y):
+    """Where the rates of y are not those of the last step's end: begin anew, with what touches at y.
+
+    Its rows at y, half a step before the midpoint, stand for those of the last step: h/(h + 0) of what turns. Sweeps.
+    """
+    layout, same = system.layout, s.grid[kt.LENGTH_LAST] > 0.0
     for i in range(s.before.shape[1]):
-        same = same and s.before[kt.V_LAST, i] == y[first + i]
-    if not same or s.grid[kt.LENGTH_LAST] == 0.0:
-        for k in range(s.memory.shape[1]):
-            for m in range(kt.MEMORY_SIZE):
-                s.memory[kt.LAST, k, m] = 0.0
+        same = same and s.before[kt.V_LAST, i] == y[layout.v + i]
+    if same:
+        return
+    s.grid[kt.LENGTH_LAST] = 0.0
+    place_joints(system, ws, y)
+    for i in range(s.before.shape[1]):
+        ws.joints[i, ka.QD], ws.joints[i, ka.QDD] = y[layout.v + i], 0.0
+    geometry(system, system.model, s, ws)
+    for k in range(ws.contacts.shape[0]):
+        last, state, link = s.memory[kt.LAST, k], ws.contacts[k], ws.links[system.contacts.link[k, ka.LINK]]
+        for m in range(kt.MEMORY_SIZE):
+            last[m] = 0.0
+        if state[ka.GAP] > TOUCHES:
+            continue
+        note_place(system, state, k, last)
+        velocity_at(link, state[ka.POSITION], state[ka.POSITION + 1], state[ka.POSITION + 2], last[kt.END_RATE :])
+        x, y_, z = last[kt.END_RATE], last[kt.END_RATE + 1], last[kt.END_RATE + 2]
+        for m in range(3):
+            d = ka.NORMAL if m == 0 else ka.FIRST_TANGENT if m == 1 else ka.SECOND_TANGENT
+            last[kt.END_RATE + m] = x * state[d] + y_ * state[d + 1] + z * state[d + 2]
+        last[kt.END_RATE + 1] *= s.law[k, kt.GRIP]
+        if last[kt.END_RATE] >= -kt.BAD:
+            slip = slip_of_rates(s, k, last[kt.END_RATE + 1], last[kt.END_RATE + 2])
+            last[kt.LISTED], last[kt.CLOSED], last[kt.SLID] = 1.0, 1.0, 1.0 if slip > kt.BAD else 0.0
+
+
+@internal_kernel
+def velocity_at(link, x, y, z, out):
+    """Velocity of a body at a point [m/s], into out, (3,) or more, after a sweep."""
+    out[0] = link[ka.V + 3] + link[ka.V + 1] * z - link[ka.V + 2] * y
+    out[1] = link[ka.V + 4] + link[ka.V + 2] * x - link[ka.V] * z
+    out[2] = link[ka.V + 5] + link[ka.V] * y - link[ka.V + 1] * x
+
+
+@internal_kernel
+def note_place(system, state, k, note):
+    """Directions and place of candidate k, by which the next step knows its rows again."""
+    for m in range(3):
+        note[kt.NORMAL_THEN + m], note[kt.TANGENT_THEN + m] = state[ka.NORMAL + m], state[ka.FIRST_TANGENT + m]
+    note[kt.CENTRE], note[kt.CENTRE + 1], note[kt.CENTRE + 2] = centre(system.shapes, state, k)
 
 
 @internal_kernel
@@ -75,7 +115,7 @@ def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
     changed = close_stops(system.unilateral, ws)
     for k in range(ws.contacts.shape[0]):
         last = s.memory[kt.LAST, k]
-        known = last[kt.LISTED] == 1.0 and goes_on(system, last, ws, k, h)
+        known = last[kt.LISTED] == 1.0 and goes_on(system, s, last, ws, k, h)
         s.turn[k, kt.KNOWN] = 1.0 if known else 0.0
         listed = ws.contacts[k, ka.GAP] <= kt.MARGIN or (known and last[kt.CLOSED] == 1.0)
         mode = ka.STICKING if listed else ka.OPEN
@@ -87,7 +127,7 @@ def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
 
 
 @internal_kernel
-def goes_on(system, last, ws: Workspace, k, h):
+def goes_on(system, s: SteppingArrays, last, ws: Workspace, k, h):
     """True when the normal of candidate k has turned a little, and its place has gone about as far as its body."""
     state, turned = ws.contacts[k], 0.0
     for m in range(3):
@@ -97,10 +137,9 @@ def goes_on(system, last, ws: Workspace, k, h):
     link = ws.links[system.contacts.link[k, ka.LINK]]
     x, y, z = centre(system.shapes, state, k)
     way = (x - last[kt.CENTRE]) ** 2 + (y - last[kt.CENTRE + 1]) ** 2 + (z - last[kt.CENTRE + 2]) ** 2
-    vx = link[ka.V + 3] + link[ka.V + 1] * z - link[ka.V + 2] * y
-    vy = link[ka.V + 4] + link[ka.V + 2] * x - link[ka.V] * z
-    vz = link[ka.V + 5] + link[ka.V] * y - link[ka.V + 1] * x
-    speed = math.sqrt(vx * vx + vy * vy + vz * vz)
+    v = s.b
+    velocity_at(link, x, y, z, v)
+    speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     return math.sqrt(way) <= SAME_PLACE * h * speed + PLACE_ROUNDING
 
 
@@ -197,7 +236,10 @@ def turn_rows(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, k,
     turn[kt.ADDED] -= turn[kt.PUSH]
     if last[kt.SLID] == 1.0:
         slip = math.sqrt(s.rate[0, r + 1] ** 2 + s.rate[0, r + 2] ** 2)
-        impulse = s.mu[r] * last[kt.NORMAL_IMPULSE] * h / s.grid[kt.LENGTH_LAST]
+        # Of a start nothing is known.
+        impulse = s.mu[r] * last[kt.NORMAL_IMPULSE]
+        if impulse > 0.0:
+            impulse *= h / s.grid[kt.LENGTH_LAST]
         if slip > impulse * largest_mobility(ws.small[0], r):
             turn[kt.MEAN] = 1.0
             turn[kt.ADDED + 1], turn[kt.ADDED + 2] = s.rate[0, r + 1], s.rate[0, r + 2]
@@ -315,10 +357,9 @@ def note_contacts(system, s: SteppingArrays, ws: Workspace):
             continue
         r = ws.active[k, ka.FIRST_ROW]
         now[kt.LISTED], now[kt.NORMAL_IMPULSE] = 1.0, s.f[r]
+        note_place(system, state, k, now)
         for m in range(3):
             now[kt.END_RATE + m] = s.rate[1, r + m]
-            now[kt.NORMAL_THEN + m], now[kt.TANGENT_THEN + m] = state[ka.NORMAL + m], state[ka.FIRST_TANGENT + m]
-        now[kt.CENTRE], now[kt.CENTRE + 1], now[kt.CENTRE + 2] = centre(system.shapes, state, k)
         if s.f[r] > 0.0 or s.w[r] <= kt.BAD:
             now[kt.CLOSED] = 1.0
             now[kt.SLID] = 1.0 if slip_of_rates(s, k, s.w[r + 1], s.w[r + 2]) > kt.BAD else 0.0
