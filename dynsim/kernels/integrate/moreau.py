@@ -72,7 +72,7 @@ from dynsim.kernels.integrate.run import (
     TIME,
     Run,
 )
-from dynsim.kernels.integrate.steps import choose_step, finished, finite
+from dynsim.kernels.integrate.steps import choose_step, finished, finite, stalled
 from dynsim.kernels.integrate.time_stepping import (
     ACCELERATION,
     APPLIED_THEN,
@@ -99,7 +99,7 @@ from dynsim.kernels.integrate.time_stepping import (
 )
 from dynsim.kernels.integrate.time_stepping import MECHANICAL as ENERGY
 from dynsim.kernels.integrate.watch import watch
-from dynsim.kernels.jit import internal_kernel, kernel
+from dynsim.kernels.jit import free_kernel, internal_kernel
 from dynsim.kernels.ledger import drive_powers
 from dynsim.kernels.state import (
     CONSTRAINT,
@@ -356,12 +356,12 @@ def commands_due(system: System, ws: Workspace, run: Run):
     return run.count[TICKED] != 0
 
 
-@kernel
+@free_kernel
 def advance_moreau(system: System, ws: Workspace, run: Run, limit):
     """``advance`` of time stepping."""
     clock, count, taken = run.clock, run.count, 0
     while not commands_due(system, ws, run):
-        if finished(run) or taken >= limit:
+        if finished(run) or taken >= limit or stalled(run):
             return
         taken += 1
         if count[PENDING] == 0:
