@@ -148,8 +148,8 @@ def cut_step(system: System, ws: Workspace, run: Run):
     count[SEARCHING] += 1
     low, high = clock[LOW], clock[HIGH]
     if high - low <= event_tolerance(clock[TIME]) or count[SEARCHING] > SEARCH_LIMIT:
-        # The step at HIGH, taken again, ends the search whatever its guards say now: a step of RADAU5 is not the same to
-        # the bit when it is repeated, since its Newton method goes by how the last one has contracted.
+        # The step at HIGH, taken again, ends the search whatever its guards say now: a step of RADAU5 is not the same
+        # to the bit when it is repeated, since its Newton method goes by how the last one has contracted.
         if h == high:
             if not hit:
                 keep_passed(run)
