@@ -16,7 +16,6 @@ import numpy as np
 
 from dynsim import interruption
 from dynsim.engine import named, note_warnings, simulate
-from dynsim.engine.dynamics import CHUNK_S
 from dynsim.engine.outcome import kernels_logged
 from dynsim.engine.prepare import Prepared, prepare
 from dynsim.engine.recording import make_record
@@ -34,6 +33,8 @@ log = logging.getLogger(__name__)
 
 WIDTH = lanes_of_runs()
 LANES = len(WIDTH)
+# Wall time between two looks for Ctrl-C [s].
+CHUNK_S = 0.1
 
 
 def can_share(scenario: Scenario) -> bool:

@@ -211,6 +211,8 @@ def advance_explicit(system: System, ws: Workspace, run: Run, limit):
     """:func:`advance` of the explicit methods."""
     order = 5.0 if run.method == DOPRI5 else 4.0
     taken, error = 0, 0.0
+    if limit < 0:
+        return
     while waiting(system, ws, run):
         if taken >= limit or finished(run) or stalled(run):
             return
@@ -234,6 +236,8 @@ def advance_radau5(system: System, ws: Workspace, run: Run, limit):
     """:func:`advance` of RADAU5. Samples wait on, with three others at most, where only ``limit`` has ended it: which
     ones are computed together must not depend on how fast the machine is."""
     taken, error = 0, 0.0
+    if limit < 0:
+        return
     while waiting(system, ws, run) and not finished(run):
         if taken >= limit:
             return
@@ -253,7 +257,7 @@ def advance_radau5(system: System, ws: Workspace, run: Run, limit):
 
 
 def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:
-    """Take up to ``limit`` steps towards END; run.count[STATUS] says how it ended.
+    """Take up to ``limit`` steps towards END; run.count[STATUS] says how it ended. Fewer than 0: only be loaded.
 
     Returns before that when an event or a tick wants the caller to look (LOGGED, TICKED), when the next step would end
     beyond HOLD: it is kept, PENDING, and accepted by the next call unless the caller drops it; and when another thread

@@ -360,6 +360,8 @@ def commands_due(system: System, ws: Workspace, run: Run):
 def advance_moreau(system: System, ws: Workspace, run: Run, limit):
     """``advance`` of time stepping."""
     clock, count, taken = run.clock, run.count, 0
+    if limit < 0:
+        return
     while not commands_due(system, ws, run):
         if finished(run) or taken >= limit or stalled(run):
             return
