@@ -17,6 +17,8 @@ from dynsim.kernels.state import block
 from dynsim.model.unilateral import START_TOLERANCE
 from dynsim.scenario import Scenario
 
+_MODES = {ka.SLIDING: "slides", ka.STICKING: "sticks"}
+
 
 def stopped(scenario: Scenario, prepared: Prepared) -> SimulationStopped:
     """The stop of a run whose STATUS says that it has not come to its end."""
@@ -44,6 +46,21 @@ def _listed(prepared: Prepared, *choices: NDArray[np.bool_]) -> str:
         if chosen[: len(prepared.contacts)].any():
             return " at " + ", ".join(c.name for c, here in zip(prepared.contacts, chosen, strict=False) if here)
     return ""
+
+
+def _doing(prepared: Prepared) -> str:
+    """What the contacts of the unilateral law do, for a sentence to end with."""
+    if prepared.system.unilateral is None or not prepared.contacts:
+        return ""
+    modes = prepared.workspace.active[: len(prepared.contacts), ka.MODE]
+    if prepared.run.stepping is not None:
+        modes = prepared.run.stepping.motion
+    doing = [
+        f"{contact.name} {_MODES[int(mode)]}"
+        for contact, mode in zip(prepared.contacts, modes, strict=True)
+        if mode != ka.OPEN
+    ]
+    return "; " + (", ".join(doing) if doing else "no contact is closed")
 
 
 def _reason(scenario: Scenario, prepared: Prepared) -> str:
@@ -78,6 +95,22 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
         return (
             f"{where}: no forces{names} agree with Coulomb's law (Painlevé's paradox, or rows that contradict each "
             "other); lower contacts.friction, or take another posture"
+        )
+    if status == ki.NO_PROGRESS:
+        return (
+            f"{where}: no progress, the last {ki.MOST_TRIALS} steps came no further than "
+            f"{run.clock[ki.LEAST_PROGRESS]:.1e} s, the last of {run.clock[ki.STEP]:.1e} s{_doing(prepared)}; "
+            "take another integrator.method, a larger rtol, or longer steps where they are fixed"
+        )
+    if status == ki.OUT_OF_TIME:
+        return (
+            f"{where}: the wall limit, integrator.wall_limit_s = {scenario.integrator.wall_limit_s:g} s, is over, the "
+            f"last step of {run.clock[ki.STEP]:.1e} s{_doing(prepared)}"
+        )
+    if status == ki.STUCK:
+        return (
+            f"{where}: one step of {run.clock[ki.STEP]:.1e} s does not end{_doing(prepared)}; "
+            "take another integrator.method, or fewer contacts"
         )
     if status == ki.CHATTER and (law := prepared.system.unilateral) is not None:
         at = _listed(

@@ -45,6 +45,7 @@ def can_share(scenario: Scenario) -> bool:
         and options.method == "rk4"
         and options.solver == "articulated"
         and scenario.config.contacts.law == "bilateral"
+        and options.wall_limit_s is None
         and COMPILED
     )
 
@@ -127,7 +128,10 @@ def finish(scenario: Scenario, prepared: Prepared, wall: float, pictured: bool) 
 
 
 def shareable(prepared: Prepared) -> bool:
-    """True where nothing but steps happens: no events, ticks, breaks, operator or ground that carries a base."""
+    """True where nothing but steps happens: no events, ticks, breaks, operator or ground that carries a base.
+
+    Steps too short to come anywhere end a run that is alone.
+    """
     run = prepared.run
     return (
         has_forms(prepared.system)
@@ -135,6 +139,7 @@ def shareable(prepared: Prepared) -> bool:
         and run.support is None
         and not (len(run.event) or len(run.tick) or len(run.breaks))
         and run.newton is None
+        and ki.MOST_TRIALS * run.clock[ki.STEP] > run.clock[ki.LEAST_PROGRESS]
         and prepared.control.operated is None
     )
 
