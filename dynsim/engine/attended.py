@@ -122,6 +122,7 @@ def attend(
         # Also after a second signal.
         if not ended:
             _of_this_thread.helper = None
+            interruption.leave()
     if error is not None:
         raise error
     return ended, wish

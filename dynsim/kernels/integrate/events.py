@@ -56,7 +56,7 @@ HAND_X, HAND_Y, HAND_Z = 6, 7, 8
 TIP_MARGIN = 9
 
 # Steps that a root may take; regula falsi with halving (Illinois) needs about eight. Guards that jump, as forces do
-# where another split of them begins, are bisected in the end.
+# where another split of them begins, are bisected in the end. Once there were too many the next one is the last.
 SEARCH_LIMIT, FALSI_LIMIT = 60, 16
 
 
@@ -148,9 +148,9 @@ def cut_step(system: System, ws: Workspace, run: Run):
     count[SEARCHING] += 1
     low, high = clock[LOW], clock[HIGH]
     if high - low <= event_tolerance(clock[TIME]) or count[SEARCHING] > SEARCH_LIMIT:
-        # The step at HIGH, taken again, ends the search whatever its guards say now: a step of RADAU5 is not the same
-        # to the bit when it is repeated, since its Newton method goes by how the last one has contracted.
-        if h == high:
+        # A step of RADAU5 taken again is not the same to the bit, since its Newton method goes by how the last one has
+        # contracted: at HIGH it may miss what had passed zero there, some times or for ever.
+        if h == high and (hit or count[SEARCHING] > SEARCH_LIMIT):
             if not hit:
                 keep_passed(run)
             count[SEARCHING], count[FIRED] = 0, 1
