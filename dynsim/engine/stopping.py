@@ -17,21 +17,37 @@ from dynsim.kernels.state import block
 from dynsim.model.unilateral import START_TOLERANCE
 from dynsim.scenario import Scenario
 
+# STATUS in a word.
+KINDS = {
+    ki.NOT_FINITE: "not_finite",
+    ki.STEP_TOO_SMALL: "step_too_small",
+    ki.NOT_PROJECTED: "not_projected",
+    ki.NO_FORCES: "no_forces",
+    ki.FORCES_REVERSED: "forces_reversed",
+    ki.SEVERAL_FORCES: "several_forces",
+    ki.STOPPED: "overturned",
+    ki.NO_CONTACT_FORCES: "no_contact_forces",
+    ki.CHATTER: "chatter",
+    ki.NO_PROGRESS: "no_progress",
+    ki.OUT_OF_TIME: "out_of_time",
+    ki.STUCK: "stuck",
+}
 _MODES = {ka.SLIDING: "slides", ka.STICKING: "sticks"}
 
 
 def stopped(scenario: Scenario, prepared: Prepared) -> SimulationStopped:
     """The stop of a run whose STATUS says that it has not come to its end."""
     run = prepared.run
+    kind = KINDS[int(run.count[ki.STATUS])]
     if found := paradox(prepared.system, prepared.workspace, run, prepared.contacts):
         reached, y, words = found
         if scenario.integrator.method == "rk4":
             words += "; a shorter integrator.step_s or an adaptive method (auto) tells whether the step is to blame"
         return SimulationStopped(
-            f"stopped at t = {reached:.6g} s: {words}", time=reached, state=last_state(prepared, y)
+            f"stopped at t = {reached:.6g} s: {words}", time=reached, state=last_state(prepared, y), kind=kind
         )
     return SimulationStopped(
-        _reason(scenario, prepared), time=float(run.clock[ki.TIME]), state=last_state(prepared, run.y)
+        _reason(scenario, prepared), time=float(run.clock[ki.TIME]), state=last_state(prepared, run.y), kind=kind
     )
 
 
