@@ -55,10 +55,12 @@ class MissingEntry(RecordError, KeyError):
 
 
 class SimulationStopped(DynsimError):
-    """The simulation could not go on (divergence, no solution).
+    """The simulation could not go on (divergence, no solution, no progress).
 
     Attributes
     ----------
+    kind : str
+        Why, in a word, such as ``step_too_small``; empty where it is not the engine of the dynamics that stopped.
     time : float
         Simulated time of the stop [s].
     state : dict[str, Any]
@@ -69,15 +71,18 @@ class SimulationStopped(DynsimError):
 
     exit_code: ClassVar[int] = 3
 
-    def __init__(self, message: str, *, time: float = float("nan"), state: dict[str, Any] | None = None) -> None:
+    def __init__(
+        self, message: str, *, time: float = float("nan"), state: dict[str, Any] | None = None, kind: str = ""
+    ) -> None:
         super().__init__(message)
+        self.kind = kind
         self.time = time
         self.state = state or {}
         self.record: Any = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Exceptions travel between processes by their arguments alone; the state and record must come along.
-        return _rebuild, (type(self), str(self), self.time, self.state, self.record)
+        return _rebuild, (type(self), str(self), self.time, self.state, self.kind, self.record)
 
 
 class SimulationInterrupted(SimulationStopped):
@@ -86,7 +91,9 @@ class SimulationInterrupted(SimulationStopped):
     exit_code: ClassVar[int] = 130
 
 
-def _rebuild(kind: type[SimulationStopped], message: str, time: float, state: dict[str, Any], record: Any) -> Any:
-    stop = kind(message, time=time, state=state)
+def _rebuild(
+    made: type[SimulationStopped], message: str, time: float, state: dict[str, Any], kind: str, record: Any
+) -> Any:
+    stop = made(message, time=time, state=state, kind=kind)
     stop.record = record
     return stop

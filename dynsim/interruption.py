@@ -20,6 +20,7 @@ _OF_THE_COMPILER = ("_raw_object_cache_notify", "_raw_object_cache_getbuffer")
 
 _pending = False
 _kept = False
+_left = False
 
 
 def _compiler_waits(frame: FrameType | None) -> bool:
@@ -86,3 +87,19 @@ def answered() -> None:
     """The last signal has been heeded: :func:`check` need not raise for it any more."""
     global _pending
     _pending = False
+
+
+def is_kept() -> bool:
+    """Whether signals wait, because a result is being made or saved."""
+    return _kept
+
+
+def leave() -> None:
+    """Note that a thread of this process goes on which nobody can end, nor waits for: it ends with the process."""
+    global _left
+    _left = True
+
+
+def is_left() -> bool:
+    """Whether there is such a thread."""
+    return _left

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import os
 import signal
+import time
 from pathlib import Path
 
+from dynsim import interruption
 from dynsim.engine import Progress
 
 
@@ -34,6 +37,39 @@ def warned(number: int, look: Progress) -> bool:
     log = logging.getLogger("dynsim.work")
     log.warning("number %d", number)
     return log.isEnabledFor(logging.WARNING)
+
+
+def hangs(number: int, look: Progress) -> int:
+    """One task holds the interpreter's lock for good, as compiled code does that never ends; one stops its process."""
+    if number == DEADLY:
+        ctypes.PyDLL(None).pause()
+    if number == REFUSED:
+        os.kill(os.getpid(), signal.SIGSTOP)
+    return number**2
+
+
+def slow(number: int, look: Progress) -> int:
+    """Longer than what is taken for silent in its test, half of it at work in Python, half of it asleep."""
+    end = time.monotonic() + 1.5
+    while time.monotonic() < end:
+        pass
+    time.sleep(1.5)
+    return number**2
+
+
+def deaf(task: tuple[int, str], look: Progress) -> int:
+    """Tells that it has begun, and never looks whether it shall stop."""
+    number, folder = task
+    Path(folder, f"begun_{number}").touch()
+    time.sleep(1000.0)
+    return number
+
+
+def leaves(number: int, look: Progress) -> int:
+    """One task leaves a thread behind that cannot be ended."""
+    if number == DEADLY:
+        interruption.leave()
+    return os.getpid()
 
 
 DEADLY, REFUSED = 5, 7

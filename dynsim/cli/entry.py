@@ -8,7 +8,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import typer
@@ -34,7 +34,13 @@ def main(received: Sequence[int]) -> None:
             if code == 0 and output.failure is not None:
                 code = _explain_lost_output(output.failure)
     garbage.keep_all()
-    sys.exit(interruption.exit_code(received) if code == SimulationInterrupted.exit_code else code)
+    code = interruption.exit_code(received) if code == SimulationInterrupted.exit_code else code
+    if interruption.is_left():
+        # The interpreter would take down what a thread in compiled code still works on.
+        with suppress(OSError, ValueError):
+            sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 def _exit_code() -> int:

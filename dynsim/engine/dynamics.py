@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import logging
 import time as clock
+from functools import partial
 
 from dynsim import interruption
-from dynsim.engine import SIMULATION, Progress, Start
-from dynsim.engine.outcome import kernels_logged, raise_stopped
+from dynsim.engine import SIMULATION, Progress, Start, attended
+from dynsim.engine.outcome import raise_stopped
 from dynsim.engine.prepare import Prepared, prepare
 from dynsim.engine.recording import make_record
 from dynsim.engine.stepped import event_name, own_guards, take_log
 from dynsim.engine.stopping import last_state, stopped
 from dynsim.errors import SimulationInterrupted, SimulationStopped
-from dynsim.kernels.integrate import driver
 from dynsim.kernels.integrate import run as ki
 from dynsim.record import Event, Record
 from dynsim.reuse import Reuse
@@ -23,26 +23,8 @@ __all__ = ["Prepared", "prepare", "simulate", "start"]
 
 log = logging.getLogger(__name__)
 
-# Wall time between two looks at progress and Ctrl-C [s].
-CHUNK_S = 0.1
-
-
-class _Pace:
-    """How many steps systems of one size and method take between two looks at progress and Ctrl-C."""
-
-    def __init__(self) -> None:
-        self.limit, self.known = 1, False
-
-    def took(self, steps: int, seconds: float) -> None:
-        """So many steps have taken so long."""
-        self.known = True
-        if steps > 0:
-            self.limit = int(min(max(min(steps * CHUNK_S / max(seconds, 1e-9), 10.0 * self.limit), 1), 1_000_000))
-
-
-def _tried(run: ki.Run) -> int:
-    """Steps accepted and refused."""
-    return int(run.count[ki.STEPS] + run.count[ki.REJECTED])
+# More steps than any run takes.
+_ALL = 1 << 62
 
 
 def start(prepared: Prepared) -> Start:
@@ -61,29 +43,29 @@ def simulate(
         from dynsim.engine import operated
 
         return operated.simulate(scenario, progress, pictured=pictured)
-    run = prepared.run
     size = prepared.model.n, len(prepared.contacts), len(prepared.stops)
-    pace = prepared.reuse.of("pace", _Pace, prepared.choice.method, *size)
-    if not pace.known:
-        # Loading or compiling the kernels is no integration time.
-        with kernels_logged(log):
-            driver.advance(prepared.system, prepared.workspace, run, 0)
-    if progress is not None:
-        progress(0.0, SIMULATION)
+    # Loading or compiling the kernels is no integration time.
+    prepared.reuse.of("kernels", partial(attended.load, prepared), prepared.choice.method, *size)
+    watch, run = attended.WallWatch(scenario.integrator.wall_limit_s), prepared.run
+
+    def look() -> None:
+        if progress is not None:
+            progress(float(run.clock[ki.TIME]), SIMULATION)
+        interruption.check()
+
     own = own_guards(prepared)
     happened: list[Event] = []
     started, interrupted = clock.perf_counter(), False
     try:
+        look()
         log.info("%s: integrating %g s by %s", scenario.title, scenario.duration_s, prepared.choice.method)
         while run.count[ki.STATUS] == ki.RUNNING:
-            before, steps = clock.perf_counter(), _tried(run)
-            driver.advance(prepared.system, prepared.workspace, run, pace.limit)
-            taken = clock.perf_counter() - before
+            prepared, raised = attended.advance(prepared, _ALL, watch, look)
+            run = prepared.run
             happened += [Event(time, *(event_name(prepared, e) or own[e])) for time, e in take_log(run)]
-            pace.took(_tried(run) - steps, taken)
-            if progress is not None:
-                progress(float(run.clock[ki.TIME]), SIMULATION)
-            interruption.check()
+            if raised is not None:
+                raise raised
+            look()
         interruption.keep()
     except KeyboardInterrupt:
         interruption.keep()

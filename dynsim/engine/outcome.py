@@ -52,7 +52,7 @@ def mark_stopped(stop: SimulationStopped, record: Record) -> None:
     """Mark the record as incomplete, and say why in its summary and provenance."""
     record.complete = False
     record.summary["warnings"].append(f"incomplete: {stop}")
-    record.provenance["stopped"] = {"time_s": stop.time, "reason": str(stop), "state": stop.state}
+    record.provenance["stopped"] = {"time_s": stop.time, "reason": str(stop), "kind": stop.kind, "state": stop.state}
 
 
 def raise_stopped(stop: SimulationStopped, record: Record) -> NoReturn:

@@ -44,6 +44,9 @@ from dynsim.scenario.schema import Integrator
 
 log = logging.getLogger(__name__)
 
+# How much longer than the wall limit a run has to be estimated at to be refused: of small systems estimates are up to
+# so many times too long.
+CLEARLY = 10.0
 # Steps that an explicit method may be held to by the electrical poles alone: a quarter of an hour for ten joints.
 STEPS_LIMIT = 2e8
 
@@ -167,6 +170,8 @@ def prepare(
         atol=options.atol,
         ticks=_ticks(control),
         breaks=_breaks(loads, control, method, options, reuse),
+        # Those who advance a run themselves may give it no end.
+        least_progress=ki.PROGRESS * min(scenario.duration_s, end or np.inf),
         events=guards(robot, contacts if real else (), stops),
         support=compile_support(robot),
         stepping=stepping,
@@ -256,11 +261,13 @@ def _check_stiffness(method: str, duration: float, robot: Robot) -> None:
 
 
 def _check_work(scenario: Scenario, n: int, p: int, method: str) -> None:
-    """Refuse what would integrate for longer than ``integrator.time_limit_h``, by an estimate from its size.
+    """Refuse what would integrate for clearly longer than ``integrator.wall_limit_s``, by an estimate from its size.
 
     While the method is not chosen yet, ``auto``, the estimate is that of the quicker one.
     """
     options = scenario.integrator
+    if options.wall_limit_s is None:
+        return
     # Measured from 10 to 1000 links with up to 250 contacts, right to a factor of two: the sweeps, the p × p system of
     # chains as long as n, its elimination, twice that for dependent rows (p > n always are).
     seconds = 1e-7 * n + 4e-10 * n * p**2 + (4e-10 if p > n else 2e-10) * p**3
@@ -271,12 +278,12 @@ def _check_work(scenario: Scenario, n: int, p: int, method: str) -> None:
     step = options.step_s if options.step_s and method != AUTO and ki.METHODS[method] in ki.FIXED_STEP else 1e-3
     explicit, implicit = 4.0 * seconds / step, ((2 * n + 14) * seconds + 3e-9 * n**3) / 1e-2
     rate = {"radau5": implicit, AUTO: min(explicit, implicit)}.get(method, explicit)
-    hours = scenario.duration_s * rate / 3600.0
-    if hours > options.time_limit_h:
+    wall = scenario.duration_s * rate
+    if wall > CLEARLY * options.wall_limit_s:
         raise ScenarioError(
             f"{n} joints with {p} contacts: a right-hand side takes about {seconds:.1g} s, so "
-            f"{scenario.duration_s:g} s would integrate for about {hours:.2g} hours, the limit "
-            f"(integrator.time_limit_h) is {options.time_limit_h:g}; "
+            f"{scenario.duration_s:g} s would integrate for about {wall:.2g} s, the limit "
+            f"(integrator.wall_limit_s) is {options.wall_limit_s:g} s; "
             "take fewer contacts or links, a shorter duration_s, or a higher limit"
         )
 

@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dynsim import interruption
+from dynsim.engine import attended
 from dynsim.engine.operator import Operator
 from dynsim.engine.outcome import mark_stopped, raise_stopped
 from dynsim.engine.prepare import prepare, sample_times
@@ -27,7 +29,6 @@ from dynsim.engine.stopping import stopped
 from dynsim.engine.trace import Trace
 from dynsim.errors import ModelError, ScenarioError, shown
 from dynsim.kernels import arrays as ka
-from dynsim.kernels.integrate import driver
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.dense import state_within
 from dynsim.kernels.state import JOINT, OUT_FORCE, OUT_MODE, OUT_VECTOR, block
@@ -43,8 +44,8 @@ from dynsim.scenario.build import check_start
 
 Array = NDArray[np.float64]
 
-# Steps in one compiled piece.
-_PIECE = 100_000
+# Steps in one compiled piece: it ends sooner where somebody wants it to, see dynsim.engine.attended.
+_PIECE = 1 << 62
 # Of the ticks of callers: kinds are bits of a number, and shorter periods would take for ever.
 MOST_TICKS, SHORTEST_PERIOD = 60, 1e-9
 # Ticks this close to the time asked for belong to it, per second of it.
@@ -113,6 +114,7 @@ class Simulation:
         self._relative = trace is not None or state is not None
         self._happened: list[Event] = []
         self._calling, self._token = False, object()
+        self._loaded, self._watch = False, attended.WallWatch(scenario.integrator.wall_limit_s)
         self._guards: list[tuple[str, str, Callable[[Simulation], None] | None]] = []
         self._calls: list[Callable[[Simulation], None]] = []
         robot = self.robot
@@ -138,7 +140,7 @@ class Simulation:
         run = self._prepared.run
         if state is not None:
             self._take(state)
-        run.clock[ki.TIME] = start
+        run.clock[[ki.TIME, ki.COUNTED_SINCE]] = start
         run.tick[:, [ki.TICK_NEXT, ki.TICK_PHASE]] = start
         self._refill()
         operated = self._prepared.control.operated
@@ -222,7 +224,10 @@ class Simulation:
         ScenarioError
             A time that is past, or not a number.
         SimulationStopped
-            Divergence or no solution; ``error.record`` holds the trace until then.
+            Divergence, no solution, no progress, or the wall limit; ``error.record`` holds the trace until then.
+        KeyboardInterrupt
+            Ctrl-C, within a second. The simulation stands at a step on the way, and can be advanced again, unless that
+            step would have taken longer.
         """
         if self._calling:
             raise ScenarioError("a callback cannot advance the simulation that calls it")
@@ -506,7 +511,7 @@ class Simulation:
             pictured=pictured,
         )
         record.complete = self.finished
-        if self._overturned():
+        if self._failed():
             mark_stopped(stopped(self._scenario, self._prepared), record)
         return record
 
@@ -548,7 +553,7 @@ class Simulation:
                 break
         if not self.finished and run.clock[ki.TIME] >= self._end:
             # A tick at the end came before the end itself.
-            driver.advance(self._prepared.system, self._prepared.workspace, run, 1)
+            self._attended(1, interruption.check)
         self._time = min(until, self._end) if not self.finished else float(run.clock[ki.TIME])
 
     def _piece(self, until: float) -> None:
@@ -560,10 +565,11 @@ class Simulation:
             run = self._prepared.run
         run.clock[ki.HOLD] = min(until, run.sample_time[-1])
         begun = clock.perf_counter()
-        driver.advance(prepared.system, prepared.workspace, run, _PIECE)
+        raised = self._attended(_PIECE, interruption.check)
+        run = self._prepared.run
         self._wall += clock.perf_counter() - begun
         self._take_events()
-        if run.count[ki.STATUS] not in (ki.RUNNING, ki.FINISHED, ki.STOPPED) or self._overturned():
+        if self._failed() and raised is None:
             self._time = float(run.clock[ki.TIME])
             raise_stopped(stopped(self._scenario, self._prepared), self.record())
         due = int(run.count[ki.TICKED])
@@ -574,6 +580,16 @@ class Simulation:
             for k, call in enumerate(self._calls):
                 if due & (ki.CALLER << k):
                     self._call(call)
+        if raised is not None:
+            raise raised
+
+    def _attended(self, limit: int, look: Callable[[], None]) -> BaseException | None:
+        """One compiled piece; what ``look`` has raised meanwhile, or a signal."""
+        if not self._loaded:
+            attended.load(self._prepared)
+            self._loaded = True
+        self._prepared, raised = attended.advance(self._prepared, limit, self._watch, look)
+        return raised
 
     def _call(self, call: Callable[[Simulation], None]) -> None:
         self._calling = True
@@ -595,6 +611,12 @@ class Simulation:
                 self._time = time
                 self._call(call)
 
+    def _failed(self) -> bool:
+        """True for a run that has ended, and not where it was to end."""
+        return (
+            bool(self._prepared.run.count[ki.STATUS] not in (ki.RUNNING, ki.FINISHED, ki.STOPPED)) or self._overturned()
+        )
+
     def _overturned(self) -> bool:
         """True when the base has tipped and its scenario says that runs stop there."""
         base = self.robot.base
@@ -611,14 +633,15 @@ class Simulation:
         count[[ki.PENDING, ki.SEARCHING, ki.FIRED]] = 0
         step = clock_[ki.STEP] = max(clock_[ki.PROPOSED], clock_[ki.STEP])
         if self._time > clock_[ki.TIME]:
-            clock_[ki.END] = self._time
-            while count[ki.STATUS] == ki.RUNNING:
-                if count[ki.PENDING] == 1:
-                    self._refill(clock_[ki.TIME] + clock_[ki.STEP])
-                    run = self._prepared.run
-                run.clock[ki.HOLD] = run.sample_time[-1]
-                driver.advance(self._prepared.system, self._prepared.workspace, run, _PIECE)
+            raised = self._go_to(self._time)
+            # Where a piece was left alone there are copies.
+            run = self._prepared.run
+            clock_, count = run.clock, run.count
             clock_[ki.END] = self._end
+            if raised is not None:
+                if count[ki.STATUS] == ki.FINISHED:
+                    count[ki.STATUS] = ki.RUNNING
+                raise raised
             self._take_events()
             if count[ki.STATUS] == ki.STOPPED and not self._overturned():
                 return
@@ -627,6 +650,20 @@ class Simulation:
             count[ki.STATUS] = ki.RUNNING
             clock_[ki.TIME] = self._time
             clock_[ki.STEP] = max(clock_[ki.STEP], step)
+
+    def _go_to(self, until: float) -> BaseException | None:
+        """Integrate until a time that ends the run; what a signal has raised on the way."""
+        self._prepared.run.clock[ki.END] = until
+        raised: BaseException | None = None
+        while self._prepared.run.count[ki.STATUS] == ki.RUNNING and raised is None:
+            run = self._prepared.run
+            if run.count[ki.PENDING] == 1:
+                self._refill(run.clock[ki.TIME] + run.clock[ki.STEP])
+                run = self._prepared.run
+            run.clock[ki.HOLD] = run.sample_time[-1]
+            # What comes to its end here is half of something: signals that wait go on waiting.
+            raised = self._attended(_PIECE, lambda: None)
+        return raised
 
     def _restart(self) -> None:
         """Derivatives have jumped: the next step starts anew from the present state, with the step size that it had."""

@@ -17,19 +17,37 @@ from dynsim.kernels.state import block
 from dynsim.model.unilateral import START_TOLERANCE
 from dynsim.scenario import Scenario
 
+# STATUS in a word.
+KINDS = {
+    ki.NOT_FINITE: "not_finite",
+    ki.STEP_TOO_SMALL: "step_too_small",
+    ki.NOT_PROJECTED: "not_projected",
+    ki.NO_FORCES: "no_forces",
+    ki.FORCES_REVERSED: "forces_reversed",
+    ki.SEVERAL_FORCES: "several_forces",
+    ki.STOPPED: "overturned",
+    ki.NO_CONTACT_FORCES: "no_contact_forces",
+    ki.CHATTER: "chatter",
+    ki.NO_PROGRESS: "no_progress",
+    ki.OUT_OF_TIME: "out_of_time",
+    ki.STUCK: "stuck",
+}
+_MODES = {ka.SLIDING: "slides", ka.STICKING: "sticks"}
+
 
 def stopped(scenario: Scenario, prepared: Prepared) -> SimulationStopped:
     """The stop of a run whose STATUS says that it has not come to its end."""
     run = prepared.run
+    kind = KINDS[int(run.count[ki.STATUS])]
     if found := paradox(prepared.system, prepared.workspace, run, prepared.contacts):
         reached, y, words = found
         if scenario.integrator.method == "rk4":
             words += "; a shorter integrator.step_s or an adaptive method (auto) tells whether the step is to blame"
         return SimulationStopped(
-            f"stopped at t = {reached:.6g} s: {words}", time=reached, state=last_state(prepared, y)
+            f"stopped at t = {reached:.6g} s: {words}", time=reached, state=last_state(prepared, y), kind=kind
         )
     return SimulationStopped(
-        _reason(scenario, prepared), time=float(run.clock[ki.TIME]), state=last_state(prepared, run.y)
+        _reason(scenario, prepared), time=float(run.clock[ki.TIME]), state=last_state(prepared, run.y), kind=kind
     )
 
 
@@ -44,6 +62,21 @@ def _listed(prepared: Prepared, *choices: NDArray[np.bool_]) -> str:
         if chosen[: len(prepared.contacts)].any():
             return " at " + ", ".join(c.name for c, here in zip(prepared.contacts, chosen, strict=False) if here)
     return ""
+
+
+def _doing(prepared: Prepared) -> str:
+    """What the contacts of the unilateral law do, for a sentence to end with."""
+    if prepared.system.unilateral is None or not prepared.contacts:
+        return ""
+    modes = prepared.workspace.active[: len(prepared.contacts), ka.MODE]
+    if prepared.run.stepping is not None:
+        modes = prepared.run.stepping.motion
+    doing = [
+        f"{contact.name} {_MODES[int(mode)]}"
+        for contact, mode in zip(prepared.contacts, modes, strict=True)
+        if mode != ka.OPEN
+    ]
+    return "; " + (", ".join(doing) if doing else "no contact is closed")
 
 
 def _reason(scenario: Scenario, prepared: Prepared) -> str:
@@ -78,6 +111,22 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
         return (
             f"{where}: no forces{names} agree with Coulomb's law (Painlevé's paradox, or rows that contradict each "
             "other); lower contacts.friction, or take another posture"
+        )
+    if status == ki.NO_PROGRESS:
+        return (
+            f"{where}: no progress, the last {ki.MOST_TRIALS} steps came no further than "
+            f"{run.clock[ki.LEAST_PROGRESS]:.1e} s, the last of {run.clock[ki.STEP]:.1e} s{_doing(prepared)}; "
+            "take another integrator.method, a larger rtol, or longer steps where they are fixed"
+        )
+    if status == ki.OUT_OF_TIME:
+        return (
+            f"{where}: the wall limit, integrator.wall_limit_s = {scenario.integrator.wall_limit_s:g} s, is over, the "
+            f"last step of {run.clock[ki.STEP]:.1e} s{_doing(prepared)}"
+        )
+    if status == ki.STUCK:
+        return (
+            f"{where}: one step of {run.clock[ki.STEP]:.1e} s does not end{_doing(prepared)}; "
+            "take another integrator.method, or fewer contacts"
         )
     if status == ki.CHATTER and (law := prepared.system.unilateral) is not None:
         at = _listed(

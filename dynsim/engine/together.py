@@ -16,7 +16,6 @@ import numpy as np
 
 from dynsim import interruption
 from dynsim.engine import named, note_warnings, simulate
-from dynsim.engine.dynamics import CHUNK_S
 from dynsim.engine.outcome import kernels_logged
 from dynsim.engine.prepare import Prepared, prepare
 from dynsim.engine.recording import make_record
@@ -34,6 +33,8 @@ log = logging.getLogger(__name__)
 
 WIDTH = lanes_of_runs()
 LANES = len(WIDTH)
+# Wall time between two looks for Ctrl-C [s].
+CHUNK_S = 0.1
 
 
 def can_share(scenario: Scenario) -> bool:
@@ -44,6 +45,7 @@ def can_share(scenario: Scenario) -> bool:
         and options.method == "rk4"
         and options.solver == "articulated"
         and scenario.config.contacts.law == "bilateral"
+        and options.wall_limit_s is None
         and COMPILED
     )
 
@@ -126,7 +128,10 @@ def finish(scenario: Scenario, prepared: Prepared, wall: float, pictured: bool) 
 
 
 def shareable(prepared: Prepared) -> bool:
-    """True where nothing but steps happens: no events, ticks, breaks, operator or ground that carries a base."""
+    """True where nothing but steps happens: no events, ticks, breaks, operator or ground that carries a base.
+
+    Steps too short to come anywhere end a run that is alone.
+    """
     run = prepared.run
     return (
         has_forms(prepared.system)
@@ -134,6 +139,7 @@ def shareable(prepared: Prepared) -> bool:
         and run.support is None
         and not (len(run.event) or len(run.tick) or len(run.breaks))
         and run.newton is None
+        and ki.MOST_TRIALS * run.clock[ki.STEP] > run.clock[ki.LEAST_PROGRESS]
         and prepared.control.operated is None
     )
 

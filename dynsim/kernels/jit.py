@@ -183,6 +183,14 @@ def kernel(function: F) -> F:
     return _compile(function)
 
 
+def free_kernel(function: F) -> F:
+    """As :func:`kernel`, without the interpreter's lock while it runs: others can listen meanwhile.
+
+    For what takes long, and only Python calls: see dynsim.engine.attended.
+    """
+    return _compile(function, nogil=True)
+
+
 def merged_kernel(function: F) -> F:
     """As :func:`kernel`, for callers of the right-hand side: merged into their caller before compilation.
 

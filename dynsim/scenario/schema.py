@@ -146,13 +146,24 @@ class Integrator(StrictConfig):
         default=THETA, ge=0.5, le=1.0, description="time_stepping: 0.5 is second order between events, 1 damps"
     )
     step_max_s: Positive | None = None
-    time_limit_h: Positive = Field(default=24.0, description="runs estimated to integrate for longer are refused [h]")
+    wall_limit_s: Positive | None = Field(
+        default=None, description="wall time that the integration may take; ten times as much by estimate is refused"
+    )
 
     @field_validator("method", mode="before")
     @classmethod
     def _replaced(cls, value: object) -> object:
         if value == "rodas4":
             raise ValueError("is no longer there; radau5 does what it did, at any inductance, and takes longer steps")
+        return value
+
+    @model_validator(mode="before")
+    @classmethod
+    def _renamed(cls, value: object) -> object:
+        if isinstance(value, dict) and "time_limit_h" in value:
+            raise error_at(
+                "time_limit_h", "is no longer there; wall_limit_s, in seconds, refuses runs too, and ends them"
+            )
         return value
 
     @model_validator(mode="after")

@@ -13,7 +13,7 @@ from dynsim.errors import DynsimError, ScenarioError, SimulationInterrupted, Sim
 from dynsim.record import Record
 from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario, require_scenario
-from dynsim.studies.processes import WorkerLost, run_in_processes
+from dynsim.studies.processes import SILENT, WorkerLost, WorkerSilent, run_in_processes
 
 Keep = Literal["none", "failed", "all"]
 Task = TypeVar("Task")
@@ -33,7 +33,7 @@ class RunResult:
     ----------
     summary : numbers of the run; of one that stopped, what was simulated until then; empty when nothing was
     reason : why it failed, "" when it did not
-    lost : its process was ended from outside, so that another attempt may do better
+    lost : with its process, which was ended, so that another attempt may do better
     record : where it was asked for
     wall_s : time that it took, all in all [s]
     """
@@ -242,6 +242,8 @@ def run_all(
         def take_late(piece: Sequence[Task], result: Callable[[], list[RunResult] | None]) -> None:
             try:
                 found = result()
+            except WorkerSilent:
+                found = [RunResult({}, SILENT, lost=True)] * len(piece)
             except WorkerLost:
                 found = [RunResult({}, f"{LOST}; is memory short for so many jobs?", lost=True)] * len(piece)
             except SimulationInterrupted:

@@ -1,5 +1,5 @@
 """Work in processes: every result as it comes, Ctrl-C lets the workers hand back what they have, a killed one costs
-only the task that it had in hand.
+only the task that it had in hand, and so does one that gives no sign of life.
 """
 
 from __future__ import annotations
@@ -34,8 +34,14 @@ if TYPE_CHECKING:
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-# Between two looks for a signal that was lost [s].
+# Between two looks for a signal that was lost, and between two signs of life of a worker [s].
 _LOOK_S = 0.5
+# A worker that gives none for so long is given up [s]. A thread of it gives them, so that they say nothing of how long
+# its work takes: they end where the process is stopped, or compiled code holds the interpreter's lock for good.
+SILENT_S, START_S = 60.0, 600.0
+SILENT = f"its process gave no sign of life for {SILENT_S:g} s and was ended"
+# So long a worker may take to hear of Ctrl-C; one that has heard may take any time to hand back what it has [s].
+_PATIENCE_S = 0.7
 # Of a task, to be sent before the worker has time for it: with longer ones another worker may have time sooner [s].
 _QUICK_S = 0.5
 # How processes begin. Spawned, not forked: the parent may hold threads and an open progress display.
@@ -85,6 +91,14 @@ class WorkerLost(Exception):
     """The process that had a task was ended from outside."""
 
 
+class WorkerSilent(WorkerLost):
+    """It gave no sign of life any more, and was ended here."""
+
+
+# Places of ``life``.
+_SIGNS, _HEARD = 0, 1
+
+
 @dataclass
 class _Worker:
     """A process and this end of its pipe.
@@ -94,13 +108,24 @@ class _Worker:
     tasks : what it has, each with how many processes have lost it: the first in hand, the others wait in the pipe
     since : when it began with the first
     took : how long the last one took [s]
+    life : signs of life so far, and 1 where it has heard of Ctrl-C; shared with the process
+    signs, silent : of ``life`` at the last look, and for how long there were no more [s]
     """
 
     process: Any
     pipe: Connection
+    life: Any
     tasks: deque[tuple[Any, int]] = field(default_factory=deque)
     since: float = 0.0
     took: float = math.inf
+    signs: int = 0
+    silent: float = 0.0
+
+    def is_silent(self, passed: float) -> bool:
+        """Look for signs of life, so long [s] after the last look; True when there were none for too long."""
+        self.silent = self.silent + passed if self.life[_SIGNS] == self.signs else 0.0
+        self.signs = self.life[_SIGNS]
+        return self.silent > (SILENT_S if self.signs > 0 else START_S)
 
     @property
     def room(self) -> int:
@@ -124,7 +149,8 @@ def run_in_processes(
     tasks : sent to the processes one by one, as they come to have time; of quick ones, one before that
     jobs : processes
     take : called here with every task and a function that returns the result or raises what the work raised, or
-        :class:`WorkerLost`; None for a task that Ctrl-C came before, and no call for those that nobody had then
+        :class:`WorkerLost`; None for a task that Ctrl-C came before, and no call for those that nobody had then. A task
+        whose process was silent is given up at once
     attempts : how many processes a task may lose before it is given up
 
     Returns
@@ -143,12 +169,12 @@ def run_in_processes(
 
     def start(sender: Connection) -> _Worker:
         here, there = context.Pipe()
-        arguments = (work, there, stop, sender, _heard_from())
         with signals_held():
-            process = context.Process(target=_serve, args=arguments)
+            life = context.RawArray("q", 2)
+            process = context.Process(target=_serve, args=(work, there, stop, life, sender, _heard_from()))
             process.start()
         there.close()
-        return _Worker(process, here)
+        return _Worker(process, here, life)
 
     def hand_out(sender: Connection) -> None:
         while True:
@@ -169,8 +195,26 @@ def run_in_processes(
             with suppress(OSError):
                 worker.pipe.send(task[0])
 
+    def dismiss(worker: _Worker) -> None:
+        """It is gone, or will be; what waited in its pipe nobody has begun with."""
+        workers.remove(worker)
+        worker.process.join()
+        again.extend(worker.tasks)
+        worker.tasks.clear()
+
+    def end(worker: _Worker, answer: Callable[[], Any]) -> None:
+        """End a worker that will not answer; ``answer`` in its stead."""
+        worker.process.kill()
+        task, _ = worker.tasks.popleft()
+        dismiss(worker)
+        take(task, answer)
+
     def collect(sender: Connection | None) -> None:
-        """Take results until there are none to come; new tasks are only handed out with a ``sender``."""
+        """Take results until there are none to come; new tasks are only handed out with a ``sender``.
+
+        Without one the workers are to stop: who has not heard of it in time is ended.
+        """
+        begun = looked = clock.monotonic()
         while True:
             if sender is not None:
                 interruption.keep()
@@ -179,27 +223,35 @@ def run_in_processes(
             busy = {worker.pipe: worker for worker in workers if worker.tasks}
             if not busy:
                 return
-            for pipe in connection.wait(busy, timeout=_LOOK_S):
+            for pipe in connection.wait(busy, timeout=_LOOK_S if sender is not None else 0.1):
                 interruption.keep()
                 worker = busy[pipe]  # type: ignore[index]
                 task, losses = worker.tasks.popleft()
                 try:
-                    good, value = worker.pipe.recv()
+                    good, value, leaves = worker.pipe.recv()
                 except (EOFError, OSError):
-                    workers.remove(worker)
-                    worker.process.join()
-                    # What waited in its pipe nobody has begun with.
-                    again.extend(worker.tasks)
+                    dismiss(worker)
                     if sender is not None and losses + 1 < attempts:
                         again.append((task, losses + 1))
                     else:
                         take(task, _raise_lost)
                 else:
                     now = clock.monotonic()
-                    worker.since, worker.took = now, now - worker.since
+                    worker.since, worker.took, worker.silent = now, now - worker.since, 0.0
+                    if leaves:
+                        dismiss(worker)
                     take(task, partial(_result, good, value))
                 interruption.heed()
             interruption.check()
+            # A process that was stopped for a while, as by Ctrl-Z, has not looked either.
+            passed, looked = min(clock.monotonic() - looked, 2.0 * _LOOK_S), clock.monotonic()
+            interruption.keep()
+            for worker in [worker for worker in workers if worker.tasks]:
+                if worker.is_silent(passed):
+                    end(worker, _raise_silent)
+                elif sender is None and not worker.life[_HEARD] and looked - begun > _PATIENCE_S:
+                    end(worker, _nothing)
+            interruption.heed()
 
     with _logged_here(context) as sender:
         try:
@@ -227,18 +279,29 @@ def _raise_lost() -> NoReturn:
     raise WorkerLost
 
 
+def _raise_silent() -> NoReturn:
+    raise WorkerSilent
+
+
+def _nothing() -> None:
+    """Of a task that Ctrl-C came before."""
+
+
 def _result(good: bool, value: Any) -> Any:
     if not good:
         raise value
     return value
 
 
-def _serve(work: Callable[[Any, Progress], Any], pipe: Connection, stop: Any, sender: Connection, level: int) -> None:
+def _serve(
+    work: Callable[[Any, Progress], Any], pipe: Connection, stop: Any, life: Any, sender: Connection, level: int
+) -> None:
     """In a worker: tasks in, results out, until the parent closes the pipe."""
     # A terminal or a service manager sends these to every process of a group: only the parent heeds them.
     for number in STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=_give_signs, args=(stop, life), daemon=True).start()
     keep_memory()
     garbage.look_rarely()
     garbage.keep_all()
@@ -249,6 +312,7 @@ def _serve(work: Callable[[Any, Progress], Any], pipe: Connection, stop: Any, se
     def look(time: float, stage: str = "") -> None:
         # Where Ctrl-C would have stopped it in the parent, with what there is.
         if stop.value:
+            life[_HEARD] = 1
             raise KeyboardInterrupt
 
     tasks: SimpleQueue[tuple[Any] | None] = SimpleQueue()
@@ -262,7 +326,20 @@ def _serve(work: Callable[[Any, Progress], Any], pipe: Connection, stop: Any, se
             except Exception as error:
                 error.add_note("".join(traceback.format_exception(error)))
                 answer = (False, error)
-            pipe.send(answer)
+            leaves = interruption.is_left()
+            pipe.send((*answer, leaves))
+            if leaves:
+                # For good: the thread that it cannot end would take the time of others.
+                os._exit(0)
+
+
+def _give_signs(stop: Any, life: Any) -> None:
+    """In a worker, for as long as it lives: signs of that. A result that is being made is handed back too."""
+    while True:
+        life[_SIGNS] += 1
+        if stop.value and interruption.is_kept():
+            life[_HEARD] = 1
+        clock.sleep(_LOOK_S if not stop.value else 0.05)
 
 
 def _read(pipe: Connection, tasks: SimpleQueue[tuple[Any] | None]) -> None:

@@ -29,7 +29,7 @@ PLANNING = ["--set", "duration_s=50000", "--set", "record.rate_hz=1"]
 
 # The command line, in a process that leaves files which say what it does. Spawned workers run this module too.
 WATCHED = """
-import os, sys
+import ctypes, os, sys
 from pathlib import Path
 
 import dynsim.control.joint_pd as joint_pd
@@ -43,8 +43,16 @@ def mark(what, function):
     return marked
 
 # The first call of advance takes no step: it loads the kernels.
-advance, watched = driver.advance, mark("simulating", driver.advance)
-driver.advance = lambda *arguments: (watched if arguments[-1] else advance)(*arguments)
+def advance(*arguments):
+    if arguments[-1] > 0:
+        Path(f"simulating_{os.getpid()}").touch()
+    if arguments[-1] > 0 and "STANDS" in os.environ:
+        compiled(*arguments[:-1], 50)
+        # As a step that does not end: without the interpreter's lock, and deaf.
+        ctypes.CDLL(None).pause()
+    compiled(*arguments)
+
+compiled, driver.advance = driver.advance, advance
 joint_pd.follow = mark("planning", joint_pd.follow)
 
 if __name__ == "__main__":
@@ -59,11 +67,13 @@ def prepare_child() -> None:
 
 
 @contextmanager
-def started(folder: Path, *arguments: str, stdout: int | IO[Any] = subprocess.PIPE) -> Iterator[subprocess.Popen[str]]:
-    """A watched process of its own group, of which nothing is left after the block."""
+def started(
+    folder: Path, *arguments: str, stdout: int | IO[Any] = subprocess.PIPE, stands: bool = False
+) -> Iterator[subprocess.Popen[str]]:
+    """A watched process of its own group, of which nothing is left after the block; ``stands``: in a step for ever."""
     (folder / "watched.py").write_text(WATCHED)
     process = subprocess.Popen(
-        [sys.executable, "watched.py", *arguments],
+        [sys.executable, "watched.py", *arguments], env=os.environ | ({"STANDS": "1"} if stands else {}),
         cwd=folder, stdout=stdout, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=prepare_child,
     )  # fmt: skip
     try:
@@ -118,6 +128,33 @@ def test_a_signal_saves_what_was_simulated(tmp_path: Path, number: signal.Signal
     record = Record.load(tmp_path / "results" / "elbow_comparison" / "two_elbows" / "record.h5")
     assert not record.complete
     assert "incomplete" in record.summary["warnings"][-1]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name)
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_a_signal_ends_runs_whose_steps_do_not(tmp_path: Path, number: signal.Signals, jobs: str):
+    """What was recorded before is saved, and no process is left in its step."""
+    arguments = ["compare", "elbow_comparison", "--jobs", jobs, *LONG, "--out", "out"]
+    with started(tmp_path, *arguments, stands=True) as process:
+        wait_until(lambda: len(pids(tmp_path, "simulating")) == int(jobs), process)
+        time.sleep(0.5)
+        process.send_signal(number)
+        _, stderr = communicate(process)
+    assert process.returncode == 128 + number, stderr
+    saved = [Record.load(path) for path in (tmp_path / "out").rglob("record.h5")]
+    assert [record.complete for record in saved] == [False] * int(jobs)
+    assert not any(is_running(pid) for pid in pids(tmp_path, "simulating"))
+
+
+def test_a_signal_ends_a_sweep_whose_steps_do_not(tmp_path: Path):
+    arguments = ["sweep", "elbow_comparison", "--grid", "contacts.friction=0,0.1,0.2", "--jobs", "2", *LONG]
+    with started(tmp_path, *arguments, "--out", "out", stands=True) as process:
+        wait_until(lambda: len(pids(tmp_path, "simulating")) == 2, process)
+        process.send_signal(signal.SIGTERM)
+        _, stderr = communicate(process)
+    assert process.returncode == 128 + signal.SIGTERM, stderr
+    assert "interrupted when 0 of 3 runs were done; --resume goes on" in stderr
+    assert not any(is_running(pid) for pid in pids(tmp_path, "simulating"))
 
 
 def test_a_signal_saves_the_variant_that_runs(tmp_path: Path):
@@ -271,22 +308,22 @@ def test_a_signal_after_the_last_step_loses_nothing(
 # A signal whose KeyboardInterrupt Python drops, because it comes while a callback of the garbage collector runs.
 LOST = """
 import os, signal, weakref
-import dynsim.kernels.integrate.driver as driver
+import dynsim.engine.attended as attended
 from dynsim.cli import main
 
 class Thing: ...
 
-advance, calls = driver.advance, []
+look, calls = attended.WallWatch.look, []
 
 def lose(*arguments):
     calls.append(1)
-    if len(calls) == 3:
+    if len(calls) == 1:
         thing = Thing()
         watch = weakref.ref(thing, lambda _: os.kill(os.getpid(), signal.SIGTERM))
         del thing
-    return advance(*arguments)
+    look(*arguments)
 
-driver.advance = lose
+attended.WallWatch.look = lose
 main()
 """
 

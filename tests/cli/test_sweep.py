@@ -58,7 +58,7 @@ def test_a_sweep_that_is_refused_says_one_line(tmp_path: Path, arguments: list[s
 
 @pytest.mark.parametrize(("limits", "well", "code"), [("1,1e-9", 1, 0), ("1e-9,2e-9", 0, 3)])
 def test_a_sweep_without_a_good_run_has_failed(tmp_path: Path, limits: str, well: int, code: int):
-    grid = f"integrator.time_limit_h={limits}"
+    grid = f"integrator.wall_limit_s={limits}"
     result = sweep("single_pendulum", "--grid", grid, *SHORT, "--jobs", "1", folder=tmp_path)
     assert f"{well} of 2 runs ended well" in result.stdout
     assert "run 1 failed: " in result.stderr

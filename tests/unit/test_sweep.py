@@ -9,7 +9,9 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
 from processes import started, wait_for
-from sweep_work import DEADLY, REFUSED, once_deadly, square, warned
+from sweep_work import DEADLY, REFUSED, deaf, hangs, leaves, once_deadly, slow, square, warned
 
 import dynsim
 from dynsim.cli import sweep as sweep_command
@@ -29,10 +31,11 @@ from dynsim.figures import sweep as pictures
 from dynsim.record import Record
 from dynsim.scenario import SetOptions, read_scenario
 from dynsim.sensitivity import sensitivities, spread
+from dynsim.studies import batch, processes
 from dynsim.studies import sweep as module
 from dynsim.studies.columns import numbers
 from dynsim.studies.plan import Axis, Law, Plan
-from dynsim.studies.processes import WorkerLost, run_in_processes
+from dynsim.studies.processes import WorkerLost, WorkerSilent, run_in_processes
 from dynsim.studies.sweep import run_sweep
 
 PENDULUM = read_scenario("single_pendulum")
@@ -210,14 +213,14 @@ def test_the_pareto_front_is_what_no_run_beats(points: list[tuple[int, int]]):
 def test_a_batch_gives_what_single_runs_give(jobs: int):
     scenarios = [dynsim.load_scenario("single_pendulum", overrides=SHORT | {LENGTH: length}) for length in (0.5, 1.0)]
     # Refused, which is no reason not to run the last.
-    scenarios.insert(1, dynsim.load_scenario("single_pendulum", overrides=SHORT | {"integrator.time_limit_h": 1e-9}))
+    scenarios.insert(1, dynsim.load_scenario("single_pendulum", overrides=SHORT | {"integrator.wall_limit_s": 1e-9}))
     finished: dict[int, Any] = {}
     results = dynsim.simulate_batch(
         scenarios, jobs=jobs, keep_records="all", finished=lambda k, result: finished.update({k: result})
     )
     assert [finished[k] for k in range(3)] == results
     assert [result.ok for result in results] == [True, False, True]
-    assert "time_limit_h" in results[1].reason
+    assert "wall_limit_s" in results[1].reason
     for scenario, result in zip(scenarios[::2], results[::2], strict=True):
         alone = dynsim.simulate(scenario)
         assert numbers(result.summary) == numbers(alone.summary)
@@ -254,6 +257,71 @@ def test_a_task_outlives_the_process_that_it_had_first(tmp_path: Path):
     run_in_processes(once_deadly, tasks, 2, lambda task, result: taken.update({task[0]: result()}), attempts=2)
     assert (tmp_path / "seen").exists()
     assert taken == {number: number**2 for number in range(8)}
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="no signal stops a process here")
+def test_a_process_that_gives_no_sign_of_life_costs_only_its_task(monkeypatch: pytest.MonkeyPatch):
+    """One is in compiled code for good, one is stopped; both are ended, and others do what is left."""
+    monkeypatch.setattr(processes, "SILENT_S", 2.0)
+    taken: dict[int, Any] = {}
+
+    def take(number: int, result: Callable[[], int]) -> None:
+        try:
+            taken[number] = result()
+        except WorkerSilent as error:
+            taken[number] = type(error)
+
+    assert run_in_processes(hangs, range(10), 2, take, attempts=2) is False
+    assert taken == {number: number**2 for number in range(10)} | {DEADLY: WorkerSilent, REFUSED: WorkerSilent}
+
+
+def test_a_process_that_takes_its_time_is_not_given_up(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(processes, "SILENT_S", 1.3)
+    taken: dict[int, int] = {}
+    run_in_processes(slow, range(2), 2, lambda number, result: taken.update({number: result()}))
+    assert taken == {0: 0, 1: 1}
+
+
+def test_ctrl_c_does_not_wait_for_who_does_not_look(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Both workers sleep for longer than any test; what they had in hand counts as not begun."""
+    taken: dict[int, Any] = {}
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def interrupt() -> None:
+        wait_for(lambda: len(list(tmp_path.glob("begun_*"))) == 2)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    Thread(target=interrupt, daemon=True).start()
+    try:
+        tasks = [(number, str(tmp_path)) for number in range(4)]
+        assert run_in_processes(deaf, tasks, 2, lambda task, result: taken.update({task[0]: result()})) is True
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert taken == {0: None, 1: None}
+
+
+def test_a_process_that_leaves_a_thread_behind_is_replaced():
+    """Its task is done, and so are the others, none of them by it."""
+    taken: dict[int, int] = {}
+    run_in_processes(leaves, range(10), 1, lambda number, result: taken.update({number: result()}))
+    assert len(taken) == 10
+    left = taken[DEADLY]
+    assert all(taken[number] == left for number in range(DEADLY))
+    assert all(taken[number] != left for number in range(DEADLY + 1, 10))
+
+
+def test_a_silent_process_is_a_row_with_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """What a sweep makes of it: the other runs are there."""
+
+    def run(work: Any, tasks: Any, jobs: int, take: Any, *, attempts: int) -> bool:
+        for k, task in enumerate(tasks):
+            take(task, processes._raise_silent if k == 1 else partial(work, task, None))
+        return False
+
+    monkeypatch.setattr(batch, "run_in_processes", run)
+    rows = run_sweep(plan(Axis.parse(f"{LENGTH}=0.5:1:3")), tmp_path, jobs=2)
+    assert [row.status for row in rows] == ["ok", "lost", "ok"]
+    assert "gave no sign of life for 60 s" in rows[1].reason
 
 
 @pytest.mark.parametrize("listens", [True, False])

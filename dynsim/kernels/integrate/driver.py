@@ -65,9 +65,9 @@ from dynsim.kernels.integrate.run import (
     Run,
 )
 from dynsim.kernels.integrate.slow_slip import longest_step
-from dynsim.kernels.integrate.steps import choose_step, finished, finite, first_step, next_step, rejected
+from dynsim.kernels.integrate.steps import choose_step, finished, finite, first_step, next_step, rejected, stalled
 from dynsim.kernels.integrate.watch import forces_unique, watch
-from dynsim.kernels.jit import apart_kernel, internal_kernel, kernel, merged_kernel
+from dynsim.kernels.jit import apart_kernel, free_kernel, internal_kernel, merged_kernel
 from dynsim.kernels.system import System
 from dynsim.kernels.tree.joints import normalise
 from dynsim.kernels.tree.support import watch_support
@@ -206,13 +206,15 @@ def conclude(system: System, ws: Workspace, run: Run, error, order):
     return run.event.shape[0] > 0 and fire_events(run)
 
 
-@kernel
+@free_kernel
 def advance_explicit(system: System, ws: Workspace, run: Run, limit):
     """:func:`advance` of the explicit methods."""
     order = 5.0 if run.method == DOPRI5 else 4.0
     taken, error = 0, 0.0
+    if limit < 0:
+        return
     while waiting(system, ws, run):
-        if taken >= limit or finished(run):
+        if taken >= limit or finished(run) or stalled(run):
             return
         taken += 1
         if run.count[PENDING] == 0:
@@ -229,14 +231,18 @@ def conclude_apart(system: System, ws: Workspace, run: Run, error, order):
     return conclude(system, ws, run, error, order)
 
 
-@kernel
+@free_kernel
 def advance_radau5(system: System, ws: Workspace, run: Run, limit):
     """:func:`advance` of RADAU5. Samples wait on, with three others at most, where only ``limit`` has ended it: which
     ones are computed together must not depend on how fast the machine is."""
     taken, error = 0, 0.0
+    if limit < 0:
+        return
     while waiting(system, ws, run) and not finished(run):
         if taken >= limit:
             return
+        if stalled(run):
+            break
         taken += 1
         if run.count[PENDING] == 0:
             propose(system, ws, run)
@@ -251,10 +257,11 @@ def advance_radau5(system: System, ws: Workspace, run: Run, limit):
 
 
 def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:
-    """Take up to ``limit`` steps towards END; run.count[STATUS] says how it ended.
+    """Take up to ``limit`` steps towards END; run.count[STATUS] says how it ended. Fewer than 0: only be loaded.
 
-    Returns before that when an event or a tick wants the caller to look (LOGGED, TICKED), and when the next step would
-    end beyond HOLD: it is kept, PENDING, and accepted by the next call unless the caller drops it.
+    Returns before that when an event or a tick wants the caller to look (LOGGED, TICKED), when the next step would end
+    beyond HOLD: it is kept, PENDING, and accepted by the next call unless the caller drops it; and when another thread
+    has set ASKED.
 
     Three compiled functions behind one name, so that each is only compiled when it is used.
     """

@@ -56,7 +56,7 @@ HAND_X, HAND_Y, HAND_Z = 6, 7, 8
 TIP_MARGIN = 9
 
 # Steps that a root may take; regula falsi with halving (Illinois) needs about eight. Guards that jump, as forces do
-# where another split of them begins, are bisected in the end.
+# where another split of them begins, are bisected in the end. Once there were too many the next one is the last.
 SEARCH_LIMIT, FALSI_LIMIT = 60, 16
 
 
@@ -148,7 +148,11 @@ def cut_step(system: System, ws: Workspace, run: Run):
     count[SEARCHING] += 1
     low, high = clock[LOW], clock[HIGH]
     if high - low <= event_tolerance(clock[TIME]) or count[SEARCHING] > SEARCH_LIMIT:
-        if hit and h == high:
+        # A step of RADAU5 taken again is not the same to the bit, since its Newton method goes by how the last one has
+        # contracted: at HIGH it may miss what had passed zero there, some times or for ever.
+        if h == high and (hit or count[SEARCHING] > SEARCH_LIMIT):
+            if not hit:
+                keep_passed(run)
             count[SEARCHING], count[FIRED] = 0, 1
             return False
         clock[STEP] = high
@@ -165,11 +169,20 @@ def cut_step(system: System, ws: Workspace, run: Run):
 
 
 @internal_kernel
+def keep_passed(run: Run):
+    """Events that had passed zero at HIGH keep the value that they had there: whoever does as they say looks at it."""
+    for e in range(run.event.shape[0]):
+        if happened(run, e, run.event[e, AT_HIGH]):
+            run.event[e, VALUE] = run.event[e, AT_HIGH]
+
+
+@internal_kernel
 def passes_over(system: System, ws: Workspace, run: Run):
     """True when a contact has been passed over within the step: STEP is then the one to take instead."""
     part = too_long(system.unilateral, ws, run.clock[STEP], run.gaps)
-    # What is none, after all, does not shorten steps for ever.
-    if part < 1.0 and run.count[GRAZING] < SEARCH_LIMIT:
+    # What is none, after all, does not shorten steps for ever, nor to nothing.
+    shorter = part * run.clock[STEP] > event_tolerance(run.clock[TIME])
+    if part < 1.0 and shorter and run.count[GRAZING] < SEARCH_LIMIT:
         run.count[GRAZING] += 1
         run.clock[STEP] *= part
         return True

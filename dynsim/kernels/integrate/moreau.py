@@ -30,7 +30,7 @@ from dynsim.kernels.integrate.step_drives import (
     eliminate_currents,
     limits_agree,
 )
-from dynsim.kernels.integrate.steps import choose_step, finished, finite
+from dynsim.kernels.integrate.steps import choose_step, finished, finite, stalled
 from dynsim.kernels.integrate.time_stepping import (
     SteppingArrays,
     constraint_rates,
@@ -39,7 +39,7 @@ from dynsim.kernels.integrate.time_stepping import (
     place_joints,
 )
 from dynsim.kernels.integrate.watch import watch
-from dynsim.kernels.jit import internal_kernel, kernel
+from dynsim.kernels.jit import free_kernel, internal_kernel
 from dynsim.kernels.ledger import drive_powers
 from dynsim.kernels.system import System
 from dynsim.kernels.tree.angles import sine_cosine
@@ -335,12 +335,14 @@ def advance_time(s: SteppingArrays, clock):
     clock[ki.STEP] = whole
 
 
-@kernel
+@free_kernel
 def advance_moreau(system: System, ws: Workspace, run: Run, limit):
     """``advance`` of time stepping."""
     clock, count, taken = run.clock, run.count, 0
+    if limit < 0:
+        return
     while not commands_due(system, ws, run):
-        if finished(run) or taken >= limit:
+        if finished(run) or taken >= limit or stalled(run):
             return
         taken += 1
         if count[ki.PENDING] == 0:

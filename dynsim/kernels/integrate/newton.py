@@ -20,9 +20,11 @@ NEWTON_CLOCK_SIZE = 6
 CLOSE_ENOUGH, CLOSE_UNDAMPED = 0.03, 0.003
 # NewtonArrays.count, int: the Jacobian must be made anew; accepted steps when it was made, and when the stages were
 # kept for extrapolation; there are such; Jacobians, factorisations, Newton iterations, steps in which they diverged;
-# samples whose states are there and that are not recorded yet.
+# samples whose states are there and that are not recorded yet; columns of Jacobians, by which whoever listens sees that
+# a large one comes on.
 STALE, MADE_AT, SEEN, EXTRAPOLATES, JACOBIANS, FACTORS, ITERATIONS, DIVERGED, WAITING = 0, 1, 2, 3, 4, 5, 6, 7, 8
-NEWTON_COUNT_SIZE = 9
+COLUMNS = 9
+NEWTON_COUNT_SIZE = 10
 
 
 class StageLanes(NamedTuple):

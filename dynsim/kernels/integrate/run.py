@@ -23,6 +23,8 @@ RUNNING, FINISHED, NOT_FINITE, STEP_TOO_SMALL, NOT_PROJECTED, NO_FORCES = 0, 1, 
 FORCES_REVERSED, SEVERAL_FORCES, STOPPED = 6, 7, 8
 # Under the unilateral law: no forces agree with Coulomb's law; modes change without end.
 NO_CONTACT_FORCES, CHATTER = 9, 10
+# MOST_TRIALS steps have come next to nowhere. By whoever listens: the wall limit is over; one step does not end.
+NO_PROGRESS, OUT_OF_TIME, STUCK = 11, 12, 13
 
 # Run.clock
 TIME, STEP, LAST_ERROR, END, RTOL, ATOL, STEP_MAX = 0, 1, 2, 3, 4, 5, 6
@@ -30,7 +32,9 @@ NOT_UNIQUE = 7  # end of the step at which the contact forces were not unique, w
 # A step that would end beyond HOLD is left pending, not accepted; the step size proposed before a cut; error norm of
 # the step taken; the bracket of the root that is searched, from TIME on [s].
 HOLD, PROPOSED, ERROR, LOW, HIGH = 8, 9, 10, 11, 12
-CLOCK_SIZE = 13
+# Time at which trials were last counted from zero, and the least that MOST_TRIALS of them have to come on by [s].
+COUNTED_SINCE, LEAST_PROGRESS = 13, 14
+CLOCK_SIZE = 15
 # Run.count, int
 STEPS, REJECTED, EVALUATIONS, PROJECTIONS, SAMPLE, STATUS, STARTED = 0, 1, 2, 3, 4, 5, 6
 # A step waits to be accepted; trials of a root; which end of the bracket moved last; the step ends at an event; it ends
@@ -39,7 +43,11 @@ PENDING, SEARCHING, TURNED_BACK, FIRED, TRIMMED, LOGGED, TICKED = 7, 8, 9, 10, 1
 NEXT_BREAK = 14  # index of the first of Run.breaks that is not past
 MODES_DUE = 15  # contact modes are to be chosen at the next start, which is that of the run, or follows a jump of rates
 GRAZING = 16  # how often the step was shortened because it passed over a contact
-COUNT_SIZE = 17
+TRIALS = 17  # steps tried, accepted or not, since COUNTED_SINCE
+ASKED = 18  # written by another thread: the piece is to end at the next step
+COUNT_SIZE = 19
+# Steps that are looked at together, and the part of a run's duration that they have to come on by.
+MOST_TRIALS, PROGRESS = 10_000, 1e-6
 AT_START, AFTER_JUMP = 1, 2
 # Run.event, and Run.event_table, int
 EVENT_LEVEL, SIDE, START_VALUE, VALUE, AT_LOW, AT_HIGH = 0, 1, 2, 3, 4, 5
@@ -129,12 +137,14 @@ def new_run(
     events: tuple[np.ndarray, np.ndarray] | None = None,
     ticks: tuple[np.ndarray, np.ndarray] | None = None,
     breaks: np.ndarray | None = None,
+    least_progress: float | None = None,
     support: SupportArrays | None = None,
     stepping: SteppingArrays | None = None,
     lanes: bool = False,
 ) -> Run:
     """Allocate a :class:`Run` from t = 0 at state y, (layout.size,).
 
+    ``least_progress``: of MOST_TRIALS steps [s]; default: PROGRESS of the run until ``end``.
     ``lanes``: RADAU5 evaluates right-hand sides together, see dynsim.kernels.lanes.system.has_forms.
 
     Raises
@@ -148,6 +158,7 @@ def new_run(
     clock = np.zeros(CLOCK_SIZE)
     clock[[STEP, LAST_ERROR, END, RTOL, ATOL, STEP_MAX]] = step, 1e-4, end, rtol, atol, step_max
     clock[HOLD] = np.inf
+    clock[LEAST_PROGRESS] = PROGRESS * end if least_progress is None else least_progress
     event, event_table = events or (np.zeros((0, EVENT_SIZE)), np.zeros((0, EVENT_TABLE_SIZE)))
     tick, tick_table = ticks or (np.zeros((0, TICK_SIZE)), np.zeros((0, TICK_TABLE_SIZE)))
     extremes = np.zeros((c, EXTREMES_SIZE))

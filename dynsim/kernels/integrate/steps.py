@@ -7,12 +7,17 @@ import math
 from dynsim.kernels.arrays import CONTRADICTORY, Workspace
 from dynsim.kernels.integrate.events import next_tick
 from dynsim.kernels.integrate.run import (
+    ASKED,
     ATOL,
+    COUNTED_SINCE,
     END,
     FINISHED,
     FIXED_STEP,
     LAST_ERROR,
+    LEAST_PROGRESS,
+    MOST_TRIALS,
     NO_FORCES,
+    NO_PROGRESS,
     NOT_FINITE,
     REJECTED,
     RK4,
@@ -23,6 +28,7 @@ from dynsim.kernels.integrate.run import (
     STEP_MAX,
     STEP_TOO_SMALL,
     TIME,
+    TRIALS,
     TRIMMED,
     Run,
 )
@@ -63,11 +69,29 @@ def finite(values):
 
 @merged_kernel
 def finished(run: Run):
-    """True when the run has ended, for whatever reason; sets STATUS at END."""
+    """True when the run has ended, for whatever reason, or is asked to; sets STATUS at END."""
     end = run.clock[END]
     if run.count[STATUS] == RUNNING and end - run.clock[TIME] <= 1e-12 * max(1.0, end):
         run.count[STATUS] = FINISHED
-    return run.count[STATUS] != RUNNING
+    return run.count[STATUS] != RUNNING or run.count[ASKED] != 0
+
+
+@internal_kernel
+def stalled(run: Run):
+    """Count one more trial; True, and STATUS, when the last MOST_TRIALS of them have come next to nowhere.
+
+    The bound of every loop of steps, trials, events and restarts, whatever keeps it going.
+    """
+    clock, count = run.clock, run.count
+    count[TRIALS] += 1
+    if count[TRIALS] < MOST_TRIALS:
+        return False
+    stands = clock[TIME] - clock[COUNTED_SINCE] <= clock[LEAST_PROGRESS]
+    if stands:
+        count[STATUS] = NO_PROGRESS
+    else:
+        count[TRIALS], clock[COUNTED_SINCE] = 0, clock[TIME]
+    return stands
 
 
 @internal_kernel

@@ -1,0 +1,243 @@
+"""Compiled code in a thread of its own, while the thread that has called for it listens.
+
+Compiled code neither hears signals nor sees a clock, and one step of it may take a minute where a contact problem has
+no solution. So it runs without the interpreter's lock in a helper thread. The caller's thread wakes for a signal, and
+looks ten times a second at whatever else may want the run to end. Then the piece is asked to end at its next step.
+Where it does not in time it is left alone: what was recorded until then is in its arrays. So is the compiler.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time as clock
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from queue import Empty, SimpleQueue
+from typing import Any
+
+import numpy as np
+
+from dynsim import interruption
+from dynsim.engine.outcome import kernels_logged
+from dynsim.engine.prepare import Prepared
+from dynsim.kernels.integrate import driver
+from dynsim.kernels.integrate import run as ki
+
+log = logging.getLogger(__name__)
+
+# Between two looks, and for how long a piece that was asked to end is waited for [s].
+LOOK_S, PATIENCE_S = 0.1, 0.5
+# After so long in one and the same step it is stuck [s]: the longest that was ever seen, of 24 contacts whose forces no
+# method of the solver finds, took 80.
+STUCK_S = 600.0
+
+
+class _Helper:
+    """A thread that does what it is given, one thing after the other."""
+
+    def __init__(self) -> None:
+        # Of the process that it is a thread of: a fork has none.
+        self.pid = os.getpid()
+        self.todo: SimpleQueue[tuple[object, Callable[[], None]] | None] = SimpleQueue()
+        self.done: SimpleQueue[tuple[object, BaseException | None]] = SimpleQueue()
+        threading.Thread(target=_serve, args=(self.todo, self.done), name="compiled code", daemon=True).start()
+
+    def __del__(self) -> None:
+        self.todo.put(None)
+
+    def wait(self, task: object, timeout: float) -> tuple[bool, BaseException | None]:
+        """Whether a task is done by then, and what it has raised."""
+        try:
+            while True:
+                done, error = self.done.get(timeout=timeout)
+                # Others are of callers who were interrupted themselves.
+                if done is task:
+                    return True, error
+        except Empty:
+            return False, None
+
+
+def _serve(todo: SimpleQueue[Any], done: SimpleQueue[Any]) -> None:
+    while (item := todo.get()) is not None:
+        task, work = item
+        error: BaseException | None = None
+        try:
+            work()
+        except BaseException as raised:
+            error = raised
+        done.put((task, error))
+        # What it has worked on is not kept until the next task comes.
+        del item, work, error
+
+
+_of_this_thread = threading.local()
+
+
+def _helper() -> _Helper:
+    helper: _Helper | None = getattr(_of_this_thread, "helper", None)
+    if helper is None or helper.pid != os.getpid():
+        helper = _of_this_thread.helper = _Helper()
+    return helper
+
+
+def attend(
+    work: Callable[[], None], ask: Callable[[], None], look: Callable[[], None]
+) -> tuple[bool, BaseException | None]:
+    """Do ``work`` in the helper thread of this one, and listen meanwhile.
+
+    Parameters
+    ----------
+    work : that releases the interpreter's lock
+    ask : asks it to end soon
+    look : called every LOOK_S; what it raises, as what signals raise here, asks the work to end
+
+    Returns
+    -------
+    ended : False when the work was left alone: it may go on for a while, and write to its arrays
+    raised : by ``look``, or by a signal
+
+    Raises
+    ------
+    Exception
+        That of the work.
+    """
+    helper, task = _helper(), object()
+    ended, error, wish = False, None, None
+    try:
+        try:
+            helper.todo.put((task, work))
+            while not ended:
+                ended, error = helper.wait(task, LOOK_S)
+                if not ended:
+                    look()
+        except BaseException as raised:
+            wish = raised
+            ask()
+            if not ended:
+                ended, error = helper.wait(task, PATIENCE_S)
+    finally:
+        # Also after a second signal.
+        if not ended:
+            _of_this_thread.helper = None
+            interruption.leave()
+    if error is not None:
+        raise error
+    return ended, wish
+
+
+class OutOfTime(Exception):
+    """Whoever listens has seen a run for too long; ``status`` is what it has come to."""
+
+    def __init__(self, status: int) -> None:
+        super().__init__(status)
+        self.status = status
+
+
+class WallWatch:
+    """Looks at the clock: for the wall limit of a run, and for one step that does not end.
+
+    Parameters
+    ----------
+    limit : wall time that the integration may take [s]; None: any
+    """
+
+    def __init__(self, limit: float | None) -> None:
+        self._limit, self._spent = limit, 0.0
+        self._looked = clock.monotonic()
+        self._seen, self._still = -1, 0.0
+
+    @property
+    def over(self) -> bool:
+        """The limit is."""
+        return self._limit is not None and self._spent > self._limit
+
+    def begin(self) -> None:
+        """A piece begins; what was between pieces counts as nothing."""
+        self._looked, self._seen, self._still = clock.monotonic(), -1, 0.0
+
+    def spend(self) -> float:
+        """Count the time since the last look, and return it [s]."""
+        now = clock.monotonic()
+        passed, self._looked = now - self._looked, now
+        self._spent += passed
+        return passed
+
+    def look(self, run: ki.Run) -> None:
+        """Raise :class:`OutOfTime` where there is a reason."""
+        passed = self.spend()
+        if self.over:
+            raise OutOfTime(ki.OUT_OF_TIME)
+        seen = int(run.count.sum()) + (0 if run.newton is None else int(run.newton.count.sum()))
+        # A process that was stopped for a while has not looked either.
+        self._still = self._still + min(passed, 10.0 * LOOK_S) if seen == self._seen else 0.0
+        self._seen = seen
+        if self._still > STUCK_S:
+            raise OutOfTime(ki.STUCK)
+
+
+def load(prepared: Prepared) -> None:
+    """Load the kernels of a run, or compile them, and log that.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        The compiler goes on alone.
+    """
+    with kernels_logged(log):
+        compiled = partial(driver.advance, prepared.system, prepared.workspace, prepared.run, -1)
+        _, raised = attend(compiled, lambda: None, interruption.check)
+    if raised is not None:
+        raise raised
+
+
+def advance(
+    prepared: Prepared, limit: int, watch: WallWatch, look: Callable[[], None]
+) -> tuple[Prepared, BaseException | None]:
+    """One piece of up to ``limit`` steps, see :func:`dynsim.kernels.integrate.driver.advance`.
+
+    STATUS may be OUT_OF_TIME or STUCK besides what the kernels make of it.
+
+    Returns
+    -------
+    prepared : the same, or a copy where the piece was left alone; that one cannot go on
+    raised : what ``look`` has raised, or a signal
+    """
+    run = prepared.run
+
+    def ask() -> None:
+        run.count[ki.ASKED] = 1
+
+    def both() -> None:
+        look()
+        watch.look(run)
+
+    watch.begin()
+    ended, raised = attend(partial(driver.advance, prepared.system, prepared.workspace, run, limit), ask, both)
+    watch.spend()
+    if not ended:
+        prepared = _copied(prepared)
+    count = prepared.run.count
+    count[ki.ASKED] = 0
+    if not ended or count[ki.STATUS] == ki.RUNNING:
+        if isinstance(raised, OutOfTime):
+            count[ki.STATUS] = raised.status
+        elif not ended:
+            count[ki.STATUS] = ki.STUCK
+        elif watch.over:
+            count[ki.STATUS] = ki.OUT_OF_TIME
+    return prepared, None if isinstance(raised, OutOfTime) else raised
+
+
+def _copied(value: Any) -> Any:
+    """Tables and arrays of their own, in which nothing moves any more."""
+    if isinstance(value, Prepared):
+        return replace(value, run=_copied(value.run), workspace=_copied(value.workspace), system=_copied(value.system))
+    if isinstance(value, np.ndarray):
+        return value.copy()
+    if isinstance(value, tuple):
+        parts = map(_copied, value)
+        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+    return value

@@ -1,0 +1,377 @@
+"""Every run ends: what bounds the loops of the integration where a trial does not repeat, and what stops a run."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import dynsim
+from dynsim import interruption
+from dynsim.engine import attended, kinematic
+from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped
+from dynsim.kernels.integrate import driver, events, radau, steps
+from dynsim.kernels.integrate import newton as kn
+from dynsim.kernels.integrate import run as ki
+
+ENDLESS = Path(__file__).parents[1] / "data" / "endless" / "arm.yaml"
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left(monkeypatch: pytest.MonkeyPatch):
+    """What was left alone here has ended, or will."""
+    monkeypatch.setattr(interruption, "_left", False)
+
+
+def test_an_arm_on_a_pipe_comes_to_its_end():
+    """At 0.196 s a step of radau5 that ends the search does not repeat to the bit; references depend on all 10 s."""
+    record = dynsim.simulate(dynsim.load_scenario(ENDLESS))
+    other = dynsim.simulate(dynsim.load_scenario(ENDLESS, overrides={"integrator.method": "dopri5"}))
+    assert record.time[-1] == 10.0
+    assert [(event.kind, event.name) for event in record.events] == [(event.kind, event.name) for event in other.events]
+    energy = record.summary["electrical_energy_J"]
+    assert energy == pytest.approx(other.summary["electrical_energy_J"], rel=1e-6)
+
+
+# ---- Loops of the driver, as plain Python
+
+
+def table(count: int = 1) -> Any:
+    """The moving part of a run with so many events, as far as the search for their roots reads it."""
+    event, event_table = np.zeros((count, ki.EVENT_SIZE)), np.zeros((count, ki.EVENT_TABLE_SIZE), dtype=int)
+    event[:, ki.SIDE] = event[:, ki.START_VALUE] = 1.0
+    return SimpleNamespace(
+        clock=np.zeros(ki.CLOCK_SIZE), count=np.zeros(ki.COUNT_SIZE, dtype=int), event=event, event_table=event_table
+    )
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_search_ends_whatever_its_trials_say(monkeypatch: pytest.MonkeyPatch, seed: int):
+    """A root at 0.3 of the step, known to 1e-12 only: closer trials lie on either side of it, as they like."""
+    random = np.random.default_rng(seed)
+    run = table(2)
+    run.clock[ki.STEP] = 1e-3
+    noise = 0.0 if seed == 0 else 1e-12
+
+    def guard(system: Any, t: float, ws: Any, run: Any, e: int) -> float:
+        return 1.0 if e == 1 else 0.3e-3 - t + noise * random.uniform(-1.0, 1.0)
+
+    monkeypatch.setattr(events, "guard", guard)
+    trials = 1
+    while events.cut_step(None, None, run):
+        trials += 1
+        assert trials < 2 * events.SEARCH_LIMIT
+    assert run.count[ki.FIRED] == 1
+    assert run.clock[ki.STEP] == pytest.approx(0.3e-3, abs=1e-11)
+    # Whoever does what the event asks for sees that it has passed.
+    assert events.happened(run, 0, run.event[0, ki.VALUE])
+    assert not events.happened(run, 1, run.event[1, ki.VALUE])
+
+
+def test_a_step_that_never_passes_again_ends_the_search_all_the_same(monkeypatch: pytest.MonkeyPatch):
+    run, values = table(), iter([-1.0])
+    run.clock[ki.STEP] = 1e-3
+    monkeypatch.setattr(events, "guard", lambda *_: next(values, 1e-15))
+    trials = 1
+    while events.cut_step(None, None, run):
+        trials += 1
+        assert trials < 2 * events.SEARCH_LIMIT
+    assert (run.count[ki.FIRED], run.clock[ki.STEP]) == (1, 1e-3)
+    assert events.happened(run, 0, run.event[0, ki.VALUE])
+
+
+def test_what_seems_to_be_passed_over_for_ever_does_not_shorten_steps_to_nothing(monkeypatch: pytest.MonkeyPatch):
+    run = table()
+    run.clock[ki.STEP], run.gaps = 1e-3, None
+    monkeypatch.setattr(events, "too_long", lambda *_: 0.01)
+    trials = 0
+    while events.passes_over(SimpleNamespace(unilateral=None), None, run):
+        trials += 1
+        assert trials <= events.SEARCH_LIMIT
+    assert run.clock[ki.STEP] > events.event_tolerance(0.0)
+
+
+def test_steps_that_are_always_refused_are_too_small_in_the_end():
+    run = table()
+    run.clock[ki.STEP], run.y_new, run.stage, run.method = 1e-3, np.zeros(2), np.zeros((8, 2)), ki.RADAU5
+    ws = SimpleNamespace(counts=np.zeros(20, dtype=int))
+    trials = 0
+    while run.count[ki.STATUS] == ki.RUNNING:
+        assert steps.rejected(ws, run, 1.0 + 1e-9, 4.0)
+        trials += 1
+        assert trials < 1000
+    assert run.count[ki.STATUS] == ki.STEP_TOO_SMALL
+
+
+def test_a_step_of_radau5_whose_newton_method_diverges_takes_two_jacobians_at_most(monkeypatch: pytest.MonkeyPatch):
+    """The first may have been made before the step; none is made twice at one place."""
+    n = 2
+    newton = kn.newton_arrays(n, 0, 0, 2 * n, 2 * n)
+    newton.count[kn.STALE], newton.count[kn.MADE_AT] = 0, -1
+    run = SimpleNamespace(
+        clock=np.ones(ki.CLOCK_SIZE), count=np.zeros(ki.COUNT_SIZE, dtype=int), newton=newton,
+        y=np.zeros(2 * n), y_new=np.zeros(2 * n), stage=np.zeros((8, 2 * n)),
+    )  # fmt: skip
+    made: list[str] = []
+
+    def differentiate(system: Any, ws: Any, run: Any) -> None:
+        made.append("jacobian")
+        run.newton.count[kn.STALE], run.newton.count[kn.MADE_AT] = 0, run.count[ki.STEPS]
+
+    def solve_stages(*_: Any) -> bool:
+        made.append("solve")
+        return False
+
+    monkeypatch.setattr(radau, "differentiate", differentiate)
+    monkeypatch.setattr(radau, "factor_both", lambda *_: None)
+    monkeypatch.setattr(radau, "solve_stages", solve_stages)
+    assert radau.step_radau5(None, None, run) == radau.NO_STAGES
+    assert made == ["solve", "jacobian", "solve"]
+
+
+# ---- The progress watch
+
+TINY = {"record.rate_hz": 10, "metrics.settle_s": 0}
+
+
+@pytest.mark.parametrize(
+    ("method", "words"),
+    [
+        ("radau5", r"elbow_4 slides, elbow_7 slides"),
+        ("dopri5", r"elbow_4 slides, elbow_7 slides"),
+        ("rk43", r"elbow_4 slides, elbow_7 slides"),
+        ("rk4", r"elbow_4 slides, elbow_7 slides"),
+        ("time_stepping", r"elbow_4 sticks, elbow_7 sticks"),
+    ],
+)
+def test_steps_that_come_nowhere_end_a_run(method: str, words: str):
+    """By every method: of 10 s they come on by 1e-9 s at a time."""
+    step = "step_s" if method in ("rk4", "time_stepping") else "step_max_s"
+    overrides = {**TINY, "integrator.method": method, f"integrator.{step}": 1e-13}
+    with pytest.raises(SimulationStopped) as raised:
+        dynsim.simulate(dynsim.load_scenario("elbow_comparison_floor", "two_elbows", overrides))
+    stop = raised.value
+    assert stop.kind == "no_progress"
+    assert stop.time < 1e-8
+    assert "no progress, the last 10000 steps came no further than 1.0e-05 s, the last of 1.0e-13 s; " in str(stop)
+    assert stop.record is not None
+    assert not stop.record.complete
+    assert stop.record.time.tolist() == [0.0]
+    assert stop.record.provenance["stopped"]["kind"] == "no_progress"
+
+
+def test_steps_are_counted_from_where_they_last_came_on():
+    """A run of so many steps that comes on is none of those that stand."""
+    overrides = {**TINY, "integrator.step_max_s": 1e-5, "duration_s": 0.5, "integrator.method": "rk43"}
+    record = dynsim.simulate(dynsim.load_scenario("single_pendulum", overrides=overrides))
+    assert record.summary["rhs_evaluations"] > 4 * 2 * ki.MOST_TRIALS
+
+
+def test_a_simulation_that_comes_nowhere_stops_with_its_trace():
+    overrides = {**TINY, "integrator.step_max_s": 1e-13, "integrator.method": "rk43"}
+    simulation = dynsim.Simulation(dynsim.load_scenario("single_pendulum", overrides=overrides), duration=np.inf)
+    with pytest.raises(SimulationStopped, match="no progress") as raised:
+        simulation.advance(1.0)
+    assert raised.value.record.time.tolist() == [0.0]
+    assert not simulation.record().complete
+
+
+def test_runs_whose_steps_share_lanes_but_come_nowhere_are_looked_at_alone():
+    overrides = {**TINY, "integrator.step_s": 1e-12, "integrator.method": "rk4"}
+    lengths = [{"plant.chain.0.length_m": length} for length in (0.5, 1.0)]
+    runs = [dynsim.load_scenario("single_pendulum", overrides={**overrides, **length}) for length in lengths]
+    assert all("no progress" in result.reason for result in dynsim.simulate_batch(runs))
+
+
+# ---- The wall limit
+
+SLOW = {"duration_s": 100, "record.rate_hz": 1, "metrics.settle_s": 0, "integrator.step_max_s": 1e-6}
+SLOW |= {"integrator.method": "rk43", "integrator.wall_limit_s": 0.3}
+
+
+def test_the_wall_limit_ends_a_run_with_what_it_has():
+    with pytest.raises(SimulationStopped, match=r"wall limit, integrator.wall_limit_s = 0\.3 s, is over") as raised:
+        dynsim.simulate(dynsim.load_scenario("single_pendulum", overrides=SLOW))
+    assert raised.value.kind == "out_of_time"
+    assert 0.0 < raised.value.time < 100.0
+    assert len(raised.value.record.time) >= 1
+
+
+def test_the_wall_limit_of_a_simulation_is_that_of_all_its_pieces():
+    simulation = dynsim.Simulation(dynsim.load_scenario("single_pendulum", overrides=SLOW))
+
+    def advance() -> None:
+        for k in range(1, 100_000):
+            simulation.advance(1e-3 * k)
+
+    with pytest.raises(SimulationStopped, match="wall limit"):
+        advance()
+
+
+def test_the_wall_limit_ends_a_snake():
+    overrides = {"duration_s": 1000, "record.rate_hz": 1, "integrator.wall_limit_s": 0.2}
+    scenario = dynsim.load_scenario("snake_circle", overrides=overrides)
+    with pytest.raises(SimulationStopped, match=r"wall limit, .*, is over, in mode") as raised:
+        kinematic.simulate(scenario)
+    assert len(raised.value.record.time) > 1
+
+
+def test_the_key_that_the_wall_limit_replaces_is_told():
+    with pytest.raises(ScenarioError, match=r"integrator\.time_limit_h = 3: is no longer there; wall_limit_s"):
+        dynsim.load_scenario("single_pendulum", overrides={"integrator.time_limit_h": 3})
+
+
+# ---- Who listens while compiled code runs
+
+PENDULUM = {"duration_s": 2.0, "record.rate_hz": 10, "metrics.settle_s": 0}
+
+
+class Stands:
+    """In the stead of the compiled driver: a step that does not end until it is let go, and heeds nobody."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, after: int = 0) -> None:
+        self.inside, self.released, self.left = threading.Event(), threading.Event(), after
+        self.advance = driver.advance
+        monkeypatch.setattr(driver, "advance", self)
+
+    def __call__(self, system: Any, ws: Any, run: Any, limit: int) -> None:
+        if limit < 0:
+            self.advance(system, ws, run, limit)
+            return
+        self.advance(system, ws, run, 20)
+        self.inside.set()
+        self.released.wait(60.0)
+
+
+def interrupt_when(event: threading.Event) -> None:
+    """Ctrl-C to this process once something has happened."""
+
+    def wait() -> None:
+        event.wait(60.0)
+        time.sleep(0.05)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+@pytest.fixture
+def ctrl_c():
+    """Where tests run in the background SIGINT is ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_ctrl_c_ends_a_run_whose_step_does_not(monkeypatch: pytest.MonkeyPatch, ctrl_c: None):
+    stands = Stands(monkeypatch)
+    interrupt_when(stands.inside)
+    try:
+        with pytest.raises(SimulationInterrupted) as raised:
+            dynsim.simulate(dynsim.load_scenario("single_pendulum", overrides=PENDULUM))
+        assert not stands.released.is_set()
+    finally:
+        stands.released.set()
+    assert raised.value.time > 0.0
+    assert not raised.value.record.complete
+
+
+def test_a_step_that_does_not_end_is_stuck(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(attended, "STUCK_S", 0.3)
+    stands = Stands(monkeypatch)
+    try:
+        with pytest.raises(SimulationStopped, match=r"one step of .* does not end") as raised:
+            dynsim.simulate(dynsim.load_scenario("single_pendulum", overrides=PENDULUM))
+    finally:
+        stands.released.set()
+    assert raised.value.kind == "stuck"
+    assert raised.value.record is not None
+
+
+def test_steps_that_take_long_are_not_stuck(monkeypatch: pytest.MonkeyPatch):
+    """Each step of a run longer than half of what is taken for stuck: it goes on, because it comes on."""
+    monkeypatch.setattr(attended, "STUCK_S", 0.4)
+    advance = driver.advance
+
+    def slowly(system: Any, ws: Any, run: Any, limit: int) -> None:
+        if limit < 0:
+            advance(system, ws, run, limit)
+            return
+        for _ in range(5):
+            time.sleep(0.25)
+            advance(system, ws, run, 1)
+        advance(system, ws, run, limit)
+
+    monkeypatch.setattr(driver, "advance", slowly)
+    assert dynsim.simulate(dynsim.load_scenario("single_pendulum", overrides=PENDULUM)).complete
+
+
+@pytest.mark.parametrize("law", ["glued", "real"])
+def test_a_simulation_goes_on_after_ctrl_c_as_if_nothing_had_been(
+    monkeypatch: pytest.MonkeyPatch, ctrl_c: None, law: str
+):
+    name = "elbow_comparison" if law == "glued" else "elbow_comparison_floor"
+    scenario = dynsim.load_scenario(name, "two_elbows", {"duration_s": 0.5})
+    whole = dynsim.Simulation(scenario)
+    whole.advance(0.5)
+    advance, begun = driver.advance, threading.Event()
+
+    def interrupted(system: Any, ws: Any, run: Any, limit: int) -> None:
+        if limit > 0 and not begun.is_set():
+            advance(system, ws, run, 10)
+            begun.set()
+            while run.count[ki.ASKED] == 0:
+                time.sleep(0.01)
+        advance(system, ws, run, limit)
+
+    monkeypatch.setattr(driver, "advance", interrupted)
+    simulation = dynsim.Simulation(scenario)
+    interrupt_when(begun)
+    with pytest.raises(KeyboardInterrupt):
+        simulation.advance(0.5)
+    assert not simulation.finished
+    simulation.advance(0.5)
+    assert simulation.state.q.tobytes() == whole.state.q.tobytes()
+    assert simulation.happened == whole.happened
+
+
+def test_a_simulation_whose_step_did_not_end_does_not_go_on(monkeypatch: pytest.MonkeyPatch, ctrl_c: None):
+    stands = Stands(monkeypatch)
+    simulation = dynsim.Simulation(dynsim.load_scenario("single_pendulum", overrides=PENDULUM))
+    interrupt_when(stands.inside)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            simulation.advance(2.0)
+    finally:
+        stands.released.set()
+    record = simulation.record()
+    assert not record.complete
+    assert "does not end" in record.summary["warnings"][-1]
+
+
+def test_what_the_work_raises_is_raised():
+    def work() -> None:
+        raise ValueError("of the work")
+
+    with pytest.raises(ValueError, match="of the work"):
+        attended.attend(work, lambda: None, lambda: None)
+
+
+def test_work_of_one_thread_is_not_mistaken_for_that_of_another_task():
+    done: list[int] = []
+    release = threading.Event()
+
+    def look() -> None:
+        raise KeyboardInterrupt
+
+    ended, raised = attended.attend(lambda: release.wait(30.0), lambda: None, look)
+    assert (ended, type(raised)) == (False, KeyboardInterrupt)
+    assert attended.attend(lambda: done.append(1), lambda: None, lambda: None) == (True, None)
+    assert done == [1]
+    release.set()
