@@ -105,10 +105,10 @@ def chattered(contacts: Sequence[Contact], unilateral: UnilateralArrays) -> list
 def coarse(stepping: dict[str, Any], turnover: float) -> list[str]:
     """Steps so long that they take or make energy, or let points sink in, and the step that would not.
 
-    turnover : [J]
+    turnover : [J]; zero where the run has ended before anything moved
     """
     found, step, worst = [], stepping["step_s"], stepping["scheme_loss_worst_J"]
-    if abs(worst) > SCHEME_LIMIT * turnover:
+    if turnover > 0.0 and abs(worst) > SCHEME_LIMIT * turnover:
         shorter = _shorter(step * SCHEME_LIMIT * turnover / abs(worst))
         found.append(
             f"time stepping: the steps themselves {'took' if worst > 0.0 else 'made'} up to {abs(worst):.3g} J, "

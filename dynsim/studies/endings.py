@@ -28,7 +28,7 @@ from dynsim.engine import Progress, simulate
 from dynsim.errors import DynsimError, SimulationInterrupted, SimulationStopped
 from dynsim.files import write_json
 from dynsim.scenario.reading import scenario_from_resolved
-from dynsim.studies.processes import WorkerLost, run_in_processes
+from dynsim.studies.processes import WorkerInterrupted, WorkerLost, run_in_processes
 
 Array = NDArray[np.float64]
 
@@ -275,6 +275,8 @@ def endings(
     def take_late(number: int, result: Callable[[], Ending | None]) -> None:
         try:
             ending = result()
+        except WorkerInterrupted:
+            return
         except WorkerLost as lost:
             ending = Ending(number, "", "", type(lost).__name__, "its process was lost", math.nan, math.nan)
         except SimulationInterrupted:
