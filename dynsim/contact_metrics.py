@@ -107,17 +107,17 @@ def chattered(contacts: Sequence[Contact], unilateral: UnilateralArrays) -> list
 def coarse(stepping: dict[str, Any], scale: float) -> list[str]:
     """Steps so long that they take or make energy, blur it, or let points sink in, and the step that would not.
 
-    scale : turnover of the energy, and no less than what the ledger resolves [J]
+    scale : turnover of the energy, no less than what the ledger resolves; zero before anything moves [J]
     """
     step, worst, blurred = (stepping[key] for key in ("step_s", "scheme_loss_worst_J", "half_step_energy_J"))
     warnings: list[str] = []
-    if abs(worst) > SCHEME_LIMIT * scale:
+    if scale > 0.0 and abs(worst) > SCHEME_LIMIT * scale:
         warnings.append(
             f"time stepping: the steps themselves {'took' if worst > 0.0 else 'made'} up to {abs(worst):.3g} J, "
             f"{100 * abs(worst) / scale:.2g} % of the turnover (limit {100 * SCHEME_LIMIT:g} %); "
             f"integrator.step_s is {step:g}: take {_shorter(step * SCHEME_LIMIT * scale / abs(worst)):g}"
         )
-    if blurred > HALF_STEP_LIMIT * scale:
+    if scale > 0.0 and blurred > HALF_STEP_LIMIT * scale:
         warnings.append(
             f"time stepping: the power changes so fast that the energy is known to {blurred:.3g} J only, "
             f"{100 * blurred / scale:.2g} % of the turnover (limit {100 * HALF_STEP_LIMIT:g} %), as it "

@@ -13,7 +13,7 @@ from dynsim.errors import DynsimError, ScenarioError, SimulationInterrupted, Sim
 from dynsim.record import Record
 from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario, require_scenario
-from dynsim.studies.processes import SILENT, WorkerLost, WorkerSilent, run_in_processes
+from dynsim.studies.processes import SILENT, WorkerInterrupted, WorkerLost, WorkerSilent, run_in_processes
 
 Keep = Literal["none", "failed", "all"]
 Task = TypeVar("Task")
@@ -242,12 +242,12 @@ def run_all(
         def take_late(piece: Sequence[Task], result: Callable[[], list[RunResult] | None]) -> None:
             try:
                 found = result()
+            except (SimulationInterrupted, WorkerInterrupted):
+                return
             except WorkerSilent:
                 found = [RunResult({}, SILENT, lost=True)] * len(piece)
             except WorkerLost:
                 found = [RunResult({}, f"{LOST}; is memory short for so many jobs?", lost=True)] * len(piece)
-            except SimulationInterrupted:
-                return
             for task, one in zip(piece, found, strict=True) if found is not None else ():
                 take(task, one)
 

@@ -15,7 +15,7 @@ from dynsim.files import json_text, replace_together
 from dynsim.record import Record
 from dynsim.scenario import Scenario, load_scenario, variant_names
 from dynsim.studies.columns import flat, is_scalar, is_text
-from dynsim.studies.processes import SILENT, WorkerLost, WorkerSilent, run_in_processes
+from dynsim.studies.processes import SILENT, WorkerInterrupted, WorkerLost, WorkerSilent, run_in_processes
 
 
 class VariantProgress(Protocol):
@@ -68,6 +68,10 @@ def compare(
     def take(name: str, result: Callable[[], Record | None]) -> None:
         try:
             record = result()
+        except WorkerInterrupted:
+            place = scenarios[name].place(variant=f" ({name})")
+            stops[name] = SimulationInterrupted(f"{place}: interrupted before there was anything to save")
+            return
         except WorkerSilent:
             stops[name] = SimulationStopped(f"{name}: {SILENT}")
             return

@@ -12,7 +12,6 @@ import argparse
 import json
 import math
 import tempfile
-import time as clock
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -28,7 +27,7 @@ from dynsim.engine import Progress, simulate
 from dynsim.errors import DynsimError, SimulationInterrupted, SimulationStopped
 from dynsim.files import write_json
 from dynsim.scenario.reading import scenario_from_resolved
-from dynsim.studies.processes import WorkerLost, run_in_processes
+from dynsim.studies.processes import WorkerInterrupted, WorkerLost, run_in_processes
 
 Array = NDArray[np.float64]
 
@@ -53,7 +52,8 @@ class Ending:
     scene : its number
     status : ``finished``, ``refused`` before the first step, or the kind of the stop
     reason : of a stop or refusal
-    wall_s : of loading, preparing and simulating it [s]
+    time_s : that was simulated [s]
+    wall_s : of its integration [s]
     """
 
     scene: int
@@ -252,18 +252,19 @@ def end(number: int, terrains: Sequence[str], look: Progress | None = None) -> E
     SimulationInterrupted
         ``look`` raised KeyboardInterrupt, or Ctrl-C.
     """
-    drawn, started = scene(number, terrains), clock.perf_counter()
+    drawn, record = scene(number, terrains), None
     status, reason, time = FINISHED, "", drawn["duration_s"]
     try:
-        simulate(scenario_from_resolved(drawn), look, pictured=False)
+        record = simulate(scenario_from_resolved(drawn), look, pictured=False)
     except SimulationInterrupted:
         raise
     except SimulationStopped as stop:
-        status, reason, time = stop.kind, str(stop), stop.time
+        status, reason, time, record = stop.kind, str(stop), stop.time, stop.record
     except DynsimError as error:
         status, reason, time = REFUSED, str(error), 0.0
     method, surface = drawn["integrator"]["method"], next(iter(drawn["surfaces"]))
-    return Ending(number, method, surface, status, reason, time, clock.perf_counter() - started)
+    wall = 0.0 if record is None else float(record.summary["integration_wall_s"])
+    return Ending(number, method, surface, status, reason, time, wall)
 
 
 def endings(
@@ -275,8 +276,10 @@ def endings(
     def take_late(number: int, result: Callable[[], Ending | None]) -> None:
         try:
             ending = result()
+        except WorkerInterrupted:
+            return
         except WorkerLost as lost:
-            ending = Ending(number, "", "", type(lost).__name__, "its process was lost", math.nan, math.nan)
+            ending = Ending(number, "", "", type(lost).__name__, "its process was lost", 0.0, 0.0)
         except SimulationInterrupted:
             return
         if ending is not None:
@@ -300,7 +303,10 @@ class _Work:
 def account(found: Sequence[Ending]) -> dict[str, Any]:
     """How many ended how, by method and surface; wall times; the first scene of each kind of stop or refusal."""
     kinds = sorted({one.status for one in found})
-    walls = {method: [one.wall_s for one in found if one.method == method] for method in sorted(set(METHODS))}
+    walls = {
+        method: [one.wall_s for one in found if one.method == method and one.status != REFUSED]
+        for method in sorted(set(METHODS))
+    }
     longest = max(found, key=lambda one: one.wall_s)
     return {
         "scenes": len(found),
@@ -329,8 +335,8 @@ def _short(reason: str) -> str:
 
 def _why(reason: str) -> str:
     """A refusal without its names and numbers."""
-    words = _short(reason).split(": ", 1)[-1].split()
-    return " ".join("…" if any(c.isdigit() or c in "'_" for c in word) else word for word in words[:24])
+    words = ["…" if any(c.isdigit() or c in "'_" for c in word) else word for word in reason.split()[1:]]
+    return " ".join(word for k, word in enumerate(words) if word != "…" or words[k - 1] != "…")
 
 
 def _options() -> argparse.Namespace:

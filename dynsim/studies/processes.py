@@ -95,6 +95,10 @@ class WorkerSilent(WorkerLost):
     """It gave no sign of life any more, and was ended here."""
 
 
+class WorkerInterrupted(WorkerLost):
+    """It was ended here, because it did not hear of Ctrl-C in what it had just begun with."""
+
+
 # Places of ``life``.
 _SIGNS, _HEARD = 0, 1
 
@@ -250,7 +254,7 @@ def run_in_processes(
                 if worker.is_silent(passed):
                     end(worker, _raise_silent)
                 elif sender is None and not worker.life[_HEARD] and looked - begun > _PATIENCE_S:
-                    end(worker, _nothing)
+                    end(worker, _raise_interrupted)
             interruption.heed()
 
     with _logged_here(context) as sender:
@@ -283,8 +287,8 @@ def _raise_silent() -> NoReturn:
     raise WorkerSilent
 
 
-def _nothing() -> None:
-    """Of a task that Ctrl-C came before."""
+def _raise_interrupted() -> NoReturn:
+    raise WorkerInterrupted
 
 
 def _result(good: bool, value: Any) -> Any:

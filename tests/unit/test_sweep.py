@@ -35,7 +35,7 @@ from dynsim.studies import batch, processes
 from dynsim.studies import sweep as module
 from dynsim.studies.columns import numbers
 from dynsim.studies.plan import Axis, Law, Plan
-from dynsim.studies.processes import WorkerLost, WorkerSilent, run_in_processes
+from dynsim.studies.processes import WorkerInterrupted, WorkerLost, WorkerSilent, run_in_processes
 from dynsim.studies.sweep import run_sweep
 
 PENDULUM = read_scenario("single_pendulum")
@@ -283,8 +283,14 @@ def test_a_process_that_takes_its_time_is_not_given_up(monkeypatch: pytest.Monke
 
 
 def test_ctrl_c_does_not_wait_for_who_does_not_look(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Both workers sleep for longer than any test; what they had in hand counts as not begun."""
+    """Both workers sleep for longer than any test; what they had in hand is interrupted."""
     taken: dict[int, Any] = {}
+
+    def take(task: tuple[int, str], result: Callable[[], int]) -> None:
+        with pytest.raises(WorkerInterrupted):
+            result()
+        taken[task[0]] = None
+
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def interrupt() -> None:
@@ -294,7 +300,7 @@ def test_ctrl_c_does_not_wait_for_who_does_not_look(tmp_path: Path, monkeypatch:
     Thread(target=interrupt, daemon=True).start()
     try:
         tasks = [(number, str(tmp_path)) for number in range(4)]
-        assert run_in_processes(deaf, tasks, 2, lambda task, result: taken.update({task[0]: result()})) is True
+        assert run_in_processes(deaf, tasks, 2, take) is True
     finally:
         signal.signal(signal.SIGINT, before)
     assert taken == {0: None, 1: None}

@@ -207,7 +207,7 @@ def book_contacts(system: System, s: SteppingArrays, ws: Workspace, y_new, h):
             tangential = work_of_row(s, ws, r + 1, h) + work_of_row(s, ws, r + 2, h)
             struck, friction = normal, tangential
             if last[kt.CLOSED] == 1.0:
-                struck = h * force * max(s.turn[k, kt.PUSH], 0.0)
+                struck = min(h * force * max(s.turn[k, kt.PUSH], 0.0), max(last[kt.BUDGET], 0.0))
                 if now[kt.SLID] == 0.0 and last[kt.SLID] == 0.0:
                     friction = 0.0
             if friction != 0.0 or now[kt.SLID] == 1.0:
