@@ -26,7 +26,7 @@ S.capsule = function (radius, length) {
 
 // Triangles with 16-bit corners within a box: {vertices, triangles, low, step}. Edges of more than 40° stay sharp.
 S.mesh = function (bytes, mesh) {
-  const codes = (block) => new Uint16Array(bytes.slice(block.at, block.at + 2 * block.count).buffer);
+  const codes = ({ at, count, bits }) => new (bits === 16 ? Uint16Array : Uint32Array)(bytes.slice(at, at + (bits / 8) * count).buffer);
   const raw = codes(mesh.vertices), corner = codes(mesh.triangles), faces = corner.length / 3;
   const at = (i, k) => mesh.low[k] + mesh.step[k] * raw[3 * i + k];
   const normals = new Float32Array(corner.length), around = new Map();
