@@ -99,6 +99,8 @@ class DrivenMotion:
     plan: CyclePlan
     duration: float
     scene: Scene | None = None
+    # The simulation that it follows has no end yet.
+    unmeasured: Record | None = None
     speed: float = 1.0
 
     @property
