@@ -303,7 +303,7 @@ def _write_times(
         if away > LED:
             written += [(end + part * offset, np.ones(2)) for part in share[:, 0, 0]]
         axes.annotate(
-            f"{time:{'.2g' if time < 100.0 else '.0f'}} s",
+            f"{time:{'.2g' if time < 100.0 else '.0f'}} s".replace("-", "−"),
             flat[-1, 1],
             xytext=tuple(offset),
             textcoords="offset points",
