@@ -33,7 +33,7 @@ def overturning(record: Record) -> Figure | None:
     loads, margin = record[LOADS], record[MARGIN]
     # Nothing is demanded of a wheel that carries nothing, and of one that carries next to nothing no number.
     traction = np.where(np.isfinite(record[TRACTION]), record[TRACTION], np.nan)
-    bare = np.isnan(traction).any(axis=1)
+    bare = np.asarray(np.isnan(traction).any(axis=1))
     demanded = np.minimum(traction, TRACTION_TOP)
     series = [loads, np.maximum(margin, MARGIN_LOW), demanded]
     rows = style.time_rows(figure, [[(record.time, one)] for one in series], style.settle_time(record))

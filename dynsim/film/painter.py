@@ -93,7 +93,7 @@ class Painter:
         found = Meshes()
         found.of_robot(record)
         shapes = body_shapes(robot.scene, robot.reach, found)
-        fixed = [shown for shape in robot.scene.fixed if (shown := drawn_shape(shape, found)) is not None]
+        self._fixed = [shown for shape in robot.scene.fixed if (shown := drawn_shape(shape, found)) is not None]
         self._meshes = simplified(found.found, TRIANGLES)
         self._wheels = wheel_groups(record, robot.scene)
         # The body that has a gripper.
@@ -109,7 +109,7 @@ class Painter:
         # Of one robot among several it is as small as its part of the film.
         self._font = font((13 if size[1] >= LOW else 11) * FINER)
         self.labels: list[Box] = []
-        self._still = self._background(fixed, *bounds)
+        self._still = self._background(*bounds)
 
     def frame(self, time: float) -> Image.Image:
         """The robot at an instant [s], between samples in straight lines."""
@@ -206,7 +206,7 @@ class Painter:
             colours = np.where(np.isfinite(own), 255.0 * own, colours)
         return colours
 
-    def _background(self, fixed: list[dict[str, Any]], low: Array, high: Array) -> Image.Image:
+    def _background(self, low: Array, high: Array) -> Image.Image:
         image = Image.new("RGB", (self.size[0] * FINER, self.size[1] * FINER), PAPER)
         draw = ImageDraw.Draw(image)
         if not self.robot.scene.surfaces:
@@ -218,7 +218,7 @@ class Painter:
                 self._paint_floor(draw, low, high, (surface.position or (0, 0, 0))[2])
             else:
                 self._paint_surface(draw, surface, low, high)
-        for shape in fixed:
+        for shape in self._fixed:
             points, cells = solid(shape, self._meshes)
             self._paint_faces(draw, points, cells, self._colours(shape, len(cells), HUB))
         if (target := self._ways.get("target")) is not None:

@@ -198,10 +198,10 @@ PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobil
 
 
 def test_a_phone_has_all_axes_beside_the_scene(teleop: Callable[..., Teleop], pilot: Callable[..., Pilot]) -> None:
-    """Sticks for all six axes of a gripper within 390 pixels, below the scene, one of which drives what had no stick."""
+    """Sticks for all six axes of a gripper within 390 pixels, below the scene; one drives what had none."""
     drive = teleop("snake_operator", "--speed", "0.2")
     one = pilot(drive, **PHONE)
-    assert one.page.inner_text(".state") == "hold a stick to drive"
+    one.until("document.querySelector('.state').textContent === 'hold a stick to drive'")
     axes = one.js("[...dynsim.drive.sticks.values()].flatMap((s) => [s.across, s.up]).filter(Boolean)")
     assert sorted(axes) == sorted(one.js("dynsim.drive.names"))
     assert len(axes) == 6
@@ -223,15 +223,18 @@ def test_a_phone_has_all_axes_beside_the_scene(teleop: Callable[..., Teleop], pi
         touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": touches})
 
     def turn() -> None:
-        finger("touchEnd")
         finger("touchStart", middle)
         finger("touchMove", (middle[0], middle[1] - 0.3 * box["height"]))
 
+    def anew() -> None:
+        finger("touchEnd")
+        one.page.wait_for_timeout(100)
+        turn()
+
     turn()
     beta = one.js("dynsim.drive.names.indexOf('beta')")
-    one.until(
-        f"dynsim.drive.wish.held && dynsim.drive.wish.axes[{beta}] > 0.8 && dynsim.drive.last.state === 'driving'", turn
-    )
+    asked = f"dynsim.drive.wish.held && dynsim.drive.wish.axes[{beta}] > 0.8"
+    one.until(f"{asked} && dynsim.drive.last.state === 'driving'", anew)
     finger("touchEnd")
     one.until("dynsim.drive.wish.held === false")
     assert drive.interrupt() == 0

@@ -330,8 +330,8 @@ def test_the_key_says_what_a_ball_below_the_floor_is(opened: Opens) -> None:
     assert "joint or hand below a surface" in signs
     assert "↓ by how much" in signs
     colour = page.js("getComputedStyle(document.querySelector('[data-colour=sunk]')).color")
-    assert colour == page.js("(c => { const d = document.createElement('i'); d.style.color = c; return d.style.color; })"
-                             "(dynsim.app.colours.sunk)")  # fmt: skip
+    paint = "(c => { const d = document.createElement('i'); d.style.color = c; return d.style.color; })"
+    assert colour == page.js(f"{paint}(dynsim.app.colours.sunk)")
     # What this record does not have is not explained.
     assert "wheel on the ground" not in signs
 
@@ -369,7 +369,7 @@ def test_variants_stand_across_what_is_long(opened: Opens) -> None:
     radius = 0.1
     for k, offset in enumerate(np.diff(offsets, axis=0)):
         assert abs(offset[0]) > 2.0 * radius, k
-        assert abs(offset[1]) < 1e-6
+        assert abs(offset[1]) < 0.01 * abs(offset[0])
     assert page.js("dynsim.app.actors.map((a) => a.surfaces[0].visible)") == [True] * 3
     page.page.keyboard.press("g")
     assert page.js("dynsim.app.actors.map((a) => a.surfaces[0].visible)") == [True, False, False]

@@ -64,15 +64,15 @@ def describe(record: Record, scene: Scene | None, states: type[IntEnum], followe
     record.scene = scene
     if scene is None or not len(record):
         return record
-    at = _path_time(record)
+    at, followed = _path_time(record), Record([0.0]) if followed is None else followed
     actual = _placed(record, scene, followed, at, "")
     if actual is None:
         return record
-    on = " on the base of the record that was followed" if followed is not None and followed.signals else ""
+    on = " on the base of the record that was followed" if followed.signals else ""
     for name in (POSITION, ORIENTATION):
         pose = actual.signals[name]
         record.add(name, pose.data, pose.unit, labels=pose.labels, description=f"from measured joints{on}")
-    for name in () if followed is None else followed.signals:
+    for name in followed.signals:
         # Columns beside measured ones stay out: the record says of them only that they were measured.
         if name != LIFTING and name not in record:
             data = _at(followed, name, at)
@@ -102,17 +102,16 @@ def _at(followed: Record, name: str, at: Array) -> Array:
     return np.column_stack([np.interp(at, followed.time, column) for column in data.T])
 
 
-def _placed(record: Record, scene: Scene, followed: Record | None, at: Array, suffix: str) -> Record | None:
+def _placed(record: Record, scene: Scene, followed: Record, at: Array, suffix: str) -> Record | None:
     """A record of the poses of all bodies, by measured joints or their goals (``suffix``); None where some lack."""
     found = Record(record.time)
     found.scene = scene
-    sources = [] if followed is None else [one for one in followed.signals if one not in (GROUNDED, LIFTING)]
     added: dict[str, Array] = {}
-    if followed is not None and LIFTING in followed:
+    if LIFTING in followed:
         added = dict(zip(followed.labels[LIFTING], _at(followed, LIFTING, at).T, strict=True))
     for name in dict.fromkeys(body.joint.signal for body in scene.bodies):
         columns: dict[str, Array] = {}
-        if name in sources and followed is not None:
+        if name in followed:
             columns |= dict(zip(followed.labels[name], _at(followed, name, at).T, strict=True))
         if f"{name}{suffix}" in record:
             data = np.asarray(record[f"{name}{suffix}"], dtype=np.float64)
