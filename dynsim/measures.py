@@ -108,7 +108,7 @@ def base_summary(
         "tip_margin_min": least(margin, -np.inf),
         "tip_margin_min_settled": least(margin, settle),
         "overturns_at_s": min(tips, default=None),
-        "traction_demand_max": float(np.nanmax(traction)) if np.isfinite(traction).any() else None,
+        "traction_demand_max": max(traction[np.isfinite(traction)].tolist(), default=None),
     }
 
 

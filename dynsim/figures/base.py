@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from dynsim.figures import events, style
 from dynsim.figures.style import Array
-from dynsim.measures import TIP_OVER
+from dynsim.measures import TIP_OVER, percent
 from dynsim.record import Record
 
 LOADS, MARGIN, TRACTION = "wheel_load", "tip_margin", "traction_demand"
@@ -29,7 +30,10 @@ def overturning(record: Record) -> Figure | None:
     if not {LOADS, MARGIN, TRACTION} <= set(record):
         return None
     figure = style.new_figure(6.2, style.title(record, "what the base stands on"))
-    loads, margin, traction = record[LOADS], record[MARGIN], record[TRACTION]
+    loads, margin = record[LOADS], record[MARGIN]
+    # Nothing is demanded of a wheel that carries nothing, and of one that carries next to nothing no number.
+    traction = np.where(np.isfinite(record[TRACTION]), record[TRACTION], np.nan)
+    bare = np.asarray(np.isnan(traction).any(axis=1))
     demanded = np.minimum(traction, TRACTION_TOP)
     series = [loads, np.maximum(margin, MARGIN_LOW), demanded]
     rows = style.time_rows(figure, [[(record.time, one)] for one in series], style.settle_time(record))
@@ -43,6 +47,7 @@ def overturning(record: Record) -> Figure | None:
         _mark_tipping(axes, [record], [style.PULLING])
     for axes in rows[2]:
         _lines(axes, record, TRACTION, "at most {}", np.nanmax)
+        _shade(axes, record.time, bare, "a wheel carries nothing")
         axes.axhline(1.0, color=style.PULLING, linewidth=0.8, label="slips above 1")
         axes.set_ylim(0.0, min(max(axes.get_ylim()[1], 1.15), TRACTION_TOP))
         _mark_tipping(axes, [record], [style.PULLING])
@@ -52,8 +57,8 @@ def overturning(record: Record) -> Figure | None:
     note = []
     if np.nanmax(traction, initial=0.0) > TRACTION_TOP:
         note.append(f"traction demand cut off at {TRACTION_TOP:g}: hardly any load")
-    if missing := float(np.isnan(traction).any(axis=1).mean()):
-        note.append(f"none without load on a wheel: {100.0 * missing:.2g} % of the samples")
+    if bare.any():
+        note.append(f"none without load on a wheel: {percent(float(bare.mean()))} of the samples")
     last = rows[2][-1]
     last.set_xlabel("\n".join([last.get_xlabel(), *note]))
     events.mark_all(rows, record)
@@ -177,8 +182,19 @@ def _lines(axes: Axes, record: Record, signal: str, note: str, extreme: Callable
     """A line for each column, its extreme in the legend."""
     for values, name, (colour, width) in zip(record[signal].T, record.labels[signal], LOOKS, strict=False):
         known = np.isfinite(values).any()
-        label = f"{name}: {note.format(style.number(float(extreme(values)), 3))}" if known else name
+        values = np.where(np.isfinite(values), values, np.nan)
+        label = f"{name}: {note.format(style.number(float(extreme(values)), 3))}" if known else f"{name}: none"
         style.line(axes, record.time, values, color=colour, linewidth=width, label=label)
+
+
+def _shade(axes: Axes, time: Array, where: NDArray[np.bool_], label: str) -> None:
+    """Bands over the samples at which something is so, named once; each as wide as to the samples beside it."""
+    edges = np.flatnonzero(np.diff(where, prepend=False, append=False)).reshape(-1, 2)
+    limits = axes.get_xlim()
+    for k, (first, end) in enumerate(edges.tolist()):
+        span = time[first], time[min(end, len(time) - 1)]
+        axes.axvspan(*span, color="#EFEFEF", linewidth=0, zorder=0.2, label=label if k == 0 else None)
+    axes.set_xlim(limits)
 
 
 def _pair(axes: Axes, time: Array, target: Array, actual: Array, name: str, colour: str, dashes: Any) -> None:

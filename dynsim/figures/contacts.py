@@ -40,15 +40,21 @@ def forces(record: Record) -> Figure | None:
     chosen = _most_interesting(names, [record])
     note = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} contacts ({_choice([record])})"
     figure = style.new_figure(0.9 + ROW * len(chosen), style.title(record, f"normal contact forces{note}"))
-    rows = inset_rows(figure, [_series(record, name) for name in chosen], style.settle_time(record))
+    real = is_real(record)
+    # An inset would lie on the bands of modes, with bands of its own.
+    arrange = style.time_rows if real else inset_rows
+    rows = arrange(figure, [_series(record, name) for name in chosen], style.settle_time(record))
     for name, panels in zip(chosen, rows, strict=True):
         force = _force(record, name)
+        # What the panel of the beginning shows would be a heap of marks in the other one.
+        begun = panels[0].get_xlim()[1] if len(panels) > 1 else -np.inf
         for axes in panels:
             style.line(axes, record.time, force, color=style.BLUE, label=force_label(record, name))
             _draw_extremes(axes, record, name, style.BLUE)
-            if is_real(record):
+            if real:
                 _draw_modes(axes, record, name)
-                events.mark(axes, events.marked(record, [name]))
+                found = events.marked(record, [name])
+                events.mark(axes, [one for one in found if axes is panels[0] or one.time > begun])
                 continue
             axes.fill_between(
                 *_thin_negative(record.time, force), 0.0, color=style.PULLING, alpha=0.3, linewidth=0, label="_pulling"
@@ -56,9 +62,9 @@ def forces(record: Record) -> Figure | None:
             _mark_pulling(axes)
         if len(panels) > 1:
             _draw_samples(panels[0], record, name, style.BLUE)
-        panels[-1].set_ylabel(f"{name}\nfₙ [N]")
-        style.legend_above(panels[-1], columns=4 if is_real(record) else 3)
-    _note_sampling(rows, [record])
+        panels[0 if real else -1].set_ylabel(f"{name}\nfₙ [N]")
+        style.legend_above(panels[-1], columns=4 if real else 3)
+    _note_sampling(rows, [record], insets=not real)
     events.explain(rows[-1][-1], events.marked(record, chosen))
     return figure
 
@@ -171,7 +177,7 @@ def _draw_samples(axes: Axes, record: Record, name: str, colour: str) -> None:
         axes.plot(record.time[inside], _force(record, name)[inside], ".", color=colour, markersize=2.5)
 
 
-def _note_sampling(rows: Sequence[Sequence[Axes]], records: Sequence[Record]) -> None:
+def _note_sampling(rows: Sequence[Sequence[Axes]], records: Sequence[Record], *, insets: bool = True) -> None:
     """Under the last panel: how often the curves are sampled, what the dashed lines are, and the insets."""
     steps = [float(np.median(np.diff(record.time))) for record in records if len(record) > 1]
     if not steps:
@@ -180,7 +186,7 @@ def _note_sampling(rows: Sequence[Sequence[Axes]], records: Sequence[Record]) ->
     if any(line.get_marker() == "." for panels in rows for line in panels[0].get_lines()):
         note += " (dots)"
     note += "; dashed: extremes of all steps"
-    if any(len(panels) > 1 for panels in rows):
+    if insets and any(len(panels) > 1 for panels in rows):
         note += "\naxes cut to the settled range; inset: the shaded beginning in full"
     last = rows[-1][-1]
     last.set_xlabel(f"{last.get_xlabel()}\n{note}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -107,7 +107,8 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
     work.set_xlabel("time [s]")
     colours = {name: str(look["color"]) for name, look in styles.items()}
     events.explain(work, events.mark_variants([(over_time,), (work,)], shown, colours))
-    _bars(total, list(shown), finals, [styles[name]["color"] for name in shown])
+    totals = _dots if logarithmic else _bars
+    totals(total, list(shown), finals, [str(styles[name]["color"]) for name in shown])
     figure.legend(*over_time.get_legend_handles_labels(), loc="outside lower center", ncols=min(len(shown), 5))
     return figure
 
@@ -208,22 +209,41 @@ def _residual(axes: Axes, record: Record, turnover: float) -> None:
     axes.set_ylabel("unexplained\n[J]")
 
 
-def _bars(axes: Axes, names: list[str], values: Array, colours: list[str]) -> None:
+def _bars(axes: Axes, names: Sequence[str], values: Array, colours: Sequence[str]) -> None:
+    axes.bar(np.arange(len(names)), values, color=colours, width=0.7)
+    _write_totals(axes, names, values, [max(float(value), 0.0) for value in values])
+    axes.margins(x=0.05, y=0.08)
+
+
+def _dots(axes: Axes, names: Sequence[str], values: Array, colours: Sequence[str]) -> None:
+    """Totals on the logarithmic axis of the curves, where bars would have no foot, as parts of the largest."""
+    axes.scatter(np.arange(len(names)), values, s=60, c=colours, zorder=3)
+    largest = float(values.max())
+    parts = ["" if value == largest else f"\n1/{style.number(largest / value, 3)}" for value in values]
+    _write_totals(axes, names, values, values.tolist(), parts)
+    # Room for the numbers, on an axis of decades.
+    axes.set_ylim(0.6 * float(values.min()), 2.0 * largest)
+    style.log_axis(axes)
+    axes.margins(x=0.2)
+
+
+def _write_totals(
+    axes: Axes, names: Sequence[str], values: Array, heights: Sequence[float], parts: Sequence[str] = ()
+) -> None:
     places = np.arange(len(names))
-    axes.bar(places, values, color=colours, width=0.7)
-    for place, value in zip(places, values, strict=True):
+    for place, value, height, part in zip(places, values, heights, parts or [""] * len(names), strict=True):
         axes.annotate(
-            f"{value:.4g}",
-            (float(place), max(float(value), 0.0)),
-            xytext=(0, 2),
+            f"{style.number(float(value))}{part}",
+            (float(place), height),
+            xytext=(0, 6 if parts else 2),
             textcoords="offset points",
             ha="center",
+            va="bottom",
             fontsize=7.5,
         )
     axes.set_xticks(places, names, rotation=30 if len(names) <= 4 else 60, ha="right")
-    axes.margins(x=0.05, y=0.08)
     axes.grid(axis="x", visible=False)
-    axes.set_title("electrical energy of the run, net [J]")
+    axes.set_title("electrical energy of the run, net [J]" + (",\nand as a part of the largest" if parts else ""))
 
 
 def _joules(values: Array, largest: float = 0.0) -> str:

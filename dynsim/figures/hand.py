@@ -71,22 +71,27 @@ def error(record: Record) -> Figure | None:
     deviation = MILLI * (record["hand_position"] - target)
     norm = np.linalg.norm(deviation, axis=1)
     figure = style.new_figure(4.1, style.title(record, "tracking error"))
-    top, bottom = figure.subplots(2, 1, sharex=True)
+    series = [[(record.time, deviation)], [(record.time, norm)]]
+    rows = style.time_rows(figure, series, style.settle_time(record))
+    settled = record.time >= style.settle_time(record)
+    late = settled if settled.any() else slice(None)
     looks = style.told_apart(
         {name: {"color": colour} for name, colour in style.AXIS_COLOURS.items()},
-        {name: (record.time, deviation[:, k]) for k, name in enumerate("xyz")},
+        {name: (record.time[late], deviation[late, k]) for k, name in enumerate("xyz")},
     )
-    for k, name in enumerate("xyz"):
-        style.line(top, record.time, deviation[:, k], label=name, **looks[name])
-    top.set_ylabel(f"hand − {target_name(record)} [mm]")
-    style.line(bottom, record.time, norm, label=_error_label("|e|", record), color=style.BLACK)
-    bottom.set_ylabel(f"distance from {target_name(record)} [mm]")
-    bottom.set_ylim(bottom=0.0)
-    bottom.set_xlabel("time [s]")
-    _mark_settle((top, bottom), record)
-    events.mark_all([(top,), (bottom,)], record)
-    style.legend_above(top, columns=4)
-    style.legend_above(bottom)
+    for axes in rows[0]:
+        for k, name in enumerate("xyz"):
+            style.line(axes, record.time, deviation[:, k], label=name, **looks[name])
+    for axes in rows[1]:
+        style.line(axes, record.time, norm, label=_error_label("|e|", record), color=style.BLACK)
+        axes.set_ylim(bottom=0.0)
+    rows[0][0].set_ylabel(f"hand − {target_name(record)} [mm]")
+    rows[1][0].set_ylabel(f"distance from {target_name(record)} [mm]")
+    for panels in zip(*rows, strict=True):
+        _mark_settle(panels, record)
+    events.mark_all(rows, record)
+    style.legend_above(rows[0][-1], columns=4)
+    style.legend_above(rows[1][-1])
     return figure
 
 
@@ -97,7 +102,6 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
         return None
     height = 4.4 + 2.0 * events.height_of_variants(shown)
     figure = style.new_figure(height, style.comparison_title(list(shown.values()), "tracking error"))
-    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[1.3, 1.0])
     deviations = {name: MILLI * (record["hand_position"] - hand_target(record)) for name, record in shown.items()}
     norms = {name: np.linalg.norm(deviation, axis=1) for name, deviation in deviations.items()}
     least = min((float(norm[norm > 0.0].min()) for norm in norms.values() if (norm > 0.0).any()), default=1.0)
@@ -106,20 +110,34 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
         {name: (record.time, np.log(np.maximum(norms[name], least))) for name, record in shown.items()},
         {name: (record.time, deviations[name][:, 2]) for name, record in shown.items()},
     )
-    for name, record in shown.items():
-        norm, deviation = norms[name], deviations[name]
-        style.line(top, record.time, norm, label=_error_label(name, record), **styles[name])
-        style.line(bottom, record.time, deviation[:, 2], **styles[name])
-    if any(line.get_ydata().max() > 0.0 for line in top.get_lines()):
-        style.log_axis(top)
-    top.set_ylabel("distance from target [mm]")
-    bottom.set_ylabel("vertical error [mm]")
-    bottom.set_xlabel("time [s]")
-    _mark_settle((top, bottom), next(iter(shown.values())))
+    settle = max(map(style.settle_time, shown.values()))
+    series = [[(r.time, norms[name]) for name, r in shown.items()]]
+    series += [[(r.time, deviations[name][:, 2]) for name, r in shown.items()]]
+    rows = style.time_rows(figure, series, settle)
+    for distance, vertical in zip(*rows, strict=True):
+        for name, record in shown.items():
+            style.line(distance, record.time, norms[name], label=_error_label(name, record), **styles[name])
+            style.line(vertical, record.time, deviations[name][:, 2], **styles[name])
+        _mark_settle((distance, vertical), next(iter(shown.values())))
+    if any((norm > 0.0).any() for norm in norms.values()):
+        late = np.concatenate([norms[name][record.time >= settle] for name, record in shown.items()])
+        _log_rows(rows[0], late[late > 0.0])
+    rows[0][0].set_ylabel("distance from target [mm]")
+    rows[1][0].set_ylabel("vertical error [mm]")
     colours = {name: str(look["color"]) for name, look in styles.items()}
-    events.explain(bottom, events.mark_variants([(top,), (bottom,)], shown, colours))
-    figure.legend(loc="outside lower center", ncols=2)
+    events.explain(rows[1][-1], events.mark_variants(rows, shown, colours))
+    figure.legend(*rows[0][-1].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
+
+
+def _log_rows(panels: Sequence[Axes], settled: Array) -> None:
+    """Logarithmic axes; that of the whole run, where the beginning has a panel of its own, for what has settled."""
+    for axes in panels:
+        axes.autoscale(axis="y")
+        style.log_axis(axes)
+    if len(panels) > 1 and settled.size:
+        panels[-1].set_ylim(float(settled.min()) / 1.3, 1.3 * float(settled.max()))
+        style.log_axis(panels[-1])
 
 
 def _height(named: int) -> float:
@@ -215,7 +233,7 @@ def _error_label(name: str, record: Record) -> str:
 def _mark_settle(panels: Sequence[Axes], record: Record) -> None:
     """A line in every panel; the legend of the first names it, as a label beside it would lie on the curves."""
     settle = style.settle_time(record)
-    if max(0.0, record.time[0]) < settle < record.time[-1]:
+    if max(0.0, record.time[0]) < settle < min(float(record.time[-1]), panels[0].get_xlim()[1]):
         for axes in panels:
             label = f"settled from {settle:g} s on" if axes is panels[0] else None
             axes.axvline(settle, color=style.GREY, linestyle=":", linewidth=1.0, label=label)

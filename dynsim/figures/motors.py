@@ -50,6 +50,7 @@ def motors(record: Record) -> Figure | None:
 
 def _draw(axes: Axes, record: Record, name: str, shown: np.ndarray, looks: Mapping[int, Mapping[str, Any]]) -> None:
     values, labels = record[name], record.labels[name]
+    called = {} if record.scene is None else record.scene.wheel_names
     if len(shown) < values.shape[1]:
         low = style.thin(record.time, values.min(axis=1))
         high = style.thin(record.time, values.max(axis=1))
@@ -64,5 +65,5 @@ def _draw(axes: Axes, record: Record, name: str, shown: np.ndarray, looks: Mappi
             label=f"all {len(labels)} motors",
         )
     for k in shown:
-        style.line(axes, record.time, values[:, k], label=labels[k], **looks[k])
+        style.line(axes, record.time, values[:, k], label=called.get(labels[k], labels[k]), **looks[k])
     axes.axhline(0.0, color=style.GREY, linewidth=0.6)

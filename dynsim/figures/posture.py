@@ -42,12 +42,14 @@ ARM_COLOUR = "#444444"
 BASE_COLOUR = "#D5D5D5"
 # Text at faint postures, and how far such a one is from the last at least, to be told from it [point].
 TIME_SIZE, APART = 6.0, 3.0
-# Points of hand path and target that times keep away from.
-WAY = 80
-# Where else than ahead of the hand they may stand.
+# Points that times keep away from: of hand path and target, and on each segment of a posture.
+WAY, ALONG = 80, 30
+# Where else than ahead of the hand they may stand, and how far away in parts of their size; a line leads to those that
+# are further than this.
 AROUND = np.array(
     [[0.0, 1.0], [1.0, 0.0], [0.0, -1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0], [-1.0, 0.0]]
 )
+AWAY, LED = (1.0, 1.8, 2.8, 4.0), 2.0
 # Width of a side view in a figure of one column, and of two [point].
 FULL, HALF = 440.0, 205.0
 
@@ -69,15 +71,15 @@ def posture(record: Record) -> Figure | None:
     size = extent[1] - extent[0]
     # What the side view needs at the width that it has, and the labels of its axis, title and legend.
     height = 5.6 if wide else 1.15 + float(np.clip(HALF / 72.0 * size[1] / size[0], 1.5, 3.4))
-    scale = (FULL if wide else min(HALF, 72.0 * (height - 1.15) * size[0] / size[1])) / size[0]
-    extent = with_labels(extent, contact_labels(body, plane, scale), scale)
+    room = np.array([FULL, np.inf]) if wide else np.array([HALF, 72.0 * (height - 1.15)])
+    extent, scale = _with_labels(extent, [body], plane, room)
     figure = style.new_figure(height, style.title(record, f"posture at {record.time[-1]:.4g} s, and before (faint)"))
     # Side by side, the labels of the 3D view need some room to their right.
     grid = figure.add_gridspec(2, 1, height_ratios=[1.25, 1.0]) if wide else figure.add_gridspec(1, 2, wspace=0.15)
     space: Any = figure.add_subplot(grid[0], projection="3d")
     side = figure.add_subplot(grid[1])
     _space_view(space, record, body, drawn, (low, high), zoom=1.65 if wide else 1.15)
-    _side_view(side, record, body, drawn, plane, scale, colour=ARM_COLOUR)
+    _side_view(side, record, body, drawn, plane, scale, extent, colour=ARM_COLOUR)
     _frame_side(side, plane, extent, () if body is None else body.scene.surfaces)
     if note:
         side.set_title(note, color=style.PULLING)
@@ -101,13 +103,15 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     # Upright arms stand beside each other.
     columns = min(len(shown), 4 if size[1] > size[0] else 2)
     lines = -(-len(shown) // columns)
-    scale = min((FULL if columns == 1 else 2.0 * HALF / columns) / size[0], 72.0 * 3.2 / size[1])
-    # Rows without labels need no room for them.
+    room = np.array([FULL if columns == 1 else 2.0 * HALF / columns, 72.0 * 3.2])
+    # All have one width; rows without labels need no height for them.
     rows = [list(shown)[start : start + columns] for start in range(0, len(shown), columns)]
-    extents = [
-        with_labels((low, high), [label for name in row for label in contact_labels(shown[name], plane, scale)], scale)
-        for row in rows
-    ]
+    framed, scale = _with_labels((low, high), list(shown.values()), plane, room)
+    extents = []
+    for row in rows:
+        labels = [label for name in row for label in contact_labels(shown[name], plane, scale)]
+        base, top = with_labels((low, high), labels, scale)
+        extents.append((np.array([framed[0][0], base[1]]), np.array([framed[1][0], top[1]])))
     widest = 6.4 / columns
     heights = [float(np.clip(widest * (top[1] - base[1]) / (top[0] - base[0]), 0.8, 3.2)) for base, top in extents]
     figure = style.new_figure(
@@ -117,8 +121,11 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     styles = style.variant_styles(list(records))
     for axes, (name, body) in zip(grid.ravel(), shown.items(), strict=False):
         colour = str(styles[name]["color"])
-        _side_view(axes, records[name], body, drawn[name], plane, scale, colour=colour, path=style.GREY, named=False)
-        _frame_side(axes, plane, extents[list(shown).index(name) // columns], body.scene.surfaces)
+        extent = extents[list(shown).index(name) // columns]
+        _side_view(
+            axes, records[name], body, drawn[name], plane, scale, extent, colour=colour, path=style.GREY, named=False
+        )
+        _frame_side(axes, plane, extent, body.scene.surfaces)
         axes.set_title(name, color=styles[name]["color"], fontweight="bold")
         axes.label_outer()
     for axes in grid.ravel()[len(shown) :]:
@@ -128,6 +135,18 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
         axes.set_xlabel("")
     _legend(figure, list(grid.ravel()))
     return figure
+
+
+def _with_labels(
+    extent: tuple[Array, Array], bodies: Sequence[Skeleton | None], plane: SidePlane, room: Array
+) -> tuple[tuple[Array, Array], float]:
+    """The extent with room for the labels of contacts, and the scale [point/m] at which it fits ``room`` [point]."""
+    wide, scale = extent, float((room / (extent[1] - extent[0])).min())
+    for _ in range(3):  # smaller pictures need more room for labels
+        labels = [label for body in bodies for label in contact_labels(body, plane, scale)]
+        wide = with_labels(extent, labels, scale)
+        scale = float((room / (wide[1] - wide[0])).min())
+    return wide, scale
 
 
 def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
@@ -163,6 +182,7 @@ def _side_view(
     drawn: Sequence[Array],
     plane: SidePlane,
     scale: float,
+    extent: tuple[Array, Array],
     *,
     colour: str,
     path: str = style.BLUE,
@@ -203,22 +223,25 @@ def _side_view(
     axes.plot(*plane.project(style.sparse(record["hand_position"])).T, color=path, lw=1.0, zorder=4, label="hand path")
     for _, _, position, force in () if body is None else body.contacts():
         axes.plot(*plane.project(position), zorder=6, linestyle="none", **_contact_mark(force))
+    labels = contact_labels(body, plane, scale)
     if body is not None:
         curves = [record["hand_position"], *([] if wanted is None else [wanted])]
         ways = [plane.project(curve[np.linspace(0, len(curve) - 1, WAY).astype(int)]) for curve in curves]
         times = [float(record.time[row]) for row in body.shown()]
-        _write_times(axes, times, [plane.project(s) for s in drawn], np.concatenate(ways), scale)
+        taken = [(label.middle(scale), label.half) for label in labels]
+        taken += [(scale * plane.project(position), np.full(2, 6.0)) for _, _, position, _ in body.contacts()]
+        _write_times(axes, times, [plane.project(s) for s in drawn], np.concatenate(ways), taken, extent, scale)
     if (deepest := max(sunk, key=lambda one: one.depth, default=None)) is not None and deepest.depth > 0.0:
         text = f"below {deepest.surface}, up to {style.number(1e3 * deepest.depth, 3)} mm"
         axes.plot([], [], label=text if named else "below a surface", color=penetration.COLOUR, lw=4.0)
-    for label in contact_labels(body, plane, scale):
+    for label in labels:
         axes.annotate(
             label.text,
-            (label.x, label.z),
-            xytext=(0, -label.offset if label.below else label.offset),
+            tuple(label.place),
+            xytext=tuple(label.offset),
             textcoords="offset points",
             ha="center",
-            va="top" if label.below else "bottom",
+            va="center",
             fontsize=LABEL_SIZE,
             linespacing=1.1,
             # A label further away says with a line where it belongs.
@@ -231,38 +254,66 @@ def _sunk_look(last: bool) -> dict[str, Any]:
     return {"colors": penetration.COLOUR, "linewidths": 4.0 if last else 2.2, "alpha": 1.0 if last else 0.5}
 
 
-def _write_times(axes: Axes, times: Sequence[float], drawn: Sequence[Array], ways: Array, scale: float) -> None:
+def _write_times(
+    axes: Axes,
+    times: Sequence[float],
+    drawn: Sequence[Array],
+    ways: Array,
+    taken: Sequence[tuple[Array, Array]],
+    extent: tuple[Array, Array],
+    scale: float,
+) -> None:
     """The times of the faint postures at their ends, as far as there is room: the earliest first.
 
-    ``ways``: points of other curves that nothing is written over, (n, 2).
+    ``ways``: points of other curves, (n, 2) [m]; ``taken``: middles and half sizes of other texts [point]. Nothing is
+    written over those, over a posture, or beside the panel.
     """
     half = 0.5 * TIME_SIZE * 0.62 * np.array([5.5, 1.9])
-    # The last posture is the picture itself: nothing is written over its segments.
-    middles = np.linspace(drawn[-1][:, 0], drawn[-1][:, 1], 5).reshape(-1, 2) if drawn else np.zeros((0, 2))
-    taken = [(scale * point, np.array([1.0, 1.0])) for point in middles]
-    taken += [(scale * point, np.zeros(2)) for point in ways]
+    low, high = (scale * corner for corner in extent)
+    share = np.linspace(0.0, 1.0, ALONG)[:, None, None]
+    lines = [(flat[:, 0] + share * (flat[:, 1] - flat[:, 0])).reshape(-1, 2) for flat in drawn if len(flat)]
+    points = scale * np.concatenate([ways, *lines])
+    points = points[np.isfinite(points).all(axis=1)]
+    written = list(taken)
+
+    def free(end: Array, offset: Array, led: bool) -> bool:
+        place = end + offset
+        if (place - half < low).any() or (place + half > high).any():
+            return False
+        if (np.abs(points - place) < half + 1.0).all(axis=1).any():
+            return False
+        leader = end + share[:, :, 0] * offset if led else place[None]
+        return not any(
+            (np.abs(place - other) < half + room).all() or (np.abs(leader - other) < room).all(axis=1).any()
+            for other, room in written
+        )
+
     for time, flat in zip(times[:-1], drawn[:-1], strict=False):
         if not len(flat) or not np.isfinite(flat[-1]).all() or scale * np.abs(flat - drawn[-1]).max() < APART:
             continue
         along = flat[-1, 1] - flat[-1, 0]
         size = float(np.linalg.norm(along))
         ahead = along / size if size > 0.0 else np.array([1.0, 0.0])
-        for offset in (away * direction * (half + 2.0) for away in (1.0, 1.8) for direction in (ahead, *AROUND)):
-            place = scale * flat[-1, 1] + offset
-            if all((np.abs(place - other) > half + room).any() for other, room in taken):
-                taken.append((place, half))
-                axes.annotate(
-                    f"{time:{'.2g' if time < 100.0 else '.0f'}} s",
-                    flat[-1, 1],
-                    xytext=tuple(offset),
-                    textcoords="offset points",
-                    ha="center",
-                    va="center",
-                    fontsize=TIME_SIZE,
-                    color=style.GREY,
-                    zorder=7,
-                )
-                break
+        end = scale * flat[-1, 1]
+        offsets = [(away, away * direction * (half + 2.0)) for away in AWAY for direction in (ahead, *AROUND)]
+        away, offset = next((one for one in offsets if free(end, one[1], one[0] > LED)), (0.0, half))
+        if not away:
+            continue
+        written.append((end + offset, half))
+        if away > LED:
+            written += [(end + part * offset, np.ones(2)) for part in share[:, 0, 0]]
+        axes.annotate(
+            f"{time:{'.2g' if time < 100.0 else '.0f'}} s".replace("-", "−"),
+            flat[-1, 1],
+            xytext=tuple(offset),
+            textcoords="offset points",
+            ha="center",
+            va="center",
+            fontsize=TIME_SIZE,
+            color=style.GREY,
+            zorder=7,
+            arrowprops={"arrowstyle": "-", "color": style.GREY, "lw": 0.4} if away > LED else None,
+        )
 
 
 def _space_view(
@@ -323,8 +374,9 @@ def _space_view(
     ):
         ticks = MaxNLocator(2 + int(3 * share), steps=[1, 2, 5, 10]).tick_values(a, b)
         ticks = ticks[(ticks >= a) & (ticks <= b)]
-        # On a short axis only the outer ones have room.
-        axis.set_ticks(ticks[[0, -1]] if share < SHORT_AXIS and len(ticks) > 2 else ticks)
+        # On a short axis only the outer ones have room; of y, which begins where x ends, the far one.
+        short = share < SHORT_AXIS and len(ticks) > (1 if axis is axes.yaxis else 2)
+        axis.set_ticks((ticks[-1:] if axis is axes.yaxis else ticks[[0, -1]]) if short else ticks)
     axes.view_init(elev=22, azim=-70)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))

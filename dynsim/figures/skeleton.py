@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,8 @@ from dynsim.record.scene import WORLD, Joint, Point, Scene, Surface
 FAINT = 6
 # Text at the contacts: size and height of its two lines [point].
 LABEL_SIZE, LABEL_HEIGHT = 7.0, 19.0
+# From the middle of a contact's mark to its text [point].
+NEAR_CONTACT = 7.0
 # Body poses are in single precision: what spreads no further than this does not spread [m].
 NOTHING = 1e-6
 
@@ -171,18 +173,32 @@ def side_plane(record: Record, drawn: Sequence[Array]) -> SidePlane:
 
 @dataclass(frozen=True)
 class Label:
-    """What is written at a contact: at (x, z) [m] in the side plane, ``level`` labels away from it."""
+    """Text at a contact at ``place`` (x, z) [m] of the side plane, on a ``side`` of it, ``level`` labels away."""
 
     text: str
-    x: float
-    z: float
-    below: bool
+    place: Array
+    side: tuple[int, int]
     level: int
 
     @property
-    def offset(self) -> float:
-        """Distance of the text from the contact [point]."""
-        return 7.0 + LABEL_HEIGHT * self.level
+    def half(self) -> Array:
+        """Half of its width and height [point]."""
+        return 0.5 * np.array([LABEL_SIZE * 0.65 * max(map(len, self.text.splitlines())), LABEL_HEIGHT])
+
+    @property
+    def offset(self) -> Array:
+        """From the contact to its middle [point]."""
+        half = float(self.half @ np.abs(self.side))
+        return np.array(self.side) * (NEAR_CONTACT + (2 * self.level + 1) * half)
+
+    def middle(self, scale: float) -> Array:
+        """Where it is in the side plane at a scale [point/m]."""
+        return scale * self.place + self.offset
+
+    def overprints(self, other: Label, scale: float) -> bool:
+        """Whether both would be written over each other."""
+        apart = np.abs(self.middle(scale) - other.middle(scale))
+        return bool((apart < self.half + other.half + [2.0, 0.0]).all())
 
 
 def contact_labels(body: Skeleton | None, plane: SidePlane, scale: float) -> list[Label]:
@@ -191,29 +207,25 @@ def contact_labels(body: Skeleton | None, plane: SidePlane, scale: float) -> lis
     Labels that would overprint each other at ``scale`` [point/m] are moved away from the surface.
     """
     found: list[Label] = []
-    ends: dict[tuple[bool, int], float] = {}
     points = [(*one, plane.project(one[2])) for one in ([] if body is None else body.contacts())]
     for contact, surface, position, force, at in sorted(points, key=lambda one: float(one[4][0])):
-        below = bool(surface.gradient(position)[2] >= 0.0)
+        along, up = plane.project(plane.origin + surface.gradient(position)) - plane.project(plane.origin)
+        steep = abs(along) > abs(up)
+        side = (-1 if along > 0.0 else 1, 0) if steep else (0, 1 if up < 0.0 else -1)
         text = contact.name if np.isnan(force) else f"{contact.name}\n{style.number(force, 3)} N"
-        half = 0.5 * LABEL_SIZE * 0.65 * max(len(line) for line in text.splitlines())
-        level, place = 0, float(at[0]) * scale
-        while place - half < ends.get((below, level), -np.inf):
-            level += 1
-        ends[below, level] = place + half + 2.0
-        found.append(Label(text, float(at[0]), float(at[1]), below, level))
+        label = Label(text, at, side, 0)
+        while any(label.overprints(other, scale) for other in found):
+            label = replace(label, level=label.level + 1)
+        found.append(label)
     return found
 
 
 def with_labels(extent: tuple[Array, Array], labels: Sequence[Label], scale: float) -> tuple[Array, Array]:
     """The extent with room for the labels."""
-    low, high = extent[0].copy(), extent[1].copy()
+    low, high = extent
     for label in labels:
-        room = (label.offset + LABEL_HEIGHT + 3.0) / scale
-        if label.below:
-            low[1] = min(low[1], label.z - room)
-        else:
-            high[1] = max(high[1], label.z + room)
+        middle, room = label.middle(scale) / scale, (label.half + 3.0) / scale
+        low, high = np.minimum(low, middle - room), np.maximum(high, middle + room)
     return low, high
 
 

@@ -22,15 +22,15 @@ from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import rotated
 from dynsim.record.scene import HERE, WORLD, Surface
 from dynsim.record.surface_points import round_patch, surface_grids
-from dynsim.view.meshes import Meshes
+from dynsim.view.meshes import Meshes, simplified
 from dynsim.view.robot import Contact, Robot, Sunk, contacts, largest_force, paths, sunk
 from dynsim.view.solids import body_shapes, drawn_shape, drawn_surface, gripper
 from dynsim.view.wheels import cop_of, supports, wheel_groups
 
 Array = NDArray[np.float64]
 FINER = 2
-# Triangles of a mesh at most: a film of a robot is some 500 pixels wide.
-TRIANGLES = 2000
+# Triangles of all meshes at most: a film of a robot is some 500 pixels wide.
+TRIANGLES = 20_000
 PAPER, GROUND, LINES, FAINT, SURFACE = "#FFFFFF", "#F1F3F5", "#D3D8DE", "#ECEEF1", "#C9D3DE"
 BODY, HUB, WHEEL, SUPPORT = "#AEB7C4", "#4A5260", "#3A4048", "#D5EAF8"
 FRICTION = "#7A3E9D"
@@ -90,13 +90,16 @@ class Painter:
         self._time = record.time
         self._position = record[POSITION].astype(np.float64)
         self._turn = record[ORIENTATION].astype(np.float64)
-        self._meshes = Meshes(TRIANGLES)
-        self._meshes.of_robot(record)
+        found = Meshes()
+        found.of_robot(record)
+        shapes = body_shapes(robot.scene, robot.reach, found)
+        self._fixed = [shown for shape in robot.scene.fixed if (shown := drawn_shape(shape, found)) is not None]
+        self._meshes = simplified(found.found, TRIANGLES)
         self._wheels = wheel_groups(record, robot.scene)
         # The body that has a gripper.
         hand = robot.scene.hand
         self._gripped = hand.body if hand is not None and "gripper" in record else WORLD
-        self._solids = self._moving()
+        self._solids = self._moving(shapes)
         self._contacts = contacts(robot)
         self._sunk = sunk(robot)
         self._full = largest_force(self._contacts)
@@ -151,16 +154,14 @@ class Painter:
         share = (time - self._time[row]) / max(self._time[row + 1] - self._time[row], 1e-12)
         return row, float(np.clip(share, 0.0, 1.0))
 
-    def _moving(self) -> _Solids:
-        scene = self.robot.scene
-        shapes = body_shapes(scene, self.robot.reach, self._meshes)
+    def _moving(self, shapes: list[list[dict[str, Any]]]) -> _Solids:
         group = {place: k for k, places in enumerate(self._wheels.places) for place in places}
         corners, bodies, faces, colours, wheels = [np.zeros((0, 3))], [np.zeros(0, int)], [], [], []
         aside, count = [np.zeros((2, 0, 3))], 0
 
         def add(body: int, shape: dict[str, Any], plain: str, wheel: int = -1, moved: Array = _NOT_MOVED) -> None:
             nonlocal count
-            points, cells = solid(shape, self._meshes.found)
+            points, cells = solid(shape, self._meshes)
             corners.append(points)
             bodies.append(np.full(len(points), body))
             faces.append(cells + count)
@@ -201,7 +202,7 @@ class Painter:
         colours = np.tile(np.array(_rgb(plain), dtype=float), (faces, 1))
         if "colour" in shape:
             colours[:] = 255.0 * np.array(shape["colour"][:3])
-        elif "mesh" in shape and (own := self._meshes.found[shape["mesh"]].colours) is not None:
+        elif "mesh" in shape and (own := self._meshes[shape["mesh"]].colours) is not None:
             colours = np.where(np.isfinite(own), 255.0 * own, colours)
         return colours
 
@@ -217,10 +218,9 @@ class Painter:
                 self._paint_floor(draw, low, high, (surface.position or (0, 0, 0))[2])
             else:
                 self._paint_surface(draw, surface, low, high)
-        for shape in self.robot.scene.fixed:
-            if (shown := drawn_shape(shape, self._meshes)) is not None:
-                points, cells = solid(shown, self._meshes.found)
-                self._paint_faces(draw, points, cells, self._colours(shown, len(cells), HUB))
+        for shape in self._fixed:
+            points, cells = solid(shape, self._meshes)
+            self._paint_faces(draw, points, cells, self._colours(shape, len(cells), HUB))
         if (target := self._ways.get("target")) is not None:
             dashes(draw, _apart(self.camera.project(target)[:, :2]), 6.0 * FINER, BLACK, FINER)
         if (way := self._ways.get("hand")) is not None:

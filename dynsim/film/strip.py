@@ -71,7 +71,8 @@ class Strip:
             if name not in record:
                 continue
             values = record[name].reshape(len(record), -1)
-            names = record.labels[name] or (name,) * values.shape[1]
+            called = {} if record.scene is None else record.scene.wheel_names
+            names = [called.get(one, one) for one in record.labels[name] or (name,) * values.shape[1]]
             several, many = len(records) > 1, values.shape[1] > 1
             shown = largest(values, 1 if several else NAMED)
             if len(shown) < values.shape[1]:

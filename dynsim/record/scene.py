@@ -293,6 +293,12 @@ class Scene:
         wheels = [k for k, body in enumerate(self.bodies) if body.parent == base and own & set(body.joint.labels)]
         return base, *wheels
 
+    @property
+    def wheel_names(self) -> dict[str, str]:
+        """What pictures call the motors of a mobile base's wheels, by their labels: "base.left" is the left wheel."""
+        labels = [label for k in self.base[1:] for label in self.bodies[k].joint.labels]
+        return {label: f"{label.rpartition('.')[2]} wheel" for label in labels}
+
     def surface(self, name: str) -> Surface | None:
         """The surface of a name."""
         return next((surface for surface in self.surfaces if surface.name == name), None)

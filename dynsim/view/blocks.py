@@ -51,11 +51,12 @@ class Blocks:
         return place | {"offset": low.tolist(), "scale": scale.tolist()}
 
     def raw(self, data: NDArray[Any]) -> dict[str, Any]:
-        """Add an array of 16-bit codes as it is (a mesh), little endian."""
-        content = data.astype("<u2").tobytes()
+        """Add an array of whole numbers ≥ 0 as it is (a mesh), little endian: in 16 bits, or 32 if one needs them."""
+        bits = 16 if data.max(initial=0) < 2**16 else 32
+        content = data.astype(_TYPES[bits]).tobytes()
         self._parts.append(content)
         start, self._size = self._size, self._size + len(content)
-        return {"at": start, "count": int(data.size)}
+        return {"at": start, "count": int(data.size), "bits": bits}
 
     def packed(self, head: dict[str, Any]) -> str:
         """Head and blocks: the length of the head in 4 bytes, its JSON, the blocks; compressed, in base64."""

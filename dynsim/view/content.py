@@ -15,7 +15,7 @@ from dynsim.record import TIME, Record, Signal
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.scene import Scene
 from dynsim.view.blocks import Blocks
-from dynsim.view.meshes import Meshes
+from dynsim.view.meshes import Meshes, simplified
 from dynsim.view.meshes import packed as packed_mesh
 from dynsim.view.robot import POSE_ERROR, Robot, azimuth, bounds, contacts, paths, robot_of, robots, sunk
 from dynsim.view.solids import body_shapes, drawn_shape, drawn_surface, gripper, thinnest
@@ -51,7 +51,7 @@ def packed(records: Mapping[str, Record], *, ghost: bool = False) -> str:
         "azimuth": turn,
         "box": [corner.tolist() for corner in bounds(every, turn)],
         "records": parts,
-        "meshes": [packed_mesh(mesh, blocks) for mesh in meshes.found],
+        "meshes": [packed_mesh(mesh, blocks) for mesh in simplified(meshes.found)],
         "notes": meshes.notes(),
     }
     return blocks.packed(head)
@@ -98,6 +98,7 @@ def _record(name: str, robot: Robot, blocks: Blocks, meshes: Meshes, low: Array,
         "wheels": None if groups.down is None else {"names": groups.names, "down": blocks.add(groups.down[rows])},
         "supports": supports(scene, groups),
         "motors": _motors(record, scene),
+        "names": scene.wheel_names,
         "limit": shared(record, "voltage_limit_V"),
         "resistance": resistance(record),
         "events": [[event.time, event.kind, event.name, _finite(event.value)] for event in record.events],

@@ -1,32 +1,39 @@
-"""Meshes of robots from URDF files: found, thinned to what a page can carry, read once each."""
+"""Meshes of robots from URDF files: found, read once each, simplified together to what a page can carry."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.view.blocks import Blocks
 from dynsim.view.mesh_files import Mesh, read_mesh
 
-# Triangles of one mesh at most: seven links of a robot are then some 150 kB.
-TRIANGLES = 5000
-# Cells along the longest side of a mesh, the first that leaves few enough triangles.
-CELLS = (2000, 400, 250, 160, 100, 64, 40, 24, 12)
+# Triangles of all meshes of a page at most: some 1 MB of it.
+TRIANGLES = 100_000
+# Corners nearer to each other than this share of a mesh's size are one: STL repeats them for every triangle.
+_WELD = 2.0**-20
+# The same before a mesh is simplified: slivers, of which meshes from CAD are full, would hold that up. The next one is
+# tried where this many times too many triangles are left.
+_COARSE, _TOO_MANY = (1 / 500, 1 / 250, 1 / 120, 1 / 60, 1 / 30), 1.5
+# Where the collapses of fast_simplification end: at an error of a hundredth of the size.
+_AGGRESSIVENESS = 2.5
+# Fewer triangles than a tetrahedron has are no solid.
+_LEAST = 4
 _CODES = 65535.0
 
 
 class Meshes:
-    """Meshes, each once, with at most so many triangles; those of a record are looked for where its robot's file is."""
+    """Meshes, each once; those of a record are looked for where its robot's file is."""
 
-    def __init__(self, most: int = TRIANGLES) -> None:
+    def __init__(self) -> None:
         self.found: list[Mesh] = []
-        self._most = most
         self._folders: tuple[Path, ...] = ()
         self._known: dict[Path, int | None] = {}
         self._missing: dict[str, None] = {}
@@ -72,14 +79,14 @@ class Meshes:
         try:
             if not path.is_file():
                 return None
-            self.found.append(thinned(read_mesh(path), self._most))
+            self.found.append(welded(read_mesh(path)))
         except (RecordError, OSError, ValueError):
             return None
         return len(self.found) - 1
 
 
 def packed(mesh: Mesh, blocks: Blocks) -> dict[str, Any]:
-    """A mesh as the page reads it: corners in 16 bits within their box, triangles, and which colours they have."""
+    """A mesh as the page reads it: corners in 16 bits within their box, triangles, and the colours of these."""
     corners, triangles, colours = mesh
     low, high = corners.min(axis=0), corners.max(axis=0)
     step = np.where(high > low, (high - low) / _CODES, 1.0)
@@ -97,8 +104,8 @@ def packed(mesh: Mesh, blocks: Blocks) -> dict[str, Any]:
     }
 
 
-def thinned(mesh: Mesh, most: int = TRIANGLES) -> Mesh:
-    """The same surface with at most so many triangles: corners within one cell of a grid become one.
+def welded(mesh: Mesh, near: float = _WELD) -> Mesh:
+    """The same surface with corners as one that are ``near``, a share of its size, without triangles that are lines.
 
     Raises
     ------
@@ -106,28 +113,95 @@ def thinned(mesh: Mesh, most: int = TRIANGLES) -> Mesh:
         Nothing is left of it.
     """
     corners, triangles, colours = mesh
-    low = corners[triangles].min(axis=(0, 1))
-    size = float((corners[triangles].max(axis=(0, 1)) - low).max())
+    low, size = _box(corners[triangles])
     if not size > 0.0:
         raise ValueError("a mesh without size")
-    for cells in CELLS:
-        cell = np.rint((corners - low) * (cells / size)).astype(np.int64)
-        _, place, number = np.unique(cell, axis=0, return_index=True, return_inverse=True)
-        faces = number.reshape(-1)[triangles]
-        whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-        faces = faces[whole]
-        # The same three corners in the same sense, beginning with the least.
-        first = faces.argmin(axis=1)[:, None]
-        faces, kept = np.unique(
-            np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1), axis=0, return_index=True
-        )
-        if len(faces) <= most:
-            break
-    if not len(faces):
+    _, place, number = np.unique(
+        np.rint((corners - low) / (near * size)), axis=0, return_index=True, return_inverse=True
+    )
+    faces = number.reshape(-1)[triangles]
+    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    if not whole.any():
         raise ValueError("a mesh without faces")
-    used, faces = np.unique(faces, return_inverse=True)
-    painted = None if colours is None else colours[whole][kept]
-    return Mesh(corners[place[used]], faces.reshape(-1, 3), painted)
+    used, faces = np.unique(faces[whole], return_inverse=True)
+    return Mesh(corners[place[used]], faces.reshape(-1, 3), None if colours is None else colours[whole])
+
+
+def _box(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """The lowest corner of the box about some points, and its longest side [m]."""
+    pooled = corners.reshape(-1, 3)
+    low = pooled.min(axis=0)
+    return low, float((pooled.max(axis=0) - low).max())
+
+
+def simplified(meshes: Sequence[Mesh], most: int = TRIANGLES) -> list[Mesh]:
+    """The same surfaces with together about ``most`` triangles; all of those that have no more.
+
+    Edges collapse where the surface changes least (quadric error metrics, Garland and Heckbert 1997). Parts of one
+    colour are simplified apart from each other, the largest first, and keep their borders: no crack opens between them.
+    """
+    limit = _limit([len(rows) for mesh in meshes for rows in _by_colour(mesh)], most)
+    return [_simplified(mesh, limit) for mesh in meshes]
+
+
+def _simplified(mesh: Mesh, most: int) -> Mesh:
+    """A mesh with at most about so many triangles of each colour."""
+    sizes = [len(rows) for rows in _by_colour(mesh)]
+    wanted = sum(min(size, most) for size in sizes)
+    if wanted == sum(sizes):
+        return mesh
+    for near in _COARSE:
+        coarse = welded(mesh, near)
+        found = welded(_joined([_decimated(coarse, rows, most) for rows in _by_colour(coarse)]))
+        if len(found.triangles) <= _TOO_MANY * wanted:
+            break
+    return found
+
+
+def _by_colour(mesh: Mesh) -> list[NDArray[np.intp]]:
+    """Rows of the triangles of each colour."""
+    if mesh.colours is None:
+        return [np.arange(len(mesh.triangles))]
+    _, number = np.unique(np.nan_to_num(mesh.colours, nan=-1.0), axis=0, return_inverse=True)
+    number = number.reshape(-1)
+    return [np.flatnonzero(number == k) for k in range(int(number.max()) + 1)]
+
+
+def _limit(counts: Sequence[int], most: int) -> int:
+    """The largest size to which those that are larger must come down, so that all have ``most`` together."""
+    left = most
+    for k, count in enumerate(sorted(counts)):
+        share = left // (len(counts) - k)
+        if count > share:
+            return max(share, _LEAST)
+        left -= count
+    return most
+
+
+def _decimated(mesh: Mesh, rows: NDArray[np.intp], most: int) -> Mesh:
+    """Some triangles of a mesh as a mesh of at most about so many."""
+    used, faces = np.unique(mesh.triangles[rows], return_inverse=True)
+    corners, faces = mesh.corners[used], faces.reshape(-1, 3)
+    paint = None if mesh.colours is None else mesh.colours[rows]
+    if len(faces) <= most:
+        return Mesh(corners, faces, paint)
+    from fast_simplification import simplify
+
+    # Its thresholds are lengths: a mesh may be in millimetres.
+    low, size = _box(corners)
+    unit = (corners - low) / size
+    fewer, faces = simplify(unit, faces.astype(np.int32), target_count=most, agg=_AGGRESSIVENESS, preserve_border=True)
+    return Mesh(low + size * fewer, faces.astype(np.int64), None if paint is None else paint[: len(faces)])
+
+
+def _joined(parts: Sequence[Mesh]) -> Mesh:
+    starts = np.cumsum([0, *(len(part.corners) for part in parts)])
+    colours = [part.colours for part in parts if part.colours is not None]
+    return Mesh(
+        np.concatenate([part.corners for part in parts]),
+        np.concatenate([part.triangles + start for part, start in zip(parts, starts, strict=False)]),
+        np.concatenate(colours) if colours else None,
+    )
 
 
 def _named(tree: Any, key: str) -> Iterator[str]:

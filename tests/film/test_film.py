@@ -336,7 +336,7 @@ def test_all_robots_are_painted_within_the_picture(kind: str, view: str, robots:
 def test_a_mesh_is_painted_with_its_faces(robots: dict[str, Record]) -> None:
     painter = Film({"one": robots["urdf"]}, view="side").painters["one"]
     # Three wedges of four triangles, a rod in place of the file that is not there, and hubs.
-    assert len(painter._meshes.found) == 3
+    assert len(painter._meshes) == 3
     lengths = np.ptp(painter._solids.corners[painter._solids.body == 0], axis=0)
     np.testing.assert_allclose(lengths, [0.1, 0.1, 0.15], atol=1e-6)
 

@@ -11,6 +11,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from dynsim.errors import RecordError
+from dynsim.figures import style
 from dynsim.hardware.bus.control_table import MX_106
 from dynsim.hardware.errors import ComparisonGateFailed, ServoMapError
 from dynsim.hardware.export import export_record
@@ -206,6 +207,28 @@ def turning(drift: float, start: float, speed: float = 1.0) -> tuple[Record, Rec
     measured.add("rho", (start + 2 * t - np.cos(t) + drift * t / speed)[:, None], "rad", labels=("rho1",))
     measured.add("rho_dot", (speed * (2 + np.sin(t)) + drift)[:, None], "rad/s", labels=("rho1",))
     return simulated, measured
+
+
+def test_wheels_are_drawn(tmp_path, monkeypatch) -> None:
+    """Their rates, measured over simulated, and what lies between, below those of the joints."""
+    comparison = compare_records(*turning(0.01, start=37.0))
+    np.testing.assert_allclose(comparison.wheel_rates[1] - comparison.wheel_rates[0], 0.01)
+    figures = []
+    monkeypatch.setattr(style, "save", lambda figure, path: figures.append(figure) or path)
+    draw_comparison(comparison, tmp_path / "wheels.png", ["rho1"])
+    labels = [axes.get_ylabel() for axes in figures[0].axes]
+    assert labels == [
+        "joint angle [rad]",
+        "measured − simulated [mrad]",
+        "wheel rate [rad/s]",
+        "measured − sim. [rad/s]",
+    ]
+    rates, errors = figures[0].axes[2:]
+    drawn = [line for line in rates.get_lines() if len(line.get_xdata())]
+    for line, values in zip(drawn, comparison.wheel_rates[::-1, :, 0], strict=True):
+        np.testing.assert_allclose(line.get_ydata(), values)
+    np.testing.assert_allclose(errors.get_lines()[0].get_ydata(), 0.01)
+    assert "rho1: rms 0.01 rad/s" in errors.get_legend().get_texts()[0].get_text()
 
 
 @pytest.mark.parametrize("speed", [1.0, 0.5])

@@ -13,9 +13,13 @@ from dynsim import cli, figures
 from dynsim.figures import measured as measured_figures
 from dynsim.figures import style
 from dynsim.hardware.replay.check import check_motion
+from dynsim.hardware.replay.measured import describe
+from dynsim.hardware.replay.states import State
+from dynsim.hardware.servo_map import SHIPPED, load_servo_map
 from dynsim.record import Record
 from dynsim.record.scene import HERE, WORLD, Body, Joint, Point, Scene
 from dynsim.scenario import build_model, load_scenario
+from dynsim.view import viewable
 
 from .conftest import Rig, swing
 
@@ -161,6 +165,53 @@ def test_where_the_base_was_is_not_invented(rig: Rig) -> None:
     measured = Rig(rig.map, record).run().result.record
     assert measured.scene == record.scene
     assert "body_position" not in measured
+
+
+def test_a_base_that_was_recorded_carries_what_was_measured(rig: Rig) -> None:
+    """Poses on the base of the record that was followed, at its time, and said to be so."""
+    record = swing()
+    base = Joint("base", "planar", (0.0, 0.0, 1.0), (0.0, 0.0, 0.0), HERE, "base_pose", ("x", "y", "yaw"))
+    record.scene = Scene((Body("base", WORLD, base), Body("upper", 0, hinge("shoulder", 0.0))))
+    pose = np.stack([record.time, 0.0 * record.time, 0.0 * record.time], axis=1)
+    record.add("base_pose", pose, "m, m, rad", labels=("x", "y", "yaw"))
+    measured = Rig(rig.map, record).run().result.record
+    at = measured["record_time"]
+    known = np.isfinite(at)
+    assert known.sum() > 10
+    # Before the motion begins it stands where that will, after its end where it ended.
+    end = record.time[-1] - record.time[0]
+    wanted = np.clip(at[known], 0.0, end) + record.time[0]
+    np.testing.assert_allclose(measured["body_position"][known, 0, 0], wanted, atol=1e-6)
+    np.testing.assert_array_equal(measured["body_position"][: np.flatnonzero(known)[0], 0, 0], 0.0)
+    turned = 2.0 * np.arctan2(measured["body_orientation"][:, 1, 2], measured["body_orientation"][:, 1, 0])
+    np.testing.assert_allclose(turned, measured["q"][:, 0], atol=1e-6)
+    for name in ("base_pose", "body_position"):
+        assert "of the record that was followed" in measured.signals[name].description
+
+
+def test_a_measured_snake_can_be_viewed() -> None:
+    """Servos that are exactly where they should be, pitched for lifted wheels: every body is where it was simulated."""
+    simulated = dynsim.simulate(load_scenario("snake_positioning", "x", {"duration_s": 2.0}))
+    servo_map = load_servo_map(SHIPPED / "snake.yaml")
+    motion = check_motion(simulated, servo_map)
+    goals = np.array([motion.path.at(time)[0] for time in simulated.time])
+    measured = Record(simulated.time, provenance={"robot": "snake"})
+    measured.add("record_time", simulated.time, "s")
+    measured.add("state", np.full(len(simulated), int(State.REPLAY)), "1")
+    for name in ("phi", "rho"):
+        columns = [k for k, servo in enumerate(servo_map.servos) if servo.kind.follows.position == name]
+        labels = tuple(servo_map.servos[k].label for k in columns)
+        measured.add(name, goals[:, columns], "rad", labels=labels)
+    describe(measured, simulated.scene, State, motion.unmeasured)
+    wheels = [k for k, name in enumerate(simulated.labels["body_position"]) if name.startswith("wheel")]
+    others = np.delete(np.arange(len(simulated.labels["body_position"])), wheels)
+    for rows in (others, wheels):
+        where = measured["body_position"][:, rows], simulated["body_position"][:, rows]
+        np.testing.assert_allclose(*where, atol=1e-5)
+    np.testing.assert_array_equal(measured["grounded"], simulated["grounded"])
+    assert (simulated["grounded"] == 0).any()
+    assert viewable(measured)
+    np.testing.assert_allclose(measured["hand_position"], simulated["w"][:, :3], atol=1e-5)
 
 
 def test_a_dry_run_has_a_record_without_goals(scenic: Rig, tmp_path: Path) -> None:

@@ -79,13 +79,13 @@ class Pilot:
 
 
 @pytest.fixture
-def pilot(browser: Any) -> Iterator[Callable[[Teleop], Pilot]]:
+def pilot(browser: Any) -> Iterator[Callable[..., Pilot]]:
     """Opens the page of a drive; at the end it has asked for nothing else and complained of nothing."""
     found: list[tuple[Pilot, Teleop]] = []
     contexts: list[Any] = []
 
-    def opens(teleop: Teleop) -> Pilot:
-        context = browser.new_context(viewport={"width": 700, "height": 500})
+    def opens(teleop: Teleop, **screen: Any) -> Pilot:
+        context = browser.new_context(**{"viewport": {"width": 700, "height": 500}} | screen)
         context.set_default_timeout(1e3 * PATIENCE_S)
         contexts.append(context)
         one = Pilot(context.new_page(), teleop)
@@ -192,3 +192,73 @@ def test_focus_that_is_lost_lets_everything_go(teleop: Callable[..., Teleop], pi
     keyboard.up(" ")
     assert drive.interrupt() == 0
     assert drive.group_is_gone()
+
+
+PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
+
+
+def test_a_phone_has_all_axes_beside_the_scene(teleop: Callable[..., Teleop], pilot: Callable[..., Pilot]) -> None:
+    """Sticks for all six axes of a gripper within 390 pixels, below the scene; one drives what had none."""
+    drive = teleop("snake_operator", "--speed", "0.2")
+    one = pilot(drive, **PHONE)
+    one.until("document.querySelector('.state').textContent === 'hold a stick to drive'")
+    axes = one.js("[...dynsim.drive.sticks.values()].flatMap((s) => [s.across, s.up]).filter(Boolean)")
+    assert sorted(axes) == sorted(one.js("dynsim.drive.names"))
+    assert len(axes) == 6
+    assert one.js("[document.documentElement.scrollWidth, document.documentElement.scrollHeight]") == [390, 844]
+    view = one.page.locator("#view").bounding_box()
+    assert view["height"] > 300
+    for part in (".stick >> nth=0", ".stick >> nth=2", "#end", "#role", ".state"):
+        box = one.page.locator(part).bounding_box()
+        assert box["y"] >= view["y"] + view["height"]
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= 390
+        assert box["y"] + box["height"] <= 844
+    box = one.page.locator(".stick[data-name=beta]").bounding_box()
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    touch = one.page.context.new_cdp_session(one.page)
+
+    def finger(kind: str, *points: tuple[float, float]) -> None:
+        touches = [{"x": x, "y": y} for x, y in points]
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": touches})
+
+    def turn() -> None:
+        finger("touchStart", middle)
+        finger("touchMove", (middle[0], middle[1] - 0.3 * box["height"]))
+
+    def anew() -> None:
+        finger("touchEnd")
+        one.page.wait_for_timeout(100)
+        turn()
+
+    turn()
+    beta = one.js("dynsim.drive.names.indexOf('beta')")
+    asked = f"dynsim.drive.wish.held && dynsim.drive.wish.axes[{beta}] > 0.8"
+    one.until(f"{asked} && dynsim.drive.last.state === 'driving'", anew)
+    finger("touchEnd")
+    one.until("dynsim.drive.wish.held === false")
+    assert drive.interrupt() == 0
+
+
+def test_a_watcher_is_told_nothing_that_the_pilot_is_to_do(
+    teleop: Callable[..., Teleop], pilot: Callable[..., Pilot], browser: Any
+) -> None:
+    drive = teleop("elbow_comparison", "--variant", "two_elbows")
+    one = pilot(drive)
+    context = browser.new_context(**PHONE)
+    watcher = context.new_page()
+    watcher.goto(drive.address)
+    watcher.evaluate("dynsim.ready")
+    one.space()
+    one.until("dynsim.drive.last.state === 'driving'", one.space)
+    one.js("dynsim.drive.say = () => {}")
+    end = time.monotonic() + PATIENCE_S
+    while watcher.evaluate("dynsim.drive?.last?.state") != "silent":
+        assert time.monotonic() < end
+        watcher.wait_for_timeout(20)
+    assert watcher.evaluate("dynsim.drive.role") == "watching"
+    assert watcher.inner_text(".state") == "the pilot is silent"
+    assert not any(watcher.locator(part).is_visible() for part in (".stick >> nth=0", "#hold", "#end"))
+    one.until("document.querySelector('.state.silent')?.textContent.includes('let the key go once')")
+    context.close()
+    assert drive.interrupt() == 0

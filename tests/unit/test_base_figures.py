@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 from pathlib import Path
@@ -12,9 +13,10 @@ from matplotlib.figure import Figure
 from scipy.spatial import ConvexHull
 
 import dynsim
-from dynsim import figures
-from dynsim.figures import arm, base, posture, skeleton, solids, style, top_view
+from dynsim import figures, measures
+from dynsim.figures import arm, base, motors, posture, skeleton, solids, style, top_view
 from dynsim.hardware.export import export_record, joint_motion
+from dynsim.measures import percent
 from dynsim.record import Event, Record
 from dynsim.record.scene import Scene, Shape
 from dynsim.scenario import load_scenario
@@ -180,6 +182,34 @@ def test_a_peak_of_the_demand_does_not_hide_the_rest(braced: Record) -> None:
     columns = len(figure.axes) // 3
     assert all(axes.get_ylim()[1] <= base.TRACTION_TOP for axes in figure.axes[2 * columns :])
     assert f"cut off at {base.TRACTION_TOP:g}" in figure.axes[-1].get_xlabel()
+
+
+def test_demand_without_load_is_said_and_no_number(braced: Record) -> None:
+    record = copy.deepcopy(braced)
+    rows = np.flatnonzero((record.time > 0.1) & (record.time < 0.2))
+    record["traction_demand"][rows, 1] = np.inf
+    record["traction_demand"][rows + len(rows), 0] = np.nan
+    figure = drawn(base.overturning(record))
+    text = texts(figure)
+    assert "a wheel carries nothing" in text
+    assert "inf" not in text
+    assert "nan" not in text
+    share = 2 * len(rows) / len(record)
+    assert f"none without load on a wheel: {percent(share)} of the samples" in figure.axes[-1].get_xlabel()
+    finite = record["traction_demand"][np.isfinite(record["traction_demand"])]
+    summary = measures.base_summary(record, 0.0, np.zeros(0), np.zeros(len(record)))
+    assert summary["traction_demand_max"] == finite.max()
+
+
+def test_motors_of_wheels_have_names(turning: Record) -> None:
+    assert turning.scene is not None
+    assert turning.scene.wheel_names == {"base.left": "left wheel", "base.right": "right wheel"}
+    record = copy.deepcopy(turning)
+    record["current"][:, :2] = 100.0 + record["current"][:, :2]
+    named = texts(drawn(motors.motors(record)))
+    assert "left wheel" in named
+    assert "right wheel" in named
+    assert "base.left" not in named
 
 
 def test_reference_of_an_arc_is_the_arc(turning: Record) -> None:

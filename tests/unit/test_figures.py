@@ -9,8 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
 
 import dynsim
 from dynsim import figures, measures, metrics
@@ -376,7 +379,74 @@ def test_labels_of_contacts_do_not_overprint_each_other(braced: Record) -> None:
     close = skeleton.contact_labels(body, plane, 10.0)
     assert [label.level for label in close] == [0, 1]
     low, _ = skeleton.with_labels((np.zeros(2), np.ones(2)), close, 10.0)
-    assert low[1] < close[1].z - (close[1].offset + skeleton.LABEL_HEIGHT) / 10.0
+    assert low[1] < close[1].place[1] + (close[1].offset[1] - close[1].half[1]) / 10.0
+
+
+def boxes(axes: Axes) -> list[Bbox]:
+    """Where texts of a panel are written."""
+    return [text.get_window_extent() for text in axes.texts]
+
+
+def test_labels_of_postures_lie_on_nothing() -> None:
+    """Times and contacts: not over each other, nor over any posture, way or edge of the panel; at a wall beside it."""
+    record = dynsim.simulate(load_scenario("wall_push", "weak_hold", {"integrator.rtol": 1e-4}))
+    figure = drawn(posture.posture(record))
+    figure.draw_without_rendering()
+    side = figure.axes[1]
+    (contact,) = (text for text in side.texts if "elbow" in text.get_text())
+    assert contact.get_window_extent().x0 > side.transData.transform((0.4, 0.0))[0]
+    written = boxes(side)
+    assert len(written) >= 3
+    for one, other in itertools.combinations(written, 2):
+        assert not one.overlaps(other)
+    lines = [path for lines in side.collections if isinstance(lines, LineCollection) for path in lines.get_segments()]
+    lines += [line.get_xydata() for line in side.get_lines() if len(line.get_xydata()) > 1]
+    points = [
+        np.column_stack([np.interp(np.linspace(0, len(one) - 1, 400), np.arange(len(one)), c) for c in one.T])
+        for one in lines
+    ]
+    pixels = side.transData.transform(np.concatenate(points))
+    for box in written:
+        inside = (pixels > [box.x0, box.y0]).all(axis=1) & (pixels < [box.x1, box.y1]).all(axis=1)
+        assert not inside.any()
+        assert side.bbox.x0 <= box.x0
+        assert box.x1 <= side.bbox.x1
+
+
+def test_energies_far_apart_are_dots_on_a_logarithmic_axis(braced: Record) -> None:
+    """219.7 J beside 6203 J: as bars, one of them is no more than a line."""
+    more, most = copy.deepcopy(braced), copy.deepcopy(braced)
+    more["energy_electrical"][:] *= 10.0
+    most["energy_electrical"][:] *= 28.0
+    figure = drawn(energy.energy_comparison({"a": braced, "b": more, "c": most}))
+    total = figure.axes[1]
+    assert total.get_yscale() == "log"
+    assert not total.patches
+    assert [text.get_text().splitlines()[1:] for text in total.texts] == [["1/28"], ["1/2.8"], []]
+    figure = drawn(energy.energy_comparison({"a": braced, "b": braced}))
+    assert figure.axes[1].get_yscale() == "linear"
+    assert len(figure.axes[1].patches) == 2
+
+
+def test_tracking_error_has_a_settled_axis(braced: Record) -> None:
+    """What the start alone has is drawn in a panel of its own; the other one ends near what comes after it."""
+    record = copy.deepcopy(braced)
+    wanted = measures.hand_target(record)
+    assert wanted is not None
+    since = record.time - 0.1
+    record["hand_position"][:] = wanted + np.where(since < 0.0, -since, 0.002 + 0.002 * since)[:, None] * [
+        1.0,
+        0.0,
+        0.0,
+    ]
+    figure = drawn(hand.error(record))
+    assert len(figure.axes) == 4
+    error = 1e3 * np.abs(record["hand_position"] - wanted).max()
+    for start, whole in (figure.axes[:2], figure.axes[2:]):
+        assert whole.get_ylim()[1] < 0.1 * error < error < start.get_ylim()[1]
+    compared = drawn(hand.error_comparison({"one": record, "other": record}))
+    assert compared.axes[1].get_yscale() == "log"
+    assert compared.axes[1].get_ylim()[1] < 0.1 * error
 
 
 def test_side_plane_of_an_arm_along_minus_y() -> None:
@@ -441,7 +511,14 @@ def test_real_contact_figure_names_modes_and_marks_events(real: Record) -> None:
     # The panel of the whole run; that of the transient shows what is in it.
     marks = [line for line in figure.axes[-1].get_lines() if line.get_label() == "_event"]
     shown = sorted(float(t) for line in marks for t in line.get_xdata())
-    assert shown == sorted(event.time for event in real.events if event.name == "elbow_7")
+    (start, whole), begun = figure.axes[-2:], figure.axes[-2].get_xlim()[1]
+    times = sorted(event.time for event in real.events if event.name == "elbow_7")
+    assert shown == [time for time in times if time > begun]
+    marks = [line for line in start.get_lines() if line.get_label() == "_event"]
+    assert sorted(float(t) for line in marks for t in line.get_xdata()) == [time for time in times if time <= begun]
+    # Nothing lies on the bands.
+    assert not any(axes.child_axes for axes in figure.axes)
+    assert whole.get_ylim()[1] < start.get_ylim()[1]
 
 
 def test_every_time_figure_marks_the_events_of_contacts(real: Record, braced: Record) -> None:

@@ -300,6 +300,86 @@ def test_plots_show_the_signals(braced: Record, opened: Opens) -> None:
         np.testing.assert_allclose(values, data, atol=1e-5 * np.ptp(data, axis=0).max())
 
 
+def test_the_largest_curves_are_named(mobile: Record, opened: Opens) -> None:
+    """Of twelve motors the six with the largest rms over what is shown; those of wheels by their side."""
+    page = opened({"one": mobile})
+    select = page.page.locator(".plot select").first
+    select.select_option("torque")
+    rms = np.sqrt((mobile["torque"] ** 2).mean(axis=0))
+    largest = [mobile.labels["torque"][k] for k in np.sort(np.argsort(-rms)[:6])]
+    named = {"base.left": "left wheel", "base.right": "right wheel"}
+    drawn = page.js("dynsim.app.plots.plots[0].named.map((k) => dynsim.app.plots.plots[0].drawn[k].label)")
+    assert drawn == [named.get(name, name) for name in largest]
+    text = page.page.locator(".plot .values").first.inner_text()
+    assert "… 6 smaller" in text
+    assert all(name in text for name in drawn)
+    # Zoomed in, those that are the largest there.
+    page.js("dynsim.app.plots.zoom([0.0, 0.02])")
+    early = np.sqrt((mobile["torque"][mobile.time <= 0.02] ** 2).mean(axis=0))
+    largest = [mobile.labels["torque"][k] for k in np.sort(np.argsort(-early)[:6])]
+    drawn = page.js("dynsim.app.plots.plots[0].named.map((k) => dynsim.app.plots.plots[0].drawn[k].label)")
+    assert drawn == [named.get(name, name) for name in largest]
+    choices = page.page.locator(".plot select").nth(1).locator("option").all_inner_texts()
+    assert choices[:3] == ["all", "left wheel", "right wheel"]
+
+
+def test_the_key_says_what_a_ball_below_the_floor_is(opened: Opens) -> None:
+    page = opened({"one": short("elbow_comparison", "no_elbow")})
+    page.page.click("#help")
+    signs = page.page.inner_text("#signs")
+    assert "joint or hand below a surface" in signs
+    assert "↓ by how much" in signs
+    colour = page.js("getComputedStyle(document.querySelector('[data-colour=sunk]')).color")
+    paint = "(c => { const d = document.createElement('i'); d.style.color = c; return d.style.color; })"
+    assert colour == page.js(f"{paint}(dynsim.app.colours.sunk)")
+    # What this record does not have is not explained.
+    assert "wheel on the ground" not in signs
+
+
+def contrast(one: list[float], other: list[float]) -> float:
+    """Of two colours (sRGB, 0 to 1), as WCAG 2 has it."""
+    light = [float(np.dot([0.2126, 0.7152, 0.0722], np.power(c, 2.2))) for c in (one, other)]
+    return (max(light) + 0.05) / (min(light) + 0.05)
+
+
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("kind", ["box", "height_field"])
+def test_solid_surfaces_are_seen_in_either_theme(kind: str, dark: bool, opened: Opens, tmp_path: Path) -> None:
+    """Their edges stand out from the ground behind them by 3 : 1, and so do they from their own faces, nearly."""
+    np.savetxt(tmp_path / "heights.csv", -0.2 + 0.01 * np.random.default_rng(1).random((6, 8)), delimiter=",")
+    surfaces: dict[str, Any] = {
+        "box": {"type": "box", "center_m": [0.7, 0.0, -0.3], "edges_m": [0.2, 1.0, 0.2]},
+        "height_field": {"type": "height_field", "file": str(tmp_path / "heights.csv"), "spacing_m": [0.2, 0.2]},
+    }
+    changes = {"surfaces": {"pipe": surfaces[kind]}, "contacts.points.elbow.enabled": False}
+    page = opened({"one": short("brace_on_cylinder", "real", **changes)}, dark=dark)
+    colours = "(m => [m.children[0].material.color, m.material.color].map((c) => [c.r, c.g, c.b]))"
+    edge, face = page.js(f"{colours}(dynsim.app.actors[0].surfaces[0])")
+    fog = page.js("(c => [c.r, c.g, c.b])(dynsim.app.stage.scene.background)")
+    assert page.js("dynsim.app.actors[0].surfaces[0].children[0].geometry.attributes.position.count") >= 24
+    assert contrast(edge, fog) > 3.0
+    assert contrast(edge, face) > 1.9
+
+
+def test_variants_stand_across_what_is_long(opened: Opens) -> None:
+    """The pipe lies along y: variants behind each other would stand on each other's; a wall goes on for all."""
+    records = {name: short("brace_on_cylinder", name) for name in ("real", "glued", "free")}
+    page = opened(records)
+    offsets = np.array([record["offset"] for record in page.state()["records"]])
+    radius = 0.1
+    for k, offset in enumerate(np.diff(offsets, axis=0)):
+        assert abs(offset[0]) > 2.0 * radius, k
+        assert abs(offset[1]) < 0.01 * abs(offset[0])
+    assert page.js("dynsim.app.actors.map((a) => a.surfaces[0].visible)") == [True] * 3
+    page.page.keyboard.press("g")
+    assert page.js("dynsim.app.actors.map((a) => a.surfaces[0].visible)") == [True, False, False]
+    walls = {name: short("wall_push", name) for name in ("weak_hold", "strong_hold")}
+    page = opened(walls)
+    _, second = page.state()["records"]
+    assert abs(second["offset"][1]) > 0.1
+    assert page.js("dynsim.app.actors.map((a) => a.surfaces[0].visible)") == [True, False]
+
+
 def test_a_phone(mobile: Record, opened: Opens) -> None:
     page = opened({"one": mobile}, size=(390, 844), dark=True)
     assert page.js("document.documentElement.scrollWidth") <= 390

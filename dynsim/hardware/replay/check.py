@@ -14,6 +14,7 @@ import numpy as np
 
 from dynsim.hardware.bus.control_table import HEALTH_BLOCK, STATE_BLOCK, TICKS_PER_TURN
 from dynsim.hardware.errors import CheckRefused
+from dynsim.hardware.replay.measured import unmeasured
 from dynsim.hardware.replay.motion import Array, Course, Needs, Planned
 from dynsim.hardware.replay.trajectory import (
     COMMON,
@@ -134,6 +135,8 @@ class CheckedMotion:
     warnings : tuple of str
     scene : Scene or None
         What the record says of the robot's looks; the measured record takes it over.
+    unmeasured : Record or None
+        See :func:`dynsim.hardware.replay.measured.unmeasured`.
     """
 
     path: Path
@@ -142,6 +145,7 @@ class CheckedMotion:
     margins: tuple[Margin, ...]
     warnings: tuple[str, ...]
     scene: Scene | None = None
+    unmeasured: Record | None = None
 
     @property
     def start(self) -> Array:
@@ -205,7 +209,9 @@ def check_motion(
         warnings.append(
             f"{len(missing)} of {len(record) - 1} steps are long, samples of the record may be missing: {missing[0]}"
         )
-    return CheckedMotion(path, speed, plan, tuple(margins), tuple(warnings), record.scene)
+    return CheckedMotion(
+        path, speed, plan, tuple(margins), tuple(warnings), record.scene, unmeasured(record, servo_map)
+    )
 
 
 def _check_duration(record: Record, speed: float) -> None:

@@ -109,6 +109,8 @@ class Comparison:
         Record time [s].
     simulated, measured : array, shape (T, N)
         [rad].
+    wheel_rates : array, shape (2, T, number of wheels)
+        Simulated and measured [rad/s].
     """
 
     delay: float
@@ -117,6 +119,7 @@ class Comparison:
     time: Array
     simulated: Array
     measured: Array
+    wheel_rates: Array
 
     @property
     def worst(self) -> JointError:
@@ -215,8 +218,8 @@ def compare_records(simulated: Record, measured: Record) -> Comparison:
                 delay=_delay(at, time, actual, only) / speed,
             )
         )
-    wheels = _wheel_errors(simulated, measured, rows, time, speed)
-    return Comparison(delay / speed, tuple(joints), wheels, time, at(time), actual)
+    wheels, rates = _wheel_errors(simulated, measured, rows, time, speed)
+    return Comparison(delay / speed, tuple(joints), wheels, time, at(time), actual, rates)
 
 
 def _rms(error: Array) -> float:
@@ -232,14 +235,17 @@ def _largest(error: Array, time: Array) -> tuple[float, float]:
 
 def _wheel_errors(
     simulated: Record, measured: Record, rows: NDArray[np.bool_], time: Array, speed: float
-) -> tuple[WheelError, ...]:
+) -> tuple[tuple[WheelError, ...], Array]:
+    """Errors of the wheels, and their rates as :class:`Comparison` has them."""
     angles = {label: (ours, theirs) for label, ours, theirs in _columns(simulated, measured, WHEEL_ANGLE)}
     own_time = simulated.time - simulated.time[0]
-    found = []
+    found, rates = [], np.zeros((2, len(time), 0))
     for label, ours, theirs in _columns(simulated, measured, WHEEL_RATE):
         if label not in angles:
             continue
-        rate = theirs[rows] - speed * np.interp(time, own_time, ours)
+        pair = np.stack([speed * np.interp(time, own_time, ours), theirs[rows]])
+        rates = np.concatenate([rates, pair[:, :, None]], axis=2)
+        rate = pair[1] - pair[0]
         asked = np.interp(time, own_time, angles[label][0])
         turned = angles[label][1][rows]
         seen = np.flatnonzero(np.isfinite(turned))  # not NaN, as where an answer was missed
@@ -256,7 +262,7 @@ def _wheel_errors(
                 angle_end=float(angle[seen[-1]]),
             )
         )
-    return tuple(found)
+    return tuple(found), rates
 
 
 def _columns(simulated: Record, measured: Record, name: str) -> list[tuple[str, Array, Array]]:
@@ -354,11 +360,11 @@ def check_gate(comparison: Comparison, gate: Gate) -> None:
 
 
 def draw_comparison(comparison: Comparison, path: Path, joints: Sequence[str] = ()) -> Path:
-    """Figure: angles of some joints, measured over simulated, and every joint's error over time.
+    """Figure: angles of some joints, measured over simulated, and every joint's error over time; the same of wheels.
 
     Parameters
     ----------
-    joints : names of those drawn in colour; the ``STRONG`` worst if none are given
+    joints : names of those drawn in colour, wheels among them; the ``STRONG`` worst of either if none are given
 
     Raises
     ------
@@ -368,42 +374,87 @@ def draw_comparison(comparison: Comparison, path: Path, joints: Sequence[str] = 
     from dynsim.figures import style
 
     names = [joint.joint for joint in comparison.joints]
+    wheels = [wheel.wheel for wheel in comparison.wheels]
     for name in joints:
-        if name not in names:
-            raise RecordError(f"no joint {shown(name)} was compared; there are: {', '.join(names)}")
-    ranking = sorted(range(len(names)), key=lambda k: -comparison.joints[k].rms)
-    chosen = [names.index(name) for name in dict.fromkeys(joints)] or ranking[:STRONG]
-    looks = style.variant_styles([names[k] for k in chosen])
-    for look in looks.values():
-        del look["linewidth"]
+        if name not in names + wheels:
+            raise RecordError(f"no joint {shown(name)} was compared; there are: {', '.join(names + wheels)}")
+    drawn = [
+        _Drawn(
+            "joint angle [rad]",
+            "measured − simulated [mrad]",
+            "joints",
+            names,
+            [
+                (one.rms, f"{one.joint}: rms {1e3 * one.rms:.3g} mrad, at most {1e3 * one.max:.3g}")
+                for one in comparison.joints
+            ],
+            np.stack([comparison.simulated, comparison.measured]),
+            1e3,
+        )
+    ]
+    if wheels:
+        labels = [
+            (one.rate_rms, f"{one.wheel}: rms {one.rate_rms:.3g} rad/s, angle at most {one.angle_max:.3g} rad")
+            for one in comparison.wheels
+        ]
+        drawn.append(
+            _Drawn(
+                "wheel rate [rad/s]", "measured − sim. [rad/s]", "wheels", wheels, labels, comparison.wheel_rates, 1.0
+            )
+        )
     with style.look():
         figure = style.new_figure(
-            5.0 + style.LEGEND_ROW / 72.0 * -(-len(chosen) // 2),
+            sum(4.2 + style.LEGEND_ROW / 72.0 * (3 + min(len(one.names), STRONG)) / 2 for one in drawn),
             f"measured and simulated joints: delay {comparison.delay * 1e3:.1f} ms, worst {comparison.worst.joint} "
             f"with rms {1e3 * comparison.worst.rms:.3g} mrad",
         )
-        angles, errors = figure.subplots(2, 1, sharex=True)
+        panels = figure.subplots(2 * len(drawn), 1, sharex=True)
+        for one, (values, errors) in zip(drawn, panels.reshape(-1, 2), strict=True):
+            one.draw(values, errors, comparison.time, joints)
+        panels[-1].set_xlabel("record time [s]")
+        return style.save(figure, path)
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """A kind of joints in the figure: two panels."""
+
+    quantity: str
+    error: str
+    kind: str
+    names: list[str]
+    labels: list[tuple[float, str]]  # rms, and words for the errors
+    values: Array  # (2, T, N), simulated and measured
+    scale: float
+
+    def draw(self, values: Any, errors: Any, time: Array, wanted: Sequence[str]) -> None:
+        """Values, measured over simulated, of some in colour, and errors of all."""
+        from dynsim.figures import style
+
+        ranking = sorted(range(len(self.names)), key=lambda k: -self.labels[k][0])
+        named = [self.names.index(name) for name in dict.fromkeys(wanted) if name in self.names]
+        chosen = named or ranking[:STRONG]
+        looks = style.variant_styles([self.names[k] for k in chosen])
+        simulated, measured = self.values
         for k in chosen:
-            look = looks[names[k]] | {"lw": 1.2}
-            style.line(angles, comparison.time, comparison.measured[:, k], **look)
+            colour = {"color": looks[self.names[k]]["color"], "linestyle": looks[self.names[k]]["linestyle"]}
+            style.line(values, time, measured[:, k], linewidth=1.2, **colour)
             # On top and dashed: where both agree, both are seen.
             over = {"color": style.BLACK, "linewidth": 0.9, "linestyle": (0, (4, 3))}
-            style.line(angles, comparison.time, comparison.simulated[:, k], **over)
+            style.line(values, time, simulated[:, k], **over)
         for k in [k for k in reversed(ranking) if k not in chosen] + chosen:
-            joint = comparison.joints[k]
-            label = f"{joint.joint}: rms {1e3 * joint.rms:.3g} mrad, at most {1e3 * joint.max:.3g}"
-            look = (
-                looks[names[k]] | {"linewidth": 1.2, "label": label} if k in chosen else {"color": "#CFCFCF", "lw": 0.7}
-            )
-            error = 1e3 * (comparison.measured[:, k] - comparison.simulated[:, k])
-            style.line(errors, comparison.time, error, **look)
-        if len(chosen) < len(names):
-            errors.plot([], [], color="#CFCFCF", lw=0.7, label=f"the other {len(names) - len(chosen)} joints")
-        angles.plot([], [], color=style.BLACK, lw=0.9, linestyle=(0, (4, 3)), label="simulated (measured in colour)")
-        style.legend_above(angles)
-        angles.set_ylabel("joint angle [rad]")
+            look: dict[str, Any] = {"color": "#CFCFCF", "linewidth": 0.7}
+            if k in chosen:
+                own = looks[self.names[k]]
+                look = {"color": own["color"], "linestyle": own["linestyle"], "linewidth": 1.2}
+                look["label"] = self.labels[k][1]
+            style.line(errors, time, self.scale * (measured[:, k] - simulated[:, k]), **look)
+        if len(chosen) < len(self.names):
+            left = len(self.names) - len(chosen)
+            errors.plot([], [], color="#CFCFCF", lw=0.7, label=f"the other {left} {self.kind}")
+        values.plot([], [], color=style.BLACK, lw=0.9, linestyle=(0, (4, 3)), label="simulated (measured in colour)")
+        style.legend_above(values)
+        style.legend_above(errors, columns=2)
+        values.set_ylabel(self.quantity)
         errors.axhline(0.0, color=style.GREY, linewidth=0.6)
-        errors.set_ylabel("measured − simulated [mrad]")
-        errors.set_xlabel("record time [s]")
-        figure.legend(*errors.get_legend_handles_labels(), loc="outside lower center", ncols=2)
-        return style.save(figure, path)
+        errors.set_ylabel(self.error)

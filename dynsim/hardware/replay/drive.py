@@ -28,6 +28,7 @@ from dynsim.hardware.replay.rules import Cause, Fault
 from dynsim.hardware.replay.states import Stopped
 from dynsim.hardware.replay.trajectory import HOLE, Path
 from dynsim.hardware.servo_map import ServoMap
+from dynsim.record import Record
 from dynsim.record.scene import Scene
 
 SLACK = 0.1
@@ -99,6 +100,8 @@ class DrivenMotion:
     plan: CyclePlan
     duration: float
     scene: Scene | None = None
+    # The simulation that it follows has no end yet.
+    unmeasured: Record | None = None
     speed: float = 1.0
 
     @property

@@ -322,7 +322,7 @@ class Replay:
         result, rows = self.result, self.recorder.rows.all()
         result.timing = timing_of(rows, self.layout)
         started = self.loop.path_started if self.loop.path_started is not None else self.loop.origin
-        record = describe(measured_record(rows, self.layout, started), self.motion.scene, State)
+        record = describe(measured_record(rows, self.layout, started), self.motion.scene, State, self.motion.unmeasured)
         record.complete = result.fault is None
         for fault in result.faults:
             record.add_event(fault.time - started, "fault", fault.cause.value, description=fault.text)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from dynsim.hardware.replay.check import CyclePlan
+    from dynsim.record import Record
     from dynsim.record.scene import Scene
 
 Array = NDArray[np.float64]
@@ -115,6 +116,8 @@ class Task(Protocol):
         Seconds of the motion per second.
     scene : Scene or None
         What is known of the robot's looks; the measured record takes it over.
+    unmeasured : Record or None
+        What is known of its place that no servo says; the measured record takes that over too.
     """
 
     @property
@@ -125,6 +128,9 @@ class Task(Protocol):
 
     @property
     def scene(self) -> Scene | None: ...
+
+    @property
+    def unmeasured(self) -> Record | None: ...
 
     @property
     def start(self) -> Array:

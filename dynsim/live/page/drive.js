@@ -19,6 +19,10 @@ const PAD_BASE = { ahead: { axis: 1, sign: -1 }, turn: { axis: 0, sign: -1 }, x:
   z: { forth: 7, back: 6 } };
 const PAD_HOLD = [4, 5], PAD_GRIP = 0;
 
+// Axes of a stick, across and up; each axis has one.
+const STICKS = [["turn", "ahead"], ["y", "x"], ["gamma", "z"], ["alpha", "beta"]];
+const TOUCH = matchMedia("(hover: none)");
+
 const NOTHING = { force: NaN, normal: [0, 0, 1], tangent: [0, 0, 0], mode: null };
 
 class Drive {
@@ -188,15 +192,16 @@ class Drive {
       ...(hello.gripper ? [D.element("span", { title: "close or open the gripper" }, D.element("kbd", { textContent: "G" }), " gripper")] : []),
       ...(hello.modes.length ? [D.element("span", { title: "modes, taken when the key is held" }, D.element("kbd", { textContent: "M" }), D.element("kbd", { textContent: "N" }), " switching, fixing")] : []));
     const sticks = D.element("div", { className: "sticks" });
-    for (const [a, b] of this.names.includes("ahead") ? [["turn", "ahead"], ["y", "x"]] : [["y", "x"], [this.names.includes("gamma") ? "gamma" : null, "z"]]) {
-      if (!this.names.includes(a) && !this.names.includes(b)) continue;
-      const stick = new Stick(this.names.includes(a) ? a : null, this.names.includes(b) ? b : null);
-      this.sticks.set(b, stick);
+    for (const pair of STICKS) {
+      const [across, up] = pair.map((name) => (this.names.includes(name) ? name : null));
+      if (!across && !up) continue;
+      const stick = new Stick(across, up);
+      this.sticks.set(up ?? across, stick);
       sticks.append(stick.box);
     }
     this.bar = D.element("div", { className: "bar" }, this.stateBox, this.roleButton, acts, this.timing, this.lateBox, keys);
     this.box.append(sticks, this.bar);
-    document.getElementById("view").append(this.box);
+    document.querySelector("main").append(this.box);
     // What drives away is followed.
     dynsim.set("follow", ["ahead", "gamma"].some((name) => this.names.includes(name)));
     this.tell();
@@ -231,11 +236,13 @@ class Drive {
   status() {
     if (this.ended) return ["over", `the drive is over: ${this.over || "connection closed"}`];
     if (this.state === "driving") return this.last?.hindrance ? ["hindered", `driving, held back: ${this.last.hindrance}`] : ["driving", "driving"];
+    // What is to be done is said to the one who can do it.
+    if (this.state === "silent" && this.role !== "pilot") return ["silent", "the pilot is silent"];
     if (this.state === "silent") return ["silent", "silent: the connection or the page paused; let the key go once, then hold it again"];
     if (this.state === "the robot is not ready yet") return ["silent", this.state];
     // It has heard of the key, and does not count it: held since before the robot was ready, or by a new pilot.
     if (this.role === "pilot" && this.wish?.held && this.last?.n >= this.heldFrom && this.state === "key released") return ["silent", "let the key go once, then hold it again"];
-    return ["", this.role === "pilot" && this.state === "key released" ? "hold space to drive" : this.state];
+    return ["", this.role === "pilot" && this.state === "key released" ? `hold ${TOUCH.matches ? "a stick" : "space"} to drive` : this.state];
   }
 
   tell() {
@@ -273,11 +280,12 @@ class Stick {
 
   move(event) {
     const area = this.box.getBoundingClientRect();
-    let x = (event.clientX - area.left - area.width / 2) / (area.width / 2 - 20), y = (event.clientY - area.top - area.height / 2) / (area.height / 2 - 20);
+    const reach = area.width / 3;
+    let x = (event.clientX - area.left - area.width / 2) / reach, y = (event.clientY - area.top - area.height / 2) / reach;
     const r = Math.max(Math.hypot(x, y), 1);
     x /= r;
     y /= r;
-    this.knob.style.transform = `translate(${40 * x}px, ${40 * y}px)`;
+    this.knob.style.transform = `translate(${reach * x}px, ${reach * y}px)`;
     this.values = {};
     if (this.across) this.values[this.across] = -x;
     if (this.up) this.values[this.up] = -y;

@@ -5,9 +5,20 @@ const KEYS = [
   ["space", "play, pause"], ["← →", "one frame back, ahead; with shift ten"], ["home end", "first, last instant"],
   ["+ −", "faster, slower"], ["1 2 3 4", "from a corner, the side, the front, above"], ["f", "follow the hand"],
   ["g", "side by side or laid over each other"], ["c", "next colouring of the links"], ["d", "dark or light"],
-  ["p", "screenshot"], ["?", "this list"],
+  ["p", "screenshot"], ["?", "what is drawn, and these keys"],
+];
+// What is drawn, by the layer or the part of a record that has it.
+const SIGNS = [
+  ["forces", "push", "▲", "normal force: the surface pushes"], ["pulls", "pull", "▼", "the surface would have to pull"],
+  ["cones", "friction", "▲", "force with friction, and the cone that it cannot leave"],
+  ["modes", "stick", "●", "contact sticks"], ["modes", "slip", "●", "contact slips"], ["modes", "open", "●", "contact open"],
+  ["depths", "sunk", "●", "joint or hand below a surface by more than its link's radius, ↓ by how much: a surface holds contact points only"],
+  ["trace", "hand", "━", "way of the hand"], ["target", "target", "╍", "target of the hand"],
+  ["support", "support", "■", "what the robot stands on"], ["support", "target", "◎", "centre of pressure or of mass; orange outside"],
+  ["wheels", "down", "●", "wheel on the ground; lifted ones are white"],
 ];
 const SPEEDS = [0.05, 0.1, 0.25, 0.5, 1, 2, 5, 10];
+const ABOUT = { depths: "joints and hand below a surface, and how deep (↓)" };
 const EVENTS = { landing: "▼", lift_off: "▲", bounce: "●", slip_start: "▶", slip_stop: "■", stop_hit: "✚", stop_left: "✖", tip_over: "⚠" };
 
 function wire(app) {
@@ -24,7 +35,7 @@ function wire(app) {
   const follow = button("cameras", "follow", "follow the hand (f)", () => app.set("follow", !app.follow));
   const switches = [["forces", "forces"], ["cones", "cones"], ["trace", "trace"], ["target", "target"], ["support", "support"], ["depths", "depths"], ["labels", "labels"]]
     .filter(([name]) => app.has(name)).map(([name, text]) =>
-      [name, button("layers", text, `show or hide: ${text}`, () => app.set(name, !app.layers[name]))]);
+      [name, button("layers", text, `show or hide: ${ABOUT[name] ?? text}`, () => app.set(name, !app.layers[name]))]);
   const layout = app.actors.length > 1 ? button("layers", "", "side by side or laid over each other (g)", () => app.set("ghost", !app.ghost)) : null;
 
   for (const value of SPEEDS) $("speed").append(D.element("option", { value, textContent: `${value}×` }));
@@ -43,6 +54,12 @@ function wire(app) {
   $("theme").onclick = () => app.set("theme", app.theme === "dark" ? "light" : "dark");
   $("shot").onclick = () => app.screenshot();
   $("help").onclick = () => $("keys").open ? $("keys").close() : $("keys").showModal();
+  const signs = SIGNS.filter(([layer]) => app.has(layer)).map(([, colour, sign, what]) => {
+    const cell = D.element("th", { textContent: sign });
+    cell.dataset.colour = colour;
+    return D.element("tr", {}, cell, D.element("td", { textContent: what }));
+  });
+  if (signs.length) $("keys").append(D.element("h2", { textContent: "What is drawn" }), D.element("table", { id: "signs" }, ...signs));
   $("keys").append(D.element("h2", { textContent: "Keys" }), D.element("table", {}, ...KEYS.map(([key, what]) =>
     D.element("tr", {}, D.element("th", { textContent: key }), D.element("td", { textContent: what })))),
     D.element("p", { textContent: "Drag turns, right drag or two fingers move, wheel zooms. In plots: drag zooms, double click shows all, click goes there." }),
@@ -100,6 +117,7 @@ function wire(app) {
       actor.chip.classList.toggle("off", !actor.object.visible);
       actor.chip.firstChild.style.background = app.colourOf(actor);
     }
+    for (const cell of $("keys").querySelectorAll("[data-colour]")) cell.style.color = D.palette[app.theme][cell.dataset.colour];
     for (const sign of $("marks").children) sign.style.color = app.actors.length > 1 ? app.colourOf(app.actors[sign.dataset.actor]) : "";
   };
 }

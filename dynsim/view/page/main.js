@@ -64,24 +64,48 @@ class App {
         const made = S.surface(surface, Stage.round(actor.data.reach / 8));
         if (surface.kind === "plane") this.stage.sheets.push(made);
         made.receiveShadow = true;
+        made.userData = { surface, normal: new THREE.Vector3(0, 0, 1).applyQuaternion(made.quaternion) };
         actor.surfaces.push(made);
         actor.object.add(made);
       }
     }
   }
 
-  // Variants behind each other as the reader sees them, or all at one place.
+  // Variants beside each other, or all at one place.
   arrange() {
     const [low, high] = this.head.box.map((corner) => new THREE.Vector3(...corner));
-    const shown = this.actors.filter((a) => a.object.visible);
-    const apart = this.ghost ? 0 : high.y - low.y + 0.06 * (high.x - low.x);
+    const shown = this.actors.filter((a) => a.object.visible), first = shown[0];
+    const { along, apart } = this.ghost ? { along: "y", apart: 0 } : this.beside(shown, low, high);
     shown.forEach((actor, k) => {
-      this.stage.turned(actor.object.position.set(0, k * apart, 0));
-      for (const one of actor.surfaces) one.visible = !this.ghost || k === 0;
+      actor.object.position.set(0, 0, 0)[along] = k * apart;
+      this.stage.turned(actor.object.position);
+      for (const one of actor.surfaces) one.visible = actor === first || !this.shared(one, first, actor.object.position);
     });
-    high.y += apart * Math.max(shown.length - 1, 0);
+    high[along] += apart * Math.max(shown.length - 1, 0);
+    this.stage.row = along === "x" && shown.length > 1;
     this.stage.settle(low, high, this.floor);
     this.stage.dress(D.palette[this.theme]);
+  }
+
+  // The direction in which they stand beside each other, and how far: behind each other as the reader sees them, but
+  // across what is long that way, a pipe or a beam, or the next one would stand on it too.
+  beside(shown, low, high) {
+    const ways = ["y", "x"].map((along) => {
+      const way = this.stage.turned(new THREE.Vector3(along === "x" ? 1 : 0, along === "y" ? 1 : 0, 0));
+      const span = high[along] - low[along], ends = shown.flatMap((a) => a.surfaces.flatMap((one) => S.extent(one, way)));
+      return { along, span, apart: Math.max(span, Math.max(high[along], ...ends) - Math.min(low[along], ...ends)) };
+    });
+    const [y, x] = ways, best = x.apart / x.span < 0.7 * (y.apart / y.span) ? x : y;
+    // Ground that is larger than everything in both directions is not gone around.
+    const apart = best.apart > 3 * best.span ? best.span : best.apart;
+    return { along: best.along, apart: apart + 0.06 * Math.max(x.span, y.span) };
+  }
+
+  // Whether a surface lies on the same one of the first variant: walls go on, and laid over each other all do.
+  shared(one, first, offset) {
+    const { surface, normal } = one.userData, same = JSON.stringify(surface);
+    if (!first.surfaces.some((other) => JSON.stringify(other.userData.surface) === same)) return false;
+    return this.ghost || (surface.kind === "plane" && Math.abs(normal.dot(offset)) < 1e-6 * offset.length());
   }
 
   dress() {
@@ -93,7 +117,7 @@ class App {
       const own = this.actors.length > 1 ? this.colourOf(actor) : null;
       actor.dress(colours, own ?? colours.hub, own ?? colours.hand, this.ghost && actor !== first);
       actor.plain = new THREE.Color(colours.body);
-      for (const one of actor.surfaces) if (one.material.color) one.material.color.set(colours.surface);
+      for (const one of actor.surfaces) S.paint(one, colours);
     }
     this.stage.dress(colours);
     this.plots.redraw();
@@ -109,7 +133,8 @@ class App {
     const some = (test) => this.actors.some(test);
     return { forces: some((a) => a.contacts.length), cones: some((a) => a.data.contacts.some((c) => c.friction > 0)), labels: some((a) => a.contacts.length + a.sunk.length),
       trace: some((a) => a.data.paths.hand), target: some((a) => a.data.paths.target), support: some((a) => a.support),
-      depths: some((a) => a.sunk.length) }[layer];
+      depths: some((a) => a.sunk.length), wheels: some((a) => a.data.wheels), modes: some((a) => a.contactTables.some((c) => c.mode)),
+      pulls: some((a) => a.contactTables.some((c) => c.force.column(0).some((f) => f < 0))) }[layer];
   }
 
   // Heat of the windings R i²; where the resistance is not one for all motors, the squares of their currents.
@@ -267,7 +292,7 @@ class App {
         : `${state.name}: ${D.number(state.force, 3)} N, ${state.state}`);
       actor.saturated = this.saturated(actor);
       actor.mark(actor.saturated);
-      if (actor.saturated.length) parts.push(`voltage limit: ${actor.saturated.join(", ")}`);
+      if (actor.saturated.length) parts.push(`voltage limit: ${actor.saturated.map((name) => this.plots.called(name)).join(", ")}`);
       if (actor.data.wheels) {
         const up = actor.data.wheels.names.filter((_, k) => !(actor.shown.wheels[k] > 0));
         if (up.length) parts.push(`lifted: ${up.join(", ")}`);

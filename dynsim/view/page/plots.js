@@ -2,6 +2,9 @@
 // Curves of signals over time on small canvases, with a cursor at the time of the scene. Drag to zoom, double click for
 // all, click to go there.
 
+// Curves that a plot names, at most; of more the largest.
+const NAMED = 6;
+
 class Plots {
   constructor(parent, actors, on) {
     this.parent = parent;
@@ -40,8 +43,13 @@ class Plots {
   fill(plot) {
     const labels = this.actors.map((a) => a.signals.get(plot.signal)?.labels).find(Boolean) ?? [];
     plot.columns.replaceChildren(D.element("option", { value: "all", textContent: labels.length ? "all" : "–" }),
-      ...labels.map((name) => D.element("option", { value: name, textContent: name })));
+      ...labels.map((name) => D.element("option", { value: name, textContent: this.called(name) })));
     plot.columns.hidden = !labels.length;
+  }
+
+  // What people call a column: motors of wheels have names of their own.
+  called(label) {
+    return this.actors.map((a) => a.data.names[label]).find(Boolean) ?? label;
   }
 
   // Curves of a plot: {actor, label, times, values, colour, dash}.
@@ -56,7 +64,7 @@ class Plots {
         if (plot.column !== "all" && label !== plot.column) continue;
         const several = shown.length > 1;
         const colour = several ? this.on.colour(actor) : this.on.palette()[k % 7];
-        found.push({ actor, label, times, values: signal.table.column(k), colour, dash: several ? [[], [5, 2], [2, 2], [7, 2, 2, 2]][k % 4] : k < 7 ? [] : [4, 2], unit: signal.unit });
+        found.push({ actor, label: this.called(label), times, values: signal.table.column(k), colour, dash: several ? [[], [5, 2], [2, 2], [7, 2, 2, 2]][k % 4] : k < 7 ? [] : [4, 2], unit: signal.unit });
       }
     });
     return found;
@@ -86,7 +94,11 @@ class Plots {
       c.fillText(D.number(v), area.x - 4, Y(v) + 3);
     }
     c.textAlign = "center";
-    for (const t of Plots.ticks(t0, t1, area.w / 60)) c.fillText(D.number(t), X(t), box.height - 4);
+    for (const t of Plots.ticks(t0, t1, area.w / 60)) {
+      // The last number ends where the canvas does.
+      const text = D.number(t), half = c.measureText(text).width / 2;
+      c.fillText(text, Math.min(X(t), box.width - half), box.height - 4);
+    }
     c.textAlign = "left";
     c.save();
     c.beginPath(), c.rect(area.x, 0, area.w, box.height - 14), c.clip();
@@ -94,6 +106,7 @@ class Plots {
     curves.forEach((curve) => Plots.line(c, curve, X, Y, t0, t1, area.w));
     c.restore();
     plot.drawn = curves;
+    plot.named = Plots.largest(curves, t0, t1, NAMED);
     plot.X = X;
     plot.Y = Y;
     plot.unit = curves[0]?.unit ?? "";
@@ -127,6 +140,18 @@ class Plots {
     }
     c.stroke();
     c.setLineDash([]);
+  }
+
+  // The curves with the largest root mean square over what is shown, at most so many, in their order.
+  static largest(curves, t0, t1, most) {
+    const effort = curves.map(({ times, values }) => {
+      const first = D.before(times, t0), last = Math.min(times.length - 1, D.before(times, t1) + 1);
+      let sum = 0;
+      for (let i = first; i <= last; i++) if (Number.isFinite(values[i])) sum += values[i] ** 2;
+      return sum / (last - first + 1);
+    });
+    const order = curves.map((_, k) => k).sort((a, b) => effort[b] - effort[a] || a - b);
+    return order.slice(0, most).sort((a, b) => a - b);
   }
 
   // Range of the values shown; a spike at the start does not squeeze the rest.
@@ -172,13 +197,14 @@ class Plots {
       c.fillStyle = "rgba(90,150,220,.25)";
       c.fillRect(Math.min(...plot.drag), plot.area.y, Math.abs(plot.drag[1] - plot.drag[0]), plot.area.h);
     }
-    const most = 6, list = plot.drawn.slice(0, most).map((curve) => {
+    const list = plot.named.map((k) => plot.drawn[k]).map((curve) => {
       const name = [this.actors.length > 1 ? curve.actor.name : "", curve.label].filter(Boolean).join(" ");
       const item = D.element("span", {}, D.element("i"), `${name ? name + " " : ""}${D.number(Plots.value(curve, at))}`);
       item.firstChild.style.background = curve.colour;
       return item;
     });
-    if (plot.drawn.length > most) list.push(D.element("span", { textContent: `… ${plot.drawn.length - most} more` }));
+    const more = plot.drawn.length - list.length;
+    if (more) list.push(D.element("span", { textContent: `… ${more} smaller`, title: "named are those with the largest rms over what is shown" }));
     plot.values.replaceChildren(D.element("b", { textContent: `${plot.unit === "1" ? "" : plot.unit}` }), ...list);
   }
 

@@ -26,7 +26,7 @@ S.capsule = function (radius, length) {
 
 // Triangles with 16-bit corners within a box: {vertices, triangles, low, step}. Edges of more than 40° stay sharp.
 S.mesh = function (bytes, mesh) {
-  const codes = (block) => new Uint16Array(bytes.slice(block.at, block.at + 2 * block.count).buffer);
+  const codes = ({ at, count, bits }) => new (bits === 16 ? Uint16Array : Uint32Array)(bytes.slice(at, at + (bits / 8) * count).buffer);
   const raw = codes(mesh.vertices), corner = codes(mesh.triangles), faces = corner.length / 3;
   const at = (i, k) => mesh.low[k] + mesh.step[k] * raw[3 * i + k];
   const normals = new Float32Array(corner.length), around = new Map();
@@ -115,10 +115,60 @@ S.surface = function (surface, step) {
   const material = new THREE.MeshLambertMaterial({ transparent: !solid, opacity: solid ? 1 : 0.45, side: THREE.DoubleSide,
     depthWrite: solid, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 2 });
   const made = new THREE.Mesh(geometry, material);
+  // What is one colour in flat light is seen by its edges.
+  if (solid) made.add(new THREE.LineSegments(surface.kind === "box" ? new THREE.EdgesGeometry(geometry) : S.ruled(surface),
+    new THREE.LineBasicMaterial({ transparent: true, opacity: 0.55 })));
   if (surface.q) made.quaternion.set(...S.xyzw(surface.q));
   if (surface.p) made.position.set(...surface.p);
   made.renderOrder = solid ? 0 : -5;
   return made;
+};
+
+// Lines of a grid of points, some ten each way, and its rim.
+S.ruled = function ({ rows, columns, points }) {
+  const found = [], step = Math.max(1, Math.round(Math.max(rows, columns) / 20)), on = (k, n) => k % step === 0 || k === n - 1;
+  const add = (a, b) => { if (points[3 * a] !== null && points[3 * b] !== null) found.push(...points.slice(3 * a, 3 * a + 3), ...points.slice(3 * b, 3 * b + 3)); };
+  for (let i = 0; i < rows; i++)
+    for (let j = 0; j < columns; j++) {
+      if (on(i, rows) && j + 1 < columns) add(i * columns + j, i * columns + j + 1);
+      if (on(j, columns) && i + 1 < rows) add(i * columns + j, (i + 1) * columns + j);
+    }
+  const made = new THREE.BufferGeometry();
+  made.setAttribute("position", new THREE.Float32BufferAttribute(found, 3));
+  return made;
+};
+
+S.paint = function (made, colours) {
+  if (!made.material.color) return;
+  made.material.color.set(made.children.length ? colours.solid : colours.surface);
+  for (const edges of made.children) edges.material.color.set(colours.edge);
+};
+
+// From where to where a surface reaches along a horizontal unit vector; a plane has no end and takes no room.
+S.extent = function (made, way) {
+  const { surface } = made.userData, at = made.position.dot(way);
+  const across = (k) => Math.abs(new THREE.Vector3().setComponent(k, 1).applyQuaternion(made.quaternion).dot(way));
+  switch (surface.kind) {
+    case "sphere": return [at - Math.abs(surface.radius), at + Math.abs(surface.radius)];
+    case "cylinder": {
+      const half = 0.5 * surface.length * across(2) + Math.abs(surface.radius) * Math.sqrt(Math.max(1 - across(2) ** 2, 0));
+      return [at - half, at + half];
+    }
+    case "box": {
+      const half = surface.size.reduce((sum, edge, k) => sum + 0.5 * edge * across(k), 0);
+      return [at - half, at + half];
+    }
+    case "grid": {
+      let low = Infinity, high = -Infinity;
+      for (let i = 0; i < surface.points.length; i += 3) {
+        if (surface.points[i] === null) continue;
+        const x = surface.points[i] * way.x + surface.points[i + 1] * way.y;
+        low = Math.min(low, x), high = Math.max(high, x);
+      }
+      return low <= high ? [low, high] : [];
+    }
+  }
+  return [];
 };
 
 S.xyzw = (q) => [q[1], q[2], q[3], q[0]];

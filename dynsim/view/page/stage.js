@@ -103,7 +103,8 @@ class Stage {
   look(preset) {
     this.preset = preset;
     // Seen with the robot's longest way from left to right: that is x before the turn by the azimuth.
-    const from = { iso: [-0.5, -1, 0.5], side: [0, -1, 0.06], front: [1, 0, 0.06], top: [0, -0.001, 1] }[preset];
+    // A row of variants is seen more from the front, or its end would be far away.
+    const from = { iso: this.row ? [-0.22, -1, 0.42] : [-0.5, -1, 0.5], side: [0, -1, 0.06], front: [1, 0, 0.06], top: [0, -0.001, 1] }[preset];
     const back = this.turned(new THREE.Vector3(...from).normalize()), centre = this.centre();
     const right = new THREE.Vector3().crossVectors(this.camera.up, back).normalize();
     const up = new THREE.Vector3().crossVectors(back, right);
