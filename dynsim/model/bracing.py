@@ -228,5 +228,5 @@ def _motor_row(motor: Motor | Servo | TorqueSource | None) -> Array:
         row[kb.CONSTANT], row[kb.RESISTANCE] = motor.joint_constant, motor.resistance
         row[kb.HEAT] = motor.resistance / motor.joint_constant**2
         row[kb.VOLTAGE_LIMIT] = motor.voltage_limit
-        row[kb.CURRENT_LIMIT] = motor.greatest_current if isinstance(motor, Servo) else np.inf
+        row[kb.CURRENT_LIMIT] = motor.greatest_current
     return row

@@ -12,6 +12,7 @@ from dynsim.kernels.arrays import (
     CIRCUIT,
     COMMAND,
     CURRENT,
+    CURRENT_LIMITED,
     DC_MOTOR,
     DIDT,
     DRAG,
@@ -42,17 +43,19 @@ from dynsim.kernels.arrays import (
     ReferenceArrays,
     Workspace,
 )
-from dynsim.kernels.drive.dc import dc_balance, dc_block, dc_command, dc_torque
+from dynsim.kernels.drive.dc import at_current_limit, dc_balance, dc_block, dc_command, dc_torque, within_current
 from dynsim.kernels.drive.limit import clipped
 from dynsim.kernels.drive.servo import servo_block, servo_circuit, servo_command, servo_drag, servo_torque
 from dynsim.kernels.drive.torque import open_torque
-from dynsim.kernels.jit import internal_kernel
+from dynsim.kernels.jit import apart_kernel, internal_kernel
 from dynsim.kernels.state import StateLayout
 
-for _law in (clipped, dc_balance, dc_block, dc_command, dc_torque, open_torque):
+for _law in (at_current_limit, clipped, dc_balance, dc_block, dc_command, dc_torque, open_torque):
     internal_kernel(_law)
 for _law in (servo_block, servo_circuit, servo_command, servo_drag, servo_torque):
     internal_kernel(_law)
+# Few motors have it: merged, its product K_m v would be that of the balance too, whose last bits depend on that.
+apart_kernel(within_current)
 
 
 @internal_kernel
@@ -109,6 +112,8 @@ def drive_dc(drives: DriveArrays, asked, i, ws: Workspace, a):
     """The DC motor a at a command [V] and a current [A]."""
     motors, motor, j = ws.motors, drives.motor, drives.table[a, DRIVEN]
     u = clipped(drives.input[a, COMMAND] if drives.table[a, SAMPLED] else asked, motor[a, U_MAX])
+    if drives.table[a, CURRENT_LIMITED] != 0:
+        u = within_current(motor, a, u, ws.joints[j, QD])
     motors[a, CURRENT], motors[a, VOLTAGE] = i, u
     motors[a, DIDT] = dc_balance(motor, a, u, ws.joints[j, QD], i) / motor[a, INDUCTANCE]
     ws.joints[j, APPLIED] += dc_torque(motor, a, i)
@@ -168,10 +173,14 @@ def drive_block(drives: DriveArrays, ws: Workspace, a, block):
     for s in range(block.shape[0]):
         block[s] = 0.0
     if kind == DC_MOTOR:
-        follows = 1.0 if not sampled and abs(motors[a, VOLTAGE]) < motor[a, U_MAX] else 0.0
+        u, v = motors[a, VOLTAGE], ws.joints[drives.table[a, DRIVEN], QD]
+        limited = drives.table[a, CURRENT_LIMITED] != 0 and at_current_limit(motor, a, u, v)
+        follows = 1.0 if not sampled and abs(u) < motor[a, U_MAX] else 0.0
         found = dc_block(motor, a, follows)
         block[TORQUE_Q], block[TORQUE_V], block[TORQUE_I] = found[0], found[1], found[2]
-        block[RATE_Q], block[RATE_V], block[RATE_I] = found[3], found[4], found[5]
+        block[RATE_I] = found[5]
+        if not limited:
+            block[RATE_Q], block[RATE_V] = found[3], found[4]
     elif kind == POSITION_SERVO:
         asked = drives.input[a, COMMAND] if sampled else command(drives, ws, a)
         v = ws.joints[drives.table[a, DRIVEN], QD]
