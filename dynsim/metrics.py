@@ -21,6 +21,7 @@ from dynsim.measures import (
     energy_turnover,
     hand_error,
     least_loads,
+    overturns_settled,
     percent,
     sinks,
 )
@@ -348,18 +349,24 @@ def _tipped(record: Record, base: MobileBase, support: NDArray[np.float64], sett
     load, traction = record["wheel_load"], record["traction_demand"]
     lowest = least_loads(record, support)
     late = record["tip_margin"][record.time >= settle]
-    since = f", none from {settle:g} s on (margin at least {late.min():.3g})" if late.size and late.min() > 0.0 else ""
     first = min((event.time for event in record.events if event.kind == TIP_OVER), default=np.inf)
     if np.isfinite(first) and not base.stop_on_overturn:
         pulled = ", ".join(
             f"{name} {low:.3g}" for name, low in zip(record.labels["wheel_load"], lowest, strict=True) if low < 0.0
         )
-        found.append(
-            f"the base tips over at t = {first:.4f} s, with a tip margin below zero in "
-            f"{100 * (record['tip_margin'] < 0.0).mean():.1f} % of the samples{since}; the run goes on as if it were "
-            "held down"
-            f"{f' (least loads [N]: {pulled})' if pulled else ''}: plant.base.on_overturn: stop ends it there"
-        )
+        least = f" (least loads [N]: {pulled})" if pulled else ""
+        beyond = f"{100 * (record['tip_margin'] < 0.0).mean():.1f} % of the samples"
+        if late.size and overturns_settled(record, settle) is None:
+            found.append(
+                f"a jolt of the start takes the tip margin below zero at t = {first:.4f} s, in {beyond}, none from "
+                f"{settle:g} s on (margin at least {late.min():.3g}){least}: start with initial.equilibrium, or with a "
+                "motion that begins at rest"
+            )
+        else:
+            found.append(
+                f"the base tips over at t = {first:.4f} s, with a tip margin below zero in {beyond}; the run goes on "
+                f"as if it were held down{least}: plant.base.on_overturn: stop ends it there"
+            )
     lifted = load.sum(axis=1) <= 0.0
     if lifted.any():
         found.append(

@@ -85,7 +85,7 @@ _ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = 
     ("deepest below a surface [mm]", _deepest, str),
     ("tip margin, settled", _base("tip_margin_min_settled"), _margin),
     ("  whole run", _base("tip_margin_min"), _margin),
-    ("  tips over at [s]", _base("overturns_at_s"), lambda v: _number(v, digits=3)),
+    ("  tips over at [s]", _base("overturns_settled_at_s"), lambda v: _number(v, digits=3)),
     ("least load, wheels, caster [N]", _least_load, lambda v: _number(v, digits=3)),
     ("ledger residual, relative", lambda s: s.get("energy_residual_relative"), lambda v: f"{v:.1e}"),
     ("constraint drift [m]", lambda s: s.get("constraint_drift_max_m"), lambda v: f"{v:.1e}"),
@@ -173,12 +173,26 @@ def print_choices(console: Console) -> None:
 
 
 def print_starts(console: Console, starts: Mapping[str, Start]) -> None:
-    """Per variant the positions of hand and contact points [m], as lists of YAML that read back to the same doubles."""
+    """Per variant the positions of hand and contact points [m], as lists of YAML that read back to the same doubles.
+
+    Then how far contacts are from their surfaces, joints that on_surface has moved, and the margin of a base at rest.
+    """
     for variant, start in starts.items():
-        points = {"hand": start.hand, **{f"contact {name}": point for name, point in start.contacts.items()}}
-        width = max(map(len, points))
+        values = {"hand": f"{start.hand.tolist()}"}
+        values |= {f"contact {name}": f"{point.tolist()}" for name, point in start.contacts.items()}
+        values |= {f"gap of {name}": f"{gap:+.4g} m" for name, gap in start.gaps.items()}
+        for joint, (to, was, unit) in start.solved.items():
+            values[joint] = f"{to!r} {unit}, by on_surface; was {was:.6g}"
+        if start.tip_margin is not None:
+            braced = ""
+            if start.tip_margin_braced is not None:
+                braced = f", {start.tip_margin_braced:.4g} with braces of least heat"
+            values["tip margin"] = f"{start.tip_margin:.4g} at rest{braced} (1: safest, 0: tips)"
+        width = max(map(len, values))
         lines = [f"  {variant}{', ' if variant else ''}at the start [m]:"]
-        lines += [f"    {name:<{width}}  {point.tolist()}" for name, point in points.items()]
+        lines += [f"    {name:<{width}}  {value}" for name, value in values.items()]
+        if start.aloft:
+            lines += [f"    not on their surfaces; they would be with  {start.aloft}"]
         console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
 
 

@@ -33,6 +33,7 @@ from dynsim.hardware.cli import export, hw
 from dynsim.terminal import escaped
 
 if TYPE_CHECKING:
+    from dynsim.engine import Start
     from dynsim.record import Record
 
 
@@ -180,7 +181,8 @@ def check(
 ) -> None:
     """Validate scenarios without running them: schema, model, contacts at the start, reachable references.
 
-    Prints where hand and contact points start, in full digits, to be copied into a surface or a path.
+    Prints where hand and contact points start, in full digits, to be copied into a surface or a path, how far contacts
+    are from their surfaces, the joints that initial.on_surface has moved, and the tip margin of a base at rest.
     """
     from dynsim.engine import check as check_scenario
     from dynsim.scenario import load_scenario, variant_names
@@ -188,16 +190,19 @@ def check(
 
     failed = False
     for name in scenarios:
+        starts: dict[str, Start] = {}
         try:
             variants: Sequence[str | None] = variant_names(name) or [None]
-            starts = {}
             for variant in variants:
                 with console.status(f"checking {escaped(name)} {escaped(variant or '')}"):
-                    starts[variant or ""] = check_scenario(load_scenario(name, variant, parsed_overrides(overrides)))
+                    loaded = load_scenario(name, variant, parsed_overrides(overrides))
+                    check_scenario(loaded, partial(starts.__setitem__, variant or ""))
         except SimulationInterrupted:
             raise
         except DynsimError as error:
             failed = True
+            # Where it starts helps to find out what is wrong.
+            print_starts(console, starts)
             errors.print(f"[red]error:[/] {escaped(str(error))}")
         else:
             count = f"{len(variants)} variants" if len(variants) > 1 else "1 variant"

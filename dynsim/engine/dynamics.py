@@ -6,10 +6,11 @@ import logging
 import time as clock
 
 from dynsim import interruption
-from dynsim.engine import SIMULATION, Progress, Start
+from dynsim.engine import SIMULATION, Progress
 from dynsim.engine.outcome import kernels_logged, raise_stopped
 from dynsim.engine.prepare import Prepared, prepare
 from dynsim.engine.recording import make_record
+from dynsim.engine.start import check
 from dynsim.engine.stepped import event_name, own_guards, take_log
 from dynsim.engine.stopping import last_state, stopped
 from dynsim.errors import SimulationInterrupted, SimulationStopped
@@ -19,7 +20,7 @@ from dynsim.record import Event, Record
 from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario
 
-__all__ = ["Prepared", "prepare", "simulate", "start"]
+__all__ = ["Prepared", "check", "prepare", "simulate"]
 
 log = logging.getLogger(__name__)
 
@@ -43,13 +44,6 @@ class _Pace:
 def _tried(run: ki.Run) -> int:
     """Steps accepted and refused."""
     return int(run.count[ki.STEPS] + run.count[ki.REJECTED])
-
-
-def start(prepared: Prepared) -> Start:
-    """Positions of the hand and of the contact points at t = 0."""
-    model, q = prepared.model, prepared.model.robot.initial
-    contacts = {contact.name: model.point_position(contact.body, contact.point, q) for contact in prepared.contacts}
-    return Start(model.point_position(*model.robot.hand, q), contacts)
 
 
 def simulate(

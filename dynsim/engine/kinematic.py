@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time as clock
+from collections.abc import Callable
 
 import numpy as np
 
@@ -94,9 +95,11 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> Run:
     return run
 
 
-def start(run: Run) -> Start:
-    """Position of the controlled point at t = 0; a snake has no contact points."""
-    return Start(run.state.w_target[:3].copy(), {})
+def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
+    """See :func:`dynsim.engine.check`: the controlled point at t = 0; a snake has no contact points."""
+    start = Start(prepare(scenario).state.w_target[:3].copy(), {})
+    started(start)
+    return start
 
 
 def simulate(

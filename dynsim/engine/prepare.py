@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 
 from dynsim.engine import REFERENCES, Progress
+from dynsim.engine.equilibrium import Balance, balanced, shifted
 from dynsim.engine.method import AUTO, Choice, choose
 from dynsim.engine.outcome import check_size
 from dynsim.errors import ModelError, ScenarioError
@@ -62,6 +63,7 @@ class Prepared:
     stops: list[JointStop]
     choice: Choice
     reuse: Reuse
+    balance: Balance | None = None
 
 
 def prepare(
@@ -131,11 +133,14 @@ def prepare(
     _check_stiffness(choice.method, scenario.duration_s, robot)
     method = ki.METHODS[choice.method]
     step = options.step_s or (1e-3 if method in ki.FIXED_STEP else 0.0)
+    balance, initial = None, scenario.config.initial
+    if initial is not None and initial.equilibrium:
+        balance = balanced(model, contacts, build.loads(scenario, robot), control, real)
     system = System(
         layout=layout,
         model=model.arrays,
         drives=drives,
-        reference=control.reference,
+        reference=control.reference if balance is None else shifted(control.reference, balance.shift),
         contacts=compile_contacts(robot, contacts),
         loads=compile_loads(robot, loads),
         dense=np.zeros((size, size + 1)) if options.solver == "m_star" else None,
@@ -149,6 +154,9 @@ def prepare(
         stepping.law[:, GRIP : GRIP_AXIS + 3] = compile_grips(robot, contacts)
     y = np.zeros(layout.size)
     y[block(layout, "q")] = robot.initial
+    if balance is not None:
+        circuit = drives.table[:, ka.CIRCUIT]
+        y[layout.current + circuit[circuit >= 0]] = balance.current[circuit >= 0]
     run = ki.new_run(
         method,
         y,
@@ -172,7 +180,7 @@ def prepare(
         stepping=stepping,
         lanes=has_forms(system),
     )
-    return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops, choice, reuse)
+    return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops, choice, reuse, balance)
 
 
 def _ticks(control: JointControl) -> tuple[np.ndarray, np.ndarray] | None:
@@ -345,7 +353,8 @@ def _check_held(model: Model, contacts: Sequence[Contact], control: JointControl
     points = {body: [(contact.surface, point) for contact, point in pairs] for body, pairs in held.items()}
     for times, q in control.positions(robot):
         for link, found in gaps(robot, q, points):
-            for (contact, _), gap in zip(held[link.name], found, strict=True):
+            for (contact, _), distance in zip(held[link.name], found, strict=True):
+                gap = distance - contact.radius
                 k = int(np.abs(gap).argmax())
                 if abs(gap[k]) > tolerance:
                     first.setdefault(contact.name, float(times[np.abs(gap) > tolerance][0]))

@@ -131,6 +131,12 @@ def make_record(
     )
     record.summary = metrics.summarise(record, scenario, contacts, robot, counts, prepared.reuse)
     record.summary["warnings"] += beyond_stops(robot, prepared.stops, prepared.control)
+    if prepared.balance is not None:
+        record.summary["equilibrium"] = {
+            "heat_W": prepared.balance.heat,
+            **{f"{name}.normal_force_N": force for name, force in prepared.balance.normal_forces.items()},
+        }
+        record.summary["warnings"] += prepared.balance.warnings
     return record
 
 

@@ -313,9 +313,12 @@ class Simulation:
     def set_reference(self, joint: str, position: float, rate: float = 0.0) -> None:
         """From now on the motor of a joint follows q_d(t) = position + rate (t − now) [rad, rad/s; m, m/s].
 
-        Of an open torque ``position`` is the torque [N m].
+        Of an open torque ``position`` is the torque [N m]. What ``initial.equilibrium`` has moved the references by is
+        added.
         """
         values = _finite("reference", [position, rate])
+        if (balance := self._prepared.balance) is not None:
+            values[0] += balance.shift[self._motor(joint)]
         self._follow_line(joint, values)
         self._leave_plan(joint)
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from dynsim.figures import events, style
 from dynsim.figures.style import Array
-from dynsim.measures import TIP_OVER
+from dynsim.measures import TIP_OVER, overturns_settled
 from dynsim.record import Record
 
 LOADS, MARGIN, TRACTION = "wheel_load", "tip_margin", "traction_demand"
@@ -162,6 +162,9 @@ def _verdict(record: Record) -> str:
     if not times:
         return "it never tips over"
     more = f"{len(times)} times, first " if len(times) > 1 else ""
+    settle = style.settle_time(record)
+    if record.time[-1] > settle and overturns_settled(record, settle) is None:
+        return f"a jolt of the start takes it below zero {more}at {style.number(times[0], 3)} s"
     return f"tips over {more}at {style.number(times[0], 3)} s"
 
 
