@@ -27,7 +27,7 @@ from dynsim.measures import (
 )
 from dynsim.model.clearance import Sinking, sinking
 from dynsim.model.description import Contact, Robot
-from dynsim.model.drives import Drive, Servo, TorqueSource
+from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
 from dynsim.model.mobile_base import MobileBase
 from dynsim.model.unilateral import JointStop, told
 from dynsim.record import Record
@@ -60,6 +60,9 @@ LIMIT_SLACK = 1e-6
 # Heights below this are not resolved by landings [m]: each is found to AT_ROOT, which leaves the weight times that in
 # the ledger, and here ten of them reach the limit of its residual.
 RESOLVED_M = 10.0 * AT_ROOT / RESIDUAL_LIMIT
+START_THERE = " (initial.on_surface lets it start there)"
+# Part of a limit of current that counts as reached.
+NEAR_LIMIT = 1e-3
 NOT_ENFORCED = "no law enforces this limit"
 
 
@@ -211,7 +214,10 @@ def summarise(
         "energy_residual_relative": residual / denominator if denominator > 0.0 else 0.0,
         "constraint_drift_max_m": float(counts.extremes[:, DRIFT_MAX].max(initial=0.0)),
         **_base(record, scenario, robot, counts),
-        "contacts": [_contact(record, k, contact, counts, duration) for k, contact in enumerate(contacts)],
+        "contacts": [
+            _contact(record, k, contact, counts, duration, contact.name in scenario.config.contacts.points)
+            for k, contact in enumerate(contacts)
+        ],
         "sinking": [
             {"body": s.body, "surface": s.surface, "depth_m": s.depth, "since_s": float(record.time[s.sample])}
             for s in sunk
@@ -243,7 +249,10 @@ def _loads(record: Record) -> dict[str, Any]:
     return {"loads_work_J": dict(zip(record.labels["work_loads"], work.tolist(), strict=True))}
 
 
-def _contact(record: Record, k: int, contact: Contact, counts: Counts, duration: float) -> dict[str, Any]:
+def _contact(
+    record: Record, k: int, contact: Contact, counts: Counts, duration: float, declared: bool
+) -> dict[str, Any]:
+    """What a contact has done; of a declared point under the unilateral law also how near it came."""
     force = record["contact_normal_force"][:, k]
     real = {} if counts.unilateral is None else modes(counts.unilateral, k, duration)
     # Under the unilateral law a force ends at zero; what lies below is the tolerance of that event.
@@ -260,6 +269,7 @@ def _contact(record: Record, k: int, contact: Contact, counts: Counts, duration:
         "pulling_fraction": min(float(extremes[PULLING]) / duration, 1.0) if duration > 0.0 else 0.0,
         "slip_distance_m": float(record["contact_slip_distance"][-1, k]) if len(record) else 0.0,
         **real,
+        **({"gap_min_m": float(record["contact_gap"][:, k].min())} if real and declared and len(record) else {}),
     }
 
 
@@ -272,12 +282,21 @@ def _warnings(
     summary: dict[str, Any],
 ) -> list[str]:
     found = [] if counts.unilateral is None else [*chattered(contacts, counts.unilateral)]
+    initial = scenario.config.initial
     for contact in summary["contacts"]:
         if contact["normal_force_min_N"] < 0.0:
             found.append(
                 f"{contact['name']}: the {contact['surface']} pulls on this brace for "
                 f"{percent(contact['pulling_fraction'])} of the run, with up to "
                 f"{-contact['normal_force_min_N']:.3g} N; a real arm would lift off"
+            )
+    for contact in summary["contacts"]:
+        if "gap_min_m" in contact and contact["closed_fraction"] == 0.0:
+            nearest = int(record["contact_gap"][:, record.labels["contact_gap"].index(contact["name"])].argmin())
+            found.append(
+                f"{contact['name']}: this brace never touches the {contact['surface']}: it carries nothing; nearest "
+                f"{1e3 * contact['gap_min_m']:.3g} mm at t = {record.time[nearest]:.4g} s"
+                f"{'' if initial is not None and contact['name'] in initial.on_surface else START_THERE}"
             )
     for contact, since in zip(contacts, counts.extremes[:, LOCAL_SINCE], strict=True):
         if np.isfinite(since):
@@ -300,9 +319,11 @@ def _warnings(
     # Along samples: a third of the time.
     peaks = {name: np.abs(record[name].T.copy()).max(axis=1, initial=0.0) for name in {one[1] for *_, one in limited}}
     for a, motor, (what, signal, limit, unit) in limited:
+        # The current of a DC motor comes near to the limit of its driver, and does not reach it.
+        reached = limit * (1.0 - NEAR_LIMIT) if isinstance(motor, Motor) and what == "current" else limit
         # A run that diverged may have NaN, which hides a peak.
-        if not peaks[signal][a] < limit:
-            saturated = np.abs(record[signal][:, a]) >= limit
+        if not peaks[signal][a] < reached:
+            saturated = np.abs(record[signal][:, a]) >= reached
             if isinstance(motor, Servo):
                 # Without a current its voltage is the back-EMF.
                 saturated &= record["current"][:, a] != 0.0
@@ -391,7 +412,7 @@ def _limits_of(motor: Drive) -> list[tuple[str, str, float, str]]:
     if isinstance(motor, TorqueSource):
         return [("torque", "current", motor.torque_limit, "N m")]
     limits = [("voltage", "voltage", motor.voltage_limit, "V")]
-    if isinstance(motor, Servo):
+    if isinstance(motor, Servo) or np.isfinite(motor.current_limit):
         limits.append(("current", "current", motor.greatest_current, "A"))
     return limits
 

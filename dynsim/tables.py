@@ -108,7 +108,7 @@ def print_summary(console: Console, summary: Summary) -> None:
     for contact in summary.get("contacts", ()):
         for heading, cells in _contact_rows(contact["name"], [contact]):
             table.add_row(heading, *cells)
-    for heading, cells in _stop_rows([summary], [summary]):
+    for heading, cells in (*_stop_rows([summary], [summary]), *_motor_rows([summary], [summary])):
         table.add_row(heading, *cells)
     console.print(table)
     _print_warnings(console, {"": summary})
@@ -145,7 +145,8 @@ def _print_columns(console: Console, summaries: Mapping[str, Summary], names: Se
         by_variant = [next((c for c in s["contacts"] if c["name"] == contact), None) for s in shown]
         for heading, cells in _contact_rows(contact, by_variant):
             table.add_row(heading, *cells)
-    for heading, cells in _stop_rows(list(summaries.values()), shown):
+    everything = list(summaries.values())
+    for heading, cells in (*_stop_rows(everything, shown), *_motor_rows(everything, shown)):
         table.add_row(heading, *cells)
     console.print(table)
 
@@ -194,6 +195,7 @@ def print_starts(console: Console, starts: Mapping[str, Start]) -> None:
         if start.aloft:
             lines += [f"    not on their surfaces; they would be with  {start.aloft}"]
         console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+        _print_warnings(console, {variant: {"warnings": start.warnings}})
 
 
 def _pulling(contact: Summary) -> str:
@@ -227,8 +229,16 @@ _CONTACT_ROWS: tuple[tuple[str, Callable[[Summary], str], bool | None], ...] = (
 
 
 def _contact_rows(name: str, contacts: Sequence[Summary | None]) -> Iterator[tuple[str, list[str]]]:
-    """Rows of a contact, a cell for each run; None where a run does not have it. No rows if it never touched."""
+    """Rows of a contact, a cell for each run; None where a run does not have it.
+
+    No rows of a candidate that never touched; a declared point says how near it came.
+    """
     having = [contact for contact in contacts if contact]
+    if not any(contact["closed_fraction"] > 0.0 or "gap_min_m" in contact for contact in having):
+        return
+    if not all(contact["closed_fraction"] > 0.0 for contact in having):
+        cells = [_number(c.get("gap_min_m"), 1e3, 3) if c and not c["closed_fraction"] else "–" for c in contacts]
+        yield escaped_line(_of(name, "never touches, least gap [mm]")), cells
     if not any(contact["closed_fraction"] > 0.0 for contact in having):
         return
     for heading, show, real in _CONTACT_ROWS:
@@ -256,6 +266,37 @@ def _stop_rows(summaries: Sequence[Summary], shown: Sequence[Summary]) -> Iterat
         for heading, show in _STOP_ROWS:
             text = _of(f"{joint}, stop at {place}", heading.format(**stop))
             yield escaped_line(text), ["–" if one is None else show(one) for one in cells]
+
+
+def _motor_rows(summaries: Sequence[Summary], shown: Sequence[Summary]) -> Iterator[tuple[str, list[str]]]:
+    """Rows of motors with ratings, root mean square of nominal, a cell for each run that is shown.
+
+    Of many motors the most loaded ones.
+    """
+    for quantity, unit, label in _RATED:
+        rms, nominal = f"{quantity}_rms_{unit}", f"nominal_{quantity}_{unit}"
+        rated = [m for summary in summaries for m in summary.get("motors", ()) if m.get(nominal) and rms in m]
+        load = {m["joint"]: 0.0 for m in rated}
+        for motor in rated:
+            load[motor["joint"]] = max(load[motor["joint"]], motor[rms] / motor[nominal])
+        heaviest = sorted(load, key=lambda joint: -load[joint])[:_MOST_MOTORS]
+        for joint in (joint for joint in load if joint in heaviest):
+            found = [next((m for m in s.get("motors", ()) if m["joint"] == joint), {}) for s in shown]
+            cells = [f"{_loaded(m[rms], m[nominal])} of {m[nominal]:g}" if m.get(nominal) else "–" for m in found]
+            yield escaped_line(f"{joint}: {label}"), cells
+
+
+# Of motors: quantity and unit as in the keys of the summary, and how they are called in a table.
+_RATED = (
+    ("current", "A", "rms of nominal [A]"),
+    ("torque", "N_m", "rms of nominal [N m]"),
+    ("force", "N", "rms of nominal [N]"),
+)
+_MOST_MOTORS = 10
+
+
+def _loaded(rms: float, nominal: float) -> str:
+    return f"[bold red]{rms:.3g}[/]" if rms > nominal else f"{rms:.3g}"
 
 
 def _stop(stop: Summary) -> tuple[str, float]:

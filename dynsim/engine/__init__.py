@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import ModuleType
@@ -50,6 +50,7 @@ class Start:
     tip_margin : of a mobile base at rest under weight and loads alone; None: it stands fixed or floats
     tip_margin_braced : the same with the contacts that touch, whose forces cost the motors least heat; None: there are
         none, or they do not hold the arm
+    warnings : keys of the scenario that change nothing
     """
 
     hand: NDArray[np.float64]
@@ -59,6 +60,7 @@ class Start:
     solved: Mapping[str, tuple[float, float, str]] = field(default_factory=dict)
     tip_margin: float | None = None
     tip_margin_braced: float | None = None
+    warnings: Sequence[str] = ()
 
 
 def simulate(

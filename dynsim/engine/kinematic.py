@@ -32,6 +32,7 @@ from dynsim.record import Record
 from dynsim.record.poses import pose_columns
 from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario, build
+from dynsim.scenario.effect import without_effect
 from dynsim.snake.kinematics import pose_of_point
 from dynsim.snake.state import DONE, MODE, PLACE, TICKS, State, new_rig, new_state, new_trace
 from dynsim.snake.ticks import record_row, run_ticks
@@ -97,7 +98,7 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> Run:
 
 def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
     """See :func:`dynsim.engine.check`: the controlled point at t = 0; a snake has no contact points."""
-    start = Start(prepare(scenario).state.w_target[:3].copy(), {})
+    start = Start(prepare(scenario).state.w_target[:3].copy(), {}, warnings=without_effect(scenario))
     started(start)
     return start
 

@@ -16,6 +16,7 @@ from dynsim.model.model import Model
 from dynsim.model.shapes import gap_at
 from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario, build
+from dynsim.scenario.effect import without_effect
 
 # Joints that the solution of a posture has moved by less stay where they were [rad or m].
 MOVED = 1e-12
@@ -56,7 +57,8 @@ def start_of(scenario: Scenario, reuse: Reuse) -> Start:
                 solved[link.joint] = (to, was, "deg" if angle else "m")
     hand = model.point_position(*robot.hand, q)
     key = build.on_surface_key(scenario, aloft) if aloft else ""
-    return Start(hand, points, gaps, key, solved, *_margins(scenario, model, contacts))
+    idle = without_effect(scenario, bool(robot.motors))
+    return Start(hand, points, gaps, key, solved, *_margins(scenario, model, contacts), idle)
 
 
 def _margins(scenario: Scenario, model: Model, contacts: Sequence[Contact]) -> tuple[float | None, float | None]:

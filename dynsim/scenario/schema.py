@@ -13,6 +13,7 @@ from dynsim import notebook
 from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig, Vector3, error_at
 from dynsim.families import member, union
 from dynsim.problems import Origin, listed
+from dynsim.scenario.effect import idle_keys, is_set
 from dynsim.scenario.loads import LoadConfig
 
 # Bytes of the name of a folder on common file systems.
@@ -330,7 +331,10 @@ class Scenario:
 
     @property
     def resolved(self) -> dict[str, Any]:
-        """The scenario with every default and override written out; reading it again gives the same simulation."""
+        """The scenario with defaults and overrides written out; reading it again gives the same simulation.
+
+        Defaults that change nothing are left out.
+        """
         resolved = self.config.model_dump(mode="json", exclude_none=True)
         if not self.config.loads:
             del resolved["loads"]
@@ -338,6 +342,13 @@ class Scenario:
         for part in (resolved["contacts"], *resolved["contacts"]["points"].values()):
             for key in contacts.other_keys:
                 part.pop(key, None)
+        # What changes nothing is not there, unless it was said.
+        for keys in idle_keys(self.config):
+            section, *rest = keys
+            if len(rest) == 1 and not is_set(self.config, keys) and isinstance(resolved.get(section), dict):
+                resolved[section].pop(rest[0], None)
+                if not resolved[section]:
+                    del resolved[section]
         return resolved
 
     def place(self, keys: Sequence[int | str] = (), variant: str = "") -> str:
