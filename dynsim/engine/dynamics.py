@@ -7,7 +7,8 @@ import time as clock
 
 from dynsim import interruption
 from dynsim.engine import SIMULATION, Progress
-from dynsim.engine.outcome import kernels_logged, raise_stopped
+from dynsim.engine.compilation import kernels_logged
+from dynsim.engine.outcome import raise_stopped
 from dynsim.engine.prepare import Prepared, prepare
 from dynsim.engine.recording import make_record
 from dynsim.engine.start import check
@@ -60,7 +61,7 @@ def simulate(
     pace = prepared.reuse.of("pace", _Pace, prepared.choice.method, *size)
     if not pace.known:
         # Loading or compiling the kernels is no integration time.
-        with kernels_logged(log):
+        with kernels_logged(log, prepared.kind):
             driver.advance(prepared.system, prepared.workspace, run, 0)
     if progress is not None:
         progress(0.0, SIMULATION)

@@ -10,10 +10,11 @@ import numpy as np
 
 from dynsim import interruption
 from dynsim.engine import Progress, Start
+from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.kinematic_record import COORDINATES, make_record
 from dynsim.engine.kinematic_run import Run
 from dynsim.engine.mode_switching import ModeSwitcher
-from dynsim.engine.outcome import check_size, kernels_logged, raise_stopped
+from dynsim.engine.outcome import check_size, raise_stopped
 from dynsim.engine.provenance import provenance
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.families import member
@@ -118,7 +119,7 @@ def simulate(
     """
     run = prepare(scenario, source)
     controller, switcher = run.controller, mode_switcher(run)
-    with kernels_logged(log):
+    with kernels_logged(log, "kinematic snakes"):
         load_kernels(run)
     stop: SimulationStopped | None = None
     started = clock.perf_counter()

@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 
 from dynsim.engine import REFERENCES, Progress
+from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.equilibrium import Balance, balanced, shifted
 from dynsim.engine.method import AUTO, Choice, choose
 from dynsim.engine.outcome import check_size
@@ -64,6 +65,22 @@ class Prepared:
     choice: Choice
     reuse: Reuse
     balance: Balance | None = None
+
+    @property
+    def kind(self) -> str:
+        """What its kernels are compiled for, in words."""
+        system, robot = self.system, self.model.robot
+        parts = [self.choice.method]
+        if self.contacts or self.stops:
+            parts.append("contacts that are glued" if system.unilateral is None else "contacts that open and close")
+        extras = {
+            "spheres, boxes or height fields": system.shapes is not None,
+            "joints of several rates": self.model.arrays.compound is not None,
+            "a mobile base": robot.base is not None,
+            "planned voltages": system.reference.voltage is not None,
+            "the dense system": system.dense is not None,
+        }
+        return f"arms by {', '.join([*parts, *(name for name, there in extras.items() if there)])}"
 
 
 def prepare(
@@ -135,7 +152,8 @@ def prepare(
     step = options.step_s or (1e-3 if method in ki.FIXED_STEP else 0.0)
     balance, initial = None, scenario.config.initial
     if initial is not None and initial.equilibrium:
-        balance = balanced(model, contacts, build.loads(scenario, robot), control, real)
+        with kernels_logged(log, "the start at rest", loads=False):
+            balance = balanced(model, contacts, build.loads(scenario, robot), control, real)
     system = System(
         layout=layout,
         model=model.arrays,
@@ -296,9 +314,10 @@ def _control(
         return JointControl.absent(model.robot)
     log.info("%s: planning references over %g s", scenario.title, scenario.duration_s)
     started = clock.perf_counter()
-    control = build.controller(
-        scenario, model, None if progress is None else partial(progress, stage=REFERENCES), contacts, reuse
-    )
+    with kernels_logged(log, "references", loads=False):
+        control = build.controller(
+            scenario, model, None if progress is None else partial(progress, stage=REFERENCES), contacts, reuse
+        )
     log.info("%s: planned references in %.3f s", scenario.title, clock.perf_counter() - started)
     if not isinstance(control, JointControl):
         raise ModelError(f"controller {scenario.controller.type!r} cannot drive a {scenario.plant.type!r}")

@@ -9,6 +9,7 @@ Long because: it is one class, the public stepper, and half of it is its documen
 
 from __future__ import annotations
 
+import logging
 import math
 import time as clock
 from collections.abc import Callable, Sequence
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.operator import Operator
 from dynsim.engine.outcome import mark_stopped, raise_stopped
 from dynsim.engine.prepare import prepare, sample_times
@@ -42,6 +44,8 @@ from dynsim.scenario import Scenario, require_scenario
 from dynsim.scenario.build import check_start
 
 Array = NDArray[np.float64]
+
+log = logging.getLogger(__name__)
 
 # Steps in one compiled piece.
 _PIECE = 100_000
@@ -108,7 +112,7 @@ class Simulation:
         self._scenario = scenario
         self._end = min(end, _FAR)
         self._prepared = prepare(scenario, pushable=True, times=np.full(1, np.inf), end=self._end, motors=motors)
-        self._time, self._wall = start, 0.0
+        self._time, self._wall, self._loaded = start, 0.0, False
         # Of a ring, and of a run that goes on from another, the ledger counts from the first sample on.
         self._relative = trace is not None or state is not None
         self._happened: list[Event] = []
@@ -562,6 +566,11 @@ class Simulation:
             self._refill(run.clock[ki.TIME] + run.clock[ki.STEP])
             run = self._prepared.run
         run.clock[ki.HOLD] = min(until, run.sample_time[-1])
+        if not self._loaded:
+            self._loaded = True
+            # Loading or compiling the kernels is no integration time.
+            with kernels_logged(log, prepared.kind):
+                driver.advance(prepared.system, prepared.workspace, run, 0)
         begun = clock.perf_counter()
         driver.advance(prepared.system, prepared.workspace, run, _PIECE)
         self._wall += clock.perf_counter() - begun

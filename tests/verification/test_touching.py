@@ -34,7 +34,7 @@ def arm(tmp_path):
 
 def test_a_sphere_presses_where_it_touches(arm):
     """Its forces are those of a point below its centre, planned and in the run; its centre stays a radius up."""
-    scenario = load_scenario(arm)
+    scenario = load_scenario(arm, overrides={"integrator.rtol": 1e-9, "integrator.atol": 1e-11})
     record = simulate(scenario)
     model, q = build_model(scenario), build.robot(scenario).initial
     assert model.point_position("link_3", [0, 0, 0], q)[2] == pytest.approx(0.03, abs=1e-12)
@@ -49,7 +49,7 @@ def test_a_sphere_presses_where_it_touches(arm):
 
 def test_a_declared_brace_that_never_touches_is_said(arm):
     """Its least gap is in the summary, and a warning; a candidate that nobody declared says nothing."""
-    aloft = {"controller.brace": None, "controller.min_N": None, "initial": None, "plant.chain.1.initial_deg": 40}
+    aloft = {"controller.brace": None, "controller.min_N": 0.5, "initial": None, "plant.chain.1.initial_deg": 40}
     scenario = load_scenario(arm, overrides={**aloft, "contacts.candidates": "joints", "duration_s": 0.1})
     record = simulate(scenario)
     elbow, *others = record.summary["contacts"]
@@ -64,7 +64,7 @@ def test_a_declared_brace_that_never_touches_is_said(arm):
 
 
 def test_disabled_points_put_braced_and_free_in_one_posture(arm):
-    free = {"contacts.points.elbow.enabled": False, "controller.brace": None, "controller.min_N": None}
+    free = {"contacts.points.elbow.enabled": False, "controller.brace": None, "controller.min_N": 0.5}
     braced, alone = (build.robot(load_scenario(arm, overrides=changed)) for changed in ({}, free))
     assert braced.initial.tobytes() == alone.initial.tobytes()
     assert not build.contacts(load_scenario(arm, overrides=free))
@@ -74,7 +74,7 @@ def test_a_glued_sphere_stays_a_radius_up(arm):
     glued = {
         "contacts.law": "bilateral",
         "controller.brace": None,
-        "controller.min_N": None,
+        "controller.min_N": 0.5,
         "initial.equilibrium": False,
     }
     record = simulate(load_scenario(arm, overrides={**glued, "controller.joints": {
