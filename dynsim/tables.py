@@ -281,7 +281,7 @@ def _motor_rows(summaries: Sequence[Summary], shown: Sequence[Summary]) -> Itera
             load[motor["joint"]] = max(load[motor["joint"]], motor[rms] / motor[nominal])
         heaviest = sorted(load, key=lambda joint: -load[joint])[:_MOST_MOTORS]
         for joint in (joint for joint in load if joint in heaviest):
-            found = [next((m for m in s.get("motors", ()) if m["joint"] == joint), {}) for s in shown]
+            found: list[Summary] = [next((m for m in s.get("motors", ()) if m["joint"] == joint), {}) for s in shown]
             cells = [f"{_loaded(m[rms], m[nominal])} of {m[nominal]:g}" if m.get(nominal) else "–" for m in found]
             yield escaped_line(f"{joint}: {label}"), cells
 

@@ -22,7 +22,7 @@ from dynsim.cli.app import (
     app,
     parsed_overrides,
 )
-from dynsim.cli.display import console, errors, labelled, progress, record_files
+from dynsim.cli.display import console, errors, labelled, progress, record_files, told_in
 from dynsim.cli.drawing import Figures, Page, begin_drawing, draw, draw_all
 from dynsim.cli.hw_drive import EXAMPLE, hw_drive
 from dynsim.cli.sweep import sweep
@@ -185,6 +185,7 @@ def check(
     are from their surfaces, the joints that initial.on_surface has moved, and the tip margin of a base at rest.
     """
     from dynsim.engine import check as check_scenario
+    from dynsim.engine.compilation import watched
     from dynsim.scenario import load_scenario, variant_names
     from dynsim.tables import print_starts
 
@@ -194,7 +195,8 @@ def check(
         try:
             variants: Sequence[str | None] = variant_names(name) or [None]
             for variant in variants:
-                with console.status(f"checking {escaped(name)} {escaped(variant or '')}"):
+                task = f"checking {escaped(name)} {escaped(variant or '')}"
+                with console.status(task) as status, watched(partial(told_in, status, task)):
                     loaded = load_scenario(name, variant, parsed_overrides(overrides))
                     check_scenario(loaded, partial(starts.__setitem__, variant or ""))
         except SimulationInterrupted:

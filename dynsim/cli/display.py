@@ -14,6 +14,7 @@ from dynsim.terminal import Terminal, escaped
 
 if TYPE_CHECKING:
     from rich.progress import ProgressColumn, TaskID
+    from rich.status import Status
 
     from dynsim.engine.compilation import Compilation
     from dynsim.record import Record
@@ -101,6 +102,11 @@ def _times() -> tuple[ProgressColumn, ...]:
         TextColumn("to go"),
         TimeRemainingColumn(table_column=Column(no_wrap=True)),
     )
+
+
+def told_in(status: Status, task: str, now: Compilation | None) -> None:
+    """Say in a status what is compiled meanwhile."""
+    status.update(task if now is None else f"{task}: {escaped(now.text)}, {now.elapsed:.0f} s")
 
 
 def _silence() -> None:

@@ -18,11 +18,17 @@ def motor_loads(record: Record, robot: Robot) -> list[dict[str, Any]]:
     Over the whole run, by trapezoids between the samples; a rating that is not known is left out.
     """
     units = {link.joint: "N_m" if link.units[3] == "N m" else "N" for link in robot.links}
-    rms = {name: _rms(record.time, record[name]).tolist() for name in ("current", "torque")}
-    most = {name: np.abs(record[name]).max(axis=0, initial=0.0).tolist() for name in rms}
+    # Along samples, which lie together then: a third of the time.
+    values = {name: np.ascontiguousarray(record[name].T) for name in ("current", "torque")}
+    rms = {name: _rms(record.time, rows).tolist() for name, rows in values.items()}
+    most = {
+        name: np.maximum(rows.max(axis=1, initial=0.0), -rows.min(axis=1, initial=0.0)).tolist()
+        for name, rows in values.items()
+    }
     found = []
     for a, motor in enumerate(robot.motors):
-        unit, entry = units[motor.joint], {"joint": motor.joint}
+        unit = units[motor.joint]
+        entry: dict[str, Any] = {"joint": motor.joint}
         torque = "torque" if unit == "N_m" else "force"
         if not isinstance(motor, TorqueSource):
             entry |= {"current_rms_A": rms["current"][a], "current_max_A": most["current"][a]}
@@ -46,13 +52,14 @@ def _ratings(motor: Drive, torque: str) -> dict[str, float]:
 
 
 def _rms(time: Array, values: Array) -> Array:
-    """Root mean square over time of each column, (T, k) → (k,)."""
+    """Root mean square over time of each row, (k, T) → (k,)."""
     if len(time) < 2:
-        return np.abs(values).max(axis=0, initial=0.0)
-    step = np.diff(time)
+        return np.abs(values).max(axis=1, initial=0.0)
     # Half of each interval belongs to the sample at either end of it.
-    weight = np.concatenate([step, [0.0]]) + np.concatenate([[0.0], step])
-    mean: Array = weight @ values**2 / (2.0 * (time[-1] - time[0]))
+    weight = np.zeros(len(time))
+    weight[:-1] = np.diff(time)
+    weight[1:] += weight[:-1].copy()
+    mean: Array = (values * values) @ weight / (2.0 * (time[-1] - time[0]))
     return np.sqrt(mean)
 
 

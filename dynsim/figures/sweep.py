@@ -97,7 +97,8 @@ class Sweep:
 
 def named(key: str) -> tuple[str, float]:
     """Label of a number by its key, with the unit that is in it, and 1: ``base.tip_margin_min`` is drawn as it is."""
-    words, units = key.split("_"), []
+    words = key.split("_")
+    units: list[str] = []
     while len(words) > 1 and words[-1] in UNITS:
         units.insert(0, words.pop())
     per = units.index("per") if "per" in units else len(units)

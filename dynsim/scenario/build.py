@@ -101,8 +101,7 @@ def _nameable(scenario: Scenario, built: Robot, reuse: Reuse | None = None) -> l
     disabled = [name for name, point in options.points.items() if not point.enabled and name in initial.on_surface]
     if not disabled:
         return contacts(scenario, built, reuse)
-    points = {name: point.model_copy(update={"enabled": True}) for name, point in options.points.items()}
-    chosen = {name: points[name] for name in disabled}
+    chosen = {name: options.points[name].model_copy(update={"enabled": True}) for name in disabled}
     only = options.model_copy(update={"points": chosen, "candidates": "points"})
     alone = replace(scenario, config=scenario.config.model_copy(update={"contacts": only}))
     return [*contacts(scenario, built, reuse), *contacts(alone, built, reuse)]

@@ -115,7 +115,7 @@ def _of_time(config: ScenarioConfig) -> Iterator[tuple[Keys, str]]:
         first = getattr(load, "times_s", None)
         if first is None and load.type == "csv":
             first = load.pieces(end)[0]
-        if first is not None and first[0] >= end and not load.hold:
+        if first is not None and first[0] >= end and not getattr(load, "hold", False):
             yield ("loads", name), f"it begins at {first[0]:g} s, {ends}"
     controller = config.controller
     if controller is None:
@@ -129,7 +129,8 @@ def _of_time(config: ScenarioConfig) -> Iterator[tuple[Keys, str]]:
         if isinstance(parts, dict):
             timed += [(("controller", section, name), part) for name, part in parts.items()]
     operator = getattr(controller, "operator", None)
-    for keys, owner in ((("controller",), controller), (("controller", "operator"), operator)):
+    owners: tuple[tuple[Keys, Any], ...] = ((("controller",), controller), (("controller", "operator"), operator))
+    for keys, owner in owners:
         commands = getattr(owner, "commands", None) or ()
         timed += [((*keys, "commands", k), command) for k, command in enumerate(commands)]
     for keys, part in timed:

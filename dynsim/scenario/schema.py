@@ -344,7 +344,7 @@ class Scenario:
                 part.pop(key, None)
         # What changes nothing is not there, unless it was said.
         for keys in idle_keys(self.config):
-            section, *rest = keys
+            section, *rest = map(str, keys)
             if len(rest) == 1 and not is_set(self.config, keys) and isinstance(resolved.get(section), dict):
                 resolved[section].pop(rest[0], None)
                 if not resolved[section]:

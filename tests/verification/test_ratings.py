@@ -41,7 +41,8 @@ def test_the_peak_current_is_a_limit(arm, integrator):
     options = {f"integrator.{key}": value for key, value in integrator.items()}
     record = simulate(load_scenario(arm, overrides={**options, **tight}))
     current = np.abs(record["current"])
-    assert 7.0 * (1.0 - 1e-3) < current.max() <= 7.0 * (1.0 + 1e-12)
+    # Samples are of dense output, to the tolerance.
+    assert 7.0 * (1.0 - 1e-3) < current.max() <= 7.0 * (1.0 + 1e-9)
     # R I is what is left of the voltage there, within rounding.
     held = current[:, 0] > 7.0 * (1.0 - 1e-9)
     assert held.any()
