@@ -10,25 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim._version import __version__
-from dynsim.contact_metrics import capped, chattered, coarse, modes, touched_stops
+from dynsim.base_metrics import tipped
+from dynsim.contact_metrics import capped, chattered, coarse, modes, never_touched, touched_stops
 from dynsim.kernels.constraint.unilateral import AT_ROOT, UnilateralArrays
 from dynsim.kernels.integrate.run import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, LOCAL_SINCE, PULLING
 from dynsim.measures import (
     RESIDUAL_LIMIT,
     STORES,
-    TIP_OVER,
     base_summary,
     energy_turnover,
     hand_error,
-    least_loads,
-    overturns_settled,
     percent,
     sinks,
 )
 from dynsim.model.clearance import Sinking, sinking
 from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
-from dynsim.model.mobile_base import MobileBase
 from dynsim.model.unilateral import JointStop, told
 from dynsim.record import Record
 from dynsim.reuse import Reuse
@@ -60,7 +57,6 @@ LIMIT_SLACK = 1e-6
 # Heights below this are not resolved by landings [m]: each is found to AT_ROOT, which leaves the weight times that in
 # the ledger, and here ten of them reach the limit of its residual.
 RESOLVED_M = 10.0 * AT_ROOT / RESIDUAL_LIMIT
-START_THERE = " (initial.on_surface lets it start there)"
 # Part of a limit of current that counts as reached.
 NEAR_LIMIT = 1e-3
 NOT_ENFORCED = "no law enforces this limit"
@@ -290,14 +286,7 @@ def _warnings(
                 f"{percent(contact['pulling_fraction'])} of the run, with up to "
                 f"{-contact['normal_force_min_N']:.3g} N; a real arm would lift off"
             )
-    for contact in summary["contacts"]:
-        if "gap_min_m" in contact and contact["closed_fraction"] == 0.0:
-            nearest = int(record["contact_gap"][:, record.labels["contact_gap"].index(contact["name"])].argmin())
-            found.append(
-                f"{contact['name']}: this brace never touches the {contact['surface']}: it carries nothing; nearest "
-                f"{1e3 * contact['gap_min_m']:.3g} mm at t = {record.time[nearest]:.4g} s"
-                f"{'' if initial is not None and contact['name'] in initial.on_surface else START_THERE}"
-            )
+    found.extend(never_touched(record, summary["contacts"], () if initial is None else initial.on_surface))
     for contact, since in zip(contacts, counts.extremes[:, LOCAL_SINCE], strict=True):
         if np.isfinite(since):
             found.append(
@@ -334,7 +323,7 @@ def _warnings(
                 )
     found.extend(_passed_limits(record, robot, counts.unilateral is not None))
     if robot.base is not None:
-        found.extend(_tipped(record, robot.base, counts.support, scenario.metrics.settle_s))
+        found.extend(tipped(record, robot.base, counts.support, scenario.metrics.settle_s))
     if summary["energy_residual_relative"] > RESIDUAL_LIMIT:
         found.append(
             f"the energy ledger does not close: residual {summary['energy_residual_relative']:.1e} of the turnover; "
@@ -361,49 +350,6 @@ def _warnings(
             f"of {s.joint} is anything from {s.low:.4g} to {s.high:.4g} {s.unit} over the splits of the normal forces "
             f"that keep their signs (this run: {s.taken:.4g}); take away braces until the rest are independent"
         )
-    return found
-
-
-def _tipped(record: Record, base: MobileBase, support: NDArray[np.float64], settle: float) -> list[str]:
-    """What a mobile base does that a real one could not do."""
-    found = []
-    load, traction = record["wheel_load"], record["traction_demand"]
-    lowest = least_loads(record, support)
-    late = record["tip_margin"][record.time >= settle]
-    first = min((event.time for event in record.events if event.kind == TIP_OVER), default=np.inf)
-    if np.isfinite(first) and not base.stop_on_overturn:
-        pulled = ", ".join(
-            f"{name} {low:.3g}" for name, low in zip(record.labels["wheel_load"], lowest, strict=True) if low < 0.0
-        )
-        least = f" (least loads [N]: {pulled})" if pulled else ""
-        beyond = f"{100 * (record['tip_margin'] < 0.0).mean():.1f} % of the samples"
-        if late.size and overturns_settled(record, settle) is None:
-            found.append(
-                f"a jolt of the start takes the tip margin below zero at t = {first:.4f} s, in {beyond}, none from "
-                f"{settle:g} s on (margin at least {late.min():.3g}){least}: start with initial.equilibrium, or with a "
-                "motion that begins at rest"
-            )
-        else:
-            found.append(
-                f"the base tips over at t = {first:.4f} s, with a tip margin below zero in {beyond}; the run goes on "
-                f"as if it were held down{least}: plant.base.on_overturn: stop ends it there"
-            )
-    lifted = load.sum(axis=1) <= 0.0
-    if lifted.any():
-        found.append(
-            f"the base is lifted: no load on its wheels and caster in {100 * lifted.mean():.1f} % of the samples, "
-            f"first at t = {record.time[lifted.argmax()]:.4g} s (counts as a tip margin of -1)"
-        )
-    # Once it has tipped, the loads mean nothing.
-    standing = record.time < first
-    for name, demand in zip(record.labels["traction_demand"], traction[standing].T, strict=True):
-        slips = demand > 1.0
-        if slips.any():
-            found.append(
-                f"the {name} wheel would slip: it needs up to {np.nanmax(demand):.3g} times the traction that "
-                f"plant.base.wheel_friction = {base.wheel_friction:g} gives, first at "
-                f"t = {record.time[standing][slips.argmax()]:.4g} s; rolling is enforced all the same"
-            )
     return found
 
 

@@ -566,14 +566,15 @@ class Simulation:
             self._refill(run.clock[ki.TIME] + run.clock[ki.STEP])
             run = self._prepared.run
         run.clock[ki.HOLD] = min(until, run.sample_time[-1])
-        if not self._loaded:
-            self._loaded = True
-            # Loading or compiling the kernels is no integration time.
-            with kernels_logged(log, prepared.kind):
-                driver.advance(prepared.system, prepared.workspace, run, 0)
         begun = clock.perf_counter()
-        driver.advance(prepared.system, prepared.workspace, run, _PIECE)
-        self._wall += clock.perf_counter() - begun
+        if self._loaded:
+            driver.advance(prepared.system, prepared.workspace, run, _PIECE)
+            self._wall += clock.perf_counter() - begun
+        else:
+            # Loading or compiling the kernels is no integration time; one step, so that little else is in it.
+            with kernels_logged(log, prepared.kind):
+                driver.advance(prepared.system, prepared.workspace, run, 1)
+            self._loaded = True
         self._take_events()
         if run.count[ki.STATUS] not in (ki.RUNNING, ki.FINISHED, ki.STOPPED) or self._overturned():
             self._time = float(run.clock[ki.TIME])

@@ -137,7 +137,7 @@ class Initial(StrictConfig):
     @model_validator(mode="after")
     def _check_effect(self) -> Self:
         if not self.on_surface and not self.equilibrium:
-            raise ValueError("has no effect: name contact points in on_surface, or set equilibrium: true")
+            raise error_at("on_surface", "names no contact point; name some, or set equilibrium: true")
         if self.keep and not self.on_surface:
             raise error_at("keep", "has no effect without on_surface, for which joints move; remove it")
         return self
