@@ -93,7 +93,7 @@ def follow_path(
 @internal_kernel
 def is_limited(path: PathArrays):
     """Whether any joint has a limit."""
-    for j in range(path.column.shape[0]):
+    for j in range(path.column.shape[0]):  # noqa: SIM110 (kernels have no generators)
         if path.lower[j] > -math.inf or path.upper[j] < math.inf:
             return True
     return False
