@@ -42,6 +42,21 @@ def modes(unilateral: UnilateralArrays, k: int, duration: float) -> dict[str, An
     }
 
 
+def never_touched(record: Record, contacts: Sequence[dict[str, Any]], placed: Sequence[str]) -> list[str]:
+    """Declared points that have carried nothing, as braces shall; of ``placed`` ones the start is on their surfaces."""
+    found, columns = [], record.labels["contact_gap"]
+    for contact in contacts:
+        name = contact["name"]
+        if "gap_min_m" in contact and contact["closed_fraction"] == 0.0:
+            nearest = int(record["contact_gap"][:, columns.index(name)].argmin())
+            found.append(
+                f"{name}: this brace never touches the {contact['surface']}: it carries nothing; nearest "
+                f"{1e3 * contact['gap_min_m']:.3g} mm at t = {record.time[nearest]:.4g} s"
+                f"{'' if name in placed else ' (initial.on_surface lets it start there)'}"
+            )
+    return found
+
+
 def touched_stops(
     record: Record, robot: Robot, stops: Sequence[JointStop], unilateral: UnilateralArrays, duration: float
 ) -> list[dict[str, Any]]:

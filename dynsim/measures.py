@@ -83,7 +83,7 @@ def base_summary(
 
     Parameters
     ----------
-    settle : time from which ``tip_margin_min_settled`` counts [s]
+    settle : time from which ``tip_margin_min_settled`` and ``overturns_settled_at_s`` count [s]
     travel : way of the axle's middle along the heading, backwards negative, (T,) [m]
     steps : (4,) least loads and least margin over all steps, which are closer together than the samples; or empty
     """
@@ -108,8 +108,17 @@ def base_summary(
         "tip_margin_min": least(margin, -np.inf),
         "tip_margin_min_settled": least(margin, settle),
         "overturns_at_s": min(tips, default=None),
+        "overturns_settled_at_s": overturns_settled(record, settle),
         "traction_demand_max": max(traction[np.isfinite(traction)].tolist(), default=None),
     }
+
+
+def overturns_settled(record: Record, settle: float) -> float | None:
+    """First time from ``settle`` on at which a mobile base tips, or lies beyond tipping [s]; None: never."""
+    time, margin = record.time, record["tip_margin"]
+    late = [event.time for event in record.events if event.kind == TIP_OVER and event.time >= settle]
+    late += time[(time >= settle) & (margin < 0.0)][:1].tolist()
+    return min(late, default=None)
 
 
 def _mean(values: NDArray[np.float64], time: NDArray[np.float64]) -> float:

@@ -10,24 +10,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim._version import __version__
-from dynsim.contact_metrics import capped, chattered, coarse, modes, touched_stops
+from dynsim.base_metrics import tipped
+from dynsim.contact_metrics import capped, chattered, coarse, modes, never_touched, touched_stops
 from dynsim.kernels.constraint.unilateral import AT_ROOT, UnilateralArrays
 from dynsim.kernels.integrate.run import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, LOCAL_SINCE, PULLING
 from dynsim.measures import (
     RESIDUAL_LIMIT,
     STORES,
-    TIP_OVER,
     base_summary,
     energy_turnover,
     hand_error,
-    least_loads,
     percent,
     sinks,
 )
 from dynsim.model.clearance import Sinking, sinking
 from dynsim.model.description import Contact, Robot
-from dynsim.model.drives import Drive, Servo, TorqueSource
-from dynsim.model.mobile_base import MobileBase
+from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
 from dynsim.model.unilateral import JointStop, told
 from dynsim.record import Record
 from dynsim.reuse import Reuse
@@ -59,6 +57,8 @@ LIMIT_SLACK = 1e-6
 # Heights below this are not resolved by landings [m]: each is found to AT_ROOT, which leaves the weight times that in
 # the ledger, and here ten of them reach the limit of its residual.
 RESOLVED_M = 10.0 * AT_ROOT / RESIDUAL_LIMIT
+# Part of a limit of current that counts as reached.
+NEAR_LIMIT = 1e-3
 NOT_ENFORCED = "no law enforces this limit"
 
 
@@ -210,7 +210,10 @@ def summarise(
         "energy_residual_relative": residual / denominator if denominator > 0.0 else 0.0,
         "constraint_drift_max_m": float(counts.extremes[:, DRIFT_MAX].max(initial=0.0)),
         **_base(record, scenario, robot, counts),
-        "contacts": [_contact(record, k, contact, counts, duration) for k, contact in enumerate(contacts)],
+        "contacts": [
+            _contact(record, k, contact, counts, duration, contact.name in scenario.config.contacts.points)
+            for k, contact in enumerate(contacts)
+        ],
         "sinking": [
             {"body": s.body, "surface": s.surface, "depth_m": s.depth, "since_s": float(record.time[s.sample])}
             for s in sunk
@@ -244,7 +247,10 @@ def _loads(record: Record) -> dict[str, Any]:
     return {"loads_work_J": dict(zip(record.labels["work_loads"], work.tolist(), strict=True))}
 
 
-def _contact(record: Record, k: int, contact: Contact, counts: Counts, duration: float) -> dict[str, Any]:
+def _contact(
+    record: Record, k: int, contact: Contact, counts: Counts, duration: float, declared: bool
+) -> dict[str, Any]:
+    """What a contact has done; of a declared point under the unilateral law also how near it came."""
     force = record["contact_normal_force"][:, k]
     real = {} if counts.unilateral is None else modes(counts.unilateral, k, duration)
     # Under the unilateral law a force ends at zero; what lies below is the tolerance of that event.
@@ -261,6 +267,7 @@ def _contact(record: Record, k: int, contact: Contact, counts: Counts, duration:
         "pulling_fraction": min(float(extremes[PULLING]) / duration, 1.0) if duration > 0.0 else 0.0,
         "slip_distance_m": float(record["contact_slip_distance"][-1, k]) if len(record) else 0.0,
         **real,
+        **({"gap_min_m": float(record["contact_gap"][:, k].min())} if real and declared and len(record) else {}),
     }
 
 
@@ -274,6 +281,7 @@ def _warnings(
     scale: float,
 ) -> list[str]:
     found = [] if counts.unilateral is None else [*chattered(contacts, counts.unilateral)]
+    initial = scenario.config.initial
     for contact in summary["contacts"]:
         if contact["normal_force_min_N"] < 0.0:
             found.append(
@@ -281,6 +289,7 @@ def _warnings(
                 f"{percent(contact['pulling_fraction'])} of the run, with up to "
                 f"{-contact['normal_force_min_N']:.3g} N; a real arm would lift off"
             )
+    found.extend(never_touched(record, summary["contacts"], () if initial is None else initial.on_surface))
     for contact, since in zip(contacts, counts.extremes[:, LOCAL_SINCE], strict=True):
         if np.isfinite(since):
             found.append(
@@ -302,9 +311,11 @@ def _warnings(
     # Along samples: a third of the time.
     peaks = {name: np.abs(record[name].T.copy()).max(axis=1, initial=0.0) for name in {one[1] for *_, one in limited}}
     for a, motor, (what, signal, limit, unit) in limited:
+        # The current of a DC motor comes near to the limit of its driver, and does not reach it.
+        reached = limit * (1.0 - NEAR_LIMIT) if isinstance(motor, Motor) and what == "current" else limit
         # A run that diverged may have NaN, which hides a peak.
-        if not peaks[signal][a] < limit:
-            saturated = np.abs(record[signal][:, a]) >= limit
+        if not peaks[signal][a] < reached:
+            saturated = np.abs(record[signal][:, a]) >= reached
             if isinstance(motor, Servo):
                 # Without a current its voltage is the back-EMF.
                 saturated &= record["current"][:, a] != 0.0
@@ -315,7 +326,7 @@ def _warnings(
                 )
     found.extend(_passed_limits(record, robot, counts.unilateral is not None))
     if robot.base is not None:
-        found.extend(_tipped(record, robot.base, counts.support, scenario.metrics.settle_s))
+        found.extend(tipped(record, robot.base, counts.support, scenario.metrics.settle_s))
     if summary["energy_residual_relative"] > RESIDUAL_LIMIT:
         found.append(
             f"the energy ledger does not close: residual {summary['energy_residual_relative']:.1e} of the turnover; "
@@ -345,49 +356,12 @@ def _warnings(
     return found
 
 
-def _tipped(record: Record, base: MobileBase, support: NDArray[np.float64], settle: float) -> list[str]:
-    """What a mobile base does that a real one could not do."""
-    found = []
-    load, traction = record["wheel_load"], record["traction_demand"]
-    lowest = least_loads(record, support)
-    late = record["tip_margin"][record.time >= settle]
-    since = f", none from {settle:g} s on (margin at least {late.min():.3g})" if late.size and late.min() > 0.0 else ""
-    first = min((event.time for event in record.events if event.kind == TIP_OVER), default=np.inf)
-    if np.isfinite(first) and not base.stop_on_overturn:
-        pulled = ", ".join(
-            f"{name} {low:.3g}" for name, low in zip(record.labels["wheel_load"], lowest, strict=True) if low < 0.0
-        )
-        found.append(
-            f"the base tips over at t = {first:.4f} s, with a tip margin below zero in "
-            f"{100 * (record['tip_margin'] < 0.0).mean():.1f} % of the samples{since}; the run goes on as if it were "
-            "held down"
-            f"{f' (least loads [N]: {pulled})' if pulled else ''}: plant.base.on_overturn: stop ends it there"
-        )
-    lifted = load.sum(axis=1) <= 0.0
-    if lifted.any():
-        found.append(
-            f"the base is lifted: no load on its wheels and caster in {100 * lifted.mean():.1f} % of the samples, "
-            f"first at t = {record.time[lifted.argmax()]:.4g} s (counts as a tip margin of -1)"
-        )
-    # Once it has tipped, the loads mean nothing.
-    standing = record.time < first
-    for name, demand in zip(record.labels["traction_demand"], traction[standing].T, strict=True):
-        slips = demand > 1.0
-        if slips.any():
-            found.append(
-                f"the {name} wheel would slip: it needs up to {np.nanmax(demand):.3g} times the traction that "
-                f"plant.base.wheel_friction = {base.wheel_friction:g} gives, first at "
-                f"t = {record.time[standing][slips.argmax()]:.4g} s; rolling is enforced all the same"
-            )
-    return found
-
-
 def _limits_of(motor: Drive) -> list[tuple[str, str, float, str]]:
     """Limits of a motor: what is limited, its signal, the limit and its unit."""
     if isinstance(motor, TorqueSource):
         return [("torque", "current", motor.torque_limit, "N m")]
     limits = [("voltage", "voltage", motor.voltage_limit, "V")]
-    if isinstance(motor, Servo):
+    if isinstance(motor, Servo) or np.isfinite(motor.current_limit):
         limits.append(("current", "current", motor.greatest_current, "A"))
     return limits
 

@@ -85,7 +85,7 @@ _ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = 
     ("deepest below a surface [mm]", _deepest, str),
     ("tip margin, settled", _base("tip_margin_min_settled"), _margin),
     ("  whole run", _base("tip_margin_min"), _margin),
-    ("  tips over at [s]", _base("overturns_at_s"), lambda v: _number(v, digits=3)),
+    ("  tips over at [s]", _base("overturns_settled_at_s"), lambda v: _number(v, digits=3)),
     ("least load, wheels, caster [N]", _least_load, lambda v: _number(v, digits=3)),
     ("ledger residual, relative", lambda s: s.get("energy_residual_relative"), lambda v: f"{v:.1e}"),
     ("constraint drift [m]", lambda s: s.get("constraint_drift_max_m"), lambda v: f"{v:.1e}"),
@@ -108,7 +108,7 @@ def print_summary(console: Console, summary: Summary) -> None:
     for contact in summary.get("contacts", ()):
         for heading, cells in _contact_rows(contact["name"], [contact]):
             table.add_row(heading, *cells)
-    for heading, cells in _stop_rows([summary], [summary]):
+    for heading, cells in (*_stop_rows([summary], [summary]), *_motor_rows([summary], [summary])):
         table.add_row(heading, *cells)
     console.print(table)
     _print_warnings(console, {"": summary})
@@ -145,7 +145,8 @@ def _print_columns(console: Console, summaries: Mapping[str, Summary], names: Se
         by_variant = [next((c for c in s["contacts"] if c["name"] == contact), None) for s in shown]
         for heading, cells in _contact_rows(contact, by_variant):
             table.add_row(heading, *cells)
-    for heading, cells in _stop_rows(list(summaries.values()), shown):
+    everything = list(summaries.values())
+    for heading, cells in (*_stop_rows(everything, shown), *_motor_rows(everything, shown)):
         table.add_row(heading, *cells)
     console.print(table)
 
@@ -173,13 +174,28 @@ def print_choices(console: Console) -> None:
 
 
 def print_starts(console: Console, starts: Mapping[str, Start]) -> None:
-    """Per variant the positions of hand and contact points [m], as lists of YAML that read back to the same doubles."""
+    """Per variant the positions of hand and contact points [m], as lists of YAML that read back to the same doubles.
+
+    Then how far contacts are from their surfaces, joints that on_surface has moved, and the margin of a base at rest.
+    """
     for variant, start in starts.items():
-        points = {"hand": start.hand, **{f"contact {name}": point for name, point in start.contacts.items()}}
-        width = max(map(len, points))
+        values = {"hand": f"{start.hand.tolist()}"}
+        values |= {f"contact {name}": f"{point.tolist()}" for name, point in start.contacts.items()}
+        values |= {f"gap of {name}": f"{gap:+.4g} m" for name, gap in start.gaps.items()}
+        for joint, (to, was, unit) in start.solved.items():
+            values[joint] = f"{to!r} {unit}, by on_surface; was {was:.6g}"
+        if start.tip_margin is not None:
+            braced = ""
+            if start.tip_margin_braced is not None:
+                braced = f", {start.tip_margin_braced:.4g} with braces of least heat"
+            values["tip margin"] = f"{start.tip_margin:.4g} at rest{braced} (1: safest, 0: tips)"
+        width = max(map(len, values))
         lines = [f"  {variant}{', ' if variant else ''}at the start [m]:"]
-        lines += [f"    {name:<{width}}  {point.tolist()}" for name, point in points.items()]
+        lines += [f"    {name:<{width}}  {value}" for name, value in values.items()]
+        if start.aloft:
+            lines += [f"    not on their surfaces; they would be with  {start.aloft}"]
         console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+        _print_warnings(console, {variant: {"warnings": start.warnings}})
 
 
 def _pulling(contact: Summary) -> str:
@@ -213,8 +229,16 @@ _CONTACT_ROWS: tuple[tuple[str, Callable[[Summary], str], bool | None], ...] = (
 
 
 def _contact_rows(name: str, contacts: Sequence[Summary | None]) -> Iterator[tuple[str, list[str]]]:
-    """Rows of a contact, a cell for each run; None where a run does not have it. No rows if it never touched."""
+    """Rows of a contact, a cell for each run; None where a run does not have it.
+
+    No rows of a candidate that never touched; a declared point says how near it came.
+    """
     having = [contact for contact in contacts if contact]
+    if not any(contact["closed_fraction"] > 0.0 or "gap_min_m" in contact for contact in having):
+        return
+    if not all(contact["closed_fraction"] > 0.0 for contact in having):
+        cells = [_number(c.get("gap_min_m"), 1e3, 3) if c and not c["closed_fraction"] else "–" for c in contacts]
+        yield escaped_line(_of(name, "never touches, least gap [mm]")), cells
     if not any(contact["closed_fraction"] > 0.0 for contact in having):
         return
     for heading, show, real in _CONTACT_ROWS:
@@ -242,6 +266,37 @@ def _stop_rows(summaries: Sequence[Summary], shown: Sequence[Summary]) -> Iterat
         for heading, show in _STOP_ROWS:
             text = _of(f"{joint}, stop at {place}", heading.format(**stop))
             yield escaped_line(text), ["–" if one is None else show(one) for one in cells]
+
+
+def _motor_rows(summaries: Sequence[Summary], shown: Sequence[Summary]) -> Iterator[tuple[str, list[str]]]:
+    """Rows of motors with ratings, root mean square of nominal, a cell for each run that is shown.
+
+    Of many motors the most loaded ones.
+    """
+    for quantity, unit, label in _RATED:
+        rms, nominal = f"{quantity}_rms_{unit}", f"nominal_{quantity}_{unit}"
+        rated = [m for summary in summaries for m in summary.get("motors", ()) if m.get(nominal) and rms in m]
+        load = {m["joint"]: 0.0 for m in rated}
+        for motor in rated:
+            load[motor["joint"]] = max(load[motor["joint"]], motor[rms] / motor[nominal])
+        heaviest = sorted(load, key=lambda joint: -load[joint])[:_MOST_MOTORS]
+        for joint in (joint for joint in load if joint in heaviest):
+            found: list[Summary] = [next((m for m in s.get("motors", ()) if m["joint"] == joint), {}) for s in shown]
+            cells = [f"{_loaded(m[rms], m[nominal])} of {m[nominal]:g}" if m.get(nominal) else "–" for m in found]
+            yield escaped_line(f"{joint}: {label}"), cells
+
+
+# Of motors: quantity and unit as in the keys of the summary, and how they are called in a table.
+_RATED = (
+    ("current", "A", "rms of nominal [A]"),
+    ("torque", "N_m", "rms of nominal [N m]"),
+    ("force", "N", "rms of nominal [N]"),
+)
+_MOST_MOTORS = 10
+
+
+def _loaded(rms: float, nominal: float) -> str:
+    return f"[bold red]{rms:.3g}[/]" if rms > nominal else f"{rms:.3g}"
 
 
 def _stop(stop: Summary) -> tuple[str, float]:

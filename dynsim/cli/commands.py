@@ -22,7 +22,7 @@ from dynsim.cli.app import (
     app,
     parsed_overrides,
 )
-from dynsim.cli.display import console, errors, labelled, progress, record_files
+from dynsim.cli.display import console, errors, labelled, progress, record_files, told_in
 from dynsim.cli.drawing import Figures, Page, begin_drawing, draw, draw_all
 from dynsim.cli.hw_drive import EXAMPLE, hw_drive
 from dynsim.cli.sweep import sweep
@@ -33,6 +33,7 @@ from dynsim.hardware.cli import export, hw
 from dynsim.terminal import escaped
 
 if TYPE_CHECKING:
+    from dynsim.engine import Start
     from dynsim.record import Record
 
 
@@ -180,24 +181,30 @@ def check(
 ) -> None:
     """Validate scenarios without running them: schema, model, contacts at the start, reachable references.
 
-    Prints where hand and contact points start, in full digits, to be copied into a surface or a path.
+    Prints where hand and contact points start, in full digits, to be copied into a surface or a path, how far contacts
+    are from their surfaces, the joints that initial.on_surface has moved, and the tip margin of a base at rest.
     """
     from dynsim.engine import check as check_scenario
+    from dynsim.engine.compilation import watched
     from dynsim.scenario import load_scenario, variant_names
     from dynsim.tables import print_starts
 
     failed = False
     for name in scenarios:
+        starts: dict[str, Start] = {}
         try:
             variants: Sequence[str | None] = variant_names(name) or [None]
-            starts = {}
             for variant in variants:
-                with console.status(f"checking {escaped(name)} {escaped(variant or '')}"):
-                    starts[variant or ""] = check_scenario(load_scenario(name, variant, parsed_overrides(overrides)))
+                task = f"checking {escaped(name)} {escaped(variant or '')}"
+                with console.status(task) as status, watched(partial(told_in, status, task)):
+                    loaded = load_scenario(name, variant, parsed_overrides(overrides))
+                    check_scenario(loaded, partial(starts.__setitem__, variant or ""))
         except SimulationInterrupted:
             raise
         except DynsimError as error:
             failed = True
+            # Where it starts helps to find out what is wrong.
+            print_starts(console, starts)
             errors.print(f"[red]error:[/] {escaped(str(error))}")
         else:
             count = f"{len(variants)} variants" if len(variants) > 1 else "1 variant"

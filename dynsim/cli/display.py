@@ -14,7 +14,9 @@ from dynsim.terminal import Terminal, escaped
 
 if TYPE_CHECKING:
     from rich.progress import ProgressColumn, TaskID
+    from rich.status import Status
 
+    from dynsim.engine.compilation import Compilation
     from dynsim.record import Record
     from dynsim.scenario import Scenario
     from dynsim.studies.compare import VariantProgress
@@ -25,6 +27,8 @@ errors = Terminal(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 
 # Of a progress bar.
 _TITLE_WIDTH = 22
+# Of kernels, where none have been compiled yet [s].
+_COMPILED_S = 90.0
 # Of a run's folder, and of one of several.
 RECORD, COMPARISON = "record.h5", "comparison.json"
 
@@ -100,17 +104,29 @@ def _times() -> tuple[ProgressColumn, ...]:
     )
 
 
+def told_in(status: Status, task: str, now: Compilation | None) -> None:
+    """Say in a status what is compiled meanwhile."""
+    status.update(task if now is None else f"{task}: {escaped(now.text)}, {now.elapsed:.0f} s")
+
+
+def _silence() -> None:
+    """Kernels are compiled without a word."""
+    from dynsim.engine.compilation import shown_by_caller
+
+    shown_by_caller()
+
+
 @contextmanager
 def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProgress]:
     """A progress bar per scenario, with time and time to go, and one while references take long; yields its report."""
     if quiet:
+        _silence()
         yield lambda variant, time, stage="": None
         return
     from rich.progress import BarColumn, Progress, TextColumn
 
     from dynsim.engine import REFERENCES, SIMULATION
-    from dynsim.engine.outcome import COMPILING
-    from dynsim.kernels.jit import told_of_compilation
+    from dynsim.engine.compilation import watched
 
     # In 80 columns all fits up to 9999 s: the bar gives way, the times do not.
     columns = (
@@ -119,10 +135,18 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
         TextColumn("{task.completed:.2f} / {task.total:g} s {task.fields[what]}"),
         *_times(),
     )
-    with (
-        Progress(*columns, console=console, transient=not console.is_terminal) as bars,
-        told_of_compilation(lambda: console.print(f"{COMPILING[0].upper()}{COMPILING[1:]}.")),
-    ):
+    said: list[TaskID] = []
+
+    def compiling(now: Compilation | None) -> None:
+        if now is None:
+            bars.update(said[0], visible=False)
+            return
+        if not said:
+            console.print(f"{escaped(now.text[0].upper() + now.text[1:])}.", highlight=False)
+            said.append(bars.add_task("kernels", total=now.expected or _COMPILED_S, what="compiled"))
+        bars.update(said[0], completed=now.elapsed, visible=True)
+
+    with Progress(*columns, console=console, transient=not console.is_terminal) as bars, watched(compiling):
 
         def add(scenario: Scenario, what: str, visible: bool) -> TaskID:
             title = scenario.variant or scenario.name
@@ -144,9 +168,12 @@ def progress(scenarios: Sequence[Scenario], quiet: bool) -> Iterator[VariantProg
 def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None]]:
     """A bar over all runs of a sweep, with time, time to go and how many failed; yields its report."""
     if quiet:
+        _silence()
         yield lambda done, failed: None
         return
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    from dynsim.engine.compilation import watched
 
     columns = (
         TextColumn("runs"),
@@ -157,6 +184,14 @@ def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None
     )
     bar = Progress(*columns, console=console, transient=not console.is_terminal)
     task = bar.add_task("", total=runs, failed="")
+    said: list[str] = []
+
+    def compiling(now: Compilation | None) -> None:
+        if now is not None and not said:
+            said.append(now.text)
+            console.print(f"{escaped(now.text[0].upper() + now.text[1:])}.", highlight=False)
+        if bar.live.is_started:
+            bar.update(task, failed="" if now is None else f"compiling, {now.elapsed:.0f} s")
 
     def report(done: int, failed: int) -> None:
         # Not before: what refuses the sweep then stands alone.
@@ -164,7 +199,8 @@ def sweep_progress(runs: int, quiet: bool) -> Iterator[Callable[[int, int], None
         bar.update(task, completed=done, failed=f"{failed} failed" if failed else "")
 
     try:
-        yield report
+        with watched(compiling):
+            yield report
     finally:
         if bar.live.is_started:
             bar.stop()

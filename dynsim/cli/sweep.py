@@ -23,6 +23,7 @@ from dynsim.cli.app import (
 )
 from dynsim.cli.display import console, drawing, errors, sweep_progress
 from dynsim.errors import ScenarioError, SimulationStopped
+from dynsim.problems import suggest
 from dynsim.terminal import escaped
 
 if TYPE_CHECKING:
@@ -69,6 +70,14 @@ def sweep(
     ] = None,
     keep_records: Annotated[KeepRecords, typer.Option(help="Runs whose records are saved.")] = KeepRecords.none,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the sweep in the folder.")] = False,
+    plot: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NUMBER",
+            help="A number of the summary to draw instead of energy and error, as the table calls it, such as "
+            "base.tip_margin_min; may be repeated. --resume draws others of a sweep that is done.",
+        ),
+    ] = None,
     no_figures: FiguresOption = False,
     format_: FormatOption = FigureFormat.png,
     quiet: QuietOption = False,
@@ -82,6 +91,8 @@ def sweep(
 
     if jobs is not None and scheduler is not None:
         raise ScenarioError("--jobs are processes of this machine, --scheduler has its own workers: give one of them")
+    if plot and no_figures:
+        raise ScenarioError("--plot says what is drawn, --no-figures that nothing is: give one of them")
     if scheduler is None and (jobs or cores()) > 1:
         load_workers()
     from dynsim.files import check_writable
@@ -121,7 +132,7 @@ def sweep(
     if len(failed) > _SHOWN:
         errors.print(f"… and {len(failed) - _SHOWN} more; the table has all reasons")
     if not no_figures:
-        _draw(name, rows, plan, folder, quiet, format_)
+        _draw(name, rows, plan, folder, quiet, format_, plot or ())
     if not quiet:
         if not has_parquet():
             console.print(escaped("No Parquet: it needs pyarrow (pip install 'dynsim[tables]')."), highlight=False)
@@ -179,10 +190,19 @@ def _load_for_the_end(samples: bool, figures: bool) -> None:
             import dynsim.figures.sweep  # noqa: F401
 
 
-def _draw(name: str, rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool, format_: str) -> None:
+def _draw(
+    name: str, rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool, format_: str, plotted: Sequence[str] = ()
+) -> None:
     from dynsim.figures.sweep import Sweep, draw
-    from dynsim.studies.sweep import OK
+    from dynsim.studies.sweep import OK, TABLES
 
+    known = dict.fromkeys(key for row in rows for key in row.numbers)
+    for number in plotted:
+        if known and number not in known:
+            raise ScenarioError(
+                f"--plot {number}: no run has that number{suggest(number, known)}; {folder / TABLES[0]} has all; "
+                "--resume draws others without running anything again"
+            )
     # What a run that stopped has until then, or before it was to end, is beside the others like a fine result.
     table = Sweep(
         name,
@@ -190,6 +210,7 @@ def _draw(name: str, rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool,
         [axis.key for axis in plan.grid],
         plan.sampled,
         plan.file.variants,
+        plotted,
     )
     with drawing(folder, quiet):
         draw(table, folder, format_)

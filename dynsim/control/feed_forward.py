@@ -90,10 +90,9 @@ def _pressing_torques(
     """Torques of the motors along the references, (T, n), with braces that press."""
     attached = []
     for name, (contact, _) in braces.items():
-        if contact.radius > 0.0 or contact.tip is not None:
+        if contact.tip is not None:
             raise ModelError(
-                f"controller.brace: {name} is no point but has a radius; name points of contacts.points that are to "
-                "press",
+                f"controller.brace: {name} is the axis of a link; name points of contacts.points that are to press",
                 keys=("controller", "brace"),
             )
         attached.append(model.robot.attach(contact.body, contact.point))
@@ -102,14 +101,17 @@ def _pressing_torques(
     positions, velocities = planner.motion(points, q, v)
     tables = np.zeros((len(times), len(braces), BRACE_SIZE))
     for k, (name, (contact, force)) in enumerate(braces.items()):
-        _check_gaps(name, contact, times, contact.surface.gaps(positions[:, k]))
+        _check_gaps(name, contact, times, contact.surface.gaps(positions[:, k]) - contact.radius)
         normals = contact.surface.normals(positions[:, k])
-        slip = velocities[:, k] - np.sum(velocities[:, k] * normals, axis=1, keepdims=True) * normals
+        touching, velocity = points[k], velocities[:, k]
+        if contact.radius > 0.0:
+            touching, velocity = _lowest_points(model, attached[k], -contact.radius * normals, q, v)
+        slip = velocity - np.sum(velocity * normals, axis=1, keepdims=True) * normals
         speed = np.linalg.norm(slip, axis=1)
         slip[speed <= SLIP_MIN] = 0.0
         # A point at rest along the surface is planned without friction: what holds it then, its history decides.
         friction = np.where(speed > SLIP_MIN, contact.friction * speed / np.hypot(speed, SLIP_SCALE), 0.0)
-        tables[:, k] = brace_rows(points[k], normals, friction, min_N, np.nan if force is None else force, slip)
+        tables[:, k] = brace_rows(touching, normals, friction, min_N, np.nan if force is None else force, slip)
     torques, solved = planner.torques(q, v, vdot, tables)
     if solved < len(times):
         raise ModelError(
@@ -118,6 +120,24 @@ def _pressing_torques(
             keys=("controller", "brace"),
         )
     return torques
+
+
+def _lowest_points(
+    model: Model, attached: tuple[int, Array], offsets: Array, q: Array, v: Array
+) -> tuple[Array, Array]:
+    """Points of a body off one of its points by vectors in the world: in its frame [m], and their velocities [m/s].
+
+    Parameters
+    ----------
+    attached : link, and the point in its frame [m]
+    offsets : (T, 3) [m]
+    """
+    link, point = attached
+    planner = BracePlanner(model.robot, model.arrays, [link] * 4)
+    positions, velocities = planner.motion(point + np.vstack([np.zeros(3), np.eye(3)]), q, v)
+    axes = positions[:, 1:] - positions[:, :1]  # (T, 3, 3), a row for each axis of the body
+    shifts = np.einsum("tij,tj->ti", axes, offsets)
+    return point + shifts, velocities[:, 0] + np.einsum("ti,tij->tj", shifts, velocities[:, 1:] - velocities[:, :1])
 
 
 def _check_gaps(name: str, contact: Contact, times: Array, gaps: Array) -> None:

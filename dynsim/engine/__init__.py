@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import importlib
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Protocol
 
@@ -44,10 +44,23 @@ class Start:
     ----------
     hand : (3,) the controlled point
     contacts : (3,) of each enabled contact point, by its name
+    gaps : of the same from their surfaces [m]; negative: below
+    aloft : line of a scenario that would put the declared points which do not touch on their surfaces; empty: all do
+    solved : joints that ``initial.on_surface`` has moved: where to and from where [° or m], and the unit
+    tip_margin : of a mobile base at rest under weight and loads alone; None: it stands fixed or floats
+    tip_margin_braced : the same with the contacts that touch, whose forces cost the motors least heat; None: there are
+        none, or they do not hold the arm
+    warnings : keys of the scenario that change nothing
     """
 
     hand: NDArray[np.float64]
     contacts: Mapping[str, NDArray[np.float64]]
+    gaps: Mapping[str, float] = field(default_factory=dict)
+    aloft: str = ""
+    solved: Mapping[str, tuple[float, float, str]] = field(default_factory=dict)
+    tip_margin: float | None = None
+    tip_margin_braced: float | None = None
+    warnings: Sequence[str] = ()
 
 
 def simulate(
@@ -93,21 +106,23 @@ def note_warnings(scenario: Scenario, record: Record | None) -> None:
         log.warning("%s: %s", scenario.title, warning)
 
 
-def check(scenario: Scenario) -> Start:
+def check(scenario: Scenario, started: Callable[[Start], None] | None = None) -> Start:
     """Do everything that comes before the first step: model, contacts at the start, references, size of the record.
+
+    ``started`` : called with what is returned as soon as that is known, before contacts and references are looked at
 
     Returns
     -------
     Start
-        Positions of the hand and of the contact points at t = 0.
+        Positions of the hand and of the contact points at t = 0, and what else a start has.
 
     Raises
     ------
     ModelError, UnreachableReference, ScenarioError
     """
     with named(scenario):
-        module = _module(scenario)
-        return module.start(module.prepare(scenario))
+        start: Start = _module(scenario).check(scenario, started or (lambda start: None))
+        return start
 
 
 @contextmanager

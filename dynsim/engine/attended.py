@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from dynsim import interruption
-from dynsim.engine.outcome import kernels_logged
+from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.prepare import Prepared
 from dynsim.kernels.integrate import driver
 from dynsim.kernels.integrate import run as ki
@@ -186,7 +186,7 @@ def load(prepared: Prepared) -> None:
     KeyboardInterrupt
         The compiler goes on alone.
     """
-    with kernels_logged(log):
+    with kernels_logged(log, prepared.kind):
         compiled = partial(driver.advance, prepared.system, prepared.workspace, prepared.run, -1)
         _, raised = attend(compiled, lambda: None, interruption.check)
     if raised is not None:

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.driven import Array, Axis, Order, Pace, Shown, changed
-from dynsim.engine.outcome import kernels_logged
 from dynsim.engine.simulation import Simulation
 from dynsim.errors import ScenarioError
 from dynsim.model.control import PLANNED

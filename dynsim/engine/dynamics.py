@@ -7,10 +7,11 @@ import time as clock
 from functools import partial
 
 from dynsim import interruption
-from dynsim.engine import SIMULATION, Progress, Start, attended
+from dynsim.engine import SIMULATION, Progress, attended
 from dynsim.engine.outcome import raise_stopped
 from dynsim.engine.prepare import Prepared, prepare
 from dynsim.engine.recording import make_record
+from dynsim.engine.start import check
 from dynsim.engine.stepped import event_name, own_guards, take_log
 from dynsim.engine.stopping import last_state, stopped
 from dynsim.errors import SimulationInterrupted, SimulationStopped
@@ -19,19 +20,12 @@ from dynsim.record import Event, Record
 from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario
 
-__all__ = ["Prepared", "prepare", "simulate", "start"]
+__all__ = ["Prepared", "check", "prepare", "simulate"]
 
 log = logging.getLogger(__name__)
 
 # More steps than any run takes.
 _ALL = 1 << 62
-
-
-def start(prepared: Prepared) -> Start:
-    """Positions of the hand and of the contact points at t = 0."""
-    model, q = prepared.model, prepared.model.robot.initial
-    contacts = {contact.name: model.point_position(contact.body, contact.point, q) for contact in prepared.contacts}
-    return Start(model.point_position(*model.robot.hand, q), contacts)
 
 
 def simulate(

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import logging
 import time as clock
+from collections.abc import Callable
 
 import numpy as np
 
 from dynsim import interruption
 from dynsim.engine import Progress, Start
+from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.kinematic_record import COORDINATES, make_record
 from dynsim.engine.kinematic_run import Run
 from dynsim.engine.mode_switching import ModeSwitcher
-from dynsim.engine.outcome import check_size, kernels_logged, raise_stopped
+from dynsim.engine.outcome import check_size, raise_stopped
 from dynsim.engine.provenance import provenance
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.families import member
@@ -31,6 +33,7 @@ from dynsim.record import Record
 from dynsim.record.poses import pose_columns
 from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario, build
+from dynsim.scenario.effect import without_effect
 from dynsim.snake.kinematics import pose_of_point
 from dynsim.snake.state import DONE, MODE, PLACE, TICKS, State, new_rig, new_state, new_trace
 from dynsim.snake.ticks import record_row, run_ticks
@@ -94,9 +97,11 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> Run:
     return run
 
 
-def start(run: Run) -> Start:
-    """Position of the controlled point at t = 0; a snake has no contact points."""
-    return Start(run.state.w_target[:3].copy(), {})
+def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
+    """See :func:`dynsim.engine.check`: the controlled point at t = 0; a snake has no contact points."""
+    start = Start(prepare(scenario).state.w_target[:3].copy(), {}, warnings=without_effect(scenario))
+    started(start)
+    return start
 
 
 def simulate(
@@ -114,7 +119,7 @@ def simulate(
     """
     run = prepare(scenario, source)
     controller, switcher = run.controller, mode_switcher(run)
-    with kernels_logged(log):
+    with kernels_logged(log, "kinematic snakes"):
         load_kernels(run)
     stop: SimulationStopped | None = None
     started = clock.perf_counter()

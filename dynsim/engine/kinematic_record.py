@@ -16,6 +16,7 @@ from dynsim.model.snake import conditioning
 from dynsim.record import Record
 from dynsim.record.poses import add_body_poses
 from dynsim.scenario import Scenario
+from dynsim.scenario.effect import without_effect
 from dynsim.snake.kinematics import new_chain, posture_points
 from dynsim.snake.state import (
     CLAMPED,
@@ -210,7 +211,7 @@ def _summary(run: Run, scenario: Scenario, switcher: ModeSwitcher, record: Recor
             for row, number in enumerate(run.controller.modes.numbers)
         },
     }
-    summary["warnings"] = _warnings(run, record, summary)
+    summary["warnings"] = [*_warnings(run, record, summary), *without_effect(scenario)]
     return summary
 
 

@@ -1,34 +1,12 @@
-"""What both engines say about a run: that kernels are compiled, a record too large to be made, or not complete."""
+"""What both engines say about a run: a record too large to be made, or not complete."""
 
 from __future__ import annotations
 
-import logging
-import time as clock
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import NoReturn
 
 from dynsim.errors import ScenarioError, SimulationStopped
-from dynsim.kernels.jit import told_of_compilation
 from dynsim.record import Record
 from dynsim.scenario import Scenario
-
-COMPILING = "compiling the kernels: once for each kind of system after an installation or an edit, up to a minute"
-
-
-@contextmanager
-def kernels_logged(log: logging.Logger) -> Iterator[None]:
-    """Log the time in which the kernels are loaded, or compiled, which takes up to a minute."""
-    started, done = clock.perf_counter(), "loaded"
-
-    def tell() -> None:
-        nonlocal done
-        done = "compiled"
-        log.info(COMPILING)
-
-    with told_of_compilation(tell):
-        yield
-    log.info("%s the kernels in %.1f s", done, clock.perf_counter() - started)
 
 
 def check_size(scenario: Scenario, rows: int, columns: int) -> None:

@@ -11,6 +11,8 @@ from functools import partial
 import numpy as np
 
 from dynsim.engine import REFERENCES, Progress
+from dynsim.engine.compilation import kernels_logged
+from dynsim.engine.equilibrium import Balance, balanced, shifted
 from dynsim.engine.method import AUTO, Choice, choose
 from dynsim.engine.outcome import check_size
 from dynsim.errors import ModelError, ScenarioError
@@ -65,6 +67,23 @@ class Prepared:
     stops: list[JointStop]
     choice: Choice
     reuse: Reuse
+    balance: Balance | None = None
+
+    @property
+    def kind(self) -> str:
+        """What its kernels are compiled for, in words."""
+        system, robot = self.system, self.model.robot
+        parts = [self.choice.method]
+        if self.contacts or self.stops:
+            parts.append("contacts that are glued" if system.unilateral is None else "contacts that open and close")
+        extras = {
+            "spheres, boxes or height fields": system.shapes is not None,
+            "joints of several rates": self.model.arrays.compound is not None,
+            "a mobile base": robot.base is not None,
+            "planned voltages": system.reference.voltage is not None,
+            "the dense system": system.dense is not None,
+        }
+        return f"arms by {', '.join([*parts, *(name for name, there in extras.items() if there)])}"
 
 
 def prepare(
@@ -134,11 +153,15 @@ def prepare(
     _check_stiffness(choice.method, scenario.duration_s, robot)
     method = ki.METHODS[choice.method]
     step = options.step_s or (1e-3 if method in ki.FIXED_STEP else 0.0)
+    balance, initial = None, scenario.config.initial
+    if initial is not None and initial.equilibrium:
+        with kernels_logged(log, "the start at rest", loads=False):
+            balance = balanced(model, contacts, build.loads(scenario, robot), control, real)
     system = System(
         layout=layout,
         model=model.arrays,
         drives=drives,
-        reference=control.reference,
+        reference=control.reference if balance is None else shifted(control.reference, balance.shift),
         contacts=compile_contacts(robot, contacts),
         loads=compile_loads(robot, loads),
         dense=np.zeros((size, size + 1)) if options.solver == "m_star" else None,
@@ -152,6 +175,9 @@ def prepare(
         stepping.law[:, GRIP : GRIP_AXIS + 3] = compile_grips(robot, contacts)
     y = np.zeros(layout.size)
     y[block(layout, "q")] = robot.initial
+    if balance is not None:
+        circuit = drives.table[:, ka.CIRCUIT]
+        y[layout.current + circuit[circuit >= 0]] = balance.current[circuit >= 0]
     run = ki.new_run(
         method,
         y,
@@ -177,7 +203,7 @@ def prepare(
         stepping=stepping,
         lanes=has_forms(system),
     )
-    return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops, choice, reuse)
+    return Prepared(model, contacts, control, system, run, new_workspace(system), loads, stops, choice, reuse, balance)
 
 
 def _ticks(control: JointControl) -> tuple[np.ndarray, np.ndarray] | None:
@@ -295,9 +321,10 @@ def _control(
         return JointControl.absent(model.robot)
     log.info("%s: planning references over %g s", scenario.title, scenario.duration_s)
     started = clock.perf_counter()
-    control = build.controller(
-        scenario, model, None if progress is None else partial(progress, stage=REFERENCES), contacts, reuse
-    )
+    with kernels_logged(log, "references", loads=False):
+        control = build.controller(
+            scenario, model, None if progress is None else partial(progress, stage=REFERENCES), contacts, reuse
+        )
     log.info("%s: planned references in %.3f s", scenario.title, clock.perf_counter() - started)
     if not isinstance(control, JointControl):
         raise ModelError(f"controller {scenario.controller.type!r} cannot drive a {scenario.plant.type!r}")
@@ -352,7 +379,8 @@ def _check_held(model: Model, contacts: Sequence[Contact], control: JointControl
     points = {body: [(contact.surface, point) for contact, point in pairs] for body, pairs in held.items()}
     for times, q in control.positions(robot):
         for link, found in gaps(robot, q, points):
-            for (contact, _), gap in zip(held[link.name], found, strict=True):
+            for (contact, _), distance in zip(held[link.name], found, strict=True):
+                gap = distance - contact.radius
                 k = int(np.abs(gap).argmax())
                 if abs(gap[k]) > tolerance:
                     first.setdefault(contact.name, float(times[np.abs(gap) > tolerance][0]))

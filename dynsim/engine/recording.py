@@ -12,6 +12,7 @@ from dynsim import metrics
 from dynsim.contact_metrics import beyond_stops
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.provenance import provenance
+from dynsim.engine.ratings import motor_loads, overloaded
 from dynsim.engine.sharing import sharing
 from dynsim.engine.uniqueness import motion_spread
 from dynsim.kernels import arrays as ka
@@ -25,6 +26,7 @@ from dynsim.model.scene import robot_scene
 from dynsim.record import Event, Record
 from dynsim.record.poses import add_body_poses
 from dynsim.scenario import Scenario, build
+from dynsim.scenario.effect import without_effect
 
 
 def make_record(
@@ -131,6 +133,15 @@ def make_record(
     )
     record.summary = metrics.summarise(record, scenario, contacts, robot, counts, prepared.reuse)
     record.summary["warnings"] += beyond_stops(robot, prepared.stops, prepared.control)
+    record.summary["warnings"] += without_effect(scenario, bool(robot.motors))
+    record.summary["motors"] = motor_loads(record, robot)
+    record.summary["warnings"] += overloaded(record.summary["motors"])
+    if prepared.balance is not None:
+        record.summary["equilibrium"] = {
+            "heat_W": prepared.balance.heat,
+            **{f"{name}.normal_force_N": force for name, force in prepared.balance.normal_forces.items()},
+        }
+        record.summary["warnings"] += prepared.balance.warnings
     return record
 
 

@@ -109,7 +109,7 @@ class Simulation:
         self._scenario = scenario
         self._end = min(end, _FAR)
         self._prepared = prepare(scenario, pushable=True, times=np.full(1, np.inf), end=self._end, motors=motors)
-        self._time, self._wall = start, 0.0
+        self._time, self._wall, self._loaded = start, 0.0, False
         # Of a ring, and of a run that goes on from another, the ledger counts from the first sample on.
         self._relative = trace is not None or state is not None
         self._happened: list[Event] = []
@@ -318,9 +318,12 @@ class Simulation:
     def set_reference(self, joint: str, position: float, rate: float = 0.0) -> None:
         """From now on the motor of a joint follows q_d(t) = position + rate (t − now) [rad, rad/s; m, m/s].
 
-        Of an open torque ``position`` is the torque [N m].
+        Of an open torque ``position`` is the torque [N m]. What ``initial.equilibrium`` has moved the references by is
+        added.
         """
         values = _finite("reference", [position, rate])
+        if (balance := self._prepared.balance) is not None:
+            values[0] += balance.shift[self._motor(joint)]
         self._follow_line(joint, values)
         self._leave_plan(joint)
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from dynsim import interruption
 from dynsim.engine import named, note_warnings, simulate
-from dynsim.engine.outcome import kernels_logged
+from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.prepare import Prepared, prepare
 from dynsim.engine.recording import make_record
 from dynsim.errors import DynsimError, SimulationInterrupted

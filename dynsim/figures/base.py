@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dynsim.figures import events, style
 from dynsim.figures.style import Array
-from dynsim.measures import TIP_OVER, percent
+from dynsim.measures import TIP_OVER, overturns_settled, percent
 from dynsim.record import Record
 
 LOADS, MARGIN, TRACTION = "wheel_load", "tip_margin", "traction_demand"
@@ -167,6 +167,9 @@ def _verdict(record: Record) -> str:
     if not times:
         return "it never tips over"
     more = f"{len(times)} times, first " if len(times) > 1 else ""
+    settle = style.settle_time(record)
+    if record.time[-1] > settle and overturns_settled(record, settle) is None:
+        return f"a jolt of the start takes it below zero {more}at {style.number(times[0], 3)} s"
     return f"tips over {more}at {style.number(times[0], 3)} s"
 
 

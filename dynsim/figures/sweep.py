@@ -27,6 +27,8 @@ ERRORS = {
     "hand_error_rms_m": ("hand error, rms [mm]", 1e3),
     "final_position_error_m": ("final position error [mm]", 1e3),
 }
+# What keys of a summary end with.
+UNITS = {"m", "s", "rad", "N", "A", "V", "W", "J", "kg", "per"}
 # Parameters of a tornado, and bars of a histogram.
 _BARS, _BINS = 12, 40
 # Values whose ratio is larger are of very different size.
@@ -50,6 +52,7 @@ class Sweep:
     rows : numbers and values by column; of runs that failed only what was varied
     grid, sampled : columns that were varied
     known : all variants of the scenario, in its order: their colours do not depend on which of them were run
+    plotted : columns of numbers that are drawn; none: energy and error
     """
 
     name: str
@@ -57,6 +60,7 @@ class Sweep:
     grid: Sequence[str]
     sampled: Sequence[str]
     known: Sequence[str] = ()
+    plotted: Sequence[str] = ()
 
     @property
     def variants(self) -> list[str]:
@@ -76,7 +80,9 @@ class Sweep:
 
     @property
     def metrics(self) -> dict[str, tuple[str, float]]:
-        """Energy and error, as far as the table has them."""
+        """What is drawn, as far as the table has it: the numbers asked for, else energy and error."""
+        if self.plotted:
+            return {key: ENERGIES.get(key) or ERRORS.get(key) or named(key) for key in self.plotted if self._has(key)}
         energies = {key: look for key, look in ENERGIES.items() if self._has(key)}
         errors = [key for key in ERRORS if self._has(key)][:1]
         return energies | {key: ERRORS[key] for key in errors}
@@ -87,6 +93,17 @@ class Sweep:
     def of(self, variant: str) -> list[Mapping[str, Any]]:
         """Rows of one variant."""
         return [row for row in self.rows if str(row.get("variant", "")) == variant]
+
+
+def named(key: str) -> tuple[str, float]:
+    """Label of a number by its key, with the unit that is in it, and 1: ``base.tip_margin_min`` is drawn as it is."""
+    words = key.split("_")
+    units: list[str] = []
+    while len(words) > 1 and words[-1] in UNITS:
+        units.insert(0, words.pop())
+    per = units.index("per") if "per" in units else len(units)
+    unit = " ".join(units[:per]) + ("/" + " ".join(units[per + 1 :]) if per < len(units) else "")
+    return f"{' '.join(words)}{f' [{unit}]' if unit else ''}", 1.0
 
 
 def draw(sweep: Sweep, folder: Path, kind: str = "png") -> list[Path]:
@@ -176,8 +193,8 @@ def heat_map(sweep: Sweep) -> Figure | None:
 
 
 def pareto(sweep: Sweep) -> Figure | None:
-    """Energy against error of all runs, and those that no other run beats in both; None where the table lacks one."""
-    if len(sweep.metrics) < 2:
+    """Energy against error of all runs, and those that no other run beats in both; None without both."""
+    if sweep.plotted or len(sweep.metrics) < 2:
         return None
     (energy, (energy_label, _)), (error, (error_label, scale)) = sweep.metrics.items()
     figure = style.new_figure(3.6, f"{sweep.name}: energy against error, {len(sweep.rows)} runs{sweep.failed}")

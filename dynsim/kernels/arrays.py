@@ -55,7 +55,8 @@ DRIVE_KIND = 1
 CIRCUIT = 2  # index of its current among those of the state, -1 for none
 SAMPLED = 3  # CONTINUOUS: the command follows the state; else it is held, taken AT_TICKS or GIVEN by the caller
 SERVO_MODE = 4  # POSITION_MODE, VELOCITY_MODE or OFF; may be written between steps
-DRIVE_SIZE = 5
+CURRENT_LIMITED = 5  # 1: of a DC motor whose driver limits the current to I_MAX
+DRIVE_SIZE = 6
 CONTINUOUS, AT_TICKS, GIVEN = 0, 1, 2
 # DriveArrays.motor
 K_M = 0  # K k [N m/A = V s/rad]
@@ -66,7 +67,7 @@ D_M = 4  # d_m k^2 [N m s/rad]
 K_P = 5  # [V/rad]
 K_D = 6  # [V s/rad]
 U_MAX = 7  # voltage limit [V], inf for none
-I_MAX = 8  # current limit of a servo [A], torque limit of an open torque [N m]; inf for none
+I_MAX = 8  # current limit of a servo or DC motor [A], torque limit of an open torque [N m]; inf for none
 K_V = 9  # gain of a servo's velocity loop [V s/rad]
 COULOMB = 10  # gear friction of a servo at speed [N m]
 COULOMB_SPEED = 11  # below which it fades [rad/s]

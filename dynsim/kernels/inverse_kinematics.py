@@ -28,6 +28,8 @@ class PathArrays(NamedTuple):
     shapes: ShapeArrays | None  # of the braces; None: all are points on quadrics
     column: np.ndarray  # (c,) int, rows of the joints
     place: np.ndarray  # (c,) int, their coordinates
+    lower: np.ndarray  # (c,) limits that hold on the way [rad or m], infinite for none
+    upper: np.ndarray  # (c,)
     jacobian: np.ndarray  # (3, n)
     rates: np.ndarray  # (r, c)
     system: np.ndarray  # (r, r)
@@ -42,7 +44,8 @@ def follow_path(
 ):
     """Positions of the joints for the targets from ``begin`` up to ``end``, into ``result``.
 
-    Damped Gauss–Newton from the solution before, dq = Jᵀ (J Jᵀ + λ 1)⁻¹ e, λ falling with the error e.
+    Damped Gauss–Newton from the solution before, dq = Jᵀ (J Jᵀ + λ 1)⁻¹ e, λ falling with the error e. A joint at a
+    limit that Jᵀ e would push beyond it is left out of a step, and what a step takes beyond a limit is cut off.
 
     Parameters
     ----------
@@ -57,6 +60,7 @@ def follow_path(
     k, best : the target that is not reached, or ``end``, and the distance that is left [m]
     """
     moving, rows = path.column.shape[0], path.error.shape[0]
+    limited = is_limited(path)
     for k in range(begin, end):
         for e in range(base.shape[1]):
             q[carried + e] = base[k, e]
@@ -65,6 +69,8 @@ def follow_path(
             # the hand does not determine would run away along it.
             for j in range(moving):
                 q[path.place[j]] = 3.0 * result[k - 1, j] - 3.0 * result[k - 2, j] + result[k - 3, j]
+        if limited:
+            cut_off(path, q)
         best = math.inf
         for _ in range(ITERATIONS):
             left = errors(model, ws, path, targets[k], q)
@@ -72,12 +78,49 @@ def follow_path(
             # Two orders below the tolerance: the references shall be smooth, not just close.
             if left < 1e-4 * tolerance:
                 break
+            if limited:
+                leave_out(path, q)
             step(path, 1e-12 + 0.1 * left * left, q)
+            if limited:
+                cut_off(path, q)
         if not best <= tolerance:
             return k, best
         for j in range(moving):
             result[k, j] = q[path.place[j]]
     return end, 0.0
+
+
+@internal_kernel
+def is_limited(path: PathArrays):
+    """Whether any joint has a limit."""
+    for j in range(path.column.shape[0]):  # noqa: SIM110 (kernels have no generators)
+        if path.lower[j] > -math.inf or path.upper[j] < math.inf:
+            return True
+    return False
+
+
+@internal_kernel
+def leave_out(path: PathArrays, q):
+    """Joints at limits that a step downhill would take beyond them have no rates, so that it does not move them."""
+    for j in range(path.column.shape[0]):
+        pull = 0.0
+        for e in range(path.error.shape[0]):
+            pull += path.rates[e, j] * path.error[e]
+        at = q[path.place[j]]
+        if (at >= path.upper[j] and pull > 0.0) or (at <= path.lower[j] and pull < 0.0):
+            for e in range(path.error.shape[0]):
+                path.rates[e, j] = 0.0
+
+
+@internal_kernel
+def cut_off(path: PathArrays, q):
+    """Joints beyond a limit are put on it."""
+    for j in range(path.column.shape[0]):
+        at = q[path.place[j]]
+        if at > path.upper[j]:
+            q[path.place[j]] = path.upper[j]
+        elif at < path.lower[j]:
+            q[path.place[j]] = path.lower[j]
 
 
 @internal_kernel

@@ -138,6 +138,7 @@ def compile_drives(
         )
         if isinstance(m, Motor):
             table[a, ka.DRIVE_KIND], table[a, ka.CIRCUIT] = ka.DC_MOTOR, circuits
+            table[a, ka.CURRENT_LIMITED] = np.isfinite(m.current_limit)
             circuits += 1
             motor[a] = _dc_motor(m, k_p[a], k_d[a])
         elif isinstance(m, Servo):
@@ -156,7 +157,7 @@ def _dc_motor(m: Motor, k_p: float, k_d: float) -> np.ndarray:
     row[ka.RESISTANCE], row[ka.INDUCTANCE] = m.resistance, m.inductance
     row[ka.J_M], row[ka.D_M] = m.armature, m.reflected_damping
     row[ka.K_P], row[ka.K_D] = k_p, k_d
-    row[ka.U_MAX], row[ka.I_MAX] = m.voltage_limit, np.inf
+    row[ka.U_MAX], row[ka.I_MAX] = m.voltage_limit, m.current_limit
     return row
 
 
@@ -375,6 +376,8 @@ def _check_motor(motor: Drive, joints: dict[str, Link]) -> None:
             raise ModelError(f"motor of {motor.joint}: {quantity} {getattr(motor, quantity)} must be zero or positive")
     if not isinstance(motor, TorqueSource) and not motor.voltage_limit > 0.0:
         raise ModelError(f"motor of {motor.joint}: voltage limit {motor.voltage_limit} V must be positive")
+    if isinstance(motor, Motor) and not motor.current_limit > 0.0:
+        raise ModelError(f"motor of {motor.joint}: current limit {motor.current_limit} A must be positive")
     if not isinstance(motor, Motor) and not motor.torque_limit > 0.0:
         raise ModelError(f"motor of {motor.joint}: torque limit {motor.torque_limit} N m must be positive")
     if isinstance(motor, Servo) and joints[motor.joint].units[0] != "rad":

@@ -128,6 +128,11 @@ class BracePlanner:
         motors = np.array([_motor_row(drives.get(joint)) for joint in robot.joint_names])
         self.arrays = kb.brace_arrays(integers(links), reals(motors))
 
+    @property
+    def workspace(self) -> ka.Workspace:
+        """Room for the kernels."""
+        return self._ws
+
     def motion(self, points: Array, q: Array, v: Array) -> tuple[Array, Array]:
         """Positions and velocities of points of the braces' bodies, (c, 3) [m], along a motion, both (T, c, 3)."""
         positions, velocities = np.zeros((2, len(q), len(points), 3))
@@ -198,7 +203,7 @@ def brace_rows(point: Array, normals: Array, friction: Array, least: float, comm
 
     Parameters
     ----------
-    point : (3,) on its link [m]
+    point : (3,), or one for each instant (T, 3), on its link [m]
     normals : (T, 3) of any length
     friction : (T,)
     least, commanded : [N], NaN for no commanded force
@@ -228,5 +233,5 @@ def _motor_row(motor: Motor | Servo | TorqueSource | None) -> Array:
         row[kb.CONSTANT], row[kb.RESISTANCE] = motor.joint_constant, motor.resistance
         row[kb.HEAT] = motor.resistance / motor.joint_constant**2
         row[kb.VOLTAGE_LIMIT] = motor.voltage_limit
-        row[kb.CURRENT_LIMIT] = motor.greatest_current if isinstance(motor, Servo) else np.inf
+        row[kb.CURRENT_LIMIT] = motor.greatest_current
     return row

@@ -21,6 +21,8 @@ class Motor:
     resistance : R [Ω]; inductance : L [H]; rotor_inertia : I_m [kg m²]
     gear_ratio : k; gear_damping : d_m on the motor side [N m s/rad]
     voltage_limit : [V], inf for none
+    current_limit : [A] that its driver keeps, inf for none
+    nominal_current : [A] that it stands for ever; nominal_torque : at the joint [N m or N]; inf where not known
     mass : [kg] of a point on the link before the joint; on what stands fixed it moves nothing
     mass_point : (3,) or None
         Where, in that link's frame [m]; None: at the joint.
@@ -36,6 +38,14 @@ class Motor:
     voltage_limit: float = np.inf
     mass: float = 0.0
     mass_point: Array | None = None
+    current_limit: float = np.inf
+    nominal_current: float = np.inf
+    nominal_torque: float = np.inf
+
+    @property
+    def greatest_current(self) -> float:
+        """The limit of current [A], as of a servo."""
+        return self.current_limit
 
     @property
     def joint_constant(self) -> float:
@@ -67,6 +77,7 @@ class Servo:
     armature : J_m [kg m²]; reflected_damping : D_m [N m s/rad]
     coulomb_friction : τ_c [N m]; coulomb_speed : v_s [rad/s], below which it fades
     voltage_limit, current_limit : [V], [A]; torque_limit : of the current, K_m i [N m]; inf for none
+    nominal_current, nominal_torque : as of a :class:`Motor`
     free_drag : viscous drag of the gear while the servo is off [N m s/rad]
     mass, mass_point : as of a :class:`Motor`
     """
@@ -88,6 +99,8 @@ class Servo:
     free_drag: float = 0.0
     mass: float = 0.0
     mass_point: Array | None = None
+    nominal_current: float = np.inf
+    nominal_torque: float = np.inf
 
     @property
     def joint_constant(self) -> float:
@@ -102,12 +115,13 @@ class Servo:
 
 @dataclass(frozen=True)
 class TorqueSource:
-    """A torque on a joint that is its own reference, within ``torque_limit`` [N m, or N]; mass as of a motor."""
+    """A torque on a joint that is its own reference, within ``torque_limit`` [N m, or N]; the rest as of a motor."""
 
     joint: str
     torque_limit: float = np.inf
     mass: float = 0.0
     mass_point: Array | None = None
+    nominal_torque: float = np.inf
 
 
 Drive = Motor | Servo | TorqueSource

@@ -13,6 +13,11 @@ from dynsim.config import NonNegative, Positive, StrictConfig, Vector3, error_at
 from dynsim.model.drives import Drive, Motor
 
 
+def limit(value: float | None) -> float:
+    """A limit as motors have it: infinite for none."""
+    return np.inf if value is None else value
+
+
 class DriveParameters(StrictConfig):
     """A motor of any kind: what it weighs, and how it becomes part of a robot."""
 
@@ -21,6 +26,10 @@ class DriveParameters(StrictConfig):
     )
     mass_point_m: Vector3 | None = Field(
         default=None, description="where, in that link's frame; default: at the motor's joint"
+    )
+
+    nominal_torque_N_m: Positive | None = Field(
+        default=None, description="that motor and gear stand for ever, at the joint; N at a prismatic joint"
     )
 
     @model_validator(mode="after")
@@ -33,6 +42,11 @@ class DriveParameters(StrictConfig):
     def mass_point(self) -> NDArray[np.float64] | None:
         """Where its mass is, (3,) [m]; None: at the joint."""
         return None if self.mass_point_m is None else np.array(self.mass_point_m)
+
+    @property
+    def nominal_torque(self) -> float:
+        """[N m or N], infinite where it is not known."""
+        return limit(self.nominal_torque_N_m)
 
     @abstractmethod
     def motor(self, joint: str) -> Drive:
@@ -49,6 +63,16 @@ class MotorParameters(DriveParameters):
     gear_ratio: Positive = Field(description="motor turns per joint turn; at a prismatic joint rad of the motor per m")
     gear_damping_N_m_s_per_rad: NonNegative = Field(default=0.0, description="on the motor side")
     voltage_limit_V: Positive | None = None
+    nominal_current_A: Positive | None = Field(
+        default=None, description="that it stands for ever: a run that needs more warns"
+    )
+    peak_current_A: Positive | None = Field(default=None, description="limit of its driver")
+
+    @model_validator(mode="after")
+    def _check_currents(self) -> Self:
+        if limit(self.peak_current_A) < (self.nominal_current_A or 0.0):
+            raise error_at("peak_current_A", f"is less than nominal_current_A = {self.nominal_current_A:g}")
+        return self
 
     @field_validator("inductance_H", mode="before")
     @classmethod
@@ -68,7 +92,10 @@ class MotorParameters(DriveParameters):
             rotor_inertia=self.rotor_inertia_kg_m2,
             gear_ratio=self.gear_ratio,
             gear_damping=self.gear_damping_N_m_s_per_rad,
-            voltage_limit=np.inf if self.voltage_limit_V is None else self.voltage_limit_V,
+            voltage_limit=limit(self.voltage_limit_V),
             mass=self.mass_kg,
             mass_point=self.mass_point,
+            current_limit=limit(self.peak_current_A),
+            nominal_current=limit(self.nominal_current_A),
+            nominal_torque=self.nominal_torque,
         )

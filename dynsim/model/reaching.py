@@ -15,13 +15,19 @@ from dynsim.model.model import Model
 from dynsim.model.shapes import compile_shapes
 
 
-def path_arrays(model: Model, joints: Sequence[str], braces: Sequence[Contact] = ()) -> PathArrays:
-    """Joints that take the hand of a robot along a path and keep points on their surfaces meanwhile."""
+def path_arrays(
+    model: Model, joints: Sequence[str], braces: Sequence[Contact] = (), limited: bool = False
+) -> PathArrays:
+    """Joints that take the hand of a robot along a path and keep points on their surfaces meanwhile.
+
+    ``limited`` : the limits of the joints hold on the way
+    """
     columns = [model.joint_names.index(name) for name in joints]
     link, point = model.robot.attach(*model.robot.hand)
     # Friction moves nothing here: sweeps over it have the same path.
     points = [replace(contact, tip=None, friction=0.0) for contact in braces]
     rows = 3 + len(braces)
+    links = [model.robot.links[column] for column in columns if limited]
     return PathArrays(
         link=link,
         point=reals(point),
@@ -29,6 +35,8 @@ def path_arrays(model: Model, joints: Sequence[str], braces: Sequence[Contact] =
         shapes=compile_shapes(model.robot, points),
         column=integers(columns),
         place=integers([model.robot.position_index[column] for column in columns]),
+        lower=reals([link.lower for link in links] or np.full(len(columns), -np.inf)),
+        upper=reals([link.upper for link in links] or np.full(len(columns), np.inf)),
         jacobian=np.zeros((3, model.n)),
         rates=np.zeros((rows, len(columns))),
         system=np.zeros((rows, rows)),

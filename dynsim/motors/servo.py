@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Literal, Self
 
-import numpy as np
 from pydantic import Field, model_validator
 
 from dynsim.config import NonNegative, Positive, error_at
 from dynsim.model.drives import Servo
-from dynsim.model.motor_parameters import DriveParameters
+from dynsim.model.motor_parameters import DriveParameters, limit
 from dynsim.model.protocols import BuildContext
 
 
@@ -35,6 +34,15 @@ class Config(DriveParameters):
     coulomb_speed_rad_per_s: Positive = Field(default=0.01, description="below it the Coulomb friction fades")
     current_limit_A: Positive | None = None
     torque_limit_N_m: Positive | None = Field(default=None, description="of the current, without the gear's friction")
+    nominal_current_A: Positive | None = Field(
+        default=None, description="that it stands for ever: a run that needs more warns"
+    )
+
+    @model_validator(mode="after")
+    def _check_currents(self) -> Self:
+        if limit(self.current_limit_A) < (self.nominal_current_A or 0.0):
+            raise error_at("nominal_current_A", f"is more than current_limit_A = {self.current_limit_A:g}")
+        return self
 
     @model_validator(mode="after")
     def _check_gains(self) -> Self:
@@ -63,10 +71,12 @@ class Config(DriveParameters):
             coulomb_friction=self.coulomb_friction_N_m,
             coulomb_speed=self.coulomb_speed_rad_per_s,
             voltage_limit=self.voltage_V,
-            current_limit=np.inf if self.current_limit_A is None else self.current_limit_A,
-            torque_limit=np.inf if self.torque_limit_N_m is None else self.torque_limit_N_m,
+            current_limit=limit(self.current_limit_A),
+            torque_limit=limit(self.torque_limit_N_m),
             mass=self.mass_kg,
             mass_point=self.mass_point,
+            nominal_current=limit(self.nominal_current_A),
+            nominal_torque=self.nominal_torque,
         )
 
 

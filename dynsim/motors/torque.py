@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Literal
 
-import numpy as np
 from pydantic import Field
 
 from dynsim.config import Positive
 from dynsim.model.drives import TorqueSource
-from dynsim.model.motor_parameters import DriveParameters
+from dynsim.model.motor_parameters import DriveParameters, limit
 from dynsim.model.protocols import BuildContext
 
 
@@ -21,8 +20,7 @@ class Config(DriveParameters):
 
     def motor(self, joint: str) -> TorqueSource:
         """The torque on the joint of that name."""
-        limit = np.inf if self.limit_N_m is None else self.limit_N_m
-        return TorqueSource(joint, limit, self.mass_kg, self.mass_point)
+        return TorqueSource(joint, limit(self.limit_N_m), self.mass_kg, self.mass_point, self.nominal_torque)
 
 
 def build(config: Config, context: BuildContext) -> TorqueSource:

@@ -52,7 +52,7 @@ def robot(scenario: Scenario) -> Robot:
         reach the surfaces that ``initial`` puts them on.
     """
     built = _loaded(scenario)
-    return built if scenario.config.initial is None else _posed(scenario, built, contacts(scenario, built))
+    return built if scenario.config.initial is None else _posed(scenario, built, _nameable(scenario, built))
 
 
 def robot_and_contacts(scenario: Scenario, reuse: Reuse | None = None) -> tuple[Robot, list[Contact]]:
@@ -61,13 +61,19 @@ def robot_and_contacts(scenario: Scenario, reuse: Reuse | None = None) -> tuple[
     ``reuse`` : what other runs have computed; the robot is theirs where plant, payloads and posture are
     """
     reuse = reuse or Reuse()
-    config = scenario.config
-    built = reuse.of("plant", lambda: _loaded(scenario), config.plant, config.duration_s, config.loads)
+    config, built = scenario.config, unposed(scenario, reuse)
     touching = contacts(scenario, built, reuse)
     if config.initial is None:
         return built, touching
-    places = [contact.geometry for contact in touching]
-    return reuse.of("posture", lambda: _posed(scenario, built, touching), built, config.initial, places), touching
+    points = _nameable(scenario, built, reuse)
+    places = [contact.geometry for contact in points]
+    return reuse.of("posture", lambda: _posed(scenario, built, points), built, config.initial, places), touching
+
+
+def unposed(scenario: Scenario, reuse: Reuse) -> Robot:
+    """The robot in the posture of its plant, before ``initial``."""
+    config = scenario.config
+    return reuse.of("plant", lambda: _loaded(scenario), config.plant, config.duration_s, config.loads)
 
 
 def _loaded(scenario: Scenario) -> Robot:
@@ -86,10 +92,25 @@ def _loaded(scenario: Scenario) -> Robot:
     return replace(bare, links=tuple(links)) if inertias else bare
 
 
+def _nameable(scenario: Scenario, built: Robot, reuse: Reuse | None = None) -> list[Contact]:
+    """What ``initial`` may name: all contacts, and disabled points, so that braced and free start in one posture."""
+    initial = scenario.config.initial
+    if initial is None or not initial.on_surface:
+        return []
+    options = scenario.config.contacts
+    disabled = [name for name, point in options.points.items() if not point.enabled and name in initial.on_surface]
+    if not disabled:
+        return contacts(scenario, built, reuse)
+    chosen = {name: options.points[name].model_copy(update={"enabled": True}) for name in disabled}
+    only = options.model_copy(update={"points": chosen, "candidates": "points"})
+    alone = replace(scenario, config=scenario.config.model_copy(update={"contacts": only}))
+    return [*contacts(scenario, built, reuse), *contacts(alone, built, reuse)]
+
+
 def _posed(scenario: Scenario, built: Robot, touching: Sequence[Contact]) -> Robot:
     """The robot in the posture that ``initial`` asks for."""
     initial = scenario.config.initial
-    if initial is None:
+    if initial is None or not initial.on_surface:
         return built
     points = {contact.name: contact for contact in touching}
     try:
@@ -244,6 +265,7 @@ def contacts(scenario: Scenario, described: Robot | None = None, reuse: Reuse | 
                 surface=known[point.surface],
                 surface_name=point.surface,
                 friction=options.friction if point.friction is None else point.friction,
+                radius=point.radius_m,
                 **(_bilateral(options) if options.law == "bilateral" else _unilateral(options, point)),
             )
         )
@@ -345,9 +367,24 @@ def check_start(
             f"{dotted(keys)}: {'its point' if declared else contact.name} starts {gap:+.4g} m "
             f"from surface {contact.surface_name!r} "
             f"(limit {START_TOLERANCE:g} m), at {position.tolist()}{f' (also {others})' if others else ''}; "
-            "change the initial configuration or the surface, or disable the contact",
+            f"{_remedy(scenario, [one[0] for one in off if one[1]])}change the initial configuration or the surface, "
+            "or disable the contact",
             keys=keys,
         )
+
+
+def _remedy(scenario: Scenario, off: Sequence[Contact]) -> str:
+    """What puts declared points on their surfaces, for the end of an error; nothing where that was asked for."""
+    initial = scenario.config.initial
+    already = [] if initial is None else initial.on_surface
+    names = [contact.name for contact in off if contact.name not in already]
+    return f"`{on_surface_key(scenario, names)}` puts it there; or " if names else ""
+
+
+def on_surface_key(scenario: Scenario, names: Sequence[str]) -> str:
+    """The line of a scenario that puts these points on their surfaces, beside those that are there."""
+    initial = scenario.config.initial
+    return f"initial: {{on_surface: [{', '.join([*(initial.on_surface if initial else ()), *names])}]}}"
 
 
 def require_scenario(scenario: object) -> None:

@@ -74,7 +74,7 @@ def candidates(kind: str, robot: Robot, surfaces: Mapping[str, Surface], declare
                 still.append(name)
     if replaced:
         log.warning(
-            "contacts.candidates: declared at a joint, a point without radius touches there instead of the link: %s",
+            "contacts.candidates: declared at a joint, a point of less radius touches there instead of the link: %s",
             ", ".join(dict.fromkeys(replaced)),
         )
     if still:

@@ -13,6 +13,7 @@ from dynsim import notebook
 from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig, Vector3, error_at
 from dynsim.families import member, union
 from dynsim.problems import Origin, listed
+from dynsim.scenario.effect import idle_keys, is_set
 from dynsim.scenario.loads import LoadConfig
 
 # Bytes of the name of a folder on common file systems.
@@ -42,9 +43,10 @@ class Grip(StrictConfig):
 
 
 class ContactPoint(BodyPoint):
-    """A point fixed on a body, held to a surface."""
+    """A point fixed on a body, or a sphere about it, held to a surface."""
 
     surface: str = "floor"
+    radius_m: NonNegative = Field(default=0.0, description="of a sphere about the point, which touches instead of it")
     friction: NonNegative | None = Field(default=None, description="kinetic coefficient; default: that of contacts")
     static_friction: NonNegative | None = Field(default=None, description="default: that of contacts; unilateral law")
     restitution: Share | None = Field(default=None, description="default: that of contacts; unilateral law")
@@ -122,10 +124,23 @@ class Contacts(StrictConfig):
 
 
 class Initial(StrictConfig):
-    """What the initial posture is changed by, as little as possible."""
+    """The start: what the initial posture is changed by, as little as possible, and what holds it."""
 
-    on_surface: list[str] = Field(min_length=1, description="contact points that start exactly on their surfaces")
+    on_surface: list[str] = Field(
+        default=[], description="contact points, also disabled ones, that start exactly on their surfaces"
+    )
     keep: list[str] = Field(default=[], description="joints that do not move for it, and `hand` for the hand's place")
+    equilibrium: bool = Field(
+        default=False, description="currents that hold posture, weight, loads and braces at rest, with the least heat"
+    )
+
+    @model_validator(mode="after")
+    def _check_effect(self) -> Self:
+        if not self.on_surface and not self.equilibrium:
+            raise error_at("on_surface", "names no contact point; name some, or set equilibrium: true")
+        if self.keep and not self.on_surface:
+            raise error_at("keep", "has no effect without on_surface, for which joints move; remove it")
+        return self
 
 
 class Integrator(StrictConfig):
@@ -202,7 +217,7 @@ class ScenarioConfig(StrictConfig):
     controller: union("controller") | None = None  # type: ignore[valid-type]
     surfaces: dict[str, union("surface")] = {}  # type: ignore[valid-type]
     contacts: Contacts = Contacts()
-    initial: Initial | None = Field(default=None, description="posture solved from the plant's initial one")
+    initial: Initial | None = Field(default=None, description="posture and currents of the start")
     loads: dict[str, LoadConfig] = Field(default={}, description="forces, torques and payloads by name")
     integrator: Integrator = Integrator()
     record: RecordOptions = RecordOptions()
@@ -326,7 +341,10 @@ class Scenario:
 
     @property
     def resolved(self) -> dict[str, Any]:
-        """The scenario with every default and override written out; reading it again gives the same simulation."""
+        """The scenario with defaults and overrides written out; reading it again gives the same simulation.
+
+        Defaults that change nothing are left out.
+        """
         resolved = self.config.model_dump(mode="json", exclude_none=True)
         if not self.config.loads:
             del resolved["loads"]
@@ -334,6 +352,13 @@ class Scenario:
         for part in (resolved["contacts"], *resolved["contacts"]["points"].values()):
             for key in contacts.other_keys:
                 part.pop(key, None)
+        # What changes nothing is not there, unless it was said.
+        for keys in idle_keys(self.config):
+            section, *rest = map(str, keys)
+            if len(rest) == 1 and not is_set(self.config, keys) and isinstance(resolved.get(section), dict):
+                resolved[section].pop(rest[0], None)
+                if not resolved[section]:
+                    del resolved[section]
         return resolved
 
     def place(self, keys: Sequence[int | str] = (), variant: str = "") -> str:

@@ -9,11 +9,17 @@ _NOT_OF_THE_RUN = ("scenario", "variant", "dynsim_version", "integration_wall_s"
 
 
 def flat(summary: dict[str, Any]) -> dict[str, Any]:
-    """A summary whose numbers of a mobile base stand beside the others, under ``base.…``."""
+    """A summary whose numbers of a mobile base and of motors stand beside the others, as ``base.…`` and ``JOINT.…``."""
     base = dict(summary.get("base", {}))
     for key in [key for key, value in base.items() if isinstance(value, dict)]:
         base.update({f"{key}.{name}": value for name, value in base.pop(key).items()})
-    return summary | {f"base.{key}": value for key, value in base.items()}
+    motors = {
+        f"{motor['joint']}.{key}": value
+        for motor in summary.get("motors", ())
+        for key, value in motor.items()
+        if key != "joint"
+    }
+    return summary | {f"base.{key}": value for key, value in base.items()} | motors
 
 
 def is_text(value: Any) -> bool:

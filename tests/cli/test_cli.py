@@ -300,6 +300,29 @@ def test_check_prints_positions_that_can_be_copied_into_a_surface(tmp_path: Path
     assert not snake.contacts
 
 
+def test_check_says_where_it_starts_before_it_refuses(tmp_path: Path):
+    """Hand and gaps, also of a path out of reach and of points off their surfaces; and what puts these there."""
+    path = "controller.hand.path.center_m=[9, 9, 9]"
+    reach = dynsim("check", "elbow_comparison", "--set", path, folder=tmp_path)
+    assert reach.returncode == 2
+    start = check(load_scenario("elbow_comparison", "two_elbows"))
+    assert f"    hand             {start.hand.tolist()}" in reach.stdout.splitlines()
+    assert f"    gap of elbow_4   {start.gaps['elbow_4']:+.4g} m" in reach.stdout.splitlines()
+    assert "the hand cannot follow its path" in reach.stderr
+    off = dynsim("check", "elbow_comparison", "--set", "plant.chain.0.length_m=0.02", folder=tmp_path)
+    line = "initial: {on_surface: [elbow_4, elbow_7]}"
+    assert f"they would be with  {line}" in off.stdout
+    assert f"`{line}` puts it there" in off.stderr
+    # What it offers works, also where points are disabled: all variants start in one posture.
+    posed = ["--set", "plant.chain.0.length_m=0.02", "--set", "initial={on_surface: [elbow_4, elbow_7]}"]
+    posed += ["--set", "contacts.law=bilateral", "--set", "controller.hand=null"]
+    solved = dynsim("check", "elbow_comparison", *posed, folder=tmp_path)
+    assert solved.returncode == 0, solved.stderr
+    moved = [" ".join(line.split()) for line in solved.stdout.splitlines() if "by on_surface; was" in line]
+    assert len(moved) % 4 == 0
+    assert len(set(moved)) == len(moved) // 4 > 0
+
+
 def test_list_check_schema_and_version(tmp_path: Path):
     for arguments, expected in (
         (["list"], "wang_minami"),

@@ -130,3 +130,19 @@ def test_the_process_that_workers_are_copies_of_ends_with_the_command(tmp_path: 
     ended = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, timeout=60)
     assert ended.returncode == 2, ended.stderr
     assert "nosuch" in ended.stderr
+
+
+def test_a_number_that_no_run_has_is_refused_and_others_are_drawn_without_runs(tmp_path: Path):
+    """What was run is kept: the number is corrected with --resume, which runs nothing again."""
+    varied = ["--grid", "contacts.friction=0.1,0.2", "--set", "duration_s=0.1", "--jobs", "1", "--out", "out"]
+    wrong = sweep("elbow_comparison", *varied, "--plot", "elbow_4.normal_force_max", folder=tmp_path)
+    assert wrong.returncode == 2
+    assert "did you mean 'elbow_4.normal_force_max_N'?" in wrong.stderr
+    journal = (tmp_path / "out" / "runs.jsonl").read_bytes()
+    asked = ["--resume", "--plot", "elbow_4.normal_force_max_N", "--plot", "joint_2.current_rms_A"]
+    right = sweep("elbow_comparison", *varied, *asked, folder=tmp_path)
+    assert right.returncode == 0, right.stderr
+    assert (tmp_path / "out" / "runs.jsonl").read_bytes() == journal
+    assert {path.stem for path in (tmp_path / "out").glob("*.png")} == {"sweep_lines"}
+    header = (tmp_path / "out" / "sweep.csv").read_text().splitlines()[0].split(",")
+    assert "joint_2.current_rms_A" in header

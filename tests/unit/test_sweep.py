@@ -478,6 +478,25 @@ def test_figures_by_what_was_varied(tmp_path: Path, grid: list[str], sampled: li
     assert {path.stem for path in drawn} == {path.stem for path in tmp_path.iterdir()} == files
 
 
+@pytest.mark.parametrize(
+    ("key", "label"),
+    [
+        ("base.tip_margin_min", "base.tip margin min"),
+        ("elbow_4.normal_force_max_N", "elbow 4.normal force max [N]"),
+        ("joint_1.torque_rms_N_m", "joint 1.torque rms [N m]"),
+        ("position_error_max_m", "position error max [m]"),
+        ("slip_max_m_per_s", "slip max [m/s]"),
+    ],
+)
+def test_any_number_is_drawn_with_its_unit(tmp_path: Path, key: str, label: str):
+    rows = [{**row, key: row["mass"] - 2.0} for row in ROWS]
+    assert pictures.named(key) == (label, 1.0)
+    table = pictures.Sweep("test", rows, ["a"], ["mass"], plotted=[key, "hand_error_rms_m", "not_there"])
+    assert table.metrics == {key: (label, 1.0), "hand_error_rms_m": pictures.ERRORS["hand_error_rms_m"]}
+    assert {path.stem for path in pictures.draw(table, tmp_path)} == {"sweep_lines", "sweep_samples", "sweep_tornado"}
+    assert [axes.get_ylabel() for axes in pictures.lines(table).axes] == [label, "hand error, rms [mm]"]
+
+
 def test_the_tornado_shows_the_effect_of_a_deviation():
     figure = pictures.tornado(pictures.Sweep("test", ROWS, ["a", "b"], ["mass"]))
     assert figure is not None

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import brentq
 
 from dynsim import load_scenario, simulate
 from dynsim.kernels import arrays as ka
-from dynsim.kernels.drive.dc import dc_balance, dc_command, dc_torque
+from dynsim.kernels.drive.dc import dc_balance, dc_command, dc_torque, within_current
 from dynsim.kernels.drive.law import drive_block, take_commands
 from dynsim.kernels.drive.limit import clipped
 from dynsim.kernels.drive.servo import servo_command, servo_torque
@@ -132,6 +134,8 @@ MOTOR = Motor("shaft", 0.21, 1.3, 0.02, 1e-4, 7.0, 1e-3, voltage_limit=20.0)
 REGIMES: dict[str, tuple[Drive, float, float]] = {
     "motor": (MOTOR, 0.3, 0.4),
     "motor, voltage limit": (MOTOR, -2.0, 0.4),
+    "motor, current limit": (replace(MOTOR, current_limit=0.7), -2.0, 0.4),
+    "motor, current limit, not reached": (replace(MOTOR, current_limit=9.0), 0.99, 0.4),
     "servo": (servo(k_d=1.0, coulomb_friction=0.3), 0.9, 0.004),
     "servo, voltage limit": (servo(k_d=1.0, coulomb_friction=0.3, voltage_limit=3.0), 0.2, 0.02),
     "servo, current limit": (servo(coulomb_friction=0.3, current_limit=0.2), 0.2, 0.02),
@@ -150,7 +154,7 @@ def law(motor: Drive, drives: ka.DriveArrays, q_ref: float, sampled: bool):
 
     def dc(q, v, i):
         asked = held if sampled else dc_command(table, 0, q_ref, 0.0, q, v)
-        u = clipped(asked, table[0, ka.U_MAX])
+        u = within_current(table, 0, clipped(asked, table[0, ka.U_MAX]), v)
         return dc_torque(table, 0, i), dc_balance(table, 0, u, v, i) / table[0, ka.INDUCTANCE]
 
     def of_servo(q, v, i):

@@ -1,13 +1,27 @@
-"""A DC motor with its circuit, and the voltage PD on its terminals ([WM] eqs 16–26, 56)."""
+"""A DC motor with its circuit, and the voltage PD on its terminals ([WM] eqs 16–26, 56).
+
+A driver that limits the current to ±I lets the voltage be no further from the back-EMF than R I:
+
+    |u − K_m v| ≤ R I,  so that  L d|i|/dt ≤ R (I − |i|)
+
+The current comes near to I with the time constant L/R and never passes it.
+"""
 
 from __future__ import annotations
 
-from dynsim.kernels.arrays import INDUCTANCE, K_D, K_M, K_P, RESISTANCE
+from dynsim.kernels.arrays import I_MAX, INDUCTANCE, K_D, K_M, K_P, RESISTANCE
+from dynsim.kernels.drive.limit import clipped
 
 
 def dc_command(motor, a, q_ref, v_ref, q, v):
     """u = k_p (q_d − q) + k_d (v_d − v) [V], before its limit ([WM] eq 56)."""
     return motor[a, K_P] * (q_ref - q) + motor[a, K_D] * (v_ref - v)
+
+
+def within_current(motor, a, u, v):
+    """The voltage u where it drives no more current than the limit [V], also beyond the limit of voltage."""
+    back = motor[a, K_M] * v
+    return back + clipped(u - back, motor[a, RESISTANCE] * motor[a, I_MAX])
 
 
 def dc_torque(motor, a, i):
@@ -31,3 +45,9 @@ def dc_block(motor, a, follows):
         -(follows * motor[a, K_D] + motor[a, K_M]) / inductance,
         -motor[a, RESISTANCE] / inductance,
     )
+
+
+def at_current_limit(motor, a, u, v):
+    """Whether the voltage that is left by :func:`within_current` is that of the limit."""
+    drop = motor[a, RESISTANCE] * motor[a, I_MAX]
+    return abs(u - motor[a, K_M] * v) >= drop * (1.0 - 1e-12)

@@ -12,11 +12,13 @@ from dynsim.kernels.arrays import (
     CIRCUIT,
     COMMAND,
     CURRENT,
+    CURRENT_LIMITED,
     DC_MOTOR,
     DIDT,
     DRAG,
     DRIVE_KIND,
     DRIVEN,
+    I_MAX,
     INDUCTANCE,
     K_M,
     LINE_RATE,
@@ -28,6 +30,7 @@ from dynsim.kernels.arrays import (
     RATE_I,
     RATE_Q,
     RATE_V,
+    RESISTANCE,
     REWRITTEN,
     SAMPLED,
     SERVO_MODE,
@@ -42,7 +45,7 @@ from dynsim.kernels.arrays import (
     ReferenceArrays,
     Workspace,
 )
-from dynsim.kernels.drive.dc import dc_balance, dc_block, dc_command, dc_torque
+from dynsim.kernels.drive.dc import at_current_limit, dc_balance, dc_block, dc_command, dc_torque, within_current
 from dynsim.kernels.drive.limit import clipped
 from dynsim.kernels.drive.servo import (
     servo_block,
@@ -55,15 +58,17 @@ from dynsim.kernels.drive.servo import (
     servo_torque,
 )
 from dynsim.kernels.drive.torque import open_torque
-from dynsim.kernels.jit import internal_kernel
+from dynsim.kernels.jit import apart_kernel, internal_kernel
 from dynsim.kernels.state import StateLayout
 
-for _law in (clipped, dc_balance, dc_block, dc_command, dc_torque, open_torque):
+for _law in (at_current_limit, clipped, dc_balance, dc_block, dc_command, dc_torque, open_torque):
     internal_kernel(_law)
 for _law in (servo_segment, servo_circuit_on, servo_circuit, servo_block_on, servo_block):
     internal_kernel(_law)
 for _law in (servo_command, servo_drag, servo_torque):
     internal_kernel(_law)
+# Few motors have it: merged, its product K_m v would be that of the balance too, whose last bits depend on that.
+apart_kernel(within_current)
 
 
 @internal_kernel
@@ -120,6 +125,8 @@ def drive_dc(drives: DriveArrays, asked, i, ws: Workspace, a):
     """The DC motor a at a command [V] and a current [A]."""
     motors, motor, j = ws.motors, drives.motor, drives.table[a, DRIVEN]
     u = clipped(drives.input[a, COMMAND] if drives.table[a, SAMPLED] else asked, motor[a, U_MAX])
+    if drives.table[a, CURRENT_LIMITED] != 0:
+        u = within_current(motor, a, u, ws.joints[j, QD])
     motors[a, CURRENT], motors[a, VOLTAGE] = i, u
     motors[a, DIDT] = dc_balance(motor, a, u, ws.joints[j, QD], i) / motor[a, INDUCTANCE]
     ws.joints[j, APPLIED] += dc_torque(motor, a, i)
@@ -179,8 +186,11 @@ def drive_block(drives: DriveArrays, ws: Workspace, a, block):
     for s in range(block.shape[0]):
         block[s] = 0.0
     if kind == DC_MOTOR:
-        follows = 1.0 if not sampled and abs(motors[a, VOLTAGE]) < motor[a, U_MAX] else 0.0
-        fill_dc_block(motor, a, follows, block)
+        u, v = motors[a, VOLTAGE], ws.joints[drives.table[a, DRIVEN], QD]
+        limited = drives.table[a, CURRENT_LIMITED] != 0 and at_current_limit(motor, a, u, v)
+        fill_dc_block(motor, a, 1.0 if not sampled and abs(u) < motor[a, U_MAX] else 0.0, block)
+        if limited:
+            block[RATE_Q], block[RATE_V] = 0.0, 0.0
     elif kind == POSITION_SERVO:
         asked = drives.input[a, COMMAND] if sampled else command(drives, ws, a)
         v = ws.joints[drives.table[a, DRIVEN], QD]
@@ -214,6 +224,10 @@ def segment_of(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace
         v = ws.joints[drives.table[a, DRIVEN], QD]
         return servo_segment(motor, a, drives.table[a, SERVO_MODE], asked, v)
     if drives.table[a, DRIVE_KIND] == DC_MOTOR:
+        u = clipped(asked, motor[a, U_MAX])
+        over = u - motor[a, K_M] * ws.joints[drives.table[a, DRIVEN], QD]
+        if drives.table[a, CURRENT_LIMITED] != 0 and abs(over) > motor[a, RESISTANCE] * motor[a, I_MAX]:
+            return 2 if over > 0.0 else -2
         return 1 if asked > motor[a, U_MAX] else -1 if asked < -motor[a, U_MAX] else 0
     return 0
 
@@ -235,12 +249,16 @@ def drive_on_segments(
             linear[a, s] = 0.0
         if kind == DC_MOTOR:
             i, u = y[layout.current + table[a, CIRCUIT]], asked
-            if limit != 0:
-                u = motor[a, U_MAX] if limit > 0 else -motor[a, U_MAX]
+            if limit == 1 or limit == -1:
+                u = motor[a, U_MAX] * limit
+            elif limit != 0:
+                u = motor[a, K_M] * v + 0.5 * limit * motor[a, RESISTANCE] * motor[a, I_MAX]
             motors[a, CURRENT], motors[a, VOLTAGE] = i, u
             motors[a, DIDT] = dc_balance(motor, a, u, v, i) / motor[a, INDUCTANCE]
             joints[j, APPLIED] += dc_torque(motor, a, i)
             fill_dc_block(motor, a, 1.0 if limit == 0 and not sampled else 0.0, linear[a])
+            if limit == 2 or limit == -2:
+                linear[a, RATE_Q], linear[a, RATE_V] = 0.0, 0.0
         elif kind == POSITION_SERVO:
             motors[a, VOLTAGE], motors[a, CURRENT] = servo_circuit_on(motor, a, mode, limit, asked, v)
             motors[a, DRAG] = servo_drag(motor, a, mode, v)

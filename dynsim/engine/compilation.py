@@ -1,0 +1,178 @@
+"""What is said while kernels are compiled: which, why anew, and how long it takes.
+
+One line in the log. On a terminal, where nobody else shows it, a line on stderr that counts the seconds. Commands show
+it in their bars: also what their worker processes compile, of which a file beside the kernels says so.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+import threading
+import time as clock
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from dynsim.kernels.jit import cache_folder, told_of_compilation
+
+# Beside the folders of kernels: how long the last compilation took.
+LAST = "compiled_in_s"
+# Of a file that says what a process compiles.
+MARK = ".compiling"
+# Without a compilation to go by [s].
+USUAL = "30 to 160 s on two cores"
+# Between two looks of a display [s].
+LOOK_S = 0.5
+
+# False where a command has bars of its own.
+_on_terminal = True
+
+
+@dataclass(frozen=True)
+class Compilation:
+    """One that is under way.
+
+    Attributes
+    ----------
+    text : what, why and how long
+    since : time of the clock at its beginning [s]
+    expected : how long the last one took [s]; None: there was none
+    """
+
+    text: str
+    since: float
+    expected: float | None
+
+    @property
+    def elapsed(self) -> float:
+        """[s]"""
+        return max(clock.time() - self.since, 0.0)
+
+
+def shown_by_caller() -> None:
+    """From now on nothing of this process is written to stderr: its caller has bars."""
+    global _on_terminal
+    _on_terminal = False
+
+
+@contextmanager
+def kernels_logged(log: logging.Logger, kind: str = "", loads: bool = True) -> Iterator[None]:
+    """Log the time in which kernels are loaded, or compiled.
+
+    kind : of what system they are
+    loads : also say how long it took when none had to be compiled
+    """
+    started, begun = clock.perf_counter(), list[Callable[[], None]]()
+
+    def begin() -> None:
+        compilation = _beginning(kind)
+        log.info(compilation.text)
+        begun.append(_marked(compilation))
+        if _on_terminal and sys.stderr is not None and sys.stderr.isatty():
+            begun.append(_counted(compilation))
+
+    try:
+        with told_of_compilation(begin):
+            yield
+    finally:
+        taken = clock.perf_counter() - started
+        for end in reversed(begun):
+            end()
+    if begun:
+        with suppress(OSError):
+            (cache_folder().parent / LAST).write_text(f"{taken:.0f}")
+    if begun or loads:
+        log.info("%s the kernels in %.1f s", "compiled" if begun else "loaded", taken)
+
+
+def _beginning(kind: str) -> Compilation:
+    folder = cache_folder()
+    others = any(folder.glob("*.kernel"))
+    why = (
+        "the first of this kind since dynsim was installed, updated or edited"
+        if others
+        else "the first since dynsim, numba or numpy were installed, updated or edited"
+    )
+    expected = None
+    with suppress(OSError, ValueError):
+        expected = float((folder.parent / LAST).read_text())
+    last = USUAL if expected is None else f"the last time took {expected:.0f} s"
+    what = f" for {kind}" if kind else ""
+    return Compilation(f"compiling the kernels{what}, {why}: {last}, later runs load them", clock.time(), expected)
+
+
+def _marked(compilation: Compilation) -> Callable[[], None]:
+    """Write what is compiled where displays look for it; what is returned takes it away."""
+    path = cache_folder() / f"{os.getpid()}{MARK}"
+    with suppress(OSError):
+        path.write_text(json.dumps([os.getpgrp(), compilation.text, compilation.since, compilation.expected]))
+
+    def end() -> None:
+        with suppress(OSError):
+            path.unlink()
+
+    return end
+
+
+def under_way() -> Compilation | None:
+    """What this process or one of its group compiles, the one that began first; None: nothing."""
+    found = []
+    for path in cache_folder().glob(f"*{MARK}"):
+        with suppress(OSError, ValueError, TypeError):
+            group, text, since, expected = json.loads(path.read_text())
+            os.kill(int(path.name.removesuffix(MARK)), 0)  # of a process that died it stays
+            if group == os.getpgrp():
+                found.append(Compilation(str(text), float(since), expected))
+    return min(found, key=lambda one: one.since, default=None)
+
+
+def _counted(compilation: Compilation) -> Callable[[], None]:
+    """Count the seconds on stderr, a terminal; what is returned says how many they were."""
+    over = threading.Event()
+
+    def count() -> None:
+        while True:
+            print(
+                f"\r\x1b[Kdynsim: {compilation.text} ({compilation.elapsed:.0f} s)", end="", file=sys.stderr, flush=True
+            )
+            if over.wait(1.0):
+                break
+        print(f"\r\x1b[Kdynsim: compiled the kernels in {compilation.elapsed:.0f} s", file=sys.stderr, flush=True)
+
+    thread = threading.Thread(target=count, name="compiling", daemon=True)
+    thread.start()
+
+    def end() -> None:
+        over.set()
+        thread.join()
+
+    return end
+
+
+@contextmanager
+def watched(show: Callable[[Compilation | None], None]) -> Iterator[None]:
+    """Call ``show`` now and then while something is compiled, and once with None when that is over."""
+    shown_by_caller()
+    over, folder = threading.Event(), Path(cache_folder())
+
+    def look() -> None:
+        last: Compilation | None = None
+        while not over.wait(LOOK_S):
+            now = under_way() if folder.is_dir() else None
+            if now is not None or last is not None:
+                show(now)
+            last = now
+        if last is not None:
+            show(None)
+
+    thread = threading.Thread(target=look, name="compiling", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()

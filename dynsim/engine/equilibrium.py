@@ -1,0 +1,134 @@
+"""The start of ``initial.equilibrium``: currents that hold the posture, and commands that keep them.
+
+At rest u = R i, so a controller that follows the posture without any error has to give R i. Where it plans voltages,
+they are that; else the references of all motors are moved by a constant for the whole run,
+
+    DC motor, position servo: q_d + R i / k_p        torque source: τ_d + τ
+
+as if the sag under the weight at the start had been taken out of its set points. Errors, tracking and ledger are told
+against the references as they were.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from dynsim.kernels.arrays import ReferenceArrays
+from dynsim.model.control import JointControl
+from dynsim.model.description import Array, Contact, Load
+from dynsim.model.drives import Motor, Servo, TorqueSource
+from dynsim.model.equilibrium import load_torques, rest
+from dynsim.model.model import Model
+from dynsim.model.unilateral import told
+
+# What a reference begins with that counts as rest where the joint is [rad or m, rad/s or m/s].
+AT_REST = 1e-4
+
+
+@dataclass(frozen=True)
+class Balance:
+    """A start at rest.
+
+    Attributes
+    ----------
+    current : (na,) of the motors [A; N m of a torque source]
+    shift : (na,) of their references [rad or m; N m of a torque source]
+    heat : Σ R i² [W]
+    normal_forces : by contact that touches [N]; empty where the controller plans them
+    warnings : what jumps all the same
+    """
+
+    current: Array
+    shift: Array
+    heat: float
+    normal_forces: dict[str, float] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+
+def balanced(
+    model: Model, contacts: Sequence[Contact], loads: Sequence[Load], control: JointControl, real: bool
+) -> Balance:
+    """The start at rest of a robot under its controller.
+
+    Parameters
+    ----------
+    loads : those of the scenario, as they are at t = 0
+    real : the unilateral law
+
+    Raises
+    ------
+    ModelError
+        Nothing holds the posture.
+    """
+    robot, motors = model.robot, model.robot.motors
+    index = [model.joint_names.index(motor.joint) for motor in motors]
+    begin, rate = _begin(control.reference, len(motors))
+    current, shift = np.zeros(len(motors)), np.zeros(len(motors))
+    found: list[str] = []
+    planned = control.reference.voltage
+    if planned is None:
+        able = [
+            motor.joint
+            for motor, k_p in zip(motors, control.k_p, strict=True)
+            if isinstance(motor, TorqueSource) or (isinstance(motor, Servo) and not motor.velocity_mode)
+            or (isinstance(motor, Motor) and k_p > 0.0)
+        ]  # fmt: skip
+        held = rest(model, robot.initial, contacts, loads, able, real)
+        torques, forces = held.torques, held.normal_forces
+    else:
+        # The plan says what presses; loads it does not know, and the motors carry them.
+        torques, forces = load_torques(model, robot.initial, loads), {}
+    for a, (motor, i) in enumerate(zip(motors, index, strict=True)):
+        if isinstance(motor, TorqueSource):
+            current[a] = torques[i]
+            if control.reference.spline[a] < 0:
+                shift[a] = torques[i] - begin[a]
+            elif abs(torques[i] - begin[a]) > AT_REST:
+                found.append(
+                    f"the torque of {motor.joint} begins with {begin[a]:.4g} N m, at rest it would be {torques[i]:.4g}"
+                )
+            continue
+        drop = motor.resistance * torques[i] / motor.joint_constant
+        k_p = motor.k_p if isinstance(motor, Servo) else control.k_p[a]
+        current[a] = torques[i] / motor.joint_constant
+        if planned is not None:
+            current[a] += planned[0, a, 0] / motor.resistance
+        if drop != 0.0 and k_p > 0.0:
+            shift[a] = drop / k_p
+        unit = robot.links[i].units
+        at = robot.initial[robot.position_index[i]]
+        if k_p > 0.0 and abs(begin[a] - at) > AT_REST:
+            found.append(
+                f"the reference of {motor.joint} begins {told(begin[a] - at, unit[0], 3)} from where it stands"
+            )
+        elif k_p > 0.0 and abs(rate[a]) > AT_REST:
+            found.append(f"the reference of {motor.joint} begins with {rate[a]:.3g} {unit[1]}")
+    resistance = np.array([getattr(motor, "resistance", 0.0) for motor in motors])
+    said = (
+        ("initial.equilibrium: " + "; ".join(found) + ": that jumps at the start all the same; a path that begins at "
+         "rest where the hand is does not",)
+        if found
+        else ()
+    )  # fmt: skip
+    return Balance(current, shift, float(resistance @ current**2), forces, said)
+
+
+def shifted(reference: ReferenceArrays, shift: Array) -> ReferenceArrays:
+    """References, each moved by a constant."""
+    coefficients = reference.coefficients.copy()
+    for a, column in enumerate(reference.spline):
+        if column >= 0:
+            coefficients[:, column, 0] += shift[a]
+    return reference._replace(held=reference.held + shift, coefficients=coefficients, spline=reference.spline.copy())
+
+
+def _begin(reference: ReferenceArrays, motors: int) -> tuple[Array, Array]:
+    """Values and rates of the references at their beginning, (na,) each."""
+    begin, rate = reference.held.copy(), np.zeros(motors)
+    for a, column in enumerate(reference.spline):
+        if column >= 0:
+            begin[a], rate[a] = reference.coefficients[0, column, :2]
+    return begin, rate

@@ -1,0 +1,76 @@
+"""Where a scenario of a plant with dynamics starts, and whether everything before its first step can be done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from dynsim.engine import Start
+from dynsim.engine.prepare import prepare
+from dynsim.errors import ModelError
+from dynsim.model.description import Contact
+from dynsim.model.equilibrium import load_forces, rest
+from dynsim.model.mobile_base import static_margin
+from dynsim.model.model import Model
+from dynsim.model.shapes import gap_at
+from dynsim.reuse import Reuse
+from dynsim.scenario import Scenario, build
+from dynsim.scenario.effect import without_effect
+
+# Joints that the solution of a posture has moved by less stay where they were [rad or m].
+MOVED = 1e-12
+
+
+def check(scenario: Scenario, started: Callable[[Start], None]) -> Start:
+    """See :func:`dynsim.engine.check`."""
+    reuse = Reuse()
+    start = start_of(scenario, reuse)
+    started(start)
+    prepare(scenario, reuse=reuse)
+    return start
+
+
+def start_of(scenario: Scenario, reuse: Reuse) -> Start:
+    """Posture, gaps and margin at t = 0, whether they are allowed or not."""
+    described, contacts = build.robot_and_contacts(scenario, reuse)
+    model = reuse.of("model", lambda: Model(described), described)
+    robot = model.robot
+    q, points = robot.initial, {}
+    gaps: dict[str, float] = {}
+    for contact in contacts:
+        try:
+            gaps[contact.name] = gap_at(model, contact, q)
+        except ModelError:  # a body that there is not: the check of contacts says where
+            continue
+        points[contact.name] = model.point_position(contact.body, contact.point, q)
+    declared = scenario.config.contacts.points
+    aloft = [name for name, gap in gaps.items() if name in declared and abs(gap) > build.START_TOLERANCE]
+    solved = {}
+    if scenario.config.initial is not None and scenario.config.initial.on_surface:
+        before = build.unposed(scenario, reuse).initial
+        for link, k in zip(robot.links, robot.position_index, strict=True):
+            if len(link.row.neutral) == 1 and abs(q[k] - before[k]) > MOVED:
+                angle = link.units[0] == "rad"
+                ends = np.array([q[k], before[k]])
+                to, was = (np.degrees(ends) if angle else ends).tolist()
+                solved[link.joint] = (to, was, "deg" if angle else "m")
+    hand = model.point_position(*robot.hand, q)
+    key = build.on_surface_key(scenario, aloft) if aloft else ""
+    idle = without_effect(scenario, bool(robot.motors))
+    return Start(hand, points, gaps, key, solved, *_margins(scenario, model, contacts), idle)
+
+
+def _margins(scenario: Scenario, model: Model, contacts: Sequence[Contact]) -> tuple[float | None, float | None]:
+    """Tip margin of a mobile base at rest, alone and with its braces; None where there is none."""
+    robot, q = model.robot, model.robot.initial
+    if robot.base is None:
+        return None, None
+    loads = build.loads(scenario, robot)
+    forces = load_forces(model, q, loads)
+    alone, able = static_margin(model, q, forces), [motor.joint for motor in robot.motors]
+    try:
+        held = rest(model, q, contacts, loads, able, scenario.config.contacts.law == "unilateral")
+    except ModelError:
+        return alone, None
+    return alone, static_margin(model, q, [*forces, *held.forces]) if held.forces else None

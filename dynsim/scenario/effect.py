@@ -1,0 +1,150 @@
+"""Keys that a scenario may have and that change nothing in it: accepted, so that a run says that it ignores them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel
+
+from dynsim.families import member
+from dynsim.problems import dotted
+
+if TYPE_CHECKING:
+    from dynsim.scenario.schema import Scenario, ScenarioConfig
+
+Keys = tuple[int | str, ...]
+
+FIXED_STEPS = ("rk4", "time_stepping")
+# Sections that only plants with dynamics read.
+OF_DYNAMICS = ("contacts", "initial", "integrator", "metrics")
+# Sections of joint_pd that move a reference, or plan along one.
+MOVING = ("hand", "base", "joints", "torques", "brace")
+
+
+def without_effect(scenario: Scenario, motors: bool = True) -> list[str]:
+    """A line for each key that the scenario sets and that changes nothing, with its place and why.
+
+    ``motors`` : whether the plant has any
+    """
+    config = scenario.config
+    found: dict[Keys, str] = {}
+    if config.controller is not None and not motors:
+        found[("controller",)] = "the plant has no motors"
+    for keys, why in idle_keys(config).items():
+        if keys[:1] not in found:
+            found[keys] = why
+    return [
+        f"{dotted(keys)} has no effect: {why} ({scenario.place(keys)})"
+        for keys, why in found.items()
+        if is_set(config, keys)
+    ]
+
+
+def idle_keys(config: ScenarioConfig) -> dict[Keys, str]:
+    """Keys that change nothing, whether they are set or not, and why."""
+    kinematic = member("plant", config.plant.type).ENGINE == "kinematic"
+    rules = [_of_kinematics(config)] if kinematic else [_of_integrator(config), _of_contacts(config)]
+    return dict(pair for rule in (*rules, _of_controller(config), _of_time(config)) for pair in rule)
+
+
+def is_set(config: BaseModel, keys: Keys) -> bool:
+    """Whether file, variant or an override says the key."""
+    node: Any = config
+    for key in keys:
+        if isinstance(node, BaseModel):
+            if key not in node.model_fields_set or getattr(node, str(key)) is None:
+                return False
+            node = getattr(node, str(key))
+        else:
+            node = node[key]
+    return True
+
+
+def _of_kinematics(config: ScenarioConfig) -> Iterator[tuple[Keys, str]]:
+    """What has forces and steps is not for a kinematic plant; ``duration_s`` and the controller say all."""
+    for section in OF_DYNAMICS:
+        part = getattr(config, section)
+        for key in () if part is None else type(part).model_fields:
+            yield (section, key), f"plant {config.plant.type} is kinematic"
+
+
+def _of_integrator(config: ScenarioConfig) -> Iterator[tuple[Keys, str]]:
+    method, real = config.integrator.method, config.contacts.law == "unilateral"
+    if method not in FIXED_STEPS:
+        return
+    why = f"{method} takes steps of integrator.step_s"
+    yield ("integrator", "rtol"), why
+    yield ("integrator", "step_max_s"), why
+    if not real:  # there it says below which speed slip has no direction
+        yield ("integrator", "atol"), why
+
+
+def _of_contacts(config: ScenarioConfig) -> Iterator[tuple[Keys, str]]:
+    contacts = config.contacts
+    if contacts.law == "unilateral":
+        yield ("contacts", "reference_tolerance_m"), "it is of law: bilateral; real braces may leave their surfaces"
+    if not contacts.points and contacts.candidates == "points":
+        for key in type(contacts).model_fields:
+            if key not in ("law", "candidates", "points", "reference_tolerance_m"):
+                yield ("contacts", key), "there are no contacts.points, and contacts.candidates are points alone"
+    if contacts.candidates != "points" and not config.surfaces:
+        yield ("contacts", "candidates"), "there are no surfaces to touch"
+    for name, point in contacts.points.items():
+        if point.grip is not None and point.grip.ratio == 1.0:
+            yield ("contacts", "points", name, "grip"), "ratio 1 is the same friction in all directions"
+
+
+def _of_controller(config: ScenarioConfig) -> Iterator[tuple[Keys, str]]:
+    controller = config.controller
+    if controller is None or controller.type != "joint_pd":
+        return
+    moves = any(getattr(controller, key) for key in MOVING) or controller.feed_forward != "none"
+    if not moves:
+        yield ("controller", "knot_spacing_s"), "no reference moves"
+
+
+def _of_time(config: ScenarioConfig) -> Iterator[tuple[Keys, str]]:
+    """What begins when the run has ended."""
+    end = config.duration_s
+    ends = f"the run ends at {end:g} s"
+    settle = config.metrics.settle_s
+    if settle >= end and settle != type(config.metrics).model_fields["settle_s"].default:
+        yield ("metrics", "settle_s"), f"{ends}, so that no tracking error counts"
+    for name, load in config.loads.items():
+        first = getattr(load, "times_s", None)
+        if first is None and load.type == "csv":
+            first = load.pieces(end)[0]
+        if first is not None and first[0] >= end and not getattr(load, "hold", False):
+            yield ("loads", name), f"it begins at {first[0]:g} s, {ends}"
+    controller = config.controller
+    if controller is None:
+        return
+    timed: list[tuple[Keys, Any]] = []
+    for section in ("hand", "base"):
+        if (part := getattr(controller, section, None)) is not None:
+            timed.append((("controller", section, "path"), part.path))
+    for section in ("joints", "torques"):
+        parts = getattr(controller, section, None)
+        if isinstance(parts, dict):
+            timed += [(("controller", section, name), part) for name, part in parts.items()]
+    operator = getattr(controller, "operator", None)
+    owners: tuple[tuple[Keys, Any], ...] = ((("controller",), controller), (("controller", "operator"), operator))
+    for keys, owner in owners:
+        commands = getattr(owner, "commands", None) or ()
+        timed += [((*keys, "commands", k), command) for k, command in enumerate(commands)]
+    for keys, part in timed:
+        begins = _begins(part)
+        if begins is not None and begins >= end:
+            yield keys, f"it begins at {begins:g} s, {ends}"
+
+
+def _begins(part: Any) -> float | None:
+    """When a path, waypoints or a command begin [s]; None where that is not said."""
+    for name in ("start_s", "at_s"):
+        if isinstance(value := getattr(part, name, None), int | float):
+            return float(value)
+    if times := getattr(part, "times_s", None):
+        return float(times[0])
+    rows = getattr(part, "_rows", None)
+    return None if rows is None else float(rows[0][0])

@@ -1,0 +1,83 @@
+"""Keys that a scenario may have and that change nothing: each is in the resolved scenario or in a warning."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from dynsim import check, load_scenario
+from dynsim.scenario.effect import idle_keys, is_set, without_effect
+from dynsim.scenario.reading import scenario_from_resolved, variant_names
+from dynsim.shipped import shipped_scenarios
+
+LATE = {"type": "line", "from_m": [1, 1, 0.5], "to_m": [1, 1.1, 0.5], "start_s": 9, "duration_s": 1}
+PUSH = {"type": "samples", "body": "link_4", "times_s": [3, 4], "force_N": [[1, 0, 0], [1, 0, 0]]}
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides", "key", "why"),
+    [
+        ("elbow_comparison", {"integrator": {"method": "rk4", "rtol": 1e-8}}, "integrator.rtol", "rk4 takes steps of"),
+        ("elbow_comparison", {"integrator": {"method": "rk4", "step_max_s": 1}}, "integrator.step_max_s", "rk4 takes"),
+        ("falling_arm", {"contacts.reference_tolerance_m": 0.1}, "contacts.reference_tolerance_m", "law: bilateral"),
+        ("single_pendulum", {"contacts": {"friction": 0.3}}, "contacts.friction", "no contacts.points"),
+        ("single_pendulum", {"controller": {"type": "joint_pd", "k_p_V_per_rad": 9}}, "controller", "has no motors"),
+        ("elbow_comparison", {"duration_s": 1, "metrics.settle_s": 3}, "metrics.settle_s", "no tracking error counts"),
+        ("elbow_comparison", {"duration_s": 1, "controller.hand.path": LATE}, "controller.hand.path", "begins at 9 s"),
+        (
+            "elbow_comparison",
+            {"duration_s": 1, "controller.joints": {"joint_2": {"times_s": [2, 3], "angles_deg": [45, 50]}}},
+            "controller.joints.joint_2",
+            "begins at 2 s, the run ends at 1 s",
+        ),
+        ("elbow_comparison", {"duration_s": 1, "loads": {"push": PUSH}}, "loads.push", "begins at 3 s"),
+        (
+            "elbow_comparison",
+            {"controller": {"type": "joint_pd", "knot_spacing_s": 0.1, "hand": None}},
+            "controller.knot_spacing_s",
+            "no reference moves",
+        ),
+        ("snake_circle", {"integrator.rtol": 1e-8}, "integrator.rtol", "plant snake is kinematic"),
+    ],
+)
+def test_a_key_without_effect_is_said(name: str, overrides: dict[str, Any], key: str, why: str) -> None:
+    if overrides.get("controller", {}).get("hand", 1) is None:
+        overrides = {"controller": {k: v for k, v in overrides["controller"].items() if v is not None}}
+    scenario = load_scenario(name, overrides=overrides)
+    motors = name != "single_pendulum"
+    (line,) = [line for line in without_effect(scenario, motors) if line.startswith(f"{key} has no effect")]
+    assert why in line
+    assert "overrides" in line  # its place
+    # What it is made from says it again.
+    again = scenario_from_resolved(scenario.resolved)
+    assert [one.partition(" (")[0] for one in without_effect(again, motors)] == [line.partition(" (")[0]]
+
+
+@pytest.mark.parametrize("path", shipped_scenarios(), ids=lambda path: path.stem)
+def test_shipped_scenarios_say_nothing_in_vain(path) -> None:
+    """Nor do their resolved ones, which have all defaults that change something."""
+    for variant in variant_names(path) or [None]:
+        scenario = load_scenario(path, variant)
+        assert without_effect(scenario) == []
+        again = scenario_from_resolved(scenario.resolved)
+        assert without_effect(again) == []
+        assert again.resolved == scenario.resolved
+
+
+def test_defaults_that_change_nothing_are_not_resolved() -> None:
+    """Of fixed steps the tolerance; that of the adaptive methods is there."""
+    assert load_scenario("elbow_comparison").resolved["integrator"]["rtol"] == 1e-6
+    fixed = load_scenario("elbow_comparison", overrides={"integrator.method": "rk4"})
+    assert "rtol" not in fixed.resolved["integrator"]
+    said = load_scenario("elbow_comparison", overrides={"integrator.method": "rk4", "integrator.rtol": 1e-6})
+    assert said.resolved["integrator"]["rtol"] == 1e-6
+    assert ("integrator", "rtol") in idle_keys(said.config)
+    assert is_set(said.config, ("integrator", "rtol"))
+    assert not is_set(fixed.config, ("integrator", "rtol"))
+
+
+def test_check_says_it_too() -> None:
+    start = check(load_scenario("single_pendulum", overrides={"contacts": {"friction": 0.3}}))
+    assert len(start.warnings) == 1
+    assert start.warnings[0].startswith("contacts.friction has no effect")

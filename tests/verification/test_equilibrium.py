@@ -1,0 +1,215 @@
+"""A start at rest: nothing jumps where weight, loads and braces are held by the currents of ``initial.equilibrium``.
+
+Verification: accelerations of the compiled right-hand side against zero, heat against numpy's least squares.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import dynsim
+from dynsim import load_scenario, simulate
+from dynsim.engine.prepare import prepare
+from dynsim.errors import ModelError
+from dynsim.scenario import build
+
+# What is left of accelerations [rad/s²] and of currents that should be steady [A]: rounding of the statics, 1e-9 of
+# the forces at worst, over the lightest links.
+STILL, STEADY = 1e-6, 1e-8
+HOLD = {"initial": {"equilibrium": True}, "duration_s": 0.2, "controller.hand": None}
+
+
+def still(scenario):
+    """A record whose motion and currents do not change."""
+    record = simulate(scenario)
+    assert np.abs(record["vdot"]).max() < STILL
+    assert np.abs(record["current"] - record["current"][0]).max(initial=0.0) < STEADY
+    return record
+
+
+@pytest.mark.parametrize(
+    ("name", "variant"),
+    [("elbow_comparison", "two_elbows"), ("elbow_comparison", "no_elbow"), ("pressing", "plain")],
+)
+def test_nothing_jumps_glued_free_and_on_a_real_floor(name, variant):
+    record = still(load_scenario(name, variant, HOLD))
+    # The statics say what the simulation finds.
+    forces = [value for key, value in record.summary["equilibrium"].items() if key.endswith("normal_force_N")]
+    np.testing.assert_allclose(record["contact_normal_force"][0], forces, rtol=0, atol=1e-8)
+    assert record["current"][0].any()
+
+
+@pytest.mark.parametrize("variant", ["gravity", "optimal"])
+def test_planned_voltages_are_the_start_themselves(variant):
+    """No reference moves; with plain zero currents the same start jumps."""
+    scenario = load_scenario("pressing", variant, HOLD)
+    record = still(scenario)
+    assert not prepare(scenario).balance.shift.any()
+    jumps = simulate(load_scenario("pressing", variant, {**HOLD, "initial": None}))
+    assert np.abs(jumps["vdot"]).max() > 1.0
+    assert record["current"][0].any()
+
+
+def test_glued_braces_have_the_least_heat():
+    """Σ R i² over all normal forces is a linear least-squares problem."""
+    scenario = load_scenario("elbow_comparison", "two_elbows", HOLD)
+    prepared = prepare(scenario)
+    model, q = prepared.model, prepared.model.robot.initial
+    weight = model.bias_forces(q, np.zeros(model.n))
+    rows = [
+        contact.surface.normal(position) @ jacobian
+        for contact in prepared.contacts
+        for position, jacobian in [model.point_position_and_jacobian(contact.body, contact.point, q)]
+    ]
+    scale = np.array([np.sqrt(m.resistance) / m.joint_constant for m in model.robot.motors])
+    forces, heat, *_ = np.linalg.lstsq((np.array(rows) * scale).T, scale * weight, rcond=None)
+    assert prepared.balance.heat == pytest.approx(float(heat[0]), rel=1e-9)
+    np.testing.assert_allclose(list(prepared.balance.normal_forces.values()), forces, rtol=1e-6)
+
+
+def test_a_load_is_held_too():
+    load = {
+        "type": "constant",
+        "body": "link_10",
+        "frame": "body",
+        "force_N": [1, 2, -3],
+        "torque_N_m": [0.3, 0.1, -0.2],
+    }
+    still(load_scenario("elbow_comparison", "two_elbows", {**HOLD, "loads": {"push": load}}))
+    still(load_scenario("pressing", "gravity", {**HOLD, "loads": {"push": load}}))
+
+
+MIXED = """
+duration_s: 0.3
+plant:
+  type: serial_arm
+  link: {mass_kg: 0.4, length_m: 0.3}
+  chain:
+    - {axis: y, initial_deg: 40, motor: {type: wang_minami}}
+    - {axis: y, initial_deg: 30, motor: {type: servo, voltage_V: 12, stall_torque_N_m: 8.4,
+        no_load_speed_rad_per_s: 4.7, k_p_V_per_rad: 60, rotor_inertia_kg_m2: 0.01, coulomb_friction_N_m: 0.2}}
+    - {axis: y, initial_deg: 10, motor: {type: torque}}
+controller: {type: joint_pd, k_p_V_per_rad: [300], k_d_V_s_per_rad: 10}
+initial: {equilibrium: true}
+"""
+
+
+@pytest.fixture
+def mixed(tmp_path):
+    path = tmp_path / "mixed.yaml"
+    path.write_text(MIXED, encoding="utf-8")
+    return path
+
+
+def test_every_kind_of_drive_that_can_holds(mixed):
+    record = still(load_scenario(mixed))
+    weight = build.build_model(load_scenario(mixed)).bias_forces(record["q"][0], np.zeros(3))
+    np.testing.assert_allclose(record["torque"][0], weight, rtol=0, atol=1e-9)
+    # What follows a rewritten reference holds too.
+    simulation = dynsim.Simulation(load_scenario(mixed))
+    simulation.advance(0.1)
+    for joint, angle in zip(simulation.robot.joint_names, np.radians([40.0, 30.0, 10.0]), strict=True):
+        simulation.set_reference(joint, 0.0 if joint == "joint_3" else angle)
+    simulation.advance(0.3)
+    np.testing.assert_allclose(simulation.state.q, record["q"][0], rtol=0, atol=1e-9)
+
+
+def test_sampled_commands_hold(mixed):
+    still(load_scenario(mixed, overrides={"controller.sample_time_s": 0.001}))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ({"controller.k_p_V_per_rad": 0.0}, r"joint_1 .*nothing makes its motor hold: no controller, or k_p = 0"),
+        ({"controller": None}, r"joint_1 .*no controller"),
+        ({"plant.chain.0.motor": None, "controller": {"type": "joint_pd"}}, r"joint_1 .*\(has no motor\)"),
+        ({"plant.chain.2.motor.limit_N_m": 0.05}, r"joint_3 .*its motor gives 0\.05 N m"),
+        (
+            {
+                "plant.chain.1.motor.mode": "velocity",
+                "plant.chain.1.motor.k_p_V_per_rad": 0,
+                "plant.chain.1.motor.k_v_V_s_per_rad": 9,
+            },
+            r"joint_2 .*its servo follows rates",
+        ),
+    ],
+)  # fmt: skip
+def test_what_cannot_hold_is_named(mixed, overrides, words):
+    with pytest.raises(ModelError, match=rf"mixed\.yaml.*nothing holds this posture at rest.*{words}"):
+        simulate(load_scenario(mixed, overrides=overrides))
+
+
+def test_a_path_that_begins_elsewhere_jumps_and_is_said():
+    record = simulate(
+        load_scenario("elbow_comparison", "two_elbows", {"initial": {"equilibrium": True}, "duration_s": 0.2})
+    )
+    assert any(
+        "from where it stands" in text and "jumps at the start all the same" in text
+        for text in record.summary["warnings"]
+    )
+    # Less than a start without currents all the same.
+    plain = simulate(load_scenario("elbow_comparison", "two_elbows", {"duration_s": 0.2}))
+    assert np.abs(record["vdot"][0]).max() < np.abs(plain["vdot"][0]).max()
+
+
+def test_an_operator_takes_over_from_the_start_at_rest():
+    """Still until the first command, and no sag when references are rewritten at it: the hand goes where it is told."""
+    operator = {"joints": ["joint_1", "joint_9", "joint_10"], "commands": [{"at_s": 0.1, "hand": [0.0, 0.0, 0.01]}]}
+    controller = {"type": "joint_pd", "operator": operator}
+    overrides = {"controller": controller, "initial": {"equilibrium": True}, "duration_s": 0.6}
+    record = simulate(load_scenario("elbow_comparison", "two_elbows", overrides))
+    before = record.time <= 0.1
+    assert np.abs(record["vdot"][before]).max() < STILL
+    way = record["hand_position"] - record["hand_position"][0]
+    # Eased in at 0.5 m/s², the way of 0.5 s at 10 mm/s is 5 mm less 0.1.
+    assert way[-1, 2] == pytest.approx(0.005, abs=0.6e-3)
+    assert np.abs(way[:, :2]).max() < 0.5e-3
+    assert way[:, 2].min() > -1e-5
+
+
+MOBILE = {"duration_s": 0.6, "controller.hand": None, "metrics.settle_s": 0.4}
+
+
+def mobile(variant="two_elbows", **overrides):
+    return load_scenario("mobile_elbow_comparison", variant, {**MOBILE, **overrides})
+
+
+def test_a_base_does_not_tip_for_a_jolt_of_the_start_alone():
+    """A path that begins elsewhere tips it at once, which is not said of the rest of the run.
+
+    A start at rest does not tip, and what check says of it is what the run has.
+    """
+    jolted = simulate(load_scenario("mobile_elbow_comparison", "two_elbows", {"duration_s": 2.5}))
+    base, warnings = jolted.summary["base"], " ".join(jolted.summary["warnings"])
+    assert base["overturns_at_s"] < 0.01
+    assert base["overturns_settled_at_s"] is None
+    assert "a jolt of the start" in warnings
+    assert "tips over" not in warnings
+    held = mobile(initial={"equilibrium": True})
+    at_rest = still(held)
+    base = at_rest.summary["base"]
+    assert base["overturns_at_s"] is base["overturns_settled_at_s"] is None
+    start = dynsim.check(held)
+    assert start.tip_margin < 0.0 < start.tip_margin_braced
+    assert start.tip_margin_braced == pytest.approx(base["tip_margin_min"], abs=1e-7)
+
+
+def test_a_base_that_cannot_stand_tips_over_from_the_settled_time_on():
+    scenario = mobile("no_elbow", initial={"equilibrium": True})
+    record = still(scenario)
+    assert record.summary["base"]["overturns_settled_at_s"] == 0.4
+    assert any("the base tips over" in text for text in record.summary["warnings"])
+    start = dynsim.check(scenario)
+    assert start.tip_margin == pytest.approx(record["tip_margin"][0], abs=1e-9)
+    assert start.tip_margin_braced is None
+
+
+def test_what_has_no_motors_rests_on_friction_or_is_refused():
+    """A block on a slope of 0.4: only friction holds it, so the statics without friction are not the last."""
+    held = {"initial": {"equilibrium": True}, "duration_s": 0.1}
+    record = still(load_scenario("block_on_slope", "rests", held))
+    assert record["contact_mode"][0, 0] == 2
+    with pytest.raises(ModelError, match=r"nothing holds this posture.*foot cannot carry it"):
+        simulate(load_scenario("block_on_slope", "slides", held))

@@ -1,0 +1,89 @@
+"""Ratings of motors: a limit that the current keeps, and what runs say of nominal currents and torques."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dynsim import load_scenario, simulate
+from dynsim.errors import ScenarioError
+
+ARM = """
+duration_s: 1
+plant:
+  type: serial_arm
+  link:
+    mass_kg: 0.4
+    length_m: 0.4
+    damping_N_m_s_per_rad: 0.3
+    motor: {type: wang_minami, nominal_current_A: 6, peak_current_A: 12, nominal_torque_N_m: 5}
+  chain:
+    - {axis: y, initial_deg: 60}
+    - {axis: y, initial_deg: 60}
+    - {axis: y, initial_deg: -75}
+controller: {type: joint_pd}
+"""
+
+
+@pytest.fixture
+def arm(tmp_path):
+    path = tmp_path / "arm.yaml"
+    path.write_text(ARM, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    "integrator", [{"method": "radau5"}, {"method": "dopri5"}, {"method": "dopri5", "solver": "m_star"}]
+)
+def test_the_peak_current_is_a_limit(arm, integrator):
+    """No sample passes it, the arm sags for it, and the ledger closes; all methods and solvers agree."""
+    tight = {"integrator.rtol": 1e-9, "integrator.atol": 1e-11, "plant.link.motor.peak_current_A": 7}
+    options = {f"integrator.{key}": value for key, value in integrator.items()}
+    record = simulate(load_scenario(arm, overrides={**options, **tight}))
+    current = np.abs(record["current"])
+    # Samples are of dense output, to the tolerance.
+    assert 7.0 * (1.0 - 1e-3) < current.max() <= 7.0 * (1.0 + 1e-9)
+    # R I is what is left of the voltage there, within rounding.
+    held = current[:, 0] > 7.0 * (1.0 - 1e-9)
+    assert held.any()
+    back = 3.0 * 0.203 * record["v"][held, 0]
+    np.testing.assert_allclose(np.abs(record["voltage"][held, 0] - back), 1.1 * 7.0, rtol=1e-9)
+    free = simulate(load_scenario(arm, overrides={**options, **tight, "plant.link.motor.peak_current_A": None}))
+    assert np.abs(free["current"]).max() > 12.0
+    assert record["hand_position"][-1, 2] < free["hand_position"][-1, 2] - 0.01
+    assert record.summary["energy_residual_relative"] < 1e-7
+    assert any("joint_1: current at its limit of 7 A" in text for text in record.summary["warnings"])
+    reference = simulate(load_scenario(arm, overrides={"integrator.method": "rk43", **tight}))
+    np.testing.assert_allclose(record["q"][-1], reference["q"][-1], rtol=0, atol=2e-6)
+
+
+def test_a_limit_out_of_reach_changes_nothing(arm):
+    """Without a limit, and with one that is never near."""
+    none, far = (
+        simulate(load_scenario(arm, overrides={"plant.link.motor.peak_current_A": limit})) for limit in (None, 1e6)
+    )
+    np.testing.assert_allclose(far["q"], none["q"], rtol=0, atol=1e-12)
+
+
+def test_rms_stands_beside_nominal_and_is_warned_of(arm):
+    record = simulate(load_scenario(arm))
+    motors = {motor["joint"]: motor for motor in record.summary["motors"]}
+    assert list(motors) == ["joint_1", "joint_2", "joint_3"]
+    shoulder = motors["joint_1"]
+    squares = record["current"][:, 0] ** 2
+    mean = np.trapezoid(squares, record.time) / record.time[-1]
+    assert shoulder["current_rms_A"] == pytest.approx(np.sqrt(mean), rel=1e-12)
+    assert shoulder["current_max_A"] == np.abs(record["current"][:, 0]).max()
+    assert (shoulder["nominal_current_A"], shoulder["peak_current_A"], shoulder["nominal_torque_N_m"]) == (6, 12, 5)
+    # Σ R i² T is the Joule heat of the ledger, which the integrator has carried.
+    heat = sum(1.1 * motor["current_rms_A"] ** 2 for motor in motors.values()) * record.time[-1]
+    assert heat == pytest.approx(record.summary["joule_heat_J"], rel=2e-3)
+    warned = [text for text in record.summary["warnings"] if "rms over the run" in text]
+    assert len(warned) == 2
+    assert warned[0].startswith(f"joint_1 {shoulder['current_rms_A']:.3g} of 6 A")
+    assert "joint_3" not in warned[0]
+
+
+def test_a_peak_below_nominal_is_refused(arm):
+    with pytest.raises(ScenarioError, match=r"peak_current_A = 5: is less than nominal_current_A = 6"):
+        load_scenario(arm, overrides={"plant.link.motor.peak_current_A": 5})
