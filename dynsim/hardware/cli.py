@@ -245,14 +245,20 @@ def print_timing(result: Any) -> None:
 
 
 @hw.command(epilog="Example: dynsim hw recover results/arm_replay")
-def recover(folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of a replay whose process died.")]) -> None:
+def recover(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of a replay whose process died.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="For record and summary, FOLDER stays as it is; default: FOLDER.")
+    ] = None,
+) -> None:
     """Make a measured record, marked incomplete, of the cycles that a replay had written when it died."""
     from dynsim.hardware.replay import recover as recovery
     from dynsim.hardware.replay.folder import MEASURED
 
-    record = recovery.recover(folder)
+    record = recovery.recover(folder, out)
     span = f", {record.time[0]:.2f} to {record.time[-1]:.2f} s" if len(record) else ""
-    console.print(f"{len(record)} cycles{span}{'' if record.complete else ', incomplete'}: {folder / MEASURED}")
+    state = "complete" if record.complete else "incomplete"
+    console.print(f"{len(record)} cycles{span}, {state}: {(out or folder) / MEASURED}")
 
 
 @hw.command(
