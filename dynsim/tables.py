@@ -11,7 +11,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from dynsim.terminal import escaped_line
+from dynsim.terminal import Terminal, escaped_line, plain
 
 if TYPE_CHECKING:
     from dynsim.engine import Start
@@ -150,26 +150,37 @@ def _print_columns(console: Console, summaries: Mapping[str, Summary], names: Se
     console.print(table)
 
 
-def print_choices(console: Console) -> None:
+def print_choices(console: Terminal) -> None:
     """Shipped scenarios and the members of every family, with the first line of what they say of themselves."""
     from dynsim.families import FAMILIES, member, members
     from dynsim.scenario import load_scenario, shipped_scenarios, variant_names
 
-    table = Table(title="scenarios", box=box.SIMPLE_HEAD, title_justify="left")
-    table.add_column("name", no_wrap=True)
-    table.add_column("variants")
-    table.add_column("what")
+    scenarios = []
     for path in shipped_scenarios():
         description = load_scenario(path).config.description
         sentence = re.split(r"(?<!et al)\.\s", description, maxsplit=1)[0].strip().removesuffix(".")
-        table.add_row(escaped_line(path.stem), escaped_line(", ".join(variant_names(path))), escaped_line(sentence))
-    console.print(table)
+        scenarios.append((path.stem, ", ".join(variant_names(path)), sentence))
+    _print_choice(console, "scenarios", scenarios, ("name", "variants", "what"))
     for family in FAMILIES:
-        table = Table(title=f"{family}s", box=box.SIMPLE_HEAD, show_header=False, title_justify="left")
-        for name in members(family):
-            first = (member(family, name).__doc__ or "").strip().partition("\n")[0]
-            table.add_row(escaped_line(name), escaped_line(first))
-        console.print(table)
+        firsts = [(name, (member(family, name).__doc__ or "").strip().partition("\n")[0]) for name in members(family)]
+        _print_choice(console, f"{family}s", firsts)
+
+
+def _print_choice(
+    console: Terminal, title: str, rows: Sequence[tuple[str, ...]], headings: tuple[str, ...] = ()
+) -> None:
+    """A table on a terminal; lines with tabs for programs."""
+    if console.unbounded:
+        lines = ["\t".join(plain(cell).replace("\n", "\\n") for cell in row) for row in [(title,), *rows, ()]]
+        # Not by the console, which would write the tabs out.
+        print("\n".join(lines), file=console.file)
+        return
+    table = Table(title=title, box=box.SIMPLE_HEAD, show_header=bool(headings), title_justify="left")
+    for k, heading in enumerate(headings):
+        table.add_column(heading, no_wrap=k == 0)
+    for row in rows:
+        table.add_row(*map(escaped_line, row))
+    console.print(table)
 
 
 def print_starts(console: Console, starts: Mapping[str, Start]) -> None:

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -298,6 +299,20 @@ def test_check_prints_positions_that_can_be_copied_into_a_surface(tmp_path: Path
     snake = check(load_scenario("snake_operator"))
     assert shown[-2:] == ["  at the start [m]:", f"    hand  {snake.hand.tolist()}"]
     assert not snake.contacts
+
+
+def test_a_list_in_a_pipe_is_lines_with_tabs_and_names_papers(tmp_path: Path):
+    environment = {name: value for name, value in os.environ.items() if name != "COLUMNS"}
+    listed = dynsim("list", folder=tmp_path, env=environment).stdout
+    lines = listed.splitlines()
+    assert lines[0] == "scenarios"
+    row = next(line for line in lines if line.startswith("bouncing_link")).split("\t")
+    assert row[:2] == ["bouncing_link", "half, dead, lively"]
+    assert all(line == line.rstrip() and "  " not in line for line in lines)
+    assert "[" not in re.sub(r"\[(m|rad)\]", "", listed), "a paper is named"
+    assert "(Wang and Minami, section IV)" in listed
+    wide = dynsim("list", folder=tmp_path, env=environment | {"COLUMNS": "90"}).stdout
+    assert max(map(len, wide.splitlines())) <= 90
 
 
 def test_list_check_schema_and_version(tmp_path: Path):
