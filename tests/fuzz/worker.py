@@ -27,6 +27,7 @@ from typing import Any
 
 from fuzz import broken
 from fuzz.case import SHIPPED, Draft, draw, put
+from fuzz.inputs.sweep import forget_commit
 from fuzz.readings import Unreadable
 
 OK, REFUSED, INTERRUPTED = "ok", "refused", "interrupted"
@@ -313,6 +314,7 @@ def _load_everything(records: Path) -> None:
     from dynsim.engine import simulate
     from dynsim.scenario import load_scenario
 
+    forget_commit()
     for name in ("single_pendulum", "elbow_comparison", "snake_positioning"):
         simulate(load_scenario(name, None, {"duration_s": 0.01, "metrics.settle_s": 0}))
 

@@ -46,7 +46,7 @@ def test_check_replay_compare_on_virtual_servos(call, files: Path) -> None:
     assert code == 0
     *_, passed, tightest = out.splitlines()
     assert passed.startswith("check passed")
-    # The wheel at 3 of 5 rad/s and the joints at 0.6 of 1.05 rad leave two fifths, the joints at 0.6 · 4 of 3 rad/s one.
+    # The wheel at 3 of 5 rad/s and joints at 0.6 of 1.05 rad leave two fifths, joints at 0.6 · 4 of 3 rad/s one.
     assert re.fullmatch(r"tightest: \w+: velocity -?2\.[34]\d+ rad/s .*, limit 3\.0000 rad/s, .*, 2\d % left", tightest)
     code, out, _ = call("hw", "replay", record, "--map", map_, "--port", "virtual", "--out", files / "out")
     assert code == 0

@@ -259,7 +259,7 @@ class Ending:
         return self._journal.say("servos that are on stay ON; `dynsim hw stop` releases them")
 
     def _release(self) -> None:
-        """Torque off by broadcast, until every servo confirms or REST_TIME is over; then watchdogs. Raises PortError."""
+        """Torque off by broadcast, until all confirm or REST_TIME is over; then watchdogs off. Raises PortError."""
         loop, until = self._loop, self._loop.now() + REST_TIME
         self._released = True
         while True:
