@@ -15,8 +15,10 @@ from dynsim._version import __version__
 from dynsim.errors import DynsimError
 
 if TYPE_CHECKING:
+    from dynsim import film, view
     from dynsim.engine import check, simulate
     from dynsim.engine.simulation import Simulation, State
+    from dynsim.model.bracing import Brace
     from dynsim.model.model import Model
     from dynsim.record import Record
     from dynsim.scenario import Scenario, build_model, load_scenario
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from dynsim.studies.compare import compare
 
 __all__ = [
+    "Brace",
     "DynsimError",
     "Model",
     "Record",
@@ -34,13 +37,16 @@ __all__ = [
     "build_model",
     "check",
     "compare",
+    "film",
     "load_scenario",
     "simulate",
     "simulate_batch",
+    "view",
 ]
 
 # Loaded on first use: numba and pydantic take a second that `dynsim --help` need not wait for.
 _HOME = {
+    "Brace": "dynsim.model.bracing",
     "Model": "dynsim.model.model",
     "Record": "dynsim.record",
     "Scenario": "dynsim.scenario",
@@ -55,11 +61,17 @@ _HOME = {
 }
 
 
+# Modules of their own.
+_MODULES = ("film", "view")
+
+
 def __getattr__(name: str) -> Any:
     if name in _HOME:
         return getattr(importlib.import_module(_HOME[name]), name)
+    if name in _MODULES:
+        return importlib.import_module(f"dynsim.{name}")
     raise AttributeError(f"module 'dynsim' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted(__all__)

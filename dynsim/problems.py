@@ -13,13 +13,19 @@ import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ValidationError
 
-# Of what messages show: unknown keys, characters of a value or key.
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
+# Of what messages show: unknown keys, other problems, characters of a value or key.
 UNKNOWN_SHOWN = 20
+OTHERS_SHOWN = 4
 SHOWN_LIMIT = 80
+# Keys that say which of several configurations a mapping is.
+TAGS = ("type", "kind")
 # A list index in a dotted key.
 INDEX = re.compile("[0-9]{1,9}")
 
@@ -79,54 +85,71 @@ def unknown_keys(
 
 
 def explain(error: ValidationError, data: Any, origin: Origin, unknown: Sequence[str]) -> str:
-    """One line with file:line, key, value and fix: all unknown keys, else the first problem."""
+    """One line with file:line, key, value and fix of each problem: unknown keys first, then others."""
+    texts = list(dict.fromkeys(unknown))
+    shown = texts[:UNKNOWN_SHOWN] + (["and more"] if len(texts) > UNKNOWN_SHOWN else [])
     problems = error.errors(include_url=False, include_input=False)
-    if unknown:
-        # These first and alone: a misspelt key also makes the right one missing.
-        texts = list(dict.fromkeys(unknown))
-        shown = "; ".join(texts[:UNKNOWN_SHOWN]) + ("; and more" if len(texts) > UNKNOWN_SHOWN else "")
-        return shown + _and_more(sum(problem["type"] != "extra_forbidden" for problem in problems))
-    problem = problems[0]
-    loc = (*problem["loc"], *problem.get("ctx", {}).get("key", "").split("."))
+    others: dict[str, str] = {}
+    for problem in problems:
+        if problem["type"] == "extra_forbidden":
+            continue
+        # Of a list of fixed length: one problem for every entry that it lacks.
+        alike = sum(one["type"] == problem["type"] and one["loc"][:-1] == problem["loc"][:-1] for one in problems)
+        keys, given, text = _problem(problem, data, alike)
+        key = dotted(keys)
+        # A misspelt key also makes the right one missing.
+        misspelt = problem["type"] == "missing" and any(f"did you mean {str(keys[-1])!r}?" in one for one in texts)
+        if not misspelt:
+            # A value that may be of several types has a problem with each of them: the first is told.
+            others.setdefault(key, f"{origin.place(keys)}: {key and f'{key}{given}: '}{text}")
+    shown += itertools.islice(others.values(), OTHERS_SHOWN)
+    if (more := len(others) - OTHERS_SHOWN) > 0:
+        shown.append(f"and {more} more problem{'s' if more > 1 else ''}")
+    return "; ".join(shown)
+
+
+def _problem(problem: ErrorDetails, data: Any, alike: int) -> tuple[list[int | str], str, str]:
+    """Keys of a value, " = value" where it is short, and what is wrong; ``alike`` problems are in one list."""
+    context, kind, message = problem.get("ctx", {}), problem["type"], problem["msg"].removeprefix("Value error, ")
+    loc = (*problem["loc"], *context.get("key", "").split("."))
     keys, value, found = _locate(data, tuple(part for part in loc if part != ""))
-    kind, message = problem["type"], problem["msg"].removeprefix("Value error, ")
-    more = len(problems) - 1
+    if kind in ("union_tag_invalid", "union_tag_not_found"):
+        return _wrong_tag(keys, value, context)
     if kind == "missing" and isinstance(problem["loc"][-1], int) and isinstance(value, list):
-        # One problem for every entry that a list of fixed length lacks.
-        lacking = sum(p["type"] == kind and p["loc"][:-1] == problem["loc"][:-1] for p in problems)
-        text = f"has {len(value)} entries, {len(value) + lacking} are needed"
-        more -= lacking - 1
+        text = f"has {len(value)} entries, {len(value) + alike} are needed"
     elif kind == "missing":
         text = "is missing; add it"
-    elif kind in ("union_tag_invalid", "union_tag_not_found"):
-        expected = problem["ctx"].get("expected_tags", "").replace("'", "") if "ctx" in problem else ""
-        tag = value.get("type", "") if isinstance(value, Mapping) else ""
-        keys = [*keys, "type"]
-        if tag:
-            text = f"unknown type {value_text(tag)}{suggest(str(tag), expected.split(', '))}; known: {expected}"
-        else:
-            text = "is missing; it says which one" + (f": {expected}" if expected else "")
-        found = False
     elif kind in ("model_type", "dict_type", "model_attributes_type"):
         text = "must be a mapping of keys to values"
     elif kind in ("too_short", "too_long"):
-        limits = problem["ctx"]
         most = "at least" if kind == "too_short" else "at most"
-        needed = limits["min_length" if kind == "too_short" else "max_length"]
-        text = f"has {limits['actual_length']} entries; it must have {most} {needed}"
+        needed = context["min_length" if kind == "too_short" else "max_length"]
+        text = f"has {context['actual_length']} entries; it must have {most} {needed}"
     elif kind == "list_type":
         text = "must be a list, such as [a, b]"
+    elif kind == "literal_error":
+        choices = re.findall("'([^']*)'", context["expected"])
+        text = f"must be {context['expected']}{suggest(value, choices) if isinstance(value, str) else ''}"
     elif message.startswith("Input should be "):
         text = "must be " + message.removeprefix("Input should be ")
     else:
         text = " ".join((message[0].lower() + message[1:]).splitlines())
     given = f" = {value_text(value)}" if found and not isinstance(value, (Mapping, list)) else ""
-    key = f"{dotted(keys)}{given}: " if keys else ""
-    return f"{origin.place(keys)}: {key}{text}{_and_more(more)}"
+    return keys, given, text
 
 
-def _and_more(count: int) -> str:
-    return f" (and {count} more)" if count > 0 else ""
+def _wrong_tag(keys: list[int | str], value: Any, context: Mapping[str, Any]) -> tuple[list[int | str], str, str]:
+    """Of a mapping whose ``type`` (or ``kind``) says which one it is: it names none, is misspelt, or is not there."""
+    tag = context["discriminator"].strip("'")
+    known = context.get("expected_tags", "").replace("'", "")
+    entries = value if isinstance(value, Mapping) else {}
+    if named := entries.get(tag):
+        text = f"unknown {tag} {value_text(named)}{suggest(str(named), known.split(', '))}; known: {known}"
+        return [*keys, tag], "", text
+    near = difflib.get_close_matches(tag, [key for key in entries if isinstance(key, str)], n=1)
+    if near:
+        return [*keys, near[0]], "", f"unknown key; did you mean {tag!r}?"
+    return [*keys, tag], "", "is missing; it says which one" + (f": {known}" if known else "")
 
 
 def key_text(key: object) -> str:
@@ -166,7 +189,7 @@ def _locate(data: Any, loc: tuple[int | str, ...]) -> tuple[list[int | str], Any
         in_list = isinstance(node, list) and isinstance(part, int) and part < len(node)
         if found and (in_mapping or in_list):
             node = node[part]
-        elif isinstance(node, Mapping) and node.get("type") == part:
+        elif isinstance(node, Mapping) and part in (node.get(tag) for tag in TAGS):
             continue
         elif found and isinstance(node, (int, float, str, list)):
             # Branches of a union of plain types, such as "float" and "list[float]".
@@ -213,7 +236,8 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _literals(model: type[BaseModel]) -> tuple[Any, ...]:
-    return typing.get_args(model.model_fields["type"].annotation) if "type" in model.model_fields else ()
+    tags = [model.model_fields[tag].annotation for tag in TAGS if tag in model.model_fields]
+    return tuple(itertools.chain.from_iterable(map(typing.get_args, tags)))
 
 
 def listed(names: Sequence[str]) -> str:

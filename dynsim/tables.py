@@ -11,9 +11,12 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from dynsim.terminal import escaped_line
+from dynsim.terminal import Terminal, escaped_line, plain
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from dynsim.engine import Start
 
 Summary = Mapping[str, Any]
@@ -22,12 +25,20 @@ Summary = Mapping[str, Any]
 _HEADING_WIDTH = 30
 
 
-# Energies of no more than this share of the turnover are rounding.
+# Energies of no more than this share of the turnover are rounding, and coordinates up to this [m].
 ROUNDING = 1e-12
 
 
+def _format(value: float, form: str) -> str:
+    """A number; 0 where it is zero, and no sign before zeros that it is rounded to."""
+    text = format(value, form)
+    if value == 0.0:
+        return "0"
+    return text.removeprefix("-") if float(text) == 0.0 else text
+
+
 def _number(value: Any, scale: float = 1.0, digits: int = 4) -> str:
-    return "–" if value is None else f"{value * scale:.{digits}g}"
+    return "–" if value is None else _format(value * scale, f".{digits}g")
 
 
 def _deepest(summary: Summary) -> str | None:
@@ -50,23 +61,27 @@ def _least_load(summary: Summary) -> float | None:
     return None if loads is None else min(loads.values())
 
 
-def _impact_loss(summary: Summary) -> float | None:
-    """What impacts took [J], 0 where that is rounding beside the energy turned over."""
-    loss: float | None = summary.get("impact_loss_J")
-    return 0.0 if loss and abs(loss) <= ROUNDING * summary.get("energy_turnover_J", 0.0) else loss
+def _energy(key: str) -> Callable[[Summary], float | None]:
+    """An energy of a summary [J], 0 where it is rounding beside the energy turned over."""
+
+    def take(summary: Summary) -> float | None:
+        energy: float | None = summary.get(key)
+        return 0.0 if energy and abs(energy) <= ROUNDING * summary.get("energy_turnover_J", 0.0) else energy
+
+    return take
 
 
 # Heading, and how to take it from a summary. A row is left out when no run has it.
 _ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = (
-    ("electrical energy [J]", lambda s: s.get("electrical_energy_J"), _number),
-    ("  from one supply [J]", lambda s: s.get("electrical_energy_supply_J"), _number),
-    ("  from a supply each [J]", lambda s: s.get("electrical_energy_drawn_J"), _number),
-    ("mechanical work [J]", lambda s: s.get("mechanical_work_J"), _number),
-    ("Joule heat [J]", lambda s: s.get("joule_heat_J"), _number),
-    ("friction heat [J]", lambda s: s.get("friction_heat_J"), _number),
-    ("impact loss, all contacts [J]", _impact_loss, _number),
+    ("electrical energy [J]", _energy("electrical_energy_J"), _number),
+    ("  from one supply [J]", _energy("electrical_energy_supply_J"), _number),
+    ("  from a supply each [J]", _energy("electrical_energy_drawn_J"), _number),
+    ("mechanical work [J]", _energy("mechanical_work_J"), _number),
+    ("Joule heat [J]", _energy("joule_heat_J"), _number),
+    ("friction heat [J]", _energy("friction_heat_J"), _number),
+    ("impact loss, all contacts [J]", _energy("impact_loss_J"), _number),
     ("stop loss [J]", lambda s: s.get("stop_loss_J") or None, _number),
-    ("taken by time steps [J]", lambda s: s.get("scheme_loss_J"), _number),
+    ("taken by time steps [J]", _energy("scheme_loss_J"), _number),
     ("hand error, rms [mm]", lambda s: s.get("hand_error_rms_m"), lambda v: _number(v, 1e3)),
     ("  max [mm]", lambda s: s.get("hand_error_max_m"), lambda v: _number(v, 1e3)),
     ("  vertical, rms [mm]", lambda s: s.get("hand_error_z_rms_m"), lambda v: _number(v, 1e3)),
@@ -87,8 +102,8 @@ _ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = 
     ("  whole run", _base("tip_margin_min"), _margin),
     ("  tips over at [s]", _base("overturns_settled_at_s"), lambda v: _number(v, digits=3)),
     ("least load, wheels, caster [N]", _least_load, lambda v: _number(v, digits=3)),
-    ("ledger residual, relative", lambda s: s.get("energy_residual_relative"), lambda v: f"{v:.1e}"),
-    ("constraint drift [m]", lambda s: s.get("constraint_drift_max_m"), lambda v: f"{v:.1e}"),
+    ("ledger residual, relative", lambda s: s.get("energy_residual_relative"), lambda v: _format(v, ".1e")),
+    ("constraint drift [m]", lambda s: s.get("constraint_drift_max_m"), lambda v: _format(v, ".1e")),
     ("integrated by", lambda s: s.get("method"), str),
     ("integration [s]", lambda s: s.get("integration_wall_s"), lambda v: f"{v:.3f}"),
     ("times real time", lambda s: s.get("real_time_factor"), lambda v: f"{v:.0f}"),
@@ -151,26 +166,37 @@ def _print_columns(console: Console, summaries: Mapping[str, Summary], names: Se
     console.print(table)
 
 
-def print_choices(console: Console) -> None:
+def print_choices(console: Terminal) -> None:
     """Shipped scenarios and the members of every family, with the first line of what they say of themselves."""
     from dynsim.families import FAMILIES, member, members
     from dynsim.scenario import load_scenario, shipped_scenarios, variant_names
 
-    table = Table(title="scenarios", box=box.SIMPLE_HEAD, title_justify="left")
-    table.add_column("name", no_wrap=True)
-    table.add_column("variants")
-    table.add_column("what")
+    scenarios = []
     for path in shipped_scenarios():
         description = load_scenario(path).config.description
         sentence = re.split(r"(?<!et al)\.\s", description, maxsplit=1)[0].strip().removesuffix(".")
-        table.add_row(escaped_line(path.stem), escaped_line(", ".join(variant_names(path))), escaped_line(sentence))
-    console.print(table)
+        scenarios.append((path.stem, ", ".join(variant_names(path)), sentence))
+    _print_choice(console, "scenarios", scenarios, ("name", "variants", "what"))
     for family in FAMILIES:
-        table = Table(title=f"{family}s", box=box.SIMPLE_HEAD, show_header=False, title_justify="left")
-        for name in members(family):
-            first = (member(family, name).__doc__ or "").strip().partition("\n")[0]
-            table.add_row(escaped_line(name), escaped_line(first))
-        console.print(table)
+        firsts = [(name, (member(family, name).__doc__ or "").strip().partition("\n")[0]) for name in members(family)]
+        _print_choice(console, f"{family}s", firsts)
+
+
+def _print_choice(
+    console: Terminal, title: str, rows: Sequence[tuple[str, ...]], headings: tuple[str, ...] = ()
+) -> None:
+    """A table on a terminal; lines with tabs for programs."""
+    if console.unbounded:
+        lines = ["\t".join(plain(cell).replace("\n", "\\n") for cell in row) for row in [(title,), *rows, ()]]
+        # Not by the console, which would write the tabs out.
+        print("\n".join(lines), file=console.file)
+        return
+    table = Table(title=title, box=box.SIMPLE_HEAD, show_header=bool(headings), title_justify="left")
+    for k, heading in enumerate(headings):
+        table.add_column(heading, no_wrap=k == 0)
+    for row in rows:
+        table.add_row(*map(escaped_line, row))
+    console.print(table)
 
 
 def print_starts(console: Console, starts: Mapping[str, Start]) -> None:
@@ -179,8 +205,8 @@ def print_starts(console: Console, starts: Mapping[str, Start]) -> None:
     Then how far contacts are from their surfaces, joints that on_surface has moved, and the margin of a base at rest.
     """
     for variant, start in starts.items():
-        values = {"hand": f"{start.hand.tolist()}"}
-        values |= {f"contact {name}": f"{point.tolist()}" for name, point in start.contacts.items()}
+        values = {"hand": f"{_coordinates(start.hand)}"}
+        values |= {f"contact {name}": f"{_coordinates(point)}" for name, point in start.contacts.items()}
         values |= {f"gap of {name}": f"{gap:+.4g} m" for name, gap in start.gaps.items()}
         for joint, (to, was, unit) in start.solved.items():
             values[joint] = f"{to!r} {unit}, by on_surface; was {was:.6g}"
@@ -196,6 +222,11 @@ def print_starts(console: Console, starts: Mapping[str, Start]) -> None:
             lines += [f"    not on their surfaces; they would be with  {start.aloft}"]
         console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
         _print_warnings(console, {variant: {"warnings": start.warnings}})
+
+
+def _coordinates(point: NDArray[np.float64]) -> list[float]:
+    """Coordinates [m]; 0.0 for what is rounding of zero, the others read back to the same doubles."""
+    return [0.0 if abs(x) <= ROUNDING else x for x in point.tolist()]
 
 
 def _pulling(contact: Summary) -> str:
@@ -216,9 +247,9 @@ def _is_real(contact: Summary) -> bool:
 
 # Heading, how to show it, and whether it is said of contacts of the bilateral (False) or unilateral law (True) only.
 _CONTACT_ROWS: tuple[tuple[str, Callable[[Summary], str], bool | None], ...] = (
-    ("force, mean [N]", lambda c: f"{c['normal_force_mean_N']:.2f}", None),
-    ("  min [N]", lambda c: f"{c['normal_force_min_N']:.2f}", None),
-    ("  max [N]", lambda c: f"{c['normal_force_max_N']:.2f}", None),
+    ("force, mean [N]", lambda c: _format(c["normal_force_mean_N"], ".2f"), None),
+    ("  min [N]", lambda c: _format(c["normal_force_min_N"], ".2f"), None),
+    ("  max [N]", lambda c: _format(c["normal_force_max_N"], ".2f"), None),
     ("  pulling [% of time]", _pulling, False),
     ("  closed [% of time]", _percent("closed_fraction"), True),
     ("  sticking [% of time]", _percent("sticking_fraction"), True),

@@ -47,11 +47,14 @@ class Terminal(Console):
     """
 
     @property
+    def unbounded(self) -> bool:
+        """A file or a pipe, of which nobody has said how wide it is."""
+        return not self.is_terminal and self._width is None
+
+    @property
     def size(self) -> ConsoleDimensions:
         """That of the terminal or of COLUMNS; without either lines end where they end."""
-        if self.is_terminal or self._width is not None:
-            return super().size
-        return ConsoleDimensions(UNBOUNDED, super().size.height)
+        return ConsoleDimensions(UNBOUNDED, super().size.height) if self.unbounded else super().size
 
     @size.setter
     def size(self, new_size: tuple[int, int]) -> None:

@@ -1,4 +1,4 @@
-"""Continuous voltage PD on joint references ([WM] eq 56): u = k_p (q_d − q) + k_d (v_d − v)."""
+"""Continuous voltage PD on joint references (Wang and Minami, eq 56): u = k_p (q_d − q) + k_d (v_d − v)."""
 
 from __future__ import annotations
 

@@ -44,7 +44,9 @@ Speed = Annotated[float, typer.Option("--speed", help="1 is the record's own tim
 ReplayPort = Annotated[str, typer.Option("--port", help="Serial device, or 'virtual' for servos in memory.")]
 PolicyOption = Annotated[Policy | None, typer.Option("--policy", help="On a fault; default: the map's.")]
 Live = Annotated[bool, typer.Option("--live", help="Really move; a real port is a dry run without.")]
-Yes = Annotated[bool, typer.Option("--yes", help="Do not ask before moving.")]
+Yes = Annotated[
+    bool, typer.Option("--yes", help="Do not ask before moving; a start beyond safety.start_distance is still asked.")
+]
 Configure = Annotated[bool, typer.Option("--configure", help="Write differing EEPROM settings.")]
 Faults = Annotated[Path | None, typer.Option("--faults", help="Fault script for virtual servos.")]
 
@@ -124,8 +126,8 @@ def _compare_with_map(found: list[Any], servo_map: Any) -> None:
 @hw.command(epilog="Example: dynsim hw check results/elbow_comparison/two_elbows/record.h5 --map arm")
 def check(record: RecordFile, map_file: MapFile, rate: Rate = None, speed: Speed = 1.0) -> None:
     """Check a whole record against a robot's limits; needs no port."""
-    _, _, motion = _checked(record, map_file, rate, speed)
-    _print_check(motion)
+    _, servo_map, motion = _checked(record, map_file, rate, speed)
+    _print_check(motion, servo_map)
 
 
 def _checked(record_file: Path, map_file: Path, rate: float | None, speed: float) -> tuple[Any, Any, Any]:
@@ -137,7 +139,7 @@ def _checked(record_file: Path, map_file: Path, rate: float | None, speed: float
     return record, servo_map, check_motion(record, servo_map, rate=rate, speed=speed)
 
 
-def _print_check(motion: Any) -> None:
+def _print_check(motion: Any, servo_map: Any) -> None:
     table = Table("joint", "quantity", "tightest", "limit", "margin", "at [s]")
     for margin in motion.margins:
         table.add_row(
@@ -156,6 +158,9 @@ def _print_check(motion: Any) -> None:
         f"check passed: {motion.duration:.2f} s at {plan.rate:g} Hz, "
         f"{plan.cycle_time * 1e3:.2f} of {1e3 / plan.rate:.2f} ms a cycle on the bus"
     )
+    if tightest := motion.tightest(servo_map):
+        margin, part = tightest
+        console.print(f"tightest: {margin}, {100 * part:.0f} % left")
 
 
 @hw.command(epilog="Example: dynsim hw replay results/elbow_comparison/two_elbows/record.h5 --map arm --port virtual")
@@ -245,14 +250,20 @@ def print_timing(result: Any) -> None:
 
 
 @hw.command(epilog="Example: dynsim hw recover results/arm_replay")
-def recover(folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of a replay whose process died.")]) -> None:
+def recover(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of a replay whose process died.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="For record and summary, FOLDER stays as it is; default: FOLDER.")
+    ] = None,
+) -> None:
     """Make a measured record, marked incomplete, of the cycles that a replay had written when it died."""
     from dynsim.hardware.replay import recover as recovery
     from dynsim.hardware.replay.folder import MEASURED
 
-    record = recovery.recover(folder)
+    record = recovery.recover(folder, out)
     span = f", {record.time[0]:.2f} to {record.time[-1]:.2f} s" if len(record) else ""
-    console.print(f"{len(record)} cycles{span}{'' if record.complete else ', incomplete'}: {folder / MEASURED}")
+    state = "complete" if record.complete else "incomplete"
+    console.print(f"{len(record)} cycles{span}, {state}: {(out or folder) / MEASURED}")
 
 
 @hw.command(

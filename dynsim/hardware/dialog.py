@@ -50,7 +50,9 @@ def confirm_replay(
         console.print(f"furthest from its start: {distance}")
     agreed = not asked or _agreed(console, CLEAR, "move?")
     if agreed and way.far:
-        console.print(f"further than safety.start_distance, {servo_map.safety.start_distance:g} rad, from their start:")
+        still = "" if asked else " (asked with --yes too)"
+        bound = servo_map.safety.start_distance
+        console.print(f"further than safety.start_distance, {bound:g} rad, from their start{still}:")
         for distance in way.far:
             console.print(f"  {distance}")
         agreed = _agreed(console, "All joints go there in step: is the whole way free?", "move there?")

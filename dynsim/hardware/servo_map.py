@@ -33,6 +33,7 @@ from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.safety import Bus, Safety, objections_to_times
 from dynsim.hardware.strict_yaml import Finite, Positive, Within, read_yaml
 from dynsim.inputs import is_file
+from dynsim.problems import suggest
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent / "scenarios" / "hardware"
@@ -214,7 +215,8 @@ class _MapFile(StrictModel):
         follower: dict[tuple[str, str], str] = {}
         for joint, entry in self.servos.items():
             if entry.kind not in self.kinds:
-                raise error_at(f"servos.{joint}.kind", f"is not one of {', '.join(self.kinds)}")
+                like = suggest(entry.kind, self.kinds)
+                raise error_at(f"servos.{joint}.kind", f"is not one of {', '.join(self.kinds)}{like}")
             if entry.id in owner:
                 raise error_at(f"servos.{joint}.id", f"is also the ID of {owner[entry.id]}")
             owner[entry.id] = joint

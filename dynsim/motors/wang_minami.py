@@ -1,4 +1,4 @@
-"""The joint motors of Wang and Minami's arm ([WM] section IV: "actual motor's specifications"); no voltage limit."""
+"""The joint motors of Wang and Minami's arm (their section IV, "actual motor's specifications"); no voltage limit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An arm on a base with two driven wheels and a caster, which rolls without slip ([WM] II.E, eqs 36–50)."""
+"""An arm on a base with two driven wheels and a caster, which rolls without slip (Wang and Minami II.E, eqs 36–50)."""
 
 from __future__ import annotations
 

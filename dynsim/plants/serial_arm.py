@@ -1,4 +1,4 @@
-"""A serial chain of links on a fixed base; each joint may have a motor ([WM] section IV)."""
+"""A serial chain of links on a fixed base; each joint may have a motor (Wang and Minami, section IV)."""
 
 from __future__ import annotations
 

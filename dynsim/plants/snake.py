@@ -1,4 +1,4 @@
-"""Articulated mobile robot that raises its head: T2 Snake-3 by default ([T] Table I, section IV.A).
+"""Articulated mobile robot that raises its head: T2 Snake-3 by default (Tanaka et al. 2019, Table I).
 
 [T]: M. Tanaka et al., "Task-Space Control of Articulated Mobile Robots With a Soft Gripper for Operations", IEEE
 Transactions on Robotics 35(1), 2019. Values that [T] does not give are marked "assumed".

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -267,7 +268,7 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(tmp_path: Path):
 
 
 def test_check_prints_positions_that_can_be_copied_into_a_surface(tmp_path: Path):
-    """What is printed reads back to the same doubles, and the surface through it is accepted."""
+    """What is printed reads back to the same doubles, but for rounding of zero; the surface through it is accepted."""
     scenario = load_scenario("elbow_comparison", "two_elbows")
     start = check(scenario)
     model, robot = build_model(scenario), build.robot(scenario)
@@ -278,7 +279,7 @@ def test_check_prints_positions_that_can_be_copied_into_a_surface(tmp_path: Path
         "elbow_comparison: ok (4 variants)",
         "  two_elbows, at the start [m]:",
         f"    hand             {start.hand.tolist()}",
-        f"    contact elbow_4  {start.contacts['elbow_4'].tolist()}",
+        f"    contact elbow_4  {[*start.contacts['elbow_4'].tolist()[:2], 0.0]}",
     ]
     assert [line.split(",")[0] for line in shown if "at the start" in line][1:4] == [
         "  elbow_7", "  elbow_4", "  no_elbow",
@@ -321,6 +322,20 @@ def test_check_says_where_it_starts_before_it_refuses(tmp_path: Path):
     moved = [" ".join(line.split()) for line in solved.stdout.splitlines() if "by on_surface; was" in line]
     assert len(moved) % 4 == 0
     assert len(set(moved)) == len(moved) // 4 > 0
+
+
+def test_a_list_in_a_pipe_is_lines_with_tabs_and_names_papers(tmp_path: Path):
+    environment = {name: value for name, value in os.environ.items() if name != "COLUMNS"}
+    listed = dynsim("list", folder=tmp_path, env=environment).stdout
+    lines = listed.splitlines()
+    assert lines[0] == "scenarios"
+    row = next(line for line in lines if line.startswith("bouncing_link")).split("\t")
+    assert row[:2] == ["bouncing_link", "half, dead, lively"]
+    assert all(line == line.rstrip() and "  " not in line for line in lines)
+    assert "[" not in re.sub(r"\[(m|rad)\]", "", listed), "a paper is named"
+    assert "(Wang and Minami, section IV)" in listed
+    wide = dynsim("list", folder=tmp_path, env=environment | {"COLUMNS": "90"}).stdout
+    assert max(map(len, wide.splitlines())) <= 90
 
 
 def test_list_check_schema_and_version(tmp_path: Path):

@@ -9,11 +9,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from random import Random
 
-KINDS = ("scenario", "override", "servo_map", "urdf", "csv_path", "record")
+KINDS = ("scenario", "override", "servo_map", "urdf", "csv_path", "record", "terrain", "sweep", "faults")
 # The file of each kind that is broken.
 MAIN = {
     "scenario": "scenario.yaml", "override": "scenario.yaml", "servo_map": "map.yaml", "urdf": "robot.urdf",
-    "csv_path": "path.csv", "record": "record.h5",
+    "csv_path": "path.csv", "record": "record.h5", "terrain": "heights.csv", "sweep": "out/runs.jsonl",
+    "faults": "faults.yaml",
 }  # fmt: skip
 # What may stand in its place, and how often: no input may block or never end.
 NO_FILES = ("pipe", "folder", "nothing", "link to /dev/zero", "link to /dev/null", "link to itself", "unreadable")

@@ -27,18 +27,20 @@ from typing import Any
 
 from fuzz import broken
 from fuzz.case import SHIPPED, Draft, draw, put
+from fuzz.inputs.sweep import forget_commit
 from fuzz.readings import Unreadable
 
 OK, REFUSED, INTERRUPTED = "ok", "refused", "interrupted"
-TRACEBACK, HANG, CRASH, LOSS, MESSAGE, FILES = (
+TRACEBACK, HANG, CRASH, LOSS, MESSAGE, FILES, NUMBERS = (
     "traceback",
     "hang",
     "crash",
     "silent loss",
     "unclear error",
     "files changed",
+    "not finite",
 )
-FAILURES = (TRACEBACK, HANG, CRASH, LOSS, MESSAGE, FILES)
+FAILURES = (TRACEBACK, HANG, CRASH, LOSS, MESSAGE, FILES, NUMBERS)
 READY = "ready"
 # What a worker may use on top of what it has after loading everything [bytes].
 MEMORY = 4 << 30
@@ -73,7 +75,10 @@ def run_case(case: Draft, folder: Path, limit: float) -> Outcome:
         if ended.outcome in FAILURES:
             return ended
         after = _snapshot(folder)
-        reads_only = ended.outcome != OK or command[0] in ("check", "hw")
+        replays = command[:2] == ["hw", "replay"]
+        reads_only = (
+            (ended.outcome != OK and not replays) or command[0] == "check" or (command[0] == "hw" and not replays)
+        )
         if reads_only and "marked incomplete" not in ended.detail and before != after:
             changed = sorted(name for name in {*before, *after} if before.get(name) != after.get(name))
             return Outcome(
@@ -83,12 +88,24 @@ def run_case(case: Draft, folder: Path, limit: float) -> Outcome:
             return Outcome(FILES, f"{command[0]} left {left[0]}", command[0], ended.detail)
         if ended.outcome != OK:
             break
+        if command[0] == "run" and (wrong := _not_finite(folder / "out" / "record.h5")):
+            return Outcome(NUMBERS, f"{wrong} is not finite", command[0], ended.detail)
     if case.losses is not None:
         lost = _losses(case, folder, limit)
         if lost.outcome in FAILURES:
             return lost
         ended.compared = lost.compared
     return ended
+
+
+def _not_finite(path: Path) -> str:
+    """The first signal of a run that went well with a value that is no number, but for those that have none."""
+    import numpy as np
+
+    from dynsim.record import Record
+
+    record = Record.load(path)
+    return next((name for name in record if np.isinf(record[name]).any()), "")
 
 
 def _run_command(command: list[str], folder: Path, limit: float) -> Outcome:
@@ -127,7 +144,7 @@ def _judge(command: list[str], code: Any, out: str, err: str) -> Outcome:
         wrong = f"control characters {strange!r} reach the terminal"
     elif code == 0 and errors:
         wrong = "an error with exit code 0"
-    elif code != 0 and code not in (2, 3):
+    elif code != 0 and code not in ((1, 2, 3, 4) if command[:2] == ["hw", "replay"] else (2, 3)):
         wrong = f"exit code {code!r}"
     elif code != 0 and len(errors) != 1:
         wrong = f"{len(errors)} lines of error:"
@@ -297,6 +314,7 @@ def _load_everything(records: Path) -> None:
     from dynsim.engine import simulate
     from dynsim.scenario import load_scenario
 
+    forget_commit()
     for name in ("single_pendulum", "elbow_comparison", "snake_positioning"):
         simulate(load_scenario(name, None, {"duration_s": 0.01, "metrics.settle_s": 0}))
 

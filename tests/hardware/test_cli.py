@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -43,7 +44,10 @@ def test_check_replay_compare_on_virtual_servos(call, files: Path) -> None:
     record, map_ = files / "record.h5", files / "rig.yaml"
     code, out, _ = call("hw", "check", record, "--map", map_)
     assert code == 0
-    assert "check passed" in out
+    *_, passed, tightest = out.splitlines()
+    assert passed.startswith("check passed")
+    # The wheel at 3 of 5 rad/s and joints at 0.6 of 1.05 rad leave two fifths, joints at 0.6 · 4 of 3 rad/s one.
+    assert re.fullmatch(r"tightest: \w+: velocity -?2\.[34]\d+ rad/s .*, limit 3\.0000 rad/s, .*, 2\d % left", tightest)
     code, out, _ = call("hw", "replay", record, "--map", map_, "--port", "virtual", "--out", files / "out")
     assert code == 0
     assert {path.name for path in (files / "out").iterdir()} == {

@@ -36,6 +36,19 @@ def test_a_servo_that_is_not_there_is_refused_with_the_line_and_those_that_are(s
     assert len(load_fault_script(script).faults) == 3, "for anybody"
 
 
+def test_a_misspelt_kind_is_told_as_such(tmp_path: Path) -> None:
+    path = tmp_path / "faults.yaml"
+    path.write_text("faults:\n  - {kind: stuk, id: 2}\n  - {kid: stuck, id: 2}\n", encoding="utf-8")
+    with pytest.raises(ServoMapError) as error:
+        load_fault_script(path)
+    first, second = str(error.value).split("; /")
+    assert first.startswith(f"{path}:2: faults.0.kind: unknown kind 'stuk'; did you mean 'stuck'?; known: lost_status")
+    assert f"/{second}" == f"{path}:3: faults.1.kid: unknown key; did you mean 'kind'?"
+    path.write_text("faults: [{kind: stuck, id: 2, att: 1}]", encoding="utf-8")
+    with pytest.raises(ServoMapError, match=r"faults\.0\.att: unknown key; did you mean 'at'\?$"):
+        load_fault_script(path)
+
+
 @pytest.mark.parametrize("command", ["virtual", "replay"])
 def test_the_commands_refuse_it_before_anything_starts(script: Path, map_file: Path, command: str) -> None:
     from .conftest import swing

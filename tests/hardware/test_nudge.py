@@ -233,6 +233,7 @@ def test_a_replay_asks_with_the_way_to_its_start_and_again_where_it_is_far(
     assert f"furthest from its start: shoulder {abs(now - start):.2f}" in out
     assert f"after {1.875 * abs(now - start) / 0.3:.1f} s to the start" in out
     assert ("further than safety.start_distance, 0.5 rad" in out) is (far and (not asked or answers[0] == "y"))
+    assert ("(asked with --yes too)" in out) is (far and not asked)
 
 
 def test_who_does_not_answer_is_named_before_anything_is_asked(on_the_rig, rig) -> None:

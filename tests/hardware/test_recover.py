@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from dynsim.errors import RecordError
-from dynsim.hardware.errors import PortError, ReplayAborted
+from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted
 from dynsim.hardware.replay import session, stream
 from dynsim.hardware.replay.folder import move_away
 from dynsim.hardware.replay.loop import Loop
@@ -248,6 +248,47 @@ def test_the_end_that_a_replay_has_told_is_kept(rig: Rig, tmp_path: Path, monkey
     assert summary["recovered"]
     assert summary["timing"]["cycles"] == len(recovered)
     assert Record.load(tmp_path / "measured.h5").summary["servos"] == told["servos"]
+
+
+def test_a_complete_record_is_not_called_failed(rig: Rig, tmp_path: Path, monkeypatch) -> None:
+    """What it replaces cannot be removed, or was not written."""
+
+    unlink = Path.unlink
+
+    def refuse(self: Path, missing_ok: bool = False) -> None:
+        if self.name == PART:
+            raise PermissionError(13, "Permission denied")
+        unlink(self, missing_ok)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", refuse)
+        with pytest.raises(OutputsFailed) as error:
+            replay(rig, tmp_path / "left")
+    assert "removal of measured.part failed: [Errno 13]" in str(error.value)
+    assert str(error.value).endswith(f"{tmp_path / 'left' / 'measured.h5'} is complete")
+    assert "recover" not in str(error.value)
+    summary = json.loads((tmp_path / "left/summary.json").read_text(encoding="utf-8"))
+    assert summary["outputs_failed"].keys() == {"removal of measured.part"}
+    assert summary["timing"]["cycles"] == len(Record.load(tmp_path / "left/measured.h5"))
+    with monkeypatch.context() as patch:
+        patch.setattr(stream.RowStream, "pump", no_room)
+        with pytest.raises(OutputsFailed, match=r"streamed record failed: .*; .*measured\.h5 is complete$"):
+            replay(rig, tmp_path / "streamed")
+    assert recover(tmp_path / "left").complete
+
+
+def test_what_is_recovered_may_go_elsewhere(streamed, tmp_path: Path) -> None:
+    source, out = tmp_path / "died", tmp_path / "new" / "folder"
+    source.mkdir()
+    (source / PART).write_bytes(streamed[1])
+    same(streamed[0], recover(source, out), len(streamed[0]))
+    assert [path.name for path in source.iterdir()] == [PART]
+    assert not Record.load(out / "measured.h5").complete
+    assert {path.name for path in out.iterdir()} == {"measured.h5", "summary.json"}
+    before = (out / "measured.h5").read_bytes()
+    with pytest.raises(RecordError, match=r"has measured\.h5, summary\.json already; give another folder \(--out\)"):
+        recover(source, out)
+    assert (out / "measured.h5").read_bytes() == before
 
 
 def test_a_summary_that_was_cut_off_says_nothing(streamed, tmp_path: Path) -> None:

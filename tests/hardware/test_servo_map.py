@@ -63,7 +63,7 @@ MISTAKES = [
     (
         "kind: wheel, id: 7",
         "kind: whel, id: 7",
-        r"servos.wheel.kind = .whel.: is not one of joint, wheel",
+        r"servos.wheel.kind = .whel.: is not one of joint, wheel; did you mean .wheel.\?",
     ),
     ("baud: 1000000", "baud: 1234", r"map.yaml:2: bus.baud = 1234: is not one of 9600, 57600"),
     ("[-60, 60]", "[60, -60]", r"map.yaml:\d+: kinds.joint.limits.position_deg: 60.0 is not below -60.0"),

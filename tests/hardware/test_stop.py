@@ -134,6 +134,9 @@ def test_second_ctrl_c_during_the_controlled_stop_releases_at_once(rig) -> None:
     result = run.replay.run()
     assert result.end_state == "off"
     assert not any(servo["torque_enable"] for servo in run.line.servos.registers.values())
+    run.line.advance(run.line.time + 2 * run.map.safety.watchdog)
+    left = [servo["bus_watchdog"] for servo in run.line.servos.registers.values()]
+    assert left == [0, 0, 0], "the next one finds goals that can be written"
     last_goal = max(time for time, _, _ in run.goals())
     assert min(broadcast_torque_off(run)) > last_goal
     assert last_goal - result.fault_time < run.map.safety.stop_time / 2

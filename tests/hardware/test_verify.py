@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
+import select
+import time
 
 import pytest
 
 from dynsim.hardware.bus.control_table import OperatingMode
+from dynsim.hardware.bus.dynamixel_bus import READ_WAIT, SerialPort
 from dynsim.hardware.replay.rules import Cause
+from dynsim.hardware.replay.states import State
 
 
 @pytest.mark.parametrize(
@@ -55,6 +60,45 @@ def test_a_silent_servo_comes_with_a_hint_at_protocol_1(rig) -> None:
     result = run.replay.run()
     assert "elbow: ID 2: no answer" in result.fault.text
     assert "Protocol 1 firmware does not answer" in result.fault.text
+
+
+BUSY = "run 80 ms too late while it waited for answers: the computer is too slow or too busy; close other programs"
+
+
+@pytest.mark.parametrize("pause", [0.0, 0.08])
+@pytest.mark.parametrize(
+    ("fault", "state", "text"),
+    [
+        ({"kind": "drop_off", "id": 2}, State.VERIFY, "elbow: ID 2: no answer"),
+        ({"kind": "lost_status", "id": 2, "probability": 0.9}, State.VERIFY, "2"),
+        ({"kind": "drop_off", "id": 2, "at": 0.0}, State.ARM, "ID 2: no answer"),
+    ],
+)
+def test_an_answer_that_is_missing_on_a_busy_computer_says_so(rig, fault, state, text, pause: float) -> None:
+    run = rig.prepare(fault)
+    run.replay.bus.port.longest_pause = pause
+    result = run.replay.run()
+    assert (result.fault_state, text in result.fault.text) == (state, True)
+    assert (BUSY in result.fault.text) == bool(pause)
+
+
+def test_other_troubles_do_not_blame_the_computer(rig) -> None:
+    run = rig.prepare({"kind": "wrong_model", "id": 1, "value": 12})
+    run.replay.bus.port.longest_pause = 0.08
+    assert "too busy" not in run.replay.run().fault.text
+
+
+def test_a_port_knows_how_late_it_was_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    master, slave = os.openpty()
+    port = SerialPort(os.ttyname(slave))
+    port.setBaudRate(1_000_000)
+    wait = select.select
+    monkeypatch.setattr(select, "select", lambda *asked: (time.sleep(0.03), wait(*asked))[1])
+    assert port.readPort(1) == b""
+    assert port.longest_pause >= 0.03 - READ_WAIT
+    port.closePort()
+    os.close(master)
+    os.close(slave)
 
 
 def test_too_low_a_supply_is_reported(rig) -> None:

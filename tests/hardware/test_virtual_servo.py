@@ -246,6 +246,23 @@ def test_a_loss_of_the_supply_leaves_servos_limp_and_started_anew() -> None:
     assert bus.read(1, F["present_voltage"]) == 120
 
 
+@pytest.mark.parametrize(("drop", "dies"), [(5.9, False), (6.1, True)])
+def test_servos_die_below_six_volts_and_start_anew_above(drop: float, dies: bool) -> None:
+    """Whoever is silent draws nothing; with the supply back they are limp, as after any start."""
+    line = scripted_line({"kind": "voltage_sag", "drop": drop, "at": 0.5, "duration": 0.5})
+    write(line, 1, "torque_enable", 1)
+    line.advance(0.7)
+    assert line.servos.listens(1) != dies
+    assert line.servos.registers[1]["torque_enable"] == (not dies)
+    line.advance(0.9)
+    assert line.servos.listens(1) != dies, "a start cannot come to its end without volts"
+    line.advance(1.1 + BOOT_TIME)
+    assert line.servos.listens(1)
+    assert line.servos.registers[1]["torque_enable"] == (not dies)
+    line.servos.measure(0)
+    assert line.servos.registers[1]["present_voltage"] == 120
+
+
 def test_a_fault_in_a_long_silence_is_not_slept_over() -> None:
     """With torque off nothing moves and time passes in one step, but not past a loss of the supply."""
     line = scripted_line({"kind": "supply_loss", "at": 1.0})

@@ -235,6 +235,15 @@ def test_a_scenario_of_the_packages_own_members_looks_for_no_others(tmp_path: Pa
     assert (answer.stdout, answer.stderr) == ("looked for entry points\n", "")
 
 
+def test_the_page_shows_the_whole_project_file() -> None:
+    """With the build system, without which pip makes nothing of it."""
+    (block,) = re.findall(r"```toml\n(.*?)```", DOCS.read_text(encoding="utf-8"), flags=re.DOTALL)
+    shown = tomllib.loads(block)
+    assert shown == tomllib.loads((HERE / "pyproject.toml").read_text(encoding="utf-8"))
+    assert shown["build-system"]["build-backend"] == "hatchling.build"
+    assert "\npip install -e .\n" in DOCS.read_text(encoding="utf-8")
+
+
 @pytest.mark.parametrize("module", sorted(path.stem for path in (HERE / "example_parts").glob("[!_]*.py")))
 def test_the_documentation_shows_the_parts_as_they_are(module: str) -> None:
     """In full, without what comes before its first definition, or by the name of the file."""

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
+import pytest
 from ruamel.yaml import YAML
 
 import dynsim
@@ -32,7 +35,15 @@ def test_the_citation_is_of_this_version_and_names_both_papers() -> None:
         assert paper["title"] in " ".join((ROOT / "docs" / page).read_text(encoding="utf-8").split())
 
 
-def test_what_is_public_can_be_had_and_is_listed() -> None:
+def test_what_is_public_can_be_had_and_is_all_that_is_listed() -> None:
     for name in dynsim.__all__:
         assert getattr(dynsim, name) is not None
-        assert name in dir(dynsim)
+    assert dir(dynsim) == sorted(dynsim.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'viewer'"):
+        _ = dynsim.viewer
+
+
+def test_pages_films_and_braces_are_at_the_top_without_another_import() -> None:
+    code = "import dynsim; print(dynsim.view.write.__name__, dynsim.film.write.__name__, dynsim.Brace.__name__)"
+    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=120, check=False)
+    assert (done.stdout, done.stderr) == ("write write Brace\n", "")

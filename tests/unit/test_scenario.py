@@ -143,7 +143,23 @@ def test_all_unknown_keys_of_a_file_are_in_one_answer(tmp_path: Path):
         f"{path}:2: plant.chain.0.axs: unknown key; did you mean 'axis'?; "
         f"{path}:4: record.rate: unknown key; did you mean 'rate_hz'?; "
         f"{path}:3: integrater: unknown key; did you mean 'integrator'?; "
-        f"{path}:8: metrics.settle: unknown key; did you mean 'settle_s'? (and 1 more)"
+        f"{path}:8: metrics.settle: unknown key; did you mean 'settle_s'?; "
+        f"{path}:4: record.size_limit_GB = -1: must be greater than 0"
+    )
+
+
+def test_every_problem_is_told_with_its_place(tmp_path: Path):
+    text = MINIMAL.replace("axis: y", "axis: q, kind: prismatik, length_m: -1") + (
+        "surfaces:\n  floor: {typ: plane}\nintegrator: {rtol: x}\nrecord: {rate_hz: -1}\nmetrics: {settle_s: -1}\n"
+    )
+    path = write(tmp_path, text)
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(path)
+    assert str(caught.value) == (
+        f"{path}:2: plant.chain.0.kind = 'prismatik': must be 'revolute' or 'prismatic'; did you mean 'prismatic'?; "
+        f"{path}:2: plant.chain.0.axis = 'q': must be 'x', 'y' or 'z'; "
+        f"{path}:2: plant.chain.0.length_m = -1: must be greater than or equal to 0; "
+        f"{path}:4: surfaces.floor.typ: unknown key; did you mean 'type'?; and 3 more problems"
     )
 
 
@@ -303,7 +319,7 @@ def test_commands_that_no_snake_can_carry_out(command, expected):
     assert str(caught.value).startswith("overrides: controller.commands.1.")
     assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
-    assert "more)" not in str(caught.value)
+    assert "; overrides" not in str(caught.value), "one problem is told once"
 
 
 def test_an_unknown_mode_in_a_file_is_named_with_its_line(tmp_path: Path):

@@ -6,11 +6,12 @@ import io
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import dynsim
 from dynsim.record import Record
-from dynsim.tables import print_comparison, print_summary
+from dynsim.tables import print_comparison, print_starts, print_summary
 from dynsim.terminal import Terminal
 
 ARM = """\
@@ -60,6 +61,31 @@ def test_a_reference_beyond_a_stop_is_told(beyond: Record, tmp_path: Path) -> No
     assert first == pytest.approx(hit.time, abs=0.1)
     within = reached(tmp_path, 39.0)
     assert not any("reference" in text for text in within.summary["warnings"])
+
+
+def test_zeros_print_as_zeros() -> None:
+    summary = {
+        "scenario": "arm", "variant": "", "energy_turnover_J": 100.0, "electrical_energy_J": 3e-11,
+        "mechanical_work_J": -0.0, "friction_heat_J": 3e-10, "energy_residual_relative": 0.0,
+        "constraint_drift_max_m": 0.0,
+        "contacts": [{
+            "name": "elbow", "closed_fraction": 1.0, "pulling_fraction": 0.0, "normal_force_mean_N": -0.0,
+            "normal_force_min_N": -0.001, "normal_force_max_N": 0.004,
+        }],
+    }  # fmt: skip
+    numbers = [line.split()[-1] for line in shown({"": summary}).splitlines() if line.strip()]
+    assert numbers == ["arm", "0", "0", "3e-10", "0", "0", "0", "0.00", "0.00", "0"]
+
+
+def test_coordinates_that_are_rounding_of_zero_are_zero() -> None:
+    output = io.StringIO()
+    console = Terminal(file=output, emoji=False)
+    point = np.array([0.30000000000000004, -0.0, 5.781049840155092e-17])
+    print_starts(console, {"": dynsim.engine.Start(hand=point, contacts={"elbow": point[::-1]})})
+    assert output.getvalue().splitlines()[1:] == [
+        "    hand           [0.30000000000000004, 0.0, 0.0]",
+        "    contact elbow  [0.0, 0.0, 0.30000000000000004]",
+    ]
 
 
 def test_joint_stops_have_rows(beyond: Record, tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ import errno
 import os
 import select
 import termios
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -49,10 +50,17 @@ TORQUE_ENABLE = 64
 
 
 class SerialPort(PortHandler):
-    """The library's port, opened with a write time-out and (by default) for this process alone."""
+    """The library's port, opened with a write time-out and (by default) for this process alone.
+
+    Attributes
+    ----------
+    longest_pause : float
+        By which the system has run this process too late while it waited for a byte [s].
+    """
 
     def __init__(self, name: str, *, exclusive: bool = True) -> None:
         super().__init__(name)
+        self.longest_pause = 0.0
         self.is_open = False
         self.exclusive = exclusive
 
@@ -73,7 +81,9 @@ class SerialPort(PortHandler):
 
     def readPort(self, length: int) -> bytes:
         # A short wait instead of the library's busy loop: it leaves the processor to others.
+        began = time.monotonic()
         select.select([self.ser.fileno()], [], [], READ_WAIT)
+        self.longest_pause = max(self.longest_pause, time.monotonic() - began - READ_WAIT)
         try:
             return self.ser.read(length)
         except serial.SerialException as error:
@@ -177,6 +187,10 @@ class DynamixelBus:
         self.return_delay = return_delay
         self._library = Protocol2PacketHandler()
         self._marks: dict[tuple[str, int], Marks] = {}  # of sync reads by address, of single reads by ID
+
+    @property
+    def longest_pause(self) -> float:
+        return float(self.port.longest_pause)
 
     @property
     def name(self) -> str:

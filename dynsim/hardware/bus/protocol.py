@@ -58,6 +58,20 @@ class NoAnswer(Exception):
         self.garbled = garbled
 
 
+BUSY = 0.02
+"""A process that is run later than this while it waits is on a computer that is too busy [s]."""
+
+
+def too_busy(bus: Bus) -> str:
+    """What else than a servo may be the reason for a missing answer; empty where nothing shows it."""
+    if bus.longest_pause < BUSY:
+        return ""
+    return (
+        f"this program was run {bus.longest_pause * 1e3:.0f} ms too late while it waited for answers: the computer is "
+        "too slow or too busy; close other programs, or give the map a longer bus.latency"
+    )
+
+
 class RequestRefused(Exception):
     """A servo answered with an error code (:class:`dynsim.hardware.bus.packet.StatusError`)."""
 
@@ -68,7 +82,16 @@ class RequestRefused(Exception):
 
 
 class Bus(Protocol):
-    """A line with servos. Every method may raise PortError when the port itself is gone."""
+    """A line with servos. Every method may raise PortError when the port itself is gone.
+
+    Attributes
+    ----------
+    longest_pause : float
+        By which the system has run this process too late while it waited for answers [s].
+    """
+
+    @property
+    def longest_pause(self) -> float: ...
 
     def ping_all(self) -> dict[int, tuple[int, int]]:
         """Model number and firmware by ID of everything that answers a broadcast ping."""

@@ -147,6 +147,16 @@ class CheckedMotion:
     scene: Scene | None = None
     unmeasured: Record | None = None
 
+    def tightest(self, servo_map: ServoMap) -> tuple[Margin, float] | None:
+        """The margin that is the least part of its limit, of a position the half of its range, and that part."""
+        ranges = {servo.joint: servo.position_limits[1] - servo.position_limits[0] for servo in servo_map.servos}
+        parts = [
+            (one.margin / (0.5 * ranges[one.joint] if one.quantity == "position" else abs(one.limit)), one)
+            for one in self.margins
+        ]
+        part, margin = min(parts, key=lambda entry: entry[0], default=(math.inf, None))
+        return None if margin is None else (margin, part)
+
     @property
     def start(self) -> Array:
         """Posture in which it begins [rad], shape (N,)."""

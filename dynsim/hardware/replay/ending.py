@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -258,7 +259,7 @@ class Ending:
         return self._journal.say("servos that are on stay ON; `dynsim hw stop` releases them")
 
     def _release(self) -> None:
-        """Torque off by broadcast, until every servo confirms or REST_TIME is over. Raises PortError."""
+        """Torque off by broadcast, until all confirm or REST_TIME is over; then watchdogs off. Raises PortError."""
         loop, until = self._loop, self._loop.now() + REST_TIME
         self._released = True
         while True:
@@ -269,5 +270,10 @@ class Ending:
             if not still_on or loop.now() >= until:
                 break
             loop.pause(REST_TIME / 10)
+        # Of those that are off: a watchdog that trips later would leave goals read-only for whoever comes next.
+        for id_ in loop.map.ids:
+            if id_ not in still_on and health[id_]["bus_watchdog"]:
+                with suppress(NoAnswer, RequestRefused):
+                    loop.bus.write(id_, FIELDS["bus_watchdog"], 0)
         confirmed = f"; NOT confirmed by ID {', '.join(map(str, still_on))}" if still_on else ""
         self._journal.say(f"torque off{confirmed}")

@@ -18,7 +18,7 @@ import numpy as np
 from dynsim.files import write_json
 from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.bus.control_table import RAD_S2_PER_UNIT, RAD_S_PER_UNIT, WATCHDOG_SECONDS_PER_UNIT
-from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused
+from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused, too_busy
 from dynsim.hardware.errors import PortError
 from dynsim.hardware.replay.check import velocity_limit
 from dynsim.hardware.replay.end_state import AT_REST, read_health
@@ -136,7 +136,8 @@ class Replay:
             self._fault(Fault(Cause.PORT, str(error)))
         except (NoAnswer, RequestRefused) as error:
             cause = Cause.ARMING if self.journal.state == State.ARM else Cause.VERIFICATION
-            self._fault(Fault(cause, str(error), (error.id,)))
+            busy = too_busy(self.bus) if isinstance(error, NoAnswer) else ""
+            self._fault(Fault(cause, f"{error}{busy and '; '}{busy}", (error.id,)))
         except BaseException as error:
             # A robot with its torque on must not be left to itself, whatever went wrong.
             self._fault(Fault(Cause.PROGRAM, repr(error)))

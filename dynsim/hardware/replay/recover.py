@@ -22,35 +22,52 @@ from dynsim.record.scene import Scene
 END_STATE = "not known: the program died"
 
 
-def recover(folder: Path) -> Record:
+def recover(folder: Path, out: Path | None = None) -> Record:
     """Make ``measured.h5`` and ``summary.json`` of a ``measured.part`` that was left over, and remove that.
 
     The record is marked incomplete. A summary that is there is of the same replay, which ended, and could not write its
     record: what it says of the end is kept. A measured record that is already there is of the same replay too (what an
-    earlier one left is moved away before), and whole: it stays.
+    earlier one left is moved away before), and whole: it stays, and is all there is to do.
+
+    Parameters
+    ----------
+    out : folder for record and summary, where there is none yet; ``folder`` then stays as it is, and may be read-only
 
     Raises
     ------
     RecordError
-        There is no streamed record, it is empty or cannot be read, or its replay is still running; or the record cannot
-        be written.
+        There is neither a streamed nor a whole record, it is empty or cannot be read, or its replay is still running;
+        the record cannot be written, or ``out`` has one.
     """
     part = folder / PART
     try:
-        if not part.is_file():
-            raise RecordError(f"{folder}: no {PART} there: nothing to recover")
-        if is_held(part):
+        if part.is_file() and is_held(part):
             raise RecordError(f"{part}: the replay that writes it is still running")
-        record = _kept(folder / MEASURED)
+        record = whole = _kept(folder / MEASURED)
+        if not part.is_file() and not (whole and whole.complete):
+            raise RecordError(f"{folder}: no {PART} there: nothing to recover")
         if record is None:
             record = _read(part)
             record.summary |= {"end_state": END_STATE} | _summary(folder / SUMMARY) | {"recovered": True}
-            summary = json_text(record.summary).encode("utf-8")
-            replace_together(folder, {MEASURED: record.to_hdf5(), SUMMARY: summary})
-        part.unlink()
+        if out is not None:
+            _save(record, out, new=True)
+            return record
+        if whole is None:
+            _save(record, folder)
+        part.unlink(missing_ok=True)
     except OSError as error:
         raise RecordError(f"{part}: cannot be recovered ({error.strerror})") from error
     return record
+
+
+def _save(record: Record, folder: Path, *, new: bool = False) -> None:
+    """Record and summary; where they are to be ``new``, none may be there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    there = [name for name in (MEASURED, SUMMARY, PART) if new and (folder / name).exists()]
+    if there:
+        raise RecordError(f"{folder}: has {', '.join(there)} already; give another folder (--out)")
+    summary = json_text(record.summary).encode("utf-8")
+    replace_together(folder, {MEASURED: record.to_hdf5(), SUMMARY: summary})
 
 
 def _kept(measured: Path) -> Record | None:

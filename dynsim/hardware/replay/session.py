@@ -179,10 +179,16 @@ def _save(result: ReplayResult, folder: Path, failures: Failures) -> None:
                 SUMMARY: json_text(summary).encode(),
             }
             replace_together(folder, contents)
-            (folder / PART).unlink()
-            return
     except Exception as error:
         failures[RECORD] = error
+    if RECORD not in failures:
+        # The record is whole, whatever becomes of what it replaces.
+        try:
+            (folder / PART).unlink()
+        except OSError as error:
+            failures[f"removal of {PART}"] = error
+            _add_to_summary(folder, failures)
+        return
     # What happened to the robot is told even where there is no room for its record.
     try:
         write_json(folder / SUMMARY, result.summary() | {"outputs_failed": _named(failures)})
@@ -206,7 +212,9 @@ def raise_for(result: ReplayResult, folder: Path, failures: Failures) -> None:
     VerificationFailed, PortError, ReplayInterrupted, ReplayAborted, OutputsFailed
     """
     lost = _lost(failures)
-    if (folder / PART).exists():
+    if failures and RECORD not in failures:
+        lost += f"; {folder / MEASURED} is complete"
+    elif (folder / PART).exists():
         lost += f"; `dynsim hw recover {folder}` makes a record of what reached the disk"
     fault, state = result.fault, result.fault_state
     if fault is None or state is None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.hardware.bus.control_table import STATE_BLOCK
-from dynsim.hardware.bus.protocol import Bus
+from dynsim.hardware.bus.protocol import Bus, too_busy
 from dynsim.hardware.errors import VerificationFailed
 from dynsim.hardware.replay.motion import QUINTIC_PEAK
 from dynsim.hardware.servo_map import Servo, ServoMap
@@ -79,5 +79,8 @@ def read_ticks(bus: Bus, servos: list[Servo]) -> dict[int, int]:
             ticks[id_] = int.from_bytes(reply.data[6:10], "little", signed=True)
     silent = [f"{servo.joint} (ID {servo.id})" for servo in servos if servo.id not in ticks]
     if silent:
-        raise VerificationFailed(f"no answer from {', '.join(silent)}: check power, cable, ID and baud rate")
+        busy = too_busy(bus)
+        raise VerificationFailed(
+            f"no answer from {', '.join(silent)}: check power, cable, ID and baud rate{busy and '; '}{busy}"
+        )
     return ticks

@@ -13,7 +13,7 @@ from dynsim.hardware.bus.control_table import (
     OperatingMode,
     describe_hardware_error,
 )
-from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused
+from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused, too_busy
 from dynsim.hardware.replay.motion import Task
 from dynsim.hardware.replay.registers import LimitRow, compare_limits
 from dynsim.hardware.servo_map import Servo, ServoMap
@@ -87,6 +87,7 @@ def verify(
     """
     problems: list[str] = []
     rows: list[LimitRow] = []
+    silent = False
     present = bus.ping_all()
     poll()
     for id_, (model, firmware) in present.items():
@@ -98,6 +99,7 @@ def verify(
         try:
             registers = snapshot(bus, servo)
         except NoAnswer as missing:
+            silent = True
             hint = "two servos with this ID?" if missing.garbled or servo.id in present else ACKNOWLEDGE
             problems.append(f"{servo.joint}: {missing}; {hint}")
             continue
@@ -109,9 +111,10 @@ def verify(
             rows.append(compare_limits(servo, registers, servo_map.safety, needs))
             found += [*rows[-1].refused, *_out_of_place(servo, registers)]
         problems += [f"{servo.joint} (ID {servo.id}): {text}" for text in found]
-    if not problems:
-        problems += _trial_reads(bus, servo_map, poll)
-    return problems, rows
+    missed = [] if problems else _trial_reads(bus, servo_map, poll)
+    if (silent or missed) and (busy := too_busy(bus)):
+        missed.append(busy)
+    return problems + missed, rows
 
 
 def _unfit(servo: Servo, registers: Registers, servo_map: ServoMap) -> list[str]:

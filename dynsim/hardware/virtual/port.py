@@ -27,6 +27,7 @@ class VirtualPort(PortHandler):
         self.clock = clock
         self.baudrate = baud
         self.is_open = True
+        self.longest_pause = 0.0
         self.tx_time_per_byte = 1e3 / baud * 10.0
         self._arriving: deque[tuple[float, bytes]] = deque()
         self._input = bytearray()
@@ -68,7 +69,9 @@ class VirtualPort(PortHandler):
         if not self._input:
             time_out = (self.packet_start_time + self.packet_timeout) * 1e-3
             soon = max(self.clock.now(), time_out) + self.POLL
-            self.clock.sleep_until(min(soon, self._arriving[0][0]) if self._arriving else soon)
+            until = min(soon, self._arriving[0][0]) if self._arriving else soon
+            self.clock.sleep_until(until)
+            self.longest_pause = max(self.longest_pause, self.clock.now() - until)
             self._receive()
         data = bytes(self._input[:length])
         del self._input[:length]

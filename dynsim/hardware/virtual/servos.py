@@ -39,6 +39,8 @@ THERMAL_TIME = 300.0  # s (unverified)
 OVERLOAD_FRACTION = 0.9  # of stall torque (unverified)
 OVERLOAD_TIME = 1.0  # s (unverified)
 SUPPLY_RESISTANCE = 0.05  # Ω
+BROWN_OUT = 6.0
+"""Below this supply the servos' electronics stop, and start anew when it is back [V] (unverified)."""
 OVERHEATING, OVERLOAD, INPUT_VOLTAGE = 1 << 2, 1 << 5, 1 << 0
 
 
@@ -96,7 +98,7 @@ class VirtualServos:
         self.time = 0.0
         self.torque_since = math.inf
         self.dead: set[int] = set()
-        self._powered = True
+        self._powered = self._switched_on = True
         self._script = script
         count = len(self.ids)
         self.heard = np.zeros(count)
@@ -200,11 +202,19 @@ class VirtualServos:
 
     def set_power(self, *, on: bool) -> None:
         """Switch the supply of all servos; they start anew when it comes back."""
-        if on == self._powered:
-            return
-        self._powered = on
-        for id_ in self.ids:
-            self.reboot(id_)
+        if on != self._switched_on:
+            self._switched_on = on
+            self._feed(0.0)
+
+    def _feed(self, current: float) -> None:
+        """The supply under a current [A]: below BROWN_OUT all are silent and limp, above it they start anew."""
+        sag = sum(fault.drop for fault in self.active_faults() if isinstance(fault, VoltageSag))
+        self._drive.voltage = (self.supply - sag - SUPPLY_RESISTANCE * current) * self._switched_on
+        powered = self._drive.voltage >= BROWN_OUT
+        if powered != self._powered:
+            self._powered = powered
+            for id_ in self.ids:
+                self.reboot(id_)
 
     def forget_turns(self, index: int) -> None:
         """Count turns from here."""
@@ -250,8 +260,7 @@ class VirtualServos:
         target = AMBIENT + THERMAL_RESISTANCE * heat
         self.temperature += (target - self.temperature) * -math.expm1(-dt / THERMAL_TIME)
         self._overload = np.where(torque > self._overload_torque, self._overload + dt, 0.0)
-        sag = sum(fault.drop for fault in self.active_faults() if isinstance(fault, VoltageSag))
-        self._drive.voltage = (self.supply - sag - SUPPLY_RESISTANCE * float(current.sum())) * self._powered
+        self._feed(float(current.sum()))
         for fault in self.active_faults():
             if isinstance(fault, TemperatureRamp) and fault.id in self.registers:
                 self.temperature[self.ids.index(fault.id)] += dt * fault.heating_rate

@@ -89,8 +89,8 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
         exact += precision.measure(name, 1 if quick else precision.ROUNDS)
     report("done", 1.0)
     result: dict[str, Any] = {
-        "machine": _machine(),
-        "versions": _versions(),
+        "machine": machine(),
+        "versions": versions(),
         "method": {
             "quick": quick,
             "rounds": rounds,
@@ -277,7 +277,8 @@ def _why_no_mujoco() -> str:
     return ""
 
 
-def _machine() -> dict[str, Any]:
+def machine() -> dict[str, Any]:
+    """Processor, number of its cores, and system."""
     model = platform.processor() or platform.machine()
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as lines:
@@ -287,7 +288,8 @@ def _machine() -> dict[str, Any]:
     return {"cpu": model, "cores": os.cpu_count(), "system": f"{platform.system()} {platform.machine()}"}
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
+    """Of dynsim, with its commit, of Python and of the other programs."""
     found = {"dynsim": __version__, "commit": commit(), "python": platform.python_version()}
     for package in ("numba", "numpy", "pin", "mujoco"):
         try:

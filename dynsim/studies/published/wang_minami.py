@@ -37,11 +37,13 @@ def elbow_numbers(record: Record, scenario: Scenario) -> dict[str, float]:
     """Energies, works and the depth of the lowest joint of one variant."""
     summary, time = record.summary, record.time
     keys = ("electrical_energy_J", "electrical_energy_supply_J", "electrical_energy_drawn_J", "mechanical_work_J")
-    row = {key: summary[key] for key in keys}
+    more = ("joule_heat_J", "friction_heat_J", "hand_error_rms_m", "hand_error_z_rms_m")
+    row = {key: summary[key] for key in keys + more}
     row["sum_of_absolute_power_J"] = float(np.trapezoid(np.abs(record["torque"] * record["v"]).sum(axis=1), time))
     lowest = np.min([p[2] for _, _, p in poses(build.robot(scenario), record["q"])], axis=0)
     row["joint_depth_max_m"] = float(-lowest.min())
-    row["joint_depth_from_2_s_min_m"] = float(-lowest[time >= 2.0].max())
+    # Not −0.0 where a joint lies on the floor.
+    row["joint_depth_from_2_s_min_m"] = float(0.0 - lowest[time >= 2.0].max())
     row["joint_depth_from_2_s_max_m"] = float(-lowest[time >= 2.0].min())
     row["joint_depth_end_m"] = float(-lowest[-1])
     return row

@@ -15,6 +15,8 @@ import h5py
 import numpy as np
 
 from fuzz.case import Draft
+from fuzz.inputs.faults import make_motion
+from fuzz.inputs.sweep import make_sweep
 from fuzz.mutations import TEXTS, mutate_bytes
 from fuzz.readings import Unreadable, record_losses
 
@@ -22,7 +24,7 @@ FORMATS = ("csv", "joint-trajectory", "urdf-log")
 
 
 def make_records(folder: Path) -> None:
-    """Two short, sound records, the same ones in every campaign on a machine: nothing in them tells the time."""
+    """Short, sound records, the same ones in every campaign on a machine: nothing in them tells the time; a sweep."""
     from dynsim.engine import simulate
     from dynsim.scenario import load_scenario
 
@@ -37,6 +39,8 @@ def make_records(folder: Path) -> None:
         record.add("marker", np.ones((3, 1, 3)), "m", labels=("m",), axis="camera")
         record.add_event(0.01, "contact opens", "elbow", value=1.0)
         record.save(folder / f"{name}.h5")
+    make_sweep(folder / "sweep")
+    make_motion(folder)
 
 
 def draw(rng: Random, records: Path) -> Draft:

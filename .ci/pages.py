@@ -1,0 +1,648 @@
+"""The numbers of README.md and docs/, written from what the studies measured: ``python .ci/pages.py``.
+
+In a page a number of a sentence stands before ``<!-- = NAME -->``, NAME being a key of :data:`NUMBERS`; a table stands
+between ``<!-- table: NAME -->`` and ``<!-- end -->``, NAME being that of a function here. Both are made of the JSON
+files in results/, which say which version made them; results/README.md has the commands. ``--check`` changes nothing
+and ends with 1 where a page is stale (tests/unit/test_pages.py).
+
+Times are those of the last ``dynsim bench`` and ``python -m dynsim.studies.bench.start_up``; other numbers are the
+same on every machine, to the digits shown.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import re
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from dynsim.hardware.fault_table import markdown
+from dynsim.studies.bench.programs import (
+    ABA,
+    CONSTRAINT_DYNAMICS,
+    DYNSIM_CONTACTS,
+    DYNSIM_FREE,
+    DYNSIM_RADAU5,
+    DYNSIM_RK4,
+    DYNSIM_RK43,
+    LCABA,
+    MUJOCO_CONTACTS,
+    MUJOCO_EULER,
+    MUJOCO_FREE,
+    MUJOCO_IMPLICIT,
+)  # fmt: skip
+from dynsim.tables import print_comparison
+from dynsim.terminal import Terminal
+
+ROOT = Path(__file__).parents[1]
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+NUMBER = re.compile(r"[−+-]?\d[\d.,]*(?:e[−+-]?\d+)?(?=<!-- = (\w+) -->)")
+TABLE = re.compile(r"(?<=<!-- table: )(\w+)( -->\n).*?(?=<!-- end -->)", re.DOTALL)
+
+VARIANTS = ("two_elbows", "elbow_7", "elbow_4", "no_elbow")
+HEADS = ("two elbows", "elbow 7", "elbow 4", "no elbow")
+NONE = "–"
+
+
+@cache
+def data(file: str) -> Any:
+    return json.loads((ROOT / "results" / file).read_text(encoding="utf-8"))
+
+
+def validation() -> Any:
+    return data("reference/validation.json")
+
+
+def contact() -> Any:
+    return data("contact/comparison.json")
+
+
+def bench() -> Any:
+    return data("reference/bench.json")
+
+
+def start_up() -> Any:
+    return data("reference/start_up.json")
+
+
+def overturning() -> Any:
+    return data("overturning/configurations.json")
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """With so many digits, without an exponent; 0 where it is zero."""
+    if not value:
+        return NONE if value is None else "0"
+    places = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+    return f"{value:.{places}f}".replace("-", "−")
+
+
+def small(value: float | None, digits: int = 1) -> str:
+    """As in 3.0e-10."""
+    if value is None:
+        return NONE
+    mantissa, _, power = f"{value:.{digits}e}".partition("e")
+    return "0" if value == 0.0 else f"{mantissa.replace('-', '−')}e{int(power)}"
+
+
+def fixed(value: float | None, places: int) -> str:
+    text = NONE if value is None else f"{value:.{places}f}".replace("-", "−")
+    return "0" if text.strip("−0.") == "" else text
+
+
+def percent(share: float) -> str:
+    return fixed(100 * share, 1 if share < 0.9995 else 0)
+
+
+def grouped(value: int) -> str:
+    return f"{value:,}".replace(",", " ") if value >= 1000 else str(value)
+
+
+def lines(heads: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
+    """A table of Markdown with the first columns to the left, the others to the right."""
+    return ruled(heads, ["---"] * left + ["---:"] * (len(heads) - left), rows)
+
+
+def ruled(heads: Sequence[str], rules: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    def line(cells: Sequence[str]) -> str:
+        return "|" + "".join(f" {cell} |" if cell else " |" for cell in cells) + "\n"
+
+    return line(heads) + f"|{'|'.join(rules)}|\n" + "".join(map(line, rows))
+
+
+def of_elbows(scenario: str, key: str) -> list[float]:
+    return [validation()["runs"][f"{scenario} {name}"][key] for name in VARIANTS]
+
+
+def held(scenario: str, show: Callable[[dict[str, Any]], str]) -> list[str]:
+    """Of the first elbow that a variant declares, or of both, in each variant."""
+    cells = []
+    for name in VARIANTS:
+        touching = contact()[scenario][name]["contacts"]
+        cells.append(" / ".join(show(touching[one]) if one in touching else NONE for one in ("elbow_4", "elbow_7")))
+    return [NONE if cell == "– / –" else cell for cell in cells]
+
+
+def elbows_in_short() -> str:
+    glued, real = contact()["elbow_comparison"], contact()["elbow_comparison_floor"]
+    mean = held("elbow_comparison", lambda c: number(c["normal_force_mean_N"], 3))
+    times = {r["variant"]: r for r in bench()["variants"] if (r["contacts"], r["method"]) == ("glued", "radau5")}
+    return lines(
+        ["", *HEADS],
+        [
+            ["electrical energy in 10 s [J]", *(number(glued[v]["electrical_energy_J"]) for v in VARIANTS)],
+            ["hand error, rms [mm]", *(fixed(1e3 * glued[v]["hand_error_rms_m"], 1) for v in VARIANTS)],
+            ["mean normal force, elbow 4 / elbow 7 [N]", *mean],
+            ["on a real floor: electrical energy [J]", *(number(real[v]["electrical_energy_J"]) for v in VARIANTS)],
+            ["… hand error, rms [mm]", *(fixed(1e3 * real[v]["hand_error_rms_m"], 1) for v in VARIANTS)],
+            [
+                "… mean normal force, elbow 4 / elbow 7 [N]",
+                *held("elbow_comparison_floor", lambda c: fixed(c["normal_force_mean_N"], 2)),
+            ],
+            [
+                "… elbow sticks [% of time]",
+                *held("elbow_comparison_floor", lambda c: fixed(100 * c["sticking_fraction"], 0)),
+            ],
+            ["deepest joint below the floor [mm]", *(_depth(v, "joint_depth_max_m") for v in VARIANTS)],
+            ["energy ledger residual", *(small(glued[v]["energy_residual_relative"]) for v in VARIANTS)],
+            ["integration, processor time [ms]", *(number(1e3 * times[v]["cpu_minimum_s"], 2) for v in VARIANTS)],
+        ],
+    )
+
+
+def _depth(variant: str, key: str) -> str:
+    depth = 1e3 * validation()["elbows"][variant][key]
+    return fixed(depth, 1) if 0.05 <= depth < 9.95 else fixed(depth, 0)
+
+
+def elbows() -> str:
+    rows, ledger = validation()["elbows"], of_elbows("elbow_comparison", "energy_residual_relative")
+
+    def of(key: str, show: Callable[[float], str] = number) -> list[str]:
+        return [show(rows[v][key]) for v in VARIANTS]
+
+    return lines(
+        ["", *HEADS],
+        [
+            ["electrical energy, net [J]", *of("electrical_energy_J")],
+            ["electrical energy, from one supply that takes nothing back [J]", *of("electrical_energy_supply_J")],
+            ["electrical energy, from such a supply for each motor [J]", *of("electrical_energy_drawn_J")],
+            ["mechanical work ∫ Σ τ v dt [J]", *of("mechanical_work_J", lambda x: fixed(x, 3))],
+            ["∫ Σ \\|τ v\\| dt [J]", *of("sum_of_absolute_power_J", lambda x: fixed(x, 2))],
+            ["Joule heat [J]", *of("joule_heat_J")],
+            ["friction heat [J]", *of("friction_heat_J", lambda x: fixed(x, 3))],
+            ["hand error after 2 s, rms [mm]", *of("hand_error_rms_m", lambda x: fixed(1e3 * x, 1))],
+            ["hand error after 2 s, vertical rms [mm]", *of("hand_error_z_rms_m", lambda x: fixed(1e3 * x, 1))],
+            ["energy ledger residual / turnover", *map(small, ledger)],
+            ["largest gap at a closed contact [m]", *of("largest_gap_m", lambda x: small(x, 0) if x else NONE)],
+            [
+                "deepest joint below the floor, at most / after 10 s [mm]",
+                *(f"{_depth(v, 'joint_depth_max_m')} / {_depth(v, 'joint_depth_end_m')}" for v in VARIANTS),
+            ],
+        ],
+    )
+
+
+def glued_and_real() -> str:
+    glued, real, links = (contact()[f"elbow_comparison{name}"] for name in ("", "_floor", "_links"))
+    soft = links["soft"]
+
+    def row(heading: str, runs: Any, key: str, show: Callable[[float], str], last: str = "") -> list[str]:
+        return [heading, *(show(runs[v][key]) for v in VARIANTS), last]
+
+    def both(heading: str, elbow: str, show: Callable[[Any, Any], str]) -> list[str]:
+        pairs = ((glued[v]["contacts"].get(elbow), real[v]["contacts"].get(elbow)) for v in VARIANTS)
+        return [heading, *(NONE if None in pair else show(*pair) for pair in pairs), ""]
+
+    def millimetres(value: float) -> str:
+        return number(1e3 * value)
+
+    def forces(a: Any, b: Any) -> str:
+        return f"{fixed(a['normal_force_mean_N'], 2)}; {fixed(b['normal_force_mean_N'], 2)}"
+
+    def shares(_: Any, b: Any) -> str:
+        return "; ".join(percent(b[key]) for key in ("closed_fraction", "sticking_fraction"))
+
+    def count(variant: str) -> str:
+        kinds = [kind for _, kind, _ in real[variant]["events"]]
+        touched = bool(real[variant]["contacts"])
+        return ", ".join(str(kinds.count(kind)) for kind in ("lift_off", "landing", "slip_start")) if touched else NONE
+
+    pairs = (f"{glued[v]['rhs_evaluations']}; {real[v]['rhs_evaluations']}" for v in VARIANTS)
+    return lines(
+        ["", *HEADS, "soft"],
+        [
+            row("electrical energy, glued [J]", glued, "electrical_energy_J", number),
+            row("… on a real floor", real, "electrical_energy_J", number),
+            row("… where all links touch", links, "electrical_energy_J", number, number(soft["electrical_energy_J"])),
+            row("hand error, rms, glued [mm]", glued, "hand_error_rms_m", millimetres),
+            row("… on a real floor", real, "hand_error_rms_m", millimetres),
+            row(
+                "… where all links touch", links, "hand_error_rms_m", millimetres, millimetres(soft["hand_error_rms_m"])
+            ),
+            both("elbow 4: mean force, glued; real [N]", "elbow_4", forces),
+            both("… closed; sticking, real [% of time]", "elbow_4", shares),
+            both("elbow 7: mean force, glued; real [N]", "elbow_7", forces),
+            both("… closed; sticking, real [% of time]", "elbow_7", shares),
+            ["lift-offs, landings, slip starts, real", *map(count, VARIANTS), ""],
+            row("impact loss, real [mJ]", real, "impact_loss_J", lambda x: fixed(1e3 * x, 1)),
+            row("energy ledger residual, real", real, "energy_residual_relative", small),
+            ["evaluations of the right-hand side, glued; real", *pairs, ""],
+        ],
+    )
+
+
+def overturning_holds() -> str:
+    rows = [overturning()["mobile_elbow_comparison"][v] for v in VARIANTS]
+
+    def of(key: str, show: Callable[[Any], str]) -> list[str]:
+        return [show(row[key]) for row in rows]
+
+    def loads(one: dict[str, float]) -> str:
+        return ", ".join(fixed(one[which], 1) for which in ("left", "right", "caster"))
+
+    return lines(
+        ["the base holds", *HEADS],
+        [
+            ["least tip margin, settled", *of("tip_margin_min_settled", _margin)],
+            [
+                "least load of left wheel, right wheel, caster, settled [N]",
+                *of("wheel_load_min_settled_N", loads),
+            ],
+            ["largest traction demand of a wheel, settled", *of("traction_demand_max_settled", _demand)],
+            ["`overturns_at_s`: first crossing of zero [ms]", *of("overturns_at_s", lambda x: fixed(1e3 * x, 2))],
+            ["margin below zero [ms]", *of("margin_below_zero_s", _spans)],
+            ["least tip margin in the whole run", *of("tip_margin_min", lambda x: fixed(x, 3))],
+            [
+                "least tip margin, arm holding still (no path of the hand)",
+                *of("tip_margin_min_arm_held", _bare),
+            ],
+            [
+                "tips over, arm holding still [ms]",
+                *of("overturns_at_s_arm_held", lambda x: "never" if x is None else fixed(1e3 * x, 0)),
+            ],
+        ],
+    )
+
+
+def overturning_drives() -> str:
+    rows = [overturning()["mobile_elbow_comparison_driving"][v] for v in VARIANTS]
+    return lines(
+        ["the base drives", *HEADS],
+        [
+            ["least tip margin, settled", *(_margin(row["tip_margin_min_settled"]) for row in rows)],
+            ["margin below zero [ms]", *(_spans(row["margin_below_zero_s"]) for row in rows)],
+        ],
+    )
+
+
+def _bare(value: float) -> str:
+    return fixed(value, 3)
+
+
+def _margin(value: float) -> str:
+    return f"**{fixed(value, 3)}**" if value < 0.0 else fixed(value, 3)
+
+
+def _demand(value: float | None) -> str:
+    return NONE if value is None else fixed(value, 2)
+
+
+def _spans(spans: list[list[float]]) -> str:
+    """Milliseconds, to the sample; what lasts to the end of the fine run goes on."""
+    first = f"{1e3 * spans[0][0] - 0.05:.1f}–{1e3 * spans[0][1]:.1f}"
+    return first + (f", and from {1e3 * spans[1][0]:.0f} on" if len(spans) > 1 else "")
+
+
+def assumptions() -> str:
+    rows = []
+    for case, variants in data("reference/assumptions.json")["cases"].items():
+        energies = " · ".join(number(variants[v]["electrical_energy_J"]) for v in VARIANTS)
+        errors = " · ".join(fixed(1e3 * variants[v]["hand_error_rms_m"], 1) for v in VARIANTS)
+        pulling = percent(variants["two_elbows"]["pulling_elbow_4"])
+        name = case.replace("|", "\\|")
+        notes = {
+            "as shipped": "as shipped: horizontal circle, one turn in 10 s, v_s = 1 mm/s",
+            "one turn in 20 s": "one turn in 20 s (half a turn in the run)",
+        }
+        rows.append([notes.get(case, name), energies, errors, pulling])
+    return lines(["changed", "electrical energy", "hand error", "elbow 4 pulling [%]"], rows, left=3)
+
+
+def ledger() -> str:
+    runs, free = validation()["runs"], validation()["ledger_residual_of_free_motion"]
+
+    def of(scenario: str, *variants: str) -> str:
+        names = [f"{scenario} {v}" for v in variants] or [name for name in runs if name.split()[0] == scenario]
+        return ", ".join(small(runs[name]["energy_residual_relative"]) for name in names)
+
+    def between(scenario: str) -> str:
+        found = [one["energy_residual_relative"] for name, one in runs.items() if name.split()[0] == scenario]
+        return f"{small(min(found))} to {small(max(found))}"
+
+    left = [
+        (f"`{s}` {label}", of(s, *v))
+        for s in ("elbow_comparison", "elbow_comparison_vertical", "mobile_elbow_comparison")
+        for label, v in (("two elbows, elbow 7", VARIANTS[:2]), ("elbow 4, none", VARIANTS[2:]))
+    ]
+    left += [
+        ("`mobile_elbow_comparison_driving`, all four", between("mobile_elbow_comparison_driving")),
+        ("`mobile_path`, `mobile_reach` (until it tips)", f"{of('mobile_path')}, {of('mobile_reach')}"),
+        ("`six_axis_arm`", of("six_axis_arm")),
+        ("`thirty_links`, all three", between("thirty_links")),
+        ("`single_pendulum` (free)", of("single_pendulum")),
+    ]
+    right = [(name.replace("undamped ", ""), small(value)) for name, value in free.items()]
+    right += [("", "")] * (len(left) - len(right))
+    rows = [[a, b, "", c, d] for (a, b), (c, d) in zip(left, right, strict=True)]
+    rules = ["---", "---:", "---", "---", "---:"]
+    heads = ["driven and damped", "residual", "", "free, no loss but friction", "residual"]
+    return ruled(heads, rules, rows)
+
+
+def against_rk43() -> str:
+    rows = []
+    for scenario, one in validation()["against_rk43"].items():
+        evaluations = [
+            " to ".join(grouped(n) for n in dict.fromkeys(one[key])) for key in ("evaluations_rk43", "evaluations")
+        ]
+        differences = [
+            small(one[key]) if key in one else ""
+            for key in ("joint", "electrical_energy_J", "hand_error_rms_m", "events_s")
+        ]
+        both = [small(one["ledger_rk43"]), small(one["ledger"])]
+        rows.append([f"`{scenario}`", f"`{one['method']}`", *differences, *both, *evaluations])
+    heads = ["scenario", "by", "joint", "energy", "hand's error", "events, s", "ledger `rk43`", "now"]
+    return lines([*heads, "right-hand sides `rk43`", "now"], rows, left=2)
+
+
+def time_stepping() -> str:
+    rows = []
+    for name, one in validation()["time_stepping"].items():
+        scenario, rest = (name if " " in name else f"{name} ").split(" ", 1)
+        taken = one["taken_by_steps_relative"]
+        shown = small(taken) if abs(taken) < 1e-3 else f"{fixed(100 * taken, 2)} %"
+        depth = number(1e3 * one["penetration_max_m"], 2)
+        rows.append([f"`{scenario}` {rest}".strip(), small(one["energy_residual_relative"], 0), shown, f"{depth} mm"])
+    return lines(["", "residual", "taken by the steps, of the turnover", "sinks in by"], rows)
+
+
+def right_hand_side() -> str:
+    contenders = (
+        ("dynsim, free", DYNSIM_FREE), ("dynsim, 2 frictional contacts", DYNSIM_CONTACTS), ("Pinocchio ABA, free", ABA),
+        ("Pinocchio `constraintDynamics`, 2 × 3 rows", CONSTRAINT_DYNAMICS), ("Pinocchio `lcaba`, 2 × 3 rows", LCABA),
+        ("MuJoCo `mj_step`, free", MUJOCO_FREE), ("MuJoCo `mj_step`, 2 frictional contacts", MUJOCO_CONTACTS),
+    )  # fmt: skip
+    sizes = bench()["right_hand_side"]
+    return lines(
+        ["", *(f"{row['links']}{' links' if k == 0 else ''}" for k, row in enumerate(sizes))],
+        [[label, *(microseconds(row["median_us"].get(name)) for row in sizes)] for label, name in contenders],
+    )
+
+
+def microseconds(value: float | None) -> str:
+    if value is None:
+        return NONE
+    rounded = float(f"{value:.3g}")
+    return f"{rounded:,.0f}".replace(",", " ") if rounded >= 1000 else f"{rounded:g}"
+
+
+def ratios() -> str:
+    labels = (
+        ("Pinocchio ABA", ABA), ("Pinocchio `constraintDynamics`", CONSTRAINT_DYNAMICS), ("Pinocchio `lcaba`", LCABA),
+        ("MuJoCo, free", MUJOCO_FREE), ("MuJoCo, contacts", MUJOCO_CONTACTS),
+    )  # fmt: skip
+    rows = {one["peer"]: one["time_by_links"] for one in bench()["ratios"] if "time_by_links" in one}
+    sizes = [str(row["links"]) for row in bench()["right_hand_side"]]
+    heads = ["", *(f"{n}{' links' if k == 0 else ''}" for k, n in enumerate(sizes))]
+    cells = [
+        [
+            label,
+            *(
+                NONE if rows[peer][n] is None else f"{rows[peer][n]:.{1 if rows[peer][n] < 9.95 else 0}f}"
+                for n in sizes
+            ),
+        ]
+        for label, peer in labels
+    ]
+    return lines(heads, cells)
+
+
+def job() -> str:
+    programs = (
+        ("dynsim, `rk43`", DYNSIM_RK43), ("dynsim, `radau5`", DYNSIM_RADAU5), ("dynsim, RK4 1 ms", DYNSIM_RK4),
+        ("MuJoCo, Euler 1 ms", MUJOCO_EULER), ("MuJoCo, implicitfast 1 ms", MUJOCO_IMPLICIT),
+    )  # fmt: skip
+    rows: list[list[str]] = []
+    for case in dict.fromkeys(one["case"] for one in bench()["job"]):
+        by_program = {one["program"]: one for one in bench()["job"] if one["case"] == case}
+        for k, (label, program) in enumerate(programs):
+            one = by_program[program]
+            errors = [1e3 * one["hand_error_max_m"], 1e3 * one["hand_error_rms_m"], one["current_error_max_A"]]
+            cells = [f"{x:.2g}" if one["same_physics"] else f"({x:.2g})" for x in errors]
+            rows.append([case if k == 0 else "", label, f"{1e3 * one['cpu_median_s']:.3g}", *cells])
+    return lines(["case", "program", "CPU ms", "hand, max mm", "hand, rms mm", "current, max A"], rows, left=2)
+
+
+def precision() -> str:
+    found = bench()["precision"]
+    rtols = sorted({row["rtol"] for row in found}, reverse=True)
+    rows: list[list[str]] = []
+    for scenario in dict.fromkeys(row["scenario"] for row in found):
+        for k, method in enumerate(dict.fromkeys(row["method"] for row in found)):
+            by = {row["rtol"]: row for row in found if (row["scenario"], row["method"]) == (scenario, method)}
+            cells = [f"{1e3 * by[r]['cpu_minimum_s']:.3g} / {_error(by[r]['error'])}" for r in rtols]
+            rows.append([f"`{scenario}`" if k == 0 else "", method, *cells])
+    return lines(["scenario", "method", *(small(r, 0) for r in rtols)], rows, left=2)
+
+
+def _error(value: float) -> str:
+    # A block that rests is off by rounding.
+    return small(value, 0) if value > 1e-15 else "0"
+
+
+def sweeps() -> str:
+    wall = {(row["runs"], row["jobs"]): row["wall_s"] for row in bench()["sweeps"]}
+    rows = [[str(runs), *(fixed(wall[runs, n], 1) for n in (1, 2))] for runs in sorted({run for run, _ in wall})]
+    return lines(["runs", "one process", "two processes"], rows)
+
+
+def comparison() -> str:
+    """What `dynsim compare elbow_comparison` prints, less some rows."""
+    output = io.StringIO()
+    summaries = validation()["elbow_summaries"]
+    print_comparison(Terminal(file=output, width=120, emoji=False), summaries)
+    kept = (
+        "electrical energy", "  from", "hand error", "deepest", "ledger", "elbow_4: force", "pulling", "two_elbows",
+        "───",
+    )  # fmt: skip
+    text = [line[1:].rstrip() for line in output.getvalue().split("warning: ")[0].splitlines()]
+    rows = [row for row in text if any(one in row for one in kept) and "times the least" not in row]
+    # Of two elbows the first one's share of pulling.
+    shown = rows[: next(k for k, row in enumerate(rows) if "pulling" in row) + 1]
+    warned = {name: one["warnings"] for name, one in summaries.items()}
+    told = [f"warning: {name}: {warned[name][0]}" for name in ("two_elbows", "elbow_4")]
+    return "```\n" + "\n".join([*shown, "", *told]) + "\n```\n"
+
+
+def faults() -> str:
+    return "\n" + markdown(data("reference/bridge_faults.json")["cells"]).strip("\n") + "\n\n"
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    one.__name__: one
+    for one in (
+        elbows_in_short, elbows, glued_and_real, overturning_holds, overturning_drives, assumptions, ledger,
+        against_rk43, time_stepping, right_hand_side, ratios, job, precision, sweeps, comparison, faults,
+    )
+}  # fmt: skip
+
+
+def run(name: str) -> dict[str, Any]:
+    found: dict[str, Any] = validation()["runs"][name]
+    return found
+
+
+def residual(name: str) -> str:
+    return small(run(name)["energy_residual_relative"])
+
+
+def energy(name: str) -> str:
+    return number(run(name)["electrical_energy_J"])
+
+
+def error(name: str, digits: int = 3) -> str:
+    return number(1e3 * run(name)["hand_error_rms_m"], digits)
+
+
+def ratio_of_energies(first: str, second: str) -> float:
+    return float(run(first)["electrical_energy_J"] / run(second)["electrical_energy_J"])
+
+
+def of_job(case: str, program: str) -> dict[str, Any]:
+    return next(one for one in bench()["job"] if (one["case"], one["program"]) == (case, program))
+
+
+def against_mujoco(case: str, program: str) -> str:
+    return fixed(of_job(case, program)["cpu_median_s"] / of_job(case, DYNSIM_RADAU5)["cpu_median_s"], 1)
+
+
+def of_contact(scenario: str, variant: str, name: str) -> dict[str, Any]:
+    found: dict[str, Any] = contact()[scenario][variant]["contacts"][name]
+    return found
+
+
+def event(variant: str, kind: str, which: int = 0) -> float:
+    times = [time for time, one, _ in contact()["elbow_comparison_floor"][variant]["events"] if one == kind]
+    return float(times[which])
+
+
+def stuck(which: int) -> float:
+    """How long elbow 7 does not move, with both elbows on a real floor [s]."""
+    starts = [event("two_elbows", "slip_start", k) for k in (1, 2)]
+    return starts[which] - event("two_elbows", "slip_stop", which)
+
+
+def brush() -> dict[str, Any]:
+    """The run of an arm without elbows whose links may touch."""
+    found: dict[str, Any] = contact()["elbow_comparison_links"]["no_elbow"]
+    return found
+
+
+HELD_CASE = "two elbows held, no friction"
+NUMBERS: dict[str, Callable[[], str]] = {
+    "saving": lambda: fixed(ratio_of_energies("elbow_comparison no_elbow", "elbow_comparison two_elbows"), 0),
+    "energy_two": lambda: energy("elbow_comparison two_elbows"),
+    "energy_7": lambda: energy("elbow_comparison elbow_7"),
+    "error_two": lambda: fixed(1e3 * run("elbow_comparison two_elbows")["hand_error_rms_m"], 1),
+    "error_7": lambda: fixed(1e3 * run("elbow_comparison elbow_7")["hand_error_rms_m"], 1),
+    "hang": lambda: fixed(1e3 * validation()["elbows"]["no_elbow"]["hand_error_z_rms_m"], 0),
+    "depth_none": lambda: _depth("no_elbow", "joint_depth_max_m"),
+    "depth_4": lambda: _depth("elbow_4", "joint_depth_max_m"),
+    "pulling": lambda: percent(of_contact("elbow_comparison", "two_elbows", "elbow_4")["pulling_fraction"]),
+    "lift_off_ms": lambda: fixed(1e3 * event("two_elbows", "lift_off", 1), 1),
+    "lift_7_ms": lambda: fixed(1e3 * event("two_elbows", "lift_off"), 1),
+    "landing_7_ms": lambda: fixed(1e3 * event("two_elbows", "landing"), 0),
+    "landing_7_alone_ms": lambda: fixed(1e3 * event("elbow_7", "landing"), 0),
+    "stuck_1_s": lambda: fixed(stuck(0), 2),
+    "stuck_2_s": lambda: fixed(stuck(1), 2),
+    "brush_s": lambda: fixed(brush()["events"][0][0], 3),
+    "brush_ms": lambda: fixed(1e3 * (brush()["events"][1][0] - brush()["events"][0][0]), 0),
+    "brush_mJ": lambda: fixed(1e3 * brush()["impact_loss_J"], 0),
+    "job_held_ms": lambda: number(1e3 * of_job(HELD_CASE, DYNSIM_RADAU5)["cpu_median_s"], 2),
+    "job_held_ratio": lambda: against_mujoco(HELD_CASE, MUJOCO_EULER),
+    "job_held_ratio_implicit": lambda: against_mujoco(HELD_CASE, MUJOCO_IMPLICIT),
+    "job_free_ratio": lambda: against_mujoco("free arm", MUJOCO_EULER),
+    "job_free_ratio_implicit": lambda: against_mujoco("free arm", MUJOCO_IMPLICIT),
+    "rhs_us": lambda: number(bench()["right_hand_side"][0]["median_us"][DYNSIM_CONTACTS], 2),
+    "cold_wall_s": lambda: number(start_up()["radau5"]["cold"]["wall_s"], 2),
+    "cold_cpu_s": lambda: number(start_up()["radau5"]["cold"]["cpu_s"], 2),
+    "warm_wall_s": lambda: number(start_up()["radau5"]["warm"]["wall_s"], 2),
+    "warm_cpu_s": lambda: number(start_up()["radau5"]["warm"]["cpu_s"], 2),
+    "cold_explicit_cpu_s": lambda: number(start_up()["dopri5"]["cold"]["cpu_s"], 2),
+    "rotor_disc_J": lambda: fixed(validation()["electrical_energy_by_rotor_model_J"]["spinning"], 2),
+    "rotor_armature_J": lambda: fixed(validation()["electrical_energy_by_rotor_model_J"]["armature"], 2),
+    "knock_acceleration": lambda: number(validation()["knock_at_the_start"]["acceleration"], 4),
+    "knock_jerk": lambda: number(validation()["knock_at_the_start"]["jerk"], 5),
+    "knock_shaking": lambda: fixed(validation()["knock_at_the_start"]["shaking"], 2),
+}  # fmt: skip
+for _name, _runs in {
+    "slope": ("block_on_slope rests", "block_on_slope slides", "block_on_slope pulled"),
+    "bounce": ("bouncing_link half", "bouncing_link dead", "bouncing_link lively"),
+    "fall": ("falling_arm",),
+    "below": ("floor_below lands", "floor_below deep"),
+    "wall": ("wall_push weak_hold", "wall_push strong_hold"),
+    "pressing": ("pressing plain", "pressing gravity", "pressing commanded", "pressing optimal"),
+    "pipe": ("brace_on_cylinder real",),
+}.items():
+    for _k, _run in enumerate(_runs, 1):
+        NUMBERS[f"{_name}_{_k}_ledger"] = lambda name=_run: residual(name)
+        NUMBERS[f"{_name}_{_k}_J"] = lambda name=_run: energy(name)
+NUMBERS |= {
+    "slope_slip_s": lambda: fixed(run("block_on_slope pulled")["first_at_s"]["slip_start"], 4),
+    "bounces_half": lambda: str(run("bouncing_link half")["events"].get("bounce", 0)),
+    "bounces_dead": lambda: str(run("bouncing_link dead")["events"].get("bounce", 0)),
+    "bounces_lively": lambda: str(run("bouncing_link lively")["events"].get("bounce", 0)),
+    "fall_landings": lambda: str(run("falling_arm")["events"]["landing"]),
+    "fall_lift_offs": lambda: str(run("falling_arm")["events"]["lift_off"]),
+    "fall_rebounds": lambda: str(run("falling_arm")["events"]["bounce"]),
+    "below_landing_s": lambda: fixed(run("floor_below lands")["first_at_s"]["landing"], 3),
+    "below_mm": lambda: error("floor_below lands"),
+    "below_touch_ms": lambda: fixed(1e4 * run("floor_below deep")["contacts"]["joint_7"]["closed_fraction"], 0),
+    "wall_slip_s": lambda: fixed(run("wall_push weak_hold")["first_at_s"]["slip_start"], 2),
+    "wall_weak_N": lambda: fixed(run("wall_push weak_hold")["contacts"]["elbow"]["normal_force_max_N"], 1),
+    "wall_strong_N": lambda: fixed(run("wall_push strong_hold")["contacts"]["elbow"]["normal_force_max_N"], 1),
+    "wall_ratio": lambda: fixed(ratio_of_energies("wall_push strong_hold", "wall_push weak_hold"), 1),
+    "pressing_1_mm": lambda: error("pressing plain"),
+    "pressing_2_mm": lambda: error("pressing gravity", 2),
+    "pressing_3_mm": lambda: fixed(1e3 * run("pressing commanded")["hand_error_rms_m"], 2),
+    "pressing_4_mm": lambda: fixed(1e3 * run("pressing optimal")["hand_error_rms_m"], 2),
+    "pipe_sticks": lambda: fixed(100 * run("brace_on_cylinder real")["contacts"]["elbow"]["sticking_fraction"], 1),
+    "pipe_glued_J": lambda: energy("brace_on_cylinder glued"),
+    "pipe_free_J": lambda: fixed(run("brace_on_cylinder free")["electrical_energy_J"], 0),
+}
+
+
+def written(page: str) -> str:
+    """A page with its numbers as they are now.
+
+    Raises
+    ------
+    KeyError
+        It has a mark of a number or table that is not known.
+    """
+    page = TABLE.sub(lambda found: f"{found[1]}{found[2]}{TABLES[found[1]]()}", page)
+    return NUMBER.sub(lambda found: NUMBERS[found[1]](), page)
+
+
+def stale() -> dict[str, list[str]]:
+    """Lines that should be otherwise, by page, as they should be."""
+    found = {}
+    for path in PAGES:
+        before = path.read_text(encoding="utf-8")
+        after = written(before)
+        if before != after:
+            there = set(before.splitlines())
+            found[path.name] = [line for line in after.splitlines() if line not in there]
+    return found
+
+
+def main(arguments: Sequence[str]) -> int:
+    found = stale()
+    for page, rows in found.items():
+        print(page, *rows, sep="\n  ")
+    if "--check" in arguments:
+        return 1 if found else 0
+    for path in PAGES:
+        if path.name in found:
+            path.write_text(written(path.read_text(encoding="utf-8")), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

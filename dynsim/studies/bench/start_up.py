@@ -1,0 +1,50 @@
+"""What the first run of all takes, which compiles the kernels, and a later one.
+
+``python -m dynsim.studies.bench.start_up`` writes results/reference/start_up.json in two minutes: on a machine that
+does nothing else, the one of results/reference/bench.json.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from dynsim.files import write_json
+from dynsim.studies.bench.programs import SCENARIO
+from dynsim.studies.bench.run import machine, versions
+
+FILE = Path("results/reference/start_up.json")
+METHODS = ("radau5", "dopri5")
+
+
+def measure(method: str) -> dict[str, dict[str, float]]:
+    """Wall time and processor time of all processes [s] of a run with an empty kernel cache, and of the next one."""
+    with tempfile.TemporaryDirectory() as folder:
+        return {kind: _run(method, Path(folder)) for kind in ("cold", "warm")}
+
+
+def _run(method: str, folder: Path) -> dict[str, float]:
+    command = [sys.executable, "-m", "dynsim", "run", SCENARIO, "--no-figures", "--quiet"]
+    command += ["--set", f"integrator.method={method}", "--out", str(folder / "out")]
+    before, began = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
+    subprocess.run(command, check=True, env={**os.environ, "XDG_CACHE_HOME": str(folder / "cache")})
+    wall, after = time.monotonic() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    return {"wall_s": wall, "cpu_s": after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime}
+
+
+def start_up() -> dict[str, Any]:
+    """By method, with machine and versions."""
+    # Of other programs wall times tell as much.
+    where = {"machine": machine() | {"load_before": os.getloadavg()[0]}, "versions": versions()}
+    return where | {method: measure(method) for method in METHODS}
+
+
+if __name__ == "__main__":
+    write_json(FILE, start_up())
+    print(f"written: {FILE}; into the pages: python .ci/pages.py")

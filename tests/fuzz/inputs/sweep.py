@@ -1,0 +1,84 @@
+"""Folders of sweeps, broken, of which ``--resume`` is asked."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+from random import Random
+from typing import Any
+
+from fuzz.case import Draft
+from fuzz.mutations import mutate_bytes, mutate_text, mutate_tree
+
+COMMAND = [
+    "sweep", "single_pendulum", "--set", "duration_s=0.01", "--set", "metrics.settle_s=0",
+    "--grid", "plant.chain.0.mass_kg=1,2,3,4", "--jobs", "1", "--no-figures", "--quiet", "--out", "out",
+]  # fmt: skip
+PLAN, JOURNAL = "sweep.json", "runs.jsonl"
+
+
+def make_sweep(folder: Path) -> None:
+    """A small, sound sweep of four runs in ``folder``, of no commit: those of a tree that is edited would not go on."""
+    from dynsim.scenario import read_scenario
+    from dynsim.studies.plan import Axis, Plan
+    from dynsim.studies.sweep import run_sweep
+
+    forget_commit()
+    overrides = {"duration_s": 0.01, "metrics.settle_s": 0}
+    axes = (Axis.parse(COMMAND[COMMAND.index("--grid") + 1]),)
+    run_sweep(Plan(read_scenario("single_pendulum"), (None,), overrides, axes), folder)
+
+
+def forget_commit() -> None:
+    """Let sweeps of this process be of no commit."""
+    from dynsim.studies import sweep
+
+    sweep.commit = lambda: ""
+
+
+def draw(rng: Random, records: Path) -> Draft:
+    files: dict[str, bytes | str] = {
+        f"out/{path.name}": path.read_bytes() for path in sorted((records / "sweep").iterdir()) if path.is_file()
+    }
+    name = f"out/{rng.choice((PLAN, JOURNAL, JOURNAL, JOURNAL))}"
+    data = files[name]
+    assert isinstance(data, bytes)
+    choice = rng.random()
+    if choice < 0.5:
+        lines: list[Any] = [json.loads(line) for line in ([data] if name.endswith(PLAN) else data.splitlines())]
+        row = rng.randrange(len(lines))
+        what = mutate_tree(rng, lines[row])
+        data = "".join(f"{json.dumps(line, default=str)}\n" for line in lines).encode("utf-8", "surrogatepass")
+    elif choice < 0.75:
+        data, what = mutate_text(rng, data.decode())
+    else:
+        data, what = mutate_bytes(rng, data)
+    files[name] = data
+    if rng.random() < 0.1:
+        gone = rng.choice(sorted(files))
+        del files[gone]
+        what += f"; without {gone}"
+    return Draft(f"{name}: {what}", files, [[*COMMAND, "--resume"]], losses)
+
+
+def losses() -> list[str]:
+    """Runs of the table that are missing, or have a number that is none."""
+    from dynsim.errors import RecordError
+
+    table = Path("out/sweep.csv")
+    if not table.is_file():
+        raise RecordError("refused")
+    with table.open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    found = [] if len(rows) == 4 else [f"{len(rows)} runs of 4 are in the table"]
+    for row in rows:
+        for column, cell in row.items():
+            try:
+                value = float(cell or "0")
+            except (TypeError, ValueError):
+                continue
+            if not math.isfinite(value):
+                found.append(f"column {column} of a run is not finite")
+    return found
