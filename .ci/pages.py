@@ -372,6 +372,18 @@ def time_stepping() -> str:
     return lines(["", "residual", "taken by the steps, of the turnover", "sinks in by"], rows)
 
 
+def endings() -> str:
+    study = data("endings/endings.json")
+    kinds = [kind for kind in study["by_status"] if kind not in ("finished", "refused")]
+    rows = []
+    for method, ends in study["by_method"].items():
+        wall = study["wall_s"][method]
+        counts = [f"{ends.get(kind, 0):,}" for kind in ("finished", "refused", *kinds)]
+        rows.append([f"`{method}`", *counts, f"{1e3 * wall['median']:.0f} ms, {number(wall['longest'], 2)} s"])
+    heads = ["", "to the end", "refused before it", *(f"`{kind}`" for kind in kinds), "integration, median and longest"]
+    return lines(heads, rows)
+
+
 def right_hand_side() -> str:
     contenders = (
         ("dynsim, free", DYNSIM_FREE), ("dynsim, 2 frictional contacts", DYNSIM_CONTACTS), ("Pinocchio ABA, free", ABA),
@@ -478,7 +490,7 @@ TABLES: dict[str, Callable[[], str]] = {
     one.__name__: one
     for one in (
         elbows_in_short, elbows, glued_and_real, overturning_holds, overturning_drives, assumptions, ledger,
-        against_rk43, time_stepping, right_hand_side, ratios, job, precision, sweeps, comparison, faults,
+        against_rk43, time_stepping, endings, right_hand_side, ratios, job, precision, sweeps, comparison, faults,
     )
 }  # fmt: skip
 

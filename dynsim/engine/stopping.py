@@ -13,6 +13,7 @@ from dynsim.errors import SimulationStopped
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.constraint import unilateral as ku
 from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.integrate.project import GAP_TOLERANCE, RATE_TOLERANCE
 from dynsim.kernels.state import block
 from dynsim.model.unilateral import START_TOLERANCE
 from dynsim.scenario import Scenario
@@ -142,8 +143,8 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
             f"take {stepping if prepared.model.robot.base is None else ''}a larger integrator.atol"
         )
     ws = prepared.workspace
-    gaps = ws.rows[: ws.counts[ka.ROWS], ka.ROW_GAP]
-    worst = int(np.argmax(np.abs(gaps)))
+    gaps, rates = ws.rows[: ws.counts[ka.ROWS], [ka.ROW_GAP, ka.ROW_RATE]].T
+    worst = int(np.argmax(np.maximum(np.abs(gaps) / GAP_TOLERANCE, np.abs(rates) / RATE_TOLERANCE)))
     owner = int(ws.active[worst, ka.OWNER])
     if ws.active[worst, ka.ROW_KIND] == ka.JOINT_ROW:
         couplings = prepared.model.robot.couplings
@@ -153,7 +154,8 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
         coupling = couplings[owner]
         what = f"joint {coupling.joint} cannot be kept where {coupling.leader} leads it (off by {gaps[worst]:+.2e})"
     else:
-        what = f"contact {prepared.contacts[owner].name} cannot be kept on its surface (gap {gaps[worst]:+.2e} m)"
+        what = f"contact {prepared.contacts[owner].name} cannot be kept on its surface (gap {gaps[worst]:+.2e} m, "
+        what += f"rate {rates[worst]:+.2e} m/s)"
     return f"{where}: {what}; the contacts contradict each other or the arm is singular here" + (
         ", or integrator.step_s is too long (try integrator.method: auto)" if method == "rk4" else ""
     )
