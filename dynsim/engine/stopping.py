@@ -153,7 +153,9 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
         coupling = couplings[owner]
         what = f"joint {coupling.joint} cannot be kept where {coupling.leader} leads it (off by {gaps[worst]:+.2e})"
     else:
-        what = f"contact {prepared.contacts[owner].name} cannot be kept on its surface (gap {gaps[worst]:+.2e} m)"
+        rate = ws.rows[worst, ka.ROW_RATE]
+        where_off = f"gap {gaps[worst]:+.2e} m, rate {rate:+.2e} m/s"
+        what = f"contact {prepared.contacts[owner].name} cannot be kept on its surface ({where_off})"
     return f"{where}: {what}; the contacts contradict each other or the arm is singular here" + (
         ", or integrator.step_s is too long (try integrator.method: auto)" if method == "rk4" else ""
     )
