@@ -134,7 +134,7 @@ def test_a_signal_saves_what_was_simulated(tmp_path: Path, number: signal.Signal
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_a_signal_ends_runs_whose_steps_do_not(tmp_path: Path, number: signal.Signals, jobs: str):
     """What was recorded before is saved, and no process is left in its step."""
-    arguments = ["compare", "elbow_comparison", "--jobs", jobs, *LONG, "--out", "out"]
+    arguments = ["compare", "elbow_comparison_floor", "--jobs", jobs, *LONG, "--out", "out"]
     with started(tmp_path, *arguments, stands=True) as process:
         wait_until(lambda: len(pids(tmp_path, "simulating")) == int(jobs), process)
         time.sleep(0.5)
@@ -147,7 +147,7 @@ def test_a_signal_ends_runs_whose_steps_do_not(tmp_path: Path, number: signal.Si
 
 
 def test_a_signal_ends_a_sweep_whose_steps_do_not(tmp_path: Path):
-    arguments = ["sweep", "elbow_comparison", "--grid", "contacts.friction=0,0.1,0.2", "--jobs", "2", *LONG]
+    arguments = ["sweep", "elbow_comparison_floor", "--grid", "contacts.friction=0,0.1,0.2", "--jobs", "2", *LONG]
     with started(tmp_path, *arguments, "--out", "out", stands=True) as process:
         wait_until(lambda: len(pids(tmp_path, "simulating")) == 2, process)
         process.send_signal(signal.SIGTERM)
