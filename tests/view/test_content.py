@@ -254,6 +254,20 @@ def test_simplified_links_of_published_robots_are_not_torn(file: str) -> None:
     assert set(map(tuple, few.colours)) == set(map(tuple, whole.colours))
 
 
+@pytest.mark.parametrize("part", ["panda_description/meshes/visual/", "ur_description/meshes/ur5/visual/"])
+def test_a_published_robot_is_a_page_of_less_than_two_megabytes(part: str) -> None:
+    files = [one for one in metadata.files("example-robot-data") or () if part in str(one) and one.suffix == ".dae"]
+    meshes = [welded(read_mesh(Path(str(one.locate())))) for one in files]
+    assert len(meshes) >= 7
+    few = simplified(meshes)
+    triangles = [sum(len(mesh.triangles) for mesh in some) for some in (meshes, few)]
+    assert min(triangles[0], 95_000) <= triangles[1] <= 110_000
+    blocks = Blocks()
+    head = {"meshes": [packed(mesh, blocks) for mesh in few]}
+    # Three.js and the program take 0.75 MB.
+    assert len(blocks.packed(head)) < 1_200_000
+
+
 def sampled(mesh: Mesh) -> np.ndarray:
     """Points on a mesh, some hundred thousand, where its area is."""
     corners = mesh.corners[mesh.triangles]
