@@ -89,19 +89,11 @@ def scan(
     owners = {servo.id: servo for servo in servo_map.servos} if servo_map else {}
     table = Table("ID", "model", "fw", "bit/s", "mode", "delay µs", "V", "°C", "torque", "error", "joint")
     for servo in found:
-        table.add_row(
-            str(servo.id),
-            servo.model_name,
-            str(servo.firmware),
-            str(servo.baud),
-            str(servo.mode),
-            f"{servo.return_delay * 1e6:.0f}",
-            f"{servo.voltage:.1f}",
-            f"{servo.temperature:.0f}",
-            "ON" if servo.torque else "off",
-            f"0x{servo.hardware_error:02x}" if servo.hardware_error else "-",
-            owners[servo.id].joint if servo.id in owners else "-",
-        )
+        numbers = [f"{servo.return_delay * 1e6:.0f}", f"{servo.voltage:.1f}", f"{servo.temperature:.0f}"]
+        error = f"0x{servo.hardware_error:02x}" if servo.hardware_error else "-"
+        joint = owners[servo.id].joint if servo.id in owners else "-"
+        who = [str(servo.id), servo.model_name, *map(str, (servo.firmware, servo.baud, servo.mode))]
+        table.add_row(*who, *numbers, "ON" if servo.torque else "off", error, joint)
     console.print(table)
     if servo_map:
         _compare_with_map(found, servo_map)
@@ -142,14 +134,8 @@ def _checked(record_file: Path, map_file: Path, rate: float | None, speed: float
 def _print_check(motion: Any, servo_map: Any) -> None:
     table = Table("joint", "quantity", "tightest", "limit", "margin", "at [s]")
     for margin in motion.margins:
-        table.add_row(
-            margin.joint,
-            f"{margin.quantity} [{margin.unit}]",
-            f"{margin.value:.4f}",
-            f"{margin.limit:.4f}",
-            f"{margin.margin:.4f}",
-            f"{margin.time:.3f}",
-        )
+        numbers = [f"{number:.4f}" for number in (margin.value, margin.limit, margin.margin)]
+        table.add_row(margin.joint, f"{margin.quantity} [{margin.unit}]", *numbers, f"{margin.time:.3f}")
     console.print(table)
     for warning in motion.warnings:
         console.print(f"warning: {warning}")
@@ -289,29 +275,18 @@ def compare(
     figure = draw_comparison(comparison, folder / "comparison.png", joints or ())
     table = Table("joint", "rms [rad]", "max [rad]", "at [s]", "rms, delay removed [rad]", "delay [ms]")
     for joint in comparison.joints:
-        table.add_row(
-            joint.joint,
-            f"{joint.rms:.5f}",
-            f"{joint.max:.5f}",
-            f"{joint.time_of_max:.3f}",
-            f"{joint.rms_delay_removed:.5f}",
-            "-" if joint.delay != joint.delay else f"{joint.delay * 1e3:.1f}",
-        )
+        delay = "-" if joint.delay != joint.delay else f"{joint.delay * 1e3:.1f}"
+        errors = [f"{joint.rms:.5f}", f"{joint.max:.5f}", f"{joint.time_of_max:.3f}"]
+        table.add_row(joint.joint, *errors, f"{joint.rms_delay_removed:.5f}", delay)
     console.print(table)
     if comparison.wheels:
         wheels = Table(
             "wheel", "rate: rms [rad/s]", "max [rad/s]", "at [s]", "turned [rad]", "error: max [rad]", "at end"
         )
         for wheel in comparison.wheels:
-            wheels.add_row(
-                wheel.wheel,
-                f"{wheel.rate_rms:.4f}",
-                f"{wheel.rate_max:.4f}",
-                f"{wheel.time_of_max:.3f}",
-                f"{wheel.turned:.3f}",
-                f"{wheel.angle_max:.4f}",
-                f"{wheel.angle_end:+.4f}",
-            )
+            rates = [f"{wheel.rate_rms:.4f}", f"{wheel.rate_max:.4f}", f"{wheel.time_of_max:.3f}"]
+            angles = [f"{wheel.turned:.3f}", f"{wheel.angle_max:.4f}", f"{wheel.angle_end:+.4f}"]
+            wheels.add_row(wheel.wheel, *rates, *angles)
         console.print(wheels)
     console.print(f"delay {comparison.delay * 1e3:.1f} ms, worst joint {comparison.worst.joint}")
     write_json(folder / "comparison.json", comparison.summary())

@@ -1,9 +1,10 @@
-"""All cases of a seed, or one of them again."""
+"""All cases of a seed, or one of them again. Failures are told as they come; Ctrl-C ends it with the table so far."""
 
 from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
 import tempfile
 from pathlib import Path
@@ -37,10 +38,18 @@ def main() -> int:
             cases = [(options.kind, index) for index in range(options.count)]
         else:
             cases = campaign.spread(options.count)
-        done = []
+        done: list[campaign.Result] = []
+
+        def end(*_: object) -> None:
+            print(campaign.table(done) if done else "nothing was done", flush=True)
+            os._exit(130)
+
+        signal.signal(signal.SIGINT, end)
 
         def report(result: campaign.Result) -> None:
             done.append(result)
+            if result.failed:
+                print(result, file=sys.stderr, flush=True)
             if sys.stderr.isatty() and len(done) % 20 == 0:
                 print(f"\r{len(done)} of {len(cases)}", end="", file=sys.stderr, flush=True)
 
