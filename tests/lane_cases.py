@@ -158,8 +158,9 @@ def limited() -> Case:
     """Motors of which some lanes are at their limits."""
     rng = np.random.default_rng(6)
     robot = random_robot(rng, 6)
-    motors = tuple(replace(motor, voltage_limit=15.0) for motor in robot.motors)
-    return of(rng, bench(replace(robot, motors=motors)), 1.0)
+    motors = [replace(motor, voltage_limit=15.0) for motor in robot.motors]
+    motors[0] = replace(motors[0], current_limit=3.0)
+    return of(rng, bench(replace(robot, motors=tuple(motors))), 1.0)
 
 
 def servos() -> Case:

@@ -47,7 +47,7 @@ class Case(NamedTuple):
 
 def solved(law: Callable[..., object], until: float, start: np.ndarray, *more: object) -> np.ndarray:
     """End of an ordinary differential equation, far beyond what steps resolve."""
-    return solve_ivp(law, (0.0, until), start, "DOP853", rtol=1e-12, atol=1e-13, args=more).y[:, -1]
+    return solve_ivp(law, (0.0, until), start, "DOP853", rtol=1e-12, atol=1e-13, args=more)["y"][:, -1]
 
 
 def point(contact: Contact, mass: float, *, gravity: float = G) -> Bench:
@@ -108,7 +108,7 @@ def hump() -> Case:
         lambda _, y: [y[1], G / radius * np.sin(y[0])], (0.0, 2.0), [0.0, speed / radius], "DOP853",
         rtol=1e-12, atol=1e-13, events=leaves,
     )  # fmt: skip
-    (angle, rate), rest = way.y[:, -1], until - way.t[-1]
+    (angle, rate), rest = way["y"][:, -1], until - way["t"][-1]
     left = radius * np.array([np.sin(angle), 0.0, np.cos(angle) - 1.0])
     speeds = radius * rate * np.array([np.cos(angle), 0.0, -np.sin(angle)])
     end = left + rest * speeds - 0.5 * G * rest**2 * Z
@@ -160,7 +160,7 @@ def incline(until: float = 0.6) -> Case:
     # The plane is level here and gravity leans.
     b = point(Contact("foot", "z", np.zeros(3), plane(Z), friction=friction), 1.0)
     b.system.model.gravity[:] = G * np.array([0.0, -np.sin(slope), -np.cos(slope)])
-    return Case(b, np.zeros(3), np.r_[start, 0.0], until, np.r_[way.y[:2, -1], 0.0])
+    return Case(b, np.zeros(3), np.r_[start, 0.0], until, np.r_[way["y"][:2, -1], 0.0])
 
 
 LENGTH, MASS, FLOOR = np.array([0.3, 0.25, 0.2]), np.array([0.5, 0.4, 0.3]), -0.1

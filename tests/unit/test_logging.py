@@ -21,6 +21,7 @@ def test_a_run_logs_what_takes_long_and_its_warnings(caplog: pytest.LogCaptureFi
     record = dynsim.simulate(load_scenario("elbow_comparison", overrides=SHORT))
     assert {entry.name for entry in caplog.records} == {
         "dynsim.engine",
+        "dynsim.engine.attended",
         "dynsim.engine.prepare",
         "dynsim.engine.dynamics",
     }

@@ -144,7 +144,7 @@ def test_declared_points_are_not_candidates_once_more(tmp_path, caplog):
         ("joint_4", 0.02),
         ("link_4_end", 0.02),
     ]
-    assert "a point without radius touches there instead of the link: elbow" in caplog.text
+    assert "a point of less radius touches there instead of the link: elbow" in caplog.text
 
 
 FLAT = ["joint_3", "joint_4", "link_4_end"]

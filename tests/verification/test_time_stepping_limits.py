@@ -52,7 +52,7 @@ def test_a_stiff_velocity_loop_rolls(gain, theta):
     assert run.stepping.found[UNSETTLED] == 0
 
 
-def stiff_arm(limit: float) -> tuple[Bench, np.ndarray]:
+def stiff_arm(limit: float, current: float = np.inf) -> tuple[Bench, np.ndarray]:
     """Three joints with gains that ask for a thousand volts; at rest, and away from where they should be."""
     links = [
         Link(f"l{k}", f"j{k}", f"l{k - 1}" if k else None, "revolute", -Y, Inertia(1.0, 0.15 * X, 0.01 * np.eye(3)),
@@ -60,7 +60,16 @@ def stiff_arm(limit: float) -> tuple[Bench, np.ndarray]:
         for k in range(3)
     ]  # fmt: skip
     motors = [
-        Motor(f"j{k}", 0.05, resistance=0.6, inductance=1e-3, rotor_inertia=1e-5, gear_ratio=60.0, voltage_limit=limit)
+        Motor(
+            f"j{k}",
+            0.05,
+            resistance=0.6,
+            inductance=1e-3,
+            rotor_inertia=1e-5,
+            gear_ratio=60.0,
+            voltage_limit=limit,
+            current_limit=current,
+        )
         for k in range(3)
     ]
     b = bench(
@@ -70,10 +79,11 @@ def stiff_arm(limit: float) -> tuple[Bench, np.ndarray]:
     return b, b.state(np.zeros(3), np.zeros(3), np.zeros(3))
 
 
-@pytest.mark.parametrize("limit", [24.0, 6.0])
-def test_a_stiff_arm_at_its_voltage_limit_ends_where_radau5_does(limit):
+@pytest.mark.parametrize(("limit", "current"), [(24.0, np.inf), (6.0, np.inf), (24.0, 6.0)])
+def test_a_stiff_arm_at_its_limits_ends_where_radau5_does(limit, current):
+    """Limits of voltage, and of the current by the driver of a motor."""
     times = np.array([0.0, 0.3, 1.0])
-    b, y = stiff_arm(limit)
+    b, y = stiff_arm(limit, current)
     exact = b.simulate(y, times, "radau5", rtol=1e-9)
     errors, energies = [], []
     for step in (2e-3, 1e-3, 5e-4):

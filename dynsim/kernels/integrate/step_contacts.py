@@ -22,7 +22,7 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels.arrays import Workspace
 from dynsim.kernels.constraint import unilateral as ku
 from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, ONE_WAY, TANGENT, approach
-from dynsim.kernels.constraint.distance import RADIUS
+from dynsim.kernels.constraint.distance import MOVES, RADIUS
 from dynsim.kernels.constraint.least_norm import select_least_norm
 from dynsim.kernels.constraint.rows import point_row, set_modes
 from dynsim.kernels.constraint.unilateral import UnilateralArrays, sliding_friction, stop_gap
@@ -32,8 +32,9 @@ from dynsim.kernels.jit import internal_kernel
 
 # cos of the angle by which a row may turn in a step and still be the same row: more is a kink, an edge, another place.
 SAME_ROW = 0.95
-# A place of contact that has moved by more than this times the way of the body there is another one; rounding [m].
-SAME_PLACE, PLACE_ROUNDING = 4.0, 1e-9
+# A place of contact that has moved by more than this times the way of the body there is another one; by less than the
+# second, which the body may have gone as it turned back, it is the same [m].
+SAME_PLACE, SHORT_WAY = 4.0, 1e-4
 # What is no further from its surface touches when a run begins, or its rates have jumped [m].
 TOUCHES = 1e-9
 # A gap is closed, and depth taken back, within this time, and no shorter one than so many steps [s]; not faster than
@@ -134,13 +135,22 @@ def goes_on(system, s: SteppingArrays, last, ws: Workspace, k, h):
         turned += state[ka.NORMAL + m] * last[kt.NORMAL_THEN + m]
     if turned <= SAME_ROW:
         return False
-    link = ws.links[system.contacts.link[k, ka.LINK]]
-    x, y, z = centre(system.shapes, state, k)
+    return place_goes_on(system.shapes, s, last, state, ws.links[system.contacts.link[k, ka.LINK]], k, h)
+
+
+@internal_kernel
+def place_goes_on(shapes, s: SteppingArrays, last, state, link, k, h):
+    """True unless the place of candidate k has jumped, as that of a capsule may from one of its ends to the other."""
+    if shapes is None:  # known to the compiler
+        return True
+    if shapes.kind[k, MOVES] == 0:
+        return True
+    x, y, z = centre(shapes, state, k)
     way = (x - last[kt.CENTRE]) ** 2 + (y - last[kt.CENTRE + 1]) ** 2 + (z - last[kt.CENTRE + 2]) ** 2
     v = s.b
     velocity_at(link, x, y, z, v)
     speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-    return math.sqrt(way) <= SAME_PLACE * h * speed + PLACE_ROUNDING
+    return math.sqrt(way) <= SAME_PLACE * h * speed + SHORT_WAY
 
 
 @internal_kernel
