@@ -79,11 +79,10 @@ def stiff_arm(limit: float, current: float = np.inf) -> tuple[Bench, np.ndarray]
     return b, b.state(np.zeros(3), np.zeros(3), np.zeros(3))
 
 
-@pytest.mark.parametrize(("limit", "current"), [(24.0, np.inf), (6.0, np.inf), (24.0, 6.0)])
-def test_a_stiff_arm_at_its_limits_ends_where_radau5_does(limit, current):
-    """Limits of voltage, and of the current by the driver of a motor."""
+@pytest.mark.parametrize("limit", [24.0, 6.0])
+def test_a_stiff_arm_at_its_voltage_limit_ends_where_radau5_does(limit):
     times = np.array([0.0, 0.3, 1.0])
-    b, y = stiff_arm(limit, current)
+    b, y = stiff_arm(limit)
     exact = b.simulate(y, times, "radau5", rtol=1e-9)
     errors, energies = [], []
     for step in (2e-3, 1e-3, 5e-4):
@@ -96,6 +95,18 @@ def test_a_stiff_arm_at_its_limits_ends_where_radau5_does(limit, current):
     assert errors[2][0] < 0.2 * errors[0][0]
     assert errors[2][1] < 1e-10
     assert abs(energies[2]) < 1e-3
+
+
+def test_a_driver_that_limits_the_current_does_so_at_the_end_of_a_step():
+    """Six amperes hardly hold it: it comes on and off its limits for a second, each to within a step."""
+    times = np.array([0.0, 0.3, 1.0])
+    b, y = stiff_arm(24.0, 6.0)
+    exact = b.simulate(y, times, "radau5", rtol=1e-9).states("q")
+    runs = [stepped(b, y, times, h, 0.5) for h in (2e-3, 1e-3, 5e-4)]
+    errors = [np.abs(run.states("q") - exact).max() for run in runs]
+    assert errors[2] < 1e-3
+    assert errors[2] < 0.2 * errors[0]
+    assert all(run.stepping.found[UNSETTLED] == 0 for run in runs)
 
 
 def test_servos_with_limits_of_current_and_open_torques_end_where_radau5_does():
