@@ -14,7 +14,9 @@ import math
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -349,27 +351,32 @@ def _options() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _earlier(journal: Path | None) -> list[Ending]:
-    if journal is None or not journal.exists():
-        return []
-    return [Ending(**json.loads(line)) for line in journal.read_text("utf-8").splitlines() if line.endswith("}")]
+def note(journal: Path, ending: Ending) -> None:
+    """Add a line to a journal."""
+    with journal.open("a", encoding="utf-8") as stream:
+        stream.write(json.dumps(asdict(ending)) + "\n")
+
+
+def noted(journal: Path | None) -> list[Ending]:
+    """What a journal has; a process that was killed may have left a line unfinished."""
+    found: list[Ending] = []
+    if journal is not None and journal.exists():
+        for line in journal.read_text("utf-8").splitlines():
+            with suppress(ValueError, TypeError):
+                found.append(Ending(**json.loads(line)))
+    return found
 
 
 if __name__ == "__main__":
     given = _options()
     wanted = range(given.first, given.first + given.count)
-    earlier = [one for one in _earlier(given.journal) if one.scene in wanted]
+    earlier = [one for one in noted(given.journal) if one.scene in wanted]
     left = sorted(set(wanted) - {one.scene for one in earlier})
-
-    def keep(ending: Ending) -> None:
-        if given.journal is not None:
-            with given.journal.open("a", encoding="utf-8") as stream:
-                stream.write(json.dumps(asdict(ending)) + "\n")
-
+    keep: Callable[[Ending], None] = partial(note, given.journal) if given.journal is not None else lambda ending: None
     with tempfile.TemporaryDirectory() as temporary:
         ended, stopped = endings(left, given.jobs, write_terrains(Path(temporary)), keep)
     result = account(sorted([*earlier, *ended], key=lambda one: one.scene))
-    print(json.dumps(result, indent=2))
+    print(json.dumps(result, indent=2, ensure_ascii=False))
     if not stopped:
         given.out.parent.mkdir(parents=True, exist_ok=True)
         write_json(given.out, {"dynsim_version": __version__, "seed": SEED, **result})
