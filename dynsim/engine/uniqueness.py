@@ -66,7 +66,7 @@ class ContactMatrices:
     def basis(self) -> Array:
         """Orthonormal basis of the range of A0, (p, rank)."""
         values, vectors = np.linalg.eigh(self.frictionless)
-        return vectors[:, values > RANK_TOLERANCE * values[-1]]
+        return vectors[:, values > RANK_TOLERANCE * values.max(initial=0.0)]
 
     def determinant(self, signs: Array) -> float:
         """det A(σ) / det A0; with dependent rows of both on the range of A0."""
