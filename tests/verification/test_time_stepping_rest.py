@@ -43,7 +43,7 @@ def stays(run) -> np.ndarray:
     assert np.ptp(force, axis=0).max() < 1e-6
     assert np.abs(np.diff(run.states("q"), axis=0)).max() < 1e-10
     assert run.count[LOGGED] == 0
-    np.testing.assert_allclose(force.sum(axis=1), MASS * G, rtol=1e-9)
+    np.testing.assert_allclose(force.sum(axis=1), MASS * G, rtol=1e-8)
     return force[-1]
 
 
