@@ -115,7 +115,9 @@ class Worker:
         process.communicate()
         self._process = None
         log = self._read_log()
-        places = [line.strip() for line in log.splitlines() if line.lstrip().startswith("File ")]
+        # Of all threads that are told the main one, which began first, is the last.
+        main_thread = log.rpartition("(most recent call first)")[2]
+        places = [line.strip() for line in main_thread.splitlines() if line.lstrip().startswith("File ")]
         ours = next((line for line in places if f"{os.sep}dynsim{os.sep}" in line and "site-packages" not in line), "")
         # 'File "…/dynsim/record.py", line 144 in load' → 'dynsim/record.py:load'
         place = (
