@@ -159,11 +159,7 @@ def test_long_many_and_senseless_messages_end_a_connection(teleop: Callable[...,
     assert one.interrupt() == 0
 
 
-# Known fault: since compiled code runs in a thread of its own, this one answers no more after the first command.
-REAL_FLOOR = pytest.param(("elbow_comparison_floor",), marks=pytest.mark.xfail(reason="no frames on a real floor"))
-
-
-@pytest.mark.parametrize("scenario", [SNAKE, ("mobile_path",), REAL_FLOOR])
+@pytest.mark.parametrize("scenario", [SNAKE, ("mobile_path",), ("elbow_comparison_floor",)])
 def test_a_drive_leaves_its_record_and_a_script_that_repeats_it(
     teleop: Callable[..., Teleop], scenario: tuple[str, ...], nothing: None
 ) -> None:
