@@ -9,8 +9,8 @@ import numpy as np
 
 from dynsim.kernels.constraint import unilateral as ku
 from dynsim.kernels.constraint.unilateral import UnilateralArrays
-from dynsim.kernels.integrate.contact_events import MOST_EVENTS, WINDOW
-from dynsim.kernels.integrate.time_stepping import BAD
+from dynsim.kernels.integrate import contact_events as kev
+from dynsim.kernels.integrate import time_stepping as kt
 from dynsim.model.control import JointControl
 from dynsim.model.description import Contact, Robot
 from dynsim.model.unilateral import START_TOLERANCE, JointStop, told
@@ -113,8 +113,8 @@ def chattered(contacts: Sequence[Contact], unilateral: UnilateralArrays) -> list
     for contact, tally in zip(contacts, unilateral.tally, strict=True):
         if tally[ku.CHATTERED]:
             found.append(
-                f"{contact.name}: chatter, more than {MOST_EVENTS} contact events within {WINDOW:g} s; what left more "
-                f"slowly than {tally[ku.SETTLE]:.0e} m/s was kept on the surface"
+                f"{contact.name}: chatter, more than {kev.MOST_EVENTS} contact events within {kev.WINDOW:g} s; what "
+                f"left more slowly than {tally[ku.SETTLE]:.0e} m/s was kept on the surface"
             )
     return found
 
@@ -161,6 +161,6 @@ def capped(stepping: dict[str, Any]) -> list[str]:
         return []
     return [
         f"time stepping: {stepping['capped_solves']} of {stepping['contact_solves']} contact problems were given up "
-        f"above {BAD:g} m/s, the worst at {stepping['residual_max_m_s']:.1e} m/s: their forces are not quite "
+        f"above {kt.BAD:g} m/s, the worst at {stepping['residual_max_m_s']:.1e} m/s: their forces are not quite "
         "Coulomb's; shorten integrator.step_s"
     ]

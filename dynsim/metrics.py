@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from dynsim._version import __version__
 from dynsim.base_metrics import tipped
 from dynsim.contact_metrics import capped, chattered, coarse, modes, never_touched, touched_stops
-from dynsim.kernels.constraint.unilateral import AT_ROOT, UnilateralArrays
-from dynsim.kernels.integrate.run import DRIFT_MAX, EXTREMES_SIZE, FORCE_MAX, FORCE_MIN, LOCAL_SINCE, PULLING
+from dynsim.kernels.constraint import unilateral as ku
+from dynsim.kernels.constraint.unilateral import UnilateralArrays
+from dynsim.kernels.integrate import run as ki
 from dynsim.measures import (
     RESIDUAL_LIMIT,
     STORES,
@@ -56,7 +57,7 @@ FRICTION_ROUNDING = 1e-12
 LIMIT_SLACK = 1e-6
 # Heights below this are not resolved by landings [m]: each is found to AT_ROOT, which leaves the weight times that in
 # the ledger, and here ten of them reach the limit of its residual.
-RESOLVED_M = 10.0 * AT_ROOT / RESIDUAL_LIMIT
+RESOLVED_M = 10.0 * ku.AT_ROOT / RESIDUAL_LIMIT
 # Part of a limit of current that counts as reached.
 NEAR_LIMIT = 1e-3
 NOT_ENFORCED = "no law enforces this limit"
@@ -208,7 +209,7 @@ def summarise(
         **_loads(record),
         "energy_turnover_J": turnover,
         "energy_residual_relative": residual / denominator if denominator > 0.0 else 0.0,
-        "constraint_drift_max_m": float(counts.extremes[:, DRIFT_MAX].max(initial=0.0)),
+        "constraint_drift_max_m": float(counts.extremes[:, ki.DRIFT_MAX].max(initial=0.0)),
         **_base(record, scenario, robot, counts),
         "contacts": [
             _contact(record, k, contact, counts, duration, contact.name in scenario.config.contacts.points)
@@ -255,16 +256,16 @@ def _contact(
     real = {} if counts.unilateral is None else modes(counts.unilateral, k, duration)
     # Under the unilateral law a force ends at zero; what lies below is the tolerance of that event.
     least = -np.inf if counts.unilateral is None else 0.0
-    extremes = counts.extremes[k] if counts.steps else np.zeros(EXTREMES_SIZE)
+    extremes = counts.extremes[k] if counts.steps else np.zeros(ki.EXTREMES_SIZE)
     # Extremes are those of every accepted step, which are closer together than the samples, and of the samples.
     return {
         "name": contact.name,
         "surface": contact.surface_name,
-        "normal_force_min_N": max(float(min(extremes[FORCE_MIN], force.min(initial=np.inf))), least),
+        "normal_force_min_N": max(float(min(extremes[ki.FORCE_MIN], force.min(initial=np.inf))), least),
         "normal_force_mean_N": float(record["contact_impulse"][-1, k] / duration) if duration > 0 else 0.0,
-        "normal_force_max_N": float(max(extremes[FORCE_MAX], force.max(initial=-np.inf))),
+        "normal_force_max_N": float(max(extremes[ki.FORCE_MAX], force.max(initial=-np.inf))),
         "closed_fraction": 1.0,
-        "pulling_fraction": min(float(extremes[PULLING]) / duration, 1.0) if duration > 0.0 else 0.0,
+        "pulling_fraction": min(float(extremes[ki.PULLING]) / duration, 1.0) if duration > 0.0 else 0.0,
         "slip_distance_m": float(record["contact_slip_distance"][-1, k]) if len(record) else 0.0,
         **real,
         **({"gap_min_m": float(record["contact_gap"][:, k].min())} if real and declared and len(record) else {}),
@@ -290,7 +291,7 @@ def _warnings(
                 f"{-contact['normal_force_min_N']:.3g} N; a real arm would lift off"
             )
     found.extend(never_touched(record, summary["contacts"], () if initial is None else initial.on_surface))
-    for contact, since in zip(contacts, counts.extremes[:, LOCAL_SINCE], strict=True):
+    for contact, since in zip(contacts, counts.extremes[:, ki.LOCAL_SINCE], strict=True):
         if np.isfinite(since):
             found.append(
                 f"{contact.name}: from t = {since:.4g} s on, its friction turns its own force against it (negative "

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.errors import ModelError
-from dynsim.kernels.constraint.brace_arrays import BRACE_SIZE
+from dynsim.kernels.constraint import brace_arrays as kb
 from dynsim.model.bracing import MIN_N, BracePlanner, brace_rows
 from dynsim.model.description import Contact
 from dynsim.model.drives import Motor
@@ -99,7 +99,7 @@ def _pressing_torques(
     planner = BracePlanner(model.robot, model.arrays, [link for link, _ in attached])
     points = np.array([point for _, point in attached]).reshape(-1, 3)
     positions, velocities = planner.motion(points, q, v)
-    tables = np.zeros((len(times), len(braces), BRACE_SIZE))
+    tables = np.zeros((len(times), len(braces), kb.BRACE_SIZE))
     for k, (name, (contact, force)) in enumerate(braces.items()):
         _check_gaps(name, contact, times, contact.surface.gaps(positions[:, k]) - contact.radius)
         normals = contact.surface.normals(positions[:, k])

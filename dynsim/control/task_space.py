@@ -20,26 +20,20 @@ from dynsim.errors import ModelError
 from dynsim.kernels.jit import integers, reals
 from dynsim.model.protocols import BuildContext
 from dynsim.model.snake import ModeTable, SnakeDescription, TaskSpaceController, conditioning
-from dynsim.snake.control import (
-    LIMITS_ALLOCATE,
-    LIMITS_NONE,
-    LIMITS_SATURATE,
-    NULL_PAPER,
-    NULL_SAFE,
-    Law,
-    control_input,
-    new_work,
-)
+from dynsim.snake import control as sc
+from dynsim.snake import state as ss
+from dynsim.snake import support as ssup
+from dynsim.snake.control import Law, control_input, new_work
 from dynsim.snake.kinematics import SnakeModel, pose_of_point
-from dynsim.snake.state import ESTIMATED, FEEDFORWARD, MEASURED, Schedule
-from dynsim.snake.support import COST_ANGLES, COST_SUPPORT_MIN, COST_SUPPORT_NORM, Cost
+from dynsim.snake.state import Schedule
+from dynsim.snake.support import Cost
 
 ENGINE = "kinematic"
 
-COSTS = {"eq19": COST_ANGLES, "eq20": COST_SUPPORT_NORM, "eq20_min": COST_SUPPORT_MIN}
-LIMIT_POLICIES = {"none": LIMITS_NONE, "saturate": LIMITS_SATURATE, "allocate": LIMITS_ALLOCATE}
-STATES = {"measured": MEASURED, "estimated": ESTIMATED, "feedforward": FEEDFORWARD}
-FORMS = {"paper": NULL_PAPER, "safe": NULL_SAFE}
+COSTS = {"eq19": ssup.COST_ANGLES, "eq20": ssup.COST_SUPPORT_NORM, "eq20_min": ssup.COST_SUPPORT_MIN}
+LIMIT_POLICIES = {"none": sc.LIMITS_NONE, "saturate": sc.LIMITS_SATURATE, "allocate": sc.LIMITS_ALLOCATE}
+STATES = {"measured": ss.MEASURED, "estimated": ss.ESTIMATED, "feedforward": ss.FEEDFORWARD}
+FORMS = {"paper": sc.NULL_PAPER, "safe": sc.NULL_SAFE}
 
 
 class Config(Script):

@@ -16,7 +16,7 @@ from dynsim.model.snake import FIXING, SWITCHING, CommandBlock, Feedback
 from dynsim.record import Record
 from dynsim.record.poses import poses_at
 from dynsim.scenario import Scenario
-from dynsim.snake.state import MODE, STILL_FOR, TICKS
+from dynsim.snake import state as ss
 
 REQUESTS = {SWITCHING: "switching", FIXING: "fixing"}
 
@@ -63,7 +63,7 @@ class DrivenSnake:
     @property
     def ticks(self) -> int:
         """Control periods so far."""
-        return int(self._run.state.counts[TICKS])
+        return int(self._run.state.counts[ss.TICKS])
 
     @property
     def time(self) -> float:
@@ -101,7 +101,7 @@ class DrivenSnake:
             "phi": dict(zip(run.description.joint_names, state.phi.tolist(), strict=True)),
             "rho": dict(zip(run.description.wheel_names, state.rho.tolist(), strict=True)),
         }
-        row = int(state.counts[MODE])
+        row = int(state.counts[ss.MODE])
         return Shown(
             time=self.time,
             poses=poses_at(self._scene, signals),
@@ -120,12 +120,12 @@ class DrivenSnake:
         run = self._run
         if run.recovering:
             return OBSTACLES[-1]
-        return OBSTACLES[int(run.state.counts[STILL_FOR]) - 1] if run.blocked else ""
+        return OBSTACLES[int(run.state.counts[ss.STILL_FOR]) - 1] if run.blocked else ""
 
     def joints(self) -> Mapping[str, Array]:
         """Joints and wheels; rates are held from period to period, so that they are differences of these."""
         run, state = self._run, self._run.state
-        grounded = run.controller.law.grounded[int(state.counts[MODE])]
+        grounded = run.controller.law.grounded[int(state.counts[ss.MODE])]
         return {"phi": state.phi.copy(), "rho": state.rho.copy(), "grounded": grounded}
 
     def still(self) -> Record:

@@ -34,8 +34,9 @@ from dynsim.record.poses import pose_columns
 from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario, build
 from dynsim.scenario.effect import without_effect
+from dynsim.snake import state as ss
 from dynsim.snake.kinematics import pose_of_point
-from dynsim.snake.state import DONE, MODE, PLACE, TICKS, State, new_rig, new_state, new_trace
+from dynsim.snake.state import State, new_rig, new_state, new_trace
 from dynsim.snake.ticks import record_row, run_ticks
 
 log = logging.getLogger(__name__)
@@ -78,7 +79,7 @@ def prepare(scenario: Scenario, source: CommandSource | None = None) -> Run:
     state.base[:], state.phi[:] = description.initial_base_pose, description.initial_joints
     pose_of_point(model, state.base, state.phi, rig.work.frame, state.w_target)
     state.phi_hat[:], state.w_hat[:] = state.phi, state.w_target
-    state.counts[MODE] = controller.fixing_row
+    state.counts[ss.MODE] = controller.fixing_row
     run = Run(
         description=description,
         model=model,
@@ -133,12 +134,12 @@ def simulate(
     except KeyboardInterrupt:
         interruption.keep()
         interruption.answered()
-        reached = float(run.state.counts[TICKS] * controller.schedule.period)
+        reached = float(run.state.counts[ss.TICKS] * controller.schedule.period)
         stop = SimulationInterrupted(
             f"interrupted at t = {reached:.3f} s of {scenario.duration_s:g} s", time=reached, state=_named(run.state)
         )
     wall = clock.perf_counter() - started
-    log.info("%s: integrated %d control periods in %.3f s", scenario.title, run.state.counts[TICKS], wall)
+    log.info("%s: integrated %d control periods in %.3f s", scenario.title, run.state.counts[ss.TICKS], wall)
     record = make_record(run, scenario, provenance(scenario), switcher, wall, pictured)
     if stop is not None:
         raise_stopped(stop, record)
@@ -196,7 +197,7 @@ def read_commands(run: Run, waiting: bool) -> None:
     ModelError
         The same before the first period.
     """
-    state, period, first = run.state, run.controller.schedule.period, int(run.state.counts[TICKS])
+    state, period, first = run.state, run.controller.schedule.period, int(run.state.counts[ss.TICKS])
     w = np.zeros(6)
     pose_of_point(run.model, state.base, state.phi, run.rig.work.frame, w)
     feedback = Feedback(
@@ -205,7 +206,7 @@ def read_commands(run: Run, waiting: bool) -> None:
         w_target=state.w_target.copy(),
         base_pose=state.base.copy(),
         phi=state.phi.copy(),
-        mode=run.controller.modes.numbers[state.counts[MODE]],
+        mode=run.controller.modes.numbers[state.counts[ss.MODE]],
         waiting=waiting,
     )
     try:
@@ -221,7 +222,7 @@ def read_commands(run: Run, waiting: bool) -> None:
         raise SimulationStopped(text, time=feedback.time, state=_named(state)) from error
     run.block, run.block_start = block, first
     run.gripper[first : first + len(block.request)] = block.gripper
-    state.counts[PLACE], state.progress[DONE] = 0, 0.0
+    state.counts[ss.PLACE], state.progress[ss.DONE] = 0, 0.0
 
 
 def _checked(run: Run, block: CommandBlock, left: int) -> CommandBlock:
@@ -252,18 +253,18 @@ def _advance(run: Run, switcher: ModeSwitcher, progress: Progress | None, wall_l
         See :func:`advance_piece`; also when the wall limit [s] is over.
     """
     begun = clock.perf_counter()
-    while run.state.counts[TICKS] < run.ticks:
+    while run.state.counts[ss.TICKS] < run.ticks:
         if wall_limit is not None and clock.perf_counter() - begun > wall_limit:
-            time = float(run.state.counts[TICKS] * run.controller.schedule.period)
+            time = float(run.state.counts[ss.TICKS] * run.controller.schedule.period)
             raise SimulationStopped(
                 f"stopped at t = {time:g} s: the wall limit, integrator.wall_limit_s = {wall_limit:g} s, is over, "
-                f"in mode {run.controller.modes.numbers[run.state.counts[MODE]]}",
+                f"in mode {run.controller.modes.numbers[run.state.counts[ss.MODE]]}",
                 time=time,
                 state=_named(run.state),
             )
         advance_piece(run, switcher)
         if progress is not None:
-            progress(float(run.state.counts[TICKS] * run.controller.schedule.period))
+            progress(float(run.state.counts[ss.TICKS] * run.controller.schedule.period))
         interruption.check()
 
 
@@ -276,10 +277,10 @@ def advance_piece(run: Run, switcher: ModeSwitcher) -> None:
         The state is no longer finite, or the source failed.
     """
     state, controller, period = run.state, run.controller, run.controller.schedule.period
-    now = int(state.counts[TICKS])
+    now = int(state.counts[ss.TICKS])
     if run.switch_due:
         run.switch_due = False
-        state.counts[MODE] = switcher.at_tick(now, SWITCHING)
+        state.counts[ss.MODE] = switcher.at_tick(now, SWITCHING)
     if now == run.block_start + len(run.block.request):
         read_commands(run, waiting=run.blocked or run.recovering)
     ahead = run.block.request[now - run.block_start :]
@@ -287,7 +288,7 @@ def advance_piece(run: Run, switcher: ModeSwitcher) -> None:
     # At the ends of switching periods only, so that every recovery has at least one.
     if run.recovering and now >= (switcher.next_event() or 0) and _is_released(run):
         run.recovering, request = False, FIXING
-    state.counts[MODE] = switcher.at_tick(now, request)
+    state.counts[ss.MODE] = switcher.at_tick(now, request)
     later = 1 + np.flatnonzero(ahead[1:] != NO_REQUEST)
     ends = [now + len(ahead), now + CHUNK, *(now + later[:1])]
     if (event := switcher.next_event()) is not None:
@@ -307,7 +308,7 @@ def advance_piece(run: Run, switcher: ModeSwitcher) -> None:
         run.trace,
     )
     if done < 0:
-        time = float(state.counts[TICKS] * period)
+        time = float(state.counts[ss.TICKS] * period)
         raise SimulationStopped(
             f"the state is no longer finite at t = {time:g} s: a singular posture, or a gain too high "
             "for the control period",
@@ -328,12 +329,12 @@ def _predict(run: Run, row: int) -> tuple[float, float]:
     """Cost after one switching period in a mode with the present command held, and the smallest support margin."""
     ticks, law, real = run.controller.prediction_ticks, run.controller.law, run.controller.schedule
     schedule = run.controller.prediction
-    waits = (real.null_start_tick - int(run.state.counts[TICKS])) * real.period  # until the null space comes on [s]
+    waits = (real.null_start_tick - int(run.state.counts[ss.TICKS])) * real.period  # until the null space comes on [s]
     schedule = schedule._replace(null_start_tick=round(waits / schedule.period))
     trial, trace = _copy(run.state), new_trace(run.model, ticks + 1)
-    place = min(int(trial.counts[PLACE]), len(run.block.velocity) - 1)
+    place = min(int(trial.counts[ss.PLACE]), len(run.block.velocity) - 1)
     held = np.tile(run.block.velocity[place], (ticks, 1))
-    trial.counts[MODE], trial.counts[TICKS], trial.counts[PLACE], trial.progress[DONE] = row, 0, 0, 0.0
+    trial.counts[ss.MODE], trial.counts[ss.TICKS], trial.counts[ss.PLACE], trial.progress[ss.DONE] = row, 0, 0, 0.0
     done, _ = run_ticks(run.model, law, schedule, trial, held, ticks, 1, 1, 1, run.rig, trace)
     if done < 0:
         return np.inf, -np.inf  # no longer finite: no mode to take

@@ -17,20 +17,9 @@ from dynsim.record import Record
 from dynsim.record.poses import add_body_poses
 from dynsim.scenario import Scenario
 from dynsim.scenario.effect import without_effect
+from dynsim.snake import state as ss
 from dynsim.snake.kinematics import new_chain, posture_points
-from dynsim.snake.state import (
-    CLAMPED,
-    LATE,
-    NULL_REDUCED,
-    PATH_SLOWED,
-    SLOWED,
-    STILL,
-    STILL_FOR,
-    TICKS,
-    WAITED,
-    WAITED_FOR,
-    Trace,
-)
+from dynsim.snake.state import Trace
 from dynsim.snake.ticks import record_row
 
 # Why the target waited, in the order of the counters of dynsim.snake.state.State; the last is the rest: after
@@ -81,7 +70,7 @@ def make_record(
     pictured : with the scene and the poses of its bodies.
     """
     description, state, law = run.description, run.state, run.controller.law
-    model, period, ticks = run.model, run.controller.schedule.period, int(run.state.counts[TICKS])
+    model, period, ticks = run.model, run.controller.schedule.period, int(run.state.counts[ss.TICKS])
     rows = -(-ticks // run.stride) + 1
     trace = Trace(*(array[:rows] for array in run.trace))
     record_row(model, law, state, run.rig, rows - 1, trace)
@@ -139,17 +128,17 @@ def make_record(
 
 def _waiting_for(counts: NDArray[np.int64], period: float) -> dict[str, float]:
     """Why the target waited, and how long [s]; reasons that did not occur are left out."""
-    known = counts[WAITED_FOR + 1 : PATH_SLOWED]
-    ticks = [*known, counts[WAITED] - known.sum()]
+    known = counts[ss.WAITED_FOR + 1 : ss.PATH_SLOWED]
+    ticks = [*known, counts[ss.WAITED] - known.sum()]
     return {name: float(count * period) for name, count in zip(OBSTACLES, ticks, strict=True) if count}
 
 
 def _out_of_reach(counts: NDArray[np.int64], period: float, duration: float) -> dict[str, Any] | None:
     """Since when a target has waited that waits at the end of the run, and for what; None where it does not."""
-    still = float(counts[STILL] * period)
+    still = float(counts[ss.STILL] * period)
     if still < OUT_OF_REACH:
         return None
-    return {"since_s": duration - still, "reason": OBSTACLES[counts[STILL_FOR] - 1]}
+    return {"since_s": duration - still, "reason": OBSTACLES[counts[ss.STILL_FOR] - 1]}
 
 
 def _summary(run: Run, scenario: Scenario, switcher: ModeSwitcher, record: Record, wall: float) -> dict[str, Any]:
@@ -165,7 +154,7 @@ def _summary(run: Run, scenario: Scenario, switcher: ModeSwitcher, record: Recor
         "duration_s": duration,
         "integration_wall_s": wall,
         "real_time_factor": duration / wall if wall > 0.0 else 0.0,
-        "steps": int(counts[TICKS]),
+        "steps": int(counts[ss.TICKS]),
         "final_position_error_m": float(record["position_error"][-1]),
         "final_attitude_error_rad": float(record["attitude_error"][-1]),
         "position_error_max_m": float(record["position_error"].max()),
@@ -176,14 +165,14 @@ def _summary(run: Run, scenario: Scenario, switcher: ModeSwitcher, record: Recor
         "final_base_pose": record["base_pose"][-1].tolist(),
         "joint_limit_violation_max_rad": float(max(beyond.max(), 0.0)),
         "joints_taken_out": [description.joint_names[j] for j in np.flatnonzero((at_limit == 1).any(axis=0))],
-        "waiting_s": float(counts[WAITED] * period),
+        "waiting_s": float(counts[ss.WAITED] * period),
         "waiting_for_s": _waiting_for(counts, period),
-        "path_slowed_s": float(counts[PATH_SLOWED] * period),
-        "path_late_s": float(run.state.progress[LATE] * period),
+        "path_slowed_s": float(counts[ss.PATH_SLOWED] * period),
+        "path_late_s": float(run.state.progress[ss.LATE] * period),
         "out_of_reach": _out_of_reach(counts, period, duration),
-        "slowed_s": float(counts[SLOWED] * period),
-        "null_space_reduced_s": float(counts[NULL_REDUCED] * period),
-        "clamped_joint_ticks": int(counts[CLAMPED]),
+        "slowed_s": float(counts[ss.SLOWED] * period),
+        "null_space_reduced_s": float(counts[ss.NULL_REDUCED] * period),
+        "clamped_joint_ticks": int(counts[ss.CLAMPED]),
         "joint_rate_max_rad_s": float(np.abs(record["phi_dot"]).max()),
         "wheel_rate_max_rad_s": float(np.abs(record["rho_dot"]).max(initial=0.0)),
         "slip_max_m_s": float(record["slip"].max()),

@@ -17,14 +17,16 @@ from dynsim.engine.method import AUTO, Choice, choose
 from dynsim.engine.outcome import check_size
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.kernels import arrays as ka
+from dynsim.kernels import state as kst
+from dynsim.kernels.integrate import contact_events as kev
 from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.integrate.contact_events import NORMAL_GUARD, SLIP_GUARD, STOP_GUARD
+from dynsim.kernels.integrate import time_stepping as kt
 from dynsim.kernels.integrate.events import TIP_MARGIN
-from dynsim.kernels.integrate.time_stepping import GRIP, GRIP_AXIS, stepping_arrays
+from dynsim.kernels.integrate.time_stepping import stepping_arrays
 from dynsim.kernels.lanes.system import has_forms
-from dynsim.kernels.state import LOSSES, OutputLayout, StateLayout, block, output_layout, state_layout
+from dynsim.kernels.state import OutputLayout, StateLayout, block, output_layout, state_layout
 from dynsim.kernels.system import System, new_workspace
-from dynsim.kernels.tree.support import OUTPUTS
+from dynsim.kernels.tree import support as ks
 from dynsim.model.arrays import (
     compile_contacts,
     compile_couplings,
@@ -128,8 +130,8 @@ def prepare(
     real = scenario.config.contacts.law == "unilateral"
     stops = joint_stops(robot) if real else []
     stepped = scenario.integrator.method == "time_stepping"
-    layout = state_layout(model.nq, n, robot.circuits, c, len(loads), LOSSES if real else 0, 1 if stepped else 0)
-    columns = output_layout(n, na, c, OUTPUTS if robot.base else 0, len(stops))
+    layout = state_layout(model.nq, n, robot.circuits, c, len(loads), kst.LOSSES if real else 0, 1 if stepped else 0)
+    columns = output_layout(n, na, c, ks.OUTPUTS if robot.base else 0, len(stops))
     if times is None:
         times = sample_times(scenario, layout, columns, n)
     if stepped and robot.base is not None:
@@ -172,7 +174,7 @@ def prepare(
     stepping = None
     if method == ki.TIME_STEPPING and system.unilateral is not None:
         stepping = stepping_arrays(model.arrays, system.contacts, na, joint_rows, options.theta, system.unilateral)
-        stepping.law[:, GRIP : GRIP_AXIS + 3] = compile_grips(robot, contacts)
+        stepping.law[:, kt.GRIP : kt.GRIP_AXIS + 3] = compile_grips(robot, contacts)
     y = np.zeros(layout.size)
     y[block(layout, "q")] = robot.initial
     if balance is not None:
@@ -226,8 +228,8 @@ def guards(
     if robot.base is not None:
         rows.append((TIP_MARGIN, 0, -1, ki.STOP if robot.base.stop_on_overturn else ki.LOG))
     for k in range(len(contacts)):
-        rows += [(NORMAL_GUARD, k, -1, ki.LOG), (SLIP_GUARD, k, -1, ki.LOG)]
-    rows += [(STOP_GUARD, k, -1, ki.LOG) for k in range(len(stops))]
+        rows += [(kev.NORMAL_GUARD, k, -1, ki.LOG), (kev.SLIP_GUARD, k, -1, ki.LOG)]
+    rows += [(kev.STOP_GUARD, k, -1, ki.LOG) for k in range(len(stops))]
     if not rows:
         return None
     event = np.zeros((len(rows), ki.EVENT_SIZE))

@@ -16,9 +16,9 @@ from dynsim.engine.ratings import motor_loads, overloaded
 from dynsim.engine.sharing import sharing
 from dynsim.engine.uniqueness import motion_spread
 from dynsim.kernels import arrays as ka
+from dynsim.kernels import state as kst
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate import time_stepping
-from dynsim.kernels.state import CONTACT_SIZE, IMPULSE, OUT_FORCE, OUT_GAP, OUT_MODE, OUT_SLIP, OUT_VECTOR, SLIP
 from dynsim.kernels.tree import support as ks
 from dynsim.model.description import Link
 from dynsim.model.mobile_base import SUPPORTS, MobileBase, base_pose
@@ -87,14 +87,16 @@ def make_record(
         record.add(name, store, "J", description=f"{name.removeprefix('energy_')} energy")
     record.add("energy_residual", metrics.energy_residual(record), "J", description="what the ledger does not explain")
     touch = run.outputs("contact")
-    vector, slip = slice(OUT_VECTOR, OUT_VECTOR + 3), slice(OUT_SLIP, OUT_SLIP + 3)
-    record.add("contact_normal_force", touch[:, :, OUT_FORCE], "N", labels=names, description="f_n; negative: pulling")
+    vector, slip = slice(kst.OUT_VECTOR, kst.OUT_VECTOR + 3), slice(kst.OUT_SLIP, kst.OUT_SLIP + 3)
+    record.add(
+        "contact_normal_force", touch[:, :, kst.OUT_FORCE], "N", labels=names, description="f_n; negative: pulling"
+    )
     record.add("contact_force", touch[:, :, vector], "N", labels=names, description="normal and friction force, W")
-    record.add("contact_gap", touch[:, :, OUT_GAP], "m", labels=names, description="distance from the surface")
+    record.add("contact_gap", touch[:, :, kst.OUT_GAP], "m", labels=names, description="distance from the surface")
     record.add("contact_slip_velocity", touch[:, :, slip], "m/s", labels=names)
-    integrals = run.states("contact").reshape(rows, len(contacts), CONTACT_SIZE)
-    record.add("contact_impulse", integrals[:, :, IMPULSE], "N s", labels=names, description="∫ f_n dt")
-    record.add("contact_slip_distance", integrals[:, :, SLIP], "m", labels=names, description="∫ |v_t| dt")
+    integrals = run.states("contact").reshape(rows, len(contacts), kst.CONTACT_SIZE)
+    record.add("contact_impulse", integrals[:, :, kst.IMPULSE], "N s", labels=names, description="∫ f_n dt")
+    record.add("contact_slip_distance", integrals[:, :, kst.SLIP], "m", labels=names, description="∫ |v_t| dt")
     if prepared.system.unilateral is not None:
         _add_unilateral(record, prepared)
     for event in happened:
@@ -171,7 +173,7 @@ def _add_unilateral(record: Record, prepared: Prepared) -> None:
     """Modes of the contacts, forces of the joint stops."""
     run, robot = prepared.run, prepared.model.robot
     names = tuple(contact.name for contact in prepared.contacts)
-    modes = run.outputs("contact")[:, :, OUT_MODE]
+    modes = run.outputs("contact")[:, :, kst.OUT_MODE]
     record.add("contact_mode", modes, "1", labels=names, description="0 off its surface, 1 sliding, 2 sticking")
     if prepared.stops:
         units = {link.joint: link.units[3] for link in robot.links}

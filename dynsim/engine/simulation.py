@@ -29,9 +29,10 @@ from dynsim.engine.stopping import stopped
 from dynsim.engine.trace import Trace
 from dynsim.errors import ModelError, ScenarioError, shown
 from dynsim.kernels import arrays as ka
+from dynsim.kernels import state as kst
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.dense import state_within
-from dynsim.kernels.state import JOINT, OUT_FORCE, OUT_MODE, OUT_VECTOR, block
+from dynsim.kernels.state import block
 from dynsim.kernels.tree import loads as kl
 from dynsim.measures import TIP_OVER
 from dynsim.model.arrays import check_couplings
@@ -177,9 +178,9 @@ class Simulation:
         real = self._prepared.system.unilateral is not None
         return {
             contact.name: Touch(
-                force=float(row[OUT_FORCE]),
-                vector=row[OUT_VECTOR : OUT_VECTOR + 3].copy(),
-                mode=int(row[OUT_MODE]) if real else None,
+                force=float(row[kst.OUT_FORCE]),
+                vector=row[kst.OUT_VECTOR : kst.OUT_VECTOR + 3].copy(),
+                mode=int(row[kst.OUT_MODE]) if real else None,
             )
             for contact, row in zip(self._prepared.contacts, found, strict=True)
         }
@@ -396,7 +397,7 @@ class Simulation:
             v = run.y[block(run.layout, "v")]
             inertia = model.mass_matrix(run.y[block(run.layout, "q")]) + np.diag(model.armature)
             response = np.linalg.solve(inertia, np.eye(model.n)[j])
-            run.y[run.layout.ledger + JOINT] += 0.5 * v[j] ** 2 / response[j]
+            run.y[run.layout.ledger + kst.JOINT] += 0.5 * v[j] ** 2 / response[j]
             v -= response * (v[j] / response[j])
             v[j] = 0.0
         armature[j] = BRAKED if closed else self._armature[j]

@@ -12,8 +12,8 @@ from dynsim.engine.uniqueness import paradox
 from dynsim.errors import SimulationStopped
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.constraint import unilateral as ku
+from dynsim.kernels.integrate import project as kp
 from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.integrate.project import GAP_TOLERANCE, RATE_TOLERANCE
 from dynsim.kernels.state import block
 from dynsim.model.unilateral import START_TOLERANCE
 from dynsim.scenario import Scenario
@@ -144,7 +144,7 @@ def _reason(scenario: Scenario, prepared: Prepared) -> str:
         )
     ws = prepared.workspace
     gaps, rates = ws.rows[: ws.counts[ka.ROWS], [ka.ROW_GAP, ka.ROW_RATE]].T
-    worst = int(np.argmax(np.maximum(np.abs(gaps) / GAP_TOLERANCE, np.abs(rates) / RATE_TOLERANCE)))
+    worst = int(np.argmax(np.maximum(np.abs(gaps) / kp.GAP_TOLERANCE, np.abs(rates) / kp.RATE_TOLERANCE)))
     owner = int(ws.active[worst, ka.OWNER])
     if ws.active[worst, ka.ROW_KIND] == ka.JOINT_ROW:
         couplings = prepared.model.robot.couplings

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.kernels import arrays as ka
+from dynsim.kernels.constraint import uniqueness as kq
 from dynsim.kernels.constraint.delassus import RANK_TOLERANCE
 from dynsim.kernels.constraint.surface import SIGNS_LIMIT
-from dynsim.kernels.constraint.uniqueness import DIAGONAL_TOLERANCE, FORCE_TOLERANCE, IMMOBILE
 from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.system import System, derivative, new_workspace
 from dynsim.kernels.tree.articulated import accelerate
@@ -95,7 +95,7 @@ class ContactMatrices:
                 force = np.asarray(np.linalg.solve(self.matrix(signs), self.rhs), dtype=np.float64)
             except np.linalg.LinAlgError:
                 continue
-            scale = FORCE_TOLERANCE * max(np.abs(force).max(), np.abs(self.force).max())
+            scale = kq.FORCE_TOLERANCE * max(np.abs(force).max(), np.abs(self.force).max())
             agrees = (force * signs >= -scale)[self.free].all()
             if agrees and all(np.abs(force - other).max() > scale for other in found):
                 found.append(force)
@@ -114,7 +114,7 @@ class ContactMatrices:
     def reversed(self) -> NDArray[np.bool_]:
         """Rows whose own force alone would accelerate them against it: negative diagonal entries, (p,)."""
         own = np.diag(self.frictionless)
-        return (own > 0.0) & (np.diag(self.matrix(self.signs)) < -DIAGONAL_TOLERANCE * own)
+        return (own > 0.0) & (np.diag(self.matrix(self.signs)) < -kq.DIAGONAL_TOLERANCE * own)
 
     def finite(self) -> bool:
         """False for a state that has diverged."""
@@ -137,7 +137,7 @@ def contact_matrices(system: System, ws: ka.Workspace, t: float, y: Array) -> Co
     rows, directions = ws.column[:, 1 : 1 + 2 * p : 2], ws.column[:, 2 : 2 + 2 * p : 2]
     inverse = ws.links[:, ka.INVERSE_D, None]
     frictionless = rows.T @ (inverse * rows)
-    moving = np.diag(frictionless) > IMMOBILE * (inverse * directions**2).sum(axis=0)
+    moving = np.diag(frictionless) > kq.IMMOBILE * (inverse * directions**2).sum(axis=0)
     frictionless = frictionless * np.outer(moving, moving)
     dissipative = active[:, ka.LAW] == ka.FRICTION_DISSIPATIVE
     signs = np.where(dissipative, state[:, ka.SIGN], 1.0)

@@ -7,8 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.arrays import LINK, POINT, QD, QUADRIC, ContactArrays, ModelArrays, Q, Workspace
-from dynsim.kernels.constraint.distance import AS_POINT, RADIUS, SURFACE, ShapeArrays, distance
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import ContactArrays, ModelArrays, Workspace
+from dynsim.kernels.constraint import distance as kd
+from dynsim.kernels.constraint.distance import ShapeArrays, distance
 from dynsim.kernels.constraint.surface import hessian_product, surface_distance
 from dynsim.kernels.jit import internal_kernel, kernel
 from dynsim.kernels.tree.joints import read_positions
@@ -128,11 +130,11 @@ def errors(model: ModelArrays, ws: Workspace, path: PathArrays, target, q):
     """What is missing to the target and the surfaces, and how the joints change it; returns its length [m]."""
     if model.compound is None:  # known to the compiler
         for j in range(ws.joints.shape[0]):
-            ws.joints[j, Q] = q[j]
+            ws.joints[j, ka.Q] = q[j]
     else:
         read_positions(model.compound, model, q, 0, ws)
     for j in range(ws.joints.shape[0]):
-        ws.joints[j, QD] = 0.0
+        ws.joints[j, ka.QD] = 0.0
     kinematics(model, ws)
     position, jacobian, error = path.position, path.jacobian, path.error
     point_position(ws, path.link, path.point, position)
@@ -142,8 +144,8 @@ def errors(model: ModelArrays, ws: Workspace, path: PathArrays, target, q):
         for j in range(path.column.shape[0]):
             path.rates[e, j] = jacobian[e, path.column[j]]
     for b in range(path.braces.link.shape[0]):
-        link = path.braces.link[b, LINK]
-        point_position(ws, link, path.braces.point[b, POINT : POINT + 3], position)
+        link = path.braces.link[b, ka.LINK]
+        point_position(ws, link, path.braces.point[b, ka.POINT : ka.POINT + 3], position)
         gap, nx, ny, nz = gap_and_normal(path.shapes, path.braces, b, position[0], position[1], position[2])
         point_jacobian(model, ws, link, position, jacobian)
         error[3 + b] = -gap
@@ -160,10 +162,10 @@ def errors(model: ModelArrays, ws: Workspace, path: PathArrays, target, q):
 def gap_and_normal(shapes: ShapeArrays | None, braces: ContactArrays, b, x, y, z):
     """Distance of brace b at a point of W from its surface [m], and the normal there (3 numbers)."""
     if shapes is not None:  # noqa: SIM102 (known to the compiler)
-        if shapes.kind[b, SURFACE] != AS_POINT:
+        if shapes.kind[b, kd.SURFACE] != kd.AS_POINT:
             found = distance(shapes, b, x, y, z)
-            return found[0] - shapes.data[b, RADIUS], found[1], found[2], found[3]
-    table, s = braces.point, QUADRIC
+            return found[0] - shapes.data[b, kd.RADIUS], found[1], found[2], found[3]
+    table, s = braces.point, ka.QUADRIC
     qx = table[b, s] * x + table[b, s + 1] * y + table[b, s + 2] * z
     qy = table[b, s + 1] * x + table[b, s + 3] * y + table[b, s + 4] * z
     qz = table[b, s + 2] * x + table[b, s + 4] * y + table[b, s + 5] * z

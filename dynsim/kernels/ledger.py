@@ -4,55 +4,12 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import (
-    ARMATURE,
-    COUPLED,
-    CURRENT,
-    D_M,
-    DAMPING,
-    DIRECTION,
-    DRAG,
-    DRIVEN,
-    FIRST_ROW,
-    FORCE,
-    GAP_RATE,
-    GEAR_DAMPING,
-    INDUCTANCE,
-    J_M,
-    K_M,
-    MODE,
-    NORMAL_FORCE,
-    PARENT,
-    QD,
-    QDD,
-    RESISTANCE,
-    ROW_RATE,
-    SLIDING,
-    SLIP_VELOCITY,
-    STICKING,
-    VOLTAGE,
-    DriveArrays,
-    ModelArrays,
-    S,
-    V,
-    Workspace,
-)
+from dynsim.kernels import arrays as ka
+from dynsim.kernels import state as kst
+from dynsim.kernels.arrays import DriveArrays, ModelArrays, Workspace
 from dynsim.kernels.constraint.rows import joint_rate
 from dynsim.kernels.jit import internal_kernel, kernel
-from dynsim.kernels.state import (
-    CONSTRAINT,
-    CONTACT_SIZE,
-    DRAWN,
-    ELECTRICAL,
-    FRICTION,
-    GEAR,
-    IMPULSE,
-    JOINT,
-    JOULE,
-    MECHANICAL,
-    SLIP,
-    SUPPLY,
-)
+from dynsim.kernels.tree.spatial import point_velocity, six, vector
 from dynsim.kernels.tree.sweep import body_inertia
 
 
@@ -62,15 +19,20 @@ def drive_powers(drives: DriveArrays, ws: Workspace):
     joints, motors, motor = ws.joints, ws.motors, drives.motor
     electrical, drawn, joule, mechanical, drag = 0.0, 0.0, 0.0, 0.0, 0.0
     for a in range(motors.shape[0]):
-        i = drives.table[a, DRIVEN]
-        current, v = motors[a, CURRENT], joints[i, QD]
-        power = motors[a, VOLTAGE] * current
+        i = drives.table[a, ka.DRIVEN]
+        current, v = motors[a, ka.CURRENT], joints[i, ka.QD]
+        power = motors[a, ka.VOLTAGE] * current
         electrical += power
         drawn += max(power, 0.0)
-        joule += motor[a, RESISTANCE] * current * current
-        shaft = motor[a, K_M] * current - motor[a, J_M] * joints[i, QDD] - motor[a, D_M] * v - motors[a, DRAG]
+        joule += motor[a, ka.RESISTANCE] * current * current
+        shaft = (
+            motor[a, ka.K_M] * current
+            - motor[a, ka.J_M] * joints[i, ka.QDD]
+            - motor[a, ka.D_M] * v
+            - motors[a, ka.DRAG]
+        )
         mechanical += shaft * v
-        drag += motors[a, DRAG] * v
+        drag += motors[a, ka.DRAG] * v
     return electrical, drawn, joule, mechanical, drag
 
 
@@ -87,39 +49,43 @@ def ledger_rates(model: ModelArrays, drives: DriveArrays, ws: Workspace, out, la
     electrical, drawn, joule, mechanical, drag = drive_powers(drives, ws)
     gear, joint = 0.0, 0.0
     for i in range(joints.shape[0]):
-        square = joints[i, QD] * joints[i, QD]
-        gear += model.body[i, GEAR_DAMPING] * square
-        joint += model.body[i, DAMPING] * square
+        square = joints[i, ka.QD] * joints[i, ka.QD]
+        gear += model.body[i, ka.GEAR_DAMPING] * square
+        joint += model.body[i, ka.DAMPING] * square
     friction, constraint = 0.0, 0.0
     start, first = layout.ledger, layout.contact
     rows = ws.rows
     for k in range(state.shape[0]):
-        m, mode, slip = ws.active[k, FIRST_ROW], ws.active[k, MODE], 0.0
+        m, mode, slip = ws.active[k, ka.FIRST_ROW], ws.active[k, ka.MODE], 0.0
         # Zero of a candidate that is off its surface: no solve writes to its row.
-        f, rate = rows[m, FORCE], state[k, GAP_RATE]
-        state[k, NORMAL_FORCE] = f
-        if mode == SLIDING:
-            x, y, z = state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2]
+        f, rate = rows[m, ka.FORCE], state[k, ka.GAP_RATE]
+        state[k, ka.NORMAL_FORCE] = f
+        if mode == ka.SLIDING:
+            x, y, z = state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2]
             # The slip velocity has no part along n, so d·v_t is the friction alone.
-            friction -= f * (rows[m, DIRECTION + 3] * x + rows[m, DIRECTION + 4] * y + rows[m, DIRECTION + 5] * z)
+            friction -= f * (
+                rows[m, ka.DIRECTION + 3] * x + rows[m, ka.DIRECTION + 4] * y + rows[m, ka.DIRECTION + 5] * z
+            )
             slip = math.sqrt(x * x + y * y + z * z)
-        elif mode == STICKING:
-            constraint += rows[m + 1, FORCE] * rows[m + 1, ROW_RATE] + rows[m + 2, FORCE] * rows[m + 2, ROW_RATE]
+        elif mode == ka.STICKING:
+            constraint += (
+                rows[m + 1, ka.FORCE] * rows[m + 1, ka.ROW_RATE] + rows[m + 2, ka.FORCE] * rows[m + 2, ka.ROW_RATE]
+            )
         constraint += f * rate
-        out[first + IMPULSE] = f
-        out[first + SLIP] = slip
-        first += CONTACT_SIZE
-    for k in range(ws.counts[COUPLED]):
-        constraint += rows[k, FORCE] * joint_rate(ws, k)
-    out[start + ELECTRICAL] = electrical
-    out[start + DRAWN] = drawn
-    out[start + JOULE] = joule
-    out[start + GEAR] = gear + drag
-    out[start + JOINT] = joint
-    out[start + FRICTION] = friction
-    out[start + CONSTRAINT] = constraint
-    out[start + MECHANICAL] = mechanical
-    out[start + SUPPLY] = max(electrical, 0.0)
+        out[first + kst.IMPULSE] = f
+        out[first + kst.SLIP] = slip
+        first += kst.CONTACT_SIZE
+    for k in range(ws.counts[ka.COUPLED]):
+        constraint += rows[k, ka.FORCE] * joint_rate(ws, k)
+    out[start + kst.ELECTRICAL] = electrical
+    out[start + kst.DRAWN] = drawn
+    out[start + kst.JOULE] = joule
+    out[start + kst.GEAR] = gear + drag
+    out[start + kst.JOINT] = joint
+    out[start + kst.FRICTION] = friction
+    out[start + kst.CONSTRAINT] = constraint
+    out[start + kst.MECHANICAL] = mechanical
+    out[start + kst.SUPPLY] = max(electrical, 0.0)
 
 
 @kernel
@@ -128,26 +94,18 @@ def kinetic_energy(model: ModelArrays, ws: Workspace):
     tree, links, joints = model.tree, ws.links, ws.joints
     total = 0.0
     for i in range(tree.shape[0]):
-        j = tree[i, PARENT]
+        j = tree[i, ka.PARENT]
         for s in range(6):
-            links[i, V + s] = links[i, S + s] * joints[i, QD] + (links[j, V + s] if j >= 0 else 0.0)
-        wx, wy, wz, ox, oy, oz = (
-            links[i, V],
-            links[i, V + 1],
-            links[i, V + 2],
-            links[i, V + 3],
-            links[i, V + 4],
-            links[i, V + 5],
-        )
-        m, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz = body_inertia(model, ws, i)
-        vx, vy, vz = ox + wy * cz - wz * cy, oy + wz * cx - wx * cz, oz + wx * cy - wy * cx
+            links[i, ka.V + s] = links[i, ka.S + s] * joints[i, ka.QD] + (links[j, ka.V + s] if j >= 0 else 0.0)
+        m, c, I = body_inertia(model, ws, i)
+        w, v = vector(links, i, ka.V), point_velocity(six(links, i, ka.V), c)
         total += 0.5 * (
-            wx * (ixx * wx + 2.0 * (ixy * wy + ixz * wz))
-            + wy * (iyy * wy + 2.0 * iyz * wz)
-            + izz * wz * wz
-            + m * (vx * vx + vy * vy + vz * vz)
+            w[0] * (I[0] * w[0] + 2.0 * (I[1] * w[1] + I[2] * w[2]))
+            + w[1] * (I[3] * w[1] + 2.0 * I[4] * w[2])
+            + I[5] * w[2] * w[2]
+            + m * (v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
         )
-        total += 0.5 * model.body[i, ARMATURE] * joints[i, QD] * joints[i, QD]
+        total += 0.5 * model.body[i, ka.ARMATURE] * joints[i, ka.QD] * joints[i, ka.QD]
     return total
 
 
@@ -156,8 +114,8 @@ def potential_energy(model: ModelArrays, ws: Workspace):
     """−Σ m g·c [J], zero at the world origin, after ``forward_sweep``."""
     total = 0.0
     for i in range(ws.links.shape[0]):
-        m, cx, cy, cz, _, _, _, _, _, _ = body_inertia(model, ws, i)
-        total -= m * (cx * model.gravity[0] + cy * model.gravity[1] + cz * model.gravity[2])
+        m, c, _ = body_inertia(model, ws, i)
+        total -= m * (c[0] * model.gravity[0] + c[1] * model.gravity[1] + c[2] * model.gravity[2])
     return total
 
 
@@ -166,5 +124,5 @@ def magnetic_energy(drives: DriveArrays, ws: Workspace):
     """½ Σ L i² [J]."""
     total = 0.0
     for a in range(ws.motors.shape[0]):
-        total += 0.5 * drives.motor[a, INDUCTANCE] * ws.motors[a, CURRENT] * ws.motors[a, CURRENT]
+        total += 0.5 * drives.motor[a, ka.INDUCTANCE] * ws.motors[a, ka.CURRENT] * ws.motors[a, ka.CURRENT]
     return total

@@ -9,25 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dynsim.kernels import arrays as ka
 from dynsim.kernels.arrays import (
-    APPLIED,
-    CIRCUIT,
-    COUPLING_JOINT_SIZE,
-    COUPLING_SIZE,
-    DAMPING,
-    DEPENDENT,
-    DIDT,
-    GEAR_DAMPING,
-    OPEN,
-    QD,
-    QDD,
-    ROWS,
-    SLIDING,
     ContactArrays,
     CouplingArrays,
     DriveArrays,
     ModelArrays,
-    Q,
     ReferenceArrays,
     Workspace,
     workspace,
@@ -61,7 +48,7 @@ class System(NamedTuple):
     loads: LoadArrays
     dense: np.ndarray | None  # room for M* and b, see constraint.m_star; None for the articulated solve alone
     couplings: CouplingArrays = CouplingArrays(
-        integers(np.zeros((0, COUPLING_JOINT_SIZE))), reals(np.zeros((0, COUPLING_SIZE)))
+        integers(np.zeros((0, ka.COUPLING_JOINT_SIZE))), reals(np.zeros((0, ka.COUPLING_SIZE)))
     )
     unilateral: UnilateralArrays | None = None  # candidates are glued to their surfaces, and joints have no stops
     shapes: ShapeArrays | None = None  # of candidates that are not points on quadrics; None: all are
@@ -74,7 +61,7 @@ def new_workspace(system: System) -> Workspace:
     if unilateral is not None:
         joint_rows += unilateral.stop.shape[0]
     ws = workspace(system.model.tree.shape[0], system.drives.table.shape[0], c, joint_rows)
-    set_modes(contacts, couplings, unilateral, ws, integers(np.full(c, SLIDING if unilateral is None else OPEN)))
+    set_modes(contacts, couplings, unilateral, ws, integers(np.full(c, ka.SLIDING if unilateral is None else ka.OPEN)))
     return ws
 
 
@@ -82,11 +69,11 @@ def new_workspace(system: System) -> Workspace:
 def constrained_acceleration(model: ModelArrays, ws: Workspace):
     """vdot and row forces of the applied forces, by the articulated solve, into ``ws.joints`` and ``ws.rows``."""
     factor(model, ws)
-    p, passes = ws.counts[ROWS], 0
+    p, passes = ws.counts[ka.ROWS], 0
     while p > 0:
         passes += 1
         row_system(model, ws)
-        ws.counts[DEPENDENT] += solve_small(ws.small, ws.rows, ws.active, p)
+        ws.counts[ka.DEPENDENT] += solve_small(ws.small, ws.rows, ws.active, p)
         if not sign_changed(ws, passes):
             break
     add_row_forces(model, ws)
@@ -102,7 +89,7 @@ def m_star_acceleration(dense, model: ModelArrays, drives: DriveArrays, ws: Work
     """
     if dense is None:  # known to the compiler, which then leaves M* out of the default program
         return
-    ws.counts[DEPENDENT] = found
+    ws.counts[ka.DEPENDENT] = found
     passes = 1
     solve_m_star(dense, model, drives, ws)
     while sign_changed(ws, passes):
@@ -122,11 +109,11 @@ def derivative(system: System, t, y, ws: Workspace, dy):
         read_positions(model.compound, model, y, layout.q, ws)
     for i in range(n):
         if plain:
-            joints[i, Q] = y[layout.q + i]
-        joints[i, QD] = y[layout.v + i]
+            joints[i, ka.Q] = y[layout.q + i]
+        joints[i, ka.QD] = y[layout.v + i]
         # The sweep multiplies it by zero, which would keep a NaN of a state without solution for ever.
-        joints[i, QDD] = 0.0
-        joints[i, APPLIED] = -(model.body[i, DAMPING] + model.body[i, GEAR_DAMPING]) * joints[i, QD]
+        joints[i, ka.QDD] = 0.0
+        joints[i, ka.APPLIED] = -(model.body[i, ka.DAMPING] + model.body[i, ka.GEAR_DAMPING]) * joints[i, ka.QD]
     drive(drives, system.reference, t, y, layout, ws)
 
     forward_sweep(model, ws, 1.0, 0.0, 1.0)
@@ -134,7 +121,7 @@ def derivative(system: System, t, y, ws: Workspace, dy):
         add_loads(model, system.loads, t, ws, dy, layout.load)
     contact_rows(model, contacts, system.unilateral, ws)
     shaped_rows(system.shapes, system.unilateral, model, contacts, ws)
-    found = ws.counts[DEPENDENT]
+    found = ws.counts[ka.DEPENDENT]
     constrained_acceleration(model, ws)
     m_star_acceleration(system.dense, model, drives, ws, found)
     admissible_forces(system.unilateral, ws)
@@ -143,9 +130,9 @@ def derivative(system: System, t, y, ws: Workspace, dy):
         position_rates(model.compound, model, ws, dy, layout.q)
     for i in range(n):
         if plain:
-            dy[layout.q + i] = joints[i, QD]
-        dy[layout.v + i] = joints[i, QDD]
+            dy[layout.q + i] = joints[i, ka.QD]
+        dy[layout.v + i] = joints[i, ka.QDD]
     for a in range(na):
-        if drives.table[a, CIRCUIT] >= 0:
-            dy[layout.current + drives.table[a, CIRCUIT]] = motors[a, DIDT]
+        if drives.table[a, ka.CIRCUIT] >= 0:
+            dy[layout.current + drives.table[a, ka.CIRCUIT]] = motors[a, ka.DIDT]
     ledger_rates(model, drives, ws, dy, layout)

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dynsim.errors import ModelError
-from dynsim.kernels.arrays import HELD_POSITION, ReferenceArrays
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import ReferenceArrays
 from dynsim.kernels.jit import integers, reals
 from dynsim.model.description import Robot
 from dynsim.model.drives import TorqueSource
@@ -130,7 +131,7 @@ class JointControl:
             if column.shape != grid.shape or not np.isfinite(column).all():
                 raise ModelError(f"the reference of {name} needs {len(grid)} finite positions, one for each time")
             columns.append(column)
-        spline = np.full(len(driven), HELD_POSITION)
+        spline = np.full(len(driven), ka.HELD_POSITION)
         for k, name in enumerate(positions):
             spline[driven.index(name)] = k
         spacing = float(grid[1]) - float(grid[0])
@@ -211,7 +212,7 @@ class JointControl:
         angles = np.zeros((len(pieces), 2, 6))
         angles[:, :, 0] = robot.initial[k : k + 2]
         for wheel, joint in enumerate(robot.base.wheels):
-            column = self.reference.spline[driven.index(joint)] if joint in driven else HELD_POSITION
+            column = self.reference.spline[driven.index(joint)] if joint in driven else ka.HELD_POSITION
             if column >= 0:
                 angles[:, wheel] = pieces[:, column]
         return angles
@@ -257,7 +258,7 @@ def _reference(
 ) -> ReferenceArrays:
     """References as the kernels take them: ``held``, (na,), where ``spline`` is HELD_POSITION, else that column."""
     return ReferenceArrays(
-        spline=integers(np.full(len(held), HELD_POSITION) if spline is None else spline),
+        spline=integers(np.full(len(held), ka.HELD_POSITION) if spline is None else spline),
         held=reals(held),
         grid=reals(grid),
         coefficients=reals(np.zeros((1, 0, 6)) if coefficients is None else coefficients),

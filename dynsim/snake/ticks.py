@@ -5,37 +5,11 @@ from __future__ import annotations
 import math
 
 from dynsim.kernels.jit import internal_kernel, kernel
-from dynsim.snake.control import (
-    LIMITS_ALLOCATE,
-    LIMITS_NONE,
-    control_input,
-    estimate_from_joints,
-    sigma_min,
-)
+from dynsim.snake import control as sc
+from dynsim.snake import state as ss
+from dynsim.snake.control import control_input, estimate_from_joints, sigma_min
 from dynsim.snake.kinematics import constraint_matrices, pose_of_point, walk_chain, wrap_angle
 from dynsim.snake.plant import advance_plant
-from dynsim.snake.state import (
-    ATTITUDE,
-    CLAMPED,
-    DONE,
-    FEEDFORWARD,
-    JOINT_LIMIT,
-    LATE,
-    MEASURED,
-    MODE,
-    NO_OBSTACLE,
-    NULL_REDUCED,
-    PATH_SLOWED,
-    PLACE,
-    RATE_LIMIT,
-    SINGULAR,
-    SLOWED,
-    STILL,
-    STILL_FOR,
-    TICKS,
-    WAITED,
-    WAITED_FOR,
-)
 from dynsim.snake.support import cost_value, polygon_area, support_polygon
 
 # With gain K, damping that withholds this much of a command leaves a head error of WITHHELD / K [m/s, rad/s].
@@ -65,10 +39,10 @@ def copy(source, target):
 @internal_kernel
 def believe(model, schedule, state, rig):
     """What the controller takes for w and phi ([T] IV.C.1 and IV.C.2), into ``state.w_hat`` and ``state.phi_hat``."""
-    if schedule.state_source != FEEDFORWARD:
+    if schedule.state_source != ss.FEEDFORWARD:
         for j in range(state.phi.shape[0]):
             state.phi_hat[j] = state.phi[j]
-    if schedule.state_source == MEASURED:
+    if schedule.state_source == ss.MEASURED:
         pose_of_point(model, state.base, state.phi, rig.work.frame, state.w_hat)
     else:
         estimate_from_joints(model, state.phi_hat, rig.work.frame, rig.origin, state.w_hat, rig.pose)
@@ -78,13 +52,13 @@ def believe(model, schedule, state, rig):
 def obstacle(law, work, joints):
     """Why ``work.u`` cannot be carried out: SINGULAR, JOINT_LIMIT, RATE_LIMIT or NO_OBSTACLE."""
     if work.withheld[0] > WITHHELD:
-        return SINGULAR
-    found = NO_OBSTACLE
+        return ss.SINGULAR
+    found = ss.NO_OBSTACLE
     for j in range(joints):
         if work.at_limit[j] == 2:
-            return JOINT_LIMIT
+            return ss.JOINT_LIMIT
         if abs(work.u[j]) > law.rate_limit:
-            found = RATE_LIMIT
+            found = ss.RATE_LIMIT
     return found
 
 
@@ -114,7 +88,7 @@ def is_too_fast(model, law, work, found, phi):
             left = model.upper[j] - phi[j] if work.u[j] > 0.0 else phi[j] - model.lower[j]
             if left < AT_LIMIT and abs(work.u[j]) <= law.rate_limit:
                 return False
-    return found in (RATE_LIMIT, JOINT_LIMIT)
+    return found in (ss.RATE_LIMIT, ss.JOINT_LIMIT)
 
 
 @internal_kernel
@@ -174,16 +148,16 @@ def tick(model, law, schedule, state, velocity, moving, slows, rig):
     blocked : bool
         The command was not carried out.
     """
-    work, period, mode = rig.work, schedule.period, state.counts[MODE]
+    work, period, mode = rig.work, schedule.period, state.counts[ss.MODE]
     phi, phi_hat, w_hat, w_target = state.phi, state.phi_hat, state.w_hat, state.w_target
     pose, target, joints_ahead, u, error, rate = rig.pose, rig.target, rig.phi_stage, work.u, work.error, rig.rate
     joints = phi.shape[0]
-    full_gain = law.null_gain if state.counts[TICKS] >= schedule.null_start_tick else 0.0
+    full_gain = law.null_gain if state.counts[ss.TICKS] >= schedule.null_start_tick else 0.0
     null_gain = full_gain
-    allocate = law.limit_policy == LIMITS_ALLOCATE
+    allocate = law.limit_policy == sc.LIMITS_ALLOCATE
     believe(model, schedule, state, rig)
-    reason, waits, reductions, slowed = NO_OBSTACLE, False, 0, False
-    place, done, speed, tries = state.counts[PLACE], state.progress[DONE], 1.0, 0
+    reason, waits, reductions, slowed = ss.NO_OBSTACLE, False, 0, False
+    place, done, speed, tries = state.counts[ss.PLACE], state.progress[ss.DONE], 1.0, 0
     commanded = False
     for i in range(6):
         rate[i] = 0.0
@@ -193,7 +167,7 @@ def tick(model, law, schedule, state, velocity, moving, slows, rig):
         commanded = commanded or rate[i] != 0.0
     beta = wrap_angle(w_target[4])
     if allocate and abs(beta) > BETA_LIMIT and beta * rate[4] > 0.0:
-        reason, waits = ATTITUDE, True
+        reason, waits = ss.ATTITUDE, True
         for i in range(6):
             rate[i] = 0.0
     while True:
@@ -211,12 +185,12 @@ def tick(model, law, schedule, state, velocity, moving, slows, rig):
         if not allocate:
             break
         found = obstacle(law, work, joints)
-        if found == NO_OBSTACLE:
+        if found == ss.NO_OBSTACLE:
             break
         fastest = 0.0
         for j in range(joints):
             fastest = max(fastest, abs(u[j]))
-        if found == RATE_LIMIT and reductions < NULL_REDUCTIONS and null_gain != 0.0:
+        if found == ss.RATE_LIMIT and reductions < NULL_REDUCTIONS and null_gain != 0.0:
             reductions += 1
             null_gain *= 0.0 if reductions == NULL_REDUCTIONS else 0.9 * law.rate_limit / fastest
         elif slows and commanded and tries < SLOW_DOWNS and not waits and is_too_fast(model, law, work, found, phi):
@@ -235,16 +209,16 @@ def tick(model, law, schedule, state, velocity, moving, slows, rig):
         else:
             slowed = slow_down(model, law, u, phi)
             break
-    state.counts[SLOWED] += int(slowed)
-    state.counts[NULL_REDUCED] += int(reductions > 0)
-    if law.limit_policy != LIMITS_NONE:  # the mechanical stop, and what is left when no allocation helps
+    state.counts[ss.SLOWED] += int(slowed)
+    state.counts[ss.NULL_REDUCED] += int(reductions > 0)
+    if law.limit_policy != sc.LIMITS_NONE:  # the mechanical stop, and what is left when no allocation helps
         for j in range(joints):
             up = max(model.upper[j] - phi[j], 0.0) / period
             down = min(model.lower[j] - phi[j], 0.0) / period
             if u[j] > up or u[j] < down:
                 # rounding of an allocated bound is no event
                 if u[j] > up + 1e-9 or u[j] < down - 1e-9:
-                    state.counts[CLAMPED] += 1
+                    state.counts[ss.CLAMPED] += 1
                 u[j] = up if u[j] > up else down
     slip = advance_plant(model, law.grounded[mode], period, schedule.substeps, state, u, rig)
     for j in range(joints):
@@ -252,30 +226,30 @@ def tick(model, law, schedule, state, velocity, moving, slows, rig):
     for i in range(6):
         w_target[i] += period * rate[i]
         w_hat[i] += period * rate[i]  # x, y, gamma of the estimated state; the rest is overwritten
-    state.counts[TICKS] += 1
+    state.counts[ss.TICKS] += 1
     blocked = waits and commanded
     if blocked:
-        state.counts[WAITED_FOR + reason] += 1
-        state.counts[STILL] += 1
-        state.counts[STILL_FOR] = reason
+        state.counts[ss.WAITED_FOR + reason] += 1
+        state.counts[ss.STILL] += 1
+        state.counts[ss.STILL_FOR] = reason
     elif moving:
-        state.counts[STILL] = 0
-        state.counts[PATH_SLOWED] += int(speed < 1.0)
-        state.progress[LATE] += 1.0 - speed
+        state.counts[ss.STILL] = 0
+        state.counts[ss.PATH_SLOWED] += int(speed < 1.0)
+        state.progress[ss.LATE] += 1.0 - speed
         done += speed
         if done >= 1.0 - 1e-12:
-            state.counts[PLACE] += 1
+            state.counts[ss.PLACE] += 1
             done = max(done - 1.0, 0.0)
-        state.progress[DONE] = done
+        state.progress[ss.DONE] = done
     if blocked or not moving:
-        state.counts[WAITED] += 1
+        state.counts[ss.WAITED] += 1
     return slip, blocked
 
 
 @kernel
 def record_row(model, law, state, rig, r, trace):
     """Write the state, and what follows from it, to row r of the trace."""
-    work, chain, support, pose, mode = rig.work, rig.work.chain, rig.work.support, rig.pose, state.counts[MODE]
+    work, chain, support, pose, mode = rig.work, rig.work.chain, rig.work.support, rig.pose, state.counts[ss.MODE]
     phi, rho, grounded = state.phi, state.rho, law.grounded[mode]
     pose_of_point(model, state.base, phi, work.frame, pose)
     walk_chain(model, pose, phi, work.frame, chain)
@@ -318,7 +292,7 @@ def run_ticks(model, law, schedule, state, velocity, count, moving, stop, stride
     base, phi, counts, at_limit = state.base, state.phi, state.counts, rig.work.at_limit
     blocked, slows = False, 0 if stop else 1
     for k in range(count):
-        now = counts[TICKS]
+        now = counts[ss.TICKS]
         r = now // stride if now % stride == 0 else -1
         if r >= 0:
             record_row(model, law, state, rig, r, trace)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.arrays import MOST_ROWS
+from dynsim.kernels import arrays as ka
 from dynsim.kernels.constraint.cone_program import ConeProgram, cone_program
 from dynsim.kernels.jit import integers, reals
 
@@ -51,7 +51,7 @@ class BraceArrays(NamedTuple):
 def brace_arrays(link: np.ndarray, motors: np.ndarray) -> BraceArrays:
     """Allocate a :class:`BraceArrays` for braces on these links and for these motors."""
     c, n = len(link), len(motors)
-    forces = MOST_ROWS * c
+    forces = ka.MOST_ROWS * c
     return BraceArrays(
         link=link,
         table=reals(np.zeros((c, BRACE_SIZE))),

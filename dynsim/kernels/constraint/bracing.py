@@ -13,26 +13,10 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import ARMATURE, BIAS, DAMPING, GEAR_DAMPING, MOST_ROWS, QD, QDD, ModelArrays, Q, Workspace
-from dynsim.kernels.constraint.brace_arrays import (
-    AXES,
-    BRACE_SIZE,
-    COMMANDED,
-    CONSTANT,
-    CURRENT_LIMIT,
-    FORCES,
-    FRICTION,
-    HEAT,
-    HIGH,
-    LEAST,
-    LOW,
-    LOWER,
-    RESISTANCE,
-    SLIP,
-    UPPER,
-    VOLTAGE_LIMIT,
-    BraceArrays,
-)
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import ModelArrays, Workspace
+from dynsim.kernels.constraint import brace_arrays as kb
+from dynsim.kernels.constraint.brace_arrays import BraceArrays
 from dynsim.kernels.constraint.cone_program import ConeProgram, solve_cone_program
 from dynsim.kernels.jit import internal_kernel, kernel
 from dynsim.kernels.tree.joints import read_positions
@@ -89,7 +73,7 @@ def brace_statics(model: ModelArrays, ws: Workspace, braces: BraceArrays, q, v, 
     """
     for t in range(q.shape[0]):
         for k in range(braces.link.shape[0]):
-            for e in range(BRACE_SIZE):
+            for e in range(kb.BRACE_SIZE):
                 braces.table[k, e] = tables[t, k, e]
         set_motion(model, ws, q[t], v[t], vdot[t])
         torque_limits(braces, ws)
@@ -105,11 +89,11 @@ def set_motion(model: ModelArrays, ws: Workspace, q, v, vdot):
     """Coordinates, rates and accelerations into the workspace."""
     if model.compound is None:  # known to the compiler
         for j in range(v.shape[0]):
-            ws.joints[j, Q] = q[j]
+            ws.joints[j, ka.Q] = q[j]
     else:
         read_positions(model.compound, model, q, 0, ws)
     for j in range(v.shape[0]):
-        ws.joints[j, QD], ws.joints[j, QDD] = v[j], vdot[j]
+        ws.joints[j, ka.QD], ws.joints[j, ka.QDD] = v[j], vdot[j]
 
 
 @internal_kernel
@@ -120,13 +104,13 @@ def torque_limits(braces: BraceArrays, ws: Workspace):
     """
     motors = braces.motors
     for j in range(motors.shape[0]):
-        constant, resistance, current = motors[j, CONSTANT], motors[j, RESISTANCE], motors[j, CURRENT_LIMIT]
+        constant, resistance, current = motors[j, kb.CONSTANT], motors[j, kb.RESISTANCE], motors[j, kb.CURRENT_LIMIT]
         low, high = -current, current
         if resistance > 0.0:
-            induced = constant * ws.joints[j, QD]
-            low = min(max(low, (-motors[j, VOLTAGE_LIMIT] - induced) / resistance), current)
-            high = max(min(high, (motors[j, VOLTAGE_LIMIT] - induced) / resistance), -current)
-        motors[j, LOWER], motors[j, UPPER] = constant * low, constant * high
+            induced = constant * ws.joints[j, ka.QD]
+            low = min(max(low, (-motors[j, kb.VOLTAGE_LIMIT] - induced) / resistance), current)
+            high = max(min(high, (motors[j, kb.VOLTAGE_LIMIT] - induced) / resistance), -current)
+        motors[j, kb.LOWER], motors[j, kb.UPPER] = constant * low, constant * high
 
 
 @internal_kernel
@@ -138,8 +122,8 @@ def least_heat_forces(model: ModelArrays, ws: Workspace, braces: BraceArrays, in
     unknowns = first[c]
     passive, limited = 0, False
     for j in range(n):
-        passive += motors[j, LOWER] == motors[j, UPPER]
-        limited |= not (math.isinf(motors[j, LOWER]) and math.isinf(motors[j, UPPER]))
+        passive += motors[j, kb.LOWER] == motors[j, kb.UPPER]
+        limited |= not (math.isinf(motors[j, kb.LOWER]) and math.isinf(motors[j, kb.UPPER]))
     best = False
     if passive == 0:
         # The optimum without limits is that within them where it keeps them: mostly.
@@ -168,17 +152,17 @@ def least_heat_forces(model: ModelArrays, ws: Workspace, braces: BraceArrays, in
             keep(braces, scale)
         for k in range(c):
             for end in range(2):
-                if table[k, COMMANDED] == table[k, COMMANDED]:
-                    found[k, LOW + end] = table[k, COMMANDED]
+                if table[k, kb.COMMANDED] == table[k, kb.COMMANDED]:
+                    found[k, kb.LOW + end] = table[k, kb.COMMANDED]
                 elif inside <= SLACK:
-                    found[k, LOW + end] = found[k, FORCES]
+                    found[k, kb.LOW + end] = found[k, kb.FORCES]
                 elif intervals:
-                    found[k, LOW + end] = extreme_force(braces, unknowns, equations, cones, k, end, scale)
+                    found[k, kb.LOW + end] = extreme_force(braces, unknowns, equations, cones, k, end, scale)
         return True
     for k in range(c):
-        commanded = table[k, COMMANDED] == table[k, COMMANDED]
-        found[k, LOW] = table[k, COMMANDED] if commanded else table[k, LEAST]
-        found[k, HIGH] = table[k, COMMANDED] if commanded else math.inf
+        commanded = table[k, kb.COMMANDED] == table[k, kb.COMMANDED]
+        found[k, kb.LOW] = table[k, kb.COMMANDED] if commanded else table[k, kb.LEAST]
+        found[k, kb.HIGH] = table[k, kb.COMMANDED] if commanded else math.inf
     return True
 
 
@@ -198,17 +182,19 @@ def keep(braces: BraceArrays, scale):
 def brace_forces(braces: BraceArrays, k, scale):
     """The force of brace k from the unknowns, along its axes and in the world."""
     table, found, x, at = braces.table, braces.found, braces.program.x, braces.first[k]
-    normal = table[k, COMMANDED]
+    normal = table[k, kb.COMMANDED]
     if normal != normal:
         normal, at = scale * x[at], at + 1
-    found[k, FORCES] = normal
+    found[k, kb.FORCES] = normal
     for e in range(2):
         directed = at == braces.first[k + 1]
-        found[k, FORCES + 1 + e] = -table[k, FRICTION] * normal * table[k, SLIP + e] if directed else scale * x[at + e]
+        found[k, kb.FORCES + 1 + e] = (
+            -table[k, kb.FRICTION] * normal * table[k, kb.SLIP + e] if directed else scale * x[at + e]
+        )
     for i in range(3):
         braces.forces[k, i] = 0.0
-        for e in range(MOST_ROWS):
-            braces.forces[k, i] += found[k, FORCES + e] * table[k, AXES + 3 * e + i]
+        for e in range(ka.MOST_ROWS):
+            braces.forces[k, i] += found[k, kb.FORCES + e] * table[k, kb.AXES + 3 * e + i]
 
 
 @internal_kernel
@@ -216,7 +202,7 @@ def ample(braces: BraceArrays, scale):
     """Whether all torques keep their limits and there is room for more."""
     for j in range(braces.free.shape[0]):
         torque, room = braces.torques[j], AMPLE * scale
-        if torque - braces.motors[j, LOWER] < room or braces.motors[j, UPPER] - torque < room:
+        if torque - braces.motors[j, kb.LOWER] < room or braces.motors[j, kb.UPPER] - torque < room:
             return False
     return True
 
@@ -228,8 +214,8 @@ def middle_forces(braces: BraceArrays, scale):
     for k in range(braces.link.shape[0]):
         for i in range(first[k], first[k + 1]):
             x[i] = 0.0
-        if table[k, COMMANDED] != table[k, COMMANDED]:
-            x[first[k]] = 1.0 + 2.0 * table[k, LEAST] / scale
+        if table[k, kb.COMMANDED] != table[k, kb.COMMANDED]:
+            x[first[k]] = 1.0 + 2.0 * table[k, kb.LEAST] / scale
 
 
 @internal_kernel
@@ -255,16 +241,18 @@ def brace_rows(model: ModelArrays, ws: Workspace, braces: BraceArrays):
     table, B, jacobian, first, n = braces.table, braces.B, braces.jacobian, braces.first, braces.free.shape[0]
     torque, lever, scale = 0.0, 0.0, 1e-3
     for j in range(n):
-        losses = model.body[j, DAMPING] + model.body[j, GEAR_DAMPING]
-        braces.free[j] = ws.joints[j, BIAS] + model.body[j, ARMATURE] * ws.joints[j, QDD] + losses * ws.joints[j, QD]
+        losses = model.body[j, ka.DAMPING] + model.body[j, ka.GEAR_DAMPING]
+        braces.free[j] = (
+            ws.joints[j, ka.BIAS] + model.body[j, ka.ARMATURE] * ws.joints[j, ka.QDD] + losses * ws.joints[j, ka.QD]
+        )
         torque = max(torque, abs(braces.free[j]))
     first[0] = 0
     for k in range(braces.link.shape[0]):
         point_position(ws, braces.link[k], table[k], braces.position)
         point_jacobian(model, ws, braces.link[k], braces.position, jacobian)
-        scale = max(scale, table[k, LEAST])
-        commanded, mu, at = table[k, COMMANDED] == table[k, COMMANDED], table[k, FRICTION], first[k]
-        directed = mu == 0.0 or table[k, SLIP] != 0.0 or table[k, SLIP + 1] != 0.0
+        scale = max(scale, table[k, kb.LEAST])
+        commanded, mu, at = table[k, kb.COMMANDED] == table[k, kb.COMMANDED], table[k, kb.FRICTION], first[k]
+        directed = mu == 0.0 or table[k, kb.SLIP] != 0.0 or table[k, kb.SLIP + 1] != 0.0
         tangents = at + (0 if commanded else 1)
         first[k + 1] = tangents + (0 if directed else 2)
         for j in range(n):
@@ -272,11 +260,11 @@ def brace_rows(model: ModelArrays, ws: Workspace, braces: BraceArrays):
             one, other = along(table, jacobian, k, j, 1), along(table, jacobian, k, j, 2)
             lever = max(lever, abs(rate), abs(one), abs(other))
             if directed:
-                rate -= mu * (table[k, SLIP] * one + table[k, SLIP + 1] * other)
+                rate -= mu * (table[k, kb.SLIP] * one + table[k, kb.SLIP + 1] * other)
             else:
                 B[tangents, j], B[tangents + 1, j] = one, other
             if commanded:
-                braces.free[j] -= table[k, COMMANDED] * rate
+                braces.free[j] -= table[k, kb.COMMANDED] * rate
             else:
                 B[at, j] = rate
     return max(scale, torque / lever) if lever > 0.0 else scale
@@ -285,7 +273,7 @@ def brace_rows(model: ModelArrays, ws: Workspace, braces: BraceArrays):
 @internal_kernel
 def along(table, jacobian, k, j, e):
     """Velocity of the point of brace k along its axis e for each unit of rate j."""
-    at = AXES + 3 * e
+    at = kb.AXES + 3 * e
     return table[k, at] * jacobian[0, j] + table[k, at + 1] * jacobian[1, j] + table[k, at + 2] * jacobian[2, j]
 
 
@@ -306,23 +294,23 @@ def constraints(braces: BraceArrays, scale, limits, relaxed):
             G[i, k] = 0.0
         h[i] = 0.0
     for j in range(c):
-        k, mu, commanded = braces.first[j], table[j, FRICTION], table[j, COMMANDED] == table[j, COMMANDED]
+        k, mu, commanded = braces.first[j], table[j, kb.FRICTION], table[j, kb.COMMANDED] == table[j, kb.COMMANDED]
         tangents = k + (0 if commanded else 1)
         if not commanded:
-            G[rows, k], h[rows], first[cones] = 1.0, -table[j, LEAST] / scale, rows
+            G[rows, k], h[rows], first[cones] = 1.0, -table[j, kb.LEAST] / scale, rows
             G[rows, unknowns] = -1.0
             rows, cones = rows + 1, cones + 1
         if tangents < braces.first[j + 1]:
             first[cones] = rows
             if commanded:
-                h[rows] = mu * table[j, COMMANDED] / scale
+                h[rows] = mu * table[j, kb.COMMANDED] / scale
             else:
                 G[rows, k] = mu
             G[rows + 1, tangents], G[rows + 2, tangents + 1], G[rows, unknowns] = 1.0, 1.0, -1.0
             rows, cones = rows + 3, cones + 1
     # Torques in units of the force scale.
     for j in range(n if limits else 0):
-        low, high = motors[j, LOWER], motors[j, UPPER]
+        low, high = motors[j, kb.LOWER], motors[j, kb.UPPER]
         if low == high and not relaxed:
             for k in range(unknowns):
                 A[equations, k] = B[k, j]
@@ -376,7 +364,7 @@ def contradiction(braces: BraceArrays, equations, cones, relaxed):
     # Torques are the last of the equations and of the cones: backwards.
     e, i = equations - 1, program.first[cones] - 1
     for j in range(braces.free.shape[0] - 1, -1, -1):
-        low, high = motors[j, LOWER], motors[j, UPPER]
+        low, high = motors[j, kb.LOWER], motors[j, kb.UPPER]
         braces.certificate[j] = 0.0
         if low == high and not relaxed:
             braces.certificate[j] = -program.y[e]
@@ -395,7 +383,7 @@ def extreme_force(braces: BraceArrays, unknowns, equations, cones, j, end, scale
     """The least (end 0) or largest (end 1) normal force of brace j within all constraints [N], from a point inside."""
     program, k, x = braces.program, braces.first[j], braces.program.x
     if end == 0 and equations == 0 and holds_with_least(braces, j):
-        return braces.table[j, LEAST]
+        return braces.table[j, kb.LEAST]
     rows, first = program.first[cones], program.first
     clear_objective(program, unknowns)
     sign = 1.0 if end == 0 else -1.0
@@ -411,14 +399,14 @@ def extreme_force(braces: BraceArrays, unknowns, equations, cones, j, end, scale
 @internal_kernel
 def holds_with_least(braces: BraceArrays, j):
     """Whether the forces found stay possible when that of brace j is shortened to the least that it may be."""
-    found, k, least = braces.found, braces.first[j], braces.table[j, LEAST]
-    shorter = found[j, FORCES] - least
-    share = shorter / found[j, FORCES] if shorter > 0.0 else 0.0
+    found, k, least = braces.found, braces.first[j], braces.table[j, kb.LEAST]
+    shorter = found[j, kb.FORCES] - least
+    share = shorter / found[j, kb.FORCES] if shorter > 0.0 else 0.0
     for i in range(braces.free.shape[0]):
         torque = braces.torques[i] + shorter * braces.B[k, i]
         for e in range(k + 1, braces.first[j + 1]):
-            torque += share * found[j, FORCES + e - k] * braces.B[e, i]
-        if not braces.motors[i, LOWER] <= torque <= braces.motors[i, UPPER]:
+            torque += share * found[j, kb.FORCES + e - k] * braces.B[e, i]
+        if not braces.motors[i, kb.LOWER] <= torque <= braces.motors[i, kb.UPPER]:
             return False
     return True
 
@@ -433,11 +421,11 @@ def least_heat(braces: BraceArrays, unknowns, equations, cones, scale):
         for m in range(k + 1):
             total = 0.0
             for j in range(n):
-                total += B[k, j] * motors[j, HEAT] * B[m, j]
+                total += B[k, j] * motors[j, kb.HEAT] * B[m, j]
             program.H[k, m], program.H[m, k] = total, total
             largest = max(largest, abs(total))
         for j in range(n):
-            program.g[k] -= B[k, j] * motors[j, HEAT] * braces.free[j] / scale
+            program.g[k] -= B[k, j] * motors[j, kb.HEAT] * braces.free[j] / scale
     unit = 1.0 / largest if largest > 0.0 else 1.0
     for k in range(unknowns):
         for m in range(unknowns):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import FORCE, ORDER, RHS
+from dynsim.kernels import arrays as ka
 from dynsim.kernels.jit import apart_kernel, internal_kernel
 
 # A pivot below this fraction of the largest entry counts as a dependent row: far above rounding (1e-16 times a few
@@ -34,15 +34,15 @@ def solve_small(small, state, active, p):
     state, active : (p or more, ROW_STATE_SIZE), (p or more, ACTIVE_SIZE) int
     """
     if p == 1 and small[0, 0, 0] != 0.0:
-        state[0, FORCE] = state[0, RHS] / small[0, 0, 0]
+        state[0, ka.FORCE] = state[0, ka.RHS] / small[0, 0, 0]
         return 0
     if p == 2:
         a, b, c, d = small[0, 0, 0], small[0, 0, 1], small[0, 1, 0], small[0, 1, 1]
         determinant = a * d - b * c
         # Well conditioned: Cramer's rule loses no more than the elimination.
         if abs(determinant) > 1e-3 * (abs(a * d) + abs(b * c)):
-            x, y = state[0, RHS] / determinant, state[1, RHS] / determinant
-            state[0, FORCE], state[1, FORCE] = d * x - b * y, a * y - c * x
+            x, y = state[0, ka.RHS] / determinant, state[1, ka.RHS] / determinant
+            state[0, ka.FORCE], state[1, ka.FORCE] = d * x - b * y, a * y - c * x
             return 0
     return eliminate(small, state, active, p)
 
@@ -52,7 +52,7 @@ def eliminate(small, state, active, p):
     """:func:`solve_small` for any number of rows, without the closed forms."""
     largest, least = 0.0, math.inf
     for i in range(p):
-        state[i, FORCE] = state[i, RHS]
+        state[i, ka.FORCE] = state[i, ka.RHS]
         for j in range(p):
             small[1, i, j] = small[0, i, j]
             largest = max(largest, abs(small[0, i, j]))
@@ -69,19 +69,19 @@ def eliminate(small, state, active, p):
         if best != k:
             for j in range(p):
                 small[1, k, j], small[1, best, j] = small[1, best, j], small[1, k, j]
-            state[k, FORCE], state[best, FORCE] = state[best, FORCE], state[k, FORCE]
+            state[k, ka.FORCE], state[best, ka.FORCE] = state[best, ka.FORCE], state[k, ka.FORCE]
         inverse = 1.0 / small[1, k, k]
         for i in range(k + 1, p):
             factor = small[1, i, k] * inverse
             small[1, i, k] = factor
             for j in range(k + 1, p):
                 small[1, i, j] -= factor * small[1, k, j]
-            state[i, FORCE] -= factor * state[k, FORCE]
+            state[i, ka.FORCE] -= factor * state[k, ka.FORCE]
     for i in range(p - 1, -1, -1):
-        total = state[i, FORCE]
+        total = state[i, ka.FORCE]
         for j in range(i + 1, p):
-            total -= small[1, i, j] * state[j, FORCE]
-        state[i, FORCE] = total / small[1, i, i]
+            total -= small[1, i, j] * state[j, ka.FORCE]
+        state[i, ka.FORCE] = total / small[1, i, i]
     return 0
 
 
@@ -99,7 +99,7 @@ def least_norm(small, state, active, p, start, largest):
     matrix, wide, part = small[1], small[2], small[3, p - 1]
     if start == 0:
         for i in range(p):
-            state[i, FORCE] = state[i, RHS]
+            state[i, ka.FORCE] = state[i, ka.RHS]
             for j in range(p):
                 matrix[i, j] = small[0, i, j]
     r = eliminate_to_rank(small, state, active, p, start, largest)
@@ -116,31 +116,31 @@ def least_norm(small, state, active, p, start, largest):
     for k in range(r):
         for j in range(k):
             part[k] -= matrix[k, j] * part[j]
-        state[k, FORCE] += part[k]
+        state[k, ka.FORCE] += part[k]
     # s and Z, (r, d), together.
     for k in range(r - 1, -1, -1):
         inverse = 1.0 / matrix[k, k]
-        total = state[k, FORCE]
+        total = state[k, ka.FORCE]
         for a in range(d):
             wide[k, a] = matrix[k, r + a]
         for j in range(k + 1, r):
             factor = matrix[k, j]
-            total -= factor * state[j, FORCE]
+            total -= factor * state[j, ka.FORCE]
             for a in range(d):
                 wide[k, a] -= factor * wide[j, a]
-        state[k, FORCE] = total * inverse
+        state[k, ka.FORCE] = total * inverse
         for a in range(d):
             wide[k, a] *= inverse
     multiply_transposed(wide, state, r, d)
     apply_normal(small, state, p, r)
     for k in range(r):
-        state[k, FORCE] -= part[k]
+        state[k, ka.FORCE] -= part[k]
     multiply_transposed(wide, state, r, d)
     # Back to the order of the rows.
     for k in range(p):
-        part[k] = state[k, FORCE]
+        part[k] = state[k, ka.FORCE]
     for k in range(p):
-        state[active[k, ORDER], FORCE] = part[k]
+        state[active[k, ka.ORDER], ka.FORCE] = part[k]
 
 
 @internal_kernel
@@ -153,7 +153,7 @@ def eliminate_to_rank(small, state, active, p, start, largest):
     """
     matrix = small[1]
     for i in range(p):
-        active[i, ORDER] = i
+        active[i, ka.ORDER] = i
     k, last = start, p
     while k < last:
         column, row = k, largest_in_column(matrix, k, k, p)
@@ -179,14 +179,14 @@ def eliminate_to_rank(small, state, active, p, start, largest):
         if row != k:
             for j in range(p):
                 matrix[k, j], matrix[row, j] = matrix[row, j], matrix[k, j]
-            state[k, FORCE], state[row, FORCE] = state[row, FORCE], state[k, FORCE]
+            state[k, ka.FORCE], state[row, ka.FORCE] = state[row, ka.FORCE], state[k, ka.FORCE]
         inverse = 1.0 / matrix[k, k]
         for i in range(k + 1, p):
             factor = matrix[i, k] * inverse
             matrix[i, k] = factor
             for j in range(k + 1, last):
                 matrix[i, j] -= factor * matrix[k, j]
-            state[i, FORCE] -= factor * state[k, FORCE]
+            state[i, ka.FORCE] -= factor * state[k, ka.FORCE]
         k += 1
     return k
 
@@ -207,18 +207,18 @@ def swap_columns(matrix, active, p, j, k):
     if j != k:
         for i in range(p):
             matrix[i, j], matrix[i, k] = matrix[i, k], matrix[i, j]
-        active[j, ORDER], active[k, ORDER] = active[k, ORDER], active[j, ORDER]
+        active[j, ka.ORDER], active[k, ka.ORDER] = active[k, ka.ORDER], active[j, ka.ORDER]
 
 
 @internal_kernel
 def multiply_transposed(wide, state, r, d):
     """wideᵀ x of the first r forces x into the d forces behind them; wide: (r, d)."""
     for a in range(d):
-        state[r + a, FORCE] = 0.0
+        state[r + a, ka.FORCE] = 0.0
     for k in range(r):
-        x = state[k, FORCE]
+        x = state[k, ka.FORCE]
         for a in range(d):
-            state[r + a, FORCE] += wide[k, a] * x
+            state[r + a, ka.FORCE] += wide[k, a] * x
 
 
 @internal_kernel
@@ -232,12 +232,12 @@ def apply_normal(small, state, p, r):
         total = 1.0
         for k in range(r):
             total += X[k, 0] * X[k, 0]
-        factor = state[r, FORCE] / total
+        factor = state[r, ka.FORCE] / total
         for k in range(r):
             x[k] = factor * X[k, 0]
         return
     for a in range(d):
-        t[a] = state[r + a, FORCE]
+        t[a] = state[r + a, ka.FORCE]
     if d <= r:
         for a in range(d):
             for b in range(a, d):

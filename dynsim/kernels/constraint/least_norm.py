@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.constraint.cone import CONE, ONE_WAY
+from dynsim.kernels.constraint import cone as kc
 from dynsim.kernels.constraint.cone_steps import block_size
 from dynsim.kernels.jit import internal_kernel
 
@@ -92,7 +92,7 @@ def changeable(w, kind, mu, p, room):
     S, place, size = room[COLUMNS], room[PLACE, 0], room[SIZE, 0]
     n, k = 0, 0
     while k < p:
-        if kind[k] == CONE and w[k] <= STILL:
+        if kind[k] == kc.CONE and w[k] <= STILL:
             slip = math.sqrt(w[k + 1] * w[k + 1] + w[k + 2] * w[k + 2])
             if mu[k] > 0.0 and slip > STILL:
                 scale = 1.0 / math.sqrt(1.0 + mu[k] * mu[k])
@@ -103,7 +103,7 @@ def changeable(w, kind, mu, p, room):
                 for m in range(3 if mu[k] > 0.0 else 1):
                     place[n], size[n], S[n, 0] = k + m, 1.0, 1.0
                     n += 1
-        elif kind[k] == ONE_WAY and w[k] <= STILL:
+        elif kind[k] == kc.ONE_WAY and w[k] <= STILL:
             place[n], size[n], S[n, 0] = k, 1.0, 1.0
             n += 1
         k += block_size(kind, k)

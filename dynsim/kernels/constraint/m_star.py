@@ -2,35 +2,8 @@
 
 from __future__ import annotations
 
-from dynsim.kernels.arrays import (
-    APPLIED,
-    ARMATURE,
-    BIAS,
-    BODY_A,
-    BODY_B,
-    CIRCUIT,
-    CURRENT,
-    DEPENDENT,
-    DIDT,
-    DIRECTION,
-    DRIVEN,
-    FORCE,
-    INDUCTANCE,
-    JOINT_ROW,
-    PARENT,
-    QD,
-    QDD,
-    RHS,
-    ROW,
-    ROW_KIND,
-    ROWS,
-    TARGET,
-    VOLTAGE,
-    DriveArrays,
-    ModelArrays,
-    S,
-    Workspace,
-)
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import DriveArrays, ModelArrays, Workspace
 from dynsim.kernels.constraint.delassus import solve_small
 from dynsim.kernels.drive.dc import dc_balance
 from dynsim.kernels.jit import internal_kernel
@@ -47,7 +20,7 @@ def solve_m_star(K, model: ModelArrays, drives: DriveArrays, ws: Workspace):
     differs from J (rows) under friction: the paper's −J_tᵀ f_t with f_t = μ f_n has moved to the left side. Call after
     ``contact_rows``: the mass matrix overwrites velocities and wrenches of the sweep.
     """
-    n, p, na = model.tree.shape[0], ws.counts[ROWS], drives.table.shape[0]
+    n, p, na = model.tree.shape[0], ws.counts[ka.ROWS], drives.table.shape[0]
     size = K.shape[0]
     links, joints, motors, state = ws.links, ws.joints, ws.motors, ws.rows
     for i in range(size):
@@ -55,29 +28,29 @@ def solve_m_star(K, model: ModelArrays, drives: DriveArrays, ws: Workspace):
             K[i, j] = 0.0
     newton_euler(model, ws, 1.0, 0.0, 1.0)
     for i in range(n):
-        K[i, size] = joints[i, APPLIED] - joints[i, BIAS]
+        K[i, size] = joints[i, ka.APPLIED] - joints[i, ka.BIAS]
     mass_matrix(model, ws, K)
     for i in range(n):
-        K[i, i] += model.body[i, ARMATURE]
+        K[i, i] += model.body[i, ka.ARMATURE]
     for k in range(p):
-        K[n + k, size] = state[k, TARGET]
+        K[n + k, size] = state[k, ka.TARGET]
         for end in range(2):
-            j, sign = (ws.active[k, BODY_A], 1.0) if end == 0 else (ws.active[k, BODY_B], -1.0)
-            if ws.active[k, ROW_KIND] == JOINT_ROW:
-                K[n + k, j] += state[k, ROW + end]
-                K[j, n + k] -= state[k, DIRECTION + end]
+            j, sign = (ws.active[k, ka.BODY_A], 1.0) if end == 0 else (ws.active[k, ka.BODY_B], -1.0)
+            if ws.active[k, ka.ROW_KIND] == ka.JOINT_ROW:
+                K[n + k, j] += state[k, ka.ROW + end]
+                K[j, n + k] -= state[k, ka.DIRECTION + end]
                 continue
             while j >= 0:
                 for s in range(6):
-                    K[n + k, j] += sign * links[j, S + s] * state[k, ROW + s]
-                    K[j, n + k] -= sign * links[j, S + s] * state[k, DIRECTION + s]
-                j = model.tree[j, PARENT]
+                    K[n + k, j] += sign * links[j, ka.S + s] * state[k, ka.ROW + s]
+                    K[j, n + k] -= sign * links[j, ka.S + s] * state[k, ka.DIRECTION + s]
+                j = model.tree[j, ka.PARENT]
     for a in range(na):
-        row = n + p + drives.table[a, CIRCUIT]
+        row = n + p + drives.table[a, ka.CIRCUIT]
         if row >= n + p:
-            v = joints[drives.table[a, DRIVEN], QD]
-            K[row, size] = dc_balance(drives.motor, a, motors[a, VOLTAGE], v, motors[a, CURRENT])
-            K[row, row] = drives.motor[a, INDUCTANCE]
+            v = joints[drives.table[a, ka.DRIVEN], ka.QD]
+            K[row, size] = dc_balance(drives.motor, a, motors[a, ka.VOLTAGE], v, motors[a, ka.CURRENT])
+            K[row, row] = drives.motor[a, ka.INDUCTANCE]
     # Gaussian elimination. The positive definite mass block needs no pivoting; what it leaves of the constraint block
     # is J (M + J_m)⁻¹ F, not symmetric and perhaps of deficient rank.
     for k in range(n):
@@ -89,18 +62,18 @@ def solve_m_star(K, model: ModelArrays, drives: DriveArrays, ws: Workspace):
                     K[i, j] -= factor * K[k, j]
                 K[i, size] -= factor * K[k, size]
     for k in range(p):
-        state[k, RHS] = K[n + k, size]
+        state[k, ka.RHS] = K[n + k, size]
         for m in range(p):
             ws.small[0, k, m] = K[n + k, n + m]
-    ws.counts[DEPENDENT] += solve_small(ws.small, state, ws.active, p)
+    ws.counts[ka.DEPENDENT] += solve_small(ws.small, state, ws.active, p)
     for a in range(na):
-        row = n + p + drives.table[a, CIRCUIT]
+        row = n + p + drives.table[a, ka.CIRCUIT]
         if row >= n + p:
-            motors[a, DIDT] = K[row, size] / K[row, row]
+            motors[a, ka.DIDT] = K[row, size] / K[row, row]
     for i in range(n - 1, -1, -1):
         total = K[i, size]
         for k in range(p):
-            total -= K[i, n + k] * state[k, FORCE]
+            total -= K[i, n + k] * state[k, ka.FORCE]
         for j in range(i + 1, n):
-            total -= K[i, j] * joints[j, QDD]
-        joints[i, QDD] = total / K[i, i]
+            total -= K[i, j] * joints[j, ka.QDD]
+        joints[i, ka.QDD] = total / K[i, i]

@@ -9,68 +9,10 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import (
-    ANCHOR,
-    BODY_A,
-    BODY_B,
-    COUPLED,
-    DIRECTION,
-    FIRST_ROW,
-    FIRST_TANGENT,
-    FOLLOWER,
-    FORCE,
-    FORCE_VECTOR,
-    FRICTION_LAW,
-    FRICTION_SIGNED,
-    GAP,
-    GAP_RATE,
-    HELD,
-    JOINT_ROW,
-    LAW,
-    LEADER,
-    LINK,
-    MODE,
-    MOST_ROWS,
-    MU,
-    NORMAL,
-    OFFSET,
-    OPEN,
-    OWNER,
-    POSITION,
-    QD,
-    RATIO,
-    ROW,
-    ROW_GAP,
-    ROW_KIND,
-    ROW_MU,
-    ROW_OFFSET,
-    ROW_RATE,
-    ROW_STATE_SIZE,
-    ROWS,
-    SECOND_TANGENT,
-    SIGN,
-    SLIDING,
-    SLIDING_ROW,
-    STICKING,
-    STICKING_ROW,
-    TARGET,
-    A,
-    ContactArrays,
-    CouplingArrays,
-    ModelArrays,
-    Q,
-    V,
-    Workspace,
-)
-from dynsim.kernels.constraint.unilateral import (
-    LIMIT,
-    SIDE,
-    STOP_CLOSED,
-    STOP_FORCE,
-    STOP_JOINT,
-    STOP_ROW,
-    UnilateralArrays,
-)
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import ContactArrays, CouplingArrays, ModelArrays, Workspace
+from dynsim.kernels.constraint import unilateral as ku
+from dynsim.kernels.constraint.unilateral import UnilateralArrays
 from dynsim.kernels.jit import apart_kernel, internal_kernel
 
 
@@ -89,34 +31,34 @@ def set_modes(
     active, rows = ws.active, ws.rows
     p, held = couplings.joint.shape[0], 0
     for k in range(p):
-        new_row(ws, k, JOINT_ROW, k, couplings.joint[k, FOLLOWER])
-        active[k, BODY_B] = couplings.joint[k, LEADER]
-        rows[k, ROW], rows[k, ROW + 1] = 1.0, -couplings.law[k, RATIO]
-        rows[k, DIRECTION], rows[k, DIRECTION + 1] = rows[k, ROW], rows[k, ROW + 1]
-        rows[k, ROW_OFFSET] = couplings.law[k, OFFSET]
+        new_row(ws, k, ka.JOINT_ROW, k, couplings.joint[k, ka.FOLLOWER])
+        active[k, ka.BODY_B] = couplings.joint[k, ka.LEADER]
+        rows[k, ka.ROW], rows[k, ka.ROW + 1] = 1.0, -couplings.law[k, ka.RATIO]
+        rows[k, ka.DIRECTION], rows[k, ka.DIRECTION + 1] = rows[k, ka.ROW], rows[k, ka.ROW + 1]
+        rows[k, ka.ROW_OFFSET] = couplings.law[k, ka.OFFSET]
     if unilateral is not None:
         p = stop_rows(unilateral, ws, p)
     joint_rows = p
     for k in range(contacts.link.shape[0]):
-        i = contacts.link[k, LINK]
-        if modes[k] == STICKING and active[k, MODE] != STICKING:
+        i = contacts.link[k, ka.LINK]
+        if modes[k] == ka.STICKING and active[k, ka.MODE] != ka.STICKING:
             drop_anchor(ws, k)
-        active[k, MODE], active[k, FIRST_ROW] = modes[k], p
-        if modes[k] == SLIDING:
-            new_row(ws, p, SLIDING_ROW, k, i)
-            active[p, LAW] = contacts.link[k, FRICTION_LAW]
-            rows[p, ROW_MU] = contacts.point[k, MU]
+        active[k, ka.MODE], active[k, ka.FIRST_ROW] = modes[k], p
+        if modes[k] == ka.SLIDING:
+            new_row(ws, p, ka.SLIDING_ROW, k, i)
+            active[p, ka.LAW] = contacts.link[k, ka.FRICTION_LAW]
+            rows[p, ka.ROW_MU] = contacts.point[k, ka.MU]
             p += 1
-        elif modes[k] == STICKING:
+        elif modes[k] == ka.STICKING:
             held += 1
-            for _ in range(MOST_ROWS):
-                new_row(ws, p, STICKING_ROW, k, i)
+            for _ in range(ka.MOST_ROWS):
+                new_row(ws, p, ka.STICKING_ROW, k, i)
                 p += 1
-    ws.counts[ROWS], ws.counts[COUPLED], ws.counts[HELD] = p, joint_rows, held
+    ws.counts[ka.ROWS], ws.counts[ka.COUPLED], ws.counts[ka.HELD] = p, joint_rows, held
     for k in range(contacts.link.shape[0]):
-        if modes[k] == OPEN:
-            active[k, FIRST_ROW] = p
-            new_row(ws, p, SLIDING_ROW, k, contacts.link[k, LINK])
+        if modes[k] == ka.OPEN:
+            active[k, ka.FIRST_ROW] = p
+            new_row(ws, p, ka.SLIDING_ROW, k, contacts.link[k, ka.LINK])
             p += 1
     # Solves write the joints that a row feels, and read all the others as zero.
     for i in range(ws.column.shape[0]):
@@ -129,17 +71,17 @@ def stop_rows(unilateral: UnilateralArrays, ws: Workspace, p):
     """A joint row, of one joint, for every stop that is closed; returns the number of rows then."""
     table, stop, couplings = unilateral.stop_table, unilateral.stop, p
     for k in range(table.shape[0]):
-        stop[k, STOP_FORCE] = 0.0
-        if table[k, STOP_CLOSED] == 1:
-            joint = table[k, STOP_JOINT]
-            new_row(ws, p, JOINT_ROW, couplings + k, joint)
-            ws.active[p, BODY_B] = joint
-            ws.rows[p, ROW], ws.rows[p, DIRECTION], ws.rows[p, ROW_OFFSET] = (
-                stop[k, SIDE],
-                stop[k, SIDE],
-                stop[k, LIMIT],
+        stop[k, ku.STOP_FORCE] = 0.0
+        if table[k, ku.STOP_CLOSED] == 1:
+            joint = table[k, ku.STOP_JOINT]
+            new_row(ws, p, ka.JOINT_ROW, couplings + k, joint)
+            ws.active[p, ka.BODY_B] = joint
+            ws.rows[p, ka.ROW], ws.rows[p, ka.DIRECTION], ws.rows[p, ka.ROW_OFFSET] = (
+                stop[k, ku.SIDE],
+                stop[k, ku.SIDE],
+                stop[k, ku.LIMIT],
             )
-            table[k, STOP_ROW] = p
+            table[k, ku.STOP_ROW] = p
             p += 1
     return p
 
@@ -148,11 +90,11 @@ def stop_rows(unilateral: UnilateralArrays, ws: Workspace, p):
 def new_row(ws: Workspace, r, kind, owner, link):
     """Row r of one body, without friction."""
     active = ws.active
-    active[r, ROW_KIND], active[r, OWNER], active[r, LAW] = kind, owner, FRICTION_SIGNED
-    active[r, BODY_A], active[r, BODY_B] = link, -1
-    for s in range(ROW_STATE_SIZE):
+    active[r, ka.ROW_KIND], active[r, ka.OWNER], active[r, ka.LAW] = kind, owner, ka.FRICTION_SIGNED
+    active[r, ka.BODY_A], active[r, ka.BODY_B] = link, -1
+    for s in range(ka.ROW_STATE_SIZE):
         ws.rows[r, s] = 0.0
-    ws.rows[r, SIGN] = 1.0
+    ws.rows[r, ka.SIGN] = 1.0
 
 
 @internal_kernel
@@ -160,7 +102,7 @@ def drop_anchor(ws: Workspace, k):
     """Hold candidate k at the foot of its present position on the surface, along n and two tangents there."""
     state = ws.contacts
     for s in range(3):
-        state[k, ANCHOR + s] = state[k, POSITION + s] - state[k, GAP] * state[k, NORMAL + s]
+        state[k, ka.ANCHOR + s] = state[k, ka.POSITION + s] - state[k, ka.GAP] * state[k, ka.NORMAL + s]
     tangents(ws, k)
 
 
@@ -168,7 +110,7 @@ def drop_anchor(ws: Workspace, k):
 def tangents(ws: Workspace, k):
     """Two directions along the surface at the present normal of candidate k, for the rows of a point that sticks."""
     state = ws.contacts
-    x, y, z = state[k, NORMAL], state[k, NORMAL + 1], state[k, NORMAL + 2]
+    x, y, z = state[k, ka.NORMAL], state[k, ka.NORMAL + 1], state[k, ka.NORMAL + 2]
     # n × the axis that is furthest from n.
     ax, ay, az = abs(x), abs(y), abs(z)
     if ax <= ay and ax <= az:
@@ -179,17 +121,17 @@ def tangents(ws: Workspace, k):
         tx, ty, tz = y, -x, 0.0
     scale = 1.0 / math.sqrt(tx * tx + ty * ty + tz * tz)
     tx, ty, tz = scale * tx, scale * ty, scale * tz
-    state[k, FIRST_TANGENT], state[k, FIRST_TANGENT + 1], state[k, FIRST_TANGENT + 2] = tx, ty, tz
-    state[k, SECOND_TANGENT] = y * tz - z * ty
-    state[k, SECOND_TANGENT + 1] = z * tx - x * tz
-    state[k, SECOND_TANGENT + 2] = x * ty - y * tx
+    state[k, ka.FIRST_TANGENT], state[k, ka.FIRST_TANGENT + 1], state[k, ka.FIRST_TANGENT + 2] = tx, ty, tz
+    state[k, ka.SECOND_TANGENT] = y * tz - z * ty
+    state[k, ka.SECOND_TANGENT + 1] = z * tx - x * tz
+    state[k, ka.SECOND_TANGENT + 2] = x * ty - y * tx
 
 
 @internal_kernel
 def point_row(rows, r, x, y, z, dx, dy, dz):
     """Motion of a body's point at (x, y, z) along (dx, dy, dz), as row r."""
-    rows[r, ROW], rows[r, ROW + 1], rows[r, ROW + 2] = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
-    rows[r, ROW + 3], rows[r, ROW + 4], rows[r, ROW + 5] = dx, dy, dz
+    rows[r, ka.ROW], rows[r, ka.ROW + 1], rows[r, ka.ROW + 2] = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
+    rows[r, ka.ROW + 3], rows[r, ka.ROW + 4], rows[r, ka.ROW + 5] = dx, dy, dz
 
 
 @apart_kernel
@@ -201,27 +143,31 @@ def sticking_rows(model: ModelArrays, ws: Workspace, k, i):
     whatever is left of the velocity. At rest the three together are r̈ = 0.
     """
     state, rows, links, active = ws.contacts, ws.rows, ws.links, ws.active
-    first = active[k, FIRST_ROW]
-    x, y, z = state[k, POSITION], state[k, POSITION + 1], state[k, POSITION + 2]
+    first = active[k, ka.FIRST_ROW]
+    x, y, z = state[k, ka.POSITION], state[k, ka.POSITION + 1], state[k, ka.POSITION + 2]
     # Velocity of the point, and its acceleration at vdot = 0 (A carries −g from its root).
-    wx, wy, wz = links[i, V], links[i, V + 1], links[i, V + 2]
-    vx, vy, vz = links[i, V + 3] + wy * z - wz * y, links[i, V + 4] + wz * x - wx * z, links[i, V + 5] + wx * y - wy * x
-    ex, ey, ez = links[i, A], links[i, A + 1], links[i, A + 2]
-    ax = links[i, A + 3] + model.gravity[0] + ey * z - ez * y + wy * vz - wz * vy
-    ay = links[i, A + 4] + model.gravity[1] + ez * x - ex * z + wz * vx - wx * vz
-    az = links[i, A + 5] + model.gravity[2] + ex * y - ey * x + wx * vy - wy * vx
-    for m in range(MOST_ROWS):
+    wx, wy, wz = links[i, ka.V], links[i, ka.V + 1], links[i, ka.V + 2]
+    vx, vy, vz = (
+        links[i, ka.V + 3] + wy * z - wz * y,
+        links[i, ka.V + 4] + wz * x - wx * z,
+        links[i, ka.V + 5] + wx * y - wy * x,
+    )
+    ex, ey, ez = links[i, ka.A], links[i, ka.A + 1], links[i, ka.A + 2]
+    ax = links[i, ka.A + 3] + model.gravity[0] + ey * z - ez * y + wy * vz - wz * vy
+    ay = links[i, ka.A + 4] + model.gravity[1] + ez * x - ex * z + wz * vx - wx * vz
+    az = links[i, ka.A + 5] + model.gravity[2] + ex * y - ey * x + wx * vy - wy * vx
+    for m in range(ka.MOST_ROWS):
         r = first + m
-        d = NORMAL if m == 0 else FIRST_TANGENT if m == 1 else SECOND_TANGENT
+        d = ka.NORMAL if m == 0 else ka.FIRST_TANGENT if m == 1 else ka.SECOND_TANGENT
         dx, dy, dz = state[k, d], state[k, d + 1], state[k, d + 2]
         point_row(rows, r, x, y, z, dx, dy, dz)
         for s in range(6):
-            rows[r, DIRECTION + s] = rows[r, ROW + s]
+            rows[r, ka.DIRECTION + s] = rows[r, ka.ROW + s]
         if m > 0:
-            rows[r, TARGET] = -(dx * ax + dy * ay + dz * az)
-            rows[r, ROW_RATE] = dx * vx + dy * vy + dz * vz
-            rows[r, ROW_GAP] = (
-                dx * (x - state[k, ANCHOR]) + dy * (y - state[k, ANCHOR + 1]) + dz * (z - state[k, ANCHOR + 2])
+            rows[r, ka.TARGET] = -(dx * ax + dy * ay + dz * az)
+            rows[r, ka.ROW_RATE] = dx * vx + dy * vy + dz * vz
+            rows[r, ka.ROW_GAP] = (
+                dx * (x - state[k, ka.ANCHOR]) + dy * (y - state[k, ka.ANCHOR + 1]) + dz * (z - state[k, ka.ANCHOR + 2])
             )
 
 
@@ -230,13 +176,13 @@ def force_vectors(ws: Workspace):
     """Whole force of every candidate in W, friction included, into ``ws.contacts``, after ``derivative``."""
     state, rows, active = ws.contacts, ws.rows, ws.active
     for k in range(state.shape[0]):
-        first = active[k, FIRST_ROW]
+        first = active[k, ka.FIRST_ROW]
         for s in range(3):
-            state[k, FORCE_VECTOR + s] = rows[first, FORCE] * rows[first, DIRECTION + 3 + s]
-        if active[k, MODE] == STICKING:
-            for r in range(first + 1, first + MOST_ROWS):
+            state[k, ka.FORCE_VECTOR + s] = rows[first, ka.FORCE] * rows[first, ka.DIRECTION + 3 + s]
+        if active[k, ka.MODE] == ka.STICKING:
+            for r in range(first + 1, first + ka.MOST_ROWS):
                 for s in range(3):
-                    state[k, FORCE_VECTOR + s] += rows[r, FORCE] * rows[r, DIRECTION + 3 + s]
+                    state[k, ka.FORCE_VECTOR + s] += rows[r, ka.FORCE] * rows[r, ka.DIRECTION + 3 + s]
 
 
 @internal_kernel
@@ -246,18 +192,23 @@ def row_errors(ws: Workspace):
     Of a coupling q_follower − ratio q_leader − offset; those of tangential rows of sticking points are there already.
     """
     rows, active, joints = ws.rows, ws.active, ws.joints
-    for r in range(ws.counts[ROWS]):
-        if active[r, ROW_KIND] == JOINT_ROW:
-            a, b = active[r, BODY_A], active[r, BODY_B]
-            rows[r, ROW_GAP] = rows[r, ROW] * joints[a, Q] + rows[r, ROW + 1] * joints[b, Q] - rows[r, ROW_OFFSET]
-            rows[r, ROW_RATE] = joint_rate(ws, r)
+    for r in range(ws.counts[ka.ROWS]):
+        if active[r, ka.ROW_KIND] == ka.JOINT_ROW:
+            a, b = active[r, ka.BODY_A], active[r, ka.BODY_B]
+            rows[r, ka.ROW_GAP] = (
+                rows[r, ka.ROW] * joints[a, ka.Q] + rows[r, ka.ROW + 1] * joints[b, ka.Q] - rows[r, ka.ROW_OFFSET]
+            )
+            rows[r, ka.ROW_RATE] = joint_rate(ws, r)
     for k in range(ws.contacts.shape[0]):
-        r = active[k, FIRST_ROW]
-        rows[r, ROW_GAP], rows[r, ROW_RATE] = ws.contacts[k, GAP], ws.contacts[k, GAP_RATE]
+        r = active[k, ka.FIRST_ROW]
+        rows[r, ka.ROW_GAP], rows[r, ka.ROW_RATE] = ws.contacts[k, ka.GAP], ws.contacts[k, ka.GAP_RATE]
 
 
 @internal_kernel
 def joint_rate(ws: Workspace, r):
     """Rate of the joint row r."""
     rows, active, joints = ws.rows, ws.active, ws.joints
-    return rows[r, ROW] * joints[active[r, BODY_A], QD] + rows[r, ROW + 1] * joints[active[r, BODY_B], QD]
+    return (
+        rows[r, ka.ROW] * joints[active[r, ka.BODY_A], ka.QD]
+        + rows[r, ka.ROW + 1] * joints[active[r, ka.BODY_B], ka.QD]
+    )

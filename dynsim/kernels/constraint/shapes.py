@@ -15,32 +15,10 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import (
-    FIRST_ROW,
-    GAP,
-    GAP_RATE,
-    LINK,
-    MODE,
-    NORMAL,
-    POINT,
-    POSITION,
-    ROW,
-    ROW_GAP,
-    ROW_MU,
-    SLIP_VELOCITY,
-    STICKING,
-    TANGENT,
-    TARGET,
-    V_S,
-    A,
-    ContactArrays,
-    ModelArrays,
-    P,
-    R,
-    V,
-    Workspace,
-)
-from dynsim.kernels.constraint.distance import AS_POINT, MOVES, RADIUS, SURFACE, D, ShapeArrays, distance, nearest
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import ContactArrays, ModelArrays, Workspace
+from dynsim.kernels.constraint import distance as kd
+from dynsim.kernels.constraint.distance import ShapeArrays, distance, nearest
 from dynsim.kernels.constraint.rows import point_row, sticking_rows, tangents
 from dynsim.kernels.constraint.surface import signed_friction, unit_force
 from dynsim.kernels.constraint.unilateral import UnilateralArrays, slide_direction
@@ -62,7 +40,7 @@ def shaped_rows(
     if shapes is None:  # known to the compiler, which then leaves shapes out of the default program
         return
     for k in range(contacts.link.shape[0]):
-        if shapes.kind[k, SURFACE] != AS_POINT:
+        if shapes.kind[k, kd.SURFACE] != kd.AS_POINT:
             shaped_row(shapes, unilateral, model, contacts, ws, k)
 
 
@@ -85,29 +63,29 @@ def shaped_row(
     so that against a point that is held, ω × v_c becomes ω × ċ. There is no place to which it must return.
     """
     links, state, rows, point, data = ws.links, ws.contacts, ws.rows, contacts.point, shapes.data
-    i, m, radius = contacts.link[k, LINK], ws.active[k, FIRST_ROW], shapes.data[k, RADIUS]
-    x, y, z = point[k, POINT], point[k, POINT + 1], point[k, POINT + 2]
-    sx = links[i, P] + links[i, R] * x + links[i, R + 1] * y + links[i, R + 2] * z
-    sy = links[i, P + 1] + links[i, R + 3] * x + links[i, R + 4] * y + links[i, R + 5] * z
-    sz = links[i, P + 2] + links[i, R + 6] * x + links[i, R + 7] * y + links[i, R + 8] * z
-    x, y, z = data[k, D], data[k, D + 1], data[k, D + 2]
-    dx = links[i, R] * x + links[i, R + 1] * y + links[i, R + 2] * z
-    dy = links[i, R + 3] * x + links[i, R + 4] * y + links[i, R + 5] * z
-    dz = links[i, R + 6] * x + links[i, R + 7] * y + links[i, R + 8] * z
+    i, m, radius = contacts.link[k, ka.LINK], ws.active[k, ka.FIRST_ROW], shapes.data[k, kd.RADIUS]
+    x, y, z = point[k, ka.POINT], point[k, ka.POINT + 1], point[k, ka.POINT + 2]
+    sx = links[i, ka.P] + links[i, ka.R] * x + links[i, ka.R + 1] * y + links[i, ka.R + 2] * z
+    sy = links[i, ka.P + 1] + links[i, ka.R + 3] * x + links[i, ka.R + 4] * y + links[i, ka.R + 5] * z
+    sz = links[i, ka.P + 2] + links[i, ka.R + 6] * x + links[i, ka.R + 7] * y + links[i, ka.R + 8] * z
+    x, y, z = data[k, kd.D], data[k, kd.D + 1], data[k, kd.D + 2]
+    dx = links[i, ka.R] * x + links[i, ka.R + 1] * y + links[i, ka.R + 2] * z
+    dy = links[i, ka.R + 3] * x + links[i, ka.R + 4] * y + links[i, ka.R + 5] * z
+    dz = links[i, ka.R + 6] * x + links[i, ka.R + 7] * y + links[i, ka.R + 8] * z
     u = 0.0
-    if shapes.kind[k, MOVES] != 0:
+    if shapes.kind[k, kd.MOVES] != 0:
         u = nearest(shapes, k, sx, sy, sz, dx, dy, dz)
         sx, sy, sz = sx + u * dx, sy + u * dy, sz + u * dz
     far, nx, ny, nz, hxx, hxy, hxz, hyy, hyz, hzz = distance(shapes, k, sx, sy, sz)
     # Velocity of the body's point at s, and its acceleration at vdot = 0 (A carries −g from its root).
-    wx, wy, wz = links[i, V], links[i, V + 1], links[i, V + 2]
-    vx = links[i, V + 3] + wy * sz - wz * sy
-    vy = links[i, V + 4] + wz * sx - wx * sz
-    vz = links[i, V + 5] + wx * sy - wy * sx
-    ex, ey, ez = links[i, A], links[i, A + 1], links[i, A + 2]
-    ax = links[i, A + 3] + model.gravity[0] + ey * sz - ez * sy + wy * vz - wz * vy
-    ay = links[i, A + 4] + model.gravity[1] + ez * sx - ex * sz + wz * vx - wx * vz
-    az = links[i, A + 5] + model.gravity[2] + ex * sy - ey * sx + wx * vy - wy * vx
+    wx, wy, wz = links[i, ka.V], links[i, ka.V + 1], links[i, ka.V + 2]
+    vx = links[i, ka.V + 3] + wy * sz - wz * sy
+    vy = links[i, ka.V + 4] + wz * sx - wx * sz
+    vz = links[i, ka.V + 5] + wx * sy - wy * sx
+    ex, ey, ez = links[i, ka.A], links[i, ka.A + 1], links[i, ka.A + 2]
+    ax = links[i, ka.A + 3] + model.gravity[0] + ey * sz - ez * sy + wy * vz - wz * vy
+    ay = links[i, ka.A + 4] + model.gravity[1] + ez * sx - ex * sz + wz * vx - wx * vz
+    az = links[i, ka.A + 5] + model.gravity[2] + ex * sy - ey * sx + wx * vy - wy * vx
     # H v, which becomes ṅ = H ṡ, and v, which becomes ṡ.
     hx, hy, hz = hxx * vx + hxy * vy + hxz * vz, hxy * vx + hyy * vy + hyz * vz, hxz * vx + hyz * vy + hzz * vz
     second = nx * ax + ny * ay + nz * az + vx * hx + vy * hy + vz * hz
@@ -127,20 +105,20 @@ def shaped_row(
     vx, vy, vz = vx - radius * (wy * nz - wz * ny), vy - radius * (wz * nx - wx * nz), vz - radius * (wx * ny - wy * nx)
     tx, ty, tz = vx - rate * nx, vy - rate * ny, vz - rate * nz
     if unilateral is None:
-        scale = 1.0 / math.sqrt(tx * tx + ty * ty + tz * tz + point[k, V_S] * point[k, V_S])
+        scale = 1.0 / math.sqrt(tx * tx + ty * ty + tz * tz + point[k, ka.V_S] * point[k, ka.V_S])
         gx, gy, gz = tx * scale, ty * scale, tz * scale
     else:
-        gx, gy, gz, rows[m, ROW_MU] = slide_direction(unilateral, contacts, k, tx, ty, tz)
-    state[k, GAP], state[k, GAP_RATE], rows[m, TARGET] = far - radius, rate, -second
-    state[k, POSITION], state[k, POSITION + 1], state[k, POSITION + 2] = cx, cy, cz
-    state[k, NORMAL], state[k, NORMAL + 1], state[k, NORMAL + 2] = nx, ny, nz
-    state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2] = tx, ty, tz
-    state[k, TANGENT], state[k, TANGENT + 1], state[k, TANGENT + 2] = gx, gy, gz
+        gx, gy, gz, rows[m, ka.ROW_MU] = slide_direction(unilateral, contacts, k, tx, ty, tz)
+    state[k, ka.GAP], state[k, ka.GAP_RATE], rows[m, ka.TARGET] = far - radius, rate, -second
+    state[k, ka.POSITION], state[k, ka.POSITION + 1], state[k, ka.POSITION + 2] = cx, cy, cz
+    state[k, ka.NORMAL], state[k, ka.NORMAL + 1], state[k, ka.NORMAL + 2] = nx, ny, nz
+    state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2] = tx, ty, tz
+    state[k, ka.TANGENT], state[k, ka.TANGENT + 1], state[k, ka.TANGENT + 2] = gx, gy, gz
     point_row(rows, m, cx, cy, cz, nx, ny, nz)
     unit_force(rows, m, signed_friction(ws, m), cx, cy, cz, nx, ny, nz, gx, gy, gz)
-    if ws.active[k, MODE] != STICKING:
+    if ws.active[k, ka.MODE] != ka.STICKING:
         return
-    rolls = radius > 0.0 or shapes.kind[k, MOVES] != 0
+    rolls = radius > 0.0 or shapes.kind[k, kd.MOVES] != 0
     if rolls:
         # It rolls on from where it has begun to stick: any two tangents of the place where it is span the same rows.
         tangents(ws, k)
@@ -149,5 +127,5 @@ def shaped_row(
         lx, ly, lz = vx - (mx - radius * hx), vy - (my - radius * hy), vz - (mz - radius * hz)
         lx, ly, lz = wy * lz - wz * ly, wz * lx - wx * lz, wx * ly - wy * lx
         for r in range(m + 1, m + 3):
-            rows[r, TARGET] += rows[r, ROW + 3] * lx + rows[r, ROW + 4] * ly + rows[r, ROW + 5] * lz
-            rows[r, ROW_GAP] = 0.0
+            rows[r, ka.TARGET] += rows[r, ka.ROW + 3] * lx + rows[r, ka.ROW + 4] * ly + rows[r, ka.ROW + 5] * lz
+            rows[r, ka.ROW_GAP] = 0.0

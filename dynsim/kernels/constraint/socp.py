@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import MOST_ROWS
+from dynsim.kernels import arrays as ka
 from dynsim.kernels.constraint.cone_program import ConeProgram, cone_program, laid_out, program_size, solve_cone_program
 from dynsim.kernels.jit import internal_kernel, kernel
 
@@ -28,13 +28,13 @@ def split_size(r: int, count: int) -> int:
 
 def split_sizes(r: int, count: int) -> tuple[int, int, int, int]:
     """Unknowns, equations, cones and rows of the larger of its programs."""
-    return r + 1, 2 * count, count + 1, MOST_ROWS * count + 1
+    return r + 1, 2 * count, count + 1, ka.MOST_ROWS * count + 1
 
 
 @internal_kernel
 def split_room_in(flat, first, r, count):
     """:func:`split_room` in given arrays, (split_size(r, count),) and (count + 2,) int."""
-    return laid_out(flat, first, r + 1, 2 * count, count + 1, MOST_ROWS * count + 1)
+    return laid_out(flat, first, r + 1, 2 * count, count + 1, ka.MOST_ROWS * count + 1)
 
 
 @kernel
@@ -73,7 +73,7 @@ def best_split(f0, N, r, contact_first, mu, count, out, room: ConeProgram):
             worst = min(worst, (mu[j] * f0[i] - math.hypot(f0[i + 1], f0[i + 2])) / scale)
             continue
         worst = min(worst, f0[i] / scale)
-        for e in range(1, MOST_ROWS):
+        for e in range(1, ka.MOST_ROWS):
             for k in range(r):
                 room.A[equations, k] = N[i + e, k]
             room.A[equations, r] = 0.0
@@ -138,7 +138,7 @@ def cone_rows(f0, N, r, contact_first, mu, count, scale, room: ConeProgram):
         room.G[row, r], room.h[row] = -1.0, slope * f0[i] / scale
         row += 1
         if mu[j] > 0.0:
-            for e in range(1, MOST_ROWS):
+            for e in range(1, ka.MOST_ROWS):
                 for k in range(r):
                     room.G[row, k] = N[i + e, k]
                 room.G[row, r], room.h[row] = 0.0, f0[i + e] / scale

@@ -9,18 +9,11 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import FIRST_ROW, FORCE, MODE, STICKING, Workspace
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import Workspace
+from dynsim.kernels.constraint import unilateral as ku
 from dynsim.kernels.constraint.socp import best_split, split_room_in
-from dynsim.kernels.constraint.unilateral import (
-    BEST_MARGIN,
-    NULL_SPACE,
-    REDUNDANT,
-    SPLIT,
-    SPLIT_MATRIX,
-    STATIC,
-    UnilateralArrays,
-    note_stop_forces,
-)
+from dynsim.kernels.constraint.unilateral import UnilateralArrays, note_stop_forces
 from dynsim.kernels.jit import apart_kernel, internal_kernel
 
 # A pivot below this fraction of the largest is a row that depends on the others.
@@ -30,9 +23,9 @@ NULL_TOLERANCE = 1e-10
 @internal_kernel
 def margin(unilateral: UnilateralArrays, ws: Workspace, k):
     """μ_s f_n − |f_t| of candidate k, which sticks [N]."""
-    r, rows = ws.active[k, FIRST_ROW], ws.rows
-    a, b = rows[r + 1, FORCE], rows[r + 2, FORCE]
-    return unilateral.law[k, STATIC] * rows[r, FORCE] - math.sqrt(a * a + b * b)
+    r, rows = ws.active[k, ka.FIRST_ROW], ws.rows
+    a, b = rows[r + 1, ka.FORCE], rows[r + 2, ka.FORCE]
+    return unilateral.law[k, ku.STATIC] * rows[r, ka.FORCE] - math.sqrt(a * a + b * b)
 
 
 @internal_kernel
@@ -44,7 +37,7 @@ def admissible_forces(unilateral: UnilateralArrays | None, ws: Workspace):
     if unilateral is None:  # known to the compiler
         return
     # Small, because it is merged into the right-hand side.
-    if unilateral.number[REDUNDANT] == 1.0 or unilateral.stop.shape[0] > 0:
+    if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] > 0:
         look_at_forces(unilateral, ws)
 
 
@@ -52,10 +45,10 @@ def admissible_forces(unilateral: UnilateralArrays | None, ws: Workspace):
 def look_at_forces(unilateral: UnilateralArrays, ws: Workspace):
     """:func:`admissible_forces` where there are dependent rows or stops."""
     note_stop_forces(unilateral, ws)
-    unilateral.number[SPLIT] = 0.0
-    if unilateral.number[REDUNDANT] == 1.0:
+    unilateral.number[ku.SPLIT] = 0.0
+    if unilateral.number[ku.REDUNDANT] == 1.0:
         for k in range(ws.contacts.shape[0]):
-            if ws.active[k, MODE] == STICKING and margin(unilateral, ws, k) < 0.0:
+            if ws.active[k, ka.MODE] == ka.STICKING and margin(unilateral, ws, k) < 0.0:
                 split_forces(unilateral, ws)
                 return
 
@@ -67,24 +60,24 @@ def split_forces(unilateral: UnilateralArrays, ws: Workspace):
     first, row = place[0], place[1]
     count, p = 0, 0
     for k in range(ws.contacts.shape[0]):
-        if ws.active[k, MODE] == STICKING:
-            first[count], mu[count] = p, unilateral.law[k, STATIC]
+        if ws.active[k, ka.MODE] == ka.STICKING:
+            first[count], mu[count] = p, unilateral.law[k, ku.STATIC]
             for s in range(3):
-                row[p] = ws.active[k, FIRST_ROW] + s
+                row[p] = ws.active[k, ka.FIRST_ROW] + s
                 p += 1
             count += 1
     force, out = unilateral.vector[1], unilateral.vector[2]
     for i in range(p):
-        force[i] = rows[row[i], FORCE]
+        force[i] = rows[row[i], ka.FORCE]
         for j in range(p):
-            room[SPLIT_MATRIX, i, j] = ws.small[0, row[i], row[j]]
-    width = null_space(room[SPLIT_MATRIX], p, room[NULL_SPACE], place[2])
-    unilateral.number[SPLIT] = 1.0
+            room[ku.SPLIT_MATRIX, i, j] = ws.small[0, row[i], row[j]]
+    width = null_space(room[ku.SPLIT_MATRIX], p, room[ku.NULL_SPACE], place[2])
+    unilateral.number[ku.SPLIT] = 1.0
     programs = split_room_in(unilateral.split_room, place[3], width, count)
-    worst = best_split(force[:p], room[NULL_SPACE], width, first, mu, count, out[:p], programs)
-    unilateral.number[BEST_MARGIN] = worst
+    worst = best_split(force[:p], room[ku.NULL_SPACE], width, first, mu, count, out[:p], programs)
+    unilateral.number[ku.BEST_MARGIN] = worst
     for i in range(p):
-        rows[row[i], FORCE] = out[i]
+        rows[row[i], ka.FORCE] = out[i]
 
 
 @internal_kernel

@@ -4,40 +4,8 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import (
-    CONTRADICTORY,
-    CURVED,
-    DIRECTION,
-    FIRST_ROW,
-    FORCE,
-    FRICTION_DISSIPATIVE,
-    GAP,
-    GAP_RATE,
-    HELD,
-    LAW,
-    LINK,
-    MODE,
-    NORMAL,
-    OWNER,
-    POINT,
-    POSITION,
-    QUADRIC,
-    ROW_MU,
-    ROWS,
-    SIGN,
-    SLIP_VELOCITY,
-    STICKING,
-    TANGENT,
-    TARGET,
-    V_S,
-    A,
-    ContactArrays,
-    ModelArrays,
-    P,
-    R,
-    V,
-    Workspace,
-)
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import ContactArrays, ModelArrays, Workspace
 from dynsim.kernels.constraint.rows import point_row, sticking_rows
 from dynsim.kernels.constraint.unilateral import UnilateralArrays, slide_direction
 from dynsim.kernels.jit import exact_kernel, internal_kernel
@@ -66,9 +34,9 @@ def surface_distance(value, slope, curvature):
 def hessian_product(point, k, x, y, z):
     """(x, y, z)·Q (x, y, z) of the surface of contact k; point: (c, POINT_SIZE)."""
     return (
-        x * (point[k, QUADRIC] * x + 2.0 * (point[k, QUADRIC + 1] * y + point[k, QUADRIC + 2] * z))
-        + y * (point[k, QUADRIC + 3] * y + 2.0 * point[k, QUADRIC + 4] * z)
-        + z * point[k, QUADRIC + 5] * z
+        x * (point[k, ka.QUADRIC] * x + 2.0 * (point[k, ka.QUADRIC + 1] * y + point[k, ka.QUADRIC + 2] * z))
+        + y * (point[k, ka.QUADRIC + 3] * y + 2.0 * point[k, ka.QUADRIC + 4] * z)
+        + z * point[k, ka.QUADRIC + 5] * z
     )
 
 
@@ -86,20 +54,20 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: Unilat
     """
     links, state, rows, point, gravity = ws.links, ws.contacts, ws.rows, contacts.point, model.gravity
     for k in range(contacts.link.shape[0]):
-        i, m = contacts.link[k, LINK], ws.active[k, FIRST_ROW]
+        i, m = contacts.link[k, ka.LINK], ws.active[k, ka.FIRST_ROW]
         mu = signed_friction(ws, m)
-        x, y, z = point[k, POINT], point[k, POINT + 1], point[k, POINT + 2]
-        rx = links[i, P] + links[i, R] * x + links[i, R + 1] * y + links[i, R + 2] * z
-        ry = links[i, P + 1] + links[i, R + 3] * x + links[i, R + 4] * y + links[i, R + 5] * z
-        rz = links[i, P + 2] + links[i, R + 6] * x + links[i, R + 7] * y + links[i, R + 8] * z
+        x, y, z = point[k, ka.POINT], point[k, ka.POINT + 1], point[k, ka.POINT + 2]
+        rx = links[i, ka.P] + links[i, ka.R] * x + links[i, ka.R + 1] * y + links[i, ka.R + 2] * z
+        ry = links[i, ka.P + 1] + links[i, ka.R + 3] * x + links[i, ka.R + 4] * y + links[i, ka.R + 5] * z
+        rz = links[i, ka.P + 2] + links[i, ka.R + 6] * x + links[i, ka.R + 7] * y + links[i, ka.R + 8] * z
         # ∇C and C; a plane's ∇C is its unit normal, which spares every right-hand side two roots and three divisions.
-        nx, ny, nz = point[k, QUADRIC + 6], point[k, QUADRIC + 7], point[k, QUADRIC + 8]
-        gap = nx * rx + ny * ry + nz * rz + point[k, QUADRIC + 9]
-        inverse, curved = 1.0, contacts.link[k, CURVED] != 0
+        nx, ny, nz = point[k, ka.QUADRIC + 6], point[k, ka.QUADRIC + 7], point[k, ka.QUADRIC + 8]
+        gap = nx * rx + ny * ry + nz * rz + point[k, ka.QUADRIC + 9]
+        inverse, curved = 1.0, contacts.link[k, ka.CURVED] != 0
         if curved:
-            qx = point[k, QUADRIC] * rx + point[k, QUADRIC + 1] * ry + point[k, QUADRIC + 2] * rz
-            qy = point[k, QUADRIC + 1] * rx + point[k, QUADRIC + 3] * ry + point[k, QUADRIC + 4] * rz
-            qz = point[k, QUADRIC + 2] * rx + point[k, QUADRIC + 4] * ry + point[k, QUADRIC + 5] * rz
+            qx = point[k, ka.QUADRIC] * rx + point[k, ka.QUADRIC + 1] * ry + point[k, ka.QUADRIC + 2] * rz
+            qy = point[k, ka.QUADRIC + 1] * rx + point[k, ka.QUADRIC + 3] * ry + point[k, ka.QUADRIC + 4] * rz
+            qz = point[k, ka.QUADRIC + 2] * rx + point[k, ka.QUADRIC + 4] * ry + point[k, ka.QUADRIC + 5] * rz
             nx, ny, nz = nx + qx, ny + qy, nz + qz
             slope = math.sqrt(nx * nx + ny * ny + nz * nz)
             inverse = 1.0 / slope
@@ -107,45 +75,45 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: Unilat
             value = gap + 0.5 * (qx * rx + qy * ry + qz * rz)
             gap = surface_distance(value, slope, hessian_product(point, k, nx, ny, nz))
         # Velocity of the point, and its acceleration at vdot = 0 (A carries −g from its root).
-        wx, wy, wz = links[i, V], links[i, V + 1], links[i, V + 2]
-        vx = links[i, V + 3] + wy * rz - wz * ry
-        vy = links[i, V + 4] + wz * rx - wx * rz
-        vz = links[i, V + 5] + wx * ry - wy * rx
-        ex, ey, ez = links[i, A], links[i, A + 1], links[i, A + 2]
-        ax = links[i, A + 3] + gravity[0] + ey * rz - ez * ry + wy * vz - wz * vy
-        ay = links[i, A + 4] + gravity[1] + ez * rx - ex * rz + wz * vx - wx * vz
-        az = links[i, A + 5] + gravity[2] + ex * ry - ey * rx + wx * vy - wy * vx
+        wx, wy, wz = links[i, ka.V], links[i, ka.V + 1], links[i, ka.V + 2]
+        vx = links[i, ka.V + 3] + wy * rz - wz * ry
+        vy = links[i, ka.V + 4] + wz * rx - wx * rz
+        vz = links[i, ka.V + 5] + wx * ry - wy * rx
+        ex, ey, ez = links[i, ka.A], links[i, ka.A + 1], links[i, ka.A + 2]
+        ax = links[i, ka.A + 3] + gravity[0] + ey * rz - ez * ry + wy * vz - wz * vy
+        ay = links[i, ka.A + 4] + gravity[1] + ez * rx - ex * rz + wz * vx - wx * vz
+        az = links[i, ka.A + 5] + gravity[2] + ex * ry - ey * rx + wx * vy - wy * vx
         rate = nx * vx + ny * vy + nz * vz
         tx, ty, tz = vx - rate * nx, vy - rate * ny, vz - rate * nz
         if unilateral is None:
-            scale = 1.0 / math.sqrt(tx * tx + ty * ty + tz * tz + point[k, V_S] * point[k, V_S])
+            scale = 1.0 / math.sqrt(tx * tx + ty * ty + tz * tz + point[k, ka.V_S] * point[k, ka.V_S])
             sx, sy, sz = tx * scale, ty * scale, tz * scale
         else:
             sx, sy, sz, mu = slide_direction(unilateral, contacts, k, tx, ty, tz)
-            rows[m, ROW_MU] = mu
-        state[k, GAP] = gap
-        state[k, GAP_RATE] = rate
+            rows[m, ka.ROW_MU] = mu
+        state[k, ka.GAP] = gap
+        state[k, ka.GAP_RATE] = rate
         target = -(nx * ax + ny * ay + nz * az)
-        rows[m, TARGET] = target - hessian_product(point, k, vx, vy, vz) * inverse if curved else target
-        state[k, POSITION], state[k, POSITION + 1], state[k, POSITION + 2] = rx, ry, rz
-        state[k, NORMAL], state[k, NORMAL + 1], state[k, NORMAL + 2] = nx, ny, nz
-        state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2] = tx, ty, tz
+        rows[m, ka.TARGET] = target - hessian_product(point, k, vx, vy, vz) * inverse if curved else target
+        state[k, ka.POSITION], state[k, ka.POSITION + 1], state[k, ka.POSITION + 2] = rx, ry, rz
+        state[k, ka.NORMAL], state[k, ka.NORMAL + 1], state[k, ka.NORMAL + 2] = nx, ny, nz
+        state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2] = tx, ty, tz
         # From here on nothing is read back: stores to one table keep the compiler from trusting the other.
-        state[k, TANGENT], state[k, TANGENT + 1], state[k, TANGENT + 2] = sx, sy, sz
+        state[k, ka.TANGENT], state[k, ka.TANGENT + 1], state[k, ka.TANGENT + 2] = sx, sy, sz
         point_row(rows, m, rx, ry, rz, nx, ny, nz)
         unit_force(rows, m, mu, rx, ry, rz, nx, ny, nz, sx, sy, sz)
-    if ws.counts[HELD] == 0:
+    if ws.counts[ka.HELD] == 0:
         return
     for k in range(contacts.link.shape[0]):
-        if ws.active[k, MODE] == STICKING:
-            sticking_rows(model, ws, k, contacts.link[k, LINK])
+        if ws.active[k, ka.MODE] == ka.STICKING:
+            sticking_rows(model, ws, k, contacts.link[k, ka.LINK])
 
 
 @internal_kernel
 def signed_friction(ws: Workspace, m):
     """σ μ of row m."""
-    mu = ws.rows[m, ROW_MU]
-    return mu * ws.rows[m, SIGN] if ws.active[m, LAW] == FRICTION_DISSIPATIVE else mu
+    mu = ws.rows[m, ka.ROW_MU]
+    return mu * ws.rows[m, ka.SIGN] if ws.active[m, ka.LAW] == ka.FRICTION_DISSIPATIVE else mu
 
 
 @exact_kernel
@@ -156,21 +124,21 @@ def unit_force(rows, m, mu, x, y, z, nx, ny, nz, tx, ty, tz):
     signs of the one before.
     """
     fx, fy, fz = nx - mu * tx, ny - mu * ty, nz - mu * tz
-    rows[m, DIRECTION], rows[m, DIRECTION + 1], rows[m, DIRECTION + 2] = (
+    rows[m, ka.DIRECTION], rows[m, ka.DIRECTION + 1], rows[m, ka.DIRECTION + 2] = (
         y * fz - z * fy,
         z * fx - x * fz,
         x * fy - y * fx,
     )
-    rows[m, DIRECTION + 3], rows[m, DIRECTION + 4], rows[m, DIRECTION + 5] = fx, fy, fz
+    rows[m, ka.DIRECTION + 3], rows[m, ka.DIRECTION + 4], rows[m, ka.DIRECTION + 5] = fx, fy, fz
 
 
 @internal_kernel
 def turn_direction(ws: Workspace, m):
     """DIRECTION of row m for its present SIGN."""
-    state, k = ws.contacts, ws.active[m, OWNER]
-    x, y, z = state[k, POSITION], state[k, POSITION + 1], state[k, POSITION + 2]
-    nx, ny, nz = state[k, NORMAL], state[k, NORMAL + 1], state[k, NORMAL + 2]
-    tx, ty, tz = state[k, TANGENT], state[k, TANGENT + 1], state[k, TANGENT + 2]
+    state, k = ws.contacts, ws.active[m, ka.OWNER]
+    x, y, z = state[k, ka.POSITION], state[k, ka.POSITION + 1], state[k, ka.POSITION + 2]
+    nx, ny, nz = state[k, ka.NORMAL], state[k, ka.NORMAL + 1], state[k, ka.NORMAL + 2]
+    tx, ty, tz = state[k, ka.TANGENT], state[k, ka.TANGENT + 1], state[k, ka.TANGENT + 2]
     unit_force(ws.rows, m, signed_friction(ws, m), x, y, z, nx, ny, nz, tx, ty, tz)
 
 
@@ -184,33 +152,33 @@ def sign_changed(ws: Workspace, passes):
     sign and take +. So the result does not depend on the signs that the search began with, unless several choices are
     consistent (dynsim.kernels.constraint.uniqueness watches for that).
     """
-    rows, active, p = ws.rows, ws.active, ws.counts[ROWS]
+    rows, active, p = ws.rows, ws.active, ws.counts[ka.ROWS]
     limit = 2 * p + SIGN_PASSES
     changed, largest = False, 0.0
     for k in range(p):
-        largest = max(largest, abs(rows[k, FORCE]))
+        largest = max(largest, abs(rows[k, ka.FORCE]))
     for k in range(p):
-        if active[k, LAW] == FRICTION_DISSIPATIVE:
-            agreement = rows[k, FORCE] * rows[k, SIGN]
-            if agreement < -NO_FORCE * largest or (agreement <= NO_FORCE * largest and rows[k, SIGN] < 0.0):
+        if active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE:
+            agreement = rows[k, ka.FORCE] * rows[k, ka.SIGN]
+            if agreement < -NO_FORCE * largest or (agreement <= NO_FORCE * largest and rows[k, ka.SIGN] < 0.0):
                 if passes < limit and not (changed and passes > p):
-                    rows[k, SIGN] = -rows[k, SIGN]
+                    rows[k, ka.SIGN] = -rows[k, ka.SIGN]
                     turn_direction(ws, k)
                 changed = True
     if changed and passes >= limit:
         choice, free = passes - limit, 0
         for k in range(p):
-            if active[k, LAW] == FRICTION_DISSIPATIVE:
+            if active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE:
                 free += 1
         if free > SIGNS_LIMIT or choice >= 1 << free:
-            ws.counts[CONTRADICTORY] += 1
+            ws.counts[ka.CONTRADICTORY] += 1
             for k in range(p):
-                rows[k, FORCE] = math.nan
+                rows[k, ka.FORCE] = math.nan
             return False
         index = 0
         for k in range(p):
-            if active[k, LAW] == FRICTION_DISSIPATIVE:
-                rows[k, SIGN] = -1.0 if (choice >> index) & 1 == 1 else 1.0
+            if active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE:
+                rows[k, ka.SIGN] = -1.0 if (choice >> index) & 1 == 1 else 1.0
                 index += 1
                 turn_direction(ws, k)
     return changed

@@ -12,8 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.arrays import FORCE, MU, ContactArrays, Q, Workspace
-from dynsim.kernels.constraint.cone import CONE_ROOM
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import ContactArrays, Workspace
+from dynsim.kernels.constraint import cone as kc
 from dynsim.kernels.jit import internal_kernel
 
 # UnilateralArrays.law; the kinetic coefficient is ContactArrays.point[:, MU].
@@ -71,7 +72,7 @@ KINDS, TABLE_ROW = 4, 5
 PLACES = 6
 # UnilateralArrays.room
 SPLIT_MATRIX, NULL_SPACE, PROBLEM, SCRATCH = 0, 1, 2, 3
-ROOM = SCRATCH + CONE_ROOM
+ROOM = SCRATCH + kc.CONE_ROOM
 # UnilateralArrays.number
 REDUNDANT = 0  # 1: the rows of what sticks depend on each other
 BEST_MARGIN = 1  # the worst margin of the best split of their forces [N], where the least norm fits no cones
@@ -115,14 +116,14 @@ def slide_direction(unilateral: UnilateralArrays, contacts: ContactArrays, k, x,
         scale = 1.0 / size if along >= 0.0 else -1.0 / size
         a, b, c = x * scale, y * scale, z * scale
         speed = size if along >= 0.0 else -size
-    return a, b, c, sliding_friction(law, k, contacts.point[k, MU], speed)
+    return a, b, c, sliding_friction(law, k, contacts.point[k, ka.MU], speed)
 
 
 @internal_kernel
 def stop_gap(unilateral: UnilateralArrays, ws: Workspace, k):
     """What joint stop k leaves its joint to go, ≥ 0 [rad or m]."""
     stop = unilateral.stop
-    return stop[k, SIDE] * ws.joints[unilateral.stop_table[k, STOP_JOINT], Q] - stop[k, LIMIT]
+    return stop[k, SIDE] * ws.joints[unilateral.stop_table[k, STOP_JOINT], ka.Q] - stop[k, LIMIT]
 
 
 @internal_kernel
@@ -131,7 +132,7 @@ def note_stop_forces(unilateral: UnilateralArrays, ws: Workspace):
     table = unilateral.stop_table
     for k in range(table.shape[0]):
         closed = table[k, STOP_CLOSED] == 1
-        unilateral.stop[k, STOP_FORCE] = ws.rows[table[k, STOP_ROW], FORCE] if closed else 0.0
+        unilateral.stop[k, STOP_FORCE] = ws.rows[table[k, STOP_ROW], ka.FORCE] if closed else 0.0
 
 
 @internal_kernel

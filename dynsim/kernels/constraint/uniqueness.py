@@ -10,20 +10,8 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import (
-    BODY_A,
-    BODY_B,
-    FORCE,
-    FRICTION_DISSIPATIVE,
-    INVERSE_D,
-    LAW,
-    OWNER,
-    RHS,
-    ROW_MU,
-    ROWS,
-    SIGN,
-    Workspace,
-)
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import Workspace
 from dynsim.kernels.constraint.delassus import RANK_TOLERANCE
 from dynsim.kernels.constraint.surface import SIGNS_LIMIT
 from dynsim.kernels.jit import internal_kernel
@@ -48,11 +36,11 @@ def clearly_unique(ws: Workspace):
 
     Small, because it is merged into the step: passing the tables to the rest of the watch costs as much as a sweep.
     """
-    small, p = ws.small, ws.counts[ROWS]
+    small, p = ws.small, ws.counts[ka.ROWS]
     if p == 0 or p > 2:
         return p == 0
     for k in range(p):
-        if ws.active[k, LAW] == FRICTION_DISSIPATIVE or not small[0, k, k] > 0.0:
+        if ws.active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE or not small[0, k, k] > 0.0:
             return False
     if p == 1:
         return True
@@ -63,10 +51,10 @@ def clearly_unique(ws: Workspace):
 @internal_kernel
 def dominant(ws: Workspace, room):
     """True without friction, and when every A(σ) is strictly diagonally dominant, so that none of them is singular."""
-    small, p = ws.small, ws.counts[ROWS]
+    small, p = ws.small, ws.counts[ka.ROWS]
     frictional = False
     for k in range(p):
-        frictional = frictional or ws.rows[k, ROW_MU] > 0.0
+        frictional = frictional or ws.rows[k, ka.ROW_MU] > 0.0
     if not frictional:
         return True
     for k in range(p):
@@ -87,7 +75,7 @@ def dominant(ws: Workspace, room):
 @internal_kernel
 def last_link(ws: Workspace, k):
     """The last link that row k touches."""
-    return max(ws.active[k, BODY_A], ws.active[k, BODY_B])
+    return max(ws.active[k, ka.BODY_A], ws.active[k, ka.BODY_B])
 
 
 @internal_kernel
@@ -97,17 +85,17 @@ def split_matrix(ws: Workspace, room):
     A row's column is zero beyond its own links, and links come after their parents.
     """
     active, column, links, state = ws.active, ws.column, ws.links, ws.rows
-    p = ws.counts[ROWS]
+    p = ws.counts[ka.ROWS]
     for k in range(p):
         for m in range(k + 1):
             total = 0.0
             for i in range(min(last_link(ws, k), last_link(ws, m)) + 1):
-                total += column[i, 1 + 2 * k] * column[i, 1 + 2 * m] * links[i, INVERSE_D]
+                total += column[i, 1 + 2 * k] * column[i, 1 + 2 * m] * links[i, ka.INVERSE_D]
             room[FRICTIONLESS, k, m] = total
             room[FRICTIONLESS, m, k] = total
     for k in range(p):
         for m in range(p):
-            sign = state[m, SIGN] if active[m, LAW] == FRICTION_DISSIPATIVE else 1.0
+            sign = state[m, ka.SIGN] if active[m, ka.LAW] == ka.FRICTION_DISSIPATIVE else 1.0
             room[FRICTION, k, m] = sign * (room[FRICTIONLESS, k, m] - ws.small[0, k, m])
 
 
@@ -127,7 +115,7 @@ def force_verdict(ws: Workspace, room, since, t):
         return UNIQUE
     split_matrix(ws, room)
     drop_immobile(ws, room)
-    p = ws.counts[ROWS]
+    p = ws.counts[ka.ROWS]
     rank = frictionless_basis(room, p)
     negative, free = 0, 0
     for k in range(p):
@@ -135,18 +123,18 @@ def force_verdict(ws: Workspace, room, since, t):
         if own > 0.0 and ws.small[0, k, k] < -DIAGONAL_TOLERANCE * own:
             negative += 1
             # Only a frictional row can have it: that of a sliding point.
-            owner = ws.active[k, OWNER]
+            owner = ws.active[k, ka.OWNER]
             since[owner] = min(since[owner], t)
-        if ws.rows[k, ROW_MU] > 0.0 and ws.active[k, LAW] == FRICTION_DISSIPATIVE:
+        if ws.rows[k, ka.ROW_MU] > 0.0 and ws.active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE:
             free += 1
     reverse, doubtful, several = negative == p, negative == p, False
     for choice in range(1 << free if free <= SIGNS_LIMIT else free + 1):
         index = 0
         for k in range(p):
             sign = 1.0
-            if ws.active[k, LAW] == FRICTION_DISSIPATIVE:
-                sign = ws.rows[k, SIGN]
-                if ws.rows[k, ROW_MU] > 0.0:
+            if ws.active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE:
+                sign = ws.rows[k, ka.SIGN]
+                if ws.rows[k, ka.ROW_MU] > 0.0:
                     turned = (choice >> index) & 1 == 1 if free <= SIGNS_LIMIT else choice == index + 1
                     sign = -sign if turned else sign
                     index += 1
@@ -165,11 +153,11 @@ def force_verdict(ws: Workspace, room, since, t):
 @internal_kernel
 def drop_immobile(ws: Workspace, room):
     """Zero the rows of points that no joint moves along their normals: what is left there is rounding, of any sign."""
-    p = ws.counts[ROWS]
+    p = ws.counts[ka.ROWS]
     for k in range(p):
         along = 0.0
         for i in range(last_link(ws, k) + 1):
-            along += ws.column[i, 2 + 2 * k] * ws.column[i, 2 + 2 * k] * ws.links[i, INVERSE_D]
+            along += ws.column[i, 2 + 2 * k] * ws.column[i, 2 + 2 * k] * ws.links[i, ka.INVERSE_D]
         if room[FRICTIONLESS, k, k] <= IMMOBILE * along:
             for m in range(p):
                 room[FRICTIONLESS, k, m], room[FRICTIONLESS, m, k], room[FRICTION, k, m] = 0.0, 0.0, 0.0
@@ -206,10 +194,10 @@ def solve_choice(ws: Workspace, room, rank):
 
     Dependent rows: of Lᵀ A(σ) L, the forces that supports of equal stiffness have, which lie in the range of A0.
     """
-    p = ws.counts[ROWS]
+    p = ws.counts[ka.ROWS]
     target = MATRIX if rank == p else PRODUCT
     for k in range(p):
-        room[FORCES, 0, k] = ws.rows[k, RHS]
+        room[FORCES, 0, k] = ws.rows[k, ka.RHS]
         for m in range(p):
             room[target, k, m] = room[FRICTIONLESS, k, m] - room[FRICTION, k, m] * room[SIGNS, 0, m]
     if rank < p:
@@ -256,15 +244,15 @@ def eliminate(room, size):
 @internal_kernel
 def another_solution(ws: Workspace, room):
     """True when the forces in ``room`` have the signs that they were solved for and differ from those of ``ws``."""
-    largest, difference, p = 0.0, 0.0, ws.counts[ROWS]
+    largest, difference, p = 0.0, 0.0, ws.counts[ka.ROWS]
     for k in range(p):
         force = room[FORCES, 0, k]
-        largest = max(largest, abs(force), abs(ws.rows[k, FORCE]))
-        difference = max(difference, abs(force - ws.rows[k, FORCE]))
+        largest = max(largest, abs(force), abs(ws.rows[k, ka.FORCE]))
+        difference = max(difference, abs(force - ws.rows[k, ka.FORCE]))
     if not difference > FORCE_TOLERANCE * largest:
         return False
     for k in range(p):
-        free = ws.active[k, LAW] == FRICTION_DISSIPATIVE
+        free = ws.active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE
         if free and room[FORCES, 0, k] * room[SIGNS, 0, k] < -FORCE_TOLERANCE * largest:
             return False
     return True

@@ -6,45 +6,8 @@ line of ``model.arrays.compile_drives``.
 
 from __future__ import annotations
 
-from dynsim.kernels.arrays import (
-    APPLIED,
-    AT_TICKS,
-    CIRCUIT,
-    COMMAND,
-    CURRENT,
-    CURRENT_LIMITED,
-    DC_MOTOR,
-    DIDT,
-    DRAG,
-    DRIVE_KIND,
-    DRIVEN,
-    I_MAX,
-    INDUCTANCE,
-    K_M,
-    LINE_RATE,
-    LINE_SINCE,
-    LINE_START,
-    POSITION_SERVO,
-    Q_REF,
-    QD,
-    RATE_I,
-    RATE_Q,
-    RATE_V,
-    RESISTANCE,
-    REWRITTEN,
-    SAMPLED,
-    SERVO_MODE,
-    TORQUE_I,
-    TORQUE_Q,
-    TORQUE_V,
-    U_MAX,
-    V_REF,
-    VOLTAGE,
-    DriveArrays,
-    Q,
-    ReferenceArrays,
-    Workspace,
-)
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import DriveArrays, ReferenceArrays, Workspace
 from dynsim.kernels.drive.dc import at_current_limit, dc_balance, dc_block, dc_command, dc_torque, within_current
 from dynsim.kernels.drive.limit import clipped
 from dynsim.kernels.drive.servo import (
@@ -81,28 +44,30 @@ def evaluate_reference(drives: DriveArrays, reference: ReferenceArrays, t, ws: W
     x -= segment * spacing
     for a in range(motors.shape[0]):
         s = reference.spline[a]
-        if s == REWRITTEN:
-            motors[a, Q_REF] = line[a, LINE_START] + line[a, LINE_RATE] * (t - line[a, LINE_SINCE])
-            motors[a, V_REF] = line[a, LINE_RATE]
+        if s == ka.REWRITTEN:
+            motors[a, ka.Q_REF] = line[a, ka.LINE_START] + line[a, ka.LINE_RATE] * (t - line[a, ka.LINE_SINCE])
+            motors[a, ka.V_REF] = line[a, ka.LINE_RATE]
         elif s < 0:
-            motors[a, Q_REF] = reference.held[a]
-            motors[a, V_REF] = 0.0
+            motors[a, ka.Q_REF] = reference.held[a]
+            motors[a, ka.V_REF] = 0.0
         else:
             c0, c1, c2 = c[segment, s, 0], c[segment, s, 1], c[segment, s, 2]
             c3, c4, c5 = c[segment, s, 3], c[segment, s, 4], c[segment, s, 5]
-            motors[a, Q_REF] = c0 + x * (c1 + x * (c2 + x * (c3 + x * (c4 + x * c5))))
-            motors[a, V_REF] = c1 + x * (2.0 * c2 + x * (3.0 * c3 + x * (4.0 * c4 + x * 5.0 * c5)))
+            motors[a, ka.Q_REF] = c0 + x * (c1 + x * (c2 + x * (c3 + x * (c4 + x * c5))))
+            motors[a, ka.V_REF] = c1 + x * (2.0 * c2 + x * (3.0 * c3 + x * (4.0 * c4 + x * 5.0 * c5)))
 
 
 @internal_kernel
 def command(drives: DriveArrays, ws: Workspace, a):
     """What drive a is told to do, by its law at the present state, before limits [V; N m for an open torque]."""
-    motor, i, kind = drives.motor, drives.table[a, DRIVEN], drives.table[a, DRIVE_KIND]
-    q_ref, v_ref = ws.motors[a, Q_REF], ws.motors[a, V_REF]
-    if kind == DC_MOTOR:
-        return dc_command(motor, a, q_ref, v_ref, ws.joints[i, Q], ws.joints[i, QD])
-    if kind == POSITION_SERVO:
-        return servo_command(motor, a, drives.table[a, SERVO_MODE], q_ref, v_ref, ws.joints[i, Q], ws.joints[i, QD])
+    motor, i, kind = drives.motor, drives.table[a, ka.DRIVEN], drives.table[a, ka.DRIVE_KIND]
+    q_ref, v_ref = ws.motors[a, ka.Q_REF], ws.motors[a, ka.V_REF]
+    if kind == ka.DC_MOTOR:
+        return dc_command(motor, a, q_ref, v_ref, ws.joints[i, ka.Q], ws.joints[i, ka.QD])
+    if kind == ka.POSITION_SERVO:
+        return servo_command(
+            motor, a, drives.table[a, ka.SERVO_MODE], q_ref, v_ref, ws.joints[i, ka.Q], ws.joints[i, ka.QD]
+        )
     return q_ref
 
 
@@ -123,13 +88,13 @@ def fed_forward(voltage, grid, t, a, asked):
 @internal_kernel
 def drive_dc(drives: DriveArrays, asked, i, ws: Workspace, a):
     """The DC motor a at a command [V] and a current [A]."""
-    motors, motor, j = ws.motors, drives.motor, drives.table[a, DRIVEN]
-    u = clipped(drives.input[a, COMMAND] if drives.table[a, SAMPLED] else asked, motor[a, U_MAX])
-    if drives.table[a, CURRENT_LIMITED] != 0:
-        u = within_current(motor, a, u, ws.joints[j, QD])
-    motors[a, CURRENT], motors[a, VOLTAGE] = i, u
-    motors[a, DIDT] = dc_balance(motor, a, u, ws.joints[j, QD], i) / motor[a, INDUCTANCE]
-    ws.joints[j, APPLIED] += dc_torque(motor, a, i)
+    motors, motor, j = ws.motors, drives.motor, drives.table[a, ka.DRIVEN]
+    u = clipped(drives.input[a, ka.COMMAND] if drives.table[a, ka.SAMPLED] else asked, motor[a, ka.U_MAX])
+    if drives.table[a, ka.CURRENT_LIMITED] != 0:
+        u = within_current(motor, a, u, ws.joints[j, ka.QD])
+    motors[a, ka.CURRENT], motors[a, ka.VOLTAGE] = i, u
+    motors[a, ka.DIDT] = dc_balance(motor, a, u, ws.joints[j, ka.QD], i) / motor[a, ka.INDUCTANCE]
+    ws.joints[j, ka.APPLIED] += dc_torque(motor, a, i)
 
 
 @internal_kernel
@@ -143,26 +108,26 @@ def drive(drives: DriveArrays, reference: ReferenceArrays, t, y, layout: StateLa
     evaluate_reference(drives, reference, t, ws)
     if layout.circuits == na:  # every drive has a circuit, its own: the loop that most robots take
         for a in range(na):
-            j = table[a, DRIVEN]
-            asked = dc_command(motor, a, motors[a, Q_REF], motors[a, V_REF], joints[j, Q], joints[j, QD])
+            j = table[a, ka.DRIVEN]
+            asked = dc_command(motor, a, motors[a, ka.Q_REF], motors[a, ka.V_REF], joints[j, ka.Q], joints[j, ka.QD])
             asked = fed_forward(reference.voltage, reference.grid, t, a, asked)
             drive_dc(drives, asked, y[layout.current + a], ws, a)
         return
     for a in range(na):
-        j, kind = table[a, DRIVEN], table[a, DRIVE_KIND]
-        v = joints[j, QD]
-        asked = drives.input[a, COMMAND] if table[a, SAMPLED] else command(drives, ws, a)
-        if kind == DC_MOTOR:
+        j, kind = table[a, ka.DRIVEN], table[a, ka.DRIVE_KIND]
+        v = joints[j, ka.QD]
+        asked = drives.input[a, ka.COMMAND] if table[a, ka.SAMPLED] else command(drives, ws, a)
+        if kind == ka.DC_MOTOR:
             asked = fed_forward(reference.voltage, reference.grid, t, a, asked)
-            drive_dc(drives, asked, y[layout.current + table[a, CIRCUIT]], ws, a)
-        elif kind == POSITION_SERVO:
-            mode = drives.table[a, SERVO_MODE]
-            motors[a, VOLTAGE], motors[a, CURRENT] = servo_circuit(motor, a, mode, asked, v)
-            motors[a, DRAG] = servo_drag(motor, a, mode, v)
-            joints[j, APPLIED] += motor[a, K_M] * motors[a, CURRENT] - motors[a, DRAG]
+            drive_dc(drives, asked, y[layout.current + table[a, ka.CIRCUIT]], ws, a)
+        elif kind == ka.POSITION_SERVO:
+            mode = drives.table[a, ka.SERVO_MODE]
+            motors[a, ka.VOLTAGE], motors[a, ka.CURRENT] = servo_circuit(motor, a, mode, asked, v)
+            motors[a, ka.DRAG] = servo_drag(motor, a, mode, v)
+            joints[j, ka.APPLIED] += motor[a, ka.K_M] * motors[a, ka.CURRENT] - motors[a, ka.DRAG]
         else:
-            motors[a, VOLTAGE], motors[a, CURRENT] = v, open_torque(motor, a, asked)
-            joints[j, APPLIED] += motors[a, CURRENT]
+            motors[a, ka.VOLTAGE], motors[a, ka.CURRENT] = v, open_torque(motor, a, asked)
+            joints[j, ka.APPLIED] += motors[a, ka.CURRENT]
 
 
 @internal_kernel
@@ -170,9 +135,9 @@ def take_commands(drives: DriveArrays, reference: ReferenceArrays, t, ws: Worksp
     """At a tick: the commands of all sampled drives at the state in ``ws.joints``, held from now on."""
     evaluate_reference(drives, reference, t, ws)
     for a in range(ws.motors.shape[0]):
-        if drives.table[a, SAMPLED] == AT_TICKS:
+        if drives.table[a, ka.SAMPLED] == ka.AT_TICKS:
             asked = command(drives, ws, a)
-            drives.input[a, COMMAND] = fed_forward(reference.voltage, reference.grid, t, a, asked)
+            drives.input[a, ka.COMMAND] = fed_forward(reference.voltage, reference.grid, t, a, asked)
 
 
 @internal_kernel
@@ -181,37 +146,37 @@ def drive_block(drives: DriveArrays, ws: Workspace, a, block):
 
     After ``derivative``: references, voltages and states are those in the workspace.
     """
-    motors, motor, kind, mode = ws.motors, drives.motor, drives.table[a, DRIVE_KIND], drives.table[a, SERVO_MODE]
-    sampled = drives.table[a, SAMPLED] != 0
+    motors, motor, kind, mode = ws.motors, drives.motor, drives.table[a, ka.DRIVE_KIND], drives.table[a, ka.SERVO_MODE]
+    sampled = drives.table[a, ka.SAMPLED] != 0
     for s in range(block.shape[0]):
         block[s] = 0.0
-    if kind == DC_MOTOR:
-        u, v = motors[a, VOLTAGE], ws.joints[drives.table[a, DRIVEN], QD]
-        limited = drives.table[a, CURRENT_LIMITED] != 0 and at_current_limit(motor, a, u, v)
-        fill_dc_block(motor, a, 1.0 if not sampled and abs(u) < motor[a, U_MAX] else 0.0, block)
+    if kind == ka.DC_MOTOR:
+        u, v = motors[a, ka.VOLTAGE], ws.joints[drives.table[a, ka.DRIVEN], ka.QD]
+        limited = drives.table[a, ka.CURRENT_LIMITED] != 0 and at_current_limit(motor, a, u, v)
+        fill_dc_block(motor, a, 1.0 if not sampled and abs(u) < motor[a, ka.U_MAX] else 0.0, block)
         if limited:
-            block[RATE_Q], block[RATE_V] = 0.0, 0.0
-    elif kind == POSITION_SERVO:
-        asked = drives.input[a, COMMAND] if sampled else command(drives, ws, a)
-        v = ws.joints[drives.table[a, DRIVEN], QD]
-        block[TORQUE_Q], block[TORQUE_V] = servo_block(motor, a, mode, sampled, asked, v)
+            block[ka.RATE_Q], block[ka.RATE_V] = 0.0, 0.0
+    elif kind == ka.POSITION_SERVO:
+        asked = drives.input[a, ka.COMMAND] if sampled else command(drives, ws, a)
+        v = ws.joints[drives.table[a, ka.DRIVEN], ka.QD]
+        block[ka.TORQUE_Q], block[ka.TORQUE_V] = servo_block(motor, a, mode, sampled, asked, v)
 
 
 @internal_kernel
 def fill_dc_block(motor, a, follows, block):
     """:func:`dc_block` into the row ``block``."""
     slopes = dc_block(motor, a, follows)
-    block[TORQUE_Q], block[TORQUE_V], block[TORQUE_I] = slopes[0], slopes[1], slopes[2]
-    block[RATE_Q], block[RATE_V], block[RATE_I] = slopes[3], slopes[4], slopes[5]
+    block[ka.TORQUE_Q], block[ka.TORQUE_V], block[ka.TORQUE_I] = slopes[0], slopes[1], slopes[2]
+    block[ka.RATE_Q], block[ka.RATE_V], block[ka.RATE_I] = slopes[3], slopes[4], slopes[5]
 
 
 @internal_kernel
 def asked_of(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace, a):
     """What drive a is asked for at the present state and time t, before limits, after ``evaluate_reference``."""
-    if drives.table[a, SAMPLED] != 0:
-        return drives.input[a, COMMAND]
+    if drives.table[a, ka.SAMPLED] != 0:
+        return drives.input[a, ka.COMMAND]
     asked = command(drives, ws, a)
-    if drives.table[a, DRIVE_KIND] == DC_MOTOR:
+    if drives.table[a, ka.DRIVE_KIND] == ka.DC_MOTOR:
         return fed_forward(reference.voltage, reference.grid, t, a, asked)
     return asked
 
@@ -220,15 +185,15 @@ def asked_of(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace, 
 def segment_of(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace, a):
     """Which limit holds drive a at the present state: 0 none, ±1 the voltage's, ±2 the current's; as above."""
     motor, asked = drives.motor, asked_of(drives, reference, t, ws, a)
-    if drives.table[a, DRIVE_KIND] == POSITION_SERVO:
-        v = ws.joints[drives.table[a, DRIVEN], QD]
-        return servo_segment(motor, a, drives.table[a, SERVO_MODE], asked, v)
-    if drives.table[a, DRIVE_KIND] == DC_MOTOR:
-        u = clipped(asked, motor[a, U_MAX])
-        over = u - motor[a, K_M] * ws.joints[drives.table[a, DRIVEN], QD]
-        if drives.table[a, CURRENT_LIMITED] != 0 and abs(over) > motor[a, RESISTANCE] * motor[a, I_MAX]:
+    if drives.table[a, ka.DRIVE_KIND] == ka.POSITION_SERVO:
+        v = ws.joints[drives.table[a, ka.DRIVEN], ka.QD]
+        return servo_segment(motor, a, drives.table[a, ka.SERVO_MODE], asked, v)
+    if drives.table[a, ka.DRIVE_KIND] == ka.DC_MOTOR:
+        u = clipped(asked, motor[a, ka.U_MAX])
+        over = u - motor[a, ka.K_M] * ws.joints[drives.table[a, ka.DRIVEN], ka.QD]
+        if drives.table[a, ka.CURRENT_LIMITED] != 0 and abs(over) > motor[a, ka.RESISTANCE] * motor[a, ka.I_MAX]:
             return 2 if over > 0.0 else -2
-        return 1 if asked > motor[a, U_MAX] else -1 if asked < -motor[a, U_MAX] else 0
+        return 1 if asked > motor[a, ka.U_MAX] else -1 if asked < -motor[a, ka.U_MAX] else 0
     return 0
 
 
@@ -243,27 +208,27 @@ def drive_on_segments(
     table, motor, motors, joints = drives.table, drives.motor, ws.motors, ws.joints
     evaluate_reference(drives, reference, t, ws)
     for a in range(motors.shape[0]):
-        j, kind, mode, limit = table[a, DRIVEN], table[a, DRIVE_KIND], table[a, SERVO_MODE], segment[a]
-        v, asked, sampled = joints[j, QD], asked_of(drives, reference, t, ws, a), table[a, SAMPLED] != 0
+        j, kind, mode, limit = table[a, ka.DRIVEN], table[a, ka.DRIVE_KIND], table[a, ka.SERVO_MODE], segment[a]
+        v, asked, sampled = joints[j, ka.QD], asked_of(drives, reference, t, ws, a), table[a, ka.SAMPLED] != 0
         for s in range(linear.shape[1]):
             linear[a, s] = 0.0
-        if kind == DC_MOTOR:
-            i, u = y[layout.current + table[a, CIRCUIT]], asked
+        if kind == ka.DC_MOTOR:
+            i, u = y[layout.current + table[a, ka.CIRCUIT]], asked
             if limit == 1 or limit == -1:
-                u = motor[a, U_MAX] * limit
+                u = motor[a, ka.U_MAX] * limit
             elif limit != 0:
-                u = motor[a, K_M] * v + 0.5 * limit * motor[a, RESISTANCE] * motor[a, I_MAX]
-            motors[a, CURRENT], motors[a, VOLTAGE] = i, u
-            motors[a, DIDT] = dc_balance(motor, a, u, v, i) / motor[a, INDUCTANCE]
-            joints[j, APPLIED] += dc_torque(motor, a, i)
+                u = motor[a, ka.K_M] * v + 0.5 * limit * motor[a, ka.RESISTANCE] * motor[a, ka.I_MAX]
+            motors[a, ka.CURRENT], motors[a, ka.VOLTAGE] = i, u
+            motors[a, ka.DIDT] = dc_balance(motor, a, u, v, i) / motor[a, ka.INDUCTANCE]
+            joints[j, ka.APPLIED] += dc_torque(motor, a, i)
             fill_dc_block(motor, a, 1.0 if limit == 0 and not sampled else 0.0, linear[a])
             if limit == 2 or limit == -2:
-                linear[a, RATE_Q], linear[a, RATE_V] = 0.0, 0.0
-        elif kind == POSITION_SERVO:
-            motors[a, VOLTAGE], motors[a, CURRENT] = servo_circuit_on(motor, a, mode, limit, asked, v)
-            motors[a, DRAG] = servo_drag(motor, a, mode, v)
-            joints[j, APPLIED] += motor[a, K_M] * motors[a, CURRENT] - motors[a, DRAG]
-            linear[a, TORQUE_Q], linear[a, TORQUE_V] = servo_block_on(motor, a, mode, limit, sampled, v)
+                linear[a, ka.RATE_Q], linear[a, ka.RATE_V] = 0.0, 0.0
+        elif kind == ka.POSITION_SERVO:
+            motors[a, ka.VOLTAGE], motors[a, ka.CURRENT] = servo_circuit_on(motor, a, mode, limit, asked, v)
+            motors[a, ka.DRAG] = servo_drag(motor, a, mode, v)
+            joints[j, ka.APPLIED] += motor[a, ka.K_M] * motors[a, ka.CURRENT] - motors[a, ka.DRAG]
+            linear[a, ka.TORQUE_Q], linear[a, ka.TORQUE_V] = servo_block_on(motor, a, mode, limit, sampled, v)
         else:
-            motors[a, VOLTAGE], motors[a, CURRENT] = v, open_torque(motor, a, asked)
-            joints[j, APPLIED] += motors[a, CURRENT]
+            motors[a, ka.VOLTAGE], motors[a, ka.CURRENT] = v, open_torque(motor, a, asked)
+            joints[j, ka.APPLIED] += motors[a, ka.CURRENT]

@@ -5,10 +5,10 @@ To the ledger it is an ideal source with K_m = 1 and R = 0: its current is τ, i
 
 from __future__ import annotations
 
-from dynsim.kernels.arrays import I_MAX
+from dynsim.kernels import arrays as ka
 from dynsim.kernels.drive.limit import clipped
 
 
 def open_torque(motor, a, command):
     """τ [N m]: the command within the limit."""
-    return clipped(command, motor[a, I_MAX])
+    return clipped(command, motor[a, ka.I_MAX])

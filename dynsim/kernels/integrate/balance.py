@@ -21,41 +21,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from dynsim.kernels.arrays import (
-    APPLIED,
-    ARMATURE,
-    CIRCUIT,
-    CURRENT,
-    DAMPING,
-    DIDT,
-    DRIVEN,
-    GEAR_DAMPING,
-    INDUCTANCE,
-    PARENT,
-    QD,
-    RATE_I,
-    RATE_Q,
-    RATE_V,
-    A,
-    ModelArrays,
-    S,
-    V,
-    Workspace,
-)
-from dynsim.kernels.integrate.run import STEP, Run
-from dynsim.kernels.integrate.time_stepping import (
-    ACCELERATION,
-    APPLIED_THEN,
-    DIDT_THEN,
-    MAGNETIC,
-    MECHANICAL,
-    START,
-    STOP,
-    V_START,
-    place_joints,
-)
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import ModelArrays, Workspace
+from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.integrate import time_stepping as kt
+from dynsim.kernels.integrate.run import Run
+from dynsim.kernels.integrate.time_stepping import place_joints
 from dynsim.kernels.jit import internal_kernel
 from dynsim.kernels.ledger import kinetic_energy, potential_energy
+from dynsim.kernels.tree.spatial import dot, point_velocity, six, times_inertia
 from dynsim.kernels.tree.sweep import body_inertia, forward_sweep, inertial_wrench
 
 if TYPE_CHECKING:
@@ -68,14 +42,14 @@ def stored_energy(system: System, ws: Workspace, y, out):
     layout, motor = system.layout, system.drives.motor
     place_joints(system, ws, y)
     for i in range(ws.joints.shape[0]):
-        ws.joints[i, QD] = y[layout.v + i]
+        ws.joints[i, ka.QD] = y[layout.v + i]
     forward_sweep(system.model, ws, 1.0, 0.0, 1.0)
-    out[MECHANICAL] = kinetic_energy(system.model, ws) + potential_energy(system.model, ws)
-    out[MAGNETIC] = 0.0
+    out[kt.MECHANICAL] = kinetic_energy(system.model, ws) + potential_energy(system.model, ws)
+    out[kt.MAGNETIC] = 0.0
     for a in range(ws.motors.shape[0]):
-        k = system.drives.table[a, CIRCUIT]
+        k = system.drives.table[a, ka.CIRCUIT]
         if k >= 0:
-            out[MAGNETIC] += 0.5 * motor[a, INDUCTANCE] * y[layout.current + k] * y[layout.current + k]
+            out[kt.MAGNETIC] += 0.5 * motor[a, ka.INDUCTANCE] * y[layout.current + k] * y[layout.current + k]
 
 
 @internal_kernel
@@ -85,10 +59,13 @@ def begin_energy(system: System, ws: Workspace, run: Run):
     for j in range(system.layout.tracked):
         same = same and run.y[j] == run.y_new[j]
     # NaN before the first step.
-    if same and energy[STOP, MECHANICAL] == energy[STOP, MECHANICAL]:
-        energy[START, MECHANICAL], energy[START, MAGNETIC] = energy[STOP, MECHANICAL], energy[STOP, MAGNETIC]
+    if same and energy[kt.STOP, kt.MECHANICAL] == energy[kt.STOP, kt.MECHANICAL]:
+        energy[kt.START, kt.MECHANICAL], energy[kt.START, kt.MAGNETIC] = (
+            energy[kt.STOP, kt.MECHANICAL],
+            energy[kt.STOP, kt.MAGNETIC],
+        )
     else:
-        stored_energy(system, ws, run.y, energy[START])
+        stored_energy(system, ws, run.y, energy[kt.START])
 
 
 @internal_kernel
@@ -100,29 +77,21 @@ def midpoint_work(model: ModelArrays, ws: Workspace, v, vdot, h):
     tree, body, links = model.tree, model.body, ws.links
     inertia, bias = 0.0, 0.0
     for i in range(tree.shape[0]):
-        m, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz = body_inertia(model, ws, i)
-        n0, n1, n2, n3, n4, n5 = inertial_wrench(ws, i, m, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz)
-        j, rate, change = tree[i, PARENT], v[i] + 0.5 * h * vdot[i], h * vdot[i]
+        m, c, I = body_inertia(model, ws, i)
+        wrench = inertial_wrench(ws, i, m, c, I)
+        j, rate, change = tree[i, ka.PARENT], v[i] + 0.5 * h * vdot[i], h * vdot[i]
         for s in range(6):
-            links[i, V + s] = links[i, S + s] * rate + (links[j, V + s] if j >= 0 else 0.0)
-            links[i, A + s] = links[i, S + s] * change + (links[j, A + s] if j >= 0 else 0.0)
-        wx, wy, wz, ox, oy, oz = (
-            links[i, V], links[i, V + 1], links[i, V + 2], links[i, V + 3], links[i, V + 4], links[i, V + 5]
-        )  # fmt: skip
-        ex, ey, ez = links[i, A], links[i, A + 1], links[i, A + 2]
-        bias += (n0 * wx + n1 * wy) + (n2 * wz + n3 * ox) + (n4 * oy + n5 * oz)
-        vx, vy, vz = ox + wy * cz - wz * cy, oy + wz * cx - wx * cz, oz + wx * cy - wy * cx
-        ax, ay, az = (
-            links[i, A + 3] + ey * cz - ez * cy,
-            links[i, A + 4] + ez * cx - ex * cz,
-            links[i, A + 5] + ex * cy - ey * cx,
-        )
+            links[i, ka.V + s] = links[i, ka.S + s] * rate + (links[j, ka.V + s] if j >= 0 else 0.0)
+            links[i, ka.A + s] = links[i, ka.S + s] * change + (links[j, ka.A + s] if j >= 0 else 0.0)
+        V, A = six(links, i, ka.V), six(links, i, ka.A)
+        bias += dot(wrench, V)
+        at_c, change_at_c, L = point_velocity(V, c), point_velocity(A, c), times_inertia(I, A)
         inertia += (
-            wx * (ixx * ex + ixy * ey + ixz * ez)
-            + wy * (ixy * ex + iyy * ey + iyz * ez)
-            + wz * (ixz * ex + iyz * ey + izz * ez)
-            + m * (vx * ax + vy * ay + vz * az)
-            + body[i, ARMATURE] * rate * change
+            V[0] * L[0]
+            + V[1] * L[1]
+            + V[2] * L[2]
+            + m * (at_c[0] * change_at_c[0] + at_c[1] * change_at_c[1] + at_c[2] * change_at_c[2])
+            + body[i, ka.ARMATURE] * rate * change
         )
     return inertia + h * bias
 
@@ -130,21 +99,23 @@ def midpoint_work(model: ModelArrays, ws: Workspace, v, vdot, h):
 @internal_kernel
 def drive_work(system: System, ws: Workspace, run: Run):
     """What linear drives and the place of their power make [J], after ``drive`` at x_θ: its torques are in APPLIED."""
-    s, h, y, y_new, layout = run.stepping, run.clock[STEP], run.y, run.y_new, system.layout
+    s, h, y, y_new, layout = run.stepping, run.clock[ki.STEP], run.y, run.y_new, system.layout
     joints, motors, motor, body, theta = ws.joints, ws.motors, system.drives.motor, system.model.body, s.theta
-    v, vdot, applied = s.before[V_START], s.before[ACCELERATION], s.before[APPLIED_THEN]
+    v, vdot, applied = s.before[kt.V_START], s.before[kt.ACCELERATION], s.before[kt.APPLIED_THEN]
     total = 0.0
     for i in range(joints.shape[0]):
         change = h * vdot[i]
-        used = h * applied[i] - (s.body[i, ARMATURE] - body[i, ARMATURE]) * change
-        law = joints[i, APPLIED] - (body[i, DAMPING] + body[i, GEAR_DAMPING]) * joints[i, QD]
-        total += (v[i] + 0.5 * change) * used - h * joints[i, QD] * law
+        used = h * applied[i] - (s.body[i, ka.ARMATURE] - body[i, ka.ARMATURE]) * change
+        law = joints[i, ka.APPLIED] - (body[i, ka.DAMPING] + body[i, ka.GEAR_DAMPING]) * joints[i, ka.QD]
+        total += (v[i] + 0.5 * change) * used - h * joints[i, ka.QD] * law
     for a in range(motors.shape[0]):
-        k, j = system.drives.table[a, CIRCUIT], system.drives.table[a, DRIVEN]
+        k, j = system.drives.table[a, ka.CIRCUIT], system.drives.table[a, ka.DRIVEN]
         if k >= 0:
             start, linear = y[layout.current + k], s.linear[a]
             more = y_new[layout.current + k] - start
-            by_v = (linear[RATE_Q] * h * theta + linear[RATE_V]) * theta
-            rate = s.eliminated[a, DIDT_THEN] + by_v * h * vdot[j] + linear[RATE_I] * theta * more
-            total += h * motor[a, INDUCTANCE] * ((start + 0.5 * more) * rate - motors[a, CURRENT] * motors[a, DIDT])
+            by_v = (linear[ka.RATE_Q] * h * theta + linear[ka.RATE_V]) * theta
+            rate = s.eliminated[a, kt.DIDT_THEN] + by_v * h * vdot[j] + linear[ka.RATE_I] * theta * more
+            total += (
+                h * motor[a, ka.INDUCTANCE] * ((start + 0.5 * more) * rate - motors[a, ka.CURRENT] * motors[a, ka.DIDT])
+            )
     return total

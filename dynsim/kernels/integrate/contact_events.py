@@ -12,78 +12,16 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import (
-    DEPENDENT,
-    FIRST_ROW,
-    FORCE,
-    GAP,
-    GAP_RATE,
-    MODE,
-    NORMAL,
-    NORMAL_FORCE,
-    OPEN,
-    POSITION,
-    SLIDING,
-    SLIP_VELOCITY,
-    STICKING,
-    Workspace,
-)
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import Workspace
+from dynsim.kernels.constraint import unilateral as ku
 from dynsim.kernels.constraint.rows import set_modes
 from dynsim.kernels.constraint.splits import margin
-from dynsim.kernels.constraint.unilateral import (
-    AT_ROOT,
-    BEFORE,
-    BEST_MARGIN,
-    BOUNCES,
-    CHANGES,
-    CHATTERED,
-    CLOSED_TIME,
-    DEEPEST,
-    DEPTH,
-    FROZEN,
-    GIVES_WAY,
-    HEADWAY,
-    HITS,
-    LANDINGS,
-    LANDS_AT,
-    LAST_CHANGE,
-    LIFT_OFFS,
-    NEXT,
-    NEXT_SPEED,
-    REFERENCE,
-    SETTLE,
-    SLIP_STARTS,
-    SLOW,
-    SPEED,
-    SPLIT,
-    STATIC,
-    STOP_BEFORE,
-    STOP_CLOSED,
-    STOP_FORCE,
-    STRUCK,
-    TIME_OPEN,
-    WANTED,
-    WINDOW_COUNT,
-    WINDOW_START,
-    UnilateralArrays,
-    stop_gap,
-)
+from dynsim.kernels.constraint.unilateral import UnilateralArrays, stop_gap
+from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.contact_modes import begin_slip, drops, resolve, slip_on
 from dynsim.kernels.integrate.impacts import evaluate, slip_speed
-from dynsim.kernels.integrate.run import (
-    CHATTER,
-    CONTACT_LOG,
-    EVENT_INDEX,
-    EVENT_KIND,
-    LOGGED,
-    SIDE,
-    STARTED,
-    STATUS,
-    STOP_LOG,
-    TIME,
-    VALUE,
-    Run,
-)
+from dynsim.kernels.integrate.run import Run
 from dynsim.kernels.integrate.slow_slip import note_turning
 from dynsim.kernels.jit import apart_kernel, internal_kernel
 from dynsim.kernels.system import System
@@ -119,19 +57,23 @@ def contact_guard(unilateral: UnilateralArrays | None, ws: Workspace, kind, k):
     if unilateral is None:  # known to the compiler
         return 1.0
     if kind == STOP_GUARD:
-        if unilateral.stop_table[k, STOP_CLOSED] == 1:
-            return unilateral.stop[k, STOP_FORCE]
-        return stop_gap(unilateral, ws, k) + DEPTH
-    mode = ws.active[k, MODE]
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
+            return unilateral.stop[k, ku.STOP_FORCE]
+        return stop_gap(unilateral, ws, k) + ku.DEPTH
+    mode = ws.active[k, ka.MODE]
     if kind == NORMAL_GUARD:
-        return ws.contacts[k, GAP] + unilateral.slide[k, LANDS_AT] if mode == OPEN else ws.contacts[k, NORMAL_FORCE]
-    if mode == SLIDING and unilateral.law[k, STATIC] > 0.0:
-        return unilateral.slide[k, SPEED] + unilateral.slide[k, HEADWAY] + BACKWARD
-    if mode == STICKING:
-        best = unilateral.number[BEST_MARGIN]
+        return (
+            ws.contacts[k, ka.GAP] + unilateral.slide[k, ku.LANDS_AT]
+            if mode == ka.OPEN
+            else ws.contacts[k, ka.NORMAL_FORCE]
+        )
+    if mode == ka.SLIDING and unilateral.law[k, ku.STATIC] > 0.0:
+        return unilateral.slide[k, ku.SPEED] + unilateral.slide[k, ku.HEADWAY] + BACKWARD
+    if mode == ka.STICKING:
+        best = unilateral.number[ku.BEST_MARGIN]
         # Dependent rows, where the least norm fits no cones: the forces are the least that do, on some cone, and say
         # nothing of what is left. Once none fit, those of the best margin show which contacts give way.
-        if unilateral.number[SPLIT] == 1.0 and best > 0.0:
+        if unilateral.number[ku.SPLIT] == 1.0 and best > 0.0:
             return best
         return margin(unilateral, ws, k)
     return 1.0
@@ -149,24 +91,28 @@ def too_long(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
     if unilateral is None:  # known to the compiler
         return found
     for k in range(gaps.shape[0]):
-        slow = unilateral.number[SLOW]
-        if ws.active[k, MODE] == SLIDING and unilateral.slide[k, FROZEN] == 1.0 and unilateral.law[k, STATIC] > 0.0:
+        slow = unilateral.number[ku.SLOW]
+        if (
+            ws.active[k, ka.MODE] == ka.SLIDING
+            and unilateral.slide[k, ku.FROZEN] == 1.0
+            and unilateral.law[k, ku.STATIC] > 0.0
+        ):
             speed = slip_speed(ws, k)
             if speed > 2.0 * slow:
                 found = min(found, max(1.5 * slow / speed, 0.01))
         if passes_through(ws, gaps, k):
             found = min(found, 0.5)
-        if ws.active[k, MODE] != OPEN or gaps[k, RATE_THEN] >= 0.0 or ws.contacts[k, GAP_RATE] <= 0.0:
+        if ws.active[k, ka.MODE] != ka.OPEN or gaps[k, RATE_THEN] >= 0.0 or ws.contacts[k, ka.GAP_RATE] <= 0.0:
             continue
-        g0, g1 = gaps[k, GAP_THEN], ws.contacts[k, GAP]
-        d0, d1 = h * gaps[k, RATE_THEN], h * ws.contacts[k, GAP_RATE]
+        g0, g1 = gaps[k, GAP_THEN], ws.contacts[k, ka.GAP]
+        d0, d1 = h * gaps[k, RATE_THEN], h * ws.contacts[k, ka.GAP_RATE]
         # Hermite: g0 + d0 x + a x² + b x³.
         a, b = 3.0 * (g1 - g0) - 2.0 * d0 - d1, 2.0 * (g0 - g1) + d0 + d1
         root = a * a - 3.0 * b * d0
         if root <= 0.0 or a + math.sqrt(root) == 0.0:
             continue
         x = -d0 / (a + math.sqrt(root))
-        if 0.0 < x < 1.0 and g0 + x * (d0 + x * (a + x * b)) < -DEPTH:
+        if 0.0 < x < 1.0 and g0 + x * (d0 + x * (a + x * b)) < -ku.DEPTH:
             found = min(found, x)
     return found
 
@@ -179,13 +125,13 @@ def passes_through(ws: Workspace, gaps, k):
     by half a turn is π/2 as long as it looks.
     """
     state = ws.contacts[k]
-    g0, g1 = gaps[k, GAP_THEN], state[GAP]
-    if ws.active[k, MODE] != OPEN or g0 <= 0.0 or g1 <= 0.0:
+    g0, g1 = gaps[k, GAP_THEN], state[ka.GAP]
+    if ws.active[k, ka.MODE] != ka.OPEN or g0 <= 0.0 or g1 <= 0.0:
         return False
     turned, square = 0.0, 0.0
     for s in range(3):
-        turned += gaps[k, NORMAL_THEN + s] * state[NORMAL + s]
-        way = state[POSITION + s] - gaps[k, PLACE_THEN + s]
+        turned += gaps[k, NORMAL_THEN + s] * state[ka.NORMAL + s]
+        way = state[ka.POSITION + s] - gaps[k, PLACE_THEN + s]
         square += way * way
     return turned < 0.0 and 2.5 * square >= (g0 + g1) * (g0 + g1)
 
@@ -194,9 +140,12 @@ def passes_through(ws: Workspace, gaps, k):
 def note_gaps(ws: Workspace, gaps):
     """Gaps, their rates, normals and places at the start of a step, for :func:`too_long`."""
     for k in range(gaps.shape[0]):
-        gaps[k, GAP_THEN], gaps[k, RATE_THEN] = ws.contacts[k, GAP], ws.contacts[k, GAP_RATE]
+        gaps[k, GAP_THEN], gaps[k, RATE_THEN] = ws.contacts[k, ka.GAP], ws.contacts[k, ka.GAP_RATE]
         for s in range(3):
-            gaps[k, NORMAL_THEN + s], gaps[k, PLACE_THEN + s] = ws.contacts[k, NORMAL + s], ws.contacts[k, POSITION + s]
+            gaps[k, NORMAL_THEN + s], gaps[k, PLACE_THEN + s] = (
+                ws.contacts[k, ka.NORMAL + s],
+                ws.contacts[k, ka.POSITION + s],
+            )
 
 
 @internal_kernel
@@ -207,21 +156,23 @@ def watch_modes(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
     note_gaps(ws, gaps)
     state, tally, slide = ws.contacts, unilateral.tally, unilateral.slide
     for k in range(state.shape[0]):
-        tally[k, TIME_OPEN + ws.active[k, MODE]] += h
-        tally[k, DEEPEST] = max(tally[k, DEEPEST], -state[k, GAP])
-        if ws.active[k, MODE] != OPEN:
-            slide[k, LANDS_AT] = DEPTH
-        elif state[k, GAP] > DEPTH:
-            slide[k, LANDS_AT] = AT_ROOT
+        tally[k, ku.TIME_OPEN + ws.active[k, ka.MODE]] += h
+        tally[k, ku.DEEPEST] = max(tally[k, ku.DEEPEST], -state[k, ka.GAP])
+        if ws.active[k, ka.MODE] != ka.OPEN:
+            slide[k, ku.LANDS_AT] = ku.DEPTH
+        elif state[k, ka.GAP] > ku.DEPTH:
+            slide[k, ku.LANDS_AT] = ku.AT_ROOT
         speed = slip_speed(ws, k)
-        slide[k, NEXT_SPEED] = speed
+        slide[k, ku.NEXT_SPEED] = speed
         for s in range(3):
-            slide[k, NEXT + s] = state[k, SLIP_VELOCITY + s] / speed if speed > 0.0 else slide[k, REFERENCE + s]
-        if ws.active[k, MODE] == SLIDING:
+            slide[k, ku.NEXT + s] = (
+                state[k, ka.SLIP_VELOCITY + s] / speed if speed > 0.0 else slide[k, ku.REFERENCE + s]
+            )
+        if ws.active[k, ka.MODE] == ka.SLIDING:
             note_turning(unilateral, ws, k, speed)
     for k in range(unilateral.stop.shape[0]):
-        if unilateral.stop_table[k, STOP_CLOSED] == 1:
-            unilateral.stop[k, CLOSED_TIME] += h
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
+            unilateral.stop[k, ku.CLOSED_TIME] += h
 
 
 @internal_kernel
@@ -229,18 +180,18 @@ def take_directions(unilateral: UnilateralArrays | None, ws: Workspace, run: Run
     """After the samples of a step: freeze directions of what has become slow, free those of what is fast again."""
     if unilateral is None:
         return
-    slide, slow = unilateral.slide, unilateral.number[SLOW]
+    slide, slow = unilateral.slide, unilateral.number[ku.SLOW]
     for k in range(slide.shape[0]):
-        if ws.active[k, MODE] != SLIDING:
+        if ws.active[k, ka.MODE] != ka.SLIDING:
             continue
-        fast = slide[k, NEXT_SPEED] >= slow
-        if fast and slide[k, FROZEN] == 1.0:
+        fast = slide[k, ku.NEXT_SPEED] >= slow
+        if fast and slide[k, ku.FROZEN] == 1.0:
             # The direction turns a little: the next step starts anew.
-            run.count[STARTED] = 0
-        if fast or slide[k, FROZEN] == 0.0:
+            run.count[ki.STARTED] = 0
+        if fast or slide[k, ku.FROZEN] == 0.0:
             for s in range(3):
-                slide[k, REFERENCE + s] = slide[k, NEXT + s]
-        slide[k, FROZEN] = 0.0 if fast else 1.0
+                slide[k, ku.REFERENCE + s] = slide[k, ku.NEXT + s]
+        slide[k, ku.FROZEN] = 0.0 if fast else 1.0
         if not fast:
             stay_tangential(slide, ws, k)
 
@@ -253,14 +204,14 @@ def stay_tangential(slide, ws: Workspace, k):
     """
     state, size, along = ws.contacts, 0.0, 0.0
     for s in range(3):
-        along += slide[k, REFERENCE + s] * state[k, NORMAL + s]
+        along += slide[k, ku.REFERENCE + s] * state[k, ka.NORMAL + s]
     for s in range(3):
-        slide[k, REFERENCE + s] -= along * state[k, NORMAL + s]
-        size += slide[k, REFERENCE + s] ** 2
+        slide[k, ku.REFERENCE + s] -= along * state[k, ka.NORMAL + s]
+        size += slide[k, ku.REFERENCE + s] ** 2
     # Without friction there may be none yet.
     if size > 0.0:
         for s in range(3):
-            slide[k, REFERENCE + s] /= math.sqrt(size)
+            slide[k, ku.REFERENCE + s] /= math.sqrt(size)
 
 
 @internal_kernel
@@ -269,8 +220,8 @@ def at_limit(unilateral: UnilateralArrays, ws: Workspace, k):
 
     The guards of dependent rows fall together, with the best worst margin. Those with a better one hold.
     """
-    slack = FORCE_SLACK * (1.0 + abs(ws.contacts[k, NORMAL_FORCE]))
-    return unilateral.number[SPLIT] == 0.0 or margin(unilateral, ws, k) <= unilateral.number[BEST_MARGIN] + slack
+    slack = FORCE_SLACK * (1.0 + abs(ws.contacts[k, ka.NORMAL_FORCE]))
+    return unilateral.number[ku.SPLIT] == 0.0 or margin(unilateral, ws, k) <= unilateral.number[ku.BEST_MARGIN] + slack
 
 
 @internal_kernel
@@ -279,16 +230,16 @@ def consistent(system: System, ws: Workspace):
     unilateral, table = system.unilateral, system.unilateral.stop_table
     slack = 0.0
     for k in range(ws.contacts.shape[0]):
-        slack = max(slack, abs(ws.contacts[k, NORMAL_FORCE]))
+        slack = max(slack, abs(ws.contacts[k, ka.NORMAL_FORCE]))
     slack = FORCE_SLACK * (1.0 + slack)
     for k in range(table.shape[0]):
-        if table[k, STOP_CLOSED] == 1 and unilateral.stop[k, STOP_FORCE] < -slack:
+        if table[k, ku.STOP_CLOSED] == 1 and unilateral.stop[k, ku.STOP_FORCE] < -slack:
             return False
     for k in range(ws.contacts.shape[0]):
-        mode = ws.active[k, MODE]
-        if mode != OPEN and ws.contacts[k, NORMAL_FORCE] < -slack:
+        mode = ws.active[k, ka.MODE]
+        if mode != ka.OPEN and ws.contacts[k, ka.NORMAL_FORCE] < -slack:
             return False
-        if mode == STICKING and contact_guard(unilateral, ws, SLIP_GUARD, k) < -slack:
+        if mode == ka.STICKING and contact_guard(unilateral, ws, SLIP_GUARD, k) < -slack:
             return False
     return True
 
@@ -296,10 +247,10 @@ def consistent(system: System, ws: Workspace):
 @apart_kernel
 def solve_modes(system: System, ws: Workspace, run: Run, first):
     """Choose all modes anew, and log what that changes; ``first``: nothing of it is an event."""
-    before = ws.counts[DEPENDENT]
+    before = ws.counts[ka.DEPENDENT]
     resolve(system, ws, run, TOUCH)
     # Of rows that were held together only to see what they do.
-    ws.counts[DEPENDENT] = before
+    ws.counts[ka.DEPENDENT] = before
     if not first:
         log_changes(system, ws, run)
     rearm(run)
@@ -310,53 +261,53 @@ def solve_modes(system: System, ws: Workspace, run: Run, first):
 def rearm(run: Run):
     """All guards of the unilateral law are on their positive side."""
     for e in range(run.event.shape[0]):
-        if run.event_table[e, EVENT_KIND] >= NORMAL_GUARD:
-            run.event[e, SIDE], run.event[e, VALUE] = 1.0, 1.0
+        if run.event_table[e, ki.EVENT_KIND] >= NORMAL_GUARD:
+            run.event[e, ki.SIDE], run.event[e, ki.VALUE] = 1.0, 1.0
 
 
 @internal_kernel
 def count_changes(system: System, run: Run):
     """End a run whose modes go on changing without time passing."""
     number = system.unilateral.number
-    number[CHANGES] = number[CHANGES] + 1.0 if run.clock[TIME] - number[LAST_CHANGE] <= INSTANT else 1.0
-    number[LAST_CHANGE] = run.clock[TIME]
-    if number[CHANGES] > MOST_CHANGES:
-        run.count[STATUS] = CHATTER
+    number[ku.CHANGES] = number[ku.CHANGES] + 1.0 if run.clock[ki.TIME] - number[ku.LAST_CHANGE] <= INSTANT else 1.0
+    number[ku.LAST_CHANGE] = run.clock[ki.TIME]
+    if number[ku.CHANGES] > MOST_CHANGES:
+        run.count[ki.STATUS] = ki.CHATTER
 
 
 @internal_kernel
 def log(run: Run, code):
     """Write an event to the log; what finds no room is lost to the log alone."""
     count = run.count
-    if count[LOGGED] < run.log_time.shape[0]:
-        run.log_time[count[LOGGED]], run.log_event[count[LOGGED]] = run.clock[TIME], code
-        count[LOGGED] += 1
+    if count[ki.LOGGED] < run.log_time.shape[0]:
+        run.log_time[count[ki.LOGGED]], run.log_event[count[ki.LOGGED]] = run.clock[ki.TIME], code
+        count[ki.LOGGED] += 1
 
 
 @internal_kernel
 def tell(system: System, run: Run, k, kind):
     """Log an event of candidate k, count it, and watch for chatter."""
     tally = system.unilateral.tally
-    log(run, CONTACT_LOG + LOG_KINDS * k + kind)
+    log(run, ki.CONTACT_LOG + LOG_KINDS * k + kind)
     if kind == LANDING:
-        tally[k, LANDINGS] += 1.0
+        tally[k, ku.LANDINGS] += 1.0
     elif kind == LIFT_OFF:
-        tally[k, LIFT_OFFS] += 1.0
+        tally[k, ku.LIFT_OFFS] += 1.0
     elif kind == SLIP_START:
-        tally[k, SLIP_STARTS] += 1.0
+        tally[k, ku.SLIP_STARTS] += 1.0
     elif kind == BOUNCE:
-        tally[k, BOUNCES] += 1.0
-    if run.clock[TIME] - tally[k, WINDOW_START] > WINDOW:
-        tally[k, WINDOW_START], tally[k, WINDOW_COUNT] = run.clock[TIME], 0.0
-    tally[k, WINDOW_COUNT] += 1.0
-    if tally[k, WINDOW_COUNT] > MOST_EVENTS:
-        if tally[k, CHATTERED] == 0.0:
-            log(run, CONTACT_LOG + LOG_KINDS * k + CHATTERS)
-        tally[k, CHATTERED] += 1.0
-        tally[k, SETTLE] = min(10.0 * tally[k, SETTLE], MOST_SETTLE)
-        tally[k, WINDOW_START], tally[k, WINDOW_COUNT] = run.clock[TIME], 0.0
-        if tally[k, CHATTERED] > MOST_CHATTER:
-            run.count[STATUS] = CHATTER
+        tally[k, ku.BOUNCES] += 1.0
+    if run.clock[ki.TIME] - tally[k, ku.WINDOW_START] > WINDOW:
+        tally[k, ku.WINDOW_START], tally[k, ku.WINDOW_COUNT] = run.clock[ki.TIME], 0.0
+    tally[k, ku.WINDOW_COUNT] += 1.0
+    if tally[k, ku.WINDOW_COUNT] > MOST_EVENTS:
+        if tally[k, ku.CHATTERED] == 0.0:
+            log(run, ki.CONTACT_LOG + LOG_KINDS * k + CHATTERS)
+        tally[k, ku.CHATTERED] += 1.0
+        tally[k, ku.SETTLE] = min(10.0 * tally[k, ku.SETTLE], MOST_SETTLE)
+        tally[k, ku.WINDOW_START], tally[k, ku.WINDOW_COUNT] = run.clock[ki.TIME], 0.0
+        if tally[k, ku.CHATTERED] > MOST_CHATTER:
+            run.count[ki.STATUS] = ki.CHATTER
 
 
 @internal_kernel
@@ -364,25 +315,25 @@ def log_changes(system: System, ws: Workspace, run: Run):
     """Log what a choice of modes has changed."""
     unilateral, table = system.unilateral, system.unilateral.stop_table
     for k in range(ws.contacts.shape[0]):
-        before, now = unilateral.mode[k, BEFORE], ws.active[k, MODE]
-        if before == OPEN:
-            if now != OPEN:
+        before, now = unilateral.mode[k, ku.BEFORE], ws.active[k, ka.MODE]
+        if before == ka.OPEN:
+            if now != ka.OPEN:
                 tell(system, run, k, LANDING)
-            elif unilateral.mode[k, STRUCK] == 1:
+            elif unilateral.mode[k, ku.STRUCK] == 1:
                 # It flies off from where it has landed, below its surface: there it is not to land again at once.
-                unilateral.slide[k, LANDS_AT] = AT_ROOT + max(0.0, -ws.contacts[k, GAP])
+                unilateral.slide[k, ku.LANDS_AT] = ku.AT_ROOT + max(0.0, -ws.contacts[k, ka.GAP])
                 tell(system, run, k, BOUNCE)
-        elif now == OPEN:
+        elif now == ka.OPEN:
             tell(system, run, k, LIFT_OFF)
-        elif before == STICKING and now == SLIDING:
+        elif before == ka.STICKING and now == ka.SLIDING:
             tell(system, run, k, SLIP_START)
-        elif before == SLIDING and now == STICKING:
+        elif before == ka.SLIDING and now == ka.STICKING:
             tell(system, run, k, SLIP_STOP)
     for k in range(table.shape[0]):
-        if table[k, STOP_CLOSED] != table[k, STOP_BEFORE]:
-            hit = table[k, STOP_CLOSED] == 1
-            unilateral.stop[k, HITS] += 1.0 if hit else 0.0
-            log(run, STOP_LOG + LOG_KINDS * k + (STOP_HIT if hit else STOP_LEFT))
+        if table[k, ku.STOP_CLOSED] != table[k, ku.STOP_BEFORE]:
+            hit = table[k, ku.STOP_CLOSED] == 1
+            unilateral.stop[k, ku.HITS] += 1.0 if hit else 0.0
+            log(run, ki.STOP_LOG + LOG_KINDS * k + (STOP_HIT if hit else STOP_LEFT))
 
 
 @apart_kernel
@@ -393,7 +344,7 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
     mode, table = unilateral.mode, unilateral.stop_table
     happened, by_hand = 0, True
     for e in range(run.event.shape[0]):
-        if run.event_table[e, EVENT_KIND] >= NORMAL_GUARD and run.event[e, VALUE] <= 0.0:
+        if run.event_table[e, ki.EVENT_KIND] >= NORMAL_GUARD and run.event[e, ki.VALUE] <= 0.0:
             happened += 1
     if happened == 0:
         return
@@ -401,46 +352,46 @@ def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Wor
     evaluate(system, ws, run)
     strongest = 0.0
     for k in range(mode.shape[0]):
-        mode[k, WANTED] = ws.active[k, MODE]
-        strongest = max(strongest, ws.contacts[k, NORMAL_FORCE])
+        mode[k, ku.WANTED] = ws.active[k, ka.MODE]
+        strongest = max(strongest, ws.contacts[k, ka.NORMAL_FORCE])
     for e in range(run.event.shape[0]):
-        kind, k = run.event_table[e, EVENT_KIND], run.event_table[e, EVENT_INDEX]
-        if kind < NORMAL_GUARD or run.event[e, VALUE] > 0.0:
+        kind, k = run.event_table[e, ki.EVENT_KIND], run.event_table[e, ki.EVENT_INDEX]
+        if kind < NORMAL_GUARD or run.event[e, ki.VALUE] > 0.0:
             continue
         if kind == STOP_GUARD:
-            if table[k, STOP_CLOSED] == 1:
-                table[k, STOP_CLOSED] = 0
-                log(run, STOP_LOG + LOG_KINDS * k + STOP_LEFT)
+            if table[k, ku.STOP_CLOSED] == 1:
+                table[k, ku.STOP_CLOSED] = 0
+                log(run, ki.STOP_LOG + LOG_KINDS * k + STOP_LEFT)
             else:
                 by_hand = False
-        elif ws.active[k, MODE] == OPEN:
+        elif ws.active[k, ka.MODE] == ka.OPEN:
             by_hand = False
         elif kind == NORMAL_GUARD:
-            mode[k, WANTED] = OPEN
+            mode[k, ku.WANTED] = ka.OPEN
             tell(system, run, k, LIFT_OFF)
-        elif mode[k, WANTED] == STICKING:
+        elif mode[k, ku.WANTED] == ka.STICKING:
             if not at_limit(unilateral, ws, k):
                 continue
-            r = ws.active[k, FIRST_ROW]
-            if ws.rows[r, FORCE] <= NO_FORCE * strongest:
+            r = ws.active[k, ka.FIRST_ROW]
+            if ws.rows[r, ka.FORCE] <= NO_FORCE * strongest:
                 # At the apex of its cone it leaves; there is no direction in which it could slip.
-                mode[k, WANTED] = OPEN
+                mode[k, ku.WANTED] = ka.OPEN
                 tell(system, run, k, LIFT_OFF)
                 continue
             if drops(system, k):
                 # Forces jump, and with them the direction of slip.
-                mode[k, GIVES_WAY], by_hand = 1, False
+                mode[k, ku.GIVES_WAY], by_hand = 1, False
                 continue
-            begin_slip(system, ws, k, ws.rows[r + 1, FORCE], ws.rows[r + 2, FORCE])
-            mode[k, WANTED] = SLIDING
+            begin_slip(system, ws, k, ws.rows[r + 1, ka.FORCE], ws.rows[r + 2, ka.FORCE])
+            mode[k, ku.WANTED] = ka.SLIDING
             tell(system, run, k, SLIP_START)
-        elif mode[k, WANTED] == SLIDING:
+        elif mode[k, ku.WANTED] == ka.SLIDING:
             # Either slip has only turned, or all is to be looked at.
-            by_hand = slip_on(unilateral, ws, k, 10.0 * unilateral.number[SLOW]) and by_hand
+            by_hand = slip_on(unilateral, ws, k, 10.0 * unilateral.number[ku.SLOW]) and by_hand
     if by_hand:
-        set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
+        set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
         rearm(run)
         count_changes(system, run)
     else:
         solve_modes(system, ws, run, False)
-    run.count[STARTED] = 0
+    run.count[ki.STARTED] = 0

@@ -15,55 +15,14 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import (
-    DEPENDENT,
-    FIRST_ROW,
-    FIRST_TANGENT,
-    MODE,
-    MU,
-    OPEN,
-    RHS,
-    SECOND_TANGENT,
-    SLIDING,
-    SLIP_VELOCITY,
-    STICKING,
-    Workspace,
-)
-from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, ONE_WAY, TANGENT
+from dynsim.kernels import arrays as ka
+from dynsim.kernels import state as kst
+from dynsim.kernels.arrays import Workspace
+from dynsim.kernels.constraint import cone as kc
+from dynsim.kernels.constraint import unilateral as ku
 from dynsim.kernels.constraint.rows import set_modes
-from dynsim.kernels.constraint.unilateral import (
-    BEFORE,
-    CONE_FRICTION,
-    DEPTH,
-    FIRST_PART,
-    FROZEN,
-    GIVES_WAY,
-    HEADWAY,
-    KINDS,
-    LANDS_AT,
-    MOBILITY,
-    NEXT,
-    NEXT_SPEED,
-    OFFSET,
-    PROBLEM,
-    REDUNDANT,
-    REFERENCE,
-    SECOND_PART,
-    SLOW,
-    SOLUTION,
-    SPEED,
-    SPLIT,
-    STATIC,
-    STOP_BEFORE,
-    STOP_CLOSED,
-    STRIBECK,
-    STRUCK,
-    TABLE_ROW,
-    TOUCHING,
-    WANTED,
-    UnilateralArrays,
-    slide_direction,
-)
+from dynsim.kernels.constraint.unilateral import UnilateralArrays, slide_direction
+from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.impacts import (
     FORCE_TOLERANCE,
     evaluate,
@@ -75,16 +34,8 @@ from dynsim.kernels.integrate.impacts import (
     solve_problem,
 )
 from dynsim.kernels.integrate.project import project_level
-from dynsim.kernels.integrate.run import (
-    FORCES_REVERSED,
-    NO_CONTACT_FORCES,
-    NOT_UNIQUE,
-    STATUS,
-    TIME,
-    Run,
-)
+from dynsim.kernels.integrate.run import Run
 from dynsim.kernels.jit import internal_kernel
-from dynsim.kernels.state import IMPACT_LOSS
 from dynsim.kernels.system import System
 
 # An acceleration along the surface below this fraction of the largest right-hand side is none.
@@ -103,12 +54,12 @@ def resolve(system: System, ws: Workspace, run: Run, touch):
     mode, table = unilateral.mode, unilateral.stop_table
     evaluate(system, ws, run)
     for k in range(mode.shape[0]):
-        mode[k, BEFORE], mode[k, STRUCK] = ws.active[k, MODE], 0
+        mode[k, ku.BEFORE], mode[k, ku.STRUCK] = ws.active[k, ka.MODE], 0
     for k in range(table.shape[0]):
-        table[k, STOP_BEFORE] = table[k, STOP_CLOSED]
+        table[k, ku.STOP_BEFORE] = table[k, ku.STOP_CLOSED]
     if find_touching(unilateral, ws, touch):
         impact(system, ws, run)
-        if run.count[STATUS] == NO_CONTACT_FORCES:
+        if run.count[ki.STATUS] == ki.NO_CONTACT_FORCES:
             return
         evaluate(system, ws, run)
         keep_touching(unilateral, ws)
@@ -123,53 +74,53 @@ def choose(system: System, ws: Workspace, run: Run):
     p = gather(system, ws, run)
     largest = 0.0
     for r in range(p):
-        largest = max(largest, abs(ws.rows[r, RHS]))
+        largest = max(largest, abs(ws.rows[r, ka.RHS]))
     for k in range(mode.shape[0]):
-        if mode[k, TOUCHING] == 1:
-            mode[k, WANTED] = SLIDING if begins_sliding(system, ws, k) else STICKING
-            mode[k, GIVES_WAY] = 1 if mode[k, GIVES_WAY] == 1 and drops(system, k) else 0
-            r, W = ws.active[k, FIRST_ROW], ws.small[0]
-            unilateral.slide[k, MOBILITY] = W[r + 1, r + 1] + W[r + 2, r + 2]
+        if mode[k, ku.TOUCHING] == 1:
+            mode[k, ku.WANTED] = ka.SLIDING if begins_sliding(system, ws, k) else ka.STICKING
+            mode[k, ku.GIVES_WAY] = 1 if mode[k, ku.GIVES_WAY] == 1 and drops(system, k) else 0
+            r, W = ws.active[k, ka.FIRST_ROW], ws.small[0]
+            unilateral.slide[k, ku.MOBILITY] = W[r + 1, r + 1] + W[r + 2, r + 2]
     solved = False
     # Where static friction gives way to a smaller kinetic one, the others' forces change.
     for _ in range(1 + mode.shape[0]):
         size = reduce_rows(system, ws, run, p)
-        if run.count[STATUS] == FORCES_REVERSED:
+        if run.count[ki.STATUS] == ki.FORCES_REVERSED:
             break
-        solved = solve_problem(unilateral, unilateral.room[PROBLEM], size, largest, 0)
+        solved = solve_problem(unilateral, unilateral.room[ku.PROBLEM], size, largest, 0)
         if not solved or not give_way(system, ws, size, largest):
             break
         solved = False
     if not solved:
-        if run.count[STATUS] != FORCES_REVERSED:
-            run.count[STATUS] = NO_CONTACT_FORCES
-        run.clock[NOT_UNIQUE] = run.clock[TIME]
+        if run.count[ki.STATUS] != ki.FORCES_REVERSED:
+            run.count[ki.STATUS] = ki.NO_CONTACT_FORCES
+        run.clock[ki.NOT_UNIQUE] = run.clock[ki.TIME]
         # Whoever looks for the cause finds the rows that contradict the law.
-        set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
+        set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
         evaluate(system, ws, run)
         return
     take_solution(system, ws, size, largest)
     # What is left of rates after an impact that was let settle, and of points that were solved for as if at rest: those
     # that begin to slip would else go against the direction that they are given, and stop, and begin again.
     for k in range(mode.shape[0]):
-        starts = mode[k, WANTED] == SLIDING and unilateral.slide[k, FROZEN] == 1.0
-        rests = starts and slip_speed(ws, k) <= 2.0 * unilateral.number[SLOW]
-        mode[k, TOUCHING] = STICKING if rests else mode[k, WANTED]
-    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, TOUCHING])
+        starts = mode[k, ku.WANTED] == ka.SLIDING and unilateral.slide[k, ku.FROZEN] == 1.0
+        rests = starts and slip_speed(ws, k) <= 2.0 * unilateral.number[ku.SLOW]
+        mode[k, ku.TOUCHING] = ka.STICKING if rests else mode[k, ku.WANTED]
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.TOUCHING])
     # What was split before says nothing of these modes.
-    unilateral.number[REDUNDANT], unilateral.number[SPLIT] = 0.0, 0.0
+    unilateral.number[ku.REDUNDANT], unilateral.number[ku.SPLIT] = 0.0, 0.0
     evaluate(system, ws, run)
     loss = project_level(system, ws, run.y, 1)
-    run.y[system.layout.loss + IMPACT_LOSS] += loss
+    run.y[system.layout.loss + kst.IMPACT_LOSS] += loss
     evaluate(system, ws, run)
-    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
-    before = ws.counts[DEPENDENT]
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
+    before = ws.counts[ka.DEPENDENT]
     evaluate(system, ws, run)
-    unilateral.number[REDUNDANT] = 1.0 if ws.counts[DEPENDENT] > before else 0.0
+    unilateral.number[ku.REDUNDANT] = 1.0 if ws.counts[ka.DEPENDENT] > before else 0.0
     for k in range(mode.shape[0]):
-        mode[k, GIVES_WAY] = 0
-        starts = mode[k, WANTED] == SLIDING and mode[k, TOUCHING] == STICKING
-        unilateral.slide[k, HEADWAY] = max(0.0, -unilateral.slide[k, SPEED]) if starts else 0.0
+        mode[k, ku.GIVES_WAY] = 0
+        starts = mode[k, ku.WANTED] == ka.SLIDING and mode[k, ku.TOUCHING] == ka.STICKING
+        unilateral.slide[k, ku.HEADWAY] = max(0.0, -unilateral.slide[k, ku.SPEED]) if starts else 0.0
 
 
 @internal_kernel
@@ -177,10 +128,10 @@ def begins_sliding(system: System, ws: Workspace, k):
     """True for a candidate that slides already, or has no friction to stick with; sets its direction."""
     unilateral = system.unilateral
     # An impact may have turned it.
-    if slip_on(unilateral, ws, k, 2.0 * unilateral.number[SLOW]):
+    if slip_on(unilateral, ws, k, 2.0 * unilateral.number[ku.SLOW]):
         return True
-    if unilateral.law[k, STATIC] == 0.0:
-        unilateral.slide[k, FROZEN] = 0.0
+    if unilateral.law[k, ku.STATIC] == 0.0:
+        unilateral.slide[k, ku.FROZEN] = 0.0
         return True
     return False
 
@@ -190,9 +141,9 @@ def slip_on(unilateral: UnilateralArrays, ws: Workspace, k, least):
     """Let candidate k slide along its own slip, v_t/|v_t|, where that is faster than ``least`` [m/s]; True if it is."""
     slide, speed = unilateral.slide, slip_speed(ws, k)
     if speed > least:
-        slide[k, FROZEN] = 0.0
+        slide[k, ku.FROZEN] = 0.0
         for s in range(3):
-            slide[k, REFERENCE + s] = ws.contacts[k, SLIP_VELOCITY + s] / speed
+            slide[k, ku.REFERENCE + s] = ws.contacts[k, ka.SLIP_VELOCITY + s] / speed
     return speed > least
 
 
@@ -206,51 +157,51 @@ def reduce_rows(system: System, ws: Workspace, run: Run, p):
     place, vector, mode, state = unilateral.place, unilateral.vector, unilateral.mode, ws.contacts
     size, first = 0, p
     for k in range(mode.shape[0] - 1, -1, -1):
-        if mode[k, TOUCHING] == 1:
-            first = ws.active[k, FIRST_ROW]
+        if mode[k, ku.TOUCHING] == 1:
+            first = ws.active[k, ka.FIRST_ROW]
     for r in range(first):
-        place[KINDS, r] = BOTH_WAYS if r < system.couplings.joint.shape[0] else ONE_WAY
-        place[TABLE_ROW, r], vector[FIRST_PART, r], vector[SECOND_PART, r] = r, 0.0, 0.0
+        place[ku.KINDS, r] = kc.BOTH_WAYS if r < system.couplings.joint.shape[0] else kc.ONE_WAY
+        place[ku.TABLE_ROW, r], vector[ku.FIRST_PART, r], vector[ku.SECOND_PART, r] = r, 0.0, 0.0
     size = first
     for k in range(mode.shape[0]):
-        if mode[k, TOUCHING] == 0:
+        if mode[k, ku.TOUCHING] == 0:
             continue
-        r = ws.active[k, FIRST_ROW]
-        place[TABLE_ROW, size], vector[FIRST_PART, size], vector[SECOND_PART, size] = r, 0.0, 0.0
-        if mode[k, WANTED] == SLIDING:
-            x, y, z = state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2]
+        r = ws.active[k, ka.FIRST_ROW]
+        place[ku.TABLE_ROW, size], vector[ku.FIRST_PART, size], vector[ku.SECOND_PART, size] = r, 0.0, 0.0
+        if mode[k, ku.WANTED] == ka.SLIDING:
+            x, y, z = state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2]
             tx, ty, tz, mu = slide_direction(unilateral, system.contacts, k, x, y, z)
-            a, b = FIRST_TANGENT, SECOND_TANGENT
-            vector[FIRST_PART, size] = -mu * (tx * state[k, a] + ty * state[k, a + 1] + tz * state[k, a + 2])
-            vector[SECOND_PART, size] = -mu * (tx * state[k, b] + ty * state[k, b + 1] + tz * state[k, b + 2])
-            place[KINDS, size] = ONE_WAY
+            a, b = ka.FIRST_TANGENT, ka.SECOND_TANGENT
+            vector[ku.FIRST_PART, size] = -mu * (tx * state[k, a] + ty * state[k, a + 1] + tz * state[k, a + 2])
+            vector[ku.SECOND_PART, size] = -mu * (tx * state[k, b] + ty * state[k, b + 1] + tz * state[k, b + 2])
+            place[ku.KINDS, size] = kc.ONE_WAY
             size += 1
         else:
-            vector[CONE_FRICTION, size] = friction_at_rest(system, k)
+            vector[ku.CONE_FRICTION, size] = friction_at_rest(system, k)
             for s in range(3):
-                place[KINDS, size] = CONE if s == 0 else TANGENT
-                place[TABLE_ROW, size], vector[FIRST_PART, size], vector[SECOND_PART, size] = r + s, 0.0, 0.0
+                place[ku.KINDS, size] = kc.CONE if s == 0 else kc.TANGENT
+                place[ku.TABLE_ROW, size], vector[ku.FIRST_PART, size], vector[ku.SECOND_PART, size] = r + s, 0.0, 0.0
                 size += 1
     for i in range(size):
-        a = place[TABLE_ROW, i]
-        vector[OFFSET, i], vector[SOLUTION, i] = -ws.rows[a, RHS], 0.0
+        a = place[ku.TABLE_ROW, i]
+        vector[ku.OFFSET, i], vector[ku.SOLUTION, i] = -ws.rows[a, ka.RHS], 0.0
         for j in range(size):
-            b = place[TABLE_ROW, j]
+            b = place[ku.TABLE_ROW, j]
             value = W[a, b]
-            if vector[FIRST_PART, j] != 0.0 or vector[SECOND_PART, j] != 0.0:
-                value += vector[FIRST_PART, j] * W[a, b + 1] + vector[SECOND_PART, j] * W[a, b + 2]
-            unilateral.room[PROBLEM, i, j] = value
-        if place[KINDS, i] == ONE_WAY and W[a, a] > 0.0 and unilateral.room[PROBLEM, i, i] <= 1e-12 * W[a, a]:
-            run.count[STATUS] = FORCES_REVERSED
+            if vector[ku.FIRST_PART, j] != 0.0 or vector[ku.SECOND_PART, j] != 0.0:
+                value += vector[ku.FIRST_PART, j] * W[a, b + 1] + vector[ku.SECOND_PART, j] * W[a, b + 2]
+            unilateral.room[ku.PROBLEM, i, j] = value
+        if place[ku.KINDS, i] == kc.ONE_WAY and W[a, a] > 0.0 and unilateral.room[ku.PROBLEM, i, i] <= 1e-12 * W[a, a]:
+            run.count[ki.STATUS] = ki.FORCES_REVERSED
     return size
 
 
 @internal_kernel
 def acceleration(unilateral: UnilateralArrays, i, size):
     """Acceleration along row i of the reduced problem."""
-    total = unilateral.vector[OFFSET, i]
+    total = unilateral.vector[ku.OFFSET, i]
     for j in range(size):
-        total += unilateral.room[PROBLEM, i, j] * unilateral.vector[SOLUTION, j]
+        total += unilateral.room[ku.PROBLEM, i, j] * unilateral.vector[ku.SOLUTION, j]
     return total
 
 
@@ -258,7 +209,7 @@ def acceleration(unilateral: UnilateralArrays, i, size):
 def slips(system: System, i, size, largest, mu):
     """True when the contact at row i of the reduced problem, on its cone, is accelerated along its surface."""
     unilateral = system.unilateral
-    f = unilateral.vector[SOLUTION]
+    f = unilateral.vector[ku.SOLUTION]
     friction = math.sqrt(f[i + 1] * f[i + 1] + f[i + 2] * f[i + 2])
     if friction < mu * f[i] * (1.0 - ON_CONE):
         return False
@@ -271,25 +222,27 @@ def begin_slip(system: System, ws: Workspace, k, fx, fy):
     """Candidate k begins to slip against (fx, fy) along its two tangents: its friction force, or its acceleration."""
     slide, state = system.unilateral.slide, ws.contacts
     size = math.sqrt(fx * fx + fy * fy)
-    slide[k, FROZEN] = 1.0
+    slide[k, ku.FROZEN] = 1.0
     for s in range(3):
-        slide[k, REFERENCE + s] = -(fx * state[k, FIRST_TANGENT + s] + fy * state[k, SECOND_TANGENT + s]) / size
-        slide[k, NEXT + s] = slide[k, REFERENCE + s]
-    slide[k, NEXT_SPEED] = 0.0
+        slide[k, ku.REFERENCE + s] = (
+            -(fx * state[k, ka.FIRST_TANGENT + s] + fy * state[k, ka.SECOND_TANGENT + s]) / size
+        )
+        slide[k, ku.NEXT + s] = slide[k, ku.REFERENCE + s]
+    slide[k, ku.NEXT_SPEED] = 0.0
 
 
 @internal_kernel
 def drops(system: System, k):
     """True for a candidate whose friction falls from a static coefficient to a smaller kinetic one when it slips."""
     law = system.unilateral.law
-    return law[k, STRIBECK] == 0.0 and law[k, STATIC] > system.contacts.point[k, MU]
+    return law[k, ku.STRIBECK] == 0.0 and law[k, ku.STATIC] > system.contacts.point[k, ka.MU]
 
 
 @internal_kernel
 def friction_at_rest(system: System, k):
     """Coefficient of the cone of candidate k, which is at rest along its surface."""
-    gives_way = system.unilateral.mode[k, GIVES_WAY] == 1
-    return system.contacts.point[k, MU] if gives_way else system.unilateral.law[k, STATIC]
+    gives_way = system.unilateral.mode[k, ku.GIVES_WAY] == 1
+    return system.contacts.point[k, ka.MU] if gives_way else system.unilateral.law[k, ku.STATIC]
 
 
 @internal_kernel
@@ -300,16 +253,16 @@ def give_way(system: System, ws: Workspace, size, largest):
     the same in all directions.
     """
     unilateral = system.unilateral
-    place, mode, f = unilateral.place, unilateral.mode, unilateral.vector[SOLUTION]
+    place, mode, f = unilateral.place, unilateral.mode, unilateral.vector[ku.SOLUTION]
     changed, i = False, 0
     for k in range(mode.shape[0]):
-        if mode[k, TOUCHING] == 0:
+        if mode[k, ku.TOUCHING] == 0:
             continue
-        while place[TABLE_ROW, i] != ws.active[k, FIRST_ROW]:
+        while place[ku.TABLE_ROW, i] != ws.active[k, ka.FIRST_ROW]:
             i += 1
-        holds = mode[k, WANTED] == STICKING and mode[k, GIVES_WAY] == 0 and f[i] > 0.0
-        if holds and drops(system, k) and slips(system, i, size, largest, unilateral.law[k, STATIC]):
-            mode[k, GIVES_WAY] = 1
+        holds = mode[k, ku.WANTED] == ka.STICKING and mode[k, ku.GIVES_WAY] == 0 and f[i] > 0.0
+        if holds and drops(system, k) and slips(system, i, size, largest, unilateral.law[k, ku.STATIC]):
+            mode[k, ku.GIVES_WAY] = 1
             changed = True
     return changed
 
@@ -318,28 +271,28 @@ def give_way(system: System, ws: Workspace, size, largest):
 def take_solution(system: System, ws: Workspace, size, largest):
     """Modes from the forces of the reduced problem, into WANTED; stops that carry nothing open."""
     unilateral = system.unilateral
-    place, mode, f = unilateral.place, unilateral.mode, unilateral.vector[SOLUTION]
+    place, mode, f = unilateral.place, unilateral.mode, unilateral.vector[ku.SOLUTION]
     strongest = 0.0
     for i in range(size):
         strongest = max(strongest, abs(f[i]))
     i = system.couplings.joint.shape[0]
     for k in range(unilateral.stop_table.shape[0]):
-        if unilateral.stop_table[k, STOP_CLOSED] == 1:
-            unilateral.stop_table[k, STOP_CLOSED] = 1 if f[i] > FORCE_TOLERANCE * strongest else 0
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
+            unilateral.stop_table[k, ku.STOP_CLOSED] = 1 if f[i] > FORCE_TOLERANCE * strongest else 0
             i += 1
     for k in range(mode.shape[0]):
-        if mode[k, TOUCHING] == 0:
-            mode[k, WANTED] = OPEN
+        if mode[k, ku.TOUCHING] == 0:
+            mode[k, ku.WANTED] = ka.OPEN
             continue
-        while place[TABLE_ROW, i] != ws.active[k, FIRST_ROW]:
+        while place[ku.TABLE_ROW, i] != ws.active[k, ka.FIRST_ROW]:
             i += 1
         if not f[i] > FORCE_TOLERANCE * strongest:
             # It touches without a force, maybe a little below its surface: only if it goes on does it land.
-            mode[k, WANTED], unilateral.slide[k, LANDS_AT] = OPEN, DEPTH
-        elif mode[k, WANTED] == STICKING and slips(system, i, size, largest, friction_at_rest(system, k)):
+            mode[k, ku.WANTED], unilateral.slide[k, ku.LANDS_AT] = ka.OPEN, ku.DEPTH
+        elif mode[k, ku.WANTED] == ka.STICKING and slips(system, i, size, largest, friction_at_rest(system, k)):
             fx, fy = f[i + 1], f[i + 2]
             if fx == 0.0 and fy == 0.0:
                 # Kinetic friction of zero: nothing holds it where static friction gives way.
                 fx, fy = -acceleration(unilateral, i + 1, size), -acceleration(unilateral, i + 2, size)
             begin_slip(system, ws, k, fx, fy)
-            mode[k, WANTED] = SLIDING
+            mode[k, ku.WANTED] = ka.SLIDING

@@ -9,10 +9,12 @@ from numba.core import types
 from dynsim.kernels.arrays import Workspace
 from dynsim.kernels.compiler import form_of
 from dynsim.kernels.constraint.unilateral import UnilateralArrays
-from dynsim.kernels.integrate.newton import WAITING, NewtonArrays, StageLanes
+from dynsim.kernels.integrate import newton as kn
+from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.integrate.newton import NewtonArrays, StageLanes
 from dynsim.kernels.integrate.output import fill_output, write_output
 from dynsim.kernels.integrate.project import off_surface, settle
-from dynsim.kernels.integrate.run import DOPRI5, END, EVALUATIONS, RADAU5, SAMPLE, STEP, TIME, TIME_STEPPING, Run
+from dynsim.kernels.integrate.run import Run
 from dynsim.kernels.integrate.stages import evaluate_four
 from dynsim.kernels.integrate.tableaux import NODE_RADAU
 from dynsim.kernels.jit import internal_kernel, kernel, merged_kernel
@@ -36,18 +38,18 @@ def collocated(newton: NewtonArrays | None, j, whole):
 @internal_kernel
 def fill_dense(run: Run):
     """Coefficients of the dense output over the step from y to y_new, see ``Run.dense``."""
-    h, y, y_new, k, d = run.clock[STEP], run.y, run.y_new, run.stage, run.dense
+    h, y, y_new, k, d = run.clock[ki.STEP], run.y, run.y_new, run.stage, run.dense
     for j in range(y.shape[0]):
         d[0, j] = y_new[j] - y[j]
         d[3, j] = 0.0
-        if run.method == TIME_STEPPING:
+        if run.method == ki.TIME_STEPPING:
             d[1, j], d[2, j] = 0.0, 0.0
-        elif run.method == RADAU5:
+        elif run.method == ki.RADAU5:
             d[1, j], d[2, j] = collocated(run.newton, j, d[0, j])
         else:
             d[1, j] = h * k[0, j] - d[0, j]
             d[2, j] = d[0, j] - h * k[6, j] - d[1, j]
-            if run.method == DOPRI5:
+            if run.method == ki.DOPRI5:
                 d[3, j] = h * (
                     -12715105075.0 / 11282082432.0 * k[0, j]
                     + 87487479700.0 / 32700410799.0 * k[2, j]
@@ -61,7 +63,7 @@ def fill_dense(run: Run):
 @internal_kernel
 def interpolate(run: Run, t, out):
     """State at time t by ``Run.dense`` into out: (m,); of the rounding beyond the step's end nothing is made."""
-    d, x = run.dense, min((t - run.clock[TIME]) / run.clock[STEP], 1.0)
+    d, x = run.dense, min((t - run.clock[ki.TIME]) / run.clock[ki.STEP], 1.0)
     z = 1.0 - x
     for j in range(out.shape[0]):
         out[j] = run.y[j] + x * (d[0, j] + z * (d[1, j] + x * (d[2, j] + z * d[3, j])))
@@ -80,11 +82,11 @@ def sample_step(system: System, ws: Workspace, run: Run):
 
     Samples are projected like steps are, so that recorded gaps hold the promised tolerance too.
     """
-    t, h = run.clock[TIME], run.clock[STEP]
-    first = run.count[SAMPLE] + waiting_samples(run.newton)
+    t, h = run.clock[ki.TIME], run.clock[ki.STEP]
+    first = run.count[ki.SAMPLE] + waiting_samples(run.newton)
     last = first
     # A sample at END must not be lost to the rounding of t + h.
-    until = run.clock[END] if t + h >= run.clock[END] - 1e-12 * max(1.0, run.clock[END]) else t + h
+    until = run.clock[ki.END] if t + h >= run.clock[ki.END] - 1e-12 * max(1.0, run.clock[ki.END]) else t + h
     if last >= run.sample_time.shape[0] or run.sample_time[last] > until:
         return
     fill_dense(run)
@@ -99,10 +101,10 @@ def sample_step(system: System, ws: Workspace, run: Run):
 @internal_kernel
 def write_sample(system: System, ws: Workspace, run: Run):
     """Project the next sample and record it, whose state is there."""
-    s = run.count[SAMPLE]
+    s = run.count[ki.SAMPLE]
     settle(system, run.sample_time[s], run.sample[s], ws, run.stage[7], run)
     write_output(system, ws, run, s)
-    run.count[SAMPLE] = s + 1
+    run.count[ki.SAMPLE] = s + 1
 
 
 @internal_kernel
@@ -122,7 +124,7 @@ def waiting_samples(newton: NewtonArrays | None):
     """Samples whose states are there and that are not recorded yet."""
     if newton is None:  # known to the compiler
         return 0
-    return newton.count[WAITING]
+    return newton.count[kn.WAITING]
 
 
 def samples_on_lanes(newton: Any, system: Any, ws: Any, run: Any, *_: Any) -> bool:
@@ -150,11 +152,11 @@ def has_stops(unilateral: UnilateralArrays | None):
 @form_of(write_samples, samples_on_lanes)
 def write_samples_on_lanes(newton, system, ws, run, more):
     """Four at a time; those that cannot wait by fewer, and one is done sooner alone."""
-    newton.count[WAITING] += more
+    newton.count[kn.WAITING] += more
     wait, alone = may_wait(system.unilateral, run), has_stops(system.unilateral)
-    while newton.count[WAITING] >= 4 or (newton.count[WAITING] > 0 and not wait):
-        if alone or newton.count[WAITING] == 1:
-            newton.count[WAITING] -= 1
+    while newton.count[kn.WAITING] >= 4 or (newton.count[kn.WAITING] > 0 and not wait):
+        if alone or newton.count[kn.WAITING] == 1:
+            newton.count[kn.WAITING] -= 1
             write_sample(system, ws, run)
         else:
             write_together(newton, system, ws, run)
@@ -163,7 +165,7 @@ def write_samples_on_lanes(newton, system, ws, run, more):
 @form_of(write_waiting, samples_on_lanes)
 def write_waiting_on_lanes(newton, system, ws, run):
     """As lanes, even one: how a sample is computed does not depend on where a caller has looked."""
-    if newton.count[WAITING] > 0:
+    if newton.count[kn.WAITING] > 0:
         write_together(newton, system, ws, run)
 
 
@@ -179,7 +181,7 @@ def write_together(newton: NewtonArrays, system: System, ws: Workspace, run: Run
 @internal_kernel
 def load_samples(newton: NewtonArrays, run: Run, begin):
     """Samples that wait into the lanes from ``begin`` on; returns how many."""
-    lanes, first, count = newton.lanes, run.count[SAMPLE], min(newton.count[WAITING], 4 - begin)
+    lanes, first, count = newton.lanes, run.count[ki.SAMPLE], min(newton.count[kn.WAITING], 4 - begin)
     for k in range(count):
         lanes.t[begin + k] = run.sample_time[first + k]
         for j in range(run.y.shape[0]):
@@ -204,13 +206,13 @@ def take_samples(newton: NewtonArrays, system: System, ws: Workspace, run: Run, 
     lanes = newton.lanes
     tables = tables_as_lanes(lanes.ws, FOUR)
     fill_output(system, tables, run, as_lanes(lanes.output, FOUR))
-    run.count[EVALUATIONS] += count
-    newton.count[WAITING] -= count
+    run.count[ki.EVALUATIONS] += count
+    newton.count[kn.WAITING] -= count
     for k in range(begin, begin + count):
         if off_surface(lane(tables, k)):
             write_sample(system, ws, run)
         else:
-            row = run.output[run.count[SAMPLE]]
+            row = run.output[run.count[ki.SAMPLE]]
             for j in range(lanes.output.shape[0]):
                 row[j] = lanes.output[j, k]
-            run.count[SAMPLE] += 1
+            run.count[ki.SAMPLE] += 1

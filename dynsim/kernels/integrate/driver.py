@@ -18,9 +18,11 @@ After each accepted step q and v are projected onto the active rows when they ha
 
 from __future__ import annotations
 
-from dynsim.kernels.arrays import CONTRADICTORY, Workspace
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import Workspace
 from dynsim.kernels.constraint.unilateral import UnilateralArrays
 from dynsim.kernels.drive.law import take_commands
+from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.contact_events import (
     consistent,
     solve_modes,
@@ -36,34 +38,7 @@ from dynsim.kernels.integrate.moreau import advance_moreau
 from dynsim.kernels.integrate.newton import forget
 from dynsim.kernels.integrate.project import settle
 from dynsim.kernels.integrate.radau import after_step, step_radau5
-from dynsim.kernels.integrate.run import (
-    AT_START,
-    DOPRI5,
-    ERROR,
-    FIRED,
-    GRAZING,
-    HOLD,
-    MODES_DUE,
-    NO_FORCES,
-    NOT_FINITE,
-    NOT_PROJECTED,
-    PENDING,
-    PROPOSED,
-    RADAU5,
-    RK4,
-    RUNNING,
-    SEARCHING,
-    STARTED,
-    STATUS,
-    STEP,
-    STEPS,
-    TAKE_COMMANDS,
-    TICKED,
-    TIME,
-    TIME_STEPPING,
-    TRIMMED,
-    Run,
-)
+from dynsim.kernels.integrate.run import Run
 from dynsim.kernels.integrate.slow_slip import longest_step
 from dynsim.kernels.integrate.steps import choose_step, finished, finite, first_step, next_step, rejected, stalled
 from dynsim.kernels.integrate.watch import forces_unique, watch
@@ -77,38 +52,38 @@ from dynsim.kernels.tree.support import watch_support
 def start(system: System, ws: Workspace, run: Run):
     """First derivative, on the contacts, and a first step size where none is given. Sets STATUS when there is none."""
     if not start_contacts(system.unilateral, system, ws, run):
-        run.count[STATUS] = NOT_PROJECTED if run.count[STATUS] == RUNNING else run.count[STATUS]
+        run.count[ki.STATUS] = ki.NOT_PROJECTED if run.count[ki.STATUS] == ki.RUNNING else run.count[ki.STATUS]
     elif not finite(run.stage[0]):
-        run.count[STATUS] = NO_FORCES if ws.counts[CONTRADICTORY] > 0 else NOT_FINITE
-    elif forces_unique(system, ws, run, run.clock[TIME]):
+        run.count[ki.STATUS] = ki.NO_FORCES if ws.counts[ka.CONTRADICTORY] > 0 else ki.NOT_FINITE
+    elif forces_unique(system, ws, run, run.clock[ki.TIME]):
         watch(ws, run, 0.0)
-        if run.clock[STEP] <= 0.0:
+        if run.clock[ki.STEP] <= 0.0:
             first_step(system, ws, run)
-    forget(run.newton, run.count[STEPS])
-    run.count[STARTED] = 1
+    forget(run.newton, run.count[ki.STEPS])
+    run.count[ki.STARTED] = 1
 
 
 @internal_kernel
 def start_contacts(unilateral: UnilateralArrays | None, system: System, ws: Workspace, run: Run):
     """Derivative at the start of a step, on the constraints; under the unilateral law with modes that agree with it."""
     if unilateral is None:  # known to the compiler, as it is below: system.unilateral would not be
-        return settle(system, run.clock[TIME], run.y, ws, run.stage[0], run)
-    due, first = run.count[MODES_DUE] > 0, run.count[MODES_DUE] == AT_START
+        return settle(system, run.clock[ki.TIME], run.y, ws, run.stage[0], run)
+    due, first = run.count[ki.MODES_DUE] > 0, run.count[ki.MODES_DUE] == ki.AT_START
     if due:
-        run.count[MODES_DUE] = 0
+        run.count[ki.MODES_DUE] = 0
         solve_modes(system, ws, run, first)
-    if run.count[STATUS] != RUNNING or not settle(system, run.clock[TIME], run.y, ws, run.stage[0], run):
+    if run.count[ki.STATUS] != ki.RUNNING or not settle(system, run.clock[ki.TIME], run.y, ws, run.stage[0], run):
         return False
     if consistent(system, ws):
         return True
     solve_modes(system, ws, run, first)
-    return run.count[STATUS] == RUNNING and settle(system, run.clock[TIME], run.y, ws, run.stage[0], run)
+    return run.count[ki.STATUS] == ki.RUNNING and settle(system, run.clock[ki.TIME], run.y, ws, run.stage[0], run)
 
 
 @merged_kernel
 def accept(system: System, ws: Workspace, run: Run):
     """Project y_new, record, and make it the new y. Sets STATUS when contacts cannot be met or forces not be known."""
-    t, h = run.clock[TIME], run.clock[STEP]
+    t, h = run.clock[ki.TIME], run.clock[ki.STEP]
     if not end_accepted(run.newton, system, ws, run):
         return
     watch_modes(system.unilateral, ws, h, run.gaps)
@@ -122,8 +97,8 @@ def accept(system: System, ws: Workspace, run: Run):
     for j in range(run.y.shape[0]):
         run.y[j] = run.y_new[j]
         run.stage[0, j] = run.stage[6, j]
-    run.clock[TIME] = t + h
-    run.count[STEPS] += 1
+    run.clock[ki.TIME] = t + h
+    run.count[ki.STEPS] += 1
 
 
 @merged_kernel
@@ -132,9 +107,9 @@ def take_step(system: System, ws: Workspace, run: Run, error):
     clock, count = run.clock, run.count
     if run.event.shape[0] > 0 and cut_step(system, ws, run):
         return False
-    clock[ERROR] = error
-    if clock[TIME] + clock[STEP] > clock[HOLD]:
-        count[PENDING] = 1
+    clock[ki.ERROR] = error
+    if clock[ki.TIME] + clock[ki.STEP] > clock[ki.HOLD]:
+        count[ki.PENDING] = 1
         return False
     return True
 
@@ -142,12 +117,12 @@ def take_step(system: System, ws: Workspace, run: Run, error):
 @internal_kernel
 def propose(system: System, ws: Workspace, run: Run):
     """The step to try next; while a root is searched it is given."""
-    if run.count[SEARCHING] == 0:
+    if run.count[ki.SEARCHING] == 0:
         # What was passed over shortens one step of RK4, not all that follow: nothing would make them long again.
-        if run.method != RK4 or run.count[GRAZING] == 0:
-            run.clock[PROPOSED] = run.clock[STEP]
-        if run.method == RK4:
-            run.clock[STEP] = min(run.clock[STEP], longest_step(system.unilateral, ws))
+        if run.method != ki.RK4 or run.count[ki.GRAZING] == 0:
+            run.clock[ki.PROPOSED] = run.clock[ki.STEP]
+        if run.method == ki.RK4:
+            run.clock[ki.STEP] = min(run.clock[ki.STEP], longest_step(system.unilateral, ws))
         choose_step(run)
 
 
@@ -155,13 +130,13 @@ def propose(system: System, ws: Workspace, run: Run):
 def go_on(run: Run, order, beta):
     """The step size after an accepted step."""
     clock, count = run.clock, run.count
-    if run.method == RK4 or count[FIRED] == 1:
-        clock[STEP] = clock[PROPOSED]
+    if run.method == ki.RK4 or count[ki.FIRED] == 1:
+        clock[ki.STEP] = clock[ki.PROPOSED]
     else:
-        next_step(run, clock[ERROR], order, beta)
+        next_step(run, clock[ki.ERROR], order, beta)
         # A step that was cut short says nothing against the one proposed before.
-        if count[TRIMMED] == 1:
-            clock[STEP] = max(clock[STEP], clock[PROPOSED])
+        if count[ki.TRIMMED] == 1:
+            clock[ki.STEP] = max(clock[ki.STEP], clock[ki.PROPOSED])
 
 
 @internal_kernel
@@ -169,22 +144,22 @@ def ready(system: System, ws: Workspace, run: Run):
     """Start or restart where that is due, and do what is due at this time; False when the caller is to look."""
     count = run.count
     due = take_ticks(run)
-    if due & TAKE_COMMANDS:
-        settle(system, run.clock[TIME], run.y, ws, run.stage[0], run)
-        take_commands(system.drives, system.reference, run.clock[TIME], ws)
-        count[STARTED] = 0
-    if count[STARTED] == 0:
+    if due & ki.TAKE_COMMANDS:
+        settle(system, run.clock[ki.TIME], run.y, ws, run.stage[0], run)
+        take_commands(system.drives, system.reference, run.clock[ki.TIME], ws)
+        count[ki.STARTED] = 0
+    if count[ki.STARTED] == 0:
         start(system, ws, run)
         arm_events(system, ws, run)
-    count[TICKED] = due & ~TAKE_COMMANDS
-    return count[TICKED] == 0
+    count[ki.TICKED] = due & ~ki.TAKE_COMMANDS
+    return count[ki.TICKED] == 0
 
 
 @merged_kernel
 def waiting(system: System, ws: Workspace, run: Run):
     """True when a step can be taken; False when the caller is to look first."""
     # Most runs have nothing to do between two steps.
-    idle = run.count[STARTED] == 1 and run.tick.shape[0] + run.breaks.shape[0] == 0
+    idle = run.count[ki.STARTED] == 1 and run.tick.shape[0] + run.breaks.shape[0] == 0
     return idle or ready(system, ws, run)
 
 
@@ -192,16 +167,16 @@ def waiting(system: System, ws: Workspace, run: Run):
 def conclude(system: System, ws: Workspace, run: Run, error, order):
     """Accept or refuse the step just taken, or that was kept back; True when the caller is to look."""
     count = run.count
-    if count[PENDING] == 0:
+    if count[ki.PENDING] == 0:
         if rejected(ws, run, error, order):
-            count[SEARCHING] = 0
+            count[ki.SEARCHING] = 0
             return False
         if not take_step(system, ws, run, error):
-            return count[PENDING] == 1
-    count[PENDING] = 0
+            return count[ki.PENDING] == 1
+    count[ki.PENDING] = 0
     accept(system, ws, run)
     go_on(run, order, 0.04)
-    if count[FIRED] == 1 and count[STATUS] == RUNNING:
+    if count[ki.FIRED] == 1 and count[ki.STATUS] == ki.RUNNING:
         switch_contacts(system.unilateral, system, ws, run)
     return run.event.shape[0] > 0 and fire_events(run)
 
@@ -209,7 +184,7 @@ def conclude(system: System, ws: Workspace, run: Run, error, order):
 @free_kernel
 def advance_explicit(system: System, ws: Workspace, run: Run, limit):
     """:func:`advance` of the explicit methods."""
-    order = 5.0 if run.method == DOPRI5 else 4.0
+    order = 5.0 if run.method == ki.DOPRI5 else 4.0
     taken, error = 0, 0.0
     if limit < 0:
         return
@@ -217,7 +192,7 @@ def advance_explicit(system: System, ws: Workspace, run: Run, limit):
         if taken >= limit or finished(run) or stalled(run):
             return
         taken += 1
-        if run.count[PENDING] == 0:
+        if run.count[ki.PENDING] == 0:
             propose(system, ws, run)
             error = step_explicit(system, ws, run)
         if conclude(system, ws, run, error, order):
@@ -244,12 +219,12 @@ def advance_radau5(system: System, ws: Workspace, run: Run, limit):
         if stalled(run):
             break
         taken += 1
-        if run.count[PENDING] == 0:
+        if run.count[ki.PENDING] == 0:
             propose(system, ws, run)
             error = step_radau5(system, ws, run)
-        steps, h = run.count[STEPS], run.clock[STEP]
+        steps, h = run.count[ki.STEPS], run.clock[ki.STEP]
         done = conclude_apart(system, ws, run, error, 4.0)
-        if run.count[STEPS] > steps:
+        if run.count[ki.STEPS] > steps:
             after_step(run, h)
         if done:
             break
@@ -265,5 +240,5 @@ def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:
 
     Three compiled functions behind one name, so that each is only compiled when it is used.
     """
-    methods = {RADAU5: advance_radau5, TIME_STEPPING: advance_moreau}
+    methods = {ki.RADAU5: advance_radau5, ki.TIME_STEPPING: advance_moreau}
     methods.get(run.method, advance_explicit)(system, ws, run, limit)

@@ -9,13 +9,15 @@ from typing import Any
 
 from numba.core import types
 
-from dynsim.kernels.arrays import CONTRADICTORY, DEPENDENT, Workspace
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import Workspace
 from dynsim.kernels.compiler import form_of
 from dynsim.kernels.constraint.uniqueness import clearly_unique
+from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.dense import fill_lanes, load_samples, samples_on_lanes, take_samples
 from dynsim.kernels.integrate.newton import NewtonArrays
 from dynsim.kernels.integrate.project import off_surface, settle
-from dynsim.kernels.integrate.run import EVALUATIONS, NOT_PROJECTED, STATUS, STEP, TIME, Run
+from dynsim.kernels.integrate.run import Run
 from dynsim.kernels.integrate.stages import evaluate_four
 from dynsim.kernels.integrate.watch import forces_unique, watch
 from dynsim.kernels.jit import internal_kernel
@@ -33,8 +35,8 @@ def evaluate_end(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
 @internal_kernel
 def evaluate_end_alone(system: System, ws: Workspace, run: Run):
     """The same without lanes."""
-    derivative(system, run.clock[TIME] + run.clock[STEP], run.y_new, ws, run.stage[6])
-    run.count[EVALUATIONS] += 1
+    derivative(system, run.clock[ki.TIME] + run.clock[ki.STEP], run.y_new, ws, run.stage[6])
+    run.count[ki.EVALUATIONS] += 1
 
 
 @internal_kernel
@@ -46,17 +48,17 @@ def end_accepted(newton: NewtonArrays | None, system: System, ws: Workspace, run
 @internal_kernel
 def end_settled(system: System, ws: Workspace, run: Run, off):
     """True when y_new is on the constraints; where it was ``off`` them ``ws`` is of what it has become."""
-    if not off or settle(system, run.clock[TIME] + run.clock[STEP], run.y_new, ws, run.stage[6], run):
+    if not off or settle(system, run.clock[ki.TIME] + run.clock[ki.STEP], run.y_new, ws, run.stage[6], run):
         return True
-    run.count[STATUS] = NOT_PROJECTED
+    run.count[ki.STATUS] = ki.NOT_PROJECTED
     return False
 
 
 @internal_kernel
 def end_watched(system: System, ws: Workspace, run: Run):
     """True when forces at y_new are unique; ``ws`` right after ``derivative`` there."""
-    h = run.clock[STEP]
-    if not (clearly_unique(ws) or forces_unique(system, ws, run, run.clock[TIME] + h)):
+    h = run.clock[ki.STEP]
+    if not (clearly_unique(ws) or forces_unique(system, ws, run, run.clock[ki.TIME] + h)):
         return False
     watch(ws, run, h)
     return True
@@ -74,16 +76,16 @@ def evaluate_end_on_lanes(newton, system, ws, run):
         evaluate_end_alone(system, ws, run)
         return
     lanes = newton.lanes
-    lanes.t[0] = run.clock[TIME] + run.clock[STEP]
+    lanes.t[0] = run.clock[ki.TIME] + run.clock[ki.STEP]
     for j in range(run.y.shape[0]):
         lanes.y[j, 0] = run.y_new[j]
     count = load_samples(newton, run, 1)
     fill_lanes(lanes, run, 1 + count)
-    dependent, contradictory = lanes.ws.counts[DEPENDENT], lanes.ws.counts[CONTRADICTORY]
+    dependent, contradictory = lanes.ws.counts[ka.DEPENDENT], lanes.ws.counts[ka.CONTRADICTORY]
     evaluate_four(lanes, system)
-    ws.counts[DEPENDENT] += lanes.ws.counts[DEPENDENT] - dependent
-    ws.counts[CONTRADICTORY] += lanes.ws.counts[CONTRADICTORY] - contradictory
-    run.count[EVALUATIONS] += 1
+    ws.counts[ka.DEPENDENT] += lanes.ws.counts[ka.DEPENDENT] - dependent
+    ws.counts[ka.CONTRADICTORY] += lanes.ws.counts[ka.CONTRADICTORY] - contradictory
+    run.count[ki.EVALUATIONS] += 1
     for j in range(run.y.shape[0]):
         run.stage[6, j] = lanes.f[j, 0]
     take_samples(newton, system, ws, run, 1, count)

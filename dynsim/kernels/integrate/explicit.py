@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dynsim.kernels.arrays import Workspace
-from dynsim.kernels.integrate.run import ATOL, DOPRI5, EVALUATIONS, RK4, RK43, RTOL, STEP, TIME, Run
+from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.integrate.run import Run
 from dynsim.kernels.integrate.steps import error_norm, finite
 from dynsim.kernels.integrate.tableaux import (
     A_DOPRI5,
@@ -28,7 +29,7 @@ def weight_rk43(system: System, ws: Workspace, run: Run):
     stable up to z of 2.8, and smooth motions have small ones. The weight falls from 1/6 at z = 0 to 0.03
     from z = √½ on, a quarter of that.
     """
-    h, y, y_new, k, atol, rtol = run.clock[STEP], run.y, run.y_new, run.stage, run.clock[ATOL], run.clock[RTOL]
+    h, y, y_new, k, atol, rtol = run.clock[ki.STEP], run.y, run.y_new, run.stage, run.clock[ki.ATOL], run.clock[ki.RTOL]
     slope, change = 0.0, 0.0
     if system.layout.extra > 0:
         for j in range(system.layout.tracked):
@@ -65,21 +66,21 @@ def step_explicit(system: System, ws: Workspace, run: Run):
 
     The last stage is the derivative at y_new; it is left in stage[6], the error estimate in stage[7].
     """
-    t, h, y, y_new, k = run.clock[TIME], run.clock[STEP], run.y, run.y_new, run.stage
-    A = A_DOPRI5 if run.method == DOPRI5 else A_RK4
-    node = NODE_DOPRI5 if run.method == DOPRI5 else NODE_RK4
+    t, h, y, y_new, k = run.clock[ki.TIME], run.clock[ki.STEP], run.y, run.y_new, run.stage
+    A = A_DOPRI5 if run.method == ki.DOPRI5 else A_RK4
+    node = NODE_DOPRI5 if run.method == ki.DOPRI5 else NODE_RK4
     last = A.shape[0] - 1
     for s in range(1, last + 1):
         combine(y, h, A[s], s, k, y_new)
         derivative(system, t + node[s] * h, y_new, ws, k[s if s < last else 6])
         # A fixed step may jump over what an error estimate would not let pass, so its stages are watched too.
         stage = k[s if s < last else 6]
-        if run.method == RK4 and finite(stage) and not forces_unique(system, ws, run, t + node[s] * h):
+        if run.method == ki.RK4 and finite(stage) and not forces_unique(system, ws, run, t + node[s] * h):
             return 0.0
-    run.count[EVALUATIONS] += last
-    if run.method == RK4:
+    run.count[ki.EVALUATIONS] += last
+    if run.method == ki.RK4:
         return 0.0
-    if run.method == RK43:
+    if run.method == ki.RK43:
         weight = weight_rk43(system, ws, run)
         for j in range(y.shape[0]):
             k[7, j] = weight * h * (k[6, j] - k[3, j])

@@ -7,58 +7,19 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import (
-    FIRST_ROW,
-    FORCE,
-    GAP,
-    GAP_RATE,
-    MODE,
-    MU,
-    OPEN,
-    QD,
-    QDD,
-    ROW_GAP,
-    ROW_RATE,
-    ROWS,
-    SLIDING,
-    SLIP_VELOCITY,
-    STICKING,
-    Workspace,
-)
-from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, ONE_WAY, TANGENT, approach, solve_cones
+from dynsim.kernels import arrays as ka
+from dynsim.kernels import state as kst
+from dynsim.kernels.arrays import Workspace
+from dynsim.kernels.constraint import cone as kc
+from dynsim.kernels.constraint import unilateral as ku
+from dynsim.kernels.constraint.cone import approach, solve_cones
 from dynsim.kernels.constraint.rows import row_errors, set_modes
-from dynsim.kernels.constraint.unilateral import (
-    BEFORE,
-    CHANGES,
-    CONE_FRICTION,
-    KINDS,
-    LOSS,
-    OFFSET,
-    RESTITUTION,
-    SCRATCH,
-    SETTLE,
-    SIDE,
-    SOLUTION,
-    STOP_CLOSED,
-    STOP_JOINT,
-    STOP_LOSS,
-    STRUCK,
-    TOUCHING,
-    WANTED,
-    UnilateralArrays,
-    stop_gap,
-)
-from dynsim.kernels.integrate.project import PROJECTION_LIMIT, RATE_TOLERANCE, project_level
-from dynsim.kernels.integrate.run import (
-    EVALUATIONS,
-    NO_CONTACT_FORCES,
-    NOT_UNIQUE,
-    STATUS,
-    TIME,
-    Run,
-)
+from dynsim.kernels.constraint.unilateral import UnilateralArrays, stop_gap
+from dynsim.kernels.integrate import project as kp
+from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.integrate.project import project_level
+from dynsim.kernels.integrate.run import Run
 from dynsim.kernels.jit import internal_kernel
-from dynsim.kernels.state import CONTACT_SIZE, IMPACT_LOSS, IMPULSE, JOINT_STOP_LOSS
 from dynsim.kernels.system import System, derivative
 from dynsim.kernels.tree.articulated import accelerate
 
@@ -81,15 +42,15 @@ IMMOBILE = 1e-3
 def slip_speed(ws: Workspace, k):
     """|v_t| of candidate k [m/s]."""
     state = ws.contacts
-    x, y, z = state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2]
+    x, y, z = state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2]
     return math.sqrt(x * x + y * y + z * z)
 
 
 @internal_kernel
 def evaluate(system: System, ws: Workspace, run: Run):
     """The right-hand side at the present state, with the present modes, and how its rows are off."""
-    derivative(system, run.clock[TIME], run.y, ws, run.stage[0])
-    run.count[EVALUATIONS] += 1
+    derivative(system, run.clock[ki.TIME], run.y, ws, run.stage[0])
+    run.count[ki.EVALUATIONS] += 1
     row_errors(ws)
 
 
@@ -99,19 +60,19 @@ def find_touching(unilateral: UnilateralArrays, ws: Workspace, touch):
     state, mode, table, stop = ws.contacts, unilateral.mode, unilateral.stop_table, unilateral.stop
     strikes = False
     for k in range(mode.shape[0]):
-        limit = STRIKE * RATE_TOLERANCE * (1.0 + slip_speed(ws, k))
-        closed = ws.active[k, MODE] != OPEN
-        near = closed or (state[k, GAP] <= touch and state[k, GAP_RATE] <= limit)
-        mode[k, TOUCHING] = 1 if near else 0
-        if near and state[k, GAP_RATE] < -limit:
-            mode[k, STRUCK] = 1
+        limit = STRIKE * kp.RATE_TOLERANCE * (1.0 + slip_speed(ws, k))
+        closed = ws.active[k, ka.MODE] != ka.OPEN
+        near = closed or (state[k, ka.GAP] <= touch and state[k, ka.GAP_RATE] <= limit)
+        mode[k, ku.TOUCHING] = 1 if near else 0
+        if near and state[k, ka.GAP_RATE] < -limit:
+            mode[k, ku.STRUCK] = 1
         # What lands ever so slowly is stopped too: nothing else would, should it stay open.
-        strikes = strikes or (near and state[k, GAP_RATE] < (-limit if closed else 0.0))
+        strikes = strikes or (near and state[k, ka.GAP_RATE] < (-limit if closed else 0.0))
     for k in range(table.shape[0]):
-        rate = stop[k, SIDE] * ws.joints[table[k, STOP_JOINT], QD]
-        limit = STRIKE * RATE_TOLERANCE
-        near = table[k, STOP_CLOSED] == 1 or (stop_gap(unilateral, ws, k) <= touch and rate <= limit)
-        table[k, STOP_CLOSED] = 1 if near else 0
+        rate = stop[k, ku.SIDE] * ws.joints[table[k, ku.STOP_JOINT], ka.QD]
+        limit = STRIKE * kp.RATE_TOLERANCE
+        near = table[k, ku.STOP_CLOSED] == 1 or (stop_gap(unilateral, ws, k) <= touch and rate <= limit)
+        table[k, ku.STOP_CLOSED] = 1 if near else 0
         strikes = strikes or (near and rate < -limit)
     return strikes
 
@@ -121,11 +82,11 @@ def keep_touching(unilateral: UnilateralArrays, ws: Workspace):
     """After an impact: what leaves faster than SETTLE touches no more."""
     state, mode, table, stop = ws.contacts, unilateral.mode, unilateral.stop_table, unilateral.stop
     for k in range(mode.shape[0]):
-        if state[k, GAP_RATE] > unilateral.tally[k, SETTLE]:
-            mode[k, TOUCHING] = 0
+        if state[k, ka.GAP_RATE] > unilateral.tally[k, ku.SETTLE]:
+            mode[k, ku.TOUCHING] = 0
     for k in range(table.shape[0]):
-        if stop[k, SIDE] * ws.joints[table[k, STOP_JOINT], QD] > STRIKE * RATE_TOLERANCE:
-            table[k, STOP_CLOSED] = 0
+        if stop[k, ku.SIDE] * ws.joints[table[k, ku.STOP_JOINT], ka.QD] > STRIKE * kp.RATE_TOLERANCE:
+            table[k, ku.STOP_CLOSED] = 0
 
 
 @internal_kernel
@@ -139,16 +100,18 @@ def come_down(system: System, ws: Workspace, run: Run):
     unilateral = system.unilateral
     mode = unilateral.mode
     for k in range(mode.shape[0]):
-        fast = mode[k, STRUCK] == 1 and ws.contacts[k, GAP_RATE] < -unilateral.tally[k, SETTLE]
-        bounces = fast and mode[k, BEFORE] == OPEN and unilateral.law[k, RESTITUTION] > 0.0
-        held = mode[k, TOUCHING] == 1 and not bounces
-        mode[k, WANTED] = OPEN if not held else STICKING if ws.active[k, MODE] == STICKING else SLIDING
-    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
-    for _ in range(PROJECTION_LIMIT):
+        fast = mode[k, ku.STRUCK] == 1 and ws.contacts[k, ka.GAP_RATE] < -unilateral.tally[k, ku.SETTLE]
+        bounces = fast and mode[k, ku.BEFORE] == ka.OPEN and unilateral.law[k, ku.RESTITUTION] > 0.0
+        held = mode[k, ku.TOUCHING] == 1 and not bounces
+        mode[k, ku.WANTED] = (
+            ka.OPEN if not held else ka.STICKING if ws.active[k, ka.MODE] == ka.STICKING else ka.SLIDING
+        )
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
+    for _ in range(kp.PROJECTION_LIMIT):
         evaluate(system, ws, run)
         worst = 0.0
-        for r in range(ws.counts[ROWS]):
-            worst = max(worst, abs(ws.rows[r, ROW_GAP]))
+        for r in range(ws.counts[ka.ROWS]):
+            worst = max(worst, abs(ws.rows[r, ka.ROW_GAP]))
         if worst <= FOOT_TOLERANCE:
             return
         project_level(system, ws, run.y, 0)
@@ -164,16 +127,16 @@ def gather(system: System, ws: Workspace, run: Run):
     mode, place = unilateral.mode, unilateral.place
     come_down(system, ws, run)
     for k in range(mode.shape[0]):
-        mode[k, WANTED] = STICKING if mode[k, TOUCHING] == 1 else OPEN
-    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, WANTED])
+        mode[k, ku.WANTED] = ka.STICKING if mode[k, ku.TOUCHING] == 1 else ka.OPEN
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
     evaluate(system, ws, run)
-    couplings, p = system.couplings.joint.shape[0], ws.counts[ROWS]
+    couplings, p = system.couplings.joint.shape[0], ws.counts[ka.ROWS]
     for r in range(p):
-        place[KINDS, r] = BOTH_WAYS if r < couplings else ONE_WAY
+        place[ku.KINDS, r] = kc.BOTH_WAYS if r < couplings else kc.ONE_WAY
     for k in range(mode.shape[0]):
-        if mode[k, WANTED] == STICKING:
-            r = ws.active[k, FIRST_ROW]
-            place[KINDS, r], place[KINDS, r + 1], place[KINDS, r + 2] = CONE, TANGENT, TANGENT
+        if mode[k, ku.WANTED] == ka.STICKING:
+            r = ws.active[k, ka.FIRST_ROW]
+            place[ku.KINDS, r], place[ku.KINDS, r + 1], place[ku.KINDS, r + 2] = kc.CONE, kc.TANGENT, kc.TANGENT
     return p
 
 
@@ -186,8 +149,8 @@ def solve_problem(unilateral: UnilateralArrays, W, size, largest, starts):
     largest : of the rates or accelerations that it is to bring to zero
     starts : of Newton's method, before a problem that may well have no solution is given up; 0: as many as it takes
     """
-    vector, room, kind = unilateral.vector, unilateral.room[SCRATCH:], unilateral.place[KINDS]
-    b, mu, f, good = vector[OFFSET], vector[CONE_FRICTION], vector[SOLUTION], 1e-2 * CONE_TOLERANCE
+    vector, room, kind = unilateral.vector, unilateral.room[ku.SCRATCH :], unilateral.place[ku.KINDS]
+    b, mu, f, good = vector[ku.OFFSET], vector[ku.CONE_FRICTION], vector[ku.SOLUTION], 1e-2 * CONE_TOLERANCE
     good *= max(largest, IMMOBILE)
     if starts > 0:
         residual = approach(W, b, kind, mu, size, f, room, good, starts)
@@ -205,26 +168,26 @@ def impulses(system: System, ws: Workspace, p, largest, share):
     unilateral, rows = system.unilateral, ws.rows
     vector, mode = unilateral.vector, unilateral.mode
     for r in range(p):
-        vector[OFFSET, r], vector[SOLUTION, r] = rows[r, ROW_RATE], 0.0
+        vector[ku.OFFSET, r], vector[ku.SOLUTION, r] = rows[r, ka.ROW_RATE], 0.0
     for k in range(mode.shape[0]):
-        if mode[k, TOUCHING] == 1:
-            r = ws.active[k, FIRST_ROW]
-            vector[CONE_FRICTION, r] = system.contacts.point[k, MU]
+        if mode[k, ku.TOUCHING] == 1:
+            r = ws.active[k, ka.FIRST_ROW]
+            vector[ku.CONE_FRICTION, r] = system.contacts.point[k, ka.MU]
             # What was closed had no speed to turn round: a brake or another impact has just given it this one.
-            falls = mode[k, STRUCK] == 1 and mode[k, BEFORE] == OPEN
-            if falls and -rows[r, ROW_RATE] > unilateral.tally[k, SETTLE]:
-                vector[OFFSET, r] *= 1.0 + share * unilateral.law[k, RESTITUTION]
+            falls = mode[k, ku.STRUCK] == 1 and mode[k, ku.BEFORE] == ka.OPEN
+            if falls and -rows[r, ka.ROW_RATE] > unilateral.tally[k, ku.SETTLE]:
+                vector[ku.OFFSET, r] *= 1.0 + share * unilateral.law[k, ku.RESTITUTION]
     if not solve_problem(unilateral, ws.small[0], p, largest, BOUNCE_STARTS if share > 0.0 else 0):
         return False
-    f, total, turnover = vector[SOLUTION], 0.0, 0.0
+    f, total, turnover = vector[ku.SOLUTION], 0.0, 0.0
     for r in range(p):
-        after = rows[r, ROW_RATE]
+        after = rows[r, ka.ROW_RATE]
         for s in range(p):
             after += ws.small[0, r, s] * f[s]
         # FORCE is free until the next evaluation.
-        rows[r, FORCE] = -0.5 * f[r] * (rows[r, ROW_RATE] + after)
-        total += rows[r, FORCE]
-        turnover += abs(rows[r, FORCE])
+        rows[r, ka.FORCE] = -0.5 * f[r] * (rows[r, ka.ROW_RATE] + after)
+        total += rows[r, ka.FORCE]
+        turnover += abs(rows[r, ka.FORCE])
     return total >= -CONE_TOLERANCE * turnover or share == 0.0
 
 
@@ -239,32 +202,32 @@ def impact(system: System, ws: Workspace, run: Run):
     p = gather(system, ws, run)
     largest = 0.0
     for r in range(p):
-        largest = max(largest, abs(rows[r, ROW_RATE]))
+        largest = max(largest, abs(rows[r, ka.ROW_RATE]))
     # Newton's restitution may contradict friction: a point that is wedged cannot leave, and some would gain energy.
     # Those impacts are without restitution, which always has a solution, and a loss. So are those of points that throw
     # each other back and forth at one instant: what accumulates ends in contact.
-    bouncing = unilateral.number[CHANGES] <= MOST_BOUNCES and impulses(system, ws, p, largest, 1.0)
+    bouncing = unilateral.number[ku.CHANGES] <= MOST_BOUNCES and impulses(system, ws, p, largest, 1.0)
     if not bouncing and not impulses(system, ws, p, largest, 0.0):
-        run.count[STATUS], run.clock[NOT_UNIQUE] = NO_CONTACT_FORCES, run.clock[TIME]
+        run.count[ki.STATUS], run.clock[ki.NOT_UNIQUE] = ki.NO_CONTACT_FORCES, run.clock[ki.TIME]
         return
-    f = vector[SOLUTION]
+    f = vector[ku.SOLUTION]
     for i in range(ws.joints.shape[0]):
         column[i, 0] = 0.0
         for r in range(p):
             column[i, 0] += f[r] * column[i, 1 + 2 * r]
     accelerate(system.model, ws)
     for i in range(ws.joints.shape[0]):
-        y[layout.v + i] += ws.joints[i, QDD]
+        y[layout.v + i] += ws.joints[i, ka.QDD]
     for k in range(mode.shape[0]):
-        if mode[k, TOUCHING] == 1:
-            r = ws.active[k, FIRST_ROW]
-            loss = rows[r, FORCE] + rows[r + 1, FORCE] + rows[r + 2, FORCE]
-            unilateral.tally[k, LOSS] += loss
-            y[layout.loss + IMPACT_LOSS] += loss
-            y[layout.contact + CONTACT_SIZE * k + IMPULSE] += f[r]
+        if mode[k, ku.TOUCHING] == 1:
+            r = ws.active[k, ka.FIRST_ROW]
+            loss = rows[r, ka.FORCE] + rows[r + 1, ka.FORCE] + rows[r + 2, ka.FORCE]
+            unilateral.tally[k, ku.LOSS] += loss
+            y[layout.loss + kst.IMPACT_LOSS] += loss
+            y[layout.contact + kst.CONTACT_SIZE * k + kst.IMPULSE] += f[r]
     r = system.couplings.joint.shape[0]
     for k in range(unilateral.stop_table.shape[0]):
-        if unilateral.stop_table[k, STOP_CLOSED] == 1:
-            unilateral.stop[k, STOP_LOSS] += rows[r, FORCE]
-            y[layout.loss + JOINT_STOP_LOSS] += rows[r, FORCE]
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
+            unilateral.stop[k, ku.STOP_LOSS] += rows[r, ka.FORCE]
+            y[layout.loss + kst.JOINT_STOP_LOSS] += rows[r, ka.FORCE]
             r += 1

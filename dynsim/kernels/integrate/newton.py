@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.arrays import BLOCK_SIZE, Workspace
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import Workspace
 from dynsim.kernels.jit import internal_kernel
 from dynsim.kernels.lanes.system import FOUR, lane_workspace
 from dynsim.kernels.lanes.tables import aligned
@@ -82,7 +83,7 @@ def newton_arrays(n: int, na: int, circuits: int, tracked: int, m: int) -> Newto
     clock[CLOSE] = CLOSE_ENOUGH if circuits > 0 else CLOSE_UNDAMPED
     return NewtonArrays(
         along=np.zeros((2 * n + circuits, n)),
-        linear=np.zeros((na, BLOCK_SIZE)),
+        linear=np.zeros((na, ka.BLOCK_SIZE)),
         real=np.zeros((n, n)),
         complex=np.zeros((n, n), dtype=np.complex128),
         pivot=np.zeros((2, n), dtype=np.int64),

@@ -2,32 +2,19 @@
 
 from __future__ import annotations
 
-from dynsim.kernels.arrays import (
-    CURRENT,
-    D_M,
-    DRAG,
-    DRIVEN,
-    FORCE_VECTOR,
-    GAP,
-    J_M,
-    K_M,
-    MODE,
-    NORMAL_FORCE,
-    QD,
-    QDD,
-    SLIP_VELOCITY,
-    VOLTAGE,
-    Workspace,
-)
+from dynsim.kernels import arrays as ka
+from dynsim.kernels import state as kst
+from dynsim.kernels.arrays import Workspace
+from dynsim.kernels.constraint import unilateral as ku
 from dynsim.kernels.constraint.rows import force_vectors
-from dynsim.kernels.constraint.unilateral import STOP_FORCE, UnilateralArrays
+from dynsim.kernels.constraint.unilateral import UnilateralArrays
 from dynsim.kernels.integrate.run import Run
 from dynsim.kernels.jit import internal_kernel
 from dynsim.kernels.ledger import kinetic_energy, magnetic_energy, potential_energy
-from dynsim.kernels.state import OUT_FORCE, OUT_GAP, OUT_MODE, OUT_SLIP, OUT_VECTOR, OUTPUTS_PER_CONTACT
 from dynsim.kernels.system import System
+from dynsim.kernels.tree import support as ks
 from dynsim.kernels.tree.points import point_position
-from dynsim.kernels.tree.support import OUTPUTS, SupportArrays, ground_reaction
+from dynsim.kernels.tree.support import SupportArrays, ground_reaction
 
 
 @internal_kernel
@@ -43,16 +30,16 @@ def fill_output(system: System, ws: Workspace, run: Run, out):
     joints, motors, motor, state, columns = ws.joints, ws.motors, system.drives.motor, ws.contacts, run.columns
     force_vectors(ws)
     for i in range(joints.shape[0]):
-        out[columns.vdot + i] = joints[i, QDD]
+        out[columns.vdot + i] = joints[i, ka.QDD]
     for a in range(motors.shape[0]):
-        i = system.drives.table[a, DRIVEN]
-        out[columns.current + a] = motors[a, CURRENT]
-        out[columns.voltage + a] = motors[a, VOLTAGE]
+        i = system.drives.table[a, ka.DRIVEN]
+        out[columns.current + a] = motors[a, ka.CURRENT]
+        out[columns.voltage + a] = motors[a, ka.VOLTAGE]
         out[columns.torque + a] = (
-            motor[a, K_M] * motors[a, CURRENT]
-            - motor[a, J_M] * joints[i, QDD]
-            - motor[a, D_M] * joints[i, QD]
-            - motors[a, DRAG]
+            motor[a, ka.K_M] * motors[a, ka.CURRENT]
+            - motor[a, ka.J_M] * joints[i, ka.QDD]
+            - motor[a, ka.D_M] * joints[i, ka.QD]
+            - motors[a, ka.DRAG]
         )
     point_position(ws, run.hand_link, run.hand_point, out[columns.hand : columns.hand + 3])
     out[columns.energy] = kinetic_energy(system.model, ws)
@@ -60,13 +47,13 @@ def fill_output(system: System, ws: Workspace, run: Run, out):
     out[columns.energy + 2] = magnetic_energy(system.drives, ws)
     k = columns.contact
     for c in range(state.shape[0]):
-        out[k + OUT_FORCE] = state[c, NORMAL_FORCE]
-        out[k + OUT_GAP] = state[c, GAP]
-        out[k + OUT_MODE] = ws.active[c, MODE]
+        out[k + kst.OUT_FORCE] = state[c, ka.NORMAL_FORCE]
+        out[k + kst.OUT_GAP] = state[c, ka.GAP]
+        out[k + kst.OUT_MODE] = ws.active[c, ka.MODE]
         for s in range(3):
-            out[k + OUT_VECTOR + s] = state[c, FORCE_VECTOR + s]
-            out[k + OUT_SLIP + s] = state[c, SLIP_VELOCITY + s]
-        k += OUTPUTS_PER_CONTACT
+            out[k + kst.OUT_VECTOR + s] = state[c, ka.FORCE_VECTOR + s]
+            out[k + kst.OUT_SLIP + s] = state[c, ka.SLIP_VELOCITY + s]
+        k += kst.OUTPUTS_PER_CONTACT
     stop_forces(system.unilateral, out[columns.stop :])
 
 
@@ -76,7 +63,7 @@ def stop_forces(unilateral: UnilateralArrays | None, out):
     if unilateral is None:  # known to the compiler
         return
     for k in range(unilateral.stop.shape[0]):
-        out[k] = unilateral.stop[k, STOP_FORCE]
+        out[k] = unilateral.stop[k, ku.STOP_FORCE]
 
 
 @internal_kernel
@@ -85,5 +72,5 @@ def write_support(system: System, ws: Workspace, run: Run, row, support: Support
     if support is None:  # known to the compiler
         return
     ground_reaction(system.model, system.loads, run.sample_time[row], ws, support)
-    for s in range(OUTPUTS):
+    for s in range(ks.OUTPUTS):
         run.output[row, run.columns.support + s] = support.state[s]

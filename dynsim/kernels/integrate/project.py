@@ -8,26 +8,12 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import (
-    BODY_B,
-    FORCE,
-    INVERSE_D,
-    JOINT_ROW,
-    OWNER,
-    QD,
-    QDD,
-    RHS,
-    ROW,
-    ROW_GAP,
-    ROW_KIND,
-    ROW_RATE,
-    ROWS,
-    SLIP_VELOCITY,
-    Workspace,
-)
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import Workspace
 from dynsim.kernels.constraint.delassus import solve_small
 from dynsim.kernels.constraint.rows import row_errors
-from dynsim.kernels.integrate.run import EVALUATIONS, PROJECTIONS, Run
+from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.integrate.run import Run
 from dynsim.kernels.jit import internal_kernel
 from dynsim.kernels.system import System, derivative
 from dynsim.kernels.tree.articulated import accelerate
@@ -44,15 +30,15 @@ def off_surface(ws: Workspace):
     """True when the state has left an active row by more than the projection tolerances."""
     state, rows, active = ws.contacts, ws.rows, ws.active
     row_errors(ws)
-    for r in range(ws.counts[ROWS]):
+    for r in range(ws.counts[ka.ROWS]):
         # Rounding limits the rate to a fraction of the speed.
-        if active[r, ROW_KIND] == JOINT_ROW:
-            speed = abs(rows[r, ROW + 1] * ws.joints[active[r, BODY_B], QD])
+        if active[r, ka.ROW_KIND] == ka.JOINT_ROW:
+            speed = abs(rows[r, ka.ROW + 1] * ws.joints[active[r, ka.BODY_B], ka.QD])
         else:
-            k = active[r, OWNER]
-            x, y, z = state[k, SLIP_VELOCITY], state[k, SLIP_VELOCITY + 1], state[k, SLIP_VELOCITY + 2]
+            k = active[r, ka.OWNER]
+            x, y, z = state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2]
             speed = math.sqrt(x * x + y * y + z * z)
-        if abs(rows[r, ROW_GAP]) > GAP_TOLERANCE or abs(rows[r, ROW_RATE]) > RATE_TOLERANCE * (1.0 + speed):
+        if abs(rows[r, ka.ROW_GAP]) > GAP_TOLERANCE or abs(rows[r, ka.ROW_RATE]) > RATE_TOLERANCE * (1.0 + speed):
             return True
     return False
 
@@ -72,28 +58,28 @@ def project(system: System, ws: Workspace, y):
 def project_level(system: System, ws: Workspace, y, level):
     """Positions (level 0) or rates (1) of :func:`project`; returns ½ λᵀ J v, the kinetic energy that rates lose [J]."""
     state, active, column, small = ws.rows, ws.active, ws.column, ws.small
-    n, p = ws.joints.shape[0], ws.counts[ROWS]
+    n, p = ws.joints.shape[0], ws.counts[ka.ROWS]
     start = system.layout.q if level == 0 else system.layout.v
     for k in range(p):
-        state[k, RHS] = state[k, ROW_GAP] if level == 0 else state[k, ROW_RATE]
+        state[k, ka.RHS] = state[k, ka.ROW_GAP] if level == 0 else state[k, ka.ROW_RATE]
         for m in range(p):
             small[0, k, m] = 0.0
             for i in range(n):
-                small[0, k, m] += column[i, 1 + 2 * k] * column[i, 1 + 2 * m] * ws.links[i, INVERSE_D]
+                small[0, k, m] += column[i, 1 + 2 * k] * column[i, 1 + 2 * m] * ws.links[i, ka.INVERSE_D]
     solve_small(small, state, active, p)
     energy = 0.0
     for k in range(p):
-        energy += 0.5 * state[k, FORCE] * state[k, RHS]
+        energy += 0.5 * state[k, ka.FORCE] * state[k, ka.RHS]
     for i in range(n):
         column[i, 0] = 0.0
         for k in range(p):
-            column[i, 0] -= state[k, FORCE] * column[i, 1 + 2 * k]
+            column[i, 0] -= state[k, ka.FORCE] * column[i, 1 + 2 * k]
     accelerate(system.model, ws)
     if level == 0 and system.layout.extra > 0:
         displace(system.model.compound, system.model, ws, y, start)
     else:
         for i in range(n):
-            y[start + i] += ws.joints[i, QDD]
+            y[start + i] += ws.joints[i, ka.QDD]
     return energy
 
 
@@ -101,12 +87,12 @@ def project_level(system: System, ws: Workspace, y, level):
 def settle(system: System, t, y, ws: Workspace, dy, run: Run):
     """Derivative at y, projecting y first where needed. Returns False when the rows cannot be met."""
     derivative(system, t, y, ws, dy)
-    run.count[EVALUATIONS] += 1
+    run.count[ki.EVALUATIONS] += 1
     for _ in range(PROJECTION_LIMIT):
         if not off_surface(ws):
             return True
         project(system, ws, y)
         derivative(system, t, y, ws, dy)
-        run.count[EVALUATIONS] += 1
-        run.count[PROJECTIONS] += 1
+        run.count[ki.EVALUATIONS] += 1
+        run.count[ki.PROJECTIONS] += 1
     return not off_surface(ws)

@@ -18,27 +18,14 @@ from __future__ import annotations
 
 import math
 
+from dynsim.kernels import state as kst
 from dynsim.kernels.arrays import Workspace
 from dynsim.kernels.drive.law import drive_block
+from dynsim.kernels.integrate import newton as kn
+from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.ends import evaluate_end
-from dynsim.kernels.integrate.newton import (
-    CLOSE,
-    CONTRACTION,
-    DIVERGED,
-    EXTRAPOLATES,
-    FACTORED,
-    FACTORS,
-    ITERATIONS,
-    JACOBIANS,
-    KEPT,
-    LEVER,
-    MADE_AT,
-    SEEN,
-    STALE,
-    TRIED,
-)
 from dynsim.kernels.integrate.reduced import factor_both, solve_both
-from dynsim.kernels.integrate.run import ATOL, EVALUATIONS, RTOL, STEP, STEPS, TIME, Run
+from dynsim.kernels.integrate.run import Run
 from dynsim.kernels.integrate.stages import columns, evaluate_stages
 from dynsim.kernels.integrate.steps import error_norm
 from dynsim.kernels.integrate.tableaux import (
@@ -52,7 +39,6 @@ from dynsim.kernels.integrate.tableaux import (
     T_RADAU,
 )
 from dynsim.kernels.jit import apart_kernel, internal_kernel
-from dynsim.kernels.state import ELECTRICAL, JOULE
 from dynsim.kernels.system import System, derivative
 
 # Newton's method: most iterations, and the contraction below which the Jacobian stays.
@@ -70,26 +56,26 @@ def differentiate(system: System, ws: Workspace, run: Run):
 
     The stiff electrical rows are not taken from here but are the drives' own; v̇ is linear in the currents.
     """
-    t, y, x, base, r = run.clock[TIME], run.y, run.stage[6], run.stage[7], run.newton
+    t, y, x, base, r = run.clock[ki.TIME], run.y, run.stage[6], run.stage[7], run.newton
     # The workspace may still hold a sample or a rejected step.
     derivative(system, t, y, ws, base)
     for a in range(ws.motors.shape[0]):
         drive_block(system.drives, ws, a, r.linear[a])
     columns(r.lanes, system, ws, t, y, x, base, r)
-    run.count[EVALUATIONS] += r.along.shape[0] + 1
-    r.count[JACOBIANS] += 1
-    r.count[STALE], r.count[MADE_AT], r.clock[FACTORED] = 0, run.count[STEPS], 0.0
+    run.count[ki.EVALUATIONS] += r.along.shape[0] + 1
+    r.count[kn.JACOBIANS] += 1
+    r.count[kn.STALE], r.count[kn.MADE_AT], r.clock[kn.FACTORED] = 0, run.count[ki.STEPS], 0.0
     # Nothing is known of how Newton's method contracts with it.
-    r.clock[CONTRACTION] = 0.0
+    r.clock[kn.CONTRACTION] = 0.0
 
 
 @internal_kernel
 def keep_stages(run: Run):
     """The stages of the step accepted last, as a polynomial for the first guess of the next ones, and its error."""
     r, c0, c1 = run.newton, NODE_RADAU[0], NODE_RADAU[1]
-    if r.count[SEEN] == run.count[STEPS]:
+    if r.count[kn.SEEN] == run.count[ki.STEPS]:
         return
-    r.count[SEEN], r.count[EXTRAPOLATES], r.clock[KEPT] = run.count[STEPS], 1, r.clock[TRIED]
+    r.count[kn.SEEN], r.count[kn.EXTRAPOLATES], r.clock[kn.KEPT] = run.count[ki.STEPS], 1, r.clock[kn.TRIED]
     for j in range(r.kept.shape[1]):
         z0, z1, z2 = r.z[0, j], r.z[1, j], r.z[2, j]
         slope, middle = (z1 - z2) / (c1 - 1.0), (z0 - z1) / (c0 - c1)
@@ -113,7 +99,7 @@ def guess_stages(run: Run, h):
     estimate of the last step was −D/(10 γ): so its stages lead to the next ones but for h⁵.
     """
     r, c0, c1 = run.newton, NODE_RADAU[0], NODE_RADAU[1]
-    ahead = h / r.clock[KEPT] if r.count[EXTRAPOLATES] == 1 else 0.0
+    ahead = h / r.clock[kn.KEPT] if r.count[kn.EXTRAPOLATES] == 1 else 0.0
     for s in range(3):
         x = NODE_RADAU[s] * ahead
         more = -10.0 * GAMMA_RADAU * (missed(1.0 + x) - ahead**4 * missed(NODE_RADAU[s]))
@@ -132,15 +118,15 @@ def guess_stages(run: Run, h):
 @apart_kernel
 def solve_stages(system: System, ws: Workspace, run: Run, h):
     """Newton's method for the stages of a step of length h; True when it has converged."""
-    t, y, x, r = run.clock[TIME], run.y, run.y_new, run.newton
+    t, y, x, r = run.clock[ki.TIME], run.y, run.y_new, run.newton
     tracked, before, contraction = r.kept.shape[1], 0.0, 0.0
     g, c = GAMMA_RADAU / h, complex(ALPHA_RADAU / h, BETA_RADAU / h)
     guess_stages(run, h)
-    lever, least = max(r.clock[LEVER], 1e-16) ** 0.8, 1 - r.count[EXTRAPOLATES]
+    lever, least = max(r.clock[kn.LEVER], 1e-16) ** 0.8, 1 - r.count[kn.EXTRAPOLATES]
     for k in range(MOST_ITERATIONS):
         evaluate_stages(r.lanes, system, ws, t, h, y, x, r)
-        run.count[EVALUATIONS] += 3
-        r.count[ITERATIONS] += 1
+        run.count[ki.EVALUATIONS] += 3
+        r.count[kn.ITERATIONS] += 1
         for j in range(tracked):
             f0, f1, f2 = r.f[0, j], r.f[1, j], r.f[2, j]
             r.one[j] = T_INVERSE_RADAU[0, 0] * f0 + T_INVERSE_RADAU[0, 1] * f1 + T_INVERSE_RADAU[0, 2] * f2
@@ -163,9 +149,9 @@ def solve_stages(system: System, ws: Workspace, run: Run, h):
             if contraction >= 0.99:
                 return False
             lever = contraction / (1.0 - contraction)
-            if lever * change * contraction ** (MOST_ITERATIONS - 2 - k) >= r.clock[CLOSE]:
+            if lever * change * contraction ** (MOST_ITERATIONS - 2 - k) >= r.clock[kn.CLOSE]:
                 return False
-            r.clock[CONTRACTION] = contraction
+            r.clock[kn.CONTRACTION] = contraction
         before = max(change, 1e-16)
         for j in range(tracked):
             r.w[0, j] += r.one[j]
@@ -174,8 +160,8 @@ def solve_stages(system: System, ws: Workspace, run: Run, h):
             for s in range(3):
                 r.z[s, j] = T_RADAU[s, 0] * r.w[0, j] + T_RADAU[s, 1] * r.w[1, j] + T_RADAU[s, 2] * r.w[2, j]
         # The ledger adds up the derivatives of the last iterate but one: where nothing was known before, one more.
-        if lever * change <= r.clock[CLOSE] and k >= least:
-            r.clock[LEVER] = lever
+        if lever * change <= r.clock[kn.CLOSE] and k >= least:
+            r.clock[kn.LEVER] = lever
             return True
     return False
 
@@ -206,7 +192,7 @@ def estimate(system: System, ws: Workspace, run: Run, h, slope):
         error[j] = r.one[j] if j < r.one.shape[0] else 0.0
     for j in range(r.one.shape[0]):
         r.error[j] = r.one[j]
-    return error_norm(system, ws, run, error, slack(system, h, run.clock[RTOL]))
+    return error_norm(system, ws, run, error, slack(system, h, run.clock[ki.RTOL]))
 
 
 @internal_kernel
@@ -218,11 +204,11 @@ def energy_error(system: System, run: Run, h):
     """
     r, largest = run.newton, 0.0
     for e in range(2):
-        j = system.layout.ledger + (ELECTRICAL if e == 0 else JOULE)
+        j = system.layout.ledger + (kst.ELECTRICAL if e == 0 else kst.JOULE)
         error = h * run.stage[0, j]
         for s in range(3):
             error += ERROR_RADAU[s] * r.z[s, j]
-        allowed = run.clock[ATOL] + run.clock[RTOL] * (abs(run.y_new[j]) + abs(r.z[2, j]))
+        allowed = run.clock[ki.ATOL] + run.clock[ki.RTOL] * (abs(run.y_new[j]) + abs(r.z[2, j]))
         largest = max(largest, abs(error) / (GAMMA_RADAU * allowed))
     return largest
 
@@ -230,30 +216,30 @@ def energy_error(system: System, run: Run, h):
 @apart_kernel
 def step_radau5(system: System, ws: Workspace, run: Run):
     """One RADAU5 step; returns the error norm. stage[6] is the derivative at y_new."""
-    t, h, y, y_new, r = run.clock[TIME], run.clock[STEP], run.y, run.y_new, run.newton
+    t, h, y, y_new, r = run.clock[ki.TIME], run.clock[ki.STEP], run.y, run.y_new, run.newton
     tracked = r.kept.shape[1]
     keep_stages(run)
     for j in range(tracked):
-        r.weight[j] = 1.0 / (run.clock[ATOL] + run.clock[RTOL] * abs(y[j]))
+        r.weight[j] = 1.0 / (run.clock[ki.ATOL] + run.clock[ki.RTOL] * abs(y[j]))
     solved = False
     while not solved:
-        if r.count[STALE] == 1:
+        if r.count[kn.STALE] == 1:
             differentiate(system, ws, run)
-        if r.clock[FACTORED] != h:
+        if r.clock[kn.FACTORED] != h:
             factor_both(system, r, h)
-            r.clock[FACTORED] = h
-            r.count[FACTORS] += 1
+            r.clock[kn.FACTORED] = h
+            r.count[kn.FACTORS] += 1
         if solve_stages(system, ws, run, h):
             solved = True
-        elif r.count[MADE_AT] == run.count[STEPS]:
-            r.count[DIVERGED] += 1
-            r.clock[LEVER] = 1.0
+        elif r.count[kn.MADE_AT] == run.count[ki.STEPS]:
+            r.count[kn.DIVERGED] += 1
+            r.clock[kn.LEVER] = 1.0
             for j in range(y.shape[0]):
                 y_new[j], run.stage[6, j] = y[j], run.stage[0, j]
             return NO_STAGES
         else:
-            r.count[STALE] = 1
-    r.clock[TRIED] = h
+            r.count[kn.STALE] = 1
+    r.clock[kn.TRIED] = h
     for j in range(y.shape[0]):
         if j >= tracked:
             for s in range(3):
@@ -264,7 +250,7 @@ def step_radau5(system: System, ws: Workspace, run: Run):
         for j in range(y.shape[0]):
             run.stage[6, j] = y[j] + run.stage[7, j]
         derivative(system, t, run.stage[6], ws, r.f[0])
-        run.count[EVALUATIONS] += 1
+        run.count[ki.EVALUATIONS] += 1
         error = estimate(system, ws, run, h, r.f[0])
     evaluate_end(r, system, ws, run)
     return max(error, energy_error(system, run, h))
@@ -274,7 +260,7 @@ def step_radau5(system: System, ws: Workspace, run: Run):
 def after_step(run: Run, h):
     """Whether the Jacobian stays, and the factors, after a step of length h was accepted."""
     r, clock = run.newton, run.clock
-    if r.clock[CONTRACTION] > GOOD_CONTRACTION:
-        r.count[STALE] = 1
-    elif h <= clock[STEP] <= 1.2 * h:
-        clock[STEP] = h
+    if r.clock[kn.CONTRACTION] > GOOD_CONTRACTION:
+        r.count[kn.STALE] = 1
+    elif h <= clock[ki.STEP] <= 1.2 * h:
+        clock[ki.STEP] = h

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from dynsim.kernels.arrays import CIRCUIT, DRIVEN, RATE_I, RATE_Q, RATE_V, Workspace
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import Workspace
 from dynsim.kernels.compiler import form_of
 from dynsim.kernels.integrate.newton import NewtonArrays
 from dynsim.kernels.integrate.tableaux import ALPHA_RADAU, BETA_RADAU, GAMMA_RADAU
@@ -45,9 +46,9 @@ def factor_newton(system: System, r: NewtonArrays, g, matrix, pivot):
             matrix[i, j] = -along[n + j, i] - along[j, i] / g
         matrix[i, i] += g
     for a in range(table.shape[0]):
-        j, k = table[a, DRIVEN], table[a, CIRCUIT]
+        j, k = table[a, ka.DRIVEN], table[a, ka.CIRCUIT]
         if k >= 0:
-            slope = (block[a, RATE_Q] / g + block[a, RATE_V]) / (g - block[a, RATE_I])
+            slope = (block[a, ka.RATE_Q] / g + block[a, ka.RATE_V]) / (g - block[a, ka.RATE_I])
             for i in range(n):
                 matrix[i, j] -= along[first + k, i] * slope
     for k in range(n):
@@ -81,9 +82,9 @@ def solve_newton(system: System, ws: Workspace, y, r: NewtonArrays, g, matrix, p
         for i in range(n):
             u[i] += along[j, i] * angle[j]
     for a in range(table.shape[0]):
-        j, k = table[a, DRIVEN], table[a, CIRCUIT]
+        j, k = table[a, ka.DRIVEN], table[a, ka.CIRCUIT]
         if k >= 0:
-            free = (x[current + k] + block[a, RATE_Q] * angle[j]) / (g - block[a, RATE_I])
+            free = (x[current + k] + block[a, ka.RATE_Q] * angle[j]) / (g - block[a, ka.RATE_I])
             for i in range(n):
                 u[i] += along[first + k, i] * free
     for i in range(n):
@@ -97,10 +98,10 @@ def solve_newton(system: System, ws: Workspace, y, r: NewtonArrays, g, matrix, p
             u[i] -= matrix[i, j] * u[j]
         u[i] /= matrix[i, i]
     for a in range(table.shape[0]):
-        j, k = table[a, DRIVEN], table[a, CIRCUIT]
+        j, k = table[a, ka.DRIVEN], table[a, ka.CIRCUIT]
         if k >= 0:
-            pull = block[a, RATE_Q] * (angle[j] + u[j] / g) + block[a, RATE_V] * u[j]
-            x[current + k] = (x[current + k] + pull) / (g - block[a, RATE_I])
+            pull = block[a, ka.RATE_Q] * (angle[j] + u[j] / g) + block[a, ka.RATE_V] * u[j]
+            x[current + k] = (x[current + k] + pull) / (g - block[a, ka.RATE_I])
     for i in range(n):
         x[v + i] = u[i]
         if layout.extra == 0:
@@ -139,12 +140,12 @@ def invert_on_lanes(system, r, h):
         p[i, i] += gp
         m[i, i] += gm
     for a in range(table.shape[0]):
-        j, k = table[a, DRIVEN], table[a, CIRCUIT]
+        j, k = table[a, ka.DRIVEN], table[a, ka.CIRCUIT]
         if k >= 0:
-            rate = block[a, RATE_I]
+            rate = block[a, ka.RATE_I]
             cp, cm = pair(1.0 / (real - rate), 1.0 / (z - rate))
             circuit[a, 0], circuit[a, 1] = cp, cm
-            sp, sm = block[a, RATE_Q] * op + block[a, RATE_V], block[a, RATE_Q] * om
+            sp, sm = block[a, ka.RATE_Q] * op + block[a, ka.RATE_V], block[a, ka.RATE_Q] * om
             sp, sm = sp * cp - sm * cm, sp * cm + sm * cp
             for i in range(n):
                 p[i, j] -= along[first + k, i] * sp
@@ -202,9 +203,9 @@ def multiply_on_lanes(system, ws, y, r, h):
         for i in range(n):
             u[i] += along[j, i] * e
     for a in range(table.shape[0]):
-        j, k = table[a, DRIVEN], table[a, CIRCUIT]
+        j, k = table[a, ka.DRIVEN], table[a, ka.CIRCUIT]
         if k >= 0:
-            free = x[current + k] + block[a, RATE_Q] * angle[j]
+            free = x[current + k] + block[a, ka.RATE_Q] * angle[j]
             free = free * circuit[a, 0] + turned(free) * circuit[a, 1]
             for i in range(n):
                 u[i] += along[first + k, i] * free
@@ -217,11 +218,11 @@ def multiply_on_lanes(system, ws, y, r, h):
             other += m[i, j] * across[j]
         x[v + i] = total + other
     for a in range(table.shape[0]):
-        j, k = table[a, DRIVEN], table[a, CIRCUIT]
+        j, k = table[a, ka.DRIVEN], table[a, ka.CIRCUIT]
         if k >= 0:
             rate = x[v + j]
             moved = angle[j] + rate * op + turned(rate) * om
-            free = x[current + k] + block[a, RATE_Q] * moved + block[a, RATE_V] * rate
+            free = x[current + k] + block[a, ka.RATE_Q] * moved + block[a, ka.RATE_V] * rate
             x[current + k] = free * circuit[a, 0] + turned(free) * circuit[a, 1]
     if layout.extra == 0:
         for i in range(n):

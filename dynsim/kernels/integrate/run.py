@@ -6,12 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dynsim.kernels import state as kst
 from dynsim.kernels.arrays import row_limit, workspace
-from dynsim.kernels.constraint.uniqueness import ROOM
+from dynsim.kernels.constraint import uniqueness as kq
 from dynsim.kernels.integrate.newton import NewtonArrays, newton_arrays, stage_lanes
 from dynsim.kernels.integrate.time_stepping import SteppingArrays
 from dynsim.kernels.jit import integers, reals
-from dynsim.kernels.state import OUTPUTS_PER_CONTACT, OutputLayout, StateLayout, block
+from dynsim.kernels.state import OutputLayout, StateLayout, block
 from dynsim.kernels.tree.support import SupportArrays
 
 DOPRI5, RK4, RADAU5, RK43, TIME_STEPPING = 0, 1, 2, 3, 4
@@ -113,7 +114,7 @@ class Run(NamedTuple):
         """Columns of the samples' outputs by their name; those of contacts are (T, c, OUTPUTS_PER_CONTACT)."""
         found = self.output[: self.count[SAMPLE], block(self.columns, name)]
         if name == "contact":
-            return found.reshape(len(found), found.shape[1] // OUTPUTS_PER_CONTACT, OUTPUTS_PER_CONTACT)
+            return found.reshape(len(found), found.shape[1] // kst.OUTPUTS_PER_CONTACT, kst.OUTPUTS_PER_CONTACT)
         return found
 
 
@@ -178,7 +179,7 @@ def new_run(
         clock=clock,
         count=count,
         extremes=extremes,
-        room=np.zeros((ROOM, p, p)),
+        room=np.zeros((kq.ROOM, p, p)),
         hand_link=hand[0],
         hand_point=reals(hand[1]),
         sample_time=reals(sample_time),

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import FIRST_ROW, FORCE, MODE, SLIDING, Workspace
-from dynsim.kernels.constraint.unilateral import FROZEN, LONGEST, MOBILITY, SLOW, STATIC, UnilateralArrays
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import Workspace
+from dynsim.kernels.constraint import unilateral as ku
+from dynsim.kernels.constraint.unilateral import UnilateralArrays
 from dynsim.kernels.jit import internal_kernel
 
 # Of a step: h μ f_n/(m v). RK4 is stable up to 2.8.
@@ -20,8 +22,8 @@ MOST_TURN = 2.0
 def note_turning(unilateral: UnilateralArrays, ws: Workspace, k, speed):
     """At the end of an accepted step: the longest one that follows candidate k, which slips with ``speed`` [m/s]."""
     slide = unilateral.slide
-    turn = unilateral.law[k, STATIC] * abs(ws.rows[ws.active[k, FIRST_ROW], FORCE]) * slide[k, MOBILITY]
-    slide[k, LONGEST] = MOST_TURN * max(speed, unilateral.number[SLOW]) / turn if turn > 0.0 else math.inf
+    turn = unilateral.law[k, ku.STATIC] * abs(ws.rows[ws.active[k, ka.FIRST_ROW], ka.FORCE]) * slide[k, ku.MOBILITY]
+    slide[k, ku.LONGEST] = MOST_TURN * max(speed, unilateral.number[ku.SLOW]) / turn if turn > 0.0 else math.inf
 
 
 @internal_kernel
@@ -31,6 +33,6 @@ def longest_step(unilateral: UnilateralArrays | None, ws: Workspace):
     if unilateral is None:  # known to the compiler
         return longest
     for k in range(ws.active.shape[0]):
-        if ws.active[k, MODE] == SLIDING and unilateral.slide[k, FROZEN] == 0.0:
-            longest = min(longest, unilateral.slide[k, LONGEST])
+        if ws.active[k, ka.MODE] == ka.SLIDING and unilateral.slide[k, ku.FROZEN] == 0.0:
+            longest = min(longest, unilateral.slide[k, ku.LONGEST])
     return longest

@@ -9,9 +9,11 @@ from typing import Any
 
 from numba.core import types
 
-from dynsim.kernels.arrays import QDD, Workspace
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import Workspace
 from dynsim.kernels.compiler import form_of
-from dynsim.kernels.integrate.newton import COLUMNS, NewtonArrays, StageLanes
+from dynsim.kernels.integrate import newton as kn
+from dynsim.kernels.integrate.newton import NewtonArrays, StageLanes
 from dynsim.kernels.integrate.tableaux import NODE_RADAU
 from dynsim.kernels.jit import internal_kernel, separate_kernel
 from dynsim.kernels.lanes.system import FOUR, derivative_lanes
@@ -28,7 +30,7 @@ def displaced(system: System, ws: Workspace, y, s, x):
         x[j] = y[j]
     if s < n and layout.extra > 0:
         for i in range(n):
-            ws.joints[i, QDD] = 1e-7 if i == s else 0.0
+            ws.joints[i, ka.QDD] = 1e-7 if i == s else 0.0
         displace(system.model.compound, system.model, ws, x, layout.q)
         return 1e-7
     j = layout.q + s if s < n else layout.v + s - n if s < 2 * n else layout.current + s - 2 * n
@@ -44,7 +46,7 @@ def columns(lanes: StageLanes | None, system: System, ws: Workspace, t, y, x, ba
     for s in range(r.along.shape[0]):
         delta = displaced(system, ws, y, s, x)
         derivative(system, t, x, ws, r.f[0])
-        r.count[COLUMNS] += 1
+        r.count[kn.COLUMNS] += 1
         for i in range(r.along.shape[1]):
             r.along[s, i] = (r.f[0, v + i] - base[v + i]) / delta
 
@@ -84,7 +86,7 @@ def columns_on_lanes(lanes, system, ws, t, y, x, base, r):
             lanes.t[k] = t
             lanes.delta[k] = displaced(system, ws, y, min(first + k, last), lanes.y[:, k])
         evaluate_four(lanes, system)
-        r.count[COLUMNS] += 4
+        r.count[kn.COLUMNS] += 4
         for k in range(4):
             s = min(first + k, last)
             for i in range(r.along.shape[1]):

@@ -20,9 +20,10 @@ import math
 
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.arrays import Workspace
+from dynsim.kernels.constraint import cone as kc
+from dynsim.kernels.constraint import distance as kd
 from dynsim.kernels.constraint import unilateral as ku
-from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, ONE_WAY, TANGENT, approach
-from dynsim.kernels.constraint.distance import MOVES, RADIUS
+from dynsim.kernels.constraint.cone import approach
 from dynsim.kernels.constraint.least_norm import select_least_norm
 from dynsim.kernels.constraint.rows import point_row, set_modes
 from dynsim.kernels.constraint.unilateral import UnilateralArrays, sliding_friction, stop_gap
@@ -143,7 +144,7 @@ def place_goes_on(shapes, s: SteppingArrays, last, state, link, k, h):
     """True unless the place of candidate k has jumped, as that of a capsule may from one of its ends to the other."""
     if shapes is None:  # known to the compiler
         return True
-    if shapes.kind[k, MOVES] == 0:
+    if shapes.kind[k, kd.MOVES] == 0:
         return True
     x, y, z = centre(shapes, state, k)
     way = (x - last[kt.CENTRE]) ** 2 + (y - last[kt.CENTRE + 1]) ** 2 + (z - last[kt.CENTRE + 2]) ** 2
@@ -158,7 +159,7 @@ def centre(shapes, state, k):
     """Centre of the sphere with which candidate k touches [m]."""
     radius = 0.0
     if shapes is not None:
-        radius = shapes.data[k, RADIUS]
+        radius = shapes.data[k, kd.RADIUS]
     return (
         state[ka.POSITION] + radius * state[ka.NORMAL],
         state[ka.POSITION + 1] + radius * state[ka.NORMAL + 1],
@@ -187,7 +188,7 @@ def tangent_rows(system, s: SteppingArrays, ws: Workspace):
     state, rows, active = ws.contacts, ws.rows, ws.active
     for r in range(ws.counts[ka.COUPLED]):
         # Behind the couplings come joint stops.
-        s.kind[r] = BOTH_WAYS if r < system.couplings.joint.shape[0] else ONE_WAY
+        s.kind[r] = kc.BOTH_WAYS if r < system.couplings.joint.shape[0] else kc.ONE_WAY
         s.mu[r], rows[r, ka.TARGET] = 0.0, 0.0
     for k in range(state.shape[0]):
         if active[k, ka.MODE] != ka.STICKING:
@@ -202,7 +203,7 @@ def tangent_rows(system, s: SteppingArrays, ws: Workspace):
             rows[r, ka.TARGET] = 0.0
             for j in range(6):
                 rows[r, ka.DIRECTION + j] = rows[r, ka.ROW + j]
-            s.kind[r] = CONE if m == 0 else TANGENT
+            s.kind[r] = kc.CONE if m == 0 else kc.TANGENT
 
 
 @internal_kernel

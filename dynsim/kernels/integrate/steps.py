@@ -4,34 +4,11 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import CONTRADICTORY, Workspace
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import Workspace
+from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.events import next_tick
-from dynsim.kernels.integrate.run import (
-    ASKED,
-    ATOL,
-    COUNTED_SINCE,
-    END,
-    FINISHED,
-    FIXED_STEP,
-    LAST_ERROR,
-    LEAST_PROGRESS,
-    MOST_TRIALS,
-    NO_FORCES,
-    NO_PROGRESS,
-    NOT_FINITE,
-    REJECTED,
-    RK4,
-    RTOL,
-    RUNNING,
-    STATUS,
-    STEP,
-    STEP_MAX,
-    STEP_TOO_SMALL,
-    TIME,
-    TRIALS,
-    TRIMMED,
-    Run,
-)
+from dynsim.kernels.integrate.run import Run
 from dynsim.kernels.jit import internal_kernel, kernel, merged_kernel
 from dynsim.kernels.system import System
 from dynsim.kernels.tree.joints import position_error
@@ -43,7 +20,7 @@ def error_norm(system: System, ws: Workspace, run: Run, error, slack):
 
     The atol of rates and currents is ``slack`` times that of positions.
     """
-    y, y_new, atol, rtol, layout = run.y, run.y_new, run.clock[ATOL], run.clock[RTOL], system.layout
+    y, y_new, atol, rtol, layout = run.y, run.y_new, run.clock[ki.ATOL], run.clock[ki.RTOL], system.layout
     total, size = 0.0, layout.tracked
     beyond, loose = layout.q + ws.joints.shape[0] + layout.extra, slack * atol
     if layout.extra > 0:
@@ -70,10 +47,10 @@ def finite(values):
 @merged_kernel
 def finished(run: Run):
     """True when the run has ended, for whatever reason, or is asked to; sets STATUS at END."""
-    end = run.clock[END]
-    if run.count[STATUS] == RUNNING and end - run.clock[TIME] <= 1e-12 * max(1.0, end):
-        run.count[STATUS] = FINISHED
-    return run.count[STATUS] != RUNNING or run.count[ASKED] != 0
+    end = run.clock[ki.END]
+    if run.count[ki.STATUS] == ki.RUNNING and end - run.clock[ki.TIME] <= 1e-12 * max(1.0, end):
+        run.count[ki.STATUS] = ki.FINISHED
+    return run.count[ki.STATUS] != ki.RUNNING or run.count[ki.ASKED] != 0
 
 
 @internal_kernel
@@ -83,14 +60,14 @@ def stalled(run: Run):
     The bound of every loop of steps, trials, events and restarts, whatever keeps it going.
     """
     clock, count = run.clock, run.count
-    count[TRIALS] += 1
-    if count[TRIALS] < MOST_TRIALS:
+    count[ki.TRIALS] += 1
+    if count[ki.TRIALS] < ki.MOST_TRIALS:
         return False
-    stands = clock[TIME] - clock[COUNTED_SINCE] <= clock[LEAST_PROGRESS]
+    stands = clock[ki.TIME] - clock[ki.COUNTED_SINCE] <= clock[ki.LEAST_PROGRESS]
     if stands:
-        count[STATUS] = NO_PROGRESS
+        count[ki.STATUS] = ki.NO_PROGRESS
     else:
-        count[TRIALS], clock[COUNTED_SINCE] = 0, clock[TIME]
+        count[ki.TRIALS], clock[ki.COUNTED_SINCE] = 0, clock[ki.TIME]
     return stands
 
 
@@ -106,47 +83,48 @@ def first_step(system: System, ws: Workspace, run: Run):
         size, slope = error_norm(system, ws, run, y, 1.0) ** 2, error_norm(system, ws, run, k[0], 1.0) ** 2
     else:
         for j in range(system.layout.tracked):
-            scale = clock[ATOL] + clock[RTOL] * abs(y[j])
+            scale = clock[ki.ATOL] + clock[ki.RTOL] * abs(y[j])
             size += (y[j] / scale) ** 2
             slope += (k[0, j] / scale) ** 2
     guess = 0.01 * math.sqrt(size / slope) if size > 1e-10 and slope > 1e-10 else 1e-6
-    clock[STEP] = min(guess, clock[STEP_MAX], clock[END] - clock[TIME])
+    clock[ki.STEP] = min(guess, clock[ki.STEP_MAX], clock[ki.END] - clock[ki.TIME])
 
 
 @internal_kernel
 def choose_step(run: Run):
     """Trim STEP so that END, or a tick, is met exactly: halve the way rather than leave a sliver for the last step."""
     clock = run.clock
-    until = next_tick(run, clock[END])
-    remaining = until - clock[TIME]
-    run.count[TRIMMED] = 1 if until < clock[END] and remaining < 2.0 * clock[STEP] else 0
-    if run.method in FIXED_STEP:
-        if remaining < clock[STEP] * (1.0 + 1e-9):
-            clock[STEP] = remaining
-    elif remaining <= clock[STEP] * 1.0000001:
-        clock[STEP] = remaining
-    elif remaining < 2.0 * clock[STEP]:
-        clock[STEP] = 0.5 * remaining
+    until = next_tick(run, clock[ki.END])
+    remaining = until - clock[ki.TIME]
+    run.count[ki.TRIMMED] = 1 if until < clock[ki.END] and remaining < 2.0 * clock[ki.STEP] else 0
+    if run.method in ki.FIXED_STEP:
+        # A remainder of a millionth of a step would turn the velocity change of an impact into an acceleration.
+        if remaining < clock[ki.STEP] * (1.0 + 1e-6):
+            clock[ki.STEP] = remaining
+    elif remaining <= clock[ki.STEP] * 1.0000001:
+        clock[ki.STEP] = remaining
+    elif remaining < 2.0 * clock[ki.STEP]:
+        clock[ki.STEP] = 0.5 * remaining
 
 
 @internal_kernel
 def rejected(ws: Workspace, run: Run, error, order):
     """True when a step of this error norm must be repeated: shrinks STEP, or sets STATUS when that is hopeless."""
-    clock, count, h = run.clock, run.count, run.clock[STEP]
-    if count[STATUS] != RUNNING:
+    clock, count, h = run.clock, run.count, run.clock[ki.STEP]
+    if count[ki.STATUS] != ki.RUNNING:
         return True
-    broken = NO_FORCES if ws.counts[CONTRADICTORY] > 0 else NOT_FINITE
+    broken = ki.NO_FORCES if ws.counts[ka.CONTRADICTORY] > 0 else ki.NOT_FINITE
     if not (finite(run.y_new) and finite(run.stage[6])) or error != error:
-        if run.method == RK4:
-            count[STATUS] = broken
+        if run.method == ki.RK4:
+            count[ki.STATUS] = broken
             return True
         error = 1e10
     if error <= 1.0:
         return False
-    count[REJECTED] += 1
-    clock[STEP] = h * max(0.1, 0.9 * error ** (-1.0 / order))
-    if clock[STEP] < 1e-13 * max(1.0, clock[TIME]):
-        count[STATUS] = broken if error >= 1e10 else STEP_TOO_SMALL
+    count[ki.REJECTED] += 1
+    clock[ki.STEP] = h * max(0.1, 0.9 * error ** (-1.0 / order))
+    if clock[ki.STEP] < 1e-13 * max(1.0, clock[ki.TIME]):
+        count[ki.STATUS] = broken if error >= 1e10 else ki.STEP_TOO_SMALL
     return True
 
 
@@ -155,6 +133,6 @@ def next_step(run: Run, error, order, beta):
     """Proportional–integral step control (Hairer, Nørsett, Wanner II.4)."""
     clock = run.clock
     error = max(error, 1e-10)
-    change = 0.9 * error ** (0.75 * beta - 1.0 / order) * clock[LAST_ERROR] ** beta
-    clock[LAST_ERROR] = max(error, 1e-4)
-    clock[STEP] = min(clock[STEP] * min(max(change, 0.2), 5.0), clock[STEP_MAX])
+    change = 0.9 * error ** (0.75 * beta - 1.0 / order) * clock[ki.LAST_ERROR] ** beta
+    clock[ki.LAST_ERROR] = max(error, 1e-4)
+    clock[ki.STEP] = min(clock[ki.STEP] * min(max(change, 0.2), 5.0), clock[ki.STEP_MAX])

@@ -25,8 +25,8 @@ import numpy as np
 
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.arrays import ContactArrays, ModelArrays, Workspace, row_limit
+from dynsim.kernels.constraint import cone as kc
 from dynsim.kernels.constraint import unilateral as ku
-from dynsim.kernels.constraint.cone import CONE_ROOM
 from dynsim.kernels.constraint.shapes import shaped_rows
 from dynsim.kernels.constraint.surface import contact_rows
 from dynsim.kernels.constraint.unilateral import UnilateralArrays
@@ -147,7 +147,7 @@ def stepping_arrays(
         told=integers(np.full(c, -1)),
         memory=np.zeros((2, c, MEMORY_SIZE)),
         turn=np.zeros((c, TURN_SIZE)),
-        room=np.zeros((CONE_ROOM, p, p)),
+        room=np.zeros((kc.CONE_ROOM, p, p)),
         found=np.zeros(FOUND_SIZE),
         grid=np.zeros(GRID_SIZE),
     )

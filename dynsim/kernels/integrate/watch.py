@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-from dynsim.kernels.arrays import GAP, MODE, NORMAL_FORCE, OPEN, Workspace
-from dynsim.kernels.constraint.uniqueness import REVERSED, UNIQUE, force_verdict
-from dynsim.kernels.integrate.run import (
-    DRIFT_MAX,
-    FORCE_MAX,
-    FORCE_MIN,
-    FORCES_REVERSED,
-    LAST_FORCE,
-    LOCAL_SINCE,
-    NOT_UNIQUE,
-    PULLING,
-    SEVERAL_FORCES,
-    STATUS,
-    Run,
-)
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import Workspace
+from dynsim.kernels.constraint import uniqueness as kq
+from dynsim.kernels.constraint.uniqueness import force_verdict
+from dynsim.kernels.integrate import run as ki
+from dynsim.kernels.integrate.run import Run
 from dynsim.kernels.jit import internal_kernel
 from dynsim.kernels.system import System
 
@@ -26,23 +17,23 @@ def watch(ws: Workspace, run: Run, h):
     """Extremes of normal forces and gaps at accepted steps; time of pulling, the force linear within the last step."""
     state, extremes = ws.contacts, run.extremes
     for k in range(state.shape[0]):
-        low = min(extremes[k, LAST_FORCE], state[k, NORMAL_FORCE])
-        high = max(extremes[k, LAST_FORCE], state[k, NORMAL_FORCE])
+        low = min(extremes[k, ki.LAST_FORCE], state[k, ka.NORMAL_FORCE])
+        high = max(extremes[k, ki.LAST_FORCE], state[k, ka.NORMAL_FORCE])
         if low < 0.0 and h > 0.0:
-            extremes[k, PULLING] += h if high <= 0.0 else h * low / (low - high)
-        extremes[k, LAST_FORCE] = state[k, NORMAL_FORCE]
-        extremes[k, FORCE_MIN] = min(extremes[k, FORCE_MIN], state[k, NORMAL_FORCE])
-        extremes[k, FORCE_MAX] = max(extremes[k, FORCE_MAX], state[k, NORMAL_FORCE])
-        if ws.active[k, MODE] != OPEN:
-            extremes[k, DRIFT_MAX] = max(extremes[k, DRIFT_MAX], abs(state[k, GAP]))
+            extremes[k, ki.PULLING] += h if high <= 0.0 else h * low / (low - high)
+        extremes[k, ki.LAST_FORCE] = state[k, ka.NORMAL_FORCE]
+        extremes[k, ki.FORCE_MIN] = min(extremes[k, ki.FORCE_MIN], state[k, ka.NORMAL_FORCE])
+        extremes[k, ki.FORCE_MAX] = max(extremes[k, ki.FORCE_MAX], state[k, ka.NORMAL_FORCE])
+        if ws.active[k, ka.MODE] != ka.OPEN:
+            extremes[k, ki.DRIFT_MAX] = max(extremes[k, ki.DRIFT_MAX], abs(state[k, ka.GAP]))
 
 
 @internal_kernel
 def forces_unique(system: System, ws: Workspace, run: Run, t):
     """True when the contacts determine their forces at time t, right after ``derivative``; else sets STATUS."""
-    verdict = force_verdict(ws, run.room, run.extremes[:, LOCAL_SINCE], t)
-    if verdict == UNIQUE:
+    verdict = force_verdict(ws, run.room, run.extremes[:, ki.LOCAL_SINCE], t)
+    if verdict == kq.UNIQUE:
         return True
-    run.count[STATUS] = FORCES_REVERSED if verdict == REVERSED else SEVERAL_FORCES
-    run.clock[NOT_UNIQUE] = t
+    run.count[ki.STATUS] = ki.FORCES_REVERSED if verdict == kq.REVERSED else ki.SEVERAL_FORCES
+    run.clock[ki.NOT_UNIQUE] = t
     return False

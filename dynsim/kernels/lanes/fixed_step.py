@@ -11,23 +11,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.arrays import ROWS, Workspace
-from dynsim.kernels.constraint.uniqueness import UNIQUE, clearly_unique, force_verdict
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import Workspace
+from dynsim.kernels.constraint import uniqueness as kq
+from dynsim.kernels.constraint.uniqueness import clearly_unique, force_verdict
+from dynsim.kernels.integrate import project as kp
+from dynsim.kernels.integrate import run as ki
 from dynsim.kernels.integrate.dense import fill_dense, interpolate
 from dynsim.kernels.integrate.output import fill_output
-from dynsim.kernels.integrate.project import PROJECTION_LIMIT, off_surface, project
-from dynsim.kernels.integrate.run import (
-    END,
-    LOCAL_SINCE,
-    NOT_FINITE,
-    SAMPLE,
-    STARTED,
-    STATUS,
-    STEP,
-    STEPS,
-    TIME,
-    Run,
-)
+from dynsim.kernels.integrate.project import off_surface, project
+from dynsim.kernels.integrate.run import Run
 from dynsim.kernels.integrate.steps import finished, finite
 from dynsim.kernels.integrate.watch import watch
 from dynsim.kernels.jit import internal_kernel, kernel
@@ -95,28 +88,28 @@ def advance_lanes(width, system: System, ws: Workspace, runs: LaneRuns, limit):
     """
     tables, room, lanes = tables_as_lanes(system, width), tables_as_lanes(ws, width), tables_as_lanes(runs, width)
     clock, count = runs.clock, runs.count
-    if count[STARTED] == 0:
-        count[STARTED] = 1
-        derivative_lanes(tables, clock[TIME], lanes.y, room, lanes.stage[0])
-        settle_lanes(tables, clock[TIME], lanes.y, room, lanes.stage[0], lanes)
-        see(room, lanes, lanes.stage[0], clock[TIME])
+    if count[ki.STARTED] == 0:
+        count[ki.STARTED] = 1
+        derivative_lanes(tables, clock[ki.TIME], lanes.y, room, lanes.stage[0])
+        settle_lanes(tables, clock[ki.TIME], lanes.y, room, lanes.stage[0], lanes)
+        see(room, lanes, lanes.stage[0], clock[ki.TIME])
         watch_lanes(room, lanes, 0.0)
     for _ in range(limit):
         if finished(runs):
             return
-        proposed = clock[STEP]
+        proposed = clock[ki.STEP]
         # As dynsim.kernels.integrate.steps.choose_step does it.
-        if clock[END] - clock[TIME] < proposed * (1.0 + 1e-9):
-            clock[STEP] = clock[END] - clock[TIME]
+        if clock[ki.END] - clock[ki.TIME] < proposed * (1.0 + 1e-9):
+            clock[ki.STEP] = clock[ki.END] - clock[ki.TIME]
         step_rk4(tables, room, lanes)
         accept_lanes(tables, room, lanes)
-        clock[STEP] = proposed
+        clock[ki.STEP] = proposed
 
 
 @internal_kernel
 def step_rk4(system: System, ws: Workspace, runs: LaneRuns):
     """y_new, and the derivative there in stage[6]; sums in the order of dynsim.kernels.integrate.explicit."""
-    t, h, y, y_new, k = runs.clock[TIME], runs.clock[STEP], runs.y, runs.y_new, runs.stage
+    t, h, y, y_new, k = runs.clock[ki.TIME], runs.clock[ki.STEP], runs.y, runs.y_new, runs.stage
     shift(y, 0.5 * h, k[0], y_new)
     derivative_lanes(system, t + 0.5 * h, y_new, ws, k[1])
     see(ws, runs, k[1], t + 0.5 * h)
@@ -144,7 +137,7 @@ def shift(y, h, k, out):
 def accept_lanes(system: System, ws: Workspace, runs: LaneRuns):
     """Project y_new, record, and make it the new y."""
     clock, count, y, y_new, k = runs.clock, runs.count, runs.y, runs.y_new, runs.stage
-    t = clock[TIME] + clock[STEP]
+    t = clock[ki.TIME] + clock[ki.STEP]
     nothing = 0.0 * y_new[0]
     for j in range(y.shape[0]):
         nothing += y_new[j] * 0.0 + k[6, j] * 0.0
@@ -154,26 +147,26 @@ def accept_lanes(system: System, ws: Workspace, runs: LaneRuns):
             runs.failed[n] = 1
         left += 1 - runs.failed[n]
     if left == 0:
-        count[STATUS] = NOT_FINITE
+        count[ki.STATUS] = ki.NOT_FINITE
         return
     settle_lanes(system, t, y_new, ws, k[6], runs)
     see(ws, runs, k[6], t)
-    watch_lanes(ws, runs, clock[STEP])
+    watch_lanes(ws, runs, clock[ki.STEP])
     normalise_lanes(system, y_new)
     sample_lanes(system, ws, runs)
     for j in range(y.shape[0]):
         y[j] = y_new[j]
         k[0, j] = k[6, j]
-    clock[TIME] = t
-    count[STEPS] += 1
+    clock[ki.TIME] = t
+    count[ki.STEPS] += 1
 
 
 @internal_kernel
 def settle_lanes(system: System, t, y, ws: Workspace, dy, runs: LaneRuns):
     """Project those lanes that have left their surfaces, after the derivative at y; that is made anew for all."""
-    if ws.counts[ROWS] == 0:
+    if ws.counts[ka.ROWS] == 0:
         return
-    for attempt in range(PROJECTION_LIMIT):
+    for attempt in range(kp.PROJECTION_LIMIT):
         moved = False
         for k in range(lane_count(y)):
             if runs.failed[k] == 0 and off_surface(lane(ws, k)):
@@ -195,8 +188,8 @@ def see(ws: Workspace, runs: LaneRuns, dy, t):
     if clearly_unique(ws):
         return
     for k in range(lane_count(dy)):
-        since = lane(runs, k).extremes[:, LOCAL_SINCE]
-        if runs.failed[k] == 0 and finite(lane(dy, k)) and force_verdict(lane(ws, k), runs.room, since, t) != UNIQUE:
+        since = lane(runs, k).extremes[:, ki.LOCAL_SINCE]
+        if runs.failed[k] == 0 and finite(lane(dy, k)) and force_verdict(lane(ws, k), runs.room, since, t) != kq.UNIQUE:
             runs.failed[k] = 1
 
 
@@ -219,9 +212,9 @@ def normalise_lanes(system: System, y):
 @internal_kernel
 def sample_lanes(system: System, ws: Workspace, runs: LaneRuns):
     """As dynsim.kernels.integrate.dense.sample_step."""
-    t, h, end = runs.clock[TIME], runs.clock[STEP], runs.clock[END]
+    t, h, end = runs.clock[ki.TIME], runs.clock[ki.STEP], runs.clock[ki.END]
     until = end if t + h >= end - 1e-12 * max(1.0, end) else t + h
-    last = runs.count[SAMPLE]
+    last = runs.count[ki.SAMPLE]
     if last >= runs.sample_time.shape[0] or runs.sample_time[last] > until:
         return
     fill_dense(runs)
@@ -233,4 +226,4 @@ def sample_lanes(system: System, ws: Workspace, runs: LaneRuns):
         settle_lanes(system, runs.sample_time[last], y, ws, runs.stage[7], runs)
         fill_output(system, ws, runs, runs.output[last])
         last += 1
-    runs.count[SAMPLE] = last
+    runs.count[ki.SAMPLE] = last

@@ -8,25 +8,15 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import (
-    FORCE,
-    FRICTION_DISSIPATIVE,
-    I_MAX,
-    K_M,
-    LAW,
-    MU,
-    OFF,
-    RESISTANCE,
-    RHS,
-    ROWS,
-    U_MAX,
-)
+from dynsim.kernels import arrays as ka
 from dynsim.kernels.compiler import form_of
+from dynsim.kernels.constraint import unilateral as ku
+from dynsim.kernels.constraint import uniqueness as kq
 from dynsim.kernels.constraint.delassus import solve_small
 from dynsim.kernels.constraint.splits import admissible_forces, look_at_forces
 from dynsim.kernels.constraint.surface import sign_changed, surface_distance
-from dynsim.kernels.constraint.unilateral import FROZEN, REDUNDANT, REFERENCE, slide_direction, sliding_friction
-from dynsim.kernels.constraint.uniqueness import CLEAR, clearly_unique
+from dynsim.kernels.constraint.unilateral import slide_direction, sliding_friction
+from dynsim.kernels.constraint.uniqueness import clearly_unique
 from dynsim.kernels.drive.law import evaluate_reference, fed_forward
 from dynsim.kernels.drive.limit import clipped
 from dynsim.kernels.drive.servo import servo_circuit
@@ -54,12 +44,12 @@ def clipped_lanes(x, limit):
 @form_of(servo_circuit, any_lanes)
 def servo_circuit_lanes(motor, a, mode, command, v):
     """Voltage and current; lanes at the limit of current have another voltage."""
-    if mode == OFF:
-        return motor[a, K_M] * v, 0.0 * v
-    u = clipped(command, motor[a, U_MAX])
-    wanted = (u - motor[a, K_M] * v) / motor[a, RESISTANCE]
-    i = clipped(wanted, motor[a, I_MAX])
-    return select(i != wanted, motor[a, RESISTANCE] * i + motor[a, K_M] * v, u), i
+    if mode == ka.OFF:
+        return motor[a, ka.K_M] * v, 0.0 * v
+    u = clipped(command, motor[a, ka.U_MAX])
+    wanted = (u - motor[a, ka.K_M] * v) / motor[a, ka.RESISTANCE]
+    i = clipped(wanted, motor[a, ka.I_MAX])
+    return select(i != wanted, motor[a, ka.RESISTANCE] * i + motor[a, ka.K_M] * v, u), i
 
 
 @form_of(surface_distance, any_lanes)
@@ -73,14 +63,14 @@ def surface_distance_lanes(value, slope, curvature):
 def solve_small_lanes(small, state, active, p):
     """The closed forms where they hold for all lanes; else the kernel's choice for each of them, added up."""
     if p == 1 and every(small[0, 0, 0] != 0.0):
-        state[0, FORCE] = state[0, RHS] / small[0, 0, 0]
+        state[0, ka.FORCE] = state[0, ka.RHS] / small[0, 0, 0]
         return 0
     if p == 2:
         a, b, c, d = small[0, 0, 0], small[0, 0, 1], small[0, 1, 0], small[0, 1, 1]
         determinant = a * d - b * c
         if every(abs(determinant) > 1e-3 * (abs(a * d) + abs(b * c))):
-            x, y = state[0, RHS] / determinant, state[1, RHS] / determinant
-            state[0, FORCE], state[1, FORCE] = d * x - b * y, a * y - c * x
+            x, y = state[0, ka.RHS] / determinant, state[1, ka.RHS] / determinant
+            state[0, ka.FORCE], state[1, ka.FORCE] = d * x - b * y, a * y - c * x
             return 0
     dependent = 0
     for k in range(lane_count(small)):
@@ -91,32 +81,32 @@ def solve_small_lanes(small, state, active, p):
 @form_of(clearly_unique, any_lanes)
 def all_clearly_unique(ws):
     """True when it is so of every lane."""
-    small, p = ws.small, ws.counts[ROWS]
+    small, p = ws.small, ws.counts[ka.ROWS]
     if p == 0 or p > 2:
         return p == 0
     for k in range(p):
-        if ws.active[k, LAW] == FRICTION_DISSIPATIVE or not every(small[0, k, k] > 0.0):
+        if ws.active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE or not every(small[0, k, k] > 0.0):
             return False
     if p == 1:
         return True
     straight, crossed = small[0, 0, 0] * small[0, 1, 1], small[0, 0, 1] * small[0, 1, 0]
-    return every(straight - crossed > CLEAR * (straight + abs(crossed)))
+    return every(straight - crossed > kq.CLEAR * (straight + abs(crossed)))
 
 
 @form_of(slide_direction, any_lanes)
 def slide_direction_lanes(unilateral, contacts, k, x, y, z):
     """Each lane's own direction; ``unilateral.slide`` keeps the speed of the last state that was evaluated alone."""
     slide, law = unilateral.slide, unilateral.law
-    a, b, c = slide[k, REFERENCE], slide[k, REFERENCE + 1], slide[k, REFERENCE + 2]
+    a, b, c = slide[k, ku.REFERENCE], slide[k, ku.REFERENCE + 1], slide[k, ku.REFERENCE + 2]
     along = x * a + y * b + z * c
     speed = along
-    if slide[k, FROZEN] == 0.0:
+    if slide[k, ku.FROZEN] == 0.0:
         size = math.sqrt(x * x + y * y + z * z)
         moves, on = size > 0.0, along >= 0.0
         scale = select(on, 1.0 / size, -1.0 / size)
         a, b, c = select(moves, x * scale, a), select(moves, y * scale, b), select(moves, z * scale, c)
         speed = select(moves, select(on, size, -size), along)
-    return a, b, c, sliding_friction(law, k, contacts.point[k, MU], speed)
+    return a, b, c, sliding_friction(law, k, contacts.point[k, ka.MU], speed)
 
 
 @form_of(admissible_forces, any_lanes)
@@ -124,7 +114,7 @@ def admissible_forces_lanes(unilateral, ws):
     """One by one, where there is something to look at."""
     if unilateral is None:  # known to the compiler
         return
-    if unilateral.number[REDUNDANT] == 1.0 or unilateral.stop.shape[0] > 0:
+    if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] > 0:
         for k in range(lane_count(ws)):
             look_at_forces(unilateral, lane(ws, k))
 
@@ -133,8 +123,8 @@ def admissible_forces_lanes(unilateral, ws):
 def sign_changed_lanes(ws, passes):
     """True when any lane's signs have changed. The others keep theirs: once they agree they go on agreeing."""
     one_way = False
-    for k in range(ws.counts[ROWS]):
-        if ws.active[k, LAW] == FRICTION_DISSIPATIVE:
+    for k in range(ws.counts[ka.ROWS]):
+        if ws.active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE:
             one_way = True
     changed = False
     if one_way:

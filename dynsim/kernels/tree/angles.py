@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from dynsim.kernels.arrays import Q
+from dynsim.kernels import arrays as ka
 from dynsim.kernels.jit import internal_kernel
 
 TWO_OVER_PI = 2.0 / math.pi
@@ -42,6 +42,6 @@ def sine_cosine_of(q):
 def sine_cosine(joints, trig):
     """Sine and cosine of every q, into trig: (3, ≥ n), in vectors of several q."""
     for i in range(joints.shape[0]):
-        trig[2, i] = joints[i, Q]
+        trig[2, i] = joints[i, ka.Q]
     for i in range(trig.shape[1]):
         trig[0, i], trig[1, i] = sine_cosine_of(trig[2, i])

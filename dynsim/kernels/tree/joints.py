@@ -27,33 +27,8 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.arrays import (
-    BALL_X,
-    BALL_Y,
-    BALL_Z,
-    BASE,
-    EXTRA,
-    KIND,
-    LEFT_WHEEL,
-    P_PJ,
-    PARAMETER,
-    PARENT,
-    POSITION_INDEX,
-    QD,
-    QDD,
-    R_PJ,
-    RIGHT_WHEEL,
-    ROLL,
-    TURN,
-    A,
-    ModelArrays,
-    P,
-    Q,
-    R,
-    S,
-    V,
-    Workspace,
-)
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import ModelArrays, Workspace
 from dynsim.kernels.jit import apart_kernel, internal_kernel, kernel
 from dynsim.kernels.tree.angles import sine_cosine_of
 
@@ -73,11 +48,11 @@ def row_motion(model: ModelArrays, ws: Workspace, i, b0, b1, b2, b3, b4, b5, b6,
     tuple
         Rotation (9) and origin (3) of the body, axis as a motion vector at the world origin (6).
     """
-    kind, joints, trig = model.tree[i, KIND], ws.joints, ws.trig
+    kind, joints, trig = model.tree[i, ka.KIND], ws.joints, ws.trig
     # Of a unit rate: the angular velocity s, and the velocity l of the body's origin.
     sx, sy, sz, lx, ly, lz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    if kind == BALL_X:
-        w, x, y, z = joints[i, Q], joints[i, EXTRA], joints[i + 1, Q], joints[i + 2, Q]
+    if kind == ka.BALL_X:
+        w, x, y, z = joints[i, ka.Q], joints[i, ka.EXTRA], joints[i + 1, ka.Q], joints[i + 2, ka.Q]
         # A rotation whatever the length of the quaternion: between two normalisations it drifts.
         s = 2.0 / (w * w + x * x + y * y + z * z)
         r0, r1, r2 = 1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)
@@ -87,30 +62,30 @@ def row_motion(model: ModelArrays, ws: Workspace, i, b0, b1, b2, b3, b4, b5, b6,
         b3, b4, b5 = b3 * r0 + b4 * r3 + b5 * r6, b3 * r1 + b4 * r4 + b5 * r7, b3 * r2 + b4 * r5 + b5 * r8
         b6, b7, b8 = b6 * r0 + b7 * r3 + b8 * r6, b6 * r1 + b7 * r4 + b8 * r7, b6 * r2 + b7 * r5 + b8 * r8
         sx, sy, sz = b0, b3, b6
-    elif kind == BALL_Y:
+    elif kind == ka.BALL_Y:
         sx, sy, sz = b1, b4, b7
-    elif kind == BALL_Z:
+    elif kind == ka.BALL_Z:
         sx, sy, sz = b2, b5, b8
-    elif kind == ROLL:
-        x, y, s, c = joints[i, Q], joints[i, EXTRA], trig[0, i + 1], trig[1, i + 1]
+    elif kind == ka.ROLL:
+        x, y, s, c = joints[i, ka.Q], joints[i, ka.EXTRA], trig[0, i + 1], trig[1, i + 1]
         px, py, pz = px + b0 * x + b1 * y, py + b3 * x + b4 * y, pz + b6 * x + b7 * y
         b0, b1 = c * b0 + s * b1, c * b1 - s * b0
         b3, b4 = c * b3 + s * b4, c * b4 - s * b3
         b6, b7 = c * b6 + s * b7, c * b7 - s * b6
         lx, ly, lz = b0, b3, b6
-    elif kind == TURN:
+    elif kind == ka.TURN:
         sx, sy, sz = b2, b5, b8
-    elif kind == LEFT_WHEEL:
-        turn, ahead = model.body[i, PARAMETER], model.body[i + 1, PARAMETER]
-        x, y, heading = joints[i, EXTRA], joints[i + 1, EXTRA], turn * (joints[i + 1, Q] - joints[i, Q])
+    elif kind == ka.LEFT_WHEEL:
+        turn, ahead = model.body[i, ka.PARAMETER], model.body[i + 1, ka.PARAMETER]
+        x, y, heading = joints[i, ka.EXTRA], joints[i + 1, ka.EXTRA], turn * (joints[i + 1, ka.Q] - joints[i, ka.Q])
         s, c = sine_cosine_of(heading)
         px, py, pz = px + b0 * x + b1 * y, py + b3 * x + b4 * y, pz + b6 * x + b7 * y
         b0, b1 = c * b0 + s * b1, c * b1 - s * b0
         b3, b4 = c * b3 + s * b4, c * b4 - s * b3
         b6, b7 = c * b6 + s * b7, c * b7 - s * b6
         sx, sy, sz, lx, ly, lz = -turn * b2, -turn * b5, -turn * b8, ahead * b0, ahead * b3, ahead * b6
-    elif kind == RIGHT_WHEEL:
-        turn, ahead = model.body[i - 1, PARAMETER], model.body[i, PARAMETER]
+    elif kind == ka.RIGHT_WHEEL:
+        turn, ahead = model.body[i - 1, ka.PARAMETER], model.body[i, ka.PARAMETER]
         sx, sy, sz, lx, ly, lz = turn * b2, turn * b5, turn * b8, ahead * b0, ahead * b3, ahead * b6
     # As a motion at the world origin.
     lx, ly, lz = lx + py * sz - pz * sy, ly + pz * sx - px * sz, lz + px * sy - py * sx
@@ -123,13 +98,13 @@ def row_rates(compound, model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, g
 
     p is the parent, b what the joint is mounted on. ``forward_sweep`` writes this out for joints of one row.
     """
-    links, j, m = ws.links, model.tree[i, PARENT], compound[i, BASE]
-    sx, sy, sz = links[i, S], links[i, S + 1], links[i, S + 2]
-    lx, ly, lz = links[i, S + 3], links[i, S + 4], links[i, S + 5]
+    links, j, m = ws.links, model.tree[i, ka.PARENT], compound[i, ka.BASE]
+    sx, sy, sz = links[i, ka.S], links[i, ka.S + 1], links[i, ka.S + 2]
+    lx, ly, lz = links[i, ka.S + 3], links[i, ka.S + 4], links[i, ka.S + 5]
     wx, wy, wz, ox, oy, oz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     if m >= 0:
-        wx, wy, wz = links[m, V], links[m, V + 1], links[m, V + 2]
-        ox, oy, oz = links[m, V + 3], links[m, V + 4], links[m, V + 5]
+        wx, wy, wz = links[m, ka.V], links[m, ka.V + 1], links[m, ka.V + 2]
+        ox, oy, oz = links[m, ka.V + 3], links[m, ka.V + 4], links[m, ka.V + 5]
     bias = (
         wy * sz - wz * sy,
         wz * sx - wx * sz,
@@ -141,8 +116,8 @@ def row_rates(compound, model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, g
     # The world's acceleration is −g.
     root = (0.0, 0.0, 0.0, -gx, -gy, -gz)
     for s in range(6):
-        links[i, V + s] = links[i, S + s] * v + (links[j, V + s] if j >= 0 else 0.0)
-        links[i, A + s] = links[i, S + s] * vdot + bias[s] * v + (links[j, A + s] if j >= 0 else root[s])
+        links[i, ka.V + s] = links[i, ka.S + s] * v + (links[j, ka.V + s] if j >= 0 else 0.0)
+        links[i, ka.A + s] = links[i, ka.S + s] * vdot + bias[s] * v + (links[j, ka.A + s] if j >= 0 else root[s])
 
 
 @apart_kernel
@@ -153,19 +128,19 @@ def sweep_row(compound, model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, g
     """
     if compound is None:  # known to the compiler
         return
-    body, links, j = model.body, ws.links, model.tree[i, PARENT]
-    b0, b1, b2 = body[i, R_PJ], body[i, R_PJ + 1], body[i, R_PJ + 2]
-    b3, b4, b5 = body[i, R_PJ + 3], body[i, R_PJ + 4], body[i, R_PJ + 5]
-    b6, b7, b8 = body[i, R_PJ + 6], body[i, R_PJ + 7], body[i, R_PJ + 8]
-    px, py, pz = body[i, P_PJ], body[i, P_PJ + 1], body[i, P_PJ + 2]
+    body, links, j = model.body, ws.links, model.tree[i, ka.PARENT]
+    b0, b1, b2 = body[i, ka.R_PJ], body[i, ka.R_PJ + 1], body[i, ka.R_PJ + 2]
+    b3, b4, b5 = body[i, ka.R_PJ + 3], body[i, ka.R_PJ + 4], body[i, ka.R_PJ + 5]
+    b6, b7, b8 = body[i, ka.R_PJ + 6], body[i, ka.R_PJ + 7], body[i, ka.R_PJ + 8]
+    px, py, pz = body[i, ka.P_PJ], body[i, ka.P_PJ + 1], body[i, ka.P_PJ + 2]
     if j >= 0:
-        a0, a1, a2 = links[j, R], links[j, R + 1], links[j, R + 2]
-        a3, a4, a5 = links[j, R + 3], links[j, R + 4], links[j, R + 5]
-        a6, a7, a8 = links[j, R + 6], links[j, R + 7], links[j, R + 8]
+        a0, a1, a2 = links[j, ka.R], links[j, ka.R + 1], links[j, ka.R + 2]
+        a3, a4, a5 = links[j, ka.R + 3], links[j, ka.R + 4], links[j, ka.R + 5]
+        a6, a7, a8 = links[j, ka.R + 6], links[j, ka.R + 7], links[j, ka.R + 8]
         px, py, pz = (
-            links[j, P] + a0 * px + a1 * py + a2 * pz,
-            links[j, P + 1] + a3 * px + a4 * py + a5 * pz,
-            links[j, P + 2] + a6 * px + a7 * py + a8 * pz,
+            links[j, ka.P] + a0 * px + a1 * py + a2 * pz,
+            links[j, ka.P + 1] + a3 * px + a4 * py + a5 * pz,
+            links[j, ka.P + 2] + a6 * px + a7 * py + a8 * pz,
         )
         b0, b3, b6 = a0 * b0 + a1 * b3 + a2 * b6, a3 * b0 + a4 * b3 + a5 * b6, a6 * b0 + a7 * b3 + a8 * b6
         b1, b4, b7 = a0 * b1 + a1 * b4 + a2 * b7, a3 * b1 + a4 * b4 + a5 * b7, a6 * b1 + a7 * b4 + a8 * b7
@@ -173,12 +148,12 @@ def sweep_row(compound, model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, g
     b0, b1, b2, b3, b4, b5, b6, b7, b8, px, py, pz, sx, sy, sz, lx, ly, lz = row_motion(
         model, ws, i, b0, b1, b2, b3, b4, b5, b6, b7, b8, px, py, pz
     )
-    links[i, R], links[i, R + 1], links[i, R + 2] = b0, b1, b2
-    links[i, R + 3], links[i, R + 4], links[i, R + 5] = b3, b4, b5
-    links[i, R + 6], links[i, R + 7], links[i, R + 8] = b6, b7, b8
-    links[i, P], links[i, P + 1], links[i, P + 2] = px, py, pz
-    links[i, S], links[i, S + 1], links[i, S + 2] = sx, sy, sz
-    links[i, S + 3], links[i, S + 4], links[i, S + 5] = lx, ly, lz
+    links[i, ka.R], links[i, ka.R + 1], links[i, ka.R + 2] = b0, b1, b2
+    links[i, ka.R + 3], links[i, ka.R + 4], links[i, ka.R + 5] = b3, b4, b5
+    links[i, ka.R + 6], links[i, ka.R + 7], links[i, ka.R + 8] = b6, b7, b8
+    links[i, ka.P], links[i, ka.P + 1], links[i, ka.P + 2] = px, py, pz
+    links[i, ka.S], links[i, ka.S + 1], links[i, ka.S + 2] = sx, sy, sz
+    links[i, ka.S + 3], links[i, ka.S + 4], links[i, ka.S + 5] = lx, ly, lz
     row_rates(compound, model, ws, i, v, vdot, gx, gy, gz)
 
 
@@ -189,12 +164,12 @@ def read_positions(compound, model: ModelArrays, y, start, ws: Workspace):
         return
     tree, joints = model.tree, ws.joints
     for i in range(tree.shape[0]):
-        k = start + compound[i, POSITION_INDEX]
-        joints[i, Q] = y[k]
-        if tree[i, KIND] == BALL_X or tree[i, KIND] == ROLL:
-            joints[i, EXTRA] = y[k + 1]
-        elif tree[i, KIND] == LEFT_WHEEL or tree[i, KIND] == RIGHT_WHEEL:
-            joints[i, EXTRA] = y[k + 2]
+        k = start + compound[i, ka.POSITION_INDEX]
+        joints[i, ka.Q] = y[k]
+        if tree[i, ka.KIND] == ka.BALL_X or tree[i, ka.KIND] == ka.ROLL:
+            joints[i, ka.EXTRA] = y[k + 1]
+        elif tree[i, ka.KIND] == ka.LEFT_WHEEL or tree[i, ka.KIND] == ka.RIGHT_WHEEL:
+            joints[i, ka.EXTRA] = y[k + 2]
 
 
 @internal_kernel
@@ -220,23 +195,23 @@ def position_rates(compound, model: ModelArrays, ws: Workspace, dy, start):
         return
     tree, joints = model.tree, ws.joints
     for i in range(tree.shape[0]):
-        k, kind = start + compound[i, POSITION_INDEX], tree[i, KIND]
-        if kind == BALL_X:
-            w, x, y, z = joints[i, Q], joints[i, EXTRA], joints[i + 1, Q], joints[i + 2, Q]
-            rate = quaternion_rate(w, x, y, z, joints[i, QD], joints[i + 1, QD], joints[i + 2, QD])
+        k, kind = start + compound[i, ka.POSITION_INDEX], tree[i, ka.KIND]
+        if kind == ka.BALL_X:
+            w, x, y, z = joints[i, ka.Q], joints[i, ka.EXTRA], joints[i + 1, ka.Q], joints[i + 2, ka.Q]
+            rate = quaternion_rate(w, x, y, z, joints[i, ka.QD], joints[i + 1, ka.QD], joints[i + 2, ka.QD])
             for s in range(4):
                 dy[k + s] = rate[s]
-        elif kind == ROLL:
-            dy[k] = joints[i, QD] * ws.trig[1, i + 1]
-            dy[k + 1] = joints[i, QD] * ws.trig[0, i + 1]
-        elif kind == LEFT_WHEEL:
-            heading = model.body[i, PARAMETER] * (joints[i + 1, Q] - joints[i, Q])
-            speed = model.body[i + 1, PARAMETER] * (joints[i, QD] + joints[i + 1, QD])
-            dy[k], dy[k + 1] = joints[i, QD], joints[i + 1, QD]
+        elif kind == ka.ROLL:
+            dy[k] = joints[i, ka.QD] * ws.trig[1, i + 1]
+            dy[k + 1] = joints[i, ka.QD] * ws.trig[0, i + 1]
+        elif kind == ka.LEFT_WHEEL:
+            heading = model.body[i, ka.PARAMETER] * (joints[i + 1, ka.Q] - joints[i, ka.Q])
+            speed = model.body[i + 1, ka.PARAMETER] * (joints[i, ka.QD] + joints[i + 1, ka.QD])
+            dy[k], dy[k + 1] = joints[i, ka.QD], joints[i + 1, ka.QD]
             s, c = sine_cosine_of(heading)
             dy[k + 2], dy[k + 3] = speed * c, speed * s
-        elif kind != BALL_Y and kind != BALL_Z and kind != RIGHT_WHEEL:
-            dy[k] = joints[i, QD]
+        elif kind != ka.BALL_Y and kind != ka.BALL_Z and kind != ka.RIGHT_WHEEL:
+            dy[k] = joints[i, ka.QD]
 
 
 @internal_kernel
@@ -246,27 +221,27 @@ def displace(compound, model: ModelArrays, ws: Workspace, y, start):
         return
     tree, joints = model.tree, ws.joints
     for i in range(tree.shape[0]):
-        k, kind = start + compound[i, POSITION_INDEX], tree[i, KIND]
-        if kind == BALL_X:
+        k, kind = start + compound[i, ka.POSITION_INDEX], tree[i, ka.KIND]
+        if kind == ka.BALL_X:
             w, x, y0, z = y[k], y[k + 1], y[k + 2], y[k + 3]
-            change = quaternion_rate(w, x, y0, z, joints[i, QDD], joints[i + 1, QDD], joints[i + 2, QDD])
+            change = quaternion_rate(w, x, y0, z, joints[i, ka.QDD], joints[i + 1, ka.QDD], joints[i + 2, ka.QDD])
             for s in range(4):
                 y[k + s] += change[s]
-        elif kind == ROLL:
-            y[k] += joints[i, QDD] * ws.trig[1, i + 1]
-            y[k + 1] += joints[i, QDD] * ws.trig[0, i + 1]
-        elif kind == LEFT_WHEEL:
-            left, right = joints[i, QDD], joints[i + 1, QDD]
+        elif kind == ka.ROLL:
+            y[k] += joints[i, ka.QDD] * ws.trig[1, i + 1]
+            y[k + 1] += joints[i, ka.QDD] * ws.trig[0, i + 1]
+        elif kind == ka.LEFT_WHEEL:
+            left, right = joints[i, ka.QDD], joints[i + 1, ka.QDD]
             # Along the heading halfway: what is left of the displacement's square is then no first-order error.
-            heading = model.body[i, PARAMETER] * (y[k + 1] - y[k] + 0.5 * (right - left))
-            shift = model.body[i + 1, PARAMETER] * (left + right)
+            heading = model.body[i, ka.PARAMETER] * (y[k + 1] - y[k] + 0.5 * (right - left))
+            shift = model.body[i + 1, ka.PARAMETER] * (left + right)
             y[k] += left
             y[k + 1] += right
             s, c = sine_cosine_of(heading)
             y[k + 2] += shift * c
             y[k + 3] += shift * s
-        elif kind != BALL_Y and kind != BALL_Z and kind != RIGHT_WHEEL:
-            y[k] += joints[i, QDD]
+        elif kind != ka.BALL_Y and kind != ka.BALL_Z and kind != ka.RIGHT_WHEEL:
+            y[k] += joints[i, ka.QDD]
 
 
 @internal_kernel
@@ -276,8 +251,8 @@ def normalise(compound, model: ModelArrays, y, start):
         return
     tree = model.tree
     for i in range(tree.shape[0]):
-        if tree[i, KIND] == BALL_X:
-            k = start + compound[i, POSITION_INDEX]
+        if tree[i, ka.KIND] == ka.BALL_X:
+            k = start + compound[i, ka.POSITION_INDEX]
             scale = 1.0 / math.sqrt(y[k] * y[k] + y[k + 1] * y[k + 1] + y[k + 2] * y[k + 2] + y[k + 3] * y[k + 3])
             for s in range(4):
                 y[k + s] *= scale
@@ -294,8 +269,8 @@ def position_error(compound, model: ModelArrays, y, y_new, error, start, rtol, a
         return 0.0, 0
     tree, total, count = model.tree, 0.0, 0
     for i in range(tree.shape[0]):
-        k, kind = start + compound[i, POSITION_INDEX], tree[i, KIND]
-        if kind == BALL_X:
+        k, kind = start + compound[i, ka.POSITION_INDEX], tree[i, ka.KIND]
+        if kind == ka.BALL_X:
             w, x, y0, z = y_new[k], y_new[k + 1], y_new[k + 2], y_new[k + 3]
             dw, dx, dy, dz = error[k], error[k + 1], error[k + 2], error[k + 3]
             scale = 2.0 / ((w * w + x * x + y0 * y0 + z * z) * (atol + rtol))
@@ -303,8 +278,8 @@ def position_error(compound, model: ModelArrays, y, y_new, error, start, rtol, a
             ex, ey, ez = scale * ex, scale * ey, scale * ez
             total += ex * ex + ey * ey + ez * ez
             count += 3
-        elif kind != BALL_Y and kind != BALL_Z and kind != RIGHT_WHEEL:
-            for s in range(2 if kind == ROLL else 4 if kind == LEFT_WHEEL else 1):
+        elif kind != ka.BALL_Y and kind != ka.BALL_Z and kind != ka.RIGHT_WHEEL:
+            for s in range(2 if kind == ka.ROLL else 4 if kind == ka.LEFT_WHEEL else 1):
                 e = error[k + s] / (atol + rtol * max(abs(y[k + s]), abs(y_new[k + s])))
                 total += e * e
                 count += 1
@@ -318,23 +293,23 @@ def positions_along(compound, model: ModelArrays, y, start, u, out):
         return
     tree = model.tree
     for i in range(tree.shape[0]):
-        k, kind = start + compound[i, POSITION_INDEX], tree[i, KIND]
-        if kind == BALL_X:
+        k, kind = start + compound[i, ka.POSITION_INDEX], tree[i, ka.KIND]
+        if kind == ka.BALL_X:
             change = quaternion_rate(y[k], y[k + 1], y[k + 2], y[k + 3], u[i], u[i + 1], u[i + 2])
             for s in range(4):
                 out[k + s] += change[s]
-        elif kind == ROLL:
-            s, c = sine_cosine_of(y[start + compound[i + 1, POSITION_INDEX]])
+        elif kind == ka.ROLL:
+            s, c = sine_cosine_of(y[start + compound[i + 1, ka.POSITION_INDEX]])
             out[k] += c * u[i]
             out[k + 1] += s * u[i]
-        elif kind == LEFT_WHEEL:
-            s, c = sine_cosine_of(model.body[i, PARAMETER] * (y[k + 1] - y[k]))
-            shift = model.body[i + 1, PARAMETER] * (u[i] + u[i + 1])
+        elif kind == ka.LEFT_WHEEL:
+            s, c = sine_cosine_of(model.body[i, ka.PARAMETER] * (y[k + 1] - y[k]))
+            shift = model.body[i + 1, ka.PARAMETER] * (u[i] + u[i + 1])
             out[k] += u[i]
             out[k + 1] += u[i + 1]
             out[k + 2] += shift * c
             out[k + 3] += shift * s
-        elif kind != BALL_Y and kind != BALL_Z and kind != RIGHT_WHEEL:
+        elif kind != ka.BALL_Y and kind != ka.BALL_Z and kind != ka.RIGHT_WHEEL:
             out[k] += u[i]
 
 
@@ -345,13 +320,13 @@ def rates_across(compound, model: ModelArrays, y, start, d, out):
         return
     tree = model.tree
     for i in range(tree.shape[0]):
-        k, kind = start + compound[i, POSITION_INDEX], tree[i, KIND]
-        if kind == BALL_X:
+        k, kind = start + compound[i, ka.POSITION_INDEX], tree[i, ka.KIND]
+        if kind == ka.BALL_X:
             turn = quaternion_turn(y[k], y[k + 1], y[k + 2], y[k + 3], d[k], d[k + 1], d[k + 2], d[k + 3])
             for s in range(3):
                 out[i + s] = 2.0 * turn[s]
-        elif kind == ROLL:
-            s, c = sine_cosine_of(y[start + compound[i + 1, POSITION_INDEX]])
+        elif kind == ka.ROLL:
+            s, c = sine_cosine_of(y[start + compound[i + 1, ka.POSITION_INDEX]])
             out[i] = c * d[k] + s * d[k + 1]
-        elif kind != BALL_Y and kind != BALL_Z:
+        elif kind != ka.BALL_Y and kind != ka.BALL_Z:
             out[i] = d[k]

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.arrays import APPLIED, PARENT, ModelArrays, P, R, S, V, Workspace
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import ModelArrays, Workspace
 from dynsim.kernels.jit import apart_kernel, internal_kernel
 
 # LoadArrays.table, int
@@ -69,16 +70,16 @@ def load_wrench(loads: LoadArrays, k, t, ws: Workspace):
         mx += data[c + 12] + x * (data[c + 13] + x * (data[c + 14] + x * data[c + 15]))
         my += data[c + 16] + x * (data[c + 17] + x * (data[c + 18] + x * data[c + 19]))
         mz += data[c + 20] + x * (data[c + 21] + x * (data[c + 22] + x * data[c + 23]))
-    b0, b1, b2 = links[i, R], links[i, R + 1], links[i, R + 2]
-    b3, b4, b5 = links[i, R + 3], links[i, R + 4], links[i, R + 5]
-    b6, b7, b8 = links[i, R + 6], links[i, R + 7], links[i, R + 8]
+    b0, b1, b2 = links[i, ka.R], links[i, ka.R + 1], links[i, ka.R + 2]
+    b3, b4, b5 = links[i, ka.R + 3], links[i, ka.R + 4], links[i, ka.R + 5]
+    b6, b7, b8 = links[i, ka.R + 6], links[i, ka.R + 7], links[i, ka.R + 8]
     if table[k, IN_BODY] != 0:
         fx, fy, fz = b0 * fx + b1 * fy + b2 * fz, b3 * fx + b4 * fy + b5 * fz, b6 * fx + b7 * fy + b8 * fz
         mx, my, mz = b0 * mx + b1 * my + b2 * mz, b3 * mx + b4 * my + b5 * mz, b6 * mx + b7 * my + b8 * mz
     x, y, z = data[place + POINT], data[place + POINT + 1], data[place + POINT + 2]
-    rx = links[i, P] + b0 * x + b1 * y + b2 * z
-    ry = links[i, P + 1] + b3 * x + b4 * y + b5 * z
-    rz = links[i, P + 2] + b6 * x + b7 * y + b8 * z
+    rx = links[i, ka.P] + b0 * x + b1 * y + b2 * z
+    ry = links[i, ka.P + 1] + b3 * x + b4 * y + b5 * z
+    rz = links[i, ka.P + 2] + b6 * x + b7 * y + b8 * z
     mx, my, mz = mx + ry * fz - rz * fy, my + rz * fx - rx * fz, mz + rx * fy - ry * fx
     return mx, my, mz, fx, fy, fz
 
@@ -94,12 +95,12 @@ def add_loads(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, power, st
         i = table[k, LINK]
         mx, my, mz, fx, fy, fz = load_wrench(loads, k, t, ws)
         power[start + k] = (
-            mx * links[i, V] + my * links[i, V + 1] + mz * links[i, V + 2]
-            + fx * links[i, V + 3] + fy * links[i, V + 4] + fz * links[i, V + 5]
+            mx * links[i, ka.V] + my * links[i, ka.V + 1] + mz * links[i, ka.V + 2]
+            + fx * links[i, ka.V + 3] + fy * links[i, ka.V + 4] + fz * links[i, ka.V + 5]
         )  # fmt: skip
         while i >= 0:
-            joints[i, APPLIED] += (
-                mx * links[i, S] + my * links[i, S + 1] + mz * links[i, S + 2]
-                + fx * links[i, S + 3] + fy * links[i, S + 4] + fz * links[i, S + 5]
+            joints[i, ka.APPLIED] += (
+                mx * links[i, ka.S] + my * links[i, ka.S + 1] + mz * links[i, ka.S + 2]
+                + fx * links[i, ka.S + 3] + fy * links[i, ka.S + 4] + fz * links[i, ka.S + 5]
             )  # fmt: skip
-            i = model.tree[i, PARENT]
+            i = model.tree[i, ka.PARENT]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dynsim.kernels.arrays import PARENT, ModelArrays, P, R, S, Workspace
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import ModelArrays, Workspace
 from dynsim.kernels.jit import kernel
 
 
@@ -14,9 +15,9 @@ def point_position(ws: Workspace, link, point, out):
         return
     links = ws.links
     x, y, z = point[0], point[1], point[2]
-    out[0] = links[link, P] + links[link, R] * x + links[link, R + 1] * y + links[link, R + 2] * z
-    out[1] = links[link, P + 1] + links[link, R + 3] * x + links[link, R + 4] * y + links[link, R + 5] * z
-    out[2] = links[link, P + 2] + links[link, R + 6] * x + links[link, R + 7] * y + links[link, R + 8] * z
+    out[0] = links[link, ka.P] + links[link, ka.R] * x + links[link, ka.R + 1] * y + links[link, ka.R + 2] * z
+    out[1] = links[link, ka.P + 1] + links[link, ka.R + 3] * x + links[link, ka.R + 4] * y + links[link, ka.R + 5] * z
+    out[2] = links[link, ka.P + 2] + links[link, ka.R + 6] * x + links[link, ka.R + 7] * y + links[link, ka.R + 8] * z
 
 
 @kernel
@@ -30,7 +31,7 @@ def point_jacobian(model: ModelArrays, ws: Workspace, link, position, out):
     x, y, z = position[0], position[1], position[2]
     j = link
     while j >= 0:
-        out[0, j] = links[j, S + 3] + links[j, S + 1] * z - links[j, S + 2] * y
-        out[1, j] = links[j, S + 4] + links[j, S + 2] * x - links[j, S] * z
-        out[2, j] = links[j, S + 5] + links[j, S] * y - links[j, S + 1] * x
-        j = model.tree[j, PARENT]
+        out[0, j] = links[j, ka.S + 3] + links[j, ka.S + 1] * z - links[j, ka.S + 2] * y
+        out[1, j] = links[j, ka.S + 4] + links[j, ka.S + 2] * x - links[j, ka.S] * z
+        out[2, j] = links[j, ka.S + 5] + links[j, ka.S] * y - links[j, ka.S + 1] * x
+        j = model.tree[j, ka.PARENT]

@@ -13,21 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.arrays import (
-    BODY_B,
-    DIRECTION,
-    FORCE,
-    JOINT_ROW,
-    QD,
-    QDD,
-    ROW_KIND,
-    ROWS,
-    ModelArrays,
-    P,
-    R,
-    V,
-    Workspace,
-)
+from dynsim.kernels import arrays as ka
+from dynsim.kernels.arrays import ModelArrays, Workspace
 from dynsim.kernels.jit import apart_kernel, internal_kernel
 from dynsim.kernels.tree.joints import row_rates
 from dynsim.kernels.tree.loads import LoadArrays, load_wrench
@@ -84,30 +71,30 @@ def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, sup
     index, base, state = support.index, support.base, support.state
     mx, my, mz, fx, fy, fz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(joints.shape[0]):
-        row_rates(model.compound, model, ws, i, joints[i, QD], joints[i, QDD], gravity[0], gravity[1], gravity[2])
-        mass, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz = body_inertia(model, ws, i)
-        n0, n1, n2, n3, n4, n5 = inertial_wrench(ws, i, mass, cx, cy, cz, ixx, ixy, ixz, iyy, iyz, izz)
+        row_rates(model.compound, model, ws, i, joints[i, ka.QD], joints[i, ka.QDD], gravity[0], gravity[1], gravity[2])
+        mass, centre, inertia = body_inertia(model, ws, i)
+        n0, n1, n2, n3, n4, n5 = inertial_wrench(ws, i, mass, centre, inertia)
         mx, my, mz, fx, fy, fz = mx + n0, my + n1, mz + n2, fx + n3, fy + n4, fz + n5
-    for k in range(ws.counts[ROWS]):
+    for k in range(ws.counts[ka.ROWS]):
         # What joins two bodies or two joints is no force from outside.
-        if ws.active[k, ROW_KIND] != JOINT_ROW and ws.active[k, BODY_B] < 0:
-            f = ws.rows[k, FORCE]
-            mx, fx = mx - f * ws.rows[k, DIRECTION], fx - f * ws.rows[k, DIRECTION + 3]
-            my, fy = my - f * ws.rows[k, DIRECTION + 1], fy - f * ws.rows[k, DIRECTION + 4]
-            mz, fz = mz - f * ws.rows[k, DIRECTION + 2], fz - f * ws.rows[k, DIRECTION + 5]
+        if ws.active[k, ka.ROW_KIND] != ka.JOINT_ROW and ws.active[k, ka.BODY_B] < 0:
+            f = ws.rows[k, ka.FORCE]
+            mx, fx = mx - f * ws.rows[k, ka.DIRECTION], fx - f * ws.rows[k, ka.DIRECTION + 3]
+            my, fy = my - f * ws.rows[k, ka.DIRECTION + 1], fy - f * ws.rows[k, ka.DIRECTION + 4]
+            mz, fz = mz - f * ws.rows[k, ka.DIRECTION + 2], fz - f * ws.rows[k, ka.DIRECTION + 5]
     for k in range(loads.table.shape[0]):
         n0, n1, n2, n3, n4, n5 = load_wrench(loads, k, t, ws)
         mx, my, mz, fx, fy, fz = mx - n0, my - n1, mz - n2, fx - n3, fy - n4, fz - n5
     b, left, right = index[BODY], index[LEFT], index[RIGHT]
-    r0, r1, r2 = links[b, R], links[b, R + 1], links[b, R + 2]
-    r3, r4, r5 = links[b, R + 3], links[b, R + 4], links[b, R + 5]
-    r6, r7, r8 = links[b, R + 6], links[b, R + 7], links[b, R + 8]
-    spin = base[SPIN_INERTIA] * (joints[left, QD] + joints[right, QD])
-    rate = base[SPIN_INERTIA] * (joints[left, QDD] + joints[right, QDD])
-    mx += rate * r1 + spin * (links[b, V + 1] * r7 - links[b, V + 2] * r4)
-    my += rate * r4 + spin * (links[b, V + 2] * r1 - links[b, V] * r7)
-    mz += rate * r7 + spin * (links[b, V] * r4 - links[b, V + 1] * r1)
-    px, py, pz = links[b, P], links[b, P + 1], links[b, P + 2]
+    r0, r1, r2 = links[b, ka.R], links[b, ka.R + 1], links[b, ka.R + 2]
+    r3, r4, r5 = links[b, ka.R + 3], links[b, ka.R + 4], links[b, ka.R + 5]
+    r6, r7, r8 = links[b, ka.R + 6], links[b, ka.R + 7], links[b, ka.R + 8]
+    spin = base[SPIN_INERTIA] * (joints[left, ka.QD] + joints[right, ka.QD])
+    rate = base[SPIN_INERTIA] * (joints[left, ka.QDD] + joints[right, ka.QDD])
+    mx += rate * r1 + spin * (links[b, ka.V + 1] * r7 - links[b, ka.V + 2] * r4)
+    my += rate * r4 + spin * (links[b, ka.V + 2] * r1 - links[b, ka.V] * r7)
+    mz += rate * r7 + spin * (links[b, ka.V] * r4 - links[b, ka.V + 1] * r1)
+    px, py, pz = links[b, ka.P], links[b, ka.P + 1], links[b, ka.P + 2]
     mx, my, mz = mx - (py * fz - pz * fy), my - (pz * fx - px * fz), mz - (px * fy - py * fx)
     mx, my, mz = r0 * mx + r3 * my + r6 * mz, r1 * mx + r4 * my + r7 * mz, r2 * mx + r5 * my + r8 * mz
     fx, fy, fz = r0 * fx + r3 * fy + r6 * fz, r1 * fx + r4 * fy + r7 * fz, r2 * fx + r5 * fy + r8 * fz

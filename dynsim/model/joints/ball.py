@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dynsim.kernels.arrays import BALL_X, BALL_Y, BALL_Z
+from dynsim.kernels import arrays as ka
 from dynsim.model.joints import ANGLE, Array, Row
 
 if TYPE_CHECKING:
@@ -29,10 +29,10 @@ def motion(link: Link, q: Array) -> tuple[Array, Array]:
 
 ROWS = {
     "ball_x": Row(
-        BALL_X, ("1", *ANGLE[1:]), (1.0, 0.0, 0.0, 0.0), ("qw", "qx", "qy", "qz"), drawn="ball", motion=motion
+        ka.BALL_X, ("1", *ANGLE[1:]), (1.0, 0.0, 0.0, 0.0), ("qw", "qx", "qy", "qz"), drawn="ball", motion=motion
     ),
-    "ball_y": Row(BALL_Y, ("1", *ANGLE[1:]), (), offset=2, drawn="fixed"),
-    "ball_z": Row(BALL_Z, ("1", *ANGLE[1:]), (), offset=3, drawn="fixed"),
+    "ball_y": Row(ka.BALL_Y, ("1", *ANGLE[1:]), (), offset=2, drawn="fixed"),
+    "ball_z": Row(ka.BALL_Z, ("1", *ANGLE[1:]), (), offset=3, drawn="fixed"),
 }
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dynsim.kernels.arrays import ROLL, TURN
+from dynsim.kernels import arrays as ka
 from dynsim.model.joints import ANGLE, DISTANCE, Array, Row, turned
 
 if TYPE_CHECKING:
@@ -19,8 +19,8 @@ def motion(link: Link, q: Array) -> tuple[Array, Array]:
 
 
 ROWS = {
-    "roll": Row(ROLL, DISTANCE, (0.0, 0.0, 0.0), ("x", "y", "heading"), drawn="planar", motion=motion),
-    "turn": Row(TURN, ANGLE, (), offset=2, drawn="fixed"),
+    "roll": Row(ka.ROLL, DISTANCE, (0.0, 0.0, 0.0), ("x", "y", "heading"), drawn="planar", motion=motion),
+    "turn": Row(ka.TURN, ANGLE, (), offset=2, drawn="fixed"),
 }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from dynsim.kernels.arrays import PRISMATIC
+from dynsim.kernels import arrays as ka
 from dynsim.model.joints import DISTANCE, Array, Row, unturned
 
 if TYPE_CHECKING:
@@ -16,4 +16,4 @@ def motion(link: Link, q: Array) -> tuple[Array, Array]:
     return unturned(q.shape[1]), link.axis[:, None] * q[0]
 
 
-ROWS = {"prismatic": Row(PRISMATIC, DISTANCE, drawn="prismatic", motion=motion)}
+ROWS = {"prismatic": Row(ka.PRISMATIC, DISTANCE, drawn="prismatic", motion=motion)}

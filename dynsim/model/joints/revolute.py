@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dynsim.kernels.arrays import REVOLUTE
+from dynsim.kernels import arrays as ka
 from dynsim.model.joints import ANGLE, Array, Row, turned
 
 if TYPE_CHECKING:
@@ -18,4 +18,4 @@ def motion(link: Link, q: Array) -> tuple[Array, Array]:
     return turned(link.axis, q[0]), np.zeros((3, q.shape[1]))
 
 
-ROWS = {"revolute": Row(REVOLUTE, ANGLE, drawn="revolute", motion=motion)}
+ROWS = {"revolute": Row(ka.REVOLUTE, ANGLE, drawn="revolute", motion=motion)}

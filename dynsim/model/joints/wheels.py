@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dynsim.kernels.arrays import LEFT_WHEEL, RIGHT_WHEEL
+from dynsim.kernels import arrays as ka
 from dynsim.model.joints import ANGLE, Array, Row, turned
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ def motion(link: Link, q: Array) -> tuple[Array, Array]:
 
 ROWS = {
     "left_wheel": Row(
-        LEFT_WHEEL,
+        ka.LEFT_WHEEL,
         ANGLE,
         (0.0, 0.0, 0.0, 0.0),
         ("left", "right", "x", "y"),
@@ -30,7 +30,7 @@ ROWS = {
         drawn="planar",
         motion=motion,
     ),
-    "right_wheel": Row(RIGHT_WHEEL, ANGLE, (), offset=1, own_position=True, drawn="fixed"),
+    "right_wheel": Row(ka.RIGHT_WHEEL, ANGLE, (), offset=1, own_position=True, drawn="fixed"),
 }
 
 
