@@ -174,7 +174,7 @@ def gap_and_normal(shapes: ShapeArrays | None, braces: ContactArrays, b, x, y, z
     nx, ny, nz = bx + qx, by + qy, bz + qz
     slope = math.sqrt(nx * nx + ny * ny + nz * nz)
     nx, ny, nz = nx / slope, ny / slope, nz / slope
-    return surface_distance(value, slope, hessian_product(table, b, nx, ny, nz)), nx, ny, nz
+    return surface_distance(value, slope, hessian_product(table, b, (nx, ny, nz))), nx, ny, nz
 
 
 @internal_kernel

@@ -14,6 +14,19 @@ from dynsim.kernels.arrays import ContactArrays, CouplingArrays, ModelArrays, Wo
 from dynsim.kernels.constraint import unilateral as ku
 from dynsim.kernels.constraint.unilateral import UnilateralArrays
 from dynsim.kernels.jit import apart_kernel, internal_kernel
+from dynsim.kernels.tree.spatial import (
+    ZERO_VECTOR,
+    cross,
+    dot_vector,
+    point_acceleration,
+    point_velocity,
+    put_six,
+    put_vector,
+    six,
+    times_number,
+    vector,
+    wrench_at,
+)
 
 
 @internal_kernel
@@ -110,28 +123,24 @@ def drop_anchor(ws: Workspace, k):
 def tangents(ws: Workspace, k):
     """Two directions along the surface at the present normal of candidate k, for the rows of a point that sticks."""
     state = ws.contacts
-    x, y, z = state[k, ka.NORMAL], state[k, ka.NORMAL + 1], state[k, ka.NORMAL + 2]
+    n = vector(state, k, ka.NORMAL)
     # n × the axis that is furthest from n.
-    ax, ay, az = abs(x), abs(y), abs(z)
+    ax, ay, az = abs(n[0]), abs(n[1]), abs(n[2])
     if ax <= ay and ax <= az:
-        tx, ty, tz = 0.0, z, -y
+        t = 0.0, n[2], -n[1]
     elif ay <= az:
-        tx, ty, tz = -z, 0.0, x
+        t = -n[2], 0.0, n[0]
     else:
-        tx, ty, tz = y, -x, 0.0
-    scale = 1.0 / math.sqrt(tx * tx + ty * ty + tz * tz)
-    tx, ty, tz = scale * tx, scale * ty, scale * tz
-    state[k, ka.FIRST_TANGENT], state[k, ka.FIRST_TANGENT + 1], state[k, ka.FIRST_TANGENT + 2] = tx, ty, tz
-    state[k, ka.SECOND_TANGENT] = y * tz - z * ty
-    state[k, ka.SECOND_TANGENT + 1] = z * tx - x * tz
-    state[k, ka.SECOND_TANGENT + 2] = x * ty - y * tx
+        t = n[1], -n[0], 0.0
+    t = times_number(t, 1.0 / math.sqrt(dot_vector(t, t)))
+    put_vector(state, k, ka.FIRST_TANGENT, t)
+    put_vector(state, k, ka.SECOND_TANGENT, cross(n, t))
 
 
 @internal_kernel
-def point_row(rows, r, x, y, z, dx, dy, dz):
-    """Motion of a body's point at (x, y, z) along (dx, dy, dz), as row r."""
-    rows[r, ka.ROW], rows[r, ka.ROW + 1], rows[r, ka.ROW + 2] = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
-    rows[r, ka.ROW + 3], rows[r, ka.ROW + 4], rows[r, ka.ROW + 5] = dx, dy, dz
+def point_row(rows, r, at, d):
+    """Motion of a body's point at ``at`` along d, as row r."""
+    put_six(rows, r, ka.ROW, wrench_at(at, d, ZERO_VECTOR))
 
 
 @apart_kernel
@@ -144,31 +153,22 @@ def sticking_rows(model: ModelArrays, ws: Workspace, k, i):
     """
     state, rows, links, active = ws.contacts, ws.rows, ws.links, ws.active
     first = active[k, ka.FIRST_ROW]
-    x, y, z = state[k, ka.POSITION], state[k, ka.POSITION + 1], state[k, ka.POSITION + 2]
+    at = vector(state, k, ka.POSITION)
     # Velocity of the point, and its acceleration at vdot = 0 (A carries −g from its root).
-    wx, wy, wz = links[i, ka.V], links[i, ka.V + 1], links[i, ka.V + 2]
-    vx, vy, vz = (
-        links[i, ka.V + 3] + wy * z - wz * y,
-        links[i, ka.V + 4] + wz * x - wx * z,
-        links[i, ka.V + 5] + wx * y - wy * x,
-    )
-    ex, ey, ez = links[i, ka.A], links[i, ka.A + 1], links[i, ka.A + 2]
-    ax = links[i, ka.A + 3] + model.gravity[0] + ey * z - ez * y + wy * vz - wz * vy
-    ay = links[i, ka.A + 4] + model.gravity[1] + ez * x - ex * z + wz * vx - wx * vz
-    az = links[i, ka.A + 5] + model.gravity[2] + ex * y - ey * x + wx * vy - wy * vx
+    V = six(links, i, ka.V)
+    v, a = point_velocity(V, at), point_acceleration(six(links, i, ka.A), V, at)
+    a = a[0] + model.gravity[0], a[1] + model.gravity[1], a[2] + model.gravity[2]
+    offset = at[0] - state[k, ka.ANCHOR], at[1] - state[k, ka.ANCHOR + 1], at[2] - state[k, ka.ANCHOR + 2]
     for m in range(ka.MOST_ROWS):
         r = first + m
-        d = ka.NORMAL if m == 0 else ka.FIRST_TANGENT if m == 1 else ka.SECOND_TANGENT
-        dx, dy, dz = state[k, d], state[k, d + 1], state[k, d + 2]
-        point_row(rows, r, x, y, z, dx, dy, dz)
+        d = vector(state, k, ka.NORMAL if m == 0 else ka.FIRST_TANGENT if m == 1 else ka.SECOND_TANGENT)
+        point_row(rows, r, at, d)
         for s in range(6):
             rows[r, ka.DIRECTION + s] = rows[r, ka.ROW + s]
         if m > 0:
-            rows[r, ka.TARGET] = -(dx * ax + dy * ay + dz * az)
-            rows[r, ka.ROW_RATE] = dx * vx + dy * vy + dz * vz
-            rows[r, ka.ROW_GAP] = (
-                dx * (x - state[k, ka.ANCHOR]) + dy * (y - state[k, ka.ANCHOR + 1]) + dz * (z - state[k, ka.ANCHOR + 2])
-            )
+            rows[r, ka.TARGET] = -dot_vector(d, a)
+            rows[r, ka.ROW_RATE] = dot_vector(d, v)
+            rows[r, ka.ROW_GAP] = dot_vector(d, offset)
 
 
 @internal_kernel

@@ -23,6 +23,21 @@ from dynsim.kernels.constraint.rows import point_row, sticking_rows, tangents
 from dynsim.kernels.constraint.surface import signed_friction, unit_force
 from dynsim.kernels.constraint.unilateral import UnilateralArrays, slide_direction
 from dynsim.kernels.jit import internal_kernel
+from dynsim.kernels.tree.spatial import (
+    along,
+    cross,
+    dot_vector,
+    point_acceleration,
+    point_velocity,
+    put_vector,
+    rotate,
+    rotation,
+    six,
+    times_inertia,
+    times_number,
+    transform,
+    vector,
+)
 
 # sin² of the angle between an axis and the direction along which the distance does not change, below which the nearest
 # point has no speed: the axis lies along a cylinder.
@@ -64,58 +79,46 @@ def shaped_row(
     """
     links, state, rows, point, data = ws.links, ws.contacts, ws.rows, contacts.point, shapes.data
     i, m, radius = contacts.link[k, ka.LINK], ws.active[k, ka.FIRST_ROW], shapes.data[k, kd.RADIUS]
-    x, y, z = point[k, ka.POINT], point[k, ka.POINT + 1], point[k, ka.POINT + 2]
-    sx = links[i, ka.P] + links[i, ka.R] * x + links[i, ka.R + 1] * y + links[i, ka.R + 2] * z
-    sy = links[i, ka.P + 1] + links[i, ka.R + 3] * x + links[i, ka.R + 4] * y + links[i, ka.R + 5] * z
-    sz = links[i, ka.P + 2] + links[i, ka.R + 6] * x + links[i, ka.R + 7] * y + links[i, ka.R + 8] * z
-    x, y, z = data[k, kd.D], data[k, kd.D + 1], data[k, kd.D + 2]
-    dx = links[i, ka.R] * x + links[i, ka.R + 1] * y + links[i, ka.R + 2] * z
-    dy = links[i, ka.R + 3] * x + links[i, ka.R + 4] * y + links[i, ka.R + 5] * z
-    dz = links[i, ka.R + 6] * x + links[i, ka.R + 7] * y + links[i, ka.R + 8] * z
+    R = rotation(links, i, ka.R)
+    s = transform(vector(links, i, ka.P), R, vector(point, k, ka.POINT))
+    d = rotate(R, vector(data, k, kd.D))
     u = 0.0
     if shapes.kind[k, kd.MOVES] != 0:
-        u = nearest(shapes, k, sx, sy, sz, dx, dy, dz)
-        sx, sy, sz = sx + u * dx, sy + u * dy, sz + u * dz
-    far, nx, ny, nz, hxx, hxy, hxz, hyy, hyz, hzz = distance(shapes, k, sx, sy, sz)
+        u = nearest(shapes, k, s[0], s[1], s[2], d[0], d[1], d[2])
+        s = along(s, d, u)
+    far, nx, ny, nz, hxx, hxy, hxz, hyy, hyz, hzz = distance(shapes, k, s[0], s[1], s[2])
+    n, H = (nx, ny, nz), (hxx, hxy, hxz, hyy, hyz, hzz)
     # Velocity of the body's point at s, and its acceleration at vdot = 0 (A carries −g from its root).
-    wx, wy, wz = links[i, ka.V], links[i, ka.V + 1], links[i, ka.V + 2]
-    vx = links[i, ka.V + 3] + wy * sz - wz * sy
-    vy = links[i, ka.V + 4] + wz * sx - wx * sz
-    vz = links[i, ka.V + 5] + wx * sy - wy * sx
-    ex, ey, ez = links[i, ka.A], links[i, ka.A + 1], links[i, ka.A + 2]
-    ax = links[i, ka.A + 3] + model.gravity[0] + ey * sz - ez * sy + wy * vz - wz * vy
-    ay = links[i, ka.A + 4] + model.gravity[1] + ez * sx - ex * sz + wz * vx - wx * vz
-    az = links[i, ka.A + 5] + model.gravity[2] + ex * sy - ey * sx + wx * vy - wy * vx
+    V = six(links, i, ka.V)
+    w, v, a = (V[0], V[1], V[2]), point_velocity(V, s), point_acceleration(six(links, i, ka.A), V, s)
+    a = a[0] + model.gravity[0], a[1] + model.gravity[1], a[2] + model.gravity[2]
     # H v, which becomes ṅ = H ṡ, and v, which becomes ṡ.
-    hx, hy, hz = hxx * vx + hxy * vy + hxz * vz, hxy * vx + hyy * vy + hyz * vz, hxz * vx + hyz * vy + hzz * vz
-    second = nx * ax + ny * ay + nz * az + vx * hx + vy * hy + vz * hz
-    mx, my, mz = vx, vy, vz
+    n_rate, s_rate = times_inertia(H, v), v
+    second = dot_vector(n, a) + dot_vector(v, n_rate)
     if 0.0 < u < 1.0:
-        qx, qy, qz = hxx * dx + hxy * dy + hxz * dz, hxy * dx + hyy * dy + hyz * dz, hxz * dx + hyz * dy + hzz * dz
-        bent = dx * qx + dy * qy + dz * qz
-        if bent > ALONG * (dx * dx + dy * dy + dz * dz) * (hxx + hyy + hzz):
-            turned = nx * (wy * dz - wz * dy) + ny * (wz * dx - wx * dz) + nz * (wx * dy - wy * dx)
-            mixed = vx * qx + vy * qy + vz * qz + turned
+        H_d = times_inertia(H, d)
+        bent = dot_vector(d, H_d)
+        if bent > ALONG * dot_vector(d, d) * (hxx + hyy + hzz):
+            mixed = dot_vector(v, H_d) + dot_vector(n, cross(w, d))
             speed = -mixed / bent
             second += speed * mixed
-            hx, hy, hz = hx + speed * qx, hy + speed * qy, hz + speed * qz
-            mx, my, mz = mx + speed * dx, my + speed * dy, mz + speed * dz
-    cx, cy, cz = sx - radius * nx, sy - radius * ny, sz - radius * nz
-    rate = nx * vx + ny * vy + nz * vz
-    vx, vy, vz = vx - radius * (wy * nz - wz * ny), vy - radius * (wz * nx - wx * nz), vz - radius * (wx * ny - wy * nx)
-    tx, ty, tz = vx - rate * nx, vy - rate * ny, vz - rate * nz
+            n_rate, s_rate = along(n_rate, H_d, speed), along(s_rate, d, speed)
+    c = along(s, n, -radius)
+    rate = dot_vector(n, v)
+    v = along(v, cross(w, n), -radius)
+    slip = along(v, n, -rate)
     if unilateral is None:
-        scale = 1.0 / math.sqrt(tx * tx + ty * ty + tz * tz + point[k, ka.V_S] * point[k, ka.V_S])
-        gx, gy, gz = tx * scale, ty * scale, tz * scale
+        t = times_number(slip, 1.0 / math.sqrt(dot_vector(slip, slip) + point[k, ka.V_S] * point[k, ka.V_S]))
     else:
-        gx, gy, gz, rows[m, ka.ROW_MU] = slide_direction(unilateral, contacts, k, tx, ty, tz)
+        tx, ty, tz, rows[m, ka.ROW_MU] = slide_direction(unilateral, contacts, k, slip[0], slip[1], slip[2])
+        t = tx, ty, tz
     state[k, ka.GAP], state[k, ka.GAP_RATE], rows[m, ka.TARGET] = far - radius, rate, -second
-    state[k, ka.POSITION], state[k, ka.POSITION + 1], state[k, ka.POSITION + 2] = cx, cy, cz
-    state[k, ka.NORMAL], state[k, ka.NORMAL + 1], state[k, ka.NORMAL + 2] = nx, ny, nz
-    state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2] = tx, ty, tz
-    state[k, ka.TANGENT], state[k, ka.TANGENT + 1], state[k, ka.TANGENT + 2] = gx, gy, gz
-    point_row(rows, m, cx, cy, cz, nx, ny, nz)
-    unit_force(rows, m, signed_friction(ws, m), cx, cy, cz, nx, ny, nz, gx, gy, gz)
+    put_vector(state, k, ka.POSITION, c)
+    put_vector(state, k, ka.NORMAL, n)
+    put_vector(state, k, ka.SLIP_VELOCITY, slip)
+    put_vector(state, k, ka.TANGENT, t)
+    point_row(rows, m, c, n)
+    unit_force(rows, m, signed_friction(ws, m), c, n, t)
     if ws.active[k, ka.MODE] != ka.STICKING:
         return
     rolls = radius > 0.0 or shapes.kind[k, kd.MOVES] != 0
@@ -124,8 +127,9 @@ def shaped_row(
         tangents(ws, k)
     sticking_rows(model, ws, k, i)
     if rolls:
-        lx, ly, lz = vx - (mx - radius * hx), vy - (my - radius * hy), vz - (mz - radius * hz)
-        lx, ly, lz = wy * lz - wz * ly, wz * lx - wx * lz, wx * ly - wy * lx
+        # v_c − ċ
+        left = along(along(v, s_rate, -1.0), n_rate, radius)
+        extra = cross(w, left)
         for r in range(m + 1, m + 3):
-            rows[r, ka.TARGET] += rows[r, ka.ROW + 3] * lx + rows[r, ka.ROW + 4] * ly + rows[r, ka.ROW + 5] * lz
+            rows[r, ka.TARGET] += dot_vector(vector(rows, r, ka.ROW + 3), extra)
             rows[r, ka.ROW_GAP] = 0.0

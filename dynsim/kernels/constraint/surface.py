@@ -9,6 +9,21 @@ from dynsim.kernels.arrays import ContactArrays, ModelArrays, Workspace
 from dynsim.kernels.constraint.rows import point_row, sticking_rows
 from dynsim.kernels.constraint.unilateral import UnilateralArrays, slide_direction
 from dynsim.kernels.jit import exact_kernel, internal_kernel
+from dynsim.kernels.tree.spatial import (
+    ZERO_VECTOR,
+    dot_vector,
+    point_acceleration,
+    point_velocity,
+    put_six,
+    put_vector,
+    rotation,
+    six,
+    times_inertia,
+    times_number,
+    transform,
+    vector,
+    wrench_at,
+)
 
 # Tries, beyond two per contact, to find signs of dissipative contacts that agree with their forces.
 SIGN_PASSES = 64
@@ -31,12 +46,12 @@ def surface_distance(value, slope, curvature):
 
 
 @internal_kernel
-def hessian_product(point, k, x, y, z):
-    """(x, y, z)·Q (x, y, z) of the surface of contact k; point: (c, POINT_SIZE)."""
+def hessian_product(point, k, u):
+    """u·Q u of the surface of contact k; point: (c, POINT_SIZE)."""
     return (
-        x * (point[k, ka.QUADRIC] * x + 2.0 * (point[k, ka.QUADRIC + 1] * y + point[k, ka.QUADRIC + 2] * z))
-        + y * (point[k, ka.QUADRIC + 3] * y + 2.0 * point[k, ka.QUADRIC + 4] * z)
-        + z * point[k, ka.QUADRIC + 5] * z
+        u[0] * (point[k, ka.QUADRIC] * u[0] + 2.0 * (point[k, ka.QUADRIC + 1] * u[1] + point[k, ka.QUADRIC + 2] * u[2]))
+        + u[1] * (point[k, ka.QUADRIC + 3] * u[1] + 2.0 * point[k, ka.QUADRIC + 4] * u[2])
+        + u[2] * point[k, ka.QUADRIC + 5] * u[2]
     )
 
 
@@ -56,52 +71,41 @@ def contact_rows(model: ModelArrays, contacts: ContactArrays, unilateral: Unilat
     for k in range(contacts.link.shape[0]):
         i, m = contacts.link[k, ka.LINK], ws.active[k, ka.FIRST_ROW]
         mu = signed_friction(ws, m)
-        x, y, z = point[k, ka.POINT], point[k, ka.POINT + 1], point[k, ka.POINT + 2]
-        rx = links[i, ka.P] + links[i, ka.R] * x + links[i, ka.R + 1] * y + links[i, ka.R + 2] * z
-        ry = links[i, ka.P + 1] + links[i, ka.R + 3] * x + links[i, ka.R + 4] * y + links[i, ka.R + 5] * z
-        rz = links[i, ka.P + 2] + links[i, ka.R + 6] * x + links[i, ka.R + 7] * y + links[i, ka.R + 8] * z
+        R = rotation(links, i, ka.R)
+        at = transform(vector(links, i, ka.P), R, vector(point, k, ka.POINT))
         # ∇C and C; a plane's ∇C is its unit normal, which spares every right-hand side two roots and three divisions.
-        nx, ny, nz = point[k, ka.QUADRIC + 6], point[k, ka.QUADRIC + 7], point[k, ka.QUADRIC + 8]
-        gap = nx * rx + ny * ry + nz * rz + point[k, ka.QUADRIC + 9]
+        n = vector(point, k, ka.QUADRIC + 6)
+        gap = dot_vector(n, at) + point[k, ka.QUADRIC + 9]
         inverse, curved = 1.0, contacts.link[k, ka.CURVED] != 0
         if curved:
-            qx = point[k, ka.QUADRIC] * rx + point[k, ka.QUADRIC + 1] * ry + point[k, ka.QUADRIC + 2] * rz
-            qy = point[k, ka.QUADRIC + 1] * rx + point[k, ka.QUADRIC + 3] * ry + point[k, ka.QUADRIC + 4] * rz
-            qz = point[k, ka.QUADRIC + 2] * rx + point[k, ka.QUADRIC + 4] * ry + point[k, ka.QUADRIC + 5] * rz
-            nx, ny, nz = nx + qx, ny + qy, nz + qz
-            slope = math.sqrt(nx * nx + ny * ny + nz * nz)
+            bent = times_inertia(six(point, k, ka.QUADRIC), at)
+            n = n[0] + bent[0], n[1] + bent[1], n[2] + bent[2]
+            slope = math.sqrt(dot_vector(n, n))
             inverse = 1.0 / slope
-            nx, ny, nz = nx * inverse, ny * inverse, nz * inverse
-            value = gap + 0.5 * (qx * rx + qy * ry + qz * rz)
-            gap = surface_distance(value, slope, hessian_product(point, k, nx, ny, nz))
+            n = times_number(n, inverse)
+            gap = surface_distance(gap + 0.5 * dot_vector(bent, at), slope, hessian_product(point, k, n))
         # Velocity of the point, and its acceleration at vdot = 0 (A carries −g from its root).
-        wx, wy, wz = links[i, ka.V], links[i, ka.V + 1], links[i, ka.V + 2]
-        vx = links[i, ka.V + 3] + wy * rz - wz * ry
-        vy = links[i, ka.V + 4] + wz * rx - wx * rz
-        vz = links[i, ka.V + 5] + wx * ry - wy * rx
-        ex, ey, ez = links[i, ka.A], links[i, ka.A + 1], links[i, ka.A + 2]
-        ax = links[i, ka.A + 3] + gravity[0] + ey * rz - ez * ry + wy * vz - wz * vy
-        ay = links[i, ka.A + 4] + gravity[1] + ez * rx - ex * rz + wz * vx - wx * vz
-        az = links[i, ka.A + 5] + gravity[2] + ex * ry - ey * rx + wx * vy - wy * vx
-        rate = nx * vx + ny * vy + nz * vz
-        tx, ty, tz = vx - rate * nx, vy - rate * ny, vz - rate * nz
+        V = six(links, i, ka.V)
+        v, a = point_velocity(V, at), point_acceleration(six(links, i, ka.A), V, at)
+        a = a[0] + gravity[0], a[1] + gravity[1], a[2] + gravity[2]
+        rate = dot_vector(n, v)
+        slip = v[0] - rate * n[0], v[1] - rate * n[1], v[2] - rate * n[2]
         if unilateral is None:
-            scale = 1.0 / math.sqrt(tx * tx + ty * ty + tz * tz + point[k, ka.V_S] * point[k, ka.V_S])
-            sx, sy, sz = tx * scale, ty * scale, tz * scale
+            t = times_number(slip, 1.0 / math.sqrt(dot_vector(slip, slip) + point[k, ka.V_S] * point[k, ka.V_S]))
         else:
-            sx, sy, sz, mu = slide_direction(unilateral, contacts, k, tx, ty, tz)
+            x, y, z, mu = slide_direction(unilateral, contacts, k, slip[0], slip[1], slip[2])
+            t = x, y, z
             rows[m, ka.ROW_MU] = mu
-        state[k, ka.GAP] = gap
-        state[k, ka.GAP_RATE] = rate
-        target = -(nx * ax + ny * ay + nz * az)
-        rows[m, ka.TARGET] = target - hessian_product(point, k, vx, vy, vz) * inverse if curved else target
-        state[k, ka.POSITION], state[k, ka.POSITION + 1], state[k, ka.POSITION + 2] = rx, ry, rz
-        state[k, ka.NORMAL], state[k, ka.NORMAL + 1], state[k, ka.NORMAL + 2] = nx, ny, nz
-        state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2] = tx, ty, tz
+        state[k, ka.GAP], state[k, ka.GAP_RATE] = gap, rate
+        target = -dot_vector(n, a)
+        rows[m, ka.TARGET] = target - hessian_product(point, k, v) * inverse if curved else target
+        put_vector(state, k, ka.POSITION, at)
+        put_vector(state, k, ka.NORMAL, n)
+        put_vector(state, k, ka.SLIP_VELOCITY, slip)
         # From here on nothing is read back: stores to one table keep the compiler from trusting the other.
-        state[k, ka.TANGENT], state[k, ka.TANGENT + 1], state[k, ka.TANGENT + 2] = sx, sy, sz
-        point_row(rows, m, rx, ry, rz, nx, ny, nz)
-        unit_force(rows, m, mu, rx, ry, rz, nx, ny, nz, sx, sy, sz)
+        put_vector(state, k, ka.TANGENT, t)
+        point_row(rows, m, at, n)
+        unit_force(rows, m, mu, at, n, t)
     if ws.counts[ka.HELD] == 0:
         return
     for k in range(contacts.link.shape[0]):
@@ -117,29 +121,22 @@ def signed_friction(ws: Workspace, m):
 
 
 @exact_kernel
-def unit_force(rows, m, mu, x, y, z, nx, ny, nz, tx, ty, tz):
+def unit_force(rows, m, mu, at, n, t):
     """Wrench of a unit normal force with its friction, n − σ μ t through the contact point, as DIRECTION of row m.
 
     The same bits where it is first made and where a sign has turned, so that a right-hand side does not depend on the
     signs of the one before.
     """
-    fx, fy, fz = nx - mu * tx, ny - mu * ty, nz - mu * tz
-    rows[m, ka.DIRECTION], rows[m, ka.DIRECTION + 1], rows[m, ka.DIRECTION + 2] = (
-        y * fz - z * fy,
-        z * fx - x * fz,
-        x * fy - y * fx,
-    )
-    rows[m, ka.DIRECTION + 3], rows[m, ka.DIRECTION + 4], rows[m, ka.DIRECTION + 5] = fx, fy, fz
+    x, y, z = n[0] - mu * t[0], n[1] - mu * t[1], n[2] - mu * t[2]
+    put_six(rows, m, ka.DIRECTION, wrench_at(at, (x, y, z), ZERO_VECTOR))
 
 
 @internal_kernel
 def turn_direction(ws: Workspace, m):
     """DIRECTION of row m for its present SIGN."""
     state, k = ws.contacts, ws.active[m, ka.OWNER]
-    x, y, z = state[k, ka.POSITION], state[k, ka.POSITION + 1], state[k, ka.POSITION + 2]
-    nx, ny, nz = state[k, ka.NORMAL], state[k, ka.NORMAL + 1], state[k, ka.NORMAL + 2]
-    tx, ty, tz = state[k, ka.TANGENT], state[k, ka.TANGENT + 1], state[k, ka.TANGENT + 2]
-    unit_force(ws.rows, m, signed_friction(ws, m), x, y, z, nx, ny, nz, tx, ty, tz)
+    at, n, t = vector(state, k, ka.POSITION), vector(state, k, ka.NORMAL), vector(state, k, ka.TANGENT)
+    unit_force(ws.rows, m, signed_friction(ws, m), at, n, t)
 
 
 @internal_kernel

@@ -30,6 +30,7 @@ from dynsim.kernels.constraint.unilateral import UnilateralArrays, sliding_frict
 from dynsim.kernels.integrate import time_stepping as kt
 from dynsim.kernels.integrate.time_stepping import SteppingArrays, geometry, place_joints
 from dynsim.kernels.jit import internal_kernel
+from dynsim.kernels.tree.spatial import times_number, vector
 
 # cos of the angle by which a row may turn in a step and still be the same row: more is a kink, an edge, another place.
 SAME_ROW = 0.95
@@ -194,12 +195,11 @@ def tangent_rows(system, s: SteppingArrays, ws: Workspace):
         if active[k, ka.MODE] != ka.STICKING:
             continue
         first = active[k, ka.FIRST_ROW]
-        x, y, z = state[k, ka.POSITION], state[k, ka.POSITION + 1], state[k, ka.POSITION + 2]
+        at = vector(state, k, ka.POSITION)
         for m in range(ka.MOST_ROWS):
             r, d = first + m, ka.NORMAL if m == 0 else ka.FIRST_TANGENT if m == 1 else ka.SECOND_TANGENT
             scale = s.law[k, kt.GRIP] if m == 1 else 1.0
-            dx, dy, dz = scale * state[k, d], scale * state[k, d + 1], scale * state[k, d + 2]
-            point_row(rows, r, x, y, z, dx, dy, dz)
+            point_row(rows, r, at, times_number(vector(state, k, d), scale))
             rows[r, ka.TARGET] = 0.0
             for j in range(6):
                 rows[r, ka.DIRECTION + j] = rows[r, ka.ROW + j]

@@ -31,65 +31,88 @@ from dynsim.kernels import arrays as ka
 from dynsim.kernels.arrays import ModelArrays, Workspace
 from dynsim.kernels.jit import apart_kernel, internal_kernel, kernel
 from dynsim.kernels.tree.angles import sine_cosine_of
+from dynsim.kernels.tree.spatial import (
+    ZERO_SIX,
+    ZERO_VECTOR,
+    compose,
+    cross_motion,
+    first_axis,
+    put_rotation,
+    put_six,
+    put_vector,
+    rotation,
+    second_axis,
+    six,
+    third_axis,
+    times_number,
+    transform,
+    turn_z,
+    vector,
+)
 
 
 @internal_kernel
-def row_motion(model: ModelArrays, ws: Workspace, i, b0, b1, b2, b3, b4, b5, b6, b7, b8, px, py, pz):
+def row_motion(model: ModelArrays, ws: Workspace, i, B, p):
     """Pose and motion axis of row i of a joint with several rows.
 
     Parameters
     ----------
     model : tables of the joints' placements, axes and parameters
-    b, p : rotation (row-major) and origin of the joint's frame at q = 0 in the world; of a later row the pose that its
-        predecessor has left
+    B, p : rotation and origin of the joint's frame at q = 0 in the world; of a later row the pose that its predecessor
+        has left
 
     Returns
     -------
     tuple
-        Rotation (9) and origin (3) of the body, axis as a motion vector at the world origin (6).
+        Rotation and origin of the body, axis as a motion at the world origin.
     """
     kind, joints, trig = model.tree[i, ka.KIND], ws.joints, ws.trig
     # Of a unit rate: the angular velocity s, and the velocity l of the body's origin.
-    sx, sy, sz, lx, ly, lz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    s, l = ZERO_VECTOR, ZERO_VECTOR
     if kind == ka.BALL_X:
-        w, x, y, z = joints[i, ka.Q], joints[i, ka.EXTRA], joints[i + 1, ka.Q], joints[i + 2, ka.Q]
-        # A rotation whatever the length of the quaternion: between two normalisations it drifts.
-        s = 2.0 / (w * w + x * x + y * y + z * z)
-        r0, r1, r2 = 1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)
-        r3, r4, r5 = s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x)
-        r6, r7, r8 = s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y)
-        b0, b1, b2 = b0 * r0 + b1 * r3 + b2 * r6, b0 * r1 + b1 * r4 + b2 * r7, b0 * r2 + b1 * r5 + b2 * r8
-        b3, b4, b5 = b3 * r0 + b4 * r3 + b5 * r6, b3 * r1 + b4 * r4 + b5 * r7, b3 * r2 + b4 * r5 + b5 * r8
-        b6, b7, b8 = b6 * r0 + b7 * r3 + b8 * r6, b6 * r1 + b7 * r4 + b8 * r7, b6 * r2 + b7 * r5 + b8 * r8
-        sx, sy, sz = b0, b3, b6
+        B = compose(B, turned(joints[i, ka.Q], joints[i, ka.EXTRA], joints[i + 1, ka.Q], joints[i + 2, ka.Q]))
+        s = first_axis(B)
     elif kind == ka.BALL_Y:
-        sx, sy, sz = b1, b4, b7
-    elif kind == ka.BALL_Z:
-        sx, sy, sz = b2, b5, b8
+        s = second_axis(B)
+    elif kind == ka.BALL_Z or kind == ka.TURN:
+        s = third_axis(B)
     elif kind == ka.ROLL:
-        x, y, s, c = joints[i, ka.Q], joints[i, ka.EXTRA], trig[0, i + 1], trig[1, i + 1]
-        px, py, pz = px + b0 * x + b1 * y, py + b3 * x + b4 * y, pz + b6 * x + b7 * y
-        b0, b1 = c * b0 + s * b1, c * b1 - s * b0
-        b3, b4 = c * b3 + s * b4, c * b4 - s * b3
-        b6, b7 = c * b6 + s * b7, c * b7 - s * b6
-        lx, ly, lz = b0, b3, b6
-    elif kind == ka.TURN:
-        sx, sy, sz = b2, b5, b8
+        p = transform(p, B, (joints[i, ka.Q], joints[i, ka.EXTRA], 0.0))
+        B = turn_z(B, trig[0, i + 1], trig[1, i + 1])
+        l = first_axis(B)
     elif kind == ka.LEFT_WHEEL:
-        turn, ahead = model.body[i, ka.PARAMETER], model.body[i + 1, ka.PARAMETER]
-        x, y, heading = joints[i, ka.EXTRA], joints[i + 1, ka.EXTRA], turn * (joints[i + 1, ka.Q] - joints[i, ka.Q])
-        s, c = sine_cosine_of(heading)
-        px, py, pz = px + b0 * x + b1 * y, py + b3 * x + b4 * y, pz + b6 * x + b7 * y
-        b0, b1 = c * b0 + s * b1, c * b1 - s * b0
-        b3, b4 = c * b3 + s * b4, c * b4 - s * b3
-        b6, b7 = c * b6 + s * b7, c * b7 - s * b6
-        sx, sy, sz, lx, ly, lz = -turn * b2, -turn * b5, -turn * b8, ahead * b0, ahead * b3, ahead * b6
+        rate, ahead = model.body[i, ka.PARAMETER], model.body[i + 1, ka.PARAMETER]
+        sine, cosine = sine_cosine_of(rate * (joints[i + 1, ka.Q] - joints[i, ka.Q]))
+        p = transform(p, B, (joints[i, ka.EXTRA], joints[i + 1, ka.EXTRA], 0.0))
+        B = turn_z(B, sine, cosine)
+        s, l = times_number(third_axis(B), -rate), times_number(first_axis(B), ahead)
     elif kind == ka.RIGHT_WHEEL:
-        turn, ahead = model.body[i - 1, ka.PARAMETER], model.body[i, ka.PARAMETER]
-        sx, sy, sz, lx, ly, lz = turn * b2, turn * b5, turn * b8, ahead * b0, ahead * b3, ahead * b6
+        rate, ahead = model.body[i - 1, ka.PARAMETER], model.body[i, ka.PARAMETER]
+        s, l = times_number(third_axis(B), rate), times_number(first_axis(B), ahead)
     # As a motion at the world origin.
-    lx, ly, lz = lx + py * sz - pz * sy, ly + pz * sx - px * sz, lz + px * sy - py * sx
-    return b0, b1, b2, b3, b4, b5, b6, b7, b8, px, py, pz, sx, sy, sz, lx, ly, lz
+    return (
+        B,
+        p,
+        (
+            s[0],
+            s[1],
+            s[2],
+            l[0] + p[1] * s[2] - p[2] * s[1],
+            l[1] + p[2] * s[0] - p[0] * s[2],
+            l[2] + p[0] * s[1] - p[1] * s[0],
+        ),
+    )
+
+
+@internal_kernel
+def turned(w, x, y, z):
+    """Rotation of a quaternion of any length: between two normalisations it drifts."""
+    s = 2.0 / (w * w + x * x + y * y + z * z)
+    return (
+        1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y),
+        s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x),
+        s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y),
+    )  # fmt: skip
 
 
 @internal_kernel
@@ -99,20 +122,7 @@ def row_rates(compound, model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, g
     p is the parent, b what the joint is mounted on. ``forward_sweep`` writes this out for joints of one row.
     """
     links, j, m = ws.links, model.tree[i, ka.PARENT], compound[i, ka.BASE]
-    sx, sy, sz = links[i, ka.S], links[i, ka.S + 1], links[i, ka.S + 2]
-    lx, ly, lz = links[i, ka.S + 3], links[i, ka.S + 4], links[i, ka.S + 5]
-    wx, wy, wz, ox, oy, oz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    if m >= 0:
-        wx, wy, wz = links[m, ka.V], links[m, ka.V + 1], links[m, ka.V + 2]
-        ox, oy, oz = links[m, ka.V + 3], links[m, ka.V + 4], links[m, ka.V + 5]
-    bias = (
-        wy * sz - wz * sy,
-        wz * sx - wx * sz,
-        wx * sy - wy * sx,
-        wy * lz - wz * ly + oy * sz - oz * sy,
-        wz * lx - wx * lz + oz * sx - ox * sz,
-        wx * ly - wy * lx + ox * sy - oy * sx,
-    )
+    bias = cross_motion(six(links, m, ka.V), six(links, i, ka.S)) if m >= 0 else ZERO_SIX
     # The world's acceleration is −g.
     root = (0.0, 0.0, 0.0, -gx, -gy, -gz)
     for s in range(6):
@@ -129,31 +139,14 @@ def sweep_row(compound, model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, g
     if compound is None:  # known to the compiler
         return
     body, links, j = model.body, ws.links, model.tree[i, ka.PARENT]
-    b0, b1, b2 = body[i, ka.R_PJ], body[i, ka.R_PJ + 1], body[i, ka.R_PJ + 2]
-    b3, b4, b5 = body[i, ka.R_PJ + 3], body[i, ka.R_PJ + 4], body[i, ka.R_PJ + 5]
-    b6, b7, b8 = body[i, ka.R_PJ + 6], body[i, ka.R_PJ + 7], body[i, ka.R_PJ + 8]
-    px, py, pz = body[i, ka.P_PJ], body[i, ka.P_PJ + 1], body[i, ka.P_PJ + 2]
+    B, p = rotation(body, i, ka.R_PJ), vector(body, i, ka.P_PJ)
     if j >= 0:
-        a0, a1, a2 = links[j, ka.R], links[j, ka.R + 1], links[j, ka.R + 2]
-        a3, a4, a5 = links[j, ka.R + 3], links[j, ka.R + 4], links[j, ka.R + 5]
-        a6, a7, a8 = links[j, ka.R + 6], links[j, ka.R + 7], links[j, ka.R + 8]
-        px, py, pz = (
-            links[j, ka.P] + a0 * px + a1 * py + a2 * pz,
-            links[j, ka.P + 1] + a3 * px + a4 * py + a5 * pz,
-            links[j, ka.P + 2] + a6 * px + a7 * py + a8 * pz,
-        )
-        b0, b3, b6 = a0 * b0 + a1 * b3 + a2 * b6, a3 * b0 + a4 * b3 + a5 * b6, a6 * b0 + a7 * b3 + a8 * b6
-        b1, b4, b7 = a0 * b1 + a1 * b4 + a2 * b7, a3 * b1 + a4 * b4 + a5 * b7, a6 * b1 + a7 * b4 + a8 * b7
-        b2, b5, b8 = a0 * b2 + a1 * b5 + a2 * b8, a3 * b2 + a4 * b5 + a5 * b8, a6 * b2 + a7 * b5 + a8 * b8
-    b0, b1, b2, b3, b4, b5, b6, b7, b8, px, py, pz, sx, sy, sz, lx, ly, lz = row_motion(
-        model, ws, i, b0, b1, b2, b3, b4, b5, b6, b7, b8, px, py, pz
-    )
-    links[i, ka.R], links[i, ka.R + 1], links[i, ka.R + 2] = b0, b1, b2
-    links[i, ka.R + 3], links[i, ka.R + 4], links[i, ka.R + 5] = b3, b4, b5
-    links[i, ka.R + 6], links[i, ka.R + 7], links[i, ka.R + 8] = b6, b7, b8
-    links[i, ka.P], links[i, ka.P + 1], links[i, ka.P + 2] = px, py, pz
-    links[i, ka.S], links[i, ka.S + 1], links[i, ka.S + 2] = sx, sy, sz
-    links[i, ka.S + 3], links[i, ka.S + 4], links[i, ka.S + 5] = lx, ly, lz
+        A = rotation(links, j, ka.R)
+        B, p = compose(A, B), transform(vector(links, j, ka.P), A, p)
+    B, p, S = row_motion(model, ws, i, B, p)
+    put_rotation(links, i, ka.R, B)
+    put_vector(links, i, ka.P, p)
+    put_six(links, i, ka.S, S)
     row_rates(compound, model, ws, i, v, vdot, gx, gy, gz)
 
 

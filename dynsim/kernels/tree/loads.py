@@ -9,6 +9,7 @@ import numpy as np
 from dynsim.kernels import arrays as ka
 from dynsim.kernels.arrays import ModelArrays, Workspace
 from dynsim.kernels.jit import apart_kernel, internal_kernel
+from dynsim.kernels.tree.spatial import dot, rotate, rotation, six, transform, vector, wrench_at
 
 # LoadArrays.table, int
 LINK, IN_BODY, HOLDS, DATA, SEGMENTS = 0, 1, 2, 3, 4
@@ -58,30 +59,36 @@ def load_wrench(loads: LoadArrays, k, t, ws: Workspace):
     """Moment about the world origin and force of load k at time t in W [N m, N], after ``forward_sweep``."""
     links, table, data = ws.links, loads.table, loads.data
     i, place = table[k, LINK], table[k, DATA]
-    fx, fy, fz = data[place + WRENCH], data[place + WRENCH + 1], data[place + WRENCH + 2]
-    mx, my, mz = data[place + WRENCH + 3], data[place + WRENCH + 4], data[place + WRENCH + 5]
+    force, moment = segment_vector(data, place + WRENCH), segment_vector(data, place + WRENCH + 3)
     segment, at = segment_start(loads, k, t)
     if segment >= 0:
-        x = at - data[segment]
-        c = segment + 1
-        fx += data[c] + x * (data[c + 1] + x * (data[c + 2] + x * data[c + 3]))
-        fy += data[c + 4] + x * (data[c + 5] + x * (data[c + 6] + x * data[c + 7]))
-        fz += data[c + 8] + x * (data[c + 9] + x * (data[c + 10] + x * data[c + 11]))
-        mx += data[c + 12] + x * (data[c + 13] + x * (data[c + 14] + x * data[c + 15]))
-        my += data[c + 16] + x * (data[c + 17] + x * (data[c + 18] + x * data[c + 19]))
-        mz += data[c + 20] + x * (data[c + 21] + x * (data[c + 22] + x * data[c + 23]))
-    b0, b1, b2 = links[i, ka.R], links[i, ka.R + 1], links[i, ka.R + 2]
-    b3, b4, b5 = links[i, ka.R + 3], links[i, ka.R + 4], links[i, ka.R + 5]
-    b6, b7, b8 = links[i, ka.R + 6], links[i, ka.R + 7], links[i, ka.R + 8]
+        x, c = at - data[segment], segment + 1
+        force = (
+            force[0] + cubic(data, c, x),
+            force[1] + cubic(data, c + 4, x),
+            force[2] + cubic(data, c + 8, x),
+        )
+        moment = (
+            moment[0] + cubic(data, c + 12, x),
+            moment[1] + cubic(data, c + 16, x),
+            moment[2] + cubic(data, c + 20, x),
+        )
+    R = rotation(links, i, ka.R)
     if table[k, IN_BODY] != 0:
-        fx, fy, fz = b0 * fx + b1 * fy + b2 * fz, b3 * fx + b4 * fy + b5 * fz, b6 * fx + b7 * fy + b8 * fz
-        mx, my, mz = b0 * mx + b1 * my + b2 * mz, b3 * mx + b4 * my + b5 * mz, b6 * mx + b7 * my + b8 * mz
-    x, y, z = data[place + POINT], data[place + POINT + 1], data[place + POINT + 2]
-    rx = links[i, ka.P] + b0 * x + b1 * y + b2 * z
-    ry = links[i, ka.P + 1] + b3 * x + b4 * y + b5 * z
-    rz = links[i, ka.P + 2] + b6 * x + b7 * y + b8 * z
-    mx, my, mz = mx + ry * fz - rz * fy, my + rz * fx - rx * fz, mz + rx * fy - ry * fx
-    return mx, my, mz, fx, fy, fz
+        force, moment = rotate(R, force), rotate(R, moment)
+    return wrench_at(transform(vector(links, i, ka.P), R, segment_vector(data, place + POINT)), force, moment)
+
+
+@internal_kernel
+def segment_vector(data, c):
+    """Three numbers of the data from place c on."""
+    return data[c], data[c + 1], data[c + 2]
+
+
+@internal_kernel
+def cubic(data, c, x):
+    """Polynomial of degree three in x with its ascending coefficients from place c on."""
+    return data[c] + x * (data[c + 1] + x * (data[c + 2] + x * data[c + 3]))
 
 
 @apart_kernel
@@ -93,14 +100,8 @@ def add_loads(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, power, st
     links, joints, table = ws.links, ws.joints, loads.table
     for k in range(table.shape[0]):
         i = table[k, LINK]
-        mx, my, mz, fx, fy, fz = load_wrench(loads, k, t, ws)
-        power[start + k] = (
-            mx * links[i, ka.V] + my * links[i, ka.V + 1] + mz * links[i, ka.V + 2]
-            + fx * links[i, ka.V + 3] + fy * links[i, ka.V + 4] + fz * links[i, ka.V + 5]
-        )  # fmt: skip
+        W = load_wrench(loads, k, t, ws)
+        power[start + k] = dot(W, six(links, i, ka.V))
         while i >= 0:
-            joints[i, ka.APPLIED] += (
-                mx * links[i, ka.S] + my * links[i, ka.S + 1] + mz * links[i, ka.S + 2]
-                + fx * links[i, ka.S + 3] + fy * links[i, ka.S + 4] + fz * links[i, ka.S + 5]
-            )  # fmt: skip
+            joints[i, ka.APPLIED] += dot(W, six(links, i, ka.S))
             i = model.tree[i, ka.PARENT]

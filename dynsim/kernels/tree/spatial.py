@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dynsim.kernels.jit import internal_kernel
 
+ZERO_VECTOR = (0.0, 0.0, 0.0)
 ZERO_SIX = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 ZERO_INERTIA = (0.0,) * 21
 
@@ -63,12 +64,58 @@ def cross(a, b):
 
 
 @internal_kernel
+def dot_vector(a, b):
+    """a · b of 3-vectors."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@internal_kernel
+def times_number(a, x):
+    """a x of a 3-vector."""
+    return a[0] * x, a[1] * x, a[2] * x
+
+
+@internal_kernel
+def along(a, b, x):
+    """a + b x of 3-vectors."""
+    return a[0] + b[0] * x, a[1] + b[1] * x, a[2] + b[2] * x
+
+
+@internal_kernel
+def first_axis(R):
+    """R e_x: first column of a rotation."""
+    return R[0], R[3], R[6]
+
+
+@internal_kernel
+def second_axis(R):
+    """R e_y: second column of a rotation."""
+    return R[1], R[4], R[7]
+
+
+@internal_kernel
+def third_axis(R):
+    """R e_z: third column of a rotation."""
+    return R[2], R[5], R[8]
+
+
+@internal_kernel
 def rotate(R, u):
     """R u."""
     return (
         R[0] * u[0] + R[1] * u[1] + R[2] * u[2],
         R[3] * u[0] + R[4] * u[1] + R[5] * u[2],
         R[6] * u[0] + R[7] * u[1] + R[8] * u[2],
+    )
+
+
+@internal_kernel
+def rotate_back(R, u):
+    """Rᵀ u."""
+    return (
+        R[0] * u[0] + R[3] * u[1] + R[6] * u[2],
+        R[1] * u[0] + R[4] * u[1] + R[7] * u[2],
+        R[2] * u[0] + R[5] * u[1] + R[8] * u[2],
     )
 
 
@@ -163,6 +210,43 @@ def turn_z(B, s, c):
         c * B[3] + s * B[4], c * B[4] - s * B[3], B[5],
         c * B[6] + s * B[7], c * B[7] - s * B[6], B[8],
     )  # fmt: skip
+
+
+@internal_kernel
+def cross_motion(V, S):
+    """V × S of motions: rate of change of S as seen from the world when it moves with V."""
+    return (
+        V[1] * S[2] - V[2] * S[1],
+        V[2] * S[0] - V[0] * S[2],
+        V[0] * S[1] - V[1] * S[0],
+        V[1] * S[5] - V[2] * S[4] + V[4] * S[2] - V[5] * S[1],
+        V[2] * S[3] - V[0] * S[5] + V[5] * S[0] - V[3] * S[2],
+        V[0] * S[4] - V[1] * S[3] + V[3] * S[1] - V[4] * S[0],
+    )
+
+
+@internal_kernel
+def point_acceleration(A, V, c):
+    """a + ε × c + ω × (v + ω × c): acceleration of the point c of a body with V = (ω, v) and A = (ε, a)."""
+    v = point_velocity(V, c)
+    return (
+        A[3] + A[1] * c[2] - A[2] * c[1] + V[1] * v[2] - V[2] * v[1],
+        A[4] + A[2] * c[0] - A[0] * c[2] + V[2] * v[0] - V[0] * v[2],
+        A[5] + A[0] * c[1] - A[1] * c[0] + V[0] * v[1] - V[1] * v[0],
+    )
+
+
+@internal_kernel
+def wrench_at(r, force, moment):
+    """Wrench about the world origin of a force at r and a moment."""
+    return (
+        moment[0] + r[1] * force[2] - r[2] * force[1],
+        moment[1] + r[2] * force[0] - r[0] * force[2],
+        moment[2] + r[0] * force[1] - r[1] * force[0],
+        force[0],
+        force[1],
+        force[2],
+    )
 
 
 @internal_kernel

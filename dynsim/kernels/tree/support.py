@@ -18,6 +18,18 @@ from dynsim.kernels.arrays import ModelArrays, Workspace
 from dynsim.kernels.jit import apart_kernel, internal_kernel
 from dynsim.kernels.tree.joints import row_rates
 from dynsim.kernels.tree.loads import LoadArrays, load_wrench
+from dynsim.kernels.tree.spatial import (
+    ZERO_SIX,
+    cross,
+    minus_scaled,
+    plus,
+    rotate_back,
+    rotation,
+    second_axis,
+    six,
+    transform,
+    vector,
+)
 from dynsim.kernels.tree.sweep import body_inertia, inertial_wrench
 
 # SupportArrays.index, int: the body, and the rows of the wheels' rates
@@ -69,35 +81,34 @@ def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, sup
     """
     links, joints, gravity = ws.links, ws.joints, model.gravity
     index, base, state = support.index, support.base, support.state
-    mx, my, mz, fx, fy, fz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    W = ZERO_SIX
     for i in range(joints.shape[0]):
         row_rates(model.compound, model, ws, i, joints[i, ka.QD], joints[i, ka.QDD], gravity[0], gravity[1], gravity[2])
         mass, centre, inertia = body_inertia(model, ws, i)
-        n0, n1, n2, n3, n4, n5 = inertial_wrench(ws, i, mass, centre, inertia)
-        mx, my, mz, fx, fy, fz = mx + n0, my + n1, mz + n2, fx + n3, fy + n4, fz + n5
+        W = plus(W, inertial_wrench(ws, i, mass, centre, inertia))
     for k in range(ws.counts[ka.ROWS]):
         # What joins two bodies or two joints is no force from outside.
         if ws.active[k, ka.ROW_KIND] != ka.JOINT_ROW and ws.active[k, ka.BODY_B] < 0:
-            f = ws.rows[k, ka.FORCE]
-            mx, fx = mx - f * ws.rows[k, ka.DIRECTION], fx - f * ws.rows[k, ka.DIRECTION + 3]
-            my, fy = my - f * ws.rows[k, ka.DIRECTION + 1], fy - f * ws.rows[k, ka.DIRECTION + 4]
-            mz, fz = mz - f * ws.rows[k, ka.DIRECTION + 2], fz - f * ws.rows[k, ka.DIRECTION + 5]
+            W = minus_scaled(W, six(ws.rows, k, ka.DIRECTION), ws.rows[k, ka.FORCE])
     for k in range(loads.table.shape[0]):
-        n0, n1, n2, n3, n4, n5 = load_wrench(loads, k, t, ws)
-        mx, my, mz, fx, fy, fz = mx - n0, my - n1, mz - n2, fx - n3, fy - n4, fz - n5
+        W = minus_scaled(W, load_wrench(loads, k, t, ws), 1.0)
     b, left, right = index[BODY], index[LEFT], index[RIGHT]
-    r0, r1, r2 = links[b, ka.R], links[b, ka.R + 1], links[b, ka.R + 2]
-    r3, r4, r5 = links[b, ka.R + 3], links[b, ka.R + 4], links[b, ka.R + 5]
-    r6, r7, r8 = links[b, ka.R + 6], links[b, ka.R + 7], links[b, ka.R + 8]
+    R, p = rotation(links, b, ka.R), vector(links, b, ka.P)
+    axle, w = second_axis(R), vector(links, b, ka.V)
     spin = base[SPIN_INERTIA] * (joints[left, ka.QD] + joints[right, ka.QD])
     rate = base[SPIN_INERTIA] * (joints[left, ka.QDD] + joints[right, ka.QDD])
-    mx += rate * r1 + spin * (links[b, ka.V + 1] * r7 - links[b, ka.V + 2] * r4)
-    my += rate * r4 + spin * (links[b, ka.V + 2] * r1 - links[b, ka.V] * r7)
-    mz += rate * r7 + spin * (links[b, ka.V] * r4 - links[b, ka.V + 1] * r1)
-    px, py, pz = links[b, ka.P], links[b, ka.P + 1], links[b, ka.P + 2]
-    mx, my, mz = mx - (py * fz - pz * fy), my - (pz * fx - px * fz), mz - (px * fy - py * fx)
-    mx, my, mz = r0 * mx + r3 * my + r6 * mz, r1 * mx + r4 * my + r7 * mz, r2 * mx + r5 * my + r8 * mz
-    fx, fy, fz = r0 * fx + r3 * fy + r6 * fz, r1 * fx + r4 * fy + r7 * fz, r2 * fx + r5 * fy + r8 * fz
+    turning, force = cross(w, axle), (W[3], W[4], W[5])
+    at_base = cross(p, force)
+    # About the base, in its frame.
+    mx, my, mz = rotate_back(
+        R,
+        (
+            W[0] + rate * axle[0] + spin * turning[0] - at_base[0],
+            W[1] + rate * axle[1] + spin * turning[1] - at_base[1],
+            W[2] + rate * axle[2] + spin * turning[2] - at_base[2],
+        ),
+    )
+    fx, fy, fz = rotate_back(R, force)
 
     caster = -my / base[CASTER_X]
     difference = 2.0 * (mx - caster * base[CASTER_Y]) / base[TRACK]
@@ -111,7 +122,8 @@ def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, sup
     state[PRESSURE], state[PRESSURE + 1] = math.nan, math.nan
     if fz > 0.0:
         x, y = -my / fz, mx / fz
-        state[PRESSURE], state[PRESSURE + 1] = px + r0 * x + r1 * y, py + r3 * x + r4 * y
+        pressure = transform(p, R, (x, y, 0.0))
+        state[PRESSURE], state[PRESSURE + 1] = pressure[0], pressure[1]
         state[MARGIN] = math.inf
         for k in range(3):
             state[MARGIN] = min(state[MARGIN], state[LOADS + k] / fz * base[SHARE + k])

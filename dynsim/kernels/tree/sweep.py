@@ -10,15 +10,18 @@ from dynsim.kernels.tree.joints import sweep_row
 from dynsim.kernels.tree.spatial import (
     compose,
     cross,
+    first_axis,
     plus,
-    point_velocity,
+    point_acceleration,
     put_rotation,
     put_six,
     put_vector,
     rotate,
     rotation,
     scaled,
+    second_axis,
     six,
+    third_axis,
     times_inertia,
     transform,
     turn,
@@ -68,13 +71,13 @@ def forward_sweep(model: ModelArrays, ws: Workspace, velocity, acceleration, gra
                 z = rotate(B, u)
                 B = turn(B, u, z, s, c)
             elif k == ka.REVOLUTE_X:
-                z = B[0], B[3], B[6]
+                z = first_axis(B)
                 B = turn_x(B, s, c)
             elif k == ka.REVOLUTE_Y:
-                z = B[1], B[4], B[7]
+                z = second_axis(B)
                 B = turn_y(B, s, c)
             else:
-                z = B[2], B[5], B[8]
+                z = third_axis(B)
                 B = turn_z(B, s, c)
             m = cross(p, z)
             S = z[0], z[1], z[2], m[0], m[1], m[2]
@@ -125,10 +128,8 @@ def body_inertia(model: ModelArrays, ws: Workspace, i):
 def inertial_wrench(ws: Workspace, i, m, c, I):
     """Wrench about the world origin that moves body i as the sweep says: (I_c α + ω × I_c ω + c × m a_c, m a_c)."""
     w, A = vector(ws.links, i, ka.V), six(ws.links, i, ka.A)
-    v = point_velocity(six(ws.links, i, ka.V), c)
-    fx = m * (A[3] + A[1] * c[2] - A[2] * c[1] + w[1] * v[2] - w[2] * v[1])
-    fy = m * (A[4] + A[2] * c[0] - A[0] * c[2] + w[2] * v[0] - w[0] * v[2])
-    fz = m * (A[5] + A[0] * c[1] - A[1] * c[0] + w[0] * v[1] - w[1] * v[0])
+    a = point_acceleration(A, six(ws.links, i, ka.V), c)
+    fx, fy, fz = m * a[0], m * a[1], m * a[2]
     L = times_inertia(I, w)
     return (
         I[0] * A[0] + I[1] * A[1] + I[2] * A[2] + w[1] * L[2] - w[2] * L[1] + c[1] * fz - c[2] * fy,
