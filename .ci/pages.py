@@ -21,6 +21,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from dynsim.cli.tables import print_comparison
 from dynsim.hardware.fault_table import markdown
 from dynsim.studies.bench.programs import (
     ABA,
@@ -36,8 +37,7 @@ from dynsim.studies.bench.programs import (
     MUJOCO_FREE,
     MUJOCO_IMPLICIT,
 )  # fmt: skip
-from dynsim.tables import print_comparison
-from dynsim.terminal import Terminal
+from dynsim.system.terminal import Terminal
 
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))

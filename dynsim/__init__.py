@@ -15,11 +15,12 @@ from dynsim._version import __version__
 from dynsim.errors import DynsimError
 
 if TYPE_CHECKING:
-    from dynsim import film, view
+    from dynsim.compile.bracing import Brace
+    from dynsim.compile.model import Model
+    from dynsim.draw import film
+    from dynsim.draw import page as view
     from dynsim.engine import check, simulate
     from dynsim.engine.simulation import Simulation, State
-    from dynsim.model.bracing import Brace
-    from dynsim.model.model import Model
     from dynsim.record import Record
     from dynsim.scenario import Scenario, build_model, load_scenario
     from dynsim.studies.batch import simulate_batch
@@ -46,8 +47,8 @@ __all__ = [
 
 # Loaded on first use: numba and pydantic take a second that `dynsim --help` need not wait for.
 _HOME = {
-    "Brace": "dynsim.model.bracing",
-    "Model": "dynsim.model.model",
+    "Brace": "dynsim.compile.bracing",
+    "Model": "dynsim.compile.model",
     "Record": "dynsim.record",
     "Scenario": "dynsim.scenario",
     "Simulation": "dynsim.engine.simulation",
@@ -62,14 +63,14 @@ _HOME = {
 
 
 # Modules of their own.
-_MODULES = ("film", "view")
+_MODULES = {"film": "dynsim.draw.film", "view": "dynsim.draw.page"}
 
 
 def __getattr__(name: str) -> Any:
     if name in _HOME:
         return getattr(importlib.import_module(_HOME[name]), name)
     if name in _MODULES:
-        return importlib.import_module(f"dynsim.{name}")
+        return importlib.import_module(_MODULES[name])
     raise AttributeError(f"module 'dynsim' has no attribute {name!r}")
 
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from random_robots import Bench, bench, random_positions, random_robot, random_robot_of, random_unit, surface_through
 
-from dynsim.kernels import arrays as ka
-from dynsim.kernels import system
-from dynsim.kernels.constraint.rows import set_modes
-from dynsim.kernels.jit import integers, reals
+from dynsim.dynamics import derivative as system
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact.rows import set_modes
+from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Contact, Coupling, Inertia, Link, Load, Quadric, Robot
 from dynsim.model.drives import Motor, Servo, TorqueSource
 

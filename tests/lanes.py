@@ -22,9 +22,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-import dynsim.kernels
+import dynsim.dynamics
 
-KERNELS = str(Path(dynsim.kernels.__file__).parent)
+KERNELS = str(Path(dynsim.dynamics.__file__).parent)
 
 
 class Place(NamedTuple):

@@ -9,31 +9,25 @@ from typing import Any
 
 import numpy as np
 
+from dynsim.compile.contact_law import JointStop, compile_unilateral, joint_stops
+from dynsim.compile.model import Model
+from dynsim.compile.shapes import compile_shapes
+from dynsim.compile.tables import compile_contacts, compile_couplings, compile_drives, compile_loads, compile_model
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.derivative import System, derivative, new_workspace
+from dynsim.dynamics.simd.system import has_forms
+from dynsim.dynamics.state import LOSSES, block, output_layout, state_layout
 from dynsim.engine.prepare import guards
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.integrate.driver import advance
-from dynsim.kernels.integrate.newton import CLOSE
-from dynsim.kernels.integrate.run import FINISHED, METHODS, STATUS, TIME_STEPPING, Run, new_run
-from dynsim.kernels.integrate.time_stepping import stepping_arrays
-from dynsim.kernels.jit import integers, reals
-from dynsim.kernels.lanes.system import has_forms
-from dynsim.kernels.state import LOSSES, block, output_layout, state_layout
-from dynsim.kernels.system import System, derivative, new_workspace
-from dynsim.model.arrays import (
-    compile_contacts,
-    compile_couplings,
-    compile_drives,
-    compile_loads,
-    compile_model,
-)
+from dynsim.integrators.driver import advance
+from dynsim.integrators.radau5.newton import CLOSE
+from dynsim.integrators.run import FINISHED, METHODS, STATUS, TIME_STEPPING, Run, new_run
+from dynsim.integrators.stepping.tables import stepping_arrays
+from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot
 from dynsim.model.drives import Motor
 from dynsim.model.joints.ball import ball, floating
 from dynsim.model.joints.planar import planar, rolling
 from dynsim.model.joints.wheels import wheeled
-from dynsim.model.model import Model
-from dynsim.model.shapes import compile_shapes
-from dynsim.model.unilateral import JointStop, compile_unilateral, joint_stops
 
 SURFACES = ("plane", "sphere", "cylinder")
 # Methods that integrate the right-hand side, whose contacts hold both ways: time stepping has tests of its own.

@@ -2,8 +2,8 @@
 
 from hypothesis import strategies as st
 
-from dynsim.model.protocols import BuildContext
-from dynsim.plants.snake import Config, build
+from dynsim.compile.protocols import BuildContext
+from dynsim.library.plants.snake import Config, build
 
 
 @st.composite

@@ -15,7 +15,7 @@ import numpy as np
 import pinocchio as pin
 from random_robots import random_inertia, random_robot, random_unit
 
-from dynsim.model.urdf_writer import write_urdf
+from dynsim.model.urdf.writer import write_urdf
 
 Array = np.ndarray
 WHEELS = ("base.left", "base.right")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from random_robots import Bench, bench
 
-from dynsim.kernels.integrate.run import Run
+from dynsim.integrators.run import Run
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.model.drives import Servo
 from dynsim.model.joints.ball import floating

@@ -12,10 +12,10 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import make_interp_spline
 from stepping_benches import plane, stepped
 
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.integrate.run import Run
-from dynsim.kernels.integrate.time_stepping import GRIP, GRIP_AXIS
-from dynsim.kernels.jit import integers, reals
+from dynsim.dynamics import tables as ka
+from dynsim.integrators.run import Run
+from dynsim.integrators.stepping.tables import GRIP, GRIP_AXIS
+from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.model.drives import Servo
 

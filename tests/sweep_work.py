@@ -9,8 +9,8 @@ import signal
 import time
 from pathlib import Path
 
-from dynsim import interruption
 from dynsim.engine import Progress
+from dynsim.system import interruption
 
 
 def square(number: int, look: Progress) -> int:

@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 from random_robots import Bench, bench, random_contacts, random_positions, random_robot
 
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.constraint import unilateral as ku
-from dynsim.kernels.integrate import contact_events as ce
-from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.state import (
+from dynsim.compile.model import Model
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.state import (
     CONSTRAINT,
     ELECTRICAL,
     FRICTION,
@@ -24,8 +23,9 @@ from dynsim.kernels.state import (
     OUT_SLIP,
     OUT_VECTOR,
 )
+from dynsim.integrators import run as ki
+from dynsim.integrators.contacts import events as ce
 from dynsim.model.description import Contact, Quadric
-from dynsim.model.model import Model
 
 
 def raised(contact: Contact, height: float) -> Contact:

@@ -8,7 +8,7 @@ def main() -> None:
     """Entry point of ``dynsim``."""
     # Before numpy: dynsim's matrices are small, and threads that wait for work take a tenth of a run's processor time.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from dynsim import interruption
+    from dynsim.system import interruption
 
     with interruption.heeded() as received:
         try:

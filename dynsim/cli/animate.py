@@ -12,7 +12,7 @@ import typer
 from dynsim.cli.app import QuietOption
 from dynsim.cli.display import console, film_progress, labelled
 from dynsim.errors import RecordError
-from dynsim.terminal import escaped
+from dynsim.system.terminal import escaped
 
 
 class ViewName(StrEnum):
@@ -43,8 +43,8 @@ def animate(
     quiet: QuietOption = False,
 ) -> None:
     """Write a film of records, without display or browser: bodies, forces, time, and a plot with a cursor."""
-    from dynsim.film import write
-    from dynsim.film.encode import check
+    from dynsim.draw.film import write
+    from dynsim.draw.film.encode import check
 
     wanted = _size(size)
     check(out.suffix.lower().removeprefix("."), fps)

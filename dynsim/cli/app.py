@@ -8,9 +8,9 @@ from typing import Annotated, Any, TextIO
 
 import typer
 
-from dynsim import completion
 from dynsim._version import __version__
 from dynsim.cli.display import console
+from dynsim.config import completion
 
 app = typer.Typer(
     name="dynsim",

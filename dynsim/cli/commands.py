@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dynsim import completion, interruption
 from dynsim.cli.animate import animate
 from dynsim.cli.app import (
     FigureFormat,
@@ -24,13 +23,15 @@ from dynsim.cli.app import (
 )
 from dynsim.cli.display import console, errors, labelled, progress, record_files, told_in
 from dynsim.cli.drawing import Figures, Page, begin_drawing, draw, draw_all
+from dynsim.cli.hardware import export, hw
 from dynsim.cli.hw_drive import EXAMPLE, hw_drive
 from dynsim.cli.sweep import sweep
 from dynsim.cli.teleop import teleop
 from dynsim.cli.view import open_page, tell_of_view, view
+from dynsim.config import completion
 from dynsim.errors import DynsimError, RecordError, SimulationInterrupted, SimulationStopped
-from dynsim.hardware.cli import export, hw
-from dynsim.terminal import escaped
+from dynsim.system import interruption
+from dynsim.system.terminal import escaped
 
 if TYPE_CHECKING:
     from dynsim.engine import Start
@@ -57,9 +58,9 @@ def run(
 
     The method of integration follows from the system, integrator.method auto; the summary says which it is and why.
     """
-    from dynsim.files import check_writable
-    from dynsim.results import RUN_FILES, save_run
+    from dynsim.engine.results import RUN_FILES, save_run
     from dynsim.scenario import load_scenario
+    from dynsim.system.files import check_writable
 
     loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
     folder = out or Path("results", loaded.name, loaded.variant)
@@ -86,7 +87,7 @@ def run(
     elif view:
         page = shown.draw()
     if not quiet:
-        from dynsim.tables import print_summary
+        from dynsim.cli.tables import print_summary
 
         print_summary(console, record.summary)
         console.print(f"Written to {escaped(folder)}", highlight=False, soft_wrap=True)
@@ -108,9 +109,9 @@ def compare(
     quiet: QuietOption = False,
 ) -> None:
     """Simulate all variants of a scenario and compare them in a table and in figures."""
-    from dynsim.files import check_writable, discard
-    from dynsim.results import COMPARISON_FILES, RUN_FILES, save_run
+    from dynsim.engine.results import COMPARISON_FILES, RUN_FILES, save_run
     from dynsim.scenario import load_scenario, variant_names
+    from dynsim.system.files import check_writable, discard
 
     given = parsed_overrides(overrides)
     loaded = [load_scenario(scenario, name, given) for name in variant_names(scenario)]
@@ -157,7 +158,7 @@ def compare(
             together = Figures(records, folder, format_, together=True)
             page = draw_all([together, *wanted], Page(records, folder), quiet)
         if not quiet:
-            from dynsim.tables import print_comparison
+            from dynsim.cli.tables import print_comparison
 
             print_comparison(console, {name: record.summary for name, record in records.items()})
             console.print(f"Written to {escaped(folder)}", highlight=False, soft_wrap=True)
@@ -184,10 +185,10 @@ def check(
     Prints where hand and contact points start, in full digits, to be copied into a surface or a path, how far contacts
     are from their surfaces, the joints that initial.on_surface has moved, and the tip margin of a base at rest.
     """
+    from dynsim.cli.tables import print_starts
     from dynsim.engine import check as check_scenario
     from dynsim.engine.compilation import watched
     from dynsim.scenario import load_scenario, variant_names
-    from dynsim.tables import print_starts
 
     failed = False
     for name in scenarios:
@@ -218,7 +219,7 @@ def check(
 @app.command("list", epilog="Example: dynsim list")
 def list_() -> None:
     """Show shipped scenarios, plants, surfaces, controllers, paths and motors."""
-    from dynsim.tables import print_choices
+    from dynsim.cli.tables import print_choices
 
     print_choices(console)
     _warn_of_plugins()
@@ -229,7 +230,7 @@ def plot(
     records: Annotated[list[Path], typer.Argument(metavar="RECORD", help="Records (HDF5), or folders of runs.")],
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="For the figures; default: figures/ beside each record."),
+        typer.Option(metavar="FOLDER", help="For the figures; default: draw/figures/ beside each record."),
     ] = None,
     format_: FormatOption = FigureFormat.png,
 ) -> None:
@@ -257,9 +258,9 @@ def bench(
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures as JSON.")] = None,
 ) -> None:
     """Time right-hand sides and the whole job beside Pinocchio and MuJoCo (where installed)."""
-    from dynsim.files import write_json
     from dynsim.studies.bench.run import run_bench
     from dynsim.studies.bench.table import format_table
+    from dynsim.system.files import write_json
 
     with console.status("measuring"):
         result = run_bench(quick)
@@ -289,7 +290,7 @@ app.command(
 
 def _warn_of_plugins() -> None:
     """Say on stderr which plug-ins do not work; a run says so only of those that it needs."""
-    from dynsim.families import faults
+    from dynsim.library.families import faults
 
     for fault in faults():
         errors.print(f"[yellow]warning:[/] {escaped(fault)}")

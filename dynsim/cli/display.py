@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dynsim.errors import RecordError
-from dynsim.terminal import Terminal, escaped
+from dynsim.system.terminal import Terminal, escaped
 
 if TYPE_CHECKING:
     from rich.progress import ProgressColumn, TaskID
@@ -41,8 +41,8 @@ def labelled(paths: Sequence[Path]) -> dict[str, Record]:
     RecordError
         See :meth:`dynsim.record.Record.load`.
     """
-    from dynsim.files import file_name
     from dynsim.record import Record
+    from dynsim.system.files import file_name
 
     found: dict[str, Record] = {}
     for path in record_files(paths):

@@ -21,7 +21,7 @@ PARTS = 2
 class Figures:
     """Figures of one record, or of several over each other, as files of a kind in a folder.
 
-    ``part``: which of them, see :func:`dynsim.figures.draw`.
+    ``part``: which of them, see :func:`dynsim.draw.figures.draw`.
     """
 
     records: dict[str, Record]
@@ -31,8 +31,8 @@ class Figures:
     part: tuple[int, int] = (0, 1)
 
     def draw(self) -> None:
-        """See :func:`dynsim.figures.draw`."""
-        from dynsim import figures
+        """See :func:`dynsim.draw.figures.draw`."""
+        from dynsim.draw import figures
 
         if self.together:
             figures.draw_comparison(self.records, self.folder, self.kind, self.part)
@@ -50,8 +50,8 @@ class Page:
 
     def draw(self) -> Path | None:
         """Write it; None where the records have nothing to be seen."""
-        from dynsim.results import VIEW
-        from dynsim.view import viewable, write
+        from dynsim.draw.page import viewable, write
+        from dynsim.engine.results import VIEW
 
         shown = {name: record for name, record in self.records.items() if viewable(record)}
         return write(shown, self.folder / VIEW) if shown else None
@@ -68,7 +68,7 @@ def begin_drawing() -> None:
     from dynsim.studies.processes import begin_early, cores
 
     if cores() > 1:
-        begin_early("dynsim.cli.drawing", "dynsim.figures.arm", "dynsim.view")
+        begin_early("dynsim.cli.drawing", "dynsim.draw.figures.arm", "dynsim.draw.page")
 
 
 def draw_all(wanted: Sequence[Figures], page: Page, quiet: bool) -> Path | None:
@@ -77,7 +77,7 @@ def draw_all(wanted: Sequence[Figures], page: Page, quiet: bool) -> Path | None:
     Raises
     ------
     RecordError
-        See :func:`dynsim.figures.draw`; or a process was ended from outside.
+        See :func:`dynsim.draw.figures.draw`; or a process was ended from outside.
     """
     from dynsim.studies.processes import WorkerLost, cores, run_in_processes
 

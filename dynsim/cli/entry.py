@@ -13,18 +13,18 @@ from typing import Any
 
 import typer
 
-from dynsim import garbage, interruption
 from dynsim.cli.commands import app
 from dynsim.cli.display import errors
 from dynsim.errors import DynsimError, SimulationInterrupted
-from dynsim.standard_streams import lenient_streams
-from dynsim.terminal import escaped
+from dynsim.system import garbage, interruption
+from dynsim.system.standard_streams import lenient_streams
+from dynsim.system.terminal import escaped
 
 
 def main(received: Sequence[int]) -> None:
     """Errors become one line and an exit code. Ctrl-C where nothing can be saved is typer's: 130.
 
-    ``received`` : what :func:`dynsim.interruption.heeded` gives, within which this runs
+    ``received`` : what :func:`dynsim.system.interruption.heeded` gives, within which this runs
     """
     garbage.look_rarely()
     with lenient_streams() as output, _plain_warnings():

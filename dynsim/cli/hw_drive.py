@@ -9,9 +9,21 @@ from typing import Annotated, Any
 
 import typer
 
-from dynsim import interruption
 from dynsim.cli.app import QuietOption, ScenarioArgument, SetOption, parsed_overrides
 from dynsim.cli.display import errors
+from dynsim.cli.hardware import (
+    Configure,
+    Faults,
+    Live,
+    MapFile,
+    PolicyOption,
+    Rate,
+    ReplayPort,
+    Yes,
+    client_library,
+    console,
+    print_timing,
+)
 from dynsim.cli.teleop import (
     BaseSpeedOption,
     HttpPortOption,
@@ -28,20 +40,8 @@ from dynsim.cli.teleop import (
 )
 from dynsim.cli.view import write_view
 from dynsim.errors import DynsimError
-from dynsim.hardware.cli import (
-    Configure,
-    Faults,
-    Live,
-    MapFile,
-    PolicyOption,
-    Rate,
-    ReplayPort,
-    Yes,
-    client_library,
-    console,
-    print_timing,
-)
-from dynsim.terminal import escaped
+from dynsim.system import interruption
+from dynsim.system.terminal import escaped
 
 EXAMPLE = "Example: dynsim hw drive elbow_comparison --variant two_elbows --map arm --port virtual"
 SERVOS = "servos"
@@ -79,9 +79,8 @@ def hw_drive(
     """
     require_websockets()
     with client_library():
-        from dynsim.engine.driven import Pace
-        from dynsim.files import check_writable
-        from dynsim.hardware.dialog import confirm_replay, print_limits
+        from dynsim.cli.dialog import confirm_replay, print_limits
+        from dynsim.engine.results import RUN_FILES
         from dynsim.hardware.errors import ServoMapError
         from dynsim.hardware.ports import VIRTUAL, bus_on
         from dynsim.hardware.replay.display import displayed
@@ -91,10 +90,11 @@ def hw_drive(
         from dynsim.hardware.replay.states import StopRequest
         from dynsim.hardware.servo_map import load_servo_map
         from dynsim.hardware.virtual.faults import load_fault_script
-        from dynsim.live.follower import Wanted
-        from dynsim.live.servos import SimulationProcess
-        from dynsim.results import RUN_FILES
         from dynsim.scenario import load_scenario
+        from dynsim.system.files import check_writable
+        from dynsim.teleop.driven import Pace
+        from dynsim.teleop.web.follower import Wanted
+        from dynsim.teleop.web.servos import SimulationProcess
 
     if faults and port != VIRTUAL:
         raise ServoMapError("--faults is for virtual servos: --port virtual")

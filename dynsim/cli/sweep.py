@@ -22,9 +22,9 @@ from dynsim.cli.app import (
     parsed_overrides,
 )
 from dynsim.cli.display import console, drawing, errors, sweep_progress
+from dynsim.config.problems import suggest
 from dynsim.errors import ScenarioError, SimulationStopped
-from dynsim.problems import suggest
-from dynsim.terminal import escaped
+from dynsim.system.terminal import escaped
 
 if TYPE_CHECKING:
     from dynsim.studies.plan import Plan
@@ -95,10 +95,10 @@ def sweep(
         raise ScenarioError("--plot says what is drawn, --no-figures that nothing is: give one of them")
     if scheduler is None and (jobs or cores()) > 1:
         load_workers()
-    from dynsim.files import check_writable
     from dynsim.scenario import read_scenario
     from dynsim.studies.plan import Axis, Law, Plan
     from dynsim.studies.sweep import JOURNAL, OK, PLAN, STATISTICS, TABLES, has_parquet, run_sweep
+    from dynsim.system.files import check_writable
 
     file = read_scenario(scenario)
     axes, laws = tuple(map(Axis.parse, grid or ())), tuple(map(Law.parse, sample or ()))
@@ -187,13 +187,13 @@ def _load_for_the_end(samples: bool, figures: bool) -> None:
         if samples:
             import scipy.special  # noqa: F401
         if figures:
-            import dynsim.figures.sweep  # noqa: F401
+            import dynsim.draw.figures.sweep  # noqa: F401
 
 
 def _draw(
     name: str, rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool, format_: str, plotted: Sequence[str] = ()
 ) -> None:
-    from dynsim.figures.sweep import Sweep, draw
+    from dynsim.draw.figures.sweep import Sweep, draw
     from dynsim.studies.sweep import OK, TABLES
 
     known = dict.fromkeys(key for row in rows for key in row.numbers)

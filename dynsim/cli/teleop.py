@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dynsim import completion, interruption
 from dynsim.cli.app import QuietOption, ScenarioArgument, SetOption, parsed_overrides
 from dynsim.cli.display import console, errors
 from dynsim.cli.view import open_address, write_view
+from dynsim.config import completion
 from dynsim.errors import DynsimError
-from dynsim.terminal import escaped
+from dynsim.system import interruption
+from dynsim.system.terminal import escaped
 
 if TYPE_CHECKING:
-    from dynsim.live.session import Account
+    from dynsim.teleop.web.session import Account
 
 VariantOption = Annotated[
     str | None,
@@ -60,11 +61,12 @@ def teleop(
     is saved with a scenario that repeats it: `dynsim run FOLDER/scenario.yaml` gives the same record, bit for bit.
     """
     require_websockets()
-    from dynsim.engine.driven import Pace, drive
-    from dynsim.files import check_writable
-    from dynsim.live.session import Session
-    from dynsim.results import RUN_FILES, save_drive
+    from dynsim.engine.results import RUN_FILES, save_drive
     from dynsim.scenario import load_scenario
+    from dynsim.system.files import check_writable
+    from dynsim.teleop.drive import drive
+    from dynsim.teleop.driven import Pace
+    from dynsim.teleop.web.session import Session
 
     loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
     folder = out or new_folder(Path("results", loaded.name))

@@ -12,7 +12,7 @@ import typer
 
 from dynsim.cli.display import console, labelled, record_files
 from dynsim.cli.drawing import Page
-from dynsim.terminal import escaped
+from dynsim.system.terminal import escaped
 
 if TYPE_CHECKING:
     from dynsim.record import Record
@@ -35,8 +35,8 @@ def view(
     ] = None,
 ) -> None:
     """Write a page that shows records in 3D, with plots and forces over time, for any browser and without a network."""
-    from dynsim.results import VIEW
-    from dynsim.view import write
+    from dynsim.draw.page import write
+    from dynsim.engine.results import VIEW
 
     named = labelled(record_files(records))
     first = records[0] if records[0].is_dir() else records[0].parent

@@ -13,11 +13,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim import interruption
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped, UnreachableReference
 from dynsim.record import Record
-from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario, require_scenario
+from dynsim.system import interruption
+from dynsim.system.reuse import Reuse
 
 # A library says nothing unless it is asked to. Here, not in dynsim/__init__.py: everything that logs imports this.
 logging.getLogger("dynsim").addHandler(logging.NullHandler())

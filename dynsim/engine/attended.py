@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from dynsim import interruption
 from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.prepare import Prepared, right_hand_side
-from dynsim.kernels.integrate import driver
-from dynsim.kernels.integrate import run as ki
+from dynsim.integrators import driver
+from dynsim.integrators import run as ki
+from dynsim.system import interruption
 
 log = logging.getLogger(__name__)
 
@@ -211,7 +211,7 @@ def _short_steps(prepared: Prepared) -> int:
 def advance(
     prepared: Prepared, limit: int, watch: WallWatch, look: Callable[[], None]
 ) -> tuple[Prepared, BaseException | None]:
-    """One piece of up to ``limit`` steps, see :func:`dynsim.kernels.integrate.driver.advance`.
+    """One piece of up to ``limit`` steps, see :func:`dynsim.integrators.driver.advance`.
 
     STATUS may be OUT_OF_TIME or STUCK besides what the kernels make of it.
 

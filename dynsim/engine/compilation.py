@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynsim.kernels.jit import cache_folder, told_of_compilation
+from dynsim.jit.kernel import cache_folder, told_of_compilation
 
 # Beside the folders of kernels: how long the last compilation took.
 LAST = "compiled_in_s"

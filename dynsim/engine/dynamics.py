@@ -6,7 +6,6 @@ import logging
 import time as clock
 from functools import partial
 
-from dynsim import interruption
 from dynsim.engine import SIMULATION, Progress, attended
 from dynsim.engine.outcome import raise_stopped
 from dynsim.engine.prepare import Prepared, prepare
@@ -15,10 +14,11 @@ from dynsim.engine.start import check
 from dynsim.engine.stepped import event_name, own_guards, take_log
 from dynsim.engine.stopping import last_state, stopped
 from dynsim.errors import SimulationInterrupted, SimulationStopped
-from dynsim.kernels.integrate import run as ki
+from dynsim.integrators import run as ki
 from dynsim.record import Event, Record
-from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario
+from dynsim.system import interruption
+from dynsim.system.reuse import Reuse
 
 __all__ = ["Prepared", "check", "prepare", "simulate"]
 

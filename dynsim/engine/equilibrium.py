@@ -16,13 +16,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dynsim.kernels.arrays import ReferenceArrays
-from dynsim.model.control import JointControl
+from dynsim.compile.contact_law import told
+from dynsim.compile.control import JointControl
+from dynsim.compile.equilibrium import load_torques, rest
+from dynsim.compile.model import Model
+from dynsim.dynamics.tables import ReferenceArrays
 from dynsim.model.description import Array, Contact, Load
 from dynsim.model.drives import Motor, Servo, TorqueSource
-from dynsim.model.equilibrium import load_torques, rest
-from dynsim.model.model import Model
-from dynsim.model.unilateral import told
 
 # What a reference begins with that counts as rest where the joint is [rad or m, rad/s or m/s].
 AT_REST = 1e-4

@@ -27,12 +27,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.kernels import inverse_kinematics as ki
-from dynsim.kernels.arrays import workspace
-from dynsim.kernels.jit import reals
-from dynsim.model.model import Model
-from dynsim.model.operated import Operated
-from dynsim.model.reaching import path_arrays
+from dynsim.compile.model import Model
+from dynsim.compile.reaching import path_arrays
+from dynsim.compile.references.operated import Operated
+from dynsim.dynamics import inverse_kinematics as ki
+from dynsim.dynamics.tables import workspace
+from dynsim.jit.kernel import reals
 
 Array = NDArray[np.float64]
 

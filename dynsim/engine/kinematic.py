@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dynsim import interruption
+from dynsim.compile.scene import snake_scene
 from dynsim.engine import Progress, Start
 from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.kinematic_record import COORDINATES, make_record
@@ -17,10 +17,14 @@ from dynsim.engine.mode_switching import ModeSwitcher
 from dynsim.engine.outcome import check_size, raise_stopped
 from dynsim.engine.provenance import provenance
 from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
-from dynsim.families import member
-from dynsim.kernels.jit import integers, reals
-from dynsim.model.scene import snake_scene
-from dynsim.model.snake import (
+from dynsim.jit.kernel import integers, reals
+from dynsim.library.families import member
+from dynsim.record import Record
+from dynsim.record.poses import pose_columns
+from dynsim.scenario import Scenario, build
+from dynsim.scenario.effect import without_effect
+from dynsim.snake import state as ss
+from dynsim.snake.description import (
     FIXING,
     NO_REQUEST,
     SWITCHING,
@@ -29,15 +33,11 @@ from dynsim.model.snake import (
     Feedback,
     SnakeDescription,
 )
-from dynsim.record import Record
-from dynsim.record.poses import pose_columns
-from dynsim.reuse import Reuse
-from dynsim.scenario import Scenario, build
-from dynsim.scenario.effect import without_effect
-from dynsim.snake import state as ss
 from dynsim.snake.kinematics import pose_of_point
 from dynsim.snake.state import State, new_rig, new_state, new_trace
 from dynsim.snake.ticks import record_row, run_ticks
+from dynsim.system import interruption
+from dynsim.system.reuse import Reuse
 
 log = logging.getLogger(__name__)
 

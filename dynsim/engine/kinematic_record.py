@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim._version import __version__
+from dynsim.compile.scene import snake_scene
 from dynsim.engine.kinematic_run import Run
 from dynsim.engine.mode_switching import ModeSwitcher
-from dynsim.kernels.jit import reals
-from dynsim.model.scene import snake_scene
-from dynsim.model.snake import conditioning
+from dynsim.jit.kernel import reals
 from dynsim.record import Record
 from dynsim.record.poses import add_body_poses
 from dynsim.scenario import Scenario
 from dynsim.scenario.effect import without_effect
 from dynsim.snake import state as ss
+from dynsim.snake.description import conditioning
 from dynsim.snake.kinematics import new_chain, posture_points
 from dynsim.snake.state import Trace
 from dynsim.snake.ticks import record_row

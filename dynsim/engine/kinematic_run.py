@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.model.snake import CommandBlock, CommandSource, SnakeDescription, TaskSpaceController
+from dynsim.snake.description import CommandBlock, CommandSource, SnakeDescription, TaskSpaceController
 from dynsim.snake.kinematics import SnakeModel
 from dynsim.snake.state import Rig, State, Trace
 

@@ -19,13 +19,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.drive.dc import dc_block
-from dynsim.kernels.drive.servo import servo_block
-from dynsim.model.control import JointControl
+from dynsim.compile.control import JointControl
+from dynsim.compile.model import Model
+from dynsim.compile.posture import gaps_and_rates
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.drive.dc import dc_block
+from dynsim.dynamics.drive.servo import servo_block
 from dynsim.model.description import Array, Contact
-from dynsim.model.model import Model
-from dynsim.model.posture import gaps_and_rates
 from dynsim.scenario.schema import Integrator
 
 AUTO = "auto"

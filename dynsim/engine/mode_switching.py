@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from dynsim.model.snake import FIXING, SWITCHING, ModeTable, Policy
+from dynsim.snake.description import FIXING, SWITCHING, ModeTable, Policy
 
 
 class Refusal(NamedTuple):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-from dynsim import interruption
 from dynsim.engine import SIMULATION, Progress
 from dynsim.engine.outcome import mark_stopped, raise_stopped
 from dynsim.engine.simulation import Simulation
 from dynsim.errors import SimulationInterrupted, SimulationStopped
 from dynsim.record import Record
 from dynsim.scenario import Scenario
+from dynsim.system import interruption
 
 # Ticks between two looks at Ctrl-C and the progress bar.
 PIECE = 10

@@ -2,7 +2,7 @@
 
 The hand's target p_d moves with the velocity v that is asked for, in axes of the world; on a mobile base in those of
 the base, which carries it. Each tick of length h takes the joints to where the hand is at p_d + h v, at constant rates
-(damped Gauss–Newton, :func:`dynsim.kernels.inverse_kinematics.follow_path`):
+(damped Gauss–Newton, :func:`dynsim.dynamics.inverse_kinematics.follow_path`):
 
     q_d(t) = q_d + (q_d⁺ − q_d) (t − t_k)/h
 
@@ -14,21 +14,25 @@ hand comes to the edge of what its joints can do (:mod:`dynsim.engine.hand_gover
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dynsim.compile.model import Model
+from dynsim.compile.references.operated import BASE, HAND, VELOCITIES, Operated, VelocitySource
+from dynsim.compile.rolling import wheel_angles
 from dynsim.engine.hand_governor import HandGovernor
-from dynsim.model.mobile_base import base_pose, base_row
-from dynsim.model.model import Model
-from dynsim.model.operated import BASE, HAND, VELOCITIES, Operated, VelocitySource
-from dynsim.model.rolling import wheel_angles
-
-if TYPE_CHECKING:
-    from dynsim.engine.simulation import Simulation
+from dynsim.model.base_pose import base_pose, base_row
 
 Array = NDArray[np.float64]
+
+
+class Referenced(Protocol):
+    """A simulation whose references can be rewritten."""
+
+    def set_reference(self, joint: str, position: float, rate: float = 0.0) -> None:
+        """See :meth:`dynsim.engine.simulation.Simulation.set_reference`."""
 
 
 class OperatorPath:
@@ -94,7 +98,7 @@ class Operator:
             else:
                 setattr(self, name, value.copy() if isinstance(value, np.ndarray) else value)
 
-    def __call__(self, simulation: Simulation) -> None:
+    def __call__(self, simulation: Referenced) -> None:
         """Rewrite the references for the time up to the next tick."""
         wanted = self.source.read(self.ticks)
         self.ticks += 1

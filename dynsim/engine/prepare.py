@@ -10,41 +10,35 @@ from functools import partial
 
 import numpy as np
 
+from dynsim.compile.clearance import gaps
+from dynsim.compile.contact_law import JointStop, compile_grips, compile_unilateral, joint_stops
+from dynsim.compile.control import JointControl
+from dynsim.compile.model import Model
+from dynsim.compile.shapes import compile_shapes
+from dynsim.compile.tables import compile_contacts, compile_couplings, compile_drives, compile_loads, compile_support
+from dynsim.dynamics import state as kst
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.derivative import System, new_workspace
+from dynsim.dynamics.simd.system import has_forms
+from dynsim.dynamics.state import OutputLayout, StateLayout, block, output_layout, state_layout
+from dynsim.dynamics.tree import support as ks
 from dynsim.engine import REFERENCES, Progress
 from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.equilibrium import Balance, balanced, shifted
 from dynsim.engine.method import AUTO, Choice, choose
 from dynsim.engine.outcome import check_size
 from dynsim.errors import ModelError, ScenarioError
-from dynsim.kernels import arrays as ka
-from dynsim.kernels import state as kst
-from dynsim.kernels.integrate import contact_events as kev
-from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.integrate import time_stepping as kt
-from dynsim.kernels.integrate.events import TIP_MARGIN
-from dynsim.kernels.integrate.time_stepping import stepping_arrays
-from dynsim.kernels.lanes.system import has_forms
-from dynsim.kernels.state import OutputLayout, StateLayout, block, output_layout, state_layout
-from dynsim.kernels.system import System, new_workspace
-from dynsim.kernels.tree import support as ks
-from dynsim.model.arrays import (
-    compile_contacts,
-    compile_couplings,
-    compile_drives,
-    compile_loads,
-    compile_support,
-)
-from dynsim.model.clearance import gaps
-from dynsim.model.control import JointControl
+from dynsim.integrators import run as ki
+from dynsim.integrators.contacts import events as kev
+from dynsim.integrators.events import TIP_MARGIN
+from dynsim.integrators.stepping import tables as kt
+from dynsim.integrators.stepping.tables import stepping_arrays
 from dynsim.model.description import Array, Contact, Load, Robot
 from dynsim.model.drives import Drive, Motor
-from dynsim.model.model import Model
-from dynsim.model.shapes import compile_shapes
-from dynsim.model.unilateral import JointStop, compile_grips, compile_unilateral, joint_stops
 from dynsim.record.poses import pose_columns
-from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario, build
 from dynsim.scenario.schema import Integrator
+from dynsim.system.reuse import Reuse
 
 log = logging.getLogger(__name__)
 
@@ -222,7 +216,7 @@ def guards(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """The events that a run watches for by itself, and what they do: those of a base, then of the unilateral law.
 
-    Of a mobile base the margin falls through zero; of contacts and stops see dynsim.kernels.integrate.contact_events.
+    Of a mobile base the margin falls through zero; of contacts and stops see dynsim.integrators.contacts.events.
     """
     rows = []
     if robot.base is not None:

@@ -9,8 +9,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from dynsim import families
 from dynsim._version import __version__
+from dynsim.library import families
 from dynsim.scenario import Scenario
 
 LIBRARIES = ("numpy", "scipy", "numba", "h5py", "pin")

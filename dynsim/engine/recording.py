@@ -8,21 +8,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim import metrics
-from dynsim.contact_metrics import beyond_stops
+from dynsim.compile.scene import robot_scene
+from dynsim.dynamics import state as kst
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.tree import support as ks
+from dynsim.engine import summary as metrics
+from dynsim.engine.contact_metrics import beyond_stops
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.provenance import provenance
 from dynsim.engine.ratings import motor_loads, overloaded
 from dynsim.engine.sharing import sharing
 from dynsim.engine.uniqueness import motion_spread
-from dynsim.kernels import arrays as ka
-from dynsim.kernels import state as kst
-from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.integrate import time_stepping
-from dynsim.kernels.tree import support as ks
+from dynsim.integrators import run as ki
+from dynsim.integrators.stepping import tables as time_stepping
+from dynsim.model.base_pose import base_pose
 from dynsim.model.description import Link
-from dynsim.model.mobile_base import SUPPORTS, MobileBase, base_pose
-from dynsim.model.scene import robot_scene
+from dynsim.model.mobile_base import SUPPORTS, MobileBase
 from dynsim.record import Event, Record
 from dynsim.record.poses import add_body_poses
 from dynsim.scenario import Scenario, build
@@ -186,7 +187,7 @@ def _add_unilateral(record: Record, prepared: Prepared) -> None:
 
 
 def _add_base(record: Record, prepared: Prepared, base: MobileBase, as_planned: bool) -> None:
-    """Where the base is and should be, and what the ground carries; see dynsim.kernels.tree.support."""
+    """Where the base is and should be, and what the ground carries; see dynsim.dynamics.tree.support."""
     robot, run = prepared.model.robot, prepared.run
     pose, speed = base_pose(robot, run.states("q")), run.states("v")[:, list(map(robot.joint_names.index, base.wheels))]
     record.add("base_pose", pose, "m, m, rad", labels=("x", "y", "heading"), description="base in the world")

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.kernels import arrays as ka
+from dynsim.compile.model import Model
+from dynsim.compile.shapes import share_of_axis
+from dynsim.dynamics import tables as ka
 from dynsim.model.description import Contact
-from dynsim.model.model import Model
-from dynsim.model.shapes import share_of_axis
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ def sharing(model: Model, contacts: Sequence[Contact], q: Array, modes: Array) -
     Parameters
     ----------
     q : samples, (T, nq) [rad or m]
-    modes : of the contacts in them, (T, c), dynsim.kernels.arrays: OPEN, SLIDING, STICKING
+    modes : of the contacts in them, (T, c), dynsim.dynamics.tables: OPEN, SLIDING, STICKING
     """
     free = _free(model)
     found: set[int] = set()

@@ -18,7 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dynsim import interruption
+from dynsim.compile.model import Model
+from dynsim.compile.references.operated import VelocitySource
+from dynsim.compile.tables import check_couplings
+from dynsim.dynamics import state as kst
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.state import block
+from dynsim.dynamics.tree import loads as kl
 from dynsim.engine import attended
 from dynsim.engine.operator import Operator
 from dynsim.engine.outcome import mark_stopped, raise_stopped
@@ -28,20 +34,14 @@ from dynsim.engine.stepped import GUARDS, Snapshot, State, Touch, event_name, ow
 from dynsim.engine.stopping import stopped
 from dynsim.engine.trace import Trace
 from dynsim.errors import ModelError, ScenarioError, shown
-from dynsim.kernels import arrays as ka
-from dynsim.kernels import state as kst
-from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.integrate.dense import state_within
-from dynsim.kernels.state import block
-from dynsim.kernels.tree import loads as kl
-from dynsim.measures import TIP_OVER
-from dynsim.model.arrays import check_couplings
+from dynsim.integrators import run as ki
+from dynsim.integrators.dense import state_within
 from dynsim.model.drives import Drive
-from dynsim.model.model import Model
-from dynsim.model.operated import VelocitySource
 from dynsim.record import Event, Record
+from dynsim.record.measures import TIP_OVER
 from dynsim.scenario import Scenario, require_scenario
 from dynsim.scenario.build import check_start
+from dynsim.system import interruption
 
 Array = NDArray[np.float64]
 

@@ -6,17 +6,17 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from dynsim.compile.equilibrium import load_forces, rest
+from dynsim.compile.model import Model
+from dynsim.compile.shapes import gap_at
+from dynsim.compile.static_margin import static_margin
 from dynsim.engine import Start
 from dynsim.engine.prepare import prepare
 from dynsim.errors import ModelError
 from dynsim.model.description import Contact
-from dynsim.model.equilibrium import load_forces, rest
-from dynsim.model.mobile_base import static_margin
-from dynsim.model.model import Model
-from dynsim.model.shapes import gap_at
-from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario, build
 from dynsim.scenario.effect import without_effect
+from dynsim.system.reuse import Reuse
 
 # Joints that the solution of a posture has moved by less stay where they were [rad or m].
 MOVED = 1e-12

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.trace import Rows
-from dynsim.kernels.integrate import contact_events, events
-from dynsim.kernels.integrate import run as ki
-from dynsim.measures import TIP_OVER
+from dynsim.integrators import events
+from dynsim.integrators import run as ki
+from dynsim.integrators.contacts import events as contact_events
 from dynsim.record import Event, Record
+from dynsim.record.measures import TIP_OVER
 
 Array = NDArray[np.float64]
 

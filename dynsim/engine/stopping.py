@@ -7,15 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from dynsim.compile.contact_law import START_TOLERANCE
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.state import block
 from dynsim.engine.prepare import Prepared
 from dynsim.engine.uniqueness import paradox
 from dynsim.errors import SimulationStopped
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.constraint import unilateral as ku
-from dynsim.kernels.integrate import project as kp
-from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.state import block
-from dynsim.model.unilateral import START_TOLERANCE
+from dynsim.integrators import project as kp
+from dynsim.integrators import run as ki
 from dynsim.scenario import Scenario
 
 # STATUS in a word.

@@ -1,6 +1,6 @@
 """Runs of fixed steps that share lanes: four or eight scenarios of equal structure are integrated at once.
 
-What may differ from lane to lane is what tables of numbers say, see dynsim.kernels.lanes.tables.AXES: masses,
+What may differ from lane to lane is what tables of numbers say, see dynsim.dynamics.simd.tables.AXES: masses,
 dimensions, gains, motor constants, limits, friction, surfaces, gravity, references. Adaptive methods choose their own
 steps, so they never share.
 """
@@ -14,20 +14,20 @@ from typing import Any
 
 import numpy as np
 
-from dynsim import interruption
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.simd.system import COMPILED, has_forms, lanes_of_runs
+from dynsim.dynamics.simd.tables import AXES, stack_tables
 from dynsim.engine import named, note_warnings, simulate
 from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.prepare import Prepared, prepare
 from dynsim.engine.recording import make_record
 from dynsim.errors import DynsimError, SimulationInterrupted
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.lanes.fixed_step import LaneRuns, advance_lanes, lane_runs
-from dynsim.kernels.lanes.system import COMPILED, has_forms, lanes_of_runs
-from dynsim.kernels.lanes.tables import AXES, stack_tables
+from dynsim.integrators import run as ki
+from dynsim.integrators.fixed_step import LaneRuns, advance_lanes, lane_runs
 from dynsim.record import Record
-from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario
+from dynsim.system import interruption
+from dynsim.system.reuse import Reuse
 
 log = logging.getLogger(__name__)
 

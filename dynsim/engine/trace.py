@@ -8,7 +8,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.kernels.integrate import run as ki
+from dynsim.integrators import run as ki
 
 Array = NDArray[np.float64]
 Rows = tuple[Array, Array, Array]

@@ -1,6 +1,6 @@
 """What the engine says where the contacts do not determine their forces: Painlevé's paradox, and dependent rows.
 
-The watch itself is compiled (dynsim.kernels.constraint.uniqueness); here its finding is located and put into words,
+The watch itself is compiled (dynsim.dynamics.contact.uniqueness); here its finding is located and put into words,
 and the motion that dependent frictional rows leave open is measured. docs/physics.md derives the criteria.
 """
 
@@ -13,14 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.constraint import uniqueness as kq
-from dynsim.kernels.constraint.delassus import RANK_TOLERANCE
-from dynsim.kernels.constraint.surface import SIGNS_LIMIT
-from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.system import System, derivative, new_workspace
-from dynsim.kernels.tree.articulated import accelerate
-from dynsim.metrics import MotionSpread
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import uniqueness as kq
+from dynsim.dynamics.contact.delassus import RANK_TOLERANCE
+from dynsim.dynamics.contact.quadrics import SIGNS_LIMIT
+from dynsim.dynamics.derivative import System, derivative, new_workspace
+from dynsim.dynamics.tree.articulated import accelerate
+from dynsim.engine.summary import MotionSpread
+from dynsim.integrators import run as ki
 from dynsim.model.description import Contact
 
 Array = NDArray[np.float64]

@@ -12,11 +12,11 @@ import numpy as np
 from ruamel.yaml import YAML
 
 from dynsim.errors import RecordError
-from dynsim.files import write_text
 from dynsim.hardware.bus.control_table import MX_106, STATE_BLOCK
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused
 from dynsim.hardware.errors import ServoMapError, VerificationFailed
 from dynsim.hardware.servo_map import Servo, ServoMap, load_servo_map
+from dynsim.system.files import write_text
 
 Key = Literal["zero_tick", "sign"]
 READS = 20

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.errors import RecordError
-from dynsim.files import replacing
 from dynsim.hardware.replay.trajectory import Path as JointPath
 from dynsim.record import Record
+from dynsim.system.files import replacing
 
 Format = Literal["csv", "joint-trajectory", "urdf-log"]
 SUFFIX: dict[str, str] = {"csv": ".csv", "joint-trajectory": ".trajectory.yaml", "urdf-log": ".jsonl"}

@@ -26,7 +26,6 @@ from typing import Any, get_args
 import numpy as np
 
 from dynsim._version import __version__
-from dynsim.files import write_json
 from dynsim.hardware.bus.clock import VirtualClock
 from dynsim.hardware.bus.dynamixel_bus import DynamixelBus
 from dynsim.hardware.bus.packet import Instruction, Packet
@@ -42,6 +41,7 @@ from dynsim.hardware.virtual.faults import FaultScript
 from dynsim.hardware.virtual.line import VirtualLine, line_for_map
 from dynsim.hardware.virtual.port import VirtualPort
 from dynsim.record import Record
+from dynsim.system.files import write_json
 
 MAP = """\
 robot: rig

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from dynsim.config import StrictModel, error_at
+from dynsim.config.base import StrictModel, error_at
 from dynsim.hardware.bus.control_table import BAUD_RATES
 from dynsim.hardware.data_sheet import Objection, rounded_up
 from dynsim.hardware.strict_yaml import Positive, Within

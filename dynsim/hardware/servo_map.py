@@ -16,9 +16,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
-from dynsim.config import StrictModel, error_at
+from dynsim.config.base import StrictModel, error_at
+from dynsim.config.problems import suggest
 from dynsim.errors import shown
-from dynsim.files import file_name
 from dynsim.hardware.bus.control_table import (
     MAX_ID,
     MODELS,
@@ -32,8 +32,8 @@ from dynsim.hardware.data_sheet import Objection, objections_to_limits, objectio
 from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.safety import Bus, Safety, objections_to_times
 from dynsim.hardware.strict_yaml import Finite, Positive, Within, read_yaml
-from dynsim.inputs import is_file
-from dynsim.problems import suggest
+from dynsim.system.files import file_name
+from dynsim.system.inputs import is_file
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 _CHECKOUT = _PACKAGE.parent / "scenarios" / "hardware"

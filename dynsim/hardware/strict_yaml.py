@@ -9,9 +9,9 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
 from pydantic_core import core_schema
 
+from dynsim.config.problems import Origin, explain, unknown_keys
 from dynsim.hardware.errors import ServoMapError
-from dynsim.inputs import parse_yaml, read_text
-from dynsim.problems import Origin, explain, unknown_keys
+from dynsim.system.inputs import parse_yaml, read_text
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]

@@ -65,7 +65,7 @@ class Motor:
 
 @dataclass(frozen=True)
 class Servo:
-    """A position servo on a revolute joint, everything at its output shaft; its law: dynsim.kernels.drive.servo.
+    """A position servo on a revolute joint, everything at its output shaft; its law: dynsim.dynamics.drive.servo.
 
     Attributes
     ----------

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
-from dynsim.config import NonNegative, Positive, StrictConfig, Vector3, error_at
+from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3, error_at
 from dynsim.model.drives import Drive, Motor
 
 

@@ -1,6 +1,6 @@
 """Position servos outside the compiled kernels: their parameters as a table, and their law for arrays of servos.
 
-It is the source that the kernels compile (``dynsim.kernels.drive.servo``), called as plain Python: no numba here.
+It is the source that the kernels compile (``dynsim.dynamics.drive.servo``), called as plain Python: no numba here.
 """
 
 from __future__ import annotations
@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.drive import servo as law
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.drive import servo as law
 from dynsim.model.drives import Servo
 
 Array = NDArray[np.float64]

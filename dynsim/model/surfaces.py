@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
@@ -9,12 +10,15 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dynsim.errors import ModelError
 from dynsim.record.scene import Surface as Drawn
 
 if TYPE_CHECKING:
-    from dynsim.kernels.constraint.distance import ShapeArrays
+    from dynsim.dynamics.contact.distance import ShapeArrays
 
 Array = NDArray[np.float64]
+# Quadrics that spheres and capsules can touch.
+SIMPLE = ("plane", "sphere", "cylinder")
 
 
 class Surface(Protocol):
@@ -43,7 +47,7 @@ class Quadric:
 
     def gap(self, position: Array) -> float:
         """Signed distance [m] of a point along the normal; exact for plane, sphere and cylinder."""
-        from dynsim.kernels.constraint.surface import surface_distance
+        from dynsim.dynamics.contact.quadrics import surface_distance
 
         gradient = self.Q @ position + self.b
         slope = float(np.linalg.norm(gradient))
@@ -91,13 +95,11 @@ class Quadric:
 
 
 class _Shaped:
-    """Distances by the kernels of dynsim.kernels.constraint.distance."""
+    """Distances by the kernels of dynsim.dynamics.contact.distance."""
 
     @property
     def shapes(self) -> ShapeArrays:
         """Table of a point candidate on this surface."""
-        from dynsim.model.shapes import shape_arrays
-
         return shape_arrays([(self, 0.0, np.zeros(3), False)])
 
     def gap(self, position: Array) -> float:
@@ -117,7 +119,7 @@ class _Shaped:
         return self._distances(positions)[1]
 
     def _distances(self, positions: Array) -> tuple[Array, Array]:
-        from dynsim.kernels.constraint.distance import surface_distances
+        from dynsim.dynamics.contact.distance import surface_distances
 
         points = np.array(positions, dtype=np.float64, order="C")
         gaps, normals = np.zeros(len(points)), np.zeros((len(points), 3))
@@ -173,7 +175,7 @@ SURFACES = Quadric | Box | HeightField
 
 def _spline(values: Array) -> Array:
     """Coefficients of cubic B-splines along the first axis, (n, m) → (n + 2, m)."""
-    from dynsim.kernels.banded import solve_banded
+    from dynsim.dynamics.banded import solve_banded
 
     n, beside = len(values), 4
     band, right = np.zeros((n + 2, 3 * beside + 1)), np.zeros((n + 2, values.shape[1]))
@@ -182,3 +184,47 @@ def _spline(values: Array) -> Array:
     right[1:-1] = values
     solve_banded(band, beside, beside, right)
     return right
+
+
+def shape_arrays(entries: Sequence[tuple[Surface | None, float, Array, bool]]) -> ShapeArrays:
+    """Tables of candidates: surface, radius [m], axis in its body [m], and whether its nearest point touches.
+
+    The surface is None for a point on a quadric.
+    """
+    # The kernels need a second to load, which configurations can do without.
+    from dynsim.dynamics.contact import distance as kd
+    from dynsim.jit.kernel import integers, reals
+
+    simple = {"plane": kd.PLANE, "sphere": kd.SPHERE, "cylinder": kd.CYLINDER}
+    kind = np.zeros((len(entries), kd.SHAPE_KIND_SIZE), dtype=np.int64)
+    data = np.zeros((len(entries), kd.SHAPE_SIZE))
+    fields: list[Array] = [np.zeros(0)]
+    starts: dict[int, int] = {}
+    for k, (surface, radius, along, moving) in enumerate(entries):
+        if surface is None:
+            continue
+        data[k, kd.RADIUS], data[k, kd.D : kd.D + 3], kind[k, kd.MOVES] = radius, along, moving
+        if isinstance(surface, Box):
+            kind[k, kd.SURFACE] = kd.BOX
+            data[k, kd.PLACE : kd.PLACE + 3] = surface.centre
+            data[k, kd.AXES : kd.AXES + 9] = np.asarray(surface.axes).ravel()
+            data[k, kd.SIZE : kd.SIZE + 3] = 0.5 * np.asarray(surface.edges) - surface.edge_radius
+            data[k, kd.EDGE] = surface.edge_radius
+        elif isinstance(surface, HeightField):
+            kind[k, kd.SURFACE] = kd.HEIGHT_FIELD
+            if id(surface) not in starts:
+                starts[id(surface)] = sum(map(len, fields))
+                fields.append(surface.coefficients.ravel())
+            kind[k, kd.FIELD], ny, nx = starts[id(surface)], *surface.heights.shape
+            kind[k, kd.COUNT : kd.COUNT + 2] = nx, ny
+            data[k, kd.PLACE : kd.PLACE + 2], data[k, kd.SIZE : kd.SIZE + 2] = surface.origin, surface.spacing
+        elif isinstance(surface, Quadric):
+            drawn = surface.drawn
+            kind[k, kd.SURFACE] = simple[drawn.kind]
+            data[k, kd.PLACE : kd.PLACE + 3] = drawn.position
+            if drawn.direction is not None:
+                data[k, kd.AXES : kd.AXES + 3] = drawn.direction
+            data[k, kd.SIZE] = drawn.radius or 0.0
+        else:
+            raise ModelError(f"a {type(surface).__name__} is no surface that the kernels know")
+    return kd.ShapeArrays(kind=integers(kind), data=reals(data), fields=reals(np.concatenate(fields)))

@@ -26,8 +26,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.errors import RecordError
-from dynsim.files import check_complete
-from dynsim.inputs import is_file
 from dynsim.record.content import (
     FORMAT,
     OLDER,
@@ -42,6 +40,8 @@ from dynsim.record.content import (
 )
 from dynsim.record.scene import Scene
 from dynsim.record.writer import CHECKSUM, EVENT_COLUMNS, encode
+from dynsim.system.files import check_complete
+from dynsim.system.inputs import is_file
 
 SIZE_LIMIT = 2 << 30
 """A file may unpack to this many bytes, or to ``RATIO_LIMIT`` times its own size if that is more."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import bisect
 import difflib
+import importlib
 import math
 import os
 from collections.abc import Iterator, KeysView, Mapping
@@ -16,18 +17,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dynsim import notebook
 from dynsim.errors import MissingEntry, RecordError, shown
-from dynsim.files import replacing
-from dynsim.record import export, reader, writer
+from dynsim.record import export, notebook, reader, writer
 from dynsim.record.content import TIME, Content, Event, Signal, check_name, check_signal, check_time
 from dynsim.record.scene import Scene
+from dynsim.system.files import replacing
 
 if TYPE_CHECKING:
     import pandas
     import xarray
-
-    from dynsim.view import Inline
 
 # Signals named in the repr.
 _SHOWN = 6
@@ -162,7 +160,7 @@ class Record:
         what = "" if self.scene is None else "<p><code>record.view()</code> shows it in 3D.</p>"
         return notebook.table(repr(self)[1:-1], rows, what)
 
-    def view(self, *others: Record, ghost: bool = False, height: int = 640) -> Inline:
+    def view(self, *others: Record, ghost: bool = False, height: int = 640) -> Any:
         """A page that shows the run in 3D, with plots over time; notebooks show it inline.
 
         Parameters
@@ -176,13 +174,13 @@ class Record:
         RecordError
             See :func:`dynsim.view.page`.
         """
-        from dynsim.view import Inline, page
-
+        # By name: pictures know records, not the other way round.
+        page = importlib.import_module("dynsim.draw.page")
         named: dict[str, Record] = {}
         for record in (self, *others):
             name = str(record.summary.get("variant") or "record")
             named[name if name not in named else f"{name} {len(named) + 1}"] = record
-        return Inline(page(named, ghost=ghost), height)
+        return page.Inline(page.page(named, ghost=ghost), height)
 
     def keys(self) -> KeysView[str]:
         """Names of the signals."""
@@ -226,7 +224,7 @@ class Record:
         self._provenance = _entries("provenance", entries)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write HDF5 to ``path``: complete or not at all (see :func:`dynsim.files.replacing`).
+        """Write HDF5 to ``path``: complete or not at all (see :func:`dynsim.system.files.replacing`).
 
         Raises
         ------

@@ -14,7 +14,7 @@ from dynsim.scenario.reading import (
     variant_names,
 )
 from dynsim.scenario.schema import Scenario, ScenarioConfig
-from dynsim.shipped import SHIPPED, shipped_scenarios
+from dynsim.system.shipped import SHIPPED, shipped_scenarios
 
 __all__ = [
     "SHIPPED",

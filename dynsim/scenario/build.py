@@ -9,24 +9,24 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim import families
-from dynsim.config import BodyPoint
+from dynsim.compile.control import JointControl
+from dynsim.compile.model import Model
+from dynsim.compile.posture import on_surfaces
+from dynsim.compile.protocols import BuildContext
+from dynsim.compile.shapes import gap_at
+from dynsim.config.base import BodyPoint
+from dynsim.config.problems import dotted, suggest
 from dynsim.errors import ModelError, ScenarioError, shown
-from dynsim.model.control import JointControl
+from dynsim.library import families
 from dynsim.model.description import Array, Contact, Inertia, Load, Robot
-from dynsim.model.model import Model
-from dynsim.model.posture import on_surfaces
-from dynsim.model.protocols import BuildContext
-from dynsim.model.shapes import gap_at
 from dynsim.model.surfaces import SURFACES, Surface
-from dynsim.problems import dotted, suggest
-from dynsim.reuse import Reuse
 from dynsim.scenario.candidates import candidates
 from dynsim.scenario.loads import Payload
 from dynsim.scenario.schema import ContactPoint, Contacts, Scenario
+from dynsim.system.reuse import Reuse
 
 if TYPE_CHECKING:
-    from dynsim.model.snake import SnakeDescription, TaskSpaceController
+    from dynsim.snake.description import SnakeDescription, TaskSpaceController
 
 # A contact point must start this close to its surface [m].
 START_TOLERANCE = 1e-6
@@ -36,7 +36,7 @@ def machine(scenario: Scenario) -> Robot | SnakeDescription:
     """What the plant of the scenario is, a tree of bodies or a snake."""
     if scenario.engine == "kinematic":
         # Imported here and below: an arm needs nothing of a snake.
-        from dynsim.model.snake import SnakeDescription
+        from dynsim.snake.description import SnakeDescription
 
         return families.build("plant", scenario.plant, BuildContext(scenario.duration_s), SnakeDescription)
     return robot(scenario)
@@ -197,7 +197,7 @@ def controller(
             ends = f"end at {control.end:g} s, the run at {scenario.duration_s:g} s"
             raise ModelError(f"controller {config.type!r}: its references {ends}")
         return control
-    from dynsim.model.snake import TaskSpaceController
+    from dynsim.snake.description import TaskSpaceController
 
     return families.build("controller", config, context, TaskSpaceController)
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from dynsim.model.clearance import axis_ends
+from dynsim.compile.clearance import axis_ends
+from dynsim.compile.model import Model
+from dynsim.compile.shapes import bends_outward
 from dynsim.model.description import Contact, Robot
-from dynsim.model.model import Model
-from dynsim.model.shapes import bends_outward
 from dynsim.model.surfaces import Array, Surface
 
 log = logging.getLogger(__name__)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pydantic import BaseModel
 
-from dynsim.families import member
-from dynsim.problems import dotted
-
-if TYPE_CHECKING:
-    from dynsim.scenario.schema import Scenario, ScenarioConfig
+from dynsim.config.problems import dotted
+from dynsim.library.families import member
 
 Keys = tuple[int | str, ...]
 
@@ -22,10 +19,10 @@ OF_DYNAMICS = ("contacts", "initial", "integrator", "metrics")
 MOVING = ("hand", "base", "joints", "torques", "brace")
 
 
-def without_effect(scenario: Scenario, motors: bool = True) -> list[str]:
+def without_effect(scenario: Any, motors: bool = True) -> list[str]:
     """A line for each key that the scenario sets and that changes nothing, with its place and why.
 
-    ``motors`` : whether the plant has any
+    ``scenario`` : a :class:`~dynsim.scenario.schema.Scenario`; ``motors`` : whether the plant has any
     """
     config = scenario.config
     found: dict[Keys, str] = {}
@@ -41,7 +38,7 @@ def without_effect(scenario: Scenario, motors: bool = True) -> list[str]:
     ]
 
 
-def idle_keys(config: ScenarioConfig) -> dict[Keys, str]:
+def idle_keys(config: Any) -> dict[Keys, str]:
     """Keys that change nothing, whether they are set or not, and why."""
     kinematic = member("plant", config.plant.type).ENGINE == "kinematic"
     rules = [_of_kinematics(config)] if kinematic else [_of_integrator(config), _of_contacts(config)]
@@ -61,7 +58,7 @@ def is_set(config: BaseModel, keys: Keys) -> bool:
     return True
 
 
-def _of_kinematics(config: ScenarioConfig) -> Iterator[tuple[Keys, str]]:
+def _of_kinematics(config: Any) -> Iterator[tuple[Keys, str]]:
     """What has forces and steps is not for a kinematic plant; ``duration_s`` and the controller say all."""
     for section in OF_DYNAMICS:
         part = getattr(config, section)
@@ -69,7 +66,7 @@ def _of_kinematics(config: ScenarioConfig) -> Iterator[tuple[Keys, str]]:
             yield (section, key), f"plant {config.plant.type} is kinematic"
 
 
-def _of_integrator(config: ScenarioConfig) -> Iterator[tuple[Keys, str]]:
+def _of_integrator(config: Any) -> Iterator[tuple[Keys, str]]:
     method, real = config.integrator.method, config.contacts.law == "unilateral"
     if method not in FIXED_STEPS:
         return
@@ -80,7 +77,7 @@ def _of_integrator(config: ScenarioConfig) -> Iterator[tuple[Keys, str]]:
         yield ("integrator", "atol"), why
 
 
-def _of_contacts(config: ScenarioConfig) -> Iterator[tuple[Keys, str]]:
+def _of_contacts(config: Any) -> Iterator[tuple[Keys, str]]:
     contacts = config.contacts
     if contacts.law == "unilateral":
         yield ("contacts", "reference_tolerance_m"), "it is of law: bilateral; real braces may leave their surfaces"
@@ -95,7 +92,7 @@ def _of_contacts(config: ScenarioConfig) -> Iterator[tuple[Keys, str]]:
             yield ("contacts", "points", name, "grip"), "ratio 1 is the same friction in all directions"
 
 
-def _of_controller(config: ScenarioConfig) -> Iterator[tuple[Keys, str]]:
+def _of_controller(config: Any) -> Iterator[tuple[Keys, str]]:
     controller = config.controller
     if controller is None or controller.type != "joint_pd":
         return
@@ -104,7 +101,7 @@ def _of_controller(config: ScenarioConfig) -> Iterator[tuple[Keys, str]]:
         yield ("controller", "knot_spacing_s"), "no reference moves"
 
 
-def _of_time(config: ScenarioConfig) -> Iterator[tuple[Keys, str]]:
+def _of_time(config: Any) -> Iterator[tuple[Keys, str]]:
     """What begins when the run has ended."""
     end = config.duration_s
     ends = f"the run ends at {end:g} s"

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
-from dynsim.config import BodyPoint, NonNegative, Positive, Vector3, error_at
-from dynsim.csv_rows import read_rows
+from dynsim.config.base import BodyPoint, NonNegative, Positive, Vector3, error_at
+from dynsim.record.csv_rows import read_rows
 
 FORCE_COLUMNS = ("t_s", "fx_N", "fy_N", "fz_N")
 TORQUE_COLUMNS = ("mx_N_m", "my_N_m", "mz_N_m")

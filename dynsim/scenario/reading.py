@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from dynsim.config.problems import INDEX, Origin, dotted, explain, key_text, suggest, unknown_keys, value_text
 from dynsim.errors import ScenarioError, shown
-from dynsim.files import check_complete
-from dynsim.inputs import DEPTH_LIMIT, YamlMapping, is_file, parse_yaml, read_text
-from dynsim.problems import INDEX, Origin, dotted, explain, key_text, suggest, unknown_keys, value_text
 from dynsim.scenario.schema import Scenario, ScenarioConfig
-from dynsim.shipped import shipped_scenario, shipped_scenarios
+from dynsim.system.files import check_complete
+from dynsim.system.inputs import DEPTH_LIMIT, YamlMapping, is_file, parse_yaml, read_text
+from dynsim.system.shipped import shipped_scenario, shipped_scenarios
 
 # Keys of a file that are not part of one variant.
 TOP = ("variants",)

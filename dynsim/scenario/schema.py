@@ -9,10 +9,10 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from dynsim import notebook
-from dynsim.config import BodyPoint, NonNegative, Positive, StrictConfig, Vector3, error_at
-from dynsim.families import member, union
-from dynsim.problems import Origin, listed
+from dynsim.config.base import BodyPoint, NonNegative, Positive, StrictConfig, Vector3, error_at
+from dynsim.config.problems import Origin, listed
+from dynsim.library.families import member, union
+from dynsim.record import notebook
 from dynsim.scenario.effect import idle_keys, is_set
 from dynsim.scenario.loads import LoadConfig
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.jit import internal_kernel, kernel
+from dynsim.jit.kernel import internal_kernel, kernel
 
 
 class SnakeModel(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.jit import internal_kernel
+from dynsim.jit.kernel import internal_kernel
 
 
 @internal_kernel

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.snake.control import Work, new_work
+from dynsim.snake.controller import Work, new_work
 from dynsim.snake.kinematics import SnakeModel
 
 MEASURED, ESTIMATED, FEEDFORWARD = 0, 1, 2

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dynsim.kernels.jit import internal_kernel, kernel
+from dynsim.jit.kernel import internal_kernel, kernel
 from dynsim.snake.kinematics import SnakeModel
 
 COST_ANGLES = 0  # eq 19

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from dynsim.kernels.jit import internal_kernel, kernel
-from dynsim.snake import control as sc
+from dynsim.jit.kernel import internal_kernel, kernel
+from dynsim.snake import controller as sc
 from dynsim.snake import state as ss
-from dynsim.snake.control import control_input, estimate_from_joints, sigma_min
+from dynsim.snake.controller import control_input, estimate_from_joints, sigma_min
 from dynsim.snake.kinematics import constraint_matrices, pose_of_point, walk_chain, wrap_angle
 from dynsim.snake.plant import advance_plant
 from dynsim.snake.support import cost_value, polygon_area, support_polygon

@@ -8,8 +8,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from dynsim._version import __version__
-from dynsim.files import write_json
 from dynsim.studies.published.wang_minami import changed_assumptions
+from dynsim.system.files import write_json
 
 if __name__ == "__main__":
     rows = changed_assumptions()

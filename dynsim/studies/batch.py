@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Generic, Literal, TypeVar, get_args
 
-from dynsim import interruption
 from dynsim.engine import SIMULATION, Progress, simulate
 from dynsim.errors import DynsimError, ScenarioError, SimulationInterrupted, SimulationStopped, shown
 from dynsim.record import Record
-from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario, require_scenario
 from dynsim.studies.processes import SILENT, WorkerInterrupted, WorkerLost, WorkerSilent, run_in_processes
+from dynsim.system import interruption
+from dynsim.system.reuse import Reuse
 
 Keep = Literal["none", "failed", "all"]
 Task = TypeVar("Task")

@@ -10,12 +10,12 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
-from dynsim import interruption
 from dynsim._version import __version__
 from dynsim.engine import SIMULATION, Progress
 from dynsim.errors import DynsimError
 from dynsim.studies.batch import LOST, RunResult
 from dynsim.studies.processes import keep_memory
+from dynsim.system import interruption
 
 Task = TypeVar("Task")
 

@@ -11,11 +11,11 @@ from typing import Any, Protocol
 
 from dynsim.engine import SIMULATION, Progress, simulate
 from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped, shown
-from dynsim.files import json_text, replace_together
 from dynsim.record import Record
 from dynsim.scenario import Scenario, load_scenario, variant_names
 from dynsim.studies.columns import flat, is_scalar, is_text
 from dynsim.studies.processes import SILENT, WorkerInterrupted, WorkerLost, WorkerSilent, run_in_processes
+from dynsim.system.files import json_text, replace_together
 
 
 class VariantProgress(Protocol):

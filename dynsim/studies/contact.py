@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from dynsim._version import __version__
-from dynsim.figures import contacts, posture
-from dynsim.figures.style import look, save
-from dynsim.files import write_json
+from dynsim.draw.figures import contacts, posture
+from dynsim.draw.figures.style import look, save
 from dynsim.record import Record
 from dynsim.studies.compare import compare
+from dynsim.system.files import write_json
 
 FOLDER = Path("results/contact")
 GLUED, REAL, LINKS = "elbow_comparison", "elbow_comparison_floor", "elbow_comparison_links"

@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 from dynsim._version import __version__
 from dynsim.engine import Progress, simulate
 from dynsim.errors import DynsimError, SimulationInterrupted, SimulationStopped
-from dynsim.files import write_json
 from dynsim.scenario.reading import scenario_from_resolved
 from dynsim.studies.processes import WorkerInterrupted, WorkerLost, run_in_processes
+from dynsim.system.files import write_json
 
 Array = NDArray[np.float64]
 

@@ -23,11 +23,11 @@ from matplotlib.patheffects import withTickedStroke
 from numpy.typing import NDArray
 
 from dynsim._version import __version__
+from dynsim.draw.figures.style import look, new_figure, save, variant_styles
 from dynsim.engine import simulate
 from dynsim.errors import DynsimError
-from dynsim.figures.style import look, new_figure, save, variant_styles
-from dynsim.files import write_json, write_text
 from dynsim.scenario import load_scenario, variant_names
+from dynsim.system.files import write_json, write_text
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from dynsim.errors import ScenarioError
-from dynsim.inputs import parse_yaml
-from dynsim.reuse import Reuse
 from dynsim.scenario import Scenario, ScenarioFile, SetOptions
+from dynsim.system.inputs import parse_yaml
+from dynsim.system.reuse import Reuse
 
 # More runs than this are a slip of the keyboard.
 RUNS_MOST = 10_000_000

@@ -25,8 +25,8 @@ from multiprocessing.connection import Connection
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
-from dynsim import garbage, interruption
-from dynsim.interruption import STOP_SIGNALS
+from dynsim.system import garbage, interruption
+from dynsim.system.interruption import STOP_SIGNALS
 
 if TYPE_CHECKING:
     from dynsim.engine import Progress  # numba, which not every work needs

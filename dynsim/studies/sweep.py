@@ -13,13 +13,13 @@ from typing import Any
 
 from dynsim._version import __version__
 from dynsim.engine.provenance import commit
+from dynsim.engine.results import save_run
 from dynsim.errors import RecordError, ScenarioError, SimulationInterrupted
-from dynsim.files import json_text, replacing, write_text
-from dynsim.results import save_run
 from dynsim.studies.batch import Keep, RunResult, Work, run_all, shares_lanes
 from dynsim.studies.columns import numbers
 from dynsim.studies.plan import Plan, Point
 from dynsim.studies.sweep_statistics import statistics
+from dynsim.system.files import json_text, replacing, write_text
 
 PLAN, JOURNAL = "sweep.json", "runs.jsonl"
 TABLES = ("sweep.csv", "sweep.parquet")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dynsim.sensitivity import sensitivities, spread
+from dynsim.record.sensitivity import sensitivities, spread
 from dynsim.studies.plan import Plan
 
 if TYPE_CHECKING:
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 def statistics(rows: Sequence[Row], plan: Plan) -> list[dict[str, Any]]:
     """For each variant and place of the grid: runs, those without numbers, and of each number that all others have
 
-    its :class:`dynsim.sensitivity.Spread` and, where a line fits, what one standard deviation of each drawn key does
-    to it (``effect``, with the half width of its interval) and how much of the variance the line explains.
+    its :class:`dynsim.record.sensitivity.Spread` and, where a line fits, what one standard deviation of each drawn key
+    does to it (``effect``, with the half width of its interval) and how much of the variance the line explains.
     """
     groups: dict[str, list[Row]] = {}
     for row in rows:

@@ -15,7 +15,6 @@ import numpy as np
 from dynsim._version import __version__
 from dynsim.engine import simulate
 from dynsim.errors import SimulationStopped
-from dynsim.files import write_json
 from dynsim.hardware.replay.check import check_motion
 from dynsim.hardware.servo_map import load_servo_map
 from dynsim.record import Record
@@ -23,6 +22,7 @@ from dynsim.scenario import Scenario, load_scenario, scenario_from_resolved, shi
 from dynsim.studies.compare import compare
 from dynsim.studies.published.rotors import rotor_energies
 from dynsim.studies.published.wang_minami import ELBOWS, elbow_forces, elbow_numbers
+from dynsim.system.files import write_json
 
 FILE = Path("results/reference/validation.json")
 # Of a summary, what is not the same on every machine.

@@ -15,7 +15,7 @@ import pytest
 from dynsim._version import __version__
 from dynsim.cli import main
 from dynsim.engine import check
-from dynsim.kernels.jit import cache_folder
+from dynsim.jit.kernel import cache_folder
 from dynsim.record import FORMAT, Record
 from dynsim.scenario import SHIPPED, build, build_model, load_scenario
 
@@ -450,7 +450,7 @@ def test_a_terminal_that_knows_ascii_only(tmp_path: Path):
 
 def test_a_damaged_kernel_cache_is_a_warning_in_one_line(tmp_path: Path):
     build_model(load_scenario("single_pendulum")).joint_positions([0.0])
-    files = sorted(cache_folder().glob("dynsim.kernels.tree.sweep.kinematics-*"))
+    files = sorted(cache_folder().glob("dynsim.dynamics.tree.sweep.kinematics-*"))
     cache = tmp_path / "dynsim" / cache_folder().name
     cache.mkdir(parents=True, mode=0o700)
     assert files

@@ -32,8 +32,8 @@ WATCHED = """
 import ctypes, os, sys
 from pathlib import Path
 
-import dynsim.control.joint_pd as joint_pd
-import dynsim.kernels.integrate.driver as driver
+import dynsim.library.controllers.joint_pd as joint_pd
+import dynsim.integrators.driver as driver
 from dynsim.cli import main
 
 def mark(what, function):
@@ -348,5 +348,5 @@ def test_what_described_older_records_goes_with_them(tmp_path: Path):
     assert subprocess.run(again, **options).returncode == 128 + signal.SIGTERM
     assert sorted(path.name for path in out.iterdir()) == ["elbow_4", "elbow_7", "no_elbow", "two_elbows"]
     assert Record.load(out / "two_elbows" / "record.h5").time[-1] == 0.03
-    assert not list((out / "two_elbows").glob("figures/*"))
-    assert list((out / "no_elbow").glob("figures/*"))
+    assert not list((out / "two_elbows").glob("draw/figures/*"))
+    assert list((out / "no_elbow").glob("draw/figures/*"))

@@ -19,21 +19,21 @@ import dynsim
 from dynsim import cli
 from dynsim.cli import commands
 from dynsim.cli.display import record_files
+from dynsim.draw.figures.style import BLUE, PULLING
+from dynsim.draw.film import Film, write
+from dynsim.draw.film.camera import view_axes
+from dynsim.draw.film.painter import DEEP, FINER, FRICTION, Painter
+from dynsim.draw.film.solids import solid
+from dynsim.draw.film.strip import Strip, largest
+from dynsim.draw.film.strokes import font, labels
+from dynsim.draw.page.meshes import Meshes
+from dynsim.draw.page.robot import bounds
+from dynsim.draw.page.solids import body_shapes, from_z
 from dynsim.errors import RecordError
-from dynsim.figures.style import BLUE, PULLING
-from dynsim.film import Film, write
-from dynsim.film.camera import view_axes
-from dynsim.film.painter import DEEP, FINER, FRICTION, Painter
-from dynsim.film.solids import solid
-from dynsim.film.strip import Strip, largest
-from dynsim.film.strokes import font, labels
 from dynsim.record import Record
 from dynsim.record.poses import ORIENTATION, POSITION, point_positions
 from dynsim.record.scene import Surface
 from dynsim.scenario import build_model, load_scenario
-from dynsim.view.meshes import Meshes
-from dynsim.view.robot import bounds
-from dynsim.view.solids import body_shapes, from_z
 
 MARK = "#FF00FF"
 

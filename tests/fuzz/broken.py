@@ -14,7 +14,7 @@ from typing import Any
 
 def install() -> None:
     """Break the loaders of this process."""
-    from dynsim.plants.serial_arm import LinkConfig
+    from dynsim.library.plants.serial_arm import LinkConfig
     from dynsim.record import Record
 
     sound_load, sound_inertia = Record.load.__func__, LinkConfig.inertia  # type: ignore[attr-defined]

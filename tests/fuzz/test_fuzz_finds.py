@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dynsim.model.description import Inertia, Link, Robot
-from dynsim.model.urdf import read_urdf
+from dynsim.model.urdf.build import read_urdf
 from fuzz import campaign
 from fuzz.broken import WAYS
 from fuzz.case import SHIPPED
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.long
 
 # What becomes of each way in which the loader of records is broken, in the order of ``broken.WAYS``; the place is where
 # dynsim was at that moment.
-LOADING = "hardware/cli.py:_checked"
+LOADING = "cli/hardware.py:_checked"
 FOUND = {
     "raises": (TRACEBACK, "ValueError", LOADING),
     "hangs": (HANG, "hw takes more than 2 s", LOADING),

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
+from dynsim.draw.figures import style
 from dynsim.errors import RecordError
-from dynsim.figures import style
 from dynsim.hardware.bus.control_table import MX_106
 from dynsim.hardware.errors import ComparisonGateFailed, ServoMapError
 from dynsim.hardware.export import export_record

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from dynsim import load_scenario
-from dynsim.engine.driven import Order, drive
 from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.errors import CheckRefused
 from dynsim.hardware.replay.check import check_motion
@@ -18,10 +17,12 @@ from dynsim.hardware.replay.growing import GrowingPath, Sample
 from dynsim.hardware.replay.held_back import HeldBack
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.servo_map import ServoMap
-from dynsim.live.follower import NOT_LIFTED, NOT_YET, REGULAR, Columns, ServoFollower, lifting_columns
-from dynsim.live.servos import PipeFeed
-from dynsim.model.snake import FIXING, SWITCHING
 from dynsim.record import Record
+from dynsim.snake.description import FIXING, SWITCHING
+from dynsim.teleop.drive import drive
+from dynsim.teleop.driven import Order
+from dynsim.teleop.web.follower import NOT_LIFTED, NOT_YET, REGULAR, Columns, ServoFollower, lifting_columns
+from dynsim.teleop.web.servos import PipeFeed
 
 from .conftest import Rig, Run, check_goals_within_limits
 from .test_lifting import BLEND, CLEARANCE, JOINTS, Oracle, settled, snake_map, with_lifts

@@ -8,16 +8,7 @@ from pathlib import Path
 import pytest
 
 from dynsim.hardware.bus.packet import Instruction, Packet
-from dynsim.hardware.fault_table import (
-    CASES,
-    POLICIES,
-    STATES,
-    TORQUE_ADDRESS,
-    broken_promises,
-    cells,
-    markdown,
-    rig,
-)
+from dynsim.hardware.fault_table import CASES, POLICIES, STATES, TORQUE_ADDRESS, broken_promises, cells, markdown, rig
 
 pytestmark = pytest.mark.long
 

@@ -13,13 +13,13 @@ import pytest
     [
         # `dynsim run` mounts the commands: no serial port, no servo.
         ("dynsim.cli.entry", ("serial", "dynamixel_sdk", "dynsim.hardware.ports", "numba", "matplotlib", "logging")),
-        ("dynsim.hardware.cli", ("serial", "dynamixel_sdk", "dynsim.hardware.ports", "numba", "matplotlib")),
+        ("dynsim.cli.hardware", ("serial", "dynamixel_sdk", "dynsim.hardware.ports", "numba", "matplotlib")),
         # Replaying knows nothing of how a record was made, nor of what is on the bus.
         (
             "dynsim.hardware.replay.session",
-            ("numba", "dynsim.kernels", "dynsim.model", "dynsim.scenario", "matplotlib", "dynsim.hardware.virtual"),
+            ("numba", "dynsim.dynamics", "dynsim.model", "dynsim.scenario", "matplotlib", "dynsim.hardware.virtual"),
         ),
-        ("dynsim.hardware.ports", ("numba", "dynsim.kernels", "dynsim.model", "dynsim.scenario", "matplotlib")),
+        ("dynsim.hardware.ports", ("numba", "dynsim.dynamics", "dynsim.model", "dynsim.scenario", "matplotlib")),
     ],
 )
 def test_imports_stay_in_their_layer(module: str, absent: tuple[str, ...]) -> None:

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 import dynsim
-from dynsim import cli, figures
-from dynsim.figures import measured as measured_figures
-from dynsim.figures import style
+from dynsim import cli
+from dynsim.draw import figures
+from dynsim.draw.figures import measured as measured_figures
+from dynsim.draw.figures import style
+from dynsim.draw.page import viewable
 from dynsim.hardware.replay.check import check_motion
 from dynsim.hardware.replay.measured import describe
 from dynsim.hardware.replay.states import State
@@ -19,7 +21,6 @@ from dynsim.hardware.servo_map import SHIPPED, load_servo_map
 from dynsim.record import Record
 from dynsim.record.scene import HERE, WORLD, Body, Joint, Point, Scene
 from dynsim.scenario import build_model, load_scenario
-from dynsim.view import viewable
 
 from .conftest import Rig, swing
 

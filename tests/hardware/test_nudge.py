@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from dynsim import cli
-from dynsim.hardware import dialog
+from dynsim.cli import dialog
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.calibrate import write_into_map
 from dynsim.hardware.errors import ReplayAborted, ReplayInterrupted, ServoMapError, VerificationFailed
 from dynsim.hardware.nudge import ANGLE, PAUSE, SPEED, nudge, swapped
 from dynsim.hardware.replay.states import StopRequest
 from dynsim.hardware.servo_map import load_servo_map
-from dynsim.terminal import Terminal
+from dynsim.system.terminal import Terminal
 
 from .conftest import Run
 

@@ -10,7 +10,17 @@ from dynamixel_sdk import Protocol2PacketHandler
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dynsim.hardware.bus.packet import HEADER, STATUS, Decoder, Packet, crc16, encode, holds_bare_header, stuff, unstuff
+from dynsim.hardware.bus.packet import (
+    HEADER,
+    STATUS,
+    Decoder,
+    Packet,
+    crc16,
+    encode,
+    holds_bare_header,
+    stuff,
+    unstuff,
+)
 
 bodies = st.lists(st.sampled_from([0xFF, 0xFD, 0x00, 0x55, 0x12]), max_size=40).map(bytes) | st.binary(max_size=40)
 packets = st.builds(Packet, st.integers(0, 252), st.just(STATUS), bodies, st.integers(0, 255)) | st.builds(

@@ -10,14 +10,15 @@ import pytest
 
 import dynsim
 from dynsim import Record, Scenario, load_scenario, simulate
-from dynsim.engine.driven import Order, drive
 from dynsim.engine.together import simulate_together
 from dynsim.errors import DynsimError, ScenarioError
 from dynsim.hardware.replay.check import check_motion
 from dynsim.hardware.servo_map import load_servo_map
-from dynsim.model.snake import FIXING, SWITCHING
 from dynsim.record.poses import ORIENTATION, POSITION, poses_at
 from dynsim.scenario import scenario_from_resolved
+from dynsim.snake.description import FIXING, SWITCHING
+from dynsim.teleop.drive import drive
+from dynsim.teleop.driven import Order
 
 
 def assert_same(a: Record, b: Record) -> None:

@@ -7,11 +7,11 @@ import json
 
 import pytest
 
-from dynsim.engine.driven import Axis
-from dynsim.live.helm import DRIVING, NOBODY, RELEASED, SILENCE, SILENT, Helm
-from dynsim.live.pace import Pace
-from dynsim.live.wishes import Refused, Wish, read
-from dynsim.model.snake import SWITCHING
+from dynsim.snake.description import SWITCHING
+from dynsim.teleop.driven import Axis
+from dynsim.teleop.web.helm import DRIVING, NOBODY, RELEASED, SILENCE, SILENT, Helm
+from dynsim.teleop.web.pace import Pace
+from dynsim.teleop.web.wishes import Refused, Wish, read
 
 AXES = (Axis("x", "hand", "m/s", 0.1), Axis("turn", "base", "rad/s", 0.5))
 

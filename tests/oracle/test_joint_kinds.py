@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from random_robots import bench, random_contacts, random_positions, random_robot_of
 
-from dynsim.kernels import arrays as ka
+from dynsim.compile.model import Model
+from dynsim.dynamics import tables as ka
 from dynsim.model.description import Link, Robot
-from dynsim.model.model import Model
 
 seeds = st.integers(0, 2**32 - 1)
 HOLONOMIC = ("revolute", "prismatic", "ball", "floating", "planar")

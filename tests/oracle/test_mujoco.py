@@ -13,16 +13,16 @@ from hypothesis import strategies as st
 
 mujoco = pytest.importorskip("mujoco", minversion="4.0")
 
+from dynsim.compile.model import Model  # noqa: E402
+from dynsim.compile.tables import compile_contacts, compile_drives, compile_loads  # noqa: E402
+from dynsim.dynamics import tables as ka  # noqa: E402
+from dynsim.dynamics.derivative import System  # noqa: E402
+from dynsim.dynamics.state import OUT_FORCE, OUT_SLIP, OUT_VECTOR, state_layout  # noqa: E402
 from dynsim.engine.dynamics import Prepared, prepare  # noqa: E402
-from dynsim.kernels import arrays as ka  # noqa: E402
-from dynsim.kernels.integrate import run as ki  # noqa: E402
-from dynsim.kernels.integrate.driver import advance  # noqa: E402
-from dynsim.kernels.jit import integers, reals  # noqa: E402
-from dynsim.kernels.state import OUT_FORCE, OUT_SLIP, OUT_VECTOR, state_layout  # noqa: E402
-from dynsim.kernels.system import System  # noqa: E402
-from dynsim.model.arrays import compile_contacts, compile_drives, compile_loads  # noqa: E402
+from dynsim.integrators import run as ki  # noqa: E402
+from dynsim.integrators.driver import advance  # noqa: E402
+from dynsim.jit.kernel import integers, reals  # noqa: E402
 from dynsim.model.description import Inertia, Link, Robot  # noqa: E402
-from dynsim.model.model import Model  # noqa: E402
 from dynsim.scenario import load_scenario  # noqa: E402
 from dynsim.studies.bench.job import CASES, prepare_case  # noqa: E402
 from dynsim.studies.bench.mujoco_peer import build_mujoco, roll_out, setpoints, state_of  # noqa: E402

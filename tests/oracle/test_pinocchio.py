@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from pinocchio_oracle import Oracle
 from random_robots import bench, random_contacts, random_robot
 
-from dynsim.kernels import arrays as ka
+from dynsim.compile.model import Model
+from dynsim.dynamics import tables as ka
 from dynsim.model.description import Robot
-from dynsim.model.model import Model
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -16,10 +16,10 @@ from real_wheels import MOTOR, WHEELS, RealWheels, random_base, random_serial, r
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline, make_interp_spline
 
+from dynsim.compile.model import Model
+from dynsim.dynamics import tables as ka
 from dynsim.engine import simulate
-from dynsim.kernels import arrays as ka
 from dynsim.model.description import Robot
-from dynsim.model.model import Model
 from dynsim.scenario import load_scenario
 from dynsim.scenario.build import robot as build_robot
 

@@ -8,8 +8,8 @@ import pytest
 from pinocchio_oracle import Oracle
 from random_robots import bench, random_contacts, random_positions, random_robot
 
-from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.state import OUT_FORCE, OUT_VECTOR
+from dynsim.dynamics.state import OUT_FORCE, OUT_VECTOR
+from dynsim.integrators import run as ki
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot, vector
 
 mujoco = pytest.importorskip("mujoco", minversion="4.0")

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from pinocchio_oracle import Oracle
 from random_robots import Bench, bench, random_contacts, random_robot, random_unit
 
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.constraint.rows import force_vectors, set_modes
-from dynsim.kernels.jit import integers
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact.rows import force_vectors, set_modes
+from dynsim.jit.kernel import integers
 from dynsim.model.description import Contact, Coupling, Robot
-from dynsim.model.urdf import read_urdf
+from dynsim.model.urdf.build import read_urdf
 
 seeds = st.integers(0, 2**32 - 1)
 

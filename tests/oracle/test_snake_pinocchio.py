@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_snakes import robots
 
-from dynsim.kernels.jit import integers, reals
+from dynsim.jit.kernel import integers, reals
 from dynsim.snake.kinematics import active_rows, constraint_matrices, new_chain, walk_chain
 
 LOCAL_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED

@@ -155,7 +155,7 @@ def test_errors_in_a_section_of_a_part_from_outside_name_line_and_key(installed:
 
 
 GOOD = """from typing import Literal
-from dynsim.config import StrictConfig
+from dynsim.config.base import StrictConfig
 ENGINE = "dynamics"
 class Config(StrictConfig):
     type: Literal["NAME"]
@@ -166,7 +166,7 @@ def build(config, context):
 BROKEN = {
     "fails": ("import no_such_module", "importing 'fails' fails with ModuleNotFoundError: No module named 'no_such_"),
     "exits": ("raise SystemExit(3)", "importing 'exits' fails with SystemExit: 3"),
-    "no_config": ("", "'no_config' has no class Config derived from dynsim.config.StrictConfig"),
+    "no_config": ("", "'no_config' has no class Config derived from dynsim.config.base.StrictConfig"),
     "no_build": (GOOD.replace("def build", "def make"), "'no_build' has no function build(config, context)"),
     "no_engine": (GOOD.replace("ENGINE", "engine"), "'no_engine' has no text ENGINE"),
     "old_build": (GOOD.replace(", context", ""), "'old_build' has a build that does not take (config, context)"),

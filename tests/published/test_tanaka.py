@@ -7,14 +7,14 @@ brings every coordinate to its target.
 import numpy as np
 import pytest
 
-from dynsim.control import task_space
-from dynsim.control.modes import TABLE_II
+from dynsim.compile.protocols import BuildContext
 from dynsim.engine import simulate
-from dynsim.model.protocols import BuildContext
-from dynsim.model.snake import conditioning
-from dynsim.plants import snake
+from dynsim.library.controllers import task_space
+from dynsim.library.plants import snake
 from dynsim.scenario import load_scenario
+from dynsim.snake.description import conditioning
 from dynsim.snake.kinematics import pose_of_point
+from dynsim.snake.modes import TABLE_II
 
 SCENARIOS = {
     "snake_positioning": ["x", "y", "z", "alpha", "beta", "gamma"],

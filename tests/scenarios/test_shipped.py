@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import dynsim
+from dynsim.compile.contact_law import SETTLE_SPEED
 from dynsim.engine import check
-from dynsim.model.unilateral import SETTLE_SPEED
 from dynsim.scenario import shipped_scenarios, variant_names
 
 CASES = [(path.stem, variant) for path in shipped_scenarios() for variant in (variant_names(path) or [None])]

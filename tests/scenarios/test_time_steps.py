@@ -9,9 +9,9 @@ import pytest
 from stepping_benches import snake
 
 import dynsim
-from dynsim.contact_metrics import HALF_STEP_LIMIT, PENETRATION_LIMIT_M, SCHEME_LIMIT, coarse
+from dynsim.engine.contact_metrics import HALF_STEP_LIMIT, PENETRATION_LIMIT_M, SCHEME_LIMIT, coarse
 from dynsim.errors import ScenarioError
-from dynsim.model.urdf_writer import write_urdf
+from dynsim.model.urdf.writer import write_urdf
 
 G, H = 9.81, 1e-3
 STEPS = {"integrator.method": "time_stepping", "integrator.step_s": H}

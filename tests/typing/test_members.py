@@ -8,15 +8,7 @@ from typing import get_args
 
 import pytest
 
-from dynsim import families
-from dynsim.config import StrictConfig
-from dynsim.control import joint_pd, task_space
-from dynsim.control.base_paths import arc, hold, straight
-from dynsim.control.base_paths import csv as base_csv
-from dynsim.control.base_paths import waypoints as base_waypoints
-from dynsim.control.paths import circle, csv, line, waypoints
-from dynsim.errors import ModelError
-from dynsim.model.protocols import (
+from dynsim.compile.protocols import (
     BasePathModule,
     BuildContext,
     ControllerModule,
@@ -26,9 +18,17 @@ from dynsim.model.protocols import (
     PlantModule,
     SurfaceModule,
 )
-from dynsim.motors import dc, servo, torque, wang_minami
-from dynsim.plants import pws_arm, serial_arm, snake, urdf_arm
-from dynsim.surfaces import box, cylinder, height_field, plane, sphere
+from dynsim.config.base import StrictConfig
+from dynsim.errors import ModelError
+from dynsim.library import families
+from dynsim.library.base_paths import arc, hold, straight
+from dynsim.library.base_paths import csv as base_csv
+from dynsim.library.base_paths import waypoints as base_waypoints
+from dynsim.library.controllers import joint_pd, task_space
+from dynsim.library.motors import dc, servo, torque, wang_minami
+from dynsim.library.paths import circle, csv, line, waypoints
+from dynsim.library.plants import pws_arm, serial_arm, snake, urdf_arm
+from dynsim.library.surfaces import box, cylinder, height_field, plane, sphere
 
 PLANTS: Sequence[PlantModule] = (pws_arm, serial_arm, snake, urdf_arm)
 CONTROLLERS: Sequence[ControllerModule] = (joint_pd, task_space)

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.long
 
 MODULE = """
 import numpy as np
-from dynsim.kernels.jit import internal_kernel, kernel, separate_kernel
+from dynsim.jit.kernel import internal_kernel, kernel, separate_kernel
 
 @separate_kernel
 def add_to(x, y):

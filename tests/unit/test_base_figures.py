@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from scipy.spatial import ConvexHull
 
 import dynsim
-from dynsim import figures, measures
-from dynsim.figures import arm, base, motors, posture, skeleton, solids, style, top_view
+from dynsim.draw import figures
+from dynsim.draw.figures import arm, base, motors, posture, skeleton, solids, style, top_view
 from dynsim.hardware.export import export_record, joint_motion
-from dynsim.measures import percent
-from dynsim.record import Event, Record
+from dynsim.record import Event, Record, measures
+from dynsim.record.measures import percent
 from dynsim.record.scene import Scene, Shape
 from dynsim.scenario import load_scenario
 

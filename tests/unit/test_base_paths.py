@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from dynsim.control import joint_pd
+from dynsim.compile.control import JointControl
+from dynsim.compile.model import Model
+from dynsim.compile.protocols import BuildContext
+from dynsim.compile.rolling import rolled
 from dynsim.engine.prepare import prepare
 from dynsim.errors import ModelError, ScenarioError, UnreachableReference
-from dynsim.model.control import JointControl
-from dynsim.model.mobile_base import base_pose
-from dynsim.model.model import Model
-from dynsim.model.protocols import BuildContext
-from dynsim.model.rolling import rolled
+from dynsim.library.controllers import joint_pd
+from dynsim.model.base_pose import base_pose
 from dynsim.scenario import build, load_scenario
 
 DURATION, HEADING, PLACE = 10.0, np.deg2rad(30.0), np.array([0.4, -0.7])

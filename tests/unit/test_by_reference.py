@@ -11,9 +11,9 @@ import numba
 import numpy as np
 import pytest
 
-from dynsim.kernels.arrays import Workspace, workspace
-from dynsim.kernels.by_reference import Tables
-from dynsim.kernels.jit import internal_kernel, kernel
+from dynsim.dynamics.tables import Workspace, workspace
+from dynsim.jit.kernel import internal_kernel, kernel
+from dynsim.jit.struct_types import Tables
 
 
 class Inner(NamedTuple):
@@ -36,7 +36,7 @@ class Elsewhere(NamedTuple):
     second: int
 
 
-Inner.__module__ = Outer.__module__ = "dynsim.kernels.example"
+Inner.__module__ = Outer.__module__ = "dynsim.dynamics.example"
 
 
 @internal_kernel
@@ -174,8 +174,8 @@ def test_a_type_kept_on_disk_is_found_in_another_process() -> None:
     """Its hash is that of the other process, or kernels were read from the cache in every call."""
     code = """
 import pickle, sys, numba
-import dynsim.kernels.jit
-from dynsim.kernels.arrays import workspace
+import dynsim.jit.kernel
+from dynsim.dynamics.tables import workspace
 sys.stdout.buffer.write(pickle.dumps(numba.typeof(workspace(3, 3, 2))))
 """
     here = numba.typeof(workspace(3, 3, 2))

@@ -12,8 +12,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg, RendererAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from dynsim.figures import style
-from dynsim.figures.canvas import Canvas
+from dynsim.draw.figures import style
+from dynsim.draw.figures.canvas import Canvas
 
 
 def picture() -> Figure:

@@ -8,10 +8,16 @@ from pathlib import Path
 
 import pytest
 
-import dynsim.kernels
+import dynsim
 
-FOLDER = Path(dynsim.kernels.__file__).parent
-FILES = ("arrays.py", "state.py", "integrate/run.py", "integrate/events.py", "tree/loads.py")
+FOLDER = Path(dynsim.__file__).parent
+FILES = (
+    "dynamics/tables.py",
+    "dynamics/state.py",
+    "integrators/run.py",
+    "integrators/events.py",
+    "dynamics/tree/loads.py",
+)
 
 
 def given_twice(source: str) -> set[str]:

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from dynsim.engine import compilation
-from dynsim.kernels import jit
+from dynsim.jit import kernel as jit
 
 log = logging.getLogger("dynsim.test")
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dynsim.compile.control import JointControl
 from dynsim.engine.prepare import prepare
 from dynsim.errors import ModelError
-from dynsim.model.control import JointControl
 from dynsim.model.description import Robot
 from dynsim.scenario import build, load_scenario
 
@@ -71,7 +71,7 @@ def test_references_that_end_before_the_run_are_refused(monkeypatch: pytest.Monk
     scenario = load_scenario("elbow_comparison")
     model = build.build_model(scenario)
     short = JointControl.following(model.robot, 1.0, 1.0, TIMES, {"joint_1": TIMES})
-    monkeypatch.setattr("dynsim.control.joint_pd.build", lambda config, context: replace(short))
+    monkeypatch.setattr("dynsim.library.controllers.joint_pd.build", lambda config, context: replace(short))
     with pytest.raises(ModelError, match="controller 'joint_pd': its references end at 2 s, the run at 10 s"):
         build.controller(scenario, model)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from dynsim.control.paths.csv import Config
+from dynsim.library.paths.csv import Config
 
 HEADER = "t_s,x_m,y_m,z_m\n"
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import dynsim
-from dynsim.families import FAMILIES
+from dynsim.library.families import FAMILIES
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "dynsim"
@@ -108,9 +108,9 @@ def test_what_a_page_names_exists(name: str) -> None:
     [
         "`kernels/nowhere.py`",
         "`nowhere/`",
-        "`kernels/system.py` (`derivative`, `nothing`)",
-        "(`kernels/system.py`, `nothing`)",
-        "`derivative` and\n`nothing` in `kernels/system.py`",
+        "`dynamics/derivative.py` (`derivative`, `nothing`)",
+        "(`dynamics/derivative.py`, `nothing`)",
+        "`derivative` and\n`nothing` in `dynamics/derivative.py`",
         "`families.nothing`",
         "`dynsim.Simulation.nothing`",
         "`Simulation.nothing(0.1)`",

@@ -9,7 +9,7 @@ import pytest
 from dynsim import check, load_scenario
 from dynsim.scenario.effect import idle_keys, is_set, without_effect
 from dynsim.scenario.reading import scenario_from_resolved, variant_names
-from dynsim.shipped import shipped_scenarios
+from dynsim.system.shipped import shipped_scenarios
 
 LATE = {"type": "line", "from_m": [1, 1, 0.5], "to_m": [1, 1.1, 0.5], "start_s": 9, "duration_s": 1}
 PUSH = {"type": "samples", "body": "link_4", "times_s": [3, 4], "force_N": [[1, 0, 0], [1, 0, 0]]}

@@ -16,9 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
 import dynsim
-from dynsim import figures, measures, metrics
-from dynsim.errors import RecordError
-from dynsim.figures import (
+from dynsim.draw import figures
+from dynsim.draw.figures import (
     arm,
     contacts,
     energy,
@@ -31,7 +30,9 @@ from dynsim.figures import (
     skeleton,
     style,
 )
-from dynsim.record import Event, Record
+from dynsim.engine import summary as metrics
+from dynsim.errors import RecordError
+from dynsim.record import Event, Record, measures
 from dynsim.scenario import load_scenario
 
 SHORT = {"duration_s": 0.3, "metrics.settle_s": 0.1, "integrator.rtol": 1e-4}

@@ -11,9 +11,17 @@ from pathlib import Path
 
 import pytest
 
-from dynsim import files
 from dynsim.errors import RecordError
-from dynsim.files import INCOMPLETE, check_complete, check_writable, file_name, replace_together, replacing, write_text
+from dynsim.system import files
+from dynsim.system.files import (
+    INCOMPLETE,
+    check_complete,
+    check_writable,
+    file_name,
+    replace_together,
+    replacing,
+    write_text,
+)
 
 posix = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="POSIX")
 PAIR = {"a.txt": b"new a", "b.txt": b"new b"}
@@ -77,7 +85,7 @@ def test_a_full_device_is_reported(tmp_path: Path):
 def test_standard_output_goes_where_it_goes_also_if_that_is_a_file(tmp_path: Path, name: str):
     (tmp_path / "link").symlink_to("/dev/stdout")
     code = (
-        "from pathlib import Path; from dynsim.files import write_text\n"
+        "from pathlib import Path; from dynsim.system.files import write_text\n"
         f"print('before'); write_text(Path({name!r}), 'through '); print('after')"
     )
     with (tmp_path / "output").open("wb") as output:
@@ -147,7 +155,7 @@ def test_writers_of_the_same_file_do_not_share_a_temporary_name(tmp_path: Path):
 @posix
 def test_what_dead_runs_left_is_removed_and_what_living_ones_write_is_not(tmp_path: Path):
     code = (
-        "import os, signal, sys; from pathlib import Path; from dynsim.files import replacing\n"
+        "import os, signal, sys; from pathlib import Path; from dynsim.system.files import replacing\n"
         "with replacing(Path('file')): os.kill(os.getpid(), signal.SIGKILL)"
     )
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=False, timeout=60)
@@ -187,7 +195,7 @@ def test_several_files_come_all_or_none(tmp_path: Path, monkeypatch: pytest.Monk
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from dynsim import files
+from dynsim.system import files
 
 renames, replace = [], os.replace
 def dying(source, target):
@@ -248,7 +256,7 @@ def test_a_rename_that_fails_is_marked_too(tmp_path: Path, monkeypatch: pytest.M
 @posix
 def test_two_runs_that_save_to_one_folder_do_not_mix(tmp_path: Path):
     code = (
-        "import sys; from pathlib import Path; from dynsim.files import replace_together\n"
+        "import sys; from pathlib import Path; from dynsim.system.files import replace_together\n"
         "for _ in range(40): replace_together(Path('.'), dict.fromkeys('abc', sys.argv[1].encode()))"
     )
     children = [subprocess.Popen([sys.executable, "-c", code, who], cwd=tmp_path) for who in ("one", "two")]

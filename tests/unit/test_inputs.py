@@ -14,9 +14,9 @@ from dynsim.errors import RecordError, ScenarioError
 from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.servo_map import load_servo_map
 from dynsim.hardware.virtual.faults import load_fault_script
-from dynsim.inputs import DEPTH_LIMIT, NODE_LIMIT, SIZE_LIMIT, check_file, parse_yaml, read_text
 from dynsim.record import Record
 from dynsim.scenario import build_model, find_scenario, load_scenario
+from dynsim.system.inputs import DEPTH_LIMIT, NODE_LIMIT, SIZE_LIMIT, check_file, parse_yaml, read_text
 
 
 def parse(text: str):
@@ -159,7 +159,7 @@ def test_a_file_that_may_not_be_looked_up_is_refused(tmp_path: Path, monkeypatch
     def refuse(path: object) -> None:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("dynsim.inputs.os", SimpleNamespace(stat=refuse))
+    monkeypatch.setattr("dynsim.system.inputs.os", SimpleNamespace(stat=refuse))
     with pytest.raises(ScenarioError, match=r"cannot be read \(Permission denied\)"):
         check_file(tmp_path / "closed" / "case.yaml", ScenarioError)
     # The name of a shipped scenario still means it.
@@ -175,7 +175,7 @@ def test_a_file_is_read_up_to_a_size(tmp_path: Path):
 
 
 def test_a_user_without_a_home_has_a_kernel_cache(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    from dynsim.kernels.jit import cache_folder
+    from dynsim.jit.kernel import cache_folder
 
     def nobody(uid: int) -> None:
         raise KeyError(uid)

@@ -9,7 +9,7 @@ import sys
 import pytest
 from llvmlite.binding import ExecutionEngine
 
-from dynsim import interruption
+from dynsim.system import interruption
 
 
 @pytest.fixture(autouse=True)

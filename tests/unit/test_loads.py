@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
+from dynsim.compile.model import Model
 from dynsim.engine import check
 from dynsim.errors import ModelError, ScenarioError
 from dynsim.model.description import Load
-from dynsim.model.model import Model
 from dynsim.scenario import Scenario, build, json_schema, load_scenario, scenario_from_resolved, to_yaml
 
 CHAIN = "duration_s: 2\nplant:\n  type: serial_arm\n  chain: [{axis: z}, {axis: y}, {axis: y, mass_kg: 0.3}]\n"

@@ -15,8 +15,8 @@ import pytest
 from llvmlite.binding import ObjectFileRef
 
 import dynsim
-from dynsim.kernels import jit
-from dynsim.kernels.tree.sweep import newton_euler
+from dynsim.dynamics.tree.sweep import newton_euler
+from dynsim.jit import kernel as jit
 
 pytestmark = pytest.mark.long
 
@@ -27,7 +27,7 @@ import hashlib, sys
 import numpy as np
 import dynsim
 from dynsim.engine.dynamics import prepare
-from dynsim.kernels.system import derivative
+from dynsim.dynamics.derivative import derivative
 
 scenario = dynsim.load_scenario("elbow_comparison", overrides={"duration_s": 0.3})
 if "derivative" in sys.argv:
@@ -70,7 +70,7 @@ def _weak_functions(machine_code: bytes) -> int:
 @pytest.mark.skipif(sys.platform != "linux", reason="reads ELF objects")
 def test_no_function_can_be_replaced_by_one_loaded_earlier() -> None:
     dynsim.simulate(dynsim.load_scenario("elbow_comparison", overrides=SHORT))
-    files = list(jit.cache_folder().glob("dynsim.kernels.*.kernel"))
+    files = list(jit.cache_folder().glob("dynsim.dynamics.*.kernel"))
     drivers = [file for file in files if ".advance_explicit-" in file.name]
     assert drivers, files
     for file in files:
@@ -84,10 +84,10 @@ import numpy as np
 from types import ModuleType
 
 if "unmended" in sys.argv:
-    sys.modules["dynsim.kernels.numba_habits"] = ModuleType("numba_habits")
+    sys.modules["dynsim.jit.numba_patches"] = ModuleType("numba_habits")
 import numba.core.types.functions as functions
-from dynsim.kernels import jit
-from dynsim.kernels.tree.sweep import kinematics
+from dynsim.jit import kernel as jit
+from dynsim.dynamics.tree.sweep import kinematics
 from tests.random_robots import bench, random_robot
 
 print(functions.BaseFunction.get_call_type.__module__)
@@ -111,7 +111,7 @@ def _machine_code(folder: Path, *how: str) -> list[str]:
 
 def test_mended_habits_of_numba_change_no_machine_code(tmp_path: Path) -> None:
     where, mended = _machine_code(tmp_path / "mended")
-    assert where == "dynsim.kernels.numba_habits"
+    assert where == "dynsim.jit.numba_patches"
     where, unmended = _machine_code(tmp_path / "unmended", "unmended")
     assert where == "numba.core.types.functions"
     assert mended == unmended

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from dynsim import Scenario, load_scenario, simulate
+from dynsim.dynamics.derivative import derivative
+from dynsim.dynamics.state import block
 from dynsim.engine.method import fastest_rate
 from dynsim.engine.prepare import prepare
-from dynsim.kernels.state import block
-from dynsim.kernels.system import derivative
 from dynsim.scenario import scenario_from_resolved
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from dynsim import load_scenario
+from dynsim.dynamics import tables as ka
 from dynsim.engine.dynamics import prepare
 from dynsim.errors import DynsimError
-from dynsim.kernels import arrays as ka
 
 SERVO = {
     "type": "servo",

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from dynsim.cli import display
 from dynsim.cli.commands import app
-from dynsim.control import inverse_kinematics
+from dynsim.compile.references import inverse_kinematics
 from dynsim.engine import REFERENCES, simulate
 from dynsim.scenario import load_scenario
 

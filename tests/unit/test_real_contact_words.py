@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 import dynsim
-from dynsim import metrics
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
 from dynsim.engine import check
+from dynsim.engine import summary as metrics
 from dynsim.engine.prepare import Prepared, prepare
 from dynsim.engine.stopping import _reason
 from dynsim.errors import ModelError
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.constraint import unilateral as ku
-from dynsim.kernels.integrate import run as ki
+from dynsim.integrators import run as ki
 from dynsim.record import Record
 from dynsim.scenario import Scenario, build
 

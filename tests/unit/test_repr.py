@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dynsim.model.model import Model
+from dynsim.compile.model import Model
 from dynsim.scenario import build_model, load_scenario
 
 ARM = Path(__file__).parents[2] / "scenarios" / "robots" / "six_axis_arm.urdf"

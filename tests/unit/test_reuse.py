@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import dynsim
-from dynsim.model.clearance import _Clear, gaps, sinking
-from dynsim.reuse import KEPT, Reuse
+from dynsim.compile.clearance import _Clear, gaps, sinking
 from dynsim.scenario import build, read_scenario, shipped_scenarios
 from dynsim.studies.batch import Work
 from dynsim.studies.columns import numbers
 from dynsim.studies.plan import Axis, Plan
+from dynsim.system.reuse import KEPT, Reuse
 
 ELBOWS = read_scenario("elbow_comparison")
 

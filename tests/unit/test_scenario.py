@@ -426,7 +426,7 @@ def test_numbers_that_no_result_can_be_computed_from_are_refused(monkeypatch: py
     def overflow(*_: object) -> None:
         raise np.linalg.LinAlgError("Singular matrix")
 
-    monkeypatch.setattr("dynsim.control.joint_pd.follow", overflow)
+    monkeypatch.setattr("dynsim.library.controllers.joint_pd.follow", overflow)
     with pytest.raises(
         ModelError, match=r"numbers of very different size, no result can be computed \(Singular matrix"
     ):

@@ -7,12 +7,12 @@ import json
 import numpy as np
 import pytest
 
+from dynsim.compile.protocols import BuildContext
 from dynsim.errors import RecordError
+from dynsim.library.surfaces import cylinder, plane, sphere
 from dynsim.model.description import Quadric
-from dynsim.model.protocols import BuildContext
 from dynsim.record.scene import Body, Joint, Point, Scene, Shape, Surface, quaternion
 from dynsim.record.surface_points import normals, round_patch, surface_grids
-from dynsim.surfaces import cylinder, plane, sphere
 
 CONTEXT = BuildContext(1.0)
 HINGE = Joint("j", "revolute", (0.0, 1.0, 0.0), (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), "q", ("j",))

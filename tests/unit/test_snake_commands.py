@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from dynsim.control.commands import Circle, Command, DoorArc, Ramp, Script, ScriptedSource
-from dynsim.control.modes import TABLE_II
 from dynsim.engine.mode_switching import ModeSwitcher
 from dynsim.errors import ModelError
-from dynsim.model.snake import FIXING, NO_REQUEST, SWITCHING, ModeTable
+from dynsim.library.controllers.snake_commands import Circle, Command, DoorArc, Ramp, Script, ScriptedSource
+from dynsim.snake.description import FIXING, NO_REQUEST, SWITCHING, ModeTable
+from dynsim.snake.modes import TABLE_II
 
 MODES = ModeTable.from_lifted(TABLE_II, 7)
 PATHS = [

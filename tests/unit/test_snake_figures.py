@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from dynsim.draw.figures import snake as figures
+from dynsim.draw.figures import snake_view, tanaka2019
 from dynsim.engine import simulate
 from dynsim.errors import RecordError
-from dynsim.figures import snake as figures
-from dynsim.figures import snake_view, tanaka2019
 from dynsim.record import Record
 from dynsim.scenario import load_scenario
-from dynsim.snake_geometry import snake_geometry
-from dynsim.studies.published.tanaka2019 import TABLE_III, table_iii, tables
+from dynsim.snake.geometry import snake_geometry
+from dynsim.snake.published import TABLE_III, table_iii, tables
 
 
 @pytest.fixture(scope="module")

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline, make_interp_spline
 
-from dynsim.control.inverse_kinematics import follow
+from dynsim.compile.model import Model
+from dynsim.compile.references.inverse_kinematics import follow
+from dynsim.compile.splines import clamped_cubic, quintic_coefficients, quintic_rates
+from dynsim.draw.figures.solids import outline
+from dynsim.dynamics.banded import solve_banded
 from dynsim.errors import UnreachableReference
-from dynsim.figures.solids import outline
-from dynsim.kernels.banded import solve_banded
 from dynsim.model.description import Contact
-from dynsim.model.model import Model
-from dynsim.model.splines import clamped_cubic, quintic_coefficients, quintic_rates
 from dynsim.model.surfaces import Box, Quadric
 from dynsim.scenario import build_model, load_scenario
 

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 
 import dynsim
+from dynsim.compile.clearance import sinking
+from dynsim.compile.protocols import BuildContext
+from dynsim.compile.scene import GRID_LINES, robot_scene
+from dynsim.compile.shapes import compile_shapes
+from dynsim.draw.figures import posture
 from dynsim.errors import ModelError, ScenarioError
-from dynsim.figures import posture
-from dynsim.model.clearance import sinking
+from dynsim.library.surfaces import box, height_field
 from dynsim.model.description import Quadric, vector
-from dynsim.model.protocols import BuildContext
-from dynsim.model.scene import GRID_LINES, robot_scene
-from dynsim.model.shapes import compile_shapes
 from dynsim.model.surfaces import Box, HeightField
 from dynsim.record.scene import Scene
 from dynsim.scenario import build
-from dynsim.surfaces import box, height_field
 
 BASE = """duration_s: 0.02
 plant:

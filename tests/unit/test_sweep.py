@@ -25,12 +25,12 @@ from sweep_work import DEADLY, REFUSED, deaf, hangs, leaves, once_deadly, slow, 
 
 import dynsim
 from dynsim.cli import sweep as sweep_command
+from dynsim.draw.figures import style
+from dynsim.draw.figures import sweep as pictures
 from dynsim.errors import DynsimError, ScenarioError
-from dynsim.figures import style
-from dynsim.figures import sweep as pictures
 from dynsim.record import Record
+from dynsim.record.sensitivity import sensitivities, spread
 from dynsim.scenario import SetOptions, read_scenario
-from dynsim.sensitivity import sensitivities, spread
 from dynsim.studies import batch, processes
 from dynsim.studies import sweep as module
 from dynsim.studies.columns import numbers

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import dynsim
+from dynsim.cli.tables import print_comparison, print_starts, print_summary
 from dynsim.record import Record
-from dynsim.tables import print_comparison, print_starts, print_summary
-from dynsim.terminal import Terminal
+from dynsim.system.terminal import Terminal
 
 ARM = """\
 duration_s: 1.0

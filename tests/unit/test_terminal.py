@@ -5,8 +5,8 @@ import io
 import pytest
 from rich.table import Table
 
-from dynsim.tables import print_comparison, print_summary
-from dynsim.terminal import Terminal, escaped, escaped_line, plain
+from dynsim.cli.tables import print_comparison, print_summary
+from dynsim.system.terminal import Terminal, escaped, escaped_line, plain
 
 EVIL = "a\x1b]0;title\x07[red]b[/red][link=http://x]c[/link]\x9b2Jd\u202ee\x00\r\ud800\\"
 SHOWN = r"a\x1b]0;title\x07[red]b[/red][link=http://x]c[/link]\x9b2Jd\u202ee\x00\r\ud800" + "\\"

@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dynsim.compile.model import Model
 from dynsim.errors import ModelError
 from dynsim.model.description import Inertia, Link, Robot
 from dynsim.model.joints.ball import ball, floating
 from dynsim.model.joints.planar import planar, rolling
-from dynsim.model.model import Model
-from dynsim.model.urdf import read_urdf
-from dynsim.model.urdf_writer import write_urdf
+from dynsim.model.urdf.build import read_urdf
+from dynsim.model.urdf.writer import write_urdf
 
 ARM = Path(__file__).parents[2] / "scenarios" / "robots" / "six_axis_arm.urdf"
 # A text round trip through roll, pitch, yaw costs a few roundings per joint; quantities here are of order 1 to 100.

@@ -8,7 +8,7 @@ import pytest
 
 from dynsim.engine import check, simulate
 from dynsim.errors import ModelError, ScenarioError
-from dynsim.model.urdf_reader import rotation
+from dynsim.model.urdf.reader import rotation
 from dynsim.record import Record
 from dynsim.scenario import build_model, load_scenario
 

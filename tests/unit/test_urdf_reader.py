@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from dynsim.compile.model import Model
 from dynsim.errors import DynsimError, ModelError
-from dynsim.model import urdf, urdf_reader
-from dynsim.model.model import Model
-from dynsim.model.urdf import read_urdf
+from dynsim.model.urdf import build as urdf
+from dynsim.model.urdf import reader as urdf_reader
+from dynsim.model.urdf.build import read_urdf
 
 # Line 1 is the XML declaration; link "arm" is in line 3, its mass in line 6, joint "hinge" in line 10.
 GOOD = """<?xml version="1.0"?>
@@ -230,7 +231,7 @@ def test_the_longest_chain_that_is_taken_does_not_break_pinocchio(tmp_path: Path
     links = [f'<link name="l{i}">{INERTIAL}</link>' for i in range(urdf_reader.LINKS_MAX)]
     joints = [LOOP.format(f"j{i}", f"l{i}", f"l{i + 1}") for i in reversed(range(urdf_reader.LINKS_MAX - 1))]
     (tmp_path / "chain.urdf").write_text(f'<robot name="r">{"".join(links + joints)}</robot>')
-    code = "import sys; from pathlib import Path; from dynsim.model.urdf import read_urdf; "
+    code = "import sys; from pathlib import Path; from dynsim.model.urdf.build import read_urdf; "
     code += "print(len(read_urdf(Path(sys.argv[1])).links))"
     done = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path / "chain.urdf")], capture_output=True, text=True, check=False

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import dynsim
-from dynsim.control import joint_pd
 from dynsim.engine import check
 from dynsim.errors import DynsimError, ModelError
+from dynsim.library.controllers import joint_pd
 
 SCENARIO = """\
 duration_s: 0.05

@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 
 import dynsim
-from dynsim import figures
+from dynsim.compile.model import Model
+from dynsim.draw import figures
+from dynsim.draw.figures import snake as snake_figures
+from dynsim.draw.figures import style
 from dynsim.engine import provenance
 from dynsim.errors import DynsimError, MissingEntry, ModelError, RecordError, ScenarioError
-from dynsim.figures import snake as snake_figures
-from dynsim.figures import style
 from dynsim.hardware.errors import CheckRefused, ServoMapError
 from dynsim.hardware.export import export_record
 from dynsim.hardware.replay.check import check_motion
 from dynsim.hardware.replay.compare import compare_records
 from dynsim.hardware.servo_map import load_servo_map
 from dynsim.model.description import Inertia, Link, Robot
-from dynsim.model.model import Model
 from dynsim.record import Record
 from dynsim.scenario import build, build_model, load_scenario, scenario_from_resolved, variant_names
 

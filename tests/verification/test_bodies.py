@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from random_robots import bench, random_inertia, random_robot, random_unit
 
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.jit import kernel
-from dynsim.kernels.tree.angles import sine_cosine
+from dynsim.compile.model import Model
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.tree.angles import sine_cosine
+from dynsim.jit.kernel import kernel
 from dynsim.model.description import Inertia, Link, Robot
 from dynsim.model.drives import Motor
-from dynsim.model.model import Model
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -9,14 +9,14 @@ import pytest
 from random_robots import random_robot, random_rotation, random_unit
 
 import dynsim.engine
+from dynsim.compile.model import Model
+from dynsim.compile.scene import robot_scene
+from dynsim.dynamics.state import output_layout, state_layout
 from dynsim.errors import ScenarioError
-from dynsim.kernels.state import output_layout, state_layout
 from dynsim.model.description import Inertia, Link, Robot
 from dynsim.model.joints import ANGLE, Row, rows
 from dynsim.model.joints.ball import ball, floating
 from dynsim.model.joints.planar import planar, rolling
-from dynsim.model.model import Model
-from dynsim.model.scene import robot_scene
 from dynsim.record import Record
 from dynsim.record.poses import add_body_poses, point_positions, pose_columns
 from dynsim.record.quaternion import rotated

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 import dynsim
+from dynsim.compile.bracing import Brace, BracePlanner, BraceStatics, brace_rows
+from dynsim.compile.model import Model
 from dynsim.errors import ModelError
-from dynsim.model.bracing import Brace, BracePlanner, BraceStatics, brace_rows
-from dynsim.model.model import Model
 
 seeds = st.integers(0, 2**32 - 1)
 # Of components of virtual velocities and gradients near 1 that would have to be zero or positive.

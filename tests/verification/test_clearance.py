@@ -11,14 +11,14 @@ from random_robots import random_positions, random_robot, random_robot_of, rando
 from rich.console import Console
 
 import dynsim
+from dynsim.cli.tables import print_comparison, print_summary
+from dynsim.compile.clearance import poses, sinking
+from dynsim.compile.model import Model
 from dynsim.engine import check
 from dynsim.errors import ModelError
-from dynsim.model.clearance import poses, sinking
 from dynsim.model.description import Inertia, Link, Quadric, Robot
 from dynsim.model.joints.ball import floating
-from dynsim.model.model import Model
 from dynsim.scenario import build, load_scenario, scenario_from_resolved
-from dynsim.tables import print_comparison, print_summary
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -7,9 +7,9 @@ import pytest
 from random_robots import CONTINUOUS, Bench, bench
 from scipy.special import ellipk
 
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.integrate.run import DRIFT_MAX
-from dynsim.kernels.state import FRICTION, OUT_FORCE
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.state import FRICTION, OUT_FORCE
+from dynsim.integrators.run import DRIFT_MAX
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.model.drives import Motor
 

@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from dynsim.kernels.constraint.cone import BOTH_WAYS, CONE, CONE_ROOM, NO_SOLUTION, ONE_WAY, TANGENT, solve_cones
+from dynsim.dynamics.contact.cone.problem import (
+    BOTH_WAYS,
+    CONE,
+    CONE_ROOM,
+    NO_SOLUTION,
+    ONE_WAY,
+    TANGENT,
+    solve_cones,
+)
 
 BLOCK = [CONE, TANGENT, TANGENT]
 

@@ -10,12 +10,12 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from random_robots import bench, random_contacts, random_robot, surface_through
 
+from dynsim.compile.model import Model
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.state import FRICTION
 from dynsim.engine import check
 from dynsim.errors import ScenarioError
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.state import FRICTION
 from dynsim.model.description import Contact, Quadric, Robot
-from dynsim.model.model import Model
 from dynsim.scenario import load_scenario
 
 seeds = st.integers(0, 2**32 - 1)

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from random_robots import bench, random_robot
 
+from dynsim.compile.model import Model
+from dynsim.dynamics.state import CONSTRAINT
 from dynsim.engine import simulate
 from dynsim.errors import ModelError
-from dynsim.kernels.state import CONSTRAINT
 from dynsim.model.description import Coupling
-from dynsim.model.model import Model
-from dynsim.model.urdf import read_urdf
+from dynsim.model.urdf.build import read_urdf
 from dynsim.scenario import build_model, load_scenario
 
 BODY = '<inertial><mass value="{}"/><origin xyz="0 0 0.1"/>' + (

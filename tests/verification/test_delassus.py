@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.constraint.delassus import RANK_TOLERANCE, solve_small
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact.delassus import RANK_TOLERANCE, solve_small
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -9,13 +9,13 @@ import pytest
 from scipy.optimize import brentq
 
 from dynsim import load_scenario, simulate
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.drive.dc import dc_balance, dc_command, dc_torque, within_current
-from dynsim.kernels.drive.law import drive_block, take_commands
-from dynsim.kernels.drive.limit import clipped
-from dynsim.kernels.drive.servo import servo_command, servo_torque
-from dynsim.kernels.drive.torque import open_torque
-from dynsim.kernels.state import GEAR
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.drive.dc import dc_balance, dc_command, dc_torque, within_current
+from dynsim.dynamics.drive.law import drive_block, take_commands
+from dynsim.dynamics.drive.limit import clipped
+from dynsim.dynamics.drive.servo import servo_command, servo_torque
+from dynsim.dynamics.drive.torque import open_torque
+from dynsim.dynamics.state import GEAR
 from dynsim.model.description import Inertia, Link, Robot, vector
 from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
 from tests.random_robots import Bench, bench

@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 
 import dynsim
-from dynsim import interruption
 from dynsim.engine import attended, kinematic
 from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped
-from dynsim.kernels.integrate import driver, events, radau, steps
-from dynsim.kernels.integrate import newton as kn
-from dynsim.kernels.integrate import run as ki
+from dynsim.integrators import driver, events, steps
+from dynsim.integrators import run as ki
+from dynsim.integrators.radau5 import newton as kn
+from dynsim.integrators.radau5 import step as radau
+from dynsim.system import interruption
 
 ENDLESS = Path(__file__).parents[1] / "data" / "endless" / "arm.yaml"
 

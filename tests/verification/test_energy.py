@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import dynsim
-from dynsim import metrics
+from dynsim.engine import summary as metrics
 from dynsim.scenario import build, scenario_from_resolved
 from dynsim.studies.validation import FREE, free_scenario
 

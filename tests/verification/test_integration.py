@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from random_robots import CONTINUOUS, Bench, bench
 
-from dynsim.kernels.integrate.newton import ITERATIONS
-from dynsim.kernels.integrate.radau import SHORT, guess_stages, keep_stages, missed, slack
-from dynsim.kernels.integrate.run import DRIFT_MAX, FINISHED, METHODS, REJECTED, STATUS, STEP, STEP_MAX, STEPS, Run
-from dynsim.kernels.integrate.tableaux import ERROR_RADAU, GAMMA_RADAU, NODE_RADAU
-from dynsim.kernels.state import CONSTRAINT, ELECTRICAL, FRICTION, GEAR, JOINT, JOULE, OUT_GAP
+from dynsim.dynamics.state import CONSTRAINT, ELECTRICAL, FRICTION, GEAR, JOINT, JOULE, OUT_GAP
+from dynsim.integrators.radau5.newton import ITERATIONS
+from dynsim.integrators.radau5.step import SHORT, guess_stages, keep_stages, missed, slack
+from dynsim.integrators.run import DRIFT_MAX, FINISHED, METHODS, REJECTED, STATUS, STEP, STEP_MAX, STEPS, Run
+from dynsim.integrators.tableaux import ERROR_RADAU, GAMMA_RADAU, NODE_RADAU
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.model.drives import Motor
 

@@ -17,16 +17,16 @@ from random_robots import (
 )
 from scipy.special import ellipj
 
+from dynsim.compile.model import Model
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.state import CONSTRAINT, FRICTION, JOINT
+from dynsim.dynamics.tree.joints import position_error
 from dynsim.errors import ModelError
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.integrate.run import DRIFT_MAX, PROJECTIONS, REJECTED, STEPS
-from dynsim.kernels.state import CONSTRAINT, FRICTION, JOINT
-from dynsim.kernels.tree.joints import position_error
+from dynsim.integrators.run import DRIFT_MAX, PROJECTIONS, REJECTED, STEPS
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.model.drives import Motor
 from dynsim.model.joints.ball import ball, floating
 from dynsim.model.joints.planar import rolling
-from dynsim.model.model import Model
 from dynsim.record.scene import quaternion as scene_quaternion
 
 DOWN = np.array([0.0, 0.0, -9.81])

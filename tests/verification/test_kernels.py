@@ -13,10 +13,11 @@ import pytest
 from numba import config, types
 from random_robots import bench, random_contacts, random_robot
 
-from dynsim.kernels import ledger, system
-from dynsim.kernels.integrate import driver
-from dynsim.kernels.tree import articulated, points, sweep
-from dynsim.model.model import Model
+from dynsim.compile.model import Model
+from dynsim.dynamics import derivative as system
+from dynsim.dynamics import ledger
+from dynsim.dynamics.tree import articulated, points, sweep
+from dynsim.integrators import driver
 
 PLAIN_PYTHON = """
 import sys

@@ -15,11 +15,11 @@ import pytest
 from lane_cases import CASES, TIMED, Case, held, run
 from lanes import Divergent, Lanes, Notes, Place, select
 
-from dynsim.kernels import arrays as ka
-from dynsim.kernels import system
-from dynsim.kernels.constraint.shapes import shaped_rows
-from dynsim.kernels.constraint.splits import admissible_forces
-from dynsim.kernels.constraint.unilateral import slide_direction
+from dynsim.dynamics import derivative as system
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact.shapes import shaped_rows
+from dynsim.dynamics.contact.splits import admissible_forces
+from dynsim.dynamics.contact.unilateral import slide_direction
 
 N = 4
 
@@ -30,39 +30,35 @@ SEGMENT = "segment of a reference or load"
 
 # Branches that are selects without another bit. FORMS below are the selects, and cases whose lanes disagree run them.
 SELECT = {
-    Place("constraint/m_star.py", "solve_m_star", "if factor != 0.0:"): "saves work alone: taking away zero is nothing",
-    Place("constraint/surface.py", "surface_distance", "if inner <= 0.0:"): "curved surface: no root along the normal",
+    Place("contact/m_star.py", "solve_m_star", "if factor != 0.0:"): "saves work alone: taking away zero is nothing",
+    Place("contact/quadrics.py", "surface_distance", "if inner <= 0.0:"): "curved surface: no root along the normal",
     Place("drive/limit.py", "clipped", "if x.real > limit:"): LIMIT,
     Place("drive/limit.py", "clipped", "if x.real < -limit:"): LIMIT,
     Place("drive/servo.py", "servo_circuit", "if i != wanted:"): "voltage of a servo at its limit of current",
 }
 # Branches whose lanes must agree. Where they do not, the lanes are evaluated one by one.
 FALLBACK = {
-    Place("constraint/delassus.py", "solve_small", "if p == 1 and small[0, 0, 0] != 0.0:"): CLOSED_FORM,
+    Place("contact/delassus.py", "solve_small", "if p == 1 and small[0, 0, 0] != 0.0:"): CLOSED_FORM,
+    Place("contact/delassus.py", "solve_small", "if abs(determinant) > 1e-3 * (abs(a * d) + abs(b * c)):"): CLOSED_FORM,
+    Place("contact/delassus.py", "eliminate", "if abs(small[1, i, k]) > abs(small[1, best, k]):"): PIVOT,
+    Place("contact/delassus.py", "eliminate", "if abs(small[1, best, k]) <= RANK_TOLERANCE * largest:"): DEPENDENT,
     Place(
-        "constraint/delassus.py", "solve_small", "if abs(determinant) > 1e-3 * (abs(a * d) + abs(b * c)):"
-    ): CLOSED_FORM,
-    Place("constraint/delassus.py", "eliminate", "if abs(small[1, i, k]) > abs(small[1, best, k]):"): PIVOT,
-    Place("constraint/delassus.py", "eliminate", "if abs(small[1, best, k]) <= RANK_TOLERANCE * largest:"): DEPENDENT,
-    Place(
-        "constraint/delassus.py",
+        "contact/delassus.py",
         "eliminate",
         "least_norm(small, state, active, p, k if least > POOR_PIVOT * largest else 0, largest)",
     ): DEPENDENT,
     Place(
-        "constraint/delassus.py",
+        "contact/delassus.py",
         "eliminate_to_rank",
         "while last > k and abs(matrix[largest_in_column(matrix, last, k, p), last]) <= RANK_TOLERANCE * largest:",
     ): DEPENDENT,
     Place(
-        "constraint/delassus.py", "eliminate_to_rank", "if abs(matrix[row, column]) <= RANK_TOLERANCE * largest:"
+        "contact/delassus.py", "eliminate_to_rank", "if abs(matrix[row, column]) <= RANK_TOLERANCE * largest:"
     ): DEPENDENT,
-    Place("constraint/delassus.py", "eliminate_to_rank", "if abs(matrix[row, j]) > abs(matrix[row, other]):"): PIVOT,
+    Place("contact/delassus.py", "eliminate_to_rank", "if abs(matrix[row, j]) > abs(matrix[row, other]):"): PIVOT,
+    Place("contact/delassus.py", "largest_in_column", "if abs(matrix[i, column]) > abs(matrix[best, column]):"): PIVOT,
     Place(
-        "constraint/delassus.py", "largest_in_column", "if abs(matrix[i, column]) > abs(matrix[best, column]):"
-    ): PIVOT,
-    Place(
-        "constraint/surface.py",
+        "contact/quadrics.py",
         "sign_changed",
         "if agreement < -NO_FORCE * largest or (agreement <= NO_FORCE * largest and rows[k, SIGN] < 0.0):",
     ): "search for the signs of dissipative friction",
@@ -82,16 +78,16 @@ WITHOUT_LANES = (admissible_forces, slide_direction, shaped_rows)
 UNILATERAL = "the cases here are of the bilateral law"
 NEVER = {
     Place(
-        "constraint/surface.py",
+        "contact/quadrics.py",
         "contact_rows",
         "sx, sy, sz, mu = slide_direction(unilateral, contacts, k, tx, ty, tz)",
     ): UNILATERAL,
-    Place("constraint/surface.py", "contact_rows", "rows[m, ROW_MU] = mu"): UNILATERAL,
+    Place("contact/quadrics.py", "contact_rows", "rows[m, ka.ROW_MU] = mu"): UNILATERAL,
     Place("tree/joints.py", "read_positions", "return"): COMPOUND,
     Place("tree/joints.py", "position_rates", "return"): COMPOUND,
     Place("tree/joints.py", "sweep_row", "return"): COMPOUND,
-    Place("system.py", "m_star_acceleration", "passes += 1"): AGAIN,
-    Place("system.py", "m_star_acceleration", "solve_m_star(dense, model, drives, ws)"): AGAIN,
+    Place("derivative.py", "m_star_acceleration", "passes += 1"): AGAIN,
+    Place("derivative.py", "m_star_acceleration", "solve_m_star(dense, model, drives, ws)"): AGAIN,
 }
 
 

@@ -1,7 +1,7 @@
 """Right-hand sides on lanes, compiled: a lane gets what a run of its own gets, to rounding, whatever the others do.
 
 ``test_lanes`` runs the kernels' source on lanes as Python; here is the machine code, with the forms of
-``dynsim.kernels.lanes.forms`` in it.
+``dynsim.dynamics.simd.forms`` in it.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from lane_cases import CASES, TIMED, Case, of, plane
 from lanes import copies
 from random_robots import Bench, bench, braced, random_contacts, random_positions, random_robot
 
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.constraint.rows import set_modes
-from dynsim.kernels.constraint.unilateral import FROZEN, REFERENCE, STATIC, STRIBECK, VISCOUS
-from dynsim.kernels.integrate.driver import advance
-from dynsim.kernels.integrate.run import FINISHED, PROJECTIONS, SAMPLE, STATUS
-from dynsim.kernels.jit import integers, reals
-from dynsim.kernels.lanes.fixed_step import advance_lanes, lane_runs
-from dynsim.kernels.lanes.system import derivatives, lane_workspace, lanes_of_runs
-from dynsim.kernels.lanes.tables import AXES, spread_tables
-from dynsim.kernels.system import System, derivative
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact.rows import set_modes
+from dynsim.dynamics.contact.unilateral import FROZEN, REFERENCE, STATIC, STRIBECK, VISCOUS
+from dynsim.dynamics.derivative import System, derivative
+from dynsim.dynamics.simd.system import derivatives, lane_workspace, lanes_of_runs
+from dynsim.dynamics.simd.tables import AXES, spread_tables
+from dynsim.integrators.driver import advance
+from dynsim.integrators.fixed_step import advance_lanes, lane_runs
+from dynsim.integrators.run import FINISHED, PROJECTIONS, SAMPLE, STATUS
+from dynsim.jit.kernel import integers, reals
 
 pytestmark = pytest.mark.long
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from random_robots import Bench, bench, random_contacts, random_robot, surface_through
 
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.constraint.rows import force_vectors, set_modes
-from dynsim.kernels.jit import integers
-from dynsim.kernels.state import CONSTRAINT, FRICTION, OUT_FORCE, OUT_VECTOR
+from dynsim.compile.model import Model
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact.rows import force_vectors, set_modes
+from dynsim.dynamics.state import CONSTRAINT, FRICTION, OUT_FORCE, OUT_VECTOR
+from dynsim.jit.kernel import integers
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot, vector
-from dynsim.model.model import Model
 
 G = 9.81
 

@@ -24,9 +24,9 @@ import numpy as np
 from random_robots import bench, random_inertia, random_robot_of, random_rotation, without_losses
 
 import dynsim
-from dynsim.model.clearance import poses
+from dynsim.compile.clearance import poses
 from dynsim.model.description import Inertia, Link, Robot, in_rows
-from dynsim.model.model import Model
+from dynsim.compile.model import Model
 
 assert Path(dynsim.__file__).is_relative_to(sys.argv[1]), dynsim.__file__
 
@@ -86,13 +86,13 @@ def extended(folder: Path) -> Path:
     shutil.copytree(ROOT / "dynsim", folder / "dynsim", ignore=shutil.ignore_patterns("__pycache__"))
     text = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
     section = text.split("\n## A joint\n")[1].split("\n## ")[0]
-    file, column, branch = re.findall(r"```python\n(.*?)```", section, flags=re.DOTALL)
+    file, branch = re.findall(r"```python\n(.*?)```", section, flags=re.DOTALL)
     (folder / "dynsim" / "model" / "joints" / "screw.py").write_text(file, encoding="utf-8")
-    joints = folder / "dynsim" / "kernels" / "tree" / "joints.py"
+    joints = folder / "dynsim" / "dynamics" / "tree" / "joints.py"
     kernel = joints.read_text(encoding="utf-8")
-    for new, before in ((column, "from dynsim.kernels.jit import"), (branch, "    elif kind == TURN:\n")):
-        assert kernel.count(before) == 1
-        kernel = kernel.replace(before, new + before)
+    before = "\n    elif kind == ka.ROLL:\n"
+    assert kernel.count(before) == 1
+    kernel = kernel.replace(before, f"\n{branch.rstrip()}{before}")
     joints.write_text(kernel, encoding="utf-8")
     return folder
 

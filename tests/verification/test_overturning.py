@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 import dynsim
+from dynsim.compile.clearance import poses
 from dynsim.engine.stepped import State
 from dynsim.errors import ModelError, SimulationStopped
-from dynsim.model.clearance import poses
 from dynsim.model.description import Robot
 from dynsim.scenario import build
 

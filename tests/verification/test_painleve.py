@@ -10,14 +10,14 @@ import pytest
 from random_robots import Bench, bench, random_contacts, random_robot, random_unit
 
 import dynsim
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact.uniqueness import ROOM, UNIQUE, force_verdict
+from dynsim.dynamics.derivative import new_workspace
 from dynsim.engine import dynamics, recording
 from dynsim.engine.uniqueness import acceleration_range, contact_matrices, motion_spread, paradox
 from dynsim.errors import SimulationStopped
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.constraint.uniqueness import ROOM, UNIQUE, force_verdict
-from dynsim.kernels.integrate import driver
-from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.system import new_workspace
+from dynsim.integrators import driver
+from dynsim.integrators import run as ki
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot
 from dynsim.scenario import build
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import dynsim
+from dynsim.compile.bracing import Brace
+from dynsim.compile.posture import gaps_and_rates
 from dynsim.errors import DynsimError
-from dynsim.model.bracing import Brace
-from dynsim.model.posture import gaps_and_rates
 from dynsim.scenario import build
 
 ELBOWS = ["elbow_4", "elbow_7"]

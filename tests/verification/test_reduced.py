@@ -7,9 +7,9 @@ import pytest
 from lanes import copies
 from random_robots import Bench, bench, random_positions, random_robot, random_robot_of
 
-from dynsim.kernels.integrate.reduced import factor_both, solve_both
-from dynsim.kernels.integrate.tableaux import ALPHA_RADAU, BETA_RADAU, GAMMA_RADAU
-from dynsim.kernels.jit import kernel
+from dynsim.integrators.radau5.linear_systems import factor_both, solve_both
+from dynsim.integrators.tableaux import ALPHA_RADAU, BETA_RADAU, GAMMA_RADAU
+from dynsim.jit.kernel import kernel
 
 
 @kernel

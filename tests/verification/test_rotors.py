@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import dynsim
+from dynsim.dynamics.derivative import derivative
+from dynsim.dynamics.state import ELECTRICAL, block
 from dynsim.engine.dynamics import prepare
 from dynsim.errors import ScenarioError
-from dynsim.kernels.state import ELECTRICAL, block
-from dynsim.kernels.system import derivative
 from dynsim.scenario import build_model, load_scenario
 from dynsim.studies.published.rotors import rotor_energies, rotor_model
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from random_robots import Bench, braced
 
-from dynsim.kernels.integrate.run import EVALUATIONS, FINISHED, PROJECTIONS, SAMPLE, STATUS, TIME, Run
+from dynsim.integrators.run import EVALUATIONS, FINISHED, PROJECTIONS, SAMPLE, STATUS, TIME, Run
 
 STEP = 5e-3
 

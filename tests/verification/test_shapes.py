@@ -10,14 +10,14 @@ from random_robots import Bench, bench, random_robot, random_rotation, random_un
 from scipy.interpolate import make_interp_spline
 from scipy.optimize import minimize, minimize_scalar
 
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.constraint.rows import set_modes
-from dynsim.kernels.jit import integers
-from dynsim.kernels.state import OUT_FORCE
+from dynsim.compile.model import Model
+from dynsim.compile.shapes import compile_shapes, contact_gap, moves
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact.rows import set_modes
+from dynsim.dynamics.state import OUT_FORCE
+from dynsim.jit.kernel import integers
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot, vector
 from dynsim.model.joints.ball import floating
-from dynsim.model.model import Model
-from dynsim.model.shapes import compile_shapes, contact_gap, moves
 from dynsim.model.surfaces import Box, HeightField, Surface
 
 G = 9.81

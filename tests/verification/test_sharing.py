@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import dynsim
+from dynsim.dynamics.tables import OPEN, SLIDING, STICKING
 from dynsim.engine.sharing import sharing
-from dynsim.kernels.arrays import OPEN, SLIDING, STICKING
 from dynsim.scenario import build
 
 ARM = """\

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_snakes import robots
 
+from dynsim.compile.protocols import BuildContext
 from dynsim.errors import ModelError
-from dynsim.kernels.jit import integers, reals
-from dynsim.model.protocols import BuildContext
-from dynsim.plants.snake import Config, build
+from dynsim.jit.kernel import integers, reals
+from dynsim.library.plants.snake import Config, build
 from dynsim.snake.kinematics import active_rows, constraint_matrices, new_chain, pose_of_point, walk_chain
 
 seeds = st.integers(0, 2**32 - 1)

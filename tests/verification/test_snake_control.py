@@ -5,13 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dynsim.control import task_space
+from dynsim.compile.protocols import BuildContext
 from dynsim.errors import ModelError
-from dynsim.kernels.jit import reals
-from dynsim.model.protocols import BuildContext
-from dynsim.model.snake import conditioning
-from dynsim.plants import snake
-from dynsim.snake.control import control_input, new_work, sigma_min
+from dynsim.jit.kernel import reals
+from dynsim.library.controllers import task_space
+from dynsim.library.plants import snake
+from dynsim.snake.controller import control_input, new_work, sigma_min
+from dynsim.snake.description import conditioning
 from dynsim.snake.kinematics import constraint_matrices, new_chain, pose_of_point, walk_chain
 
 seeds = st.integers(0, 2**32 - 1)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dynsim.control.commands import Circle
 from dynsim.engine import kinematic
 from dynsim.errors import ModelError, SimulationInterrupted, SimulationStopped
-from dynsim.model.snake import NO_REQUEST, CommandBlock
+from dynsim.library.controllers.snake_commands import Circle
 from dynsim.record import Record
 from dynsim.scenario import load_scenario
+from dynsim.snake.description import NO_REQUEST, CommandBlock
 
 PERIOD = 0.005
 

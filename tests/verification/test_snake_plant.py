@@ -13,9 +13,10 @@ from numba import config
 from dynsim.engine import kinematic, simulate
 from dynsim.engine.kinematic_record import attitude, attitude_distance
 from dynsim.errors import ModelError, ScenarioError
-from dynsim.model.snake import NO_REQUEST, SWITCHING, CommandBlock
 from dynsim.scenario import Scenario, ScenarioConfig, load_scenario
-from dynsim.snake import control, kinematics, ticks
+from dynsim.snake import controller as control
+from dynsim.snake import kinematics, ticks
+from dynsim.snake.description import NO_REQUEST, SWITCHING, CommandBlock
 
 GAMMA = {"type": "ramp", "start_s": 0.1, "duration_s": 1.0, "displacement": [0.02, 0.03, -0.03, 0.1, 0.1, 0.3]}
 

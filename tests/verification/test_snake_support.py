@@ -6,12 +6,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from dynsim.control.modes import TABLE_II
-from dynsim.kernels.jit import reals
-from dynsim.model.protocols import BuildContext
-from dynsim.model.snake import ModeTable
-from dynsim.plants.snake import Config, build
+from dynsim.compile.protocols import BuildContext
+from dynsim.jit.kernel import reals
+from dynsim.library.plants.snake import Config, build
+from dynsim.snake.description import ModeTable
 from dynsim.snake.kinematics import new_chain, pose_of_point, walk_chain
+from dynsim.snake.modes import TABLE_II
 from dynsim.snake.support import (
     Cost,
     cost_gradient,

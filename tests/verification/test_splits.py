@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize, minimize_scalar
 
-from dynsim.kernels.constraint.cone_program import cone_program, solve_cone_program
-from dynsim.kernels.constraint.socp import best_split, split_room
-from dynsim.kernels.jit import integers, reals
+from dynsim.dynamics.contact.cone.program import cone_program, solve_cone_program
+from dynsim.dynamics.contact.cone.socp import best_split, split_room
+from dynsim.jit.kernel import integers, reals
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -1,4 +1,4 @@
-"""Nobody but dynsim.kernels.state knows where what lies in the state and in recorded outputs."""
+"""Nobody but dynsim.dynamics.state knows where what lies in the state and in recorded outputs."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import pytest
 from random_robots import CONTINUOUS, Bench, bench, random_contacts, random_robot
 
 import dynsim
+from dynsim.dynamics.derivative import new_workspace
+from dynsim.dynamics.simd.tables import aligned
+from dynsim.dynamics.state import OutputLayout, StateLayout, block
 from dynsim.engine.uniqueness import acceleration_range
-from dynsim.kernels.integrate.run import FINISHED, METHODS, PROJECTIONS, STATUS, STEPS, Run
-from dynsim.kernels.lanes.tables import aligned
-from dynsim.kernels.state import OutputLayout, StateLayout, block
-from dynsim.kernels.system import new_workspace
+from dynsim.integrators.run import FINISHED, METHODS, PROJECTIONS, STATUS, STEPS, Run
 
 PACKAGE, TESTS = Path(dynsim.__file__).parent, Path(__file__).parents[1]
 
@@ -258,9 +258,9 @@ OWN_STATE = {PACKAGE / "studies" / "published" / "rotors.py"}
 
 def _sources() -> list[Path]:
     files = [*PACKAGE.rglob("*.py"), *TESTS.rglob("*.py")]
-    assert PACKAGE / "kernels" / "system.py" in files
+    assert PACKAGE / "dynamics" / "derivative.py" in files
     assert TESTS / "random_robots.py" in files
-    return sorted({*files} - OWN_STATE - {PACKAGE / "kernels" / "state.py"})
+    return sorted({*files} - OWN_STATE - {PACKAGE / "dynamics" / "state.py"})
 
 
 def test_no_source_file_computes_where_a_block_lies():

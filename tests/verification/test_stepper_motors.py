@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import dynsim
+from dynsim.engine.summary import energy_residual
 from dynsim.errors import ModelError
-from dynsim.metrics import energy_residual
 from dynsim.model.drives import Servo
 
 K_M, R, ARMATURE = 1.9, 2.3, 0.02

@@ -9,13 +9,9 @@ from scipy.integrate import solve_ivp
 from stepping_benches import plane, snake, stepped
 
 import dynsim
-from dynsim.kernels.integrate.run import FINISHED, STATUS, Run
-from dynsim.kernels.integrate.time_stepping import (
-    GRIP,
-    GRIP_AXIS,
-    PENETRATION,
-)
-from dynsim.kernels.state import CONSTRAINT, FRICTION, IMPACT_LOSS, OUT_FORCE
+from dynsim.dynamics.state import CONSTRAINT, FRICTION, IMPACT_LOSS, OUT_FORCE
+from dynsim.integrators.run import FINISHED, STATUS, Run
+from dynsim.integrators.stepping.tables import GRIP, GRIP_AXIS, PENETRATION
 from dynsim.model.description import Contact, Inertia, Link, Robot
 from dynsim.model.drives import Motor
 

@@ -7,9 +7,9 @@ import pytest
 from random_robots import Bench, bench, random_contacts, random_positions, random_robot, random_robot_of
 from stepping_benches import snake, stepped
 
-from dynsim.kernels.integrate.run import STEPS, Run
-from dynsim.kernels.integrate.time_stepping import BAD, CAPPED, GRIP, GRIP_AXIS, PENETRATION, WORST
-from dynsim.kernels.state import CONSTRAINT, ELECTRICAL, FRICTION, GEAR, JOINT, JOULE
+from dynsim.dynamics.state import CONSTRAINT, ELECTRICAL, FRICTION, GEAR, JOINT, JOULE
+from dynsim.integrators.run import STEPS, Run
+from dynsim.integrators.stepping.tables import BAD, CAPPED, GRIP, GRIP_AXIS, PENETRATION, WORST
 from dynsim.model.description import Coupling, Load, Robot
 from dynsim.model.drives import Servo, TorqueSource
 

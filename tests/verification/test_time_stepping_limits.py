@@ -7,11 +7,11 @@ import pytest
 from random_robots import Bench, bench
 from stepping_benches import plane, stepped
 
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.drive.servo import servo_block, servo_block_on, servo_circuit, servo_circuit_on, servo_segment
-from dynsim.kernels.integrate.time_stepping import UNSETTLED
-from dynsim.kernels.jit import integers, reals
-from dynsim.kernels.state import ELECTRICAL, SLIP
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.drive.servo import servo_block, servo_block_on, servo_circuit, servo_circuit_on, servo_segment
+from dynsim.dynamics.state import ELECTRICAL, SLIP
+from dynsim.integrators.stepping.tables import UNSETTLED
+from dynsim.jit.kernel import integers, reals
 from dynsim.model.description import Contact, Inertia, Link, Robot
 from dynsim.model.drives import Motor, Servo, TorqueSource
 from dynsim.model.servo import servo_row

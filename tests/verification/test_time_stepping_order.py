@@ -7,8 +7,8 @@ import pytest
 from stepping_benches import stepped
 from stepping_cases import G, X, Z, bead, bowl, hump, incline, knife_edge, plane, point, spherical_bowl, tip
 
-from dynsim.kernels.integrate.run import LOGGED, TIME
-from dynsim.kernels.state import IMPACT_LOSS, OUT_FORCE, OUT_GAP
+from dynsim.dynamics.state import IMPACT_LOSS, OUT_FORCE, OUT_GAP
+from dynsim.integrators.run import LOGGED, TIME
 from dynsim.model.description import Contact
 
 # Errors at 1 ms of an independent prototype of the same law [m or rad]; here no more than twice of them.

@@ -7,11 +7,11 @@ import pytest
 from random_robots import Bench, bench
 from stepping_benches import plane, stepped
 
-from dynsim.kernels.constraint.cone import CONE, CONE_ROOM, TANGENT
-from dynsim.kernels.constraint.least_norm import select_least_norm
-from dynsim.kernels.integrate.run import LOGGED
-from dynsim.kernels.jit import integers, kernel
-from dynsim.kernels.state import FRICTION, IMPACT_LOSS, OUT_FORCE
+from dynsim.dynamics.contact.cone.least_norm import select_least_norm
+from dynsim.dynamics.contact.cone.problem import CONE, CONE_ROOM, TANGENT
+from dynsim.dynamics.state import FRICTION, IMPACT_LOSS, OUT_FORCE
+from dynsim.integrators.run import LOGGED
+from dynsim.jit.kernel import integers, kernel
 from dynsim.model.description import Contact, Inertia, Link, Robot
 from dynsim.model.joints.ball import floating
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dynsim import build_model, load_scenario, simulate
-from dynsim.model.bracing import Brace
+from dynsim.compile.bracing import Brace
 from dynsim.scenario import build
 
 ARM = """

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from random_robots import Bench, bench
 
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.integrate import contact_events as ce
-from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.state import FRICTION, OUT_FORCE, OUT_GAP, OUT_MODE
+from dynsim.compile.contact_law import SETTLE_SPEED
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.state import FRICTION, OUT_FORCE, OUT_GAP, OUT_MODE
+from dynsim.integrators import run as ki
+from dynsim.integrators.contacts import events as ce
 from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot, vector
 from dynsim.model.surfaces import Box
-from dynsim.model.unilateral import SETTLE_SPEED
 
 G = 9.81
 ORIGIN = np.zeros(3)

@@ -8,11 +8,11 @@ from random_robots import Bench, bench
 from scipy.integrate import solve_ivp
 from unilateral_checks import events, ledger_residual
 
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.integrate import contact_events as ce
-from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.integrate.project import GAP_TOLERANCE
-from dynsim.kernels.state import OUT_FORCE, OUT_GAP, OUT_MODE, OUT_VECTOR
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.state import OUT_FORCE, OUT_GAP, OUT_MODE, OUT_VECTOR
+from dynsim.integrators import run as ki
+from dynsim.integrators.contacts import events as ce
+from dynsim.integrators.project import GAP_TOLERANCE
 from dynsim.model.description import Contact, Inertia, Link, Quadric, Robot, vector
 
 G = 9.81

@@ -8,9 +8,9 @@ from random_robots import Bench, bench
 from scipy.integrate import solve_ivp
 from unilateral_checks import events, ledger_residual
 
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.integrate import contact_events as ce
-from dynsim.kernels.state import OUT_MODE, OUT_VECTOR
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.state import OUT_MODE, OUT_VECTOR
+from dynsim.integrators.contacts import events as ce
 from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot, vector
 from dynsim.model.joints.ball import floating
 

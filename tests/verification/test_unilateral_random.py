@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from unilateral_checks import random_touch, violations
 
-from dynsim.kernels.integrate import run as ki
+from dynsim.integrators import run as ki
 
 # No run ends without a name; those of random wedges and paradoxes are few.
 NAMED = (ki.FORCES_REVERSED, ki.SEVERAL_FORCES, ki.NO_CONTACT_FORCES, ki.CHATTER, ki.STEP_TOO_SMALL)

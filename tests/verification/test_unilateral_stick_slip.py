@@ -11,11 +11,11 @@ from scipy.optimize import brentq
 from unilateral_checks import events, random_touch, violations
 
 import dynsim
+from dynsim.dynamics.state import OUT_VECTOR
 from dynsim.engine.uniqueness import paradox
 from dynsim.errors import SimulationStopped
-from dynsim.kernels.integrate import contact_events as ce
-from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.state import OUT_VECTOR
+from dynsim.integrators import run as ki
+from dynsim.integrators.contacts import events as ce
 from dynsim.model.description import Contact, Inertia, Link, Load, Quadric, Robot
 from dynsim.model.drives import Servo
 

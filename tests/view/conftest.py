@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
+from dynsim.draw.page import write
 from dynsim.record import Record
-from dynsim.view import write
 
 # A page is drawn without a graphics card here, on a machine that other tests keep busy.
 PATIENCE_MS = 180_000

@@ -21,15 +21,15 @@ from scipy.spatial import cKDTree
 
 import dynsim
 from dynsim import cli
+from dynsim.draw.page import content, page, viewable, write
+from dynsim.draw.page.blocks import Blocks
+from dynsim.draw.page.html import three
+from dynsim.draw.page.mesh_files import Mesh, read_mesh
+from dynsim.draw.page.meshes import Meshes, packed, simplified, welded
 from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.record.poses import ORIENTATION, POSITION, add_body_poses
 from dynsim.scenario import build_model, load_scenario, variant_names
-from dynsim.view import content, page, viewable, write
-from dynsim.view.blocks import Blocks
-from dynsim.view.html import three
-from dynsim.view.mesh_files import Mesh, read_mesh
-from dynsim.view.meshes import Meshes, packed, simplified, welded
 
 pytestmark = pytest.mark.long
 

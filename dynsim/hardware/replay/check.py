@@ -15,7 +15,7 @@ import numpy as np
 from dynsim.hardware.bus.control_table import HEALTH_BLOCK, STATE_BLOCK, TICKS_PER_TURN
 from dynsim.hardware.errors import CheckRefused
 from dynsim.hardware.replay.measured import unmeasured
-from dynsim.hardware.replay.motion import Array, Course, Needs, Planned
+from dynsim.hardware.replay.motion import Array, Course, CyclePlan, Needs, Planned
 from dynsim.hardware.replay.trajectory import (
     COMMON,
     JERK_WINDOW,
@@ -96,28 +96,6 @@ class Margin:
             f"{self.joint}: {self.quantity} {self.value:.4f} {unit} at t = {self.time:.3f} s, "
             f"limit {self.limit:.4f} {unit}, margin {self.margin:+.4f} {unit}"
         )
-
-
-@dataclass(frozen=True)
-class CyclePlan:
-    """How the bus's time is spent.
-
-    Attributes
-    ----------
-    rate : float
-        Cycles per second [Hz].
-    cycle_time : float
-        Planned duration of writing all goals and reading all states [s].
-    health_time : float
-        Planned duration of one health read [s].
-    health_every : int
-        One servo's health is read every so many cycles.
-    """
-
-    rate: float
-    cycle_time: float
-    health_time: float
-    health_every: int
 
 
 @dataclass(frozen=True)

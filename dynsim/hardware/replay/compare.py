@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 from scipy.optimize import minimize_scalar
 
-from dynsim.config import StrictModel
+from dynsim.config.base import StrictModel
 from dynsim.errors import RecordError, shown
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.errors import ComparisonGateFailed
@@ -371,7 +371,7 @@ def draw_comparison(comparison: Comparison, path: Path, joints: Sequence[str] = 
     RecordError
         A joint is not among those compared, or the file cannot be written.
     """
-    from dynsim.figures import style
+    from dynsim.draw.figures import style
 
     names = [joint.joint for joint in comparison.joints]
     wheels = [wheel.wheel for wheel in comparison.wheels]
@@ -429,7 +429,7 @@ class _Drawn:
 
     def draw(self, values: Any, errors: Any, time: Array, wanted: Sequence[str]) -> None:
         """Values, measured over simulated, of some in colour, and errors of all."""
-        from dynsim.figures import style
+        from dynsim.draw.figures import style
 
         ranking = sorted(range(len(self.names)), key=lambda k: -self.labels[k][0])
         named = [self.names.index(name) for name in dict.fromkeys(wanted) if name in self.names]

@@ -20,9 +20,9 @@ from typing import Protocol
 import numpy as np
 
 from dynsim.hardware.errors import CheckRefused
-from dynsim.hardware.replay.check import ROUNDING, CyclePlan, motion_margins, plan_cycle
+from dynsim.hardware.replay.check import ROUNDING, motion_margins, plan_cycle
 from dynsim.hardware.replay.growing import GrowingPath, Sample
-from dynsim.hardware.replay.motion import Array, Course, Needs
+from dynsim.hardware.replay.motion import Array, Course, CyclePlan, Needs
 from dynsim.hardware.replay.registers import needs_of_map
 from dynsim.hardware.replay.rules import Cause, Fault
 from dynsim.hardware.replay.states import Stopped

@@ -6,9 +6,9 @@ import itertools
 import os
 from pathlib import Path
 
-from dynsim.files import INCOMPLETE, lock
 from dynsim.hardware.errors import PortError
 from dynsim.hardware.replay.stream import PART
+from dynsim.system.files import INCOMPLETE, lock
 
 MEASURED, SUMMARY, LOG = "measured.h5", "summary.json", "replay.log"
 REGISTERS, REGISTERS_AFTER_FAULT = "registers.json", "registers_after_fault.json"

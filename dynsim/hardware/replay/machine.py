@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from dynsim.files import write_json
 from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.bus.control_table import RAD_S2_PER_UNIT, RAD_S_PER_UNIT, WATCHDOG_SECONDS_PER_UNIT
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused, too_busy
@@ -36,6 +35,7 @@ from dynsim.hardware.replay.states import UNARMED, Progress, ReplayResult, State
 from dynsim.hardware.replay.verify import Registers, all_registers, configure, verify
 from dynsim.hardware.safety import FaultPolicy
 from dynsim.hardware.servo_map import Servo, ServoMap
+from dynsim.system.files import write_json
 
 APPROACH_ACCELERATION = 10.0
 """Profile acceleration the firmware is given for the move to the start [rad/s²]."""

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from dynsim.hardware.replay.check import CyclePlan
     from dynsim.record import Record
     from dynsim.record.scene import Scene
 
@@ -104,6 +103,28 @@ class Needs:
     low: float
     high: float
     fastest: float
+
+
+@dataclass(frozen=True)
+class CyclePlan:
+    """How the bus's time is spent.
+
+    Attributes
+    ----------
+    rate : float
+        Cycles per second [Hz].
+    cycle_time : float
+        Planned duration of writing all goals and reading all states [s].
+    health_time : float
+        Planned duration of one health read [s].
+    health_every : int
+        One servo's health is read every so many cycles.
+    """
+
+    rate: float
+    cycle_time: float
+    health_time: float
+    health_every: int
 
 
 class Task(Protocol):

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from dynsim.errors import RecordError
-from dynsim.files import json_text, replace_together
 from dynsim.hardware.replay.folder import MEASURED, SUMMARY, is_held
 from dynsim.hardware.replay.measured import describe
 from dynsim.hardware.replay.rows import Layout, Rows, measured_record, row_type
@@ -18,6 +17,7 @@ from dynsim.hardware.replay.states import State
 from dynsim.hardware.replay.stream import PART, PART_FORMAT
 from dynsim.record import Record
 from dynsim.record.scene import Scene
+from dynsim.system.files import json_text, replace_together
 
 END_STATE = "not known: the program died"
 

@@ -19,7 +19,7 @@ from dynsim.hardware.bus.control_table import (
     WATCHDOG_SECONDS_PER_UNIT,
     describe_hardware_error,
 )
-from dynsim.hardware.replay.check import CyclePlan
+from dynsim.hardware.replay.motion import CyclePlan
 from dynsim.hardware.safety import Safety
 from dynsim.hardware.servo_map import Servo, ServoMap
 

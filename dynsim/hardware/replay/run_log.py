@@ -11,7 +11,7 @@ from dynsim.hardware.replay.rows import RowMemory
 from dynsim.hardware.replay.rules import Cycle
 from dynsim.hardware.replay.stream import GrowingFile
 from dynsim.hardware.servo_map import ServoMap
-from dynsim.terminal import plain
+from dynsim.system.terminal import plain
 
 
 class RunLog:

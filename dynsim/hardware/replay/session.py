@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from dynsim.errors import DynsimError
-from dynsim.files import json_text, replace_together, write_json
 from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.bus.protocol import Bus
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted, ReplayInterrupted, VerificationFailed
@@ -24,6 +23,7 @@ from dynsim.hardware.replay.states import Progress, ReplayResult, StopRequest
 from dynsim.hardware.replay.stream import INTERVAL, PART, Background, RowStream
 from dynsim.hardware.safety import FaultPolicy
 from dynsim.hardware.servo_map import ServoMap
+from dynsim.system.files import json_text, replace_together, write_json
 
 Failures = dict[str, BaseException]
 

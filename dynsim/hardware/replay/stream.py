@@ -13,9 +13,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
-from dynsim.files import lock
 from dynsim.hardware.replay.rows import Layout, RowMemory
 from dynsim.record.scene import Scene
+from dynsim.system.files import lock
 
 INTERVAL = 0.5
 """Between two writes of what has come since [s]: a process that is killed loses no more than this."""
@@ -27,7 +27,9 @@ PART_FORMAT = 1
 
 
 class GrowingFile:
-    """A file that can be read while it grows; nobody else's, and held (:func:`dynsim.files.lock`) until it is closed.
+    """A file that can be read while it grows; nobody else's, and held until it is closed.
+
+    See :func:`dynsim.system.files.lock`.
 
     Attributes
     ----------

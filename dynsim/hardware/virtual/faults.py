@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, ValidationInfo, model_validator
 
-from dynsim.config import StrictModel, error_at
+from dynsim.config.base import StrictModel, error_at
 from dynsim.hardware.strict_yaml import read_yaml
 
 Probability = Annotated[float, Field(ge=0, le=1)]

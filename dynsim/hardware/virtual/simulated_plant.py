@@ -25,8 +25,8 @@ from dynsim.hardware.servo_map import ServoMap
 from dynsim.hardware.virtual.servo_plant import Drive, MotorLaw
 
 if TYPE_CHECKING:
-    from dynsim import Scenario
-    from dynsim.model.model import Model
+    from dynsim.compile.model import Model
+    from dynsim.scenario import Scenario
 
 Array = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ class SimulatedArm:
     """
 
     def __init__(self, scenario: Scenario, servo_map: ServoMap, posture: Array) -> None:
-        import dynsim
+        from dynsim.engine.simulation import Simulation, State
         from dynsim.scenario import build
 
         robot, servos = build.robot(scenario), servo_map.servos
@@ -85,8 +85,8 @@ class SimulatedArm:
         ]
         bare = _bare(scenario)
         q = possible(bare, build.build_model(bare), np.asarray(posture, dtype=np.float64))
-        start = dynsim.State(0.0, q, np.zeros(len(joints)), np.zeros(0))
-        self.simulation = dynsim.Simulation(bare, state=start, duration=math.inf, trace=0, motors=motors)
+        start = State(0.0, q, np.zeros(len(joints)), np.zeros(0))
+        self.simulation = Simulation(bare, state=start, duration=math.inf, trace=0, motors=motors)
         self._on_stand = np.ones(len(servos), dtype=bool)
         self._jammed = np.zeros(len(servos), dtype=bool)
         self._told = [("off", 0.0, 0.0)] * len(servos)
@@ -145,7 +145,7 @@ def possible(scenario: Scenario, model: Model, posture: Array) -> Array:
     gaps are rounding; what is moved is logged. A posture that would have to change by more than START_CHANGE is
     returned as it is: the simulation refuses it by name.
     """
-    from dynsim.model.shapes import gap_at
+    from dynsim.compile.shapes import gap_at
     from dynsim.scenario import build
 
     contacts = build.contacts(scenario, model.robot)

@@ -2,8 +2,8 @@
 
 A module exposes ``ROWS``, its rows by name (:attr:`dynsim.model.description.Link.kind`), and for a joint with several
 of them a function that makes its links. Modules are found by being here. The motion itself is a branch of
-:func:`dynsim.kernels.tree.sweep.forward_sweep` (one angle, one distance) or of
-:func:`dynsim.kernels.tree.joints.row_motion` (everything else).
+:func:`dynsim.dynamics.tree.sweep.forward_sweep` (one angle, one distance) or of
+:func:`dynsim.dynamics.tree.joints.row_motion` (everything else).
 """
 
 from __future__ import annotations
@@ -13,15 +13,12 @@ import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.record.scene import JointKind
-
-if TYPE_CHECKING:
-    from dynsim.model.description import Link
 
 Array = NDArray[np.float64]
 ANGLE = ("rad", "rad/s", "rad/s²", "N m")
@@ -34,7 +31,7 @@ class Row:
 
     Attributes
     ----------
-    code : its number in the kernels (dynsim.kernels.arrays)
+    code : its number in the kernels (dynsim.dynamics.tables)
     units : of position, velocity, acceleration and force
     neutral : coordinates of the whole joint where its frames coincide; of its later rows empty
     names : of these coordinates, where there are several
@@ -43,7 +40,8 @@ class Row:
         joint has several rows
     drawn : kind of joint, in the scene of a record, that moves the row's body as this row does; None: there is none,
         and records of robots with such a joint have no scene
-    motion : (link, coordinates (k, T)) → rotation (3, 3, T) and origin (3, T) of the body in the joint's frame
+    motion : (:class:`~dynsim.model.description.Link`, coordinates (k, T)) → rotation (3, 3, T) and origin (3, T) of the
+        body in the joint's frame
     """
 
     code: int
@@ -53,7 +51,7 @@ class Row:
     offset: int = 0
     own_position: bool = field(default=False, kw_only=True)
     drawn: JointKind | None = field(default=None, kw_only=True)
-    motion: Callable[[Link, Array], tuple[Array, Array]] | None = None
+    motion: Callable[[Any, Array], tuple[Array, Array]] | None = None
 
 
 @cache

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dynsim.kernels import arrays as ka
+from dynsim.dynamics import tables as ka
 from dynsim.model.joints import ANGLE, DISTANCE, Array, Row, turned
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from dynsim.kernels import arrays as ka
+from dynsim.dynamics import tables as ka
 from dynsim.model.joints import DISTANCE, Array, Row, unturned
 
 if TYPE_CHECKING:

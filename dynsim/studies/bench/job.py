@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dynsim.dynamics.simd.system import has_forms
+from dynsim.dynamics.state import block
 from dynsim.engine.dynamics import Prepared, prepare
-from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.integrate.driver import advance
-from dynsim.kernels.lanes.system import has_forms
-from dynsim.kernels.state import block
+from dynsim.integrators import run as ki
+from dynsim.integrators.driver import advance
 from dynsim.scenario import build, load_scenario
 from dynsim.studies.bench import mujoco_peer
 from dynsim.studies.bench.programs import (

@@ -12,8 +12,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.system import System
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.derivative import System
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.kernels import arrays as ka
+from dynsim.dynamics import tables as ka
 
 Array = NDArray[np.float64]
 

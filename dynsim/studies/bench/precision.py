@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from dynsim.engine.dynamics import prepare
 from dynsim.engine.recording import make_record
 from dynsim.engine.stepped import take_log
-from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.integrate.driver import advance
-from dynsim.measures import energy_turnover
+from dynsim.integrators import run as ki
+from dynsim.integrators.driver import advance
+from dynsim.record.measures import energy_turnover
 from dynsim.scenario import load_scenario, shipped_scenarios
 
 METHODS = ("rk43", "dopri5", "radau5")

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.derivative import System, derivative
+from dynsim.dynamics.simd.system import derivative_lanes
+from dynsim.dynamics.simd.tables import as_lanes, tables_as_lanes
+from dynsim.dynamics.state import block
 from dynsim.engine.dynamics import Prepared, prepare
-from dynsim.kernels import arrays as ka
-from dynsim.kernels.jit import kernel
-from dynsim.kernels.lanes.system import derivative_lanes
-from dynsim.kernels.lanes.tables import as_lanes, tables_as_lanes
-from dynsim.kernels.state import block
-from dynsim.kernels.system import System, derivative
+from dynsim.jit.kernel import kernel
 from dynsim.scenario import load_scenario
 from dynsim.studies.bench import mujoco_peer, pinocchio_peer
 from dynsim.studies.bench.programs import (

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from dynsim.dynamics.simd.system import EIGHT, FOUR, lane_workspace
+from dynsim.dynamics.simd.tables import aligned, stack_tables
 from dynsim.engine.dynamics import Prepared, prepare
 from dynsim.engine.together import LANES, integrate
-from dynsim.kernels.integrate import run as ki
-from dynsim.kernels.integrate.driver import advance
-from dynsim.kernels.lanes.system import EIGHT, FOUR, lane_workspace
-from dynsim.kernels.lanes.tables import aligned, stack_tables
+from dynsim.integrators import run as ki
+from dynsim.integrators.driver import advance
 from dynsim.scenario import load_scenario
 from dynsim.studies.bench.programs import EIGHT_LANES, FOUR_LANES, ONE_STATE, SCENARIO, STEP
 from dynsim.studies.bench.right_hand_side import repeat_derivative, repeat_lanes

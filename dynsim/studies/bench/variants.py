@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dynsim.engine.dynamics import prepare
-from dynsim.kernels.integrate.driver import advance
+from dynsim.integrators.driver import advance
 from dynsim.scenario import read_scenario
 from dynsim.studies.bench.programs import SCENARIO
 

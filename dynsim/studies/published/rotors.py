@@ -12,11 +12,11 @@ import dataclasses
 
 import numpy as np
 
+from dynsim.compile.control import JointControl
+from dynsim.compile.model import Model
 from dynsim.errors import ModelError
-from dynsim.model.control import JointControl
 from dynsim.model.description import Array, Contact, Inertia, Link, Quadric
 from dynsim.model.drives import Motor
-from dynsim.model.model import Model
 from dynsim.scenario import Scenario, build, build_model
 
 # Steps [s], and how long the first holds: while the motors take up the weight.

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dynsim.model.clearance import poses
+from dynsim.compile.clearance import poses
 from dynsim.record import Record
 from dynsim.scenario import Scenario, build
 from dynsim.studies.compare import compare

@@ -6,11 +6,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from dynsim import families
-from dynsim.config import Positive, StrictConfig
+from dynsim.compile.protocols import BuildContext
+from dynsim.config.base import Positive, StrictConfig
+from dynsim.library import families
 from dynsim.model.description import Inertia, Link, Robot, vector
 from dynsim.model.drives import Drive
-from dynsim.model.protocols import BuildContext
 
 ENGINE = "dynamics"
 

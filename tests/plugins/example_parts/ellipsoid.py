@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from dynsim.config import Positive, StrictConfig, Vector3
+from dynsim.compile.protocols import BuildContext
+from dynsim.config.base import Positive, StrictConfig, Vector3
 from dynsim.model.description import Quadric
-from dynsim.model.protocols import BuildContext
 
 
 class Config(StrictConfig):

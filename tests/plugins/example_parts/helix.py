@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.config import Positive, StrictConfig, Vector3
-from dynsim.model.control import HandPath
-from dynsim.model.protocols import BuildContext
+from dynsim.compile.control import HandPath
+from dynsim.compile.protocols import BuildContext
+from dynsim.config.base import Positive, StrictConfig, Vector3
 
 
 class Config(StrictConfig):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Literal
 
-from dynsim.config import NonNegative, Positive
+from dynsim.compile.protocols import BuildContext
+from dynsim.config.base import NonNegative, Positive
 from dynsim.model.drives import Motor
 from dynsim.model.motor_parameters import MotorParameters
-from dynsim.model.protocols import BuildContext
 
 
 class Config(MotorParameters):

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from dynsim.config import Positive, StrictConfig
-from dynsim.model.control import JointControl
-from dynsim.model.protocols import BuildContext
+from dynsim.compile.control import JointControl
+from dynsim.compile.protocols import BuildContext
+from dynsim.config.base import Positive, StrictConfig
 
 ENGINE = "dynamics"
 

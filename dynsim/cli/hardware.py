@@ -1,0 +1,430 @@
+"""`dynsim hw …` and `dynsim export`. Serial and servo modules are imported by the commands that need them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from dynsim.errors import DynsimError
+from dynsim.system.files import file_name, json_text, write_json
+from dynsim.system.terminal import Terminal, plain
+
+hw = typer.Typer(
+    no_args_is_help=True,
+    help="Replay a record on Dynamixel servos (or virtual ones). A software stop is no safety device: fit a power cut.",
+)
+# Paths must survive copy and paste: long lines are left to the terminal. Without markup: "[rad]" is a unit, no style.
+console = Terminal(soft_wrap=True, highlight=False, markup=False, emoji=False)
+
+
+class Policy(StrEnum):
+    hold = "hold"
+    decelerate = "decelerate"
+    off = "off"
+
+
+class ExportFormat(StrEnum):
+    csv = "csv"
+    joint_trajectory = "joint-trajectory"
+    urdf_log = "urdf-log"
+
+
+RecordFile = Annotated[Path, typer.Argument(metavar="RECORD", help="record.h5 of a run.")]
+MapFile = Annotated[Path, typer.Option("--map", help="Servo map: a file, or the name of a shipped one (arm, snake).")]
+Port = Annotated[str, typer.Option("--port", help="Serial device, e.g. /dev/ttyUSB0.")]
+Rate = Annotated[float | None, typer.Option("--rate", help="Goals per second [Hz]; default: the map's.")]
+Speed = Annotated[float, typer.Option("--speed", help="1 is the record's own time, 0.5 half as fast.")]
+ReplayPort = Annotated[str, typer.Option("--port", help="Serial device, or 'virtual' for servos in memory.")]
+PolicyOption = Annotated[Policy | None, typer.Option("--policy", help="On a fault; default: the map's.")]
+Live = Annotated[bool, typer.Option("--live", help="Really move; a real port is a dry run without.")]
+Yes = Annotated[
+    bool, typer.Option("--yes", help="Do not ask before moving; a start beyond safety.start_distance is still asked.")
+]
+Configure = Annotated[bool, typer.Option("--configure", help="Write differing EEPROM settings.")]
+Faults = Annotated[Path | None, typer.Option("--faults", help="Fault script for virtual servos.")]
+
+
+class MissingClientLibrary(DynsimError):
+    """The optional packages for servos are not installed."""
+
+
+@contextmanager
+def client_library() -> Iterator[None]:
+    """Raises MissingClientLibrary where the packages for servos are not installed."""
+    try:
+        import dynamixel_sdk  # noqa: F401
+        import serial  # noqa: F401
+    except ImportError as error:
+        raise MissingClientLibrary(f"{error.name} is not installed: pip install 'dynsim[hardware]'") from error
+    yield
+
+
+@hw.command(epilog="Example: dynsim hw scan --port /dev/ttyUSB0 --map arm")
+def scan(
+    port: Port,
+    map_file: Annotated[Path | None, typer.Option("--map", help="Compare with this servo map.")] = None,
+    baud: Annotated[int | None, typer.Option("--baud", help="Only this bit rate [bit/s].")] = None,
+) -> None:
+    """List the servos that answer, at every usual bit rate. Reads only."""
+    with client_library():
+        from dynsim.hardware.bus import scan as survey
+        from dynsim.hardware.errors import VerificationFailed
+        from dynsim.hardware.servo_map import load_servo_map
+
+        servo_map = load_servo_map(map_file) if map_file else None
+        bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else survey.SCAN_BAUD_RATES
+        found = survey.scan(port, bauds)
+    if not found:
+        raise VerificationFailed(
+            f"{port}: no servo answered at {', '.join(f'{b}' for b in bauds)} bit/s. Is the power on, the cable right? "
+            "MX servos with Protocol 1 firmware do not answer: update them to 2.0"
+        )
+    owners = {servo.id: servo for servo in servo_map.servos} if servo_map else {}
+    table = Table("ID", "model", "fw", "bit/s", "mode", "delay µs", "V", "°C", "torque", "error", "joint")
+    for servo in found:
+        numbers = [f"{servo.return_delay * 1e6:.0f}", f"{servo.voltage:.1f}", f"{servo.temperature:.0f}"]
+        error = f"0x{servo.hardware_error:02x}" if servo.hardware_error else "-"
+        joint = owners[servo.id].joint if servo.id in owners else "-"
+        who = [str(servo.id), servo.model_name, *map(str, (servo.firmware, servo.baud, servo.mode))]
+        table.add_row(*who, *numbers, "ON" if servo.torque else "off", error, joint)
+    console.print(table)
+    if servo_map:
+        _compare_with_map(found, servo_map)
+
+
+def _compare_with_map(found: list[Any], servo_map: Any) -> None:
+    from dynsim.hardware.errors import VerificationFailed
+
+    seen = {servo.id: servo for servo in found}
+    wrong = [f"{servo.joint} (ID {servo.id}) did not answer" for servo in servo_map.servos if servo.id not in seen]
+    wrong += [f"ID {id_} is not in the map" for id_ in seen if id_ not in servo_map.ids]
+    wrong += [
+        f"{servo.joint} (ID {servo.id}) is {seen[servo.id].model_name}, the map says {servo.model.name}"
+        for servo in servo_map.servos
+        if servo.id in seen and seen[servo.id].model != servo.model.number
+    ]
+    if wrong:
+        raise VerificationFailed("; ".join(wrong))
+    console.print(f"all {len(seen)} servos of {servo_map.path} answer")
+
+
+@hw.command(epilog="Example: dynsim hw check results/elbow_comparison/two_elbows/record.h5 --map arm")
+def check(record: RecordFile, map_file: MapFile, rate: Rate = None, speed: Speed = 1.0) -> None:
+    """Check a whole record against a robot's limits; needs no port."""
+    _, servo_map, motion = _checked(record, map_file, rate, speed)
+    _print_check(motion, servo_map)
+
+
+def _checked(record_file: Path, map_file: Path, rate: float | None, speed: float) -> tuple[Any, Any, Any]:
+    from dynsim.hardware.replay.check import check_motion
+    from dynsim.hardware.servo_map import load_servo_map
+    from dynsim.record import Record
+
+    record, servo_map = Record.load(record_file), load_servo_map(map_file)
+    return record, servo_map, check_motion(record, servo_map, rate=rate, speed=speed)
+
+
+def _print_check(motion: Any, servo_map: Any) -> None:
+    table = Table("joint", "quantity", "tightest", "limit", "margin", "at [s]")
+    for margin in motion.margins:
+        numbers = [f"{number:.4f}" for number in (margin.value, margin.limit, margin.margin)]
+        table.add_row(margin.joint, f"{margin.quantity} [{margin.unit}]", *numbers, f"{margin.time:.3f}")
+    console.print(table)
+    for warning in motion.warnings:
+        console.print(f"warning: {warning}")
+    plan = motion.plan
+    console.print(
+        f"check passed: {motion.duration:.2f} s at {plan.rate:g} Hz, "
+        f"{plan.cycle_time * 1e3:.2f} of {1e3 / plan.rate:.2f} ms a cycle on the bus"
+    )
+    if tightest := motion.tightest(servo_map):
+        margin, part = tightest
+        console.print(f"tightest: {margin}, {100 * part:.0f} % left")
+
+
+@hw.command(epilog="Example: dynsim hw replay results/elbow_comparison/two_elbows/record.h5 --map arm --port virtual")
+def replay(
+    record: RecordFile,
+    map_file: MapFile,
+    port: ReplayPort,
+    rate: Rate = None,
+    speed: Speed = 1.0,
+    policy: PolicyOption = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder; default: results/ROBOT_replay.")] = None,
+    live: Live = False,
+    yes: Yes = False,
+    configure: Configure = False,
+    faults: Faults = None,
+    plant: Annotated[str | None, typer.Option("--plant", help="Scenario whose robot the virtual servos move.")] = None,
+    variant: Annotated[str | None, typer.Option("--variant", help="Variant of that scenario.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
+) -> None:
+    """Check, verify, arm, move to the start, replay, and keep the measured run.
+
+    Ctrl-C once: controlled stop. Twice: torque off.
+    """
+    with client_library():
+        from dynsim.cli.dialog import confirm_replay, print_limits
+        from dynsim.hardware.errors import ServoMapError
+        from dynsim.hardware.ports import VIRTUAL, bus_on
+        from dynsim.hardware.replay.display import displayed
+        from dynsim.hardware.replay.session import run_replay, shown_by
+        from dynsim.hardware.replay.signals import stop_on_signals
+        from dynsim.hardware.replay.states import StopRequest
+        from dynsim.hardware.virtual.faults import load_fault_script
+
+        if (faults or plant) and port != VIRTUAL:
+            raise ServoMapError("--faults and --plant are for virtual servos: --port virtual")
+        simulated, servo_map, motion = _checked(record, map_file, rate, speed)
+        script = load_fault_script(faults, servo_map.ids) if faults else None
+        robot = _plant(plant, variant, servo_map, motion) if plant else None
+        folder = out or Path("results") / file_name(f"{servo_map.robot}_replay")
+        for warning in motion.warnings:
+            console.print(f"warning: {warning}")
+        moves = live or port == VIRTUAL
+        if live and port != VIRTUAL:
+            confirm_replay(console, servo_map, motion, port, asked=not yes)
+        stop = StopRequest()
+        with shown_by({"standard output": sys.stdout}, folder) as lost:
+            with stop_on_signals(stop), nullcontext() if quiet else displayed(console, lost) as observer:
+                result = run_replay(
+                    motion,
+                    servo_map,
+                    bus_on(port, servo_map, script=script, plant=robot),
+                    folder,
+                    policy=policy.value if policy else None,
+                    live=moves,
+                    write_eeprom=configure,
+                    stop=stop,
+                    observer=observer,
+                    provenance={"port": port, "record": str(record), "simulated": simulated.provenance},
+                )
+            print_timing(result)
+            if not moves:
+                print_limits(console, result.limits)
+                console.print("dry run: servos verified and the bus timed, nothing was moved; --live moves")
+                return
+            left = "ON, holding" if result.end_state == "holding" else "off"
+            console.print(f"replayed; torque {left}; {folder / 'measured.h5'}")
+            console.print(f"compare: dynsim hw compare {record} {folder / 'measured.h5'}")
+
+
+def _plant(scenario: str, variant: str | None, servo_map: Any, motion: Any) -> Any:
+    from dynsim.hardware.virtual.simulated_plant import simulated_arm
+
+    posture = dict(zip((servo.label for servo in servo_map.servos), motion.start, strict=True))
+    return simulated_arm(scenario, variant, servo_map, posture)
+
+
+def print_timing(result: Any) -> None:
+    """How well the loop kept its deadlines, in a line."""
+    timing = result.timing
+    if timing is None:
+        return
+    console.print(
+        f"{timing.cycles} cycles, period {timing.period_mean * 1e3:.3f} ms (longest {timing.period_max * 1e3:.3f}), "
+        f"lateness 99 % {timing.lateness_p99 * 1e3:.3f} ms, bus {timing.exchange_mean * 1e3:.2f} ms a cycle, "
+        f"{timing.skipped_cycles} skipped, {timing.missed_statuses} statuses missed"
+    )
+
+
+@hw.command(epilog="Example: dynsim hw recover results/arm_replay")
+def recover(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Of a replay whose process died.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="For record and summary, FOLDER stays as it is; default: FOLDER.")
+    ] = None,
+) -> None:
+    """Make a measured record, marked incomplete, of the cycles that a replay had written when it died."""
+    from dynsim.hardware.replay import recover as recovery
+    from dynsim.hardware.replay.folder import MEASURED
+
+    record = recovery.recover(folder, out)
+    span = f", {record.time[0]:.2f} to {record.time[-1]:.2f} s" if len(record) else ""
+    state = "complete" if record.complete else "incomplete"
+    console.print(f"{len(record)} cycles{span}, {state}: {(out or folder) / MEASURED}")
+
+
+@hw.command(
+    epilog="Example: dynsim hw compare results/elbow_comparison/two_elbows/record.h5 results/arm_replay/measured.h5"
+)
+def compare(
+    record: RecordFile,
+    measured: Annotated[Path, typer.Argument(metavar="MEASURED", help="measured.h5 of a replay.")],
+    gate: Annotated[Path | None, typer.Option("--gate", help="YAML with bounds; exit code 5 beyond them.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder; default: that of MEASURED.")] = None,
+    joints: Annotated[
+        list[str] | None, typer.Option("--joint", help="In colour in the figure; may be repeated; default: the worst.")
+    ] = None,
+) -> None:
+    """Delay, rms and largest error between a simulated and a measured run, joints and wheels, with a figure."""
+    from dynsim.hardware.replay.compare import check_gate, compare_records, draw_comparison, load_gate
+    from dynsim.record import Record
+
+    bounds = load_gate(gate) if gate else None
+    comparison = compare_records(Record.load(record), Record.load(measured))
+    folder = out or measured.parent
+    # First, because it refuses joints that are not there.
+    figure = draw_comparison(comparison, folder / "comparison.png", joints or ())
+    table = Table("joint", "rms [rad]", "max [rad]", "at [s]", "rms, delay removed [rad]", "delay [ms]")
+    for joint in comparison.joints:
+        delay = "-" if joint.delay != joint.delay else f"{joint.delay * 1e3:.1f}"
+        errors = [f"{joint.rms:.5f}", f"{joint.max:.5f}", f"{joint.time_of_max:.3f}"]
+        table.add_row(joint.joint, *errors, f"{joint.rms_delay_removed:.5f}", delay)
+    console.print(table)
+    if comparison.wheels:
+        wheels = Table(
+            "wheel", "rate: rms [rad/s]", "max [rad/s]", "at [s]", "turned [rad]", "error: max [rad]", "at end"
+        )
+        for wheel in comparison.wheels:
+            rates = [f"{wheel.rate_rms:.4f}", f"{wheel.rate_max:.4f}", f"{wheel.time_of_max:.3f}"]
+            angles = [f"{wheel.turned:.3f}", f"{wheel.angle_max:.4f}", f"{wheel.angle_end:+.4f}"]
+            wheels.add_row(wheel.wheel, *rates, *angles)
+        console.print(wheels)
+    console.print(f"delay {comparison.delay * 1e3:.1f} ms, worst joint {comparison.worst.joint}")
+    write_json(folder / "comparison.json", comparison.summary())
+    console.print(f"figure: {figure}")
+    if bounds:
+        check_gate(comparison, bounds)
+
+
+@hw.command(epilog="Example: dynsim hw virtual --map arm --link /tmp/ttyDXL")
+def virtual(
+    map_file: MapFile,
+    faults: Annotated[Path | None, typer.Option("--faults", help="Fault script.")] = None,
+    link: Annotated[Path | None, typer.Option("--link", help="Name the device by this symbolic link.")] = None,
+    plant: Annotated[str | None, typer.Option("--plant", help="Scenario whose robot the servos move.")] = None,
+    variant: Annotated[str | None, typer.Option("--variant", help="Variant of that scenario.")] = None,
+) -> None:
+    """Virtual servos behind a pseudo-terminal, for any Dynamixel tool. Ctrl-C ends it."""
+    with client_library():
+        from dynsim.hardware.replay.signals import stop_on_signals
+        from dynsim.hardware.replay.states import StopRequest
+        from dynsim.hardware.servo_map import load_servo_map
+        from dynsim.hardware.virtual.faults import load_fault_script
+        from dynsim.hardware.virtual.line import line_for_map
+        from dynsim.hardware.virtual.pseudo_terminal import PseudoTerminal
+        from dynsim.hardware.virtual.simulated_plant import simulated_arm
+
+        servo_map = load_servo_map(map_file)
+        script = load_fault_script(faults, servo_map.ids) if faults else None
+        robot = simulated_arm(plant, variant, servo_map, {}) if plant else None
+        terminal = PseudoTerminal(line_for_map(servo_map, script=script, plant=robot), link)
+        stop = StopRequest()
+        # A plain line: other programs wait for it.
+        print(
+            f"{len(servo_map.servos)} virtual servos at {servo_map.bus.baud} bit/s on {plain(link or terminal.device)}",
+            flush=True,
+        )
+        try:
+            with stop_on_signals(stop):
+                terminal.serve(lambda: stop.count == 0)
+        finally:
+            terminal.close()
+
+
+@hw.command("stop", epilog="Example: dynsim hw stop --port /dev/ttyUSB0")
+def stop_servos(
+    port: Port,
+    map_file: Annotated[Path | None, typer.Option("--map", help="Ask the servos of this map.")] = None,
+    baud: Annotated[int | None, typer.Option("--baud", help="Only this bit rate [bit/s].")] = None,
+) -> None:
+    """Torque off for every servo at every usual bit rate, beside a replay too; no substitute for a power cut."""
+    with client_library():
+        from dynsim.hardware.bus import scan as survey
+        from dynsim.hardware.errors import VerificationFailed
+        from dynsim.hardware.servo_map import load_servo_map
+
+        servo_map = load_servo_map(map_file) if map_file else None
+        bauds = (baud,) if baud else (servo_map.bus.baud,) if servo_map else survey.STOP_BAUD_RATES
+        asked = survey.stop_all(port, bauds, servo_map.ids if servo_map else ())
+    on = [id_ for id_, still_on in asked.torque.items() if still_on]
+    # With a map everybody is known; without one those at a bit rate at which the port failed are not.
+    if on or not asked.torque or (asked.trouble and not servo_map):
+        who = f"ID {', '.join(map(str, on))}" if on else "everybody" if asked.torque else "any servo"
+        why = f" ({'; '.join(asked.trouble)})" if asked.trouble else ""
+        raise VerificationFailed(f"torque off was sent, but NOT confirmed by {who}: cut the power{why}")
+    console.print(f"torque off, confirmed by {len(asked.torque)} servos")
+
+
+@hw.command(epilog="Example: dynsim hw schema > servo_map.schema.json")
+def schema() -> None:
+    """Print the JSON schema of servo maps, for editors."""
+    from dynsim.hardware.servo_map import json_schema
+
+    print(json_text(json_schema()), end="")
+
+
+@hw.command(epilog="Example: dynsim hw calibrate --map my_arm.yaml --port /dev/ttyUSB0")
+def calibrate(
+    map_file: MapFile,
+    port: Port,
+    joint: Annotated[list[str] | None, typer.Option("--joint", help="Only this joint; may be repeated.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Write here instead of into the map.")] = None,
+    nudge: Annotated[bool, typer.Option("--nudge", help="Turn each joint 3° and back, to see its sense.")] = False,
+    live: Annotated[bool, typer.Option("--live", help="Really move (--nudge).")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing, only report (--nudge).")] = False,
+    write: Annotated[bool, typer.Option("--write", help="Write wrong senses into the map (--nudge).")] = False,
+) -> None:
+    """Write the zero ticks: put the robot into its zero posture by hand (torque off), then run this.
+
+    With --nudge: find swapped senses instead, joint by joint.
+    """
+    with client_library():
+        from dynsim.cli.dialog import find_senses, may_write
+        from dynsim.hardware.calibrate import read_zero_ticks, write_into_map
+        from dynsim.hardware.errors import ServoMapError, VerificationFailed
+        from dynsim.hardware.ports import bus_on
+        from dynsim.hardware.servo_map import SHIPPED, load_servo_map
+
+        servo_map = load_servo_map(map_file)
+        target = out or servo_map.path
+        shipped = target.resolve().parent == SHIPPED
+        if shipped and (write or not nudge):
+            raise ServoMapError(f"{target} comes with dynsim; write your own map with --out")
+        unknown = [name for name in joint or () if name not in servo_map.joints]
+        if unknown:
+            raise ServoMapError(f"{map_file} has no joint {', '.join(unknown)}; it has {', '.join(servo_map.joints)}")
+        if nudge:
+            chosen = [servo for servo in servo_map.servos if servo.joint in (joint or servo_map.joints)]
+            signs, blocked = find_senses(console, servo_map, chosen, port, live=live, asked=not yes)
+            if signs and (write or (not shipped and may_write(console, list(signs), target))):
+                write_into_map(servo_map, "sign", signs, target)
+                console.print(f"written to {target}")
+            if blocked:
+                raise VerificationFailed(f"{', '.join(blocked)}: did not turn as told; is something in the way?")
+            return
+        if live or yes or write:
+            raise ServoMapError("--live, --yes and --write are for --nudge: zero ticks are read with the torque off")
+        chosen = [servo for servo in servo_map.servos if (servo.joint in joint if joint else servo.in_position_mode)]
+        with bus_on(port, servo_map) as (bus, _):
+            ticks = read_zero_ticks(bus, chosen)
+        write_into_map(servo_map, "zero_tick", ticks, target)
+    table = Table("joint", "ID", "old zero", "new zero")
+    for servo in chosen:
+        table.add_row(servo.joint, str(servo.id), str(servo.zero_tick), str(ticks[servo.joint]))
+    console.print(table)
+    console.print(f"zero ticks of {len(ticks)} joints written to {target}")
+
+
+def export(
+    record: RecordFile,
+    format_: Annotated[
+        ExportFormat, typer.Option("--format", help="csv, joint-trajectory (ROS), urdf-log (JSON lines).")
+    ],
+    rate: Annotated[float | None, typer.Option("--rate", help="Resample [Hz]; default: the record's samples.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="File; default: beside the record.")] = None,
+) -> None:
+    """Write the joint motion of a record for other programs."""
+    from dynsim.hardware.export import SUFFIX, export_record
+    from dynsim.record import Record
+
+    target = out or record.with_suffix(SUFFIX[format_.value])
+    console.print(f"written: {export_record(Record.load(record), target, format_.value, rate=rate)}")

@@ -1,0 +1,345 @@
+"""Tables of summaries and choices for the terminal."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from dynsim.system.terminal import Terminal, escaped_line, plain
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from dynsim.engine import Start
+
+Summary = Mapping[str, Any]
+
+# Room for the longest row heading.
+_HEADING_WIDTH = 30
+
+
+# Energies of no more than this share of the turnover are rounding, and coordinates up to this [m].
+ROUNDING = 1e-12
+
+
+def _format(value: float, form: str) -> str:
+    """A number; 0 where it is zero, and no sign before zeros that it is rounded to."""
+    text = format(value, form)
+    if value == 0.0:
+        return "0"
+    return text.removeprefix("-") if float(text) == 0.0 else text
+
+
+def _number(value: Any, scale: float = 1.0, digits: int = 4) -> str:
+    return "–" if value is None else _format(value * scale, f".{digits}g")
+
+
+def _deepest(summary: Summary) -> str | None:
+    """How deep the body that sank deepest lay below a surface [mm]; None where no body did."""
+    sunk = max(summary.get("sinking", ()), key=lambda entry: entry["depth_m"], default=None)
+    return None if sunk is None else f"[bold red]{_number(sunk['depth_m'], 1e3, 3)}[/]"
+
+
+def _base(key: str) -> Callable[[Summary], Any]:
+    """A number of the mobile base; None where there is none."""
+    return lambda summary: summary.get("base", {}).get(key)
+
+
+def _margin(value: float) -> str:
+    return f"[bold red]{value:.3g}[/]" if value < 0.0 else f"{value:.3g}"
+
+
+def _least_load(summary: Summary) -> float | None:
+    loads = _base("wheel_load_min_N")(summary)
+    return None if loads is None else min(loads.values())
+
+
+def _energy(key: str) -> Callable[[Summary], float | None]:
+    """An energy of a summary [J], 0 where it is rounding beside the energy turned over."""
+
+    def take(summary: Summary) -> float | None:
+        energy: float | None = summary.get(key)
+        return 0.0 if energy and abs(energy) <= ROUNDING * summary.get("energy_turnover_J", 0.0) else energy
+
+    return take
+
+
+# Heading, and how to take it from a summary. A row is left out when no run has it.
+_ROWS: tuple[tuple[str, Callable[[Summary], Any], Callable[[Any], str]], ...] = (
+    ("electrical energy [J]", _energy("electrical_energy_J"), _number),
+    ("  from one supply [J]", _energy("electrical_energy_supply_J"), _number),
+    ("  from a supply each [J]", _energy("electrical_energy_drawn_J"), _number),
+    ("mechanical work [J]", _energy("mechanical_work_J"), _number),
+    ("Joule heat [J]", _energy("joule_heat_J"), _number),
+    ("friction heat [J]", _energy("friction_heat_J"), _number),
+    ("impact loss, all contacts [J]", _energy("impact_loss_J"), _number),
+    ("stop loss [J]", lambda s: s.get("stop_loss_J") or None, _number),
+    ("taken by time steps [J]", _energy("scheme_loss_J"), _number),
+    ("hand error, rms [mm]", lambda s: s.get("hand_error_rms_m"), lambda v: _number(v, 1e3)),
+    ("  max [mm]", lambda s: s.get("hand_error_max_m"), lambda v: _number(v, 1e3)),
+    ("  vertical, rms [mm]", lambda s: s.get("hand_error_z_rms_m"), lambda v: _number(v, 1e3)),
+    ("final position error [m]", lambda s: s.get("final_position_error_m"), lambda v: _number(v, digits=3)),
+    ("final attitude error [rad]", lambda s: s.get("final_attitude_error_rad"), lambda v: _number(v, digits=3)),
+    ("position error, max [m]", lambda s: s.get("position_error_max_m"), lambda v: _number(v, digits=3)),
+    ("attitude error, max [rad]", lambda s: s.get("attitude_error_max_rad"), lambda v: _number(v, digits=3)),
+    (
+        "joint limit passed by [rad]",
+        lambda s: s.get("joint_limit_violation_max_rad"),
+        lambda v: _number(v, digits=3),
+    ),
+    ("cost, initial", lambda s: s.get("cost_initial"), _number),
+    ("cost, final", lambda s: s.get("cost_final"), _number),
+    ("mode switches", lambda s: s.get("mode_switches"), lambda v: str(v)),
+    ("deepest below a surface [mm]", _deepest, str),
+    ("tip margin, settled", _base("tip_margin_min_settled"), _margin),
+    ("  whole run", _base("tip_margin_min"), _margin),
+    ("  tips over at [s]", _base("overturns_settled_at_s"), lambda v: _number(v, digits=3)),
+    ("least load, wheels, caster [N]", _least_load, lambda v: _number(v, digits=3)),
+    ("ledger residual, relative", lambda s: s.get("energy_residual_relative"), lambda v: _format(v, ".1e")),
+    ("constraint drift [m]", lambda s: s.get("constraint_drift_max_m"), lambda v: _format(v, ".1e")),
+    ("integrated by", lambda s: s.get("method"), str),
+    ("integration [s]", lambda s: s.get("integration_wall_s"), lambda v: f"{v:.3f}"),
+    ("times real time", lambda s: s.get("real_time_factor"), lambda v: f"{v:.0f}"),
+)
+
+
+def print_summary(console: Console, summary: Summary) -> None:
+    """One run: its numbers, contacts and warnings."""
+    title = f"{summary['scenario']} {summary['variant']}".strip()
+    table = Table(title=escaped_line(title), box=box.SIMPLE_HEAD, show_header=False, title_justify="left")
+    table.add_column()
+    table.add_column(justify="right")
+    for heading, take, show in _ROWS:
+        value = take(summary)
+        if value is not None:
+            table.add_row(escaped_line(heading), show(value))
+    for contact in summary.get("contacts", ()):
+        for heading, cells in _contact_rows(contact["name"], [contact]):
+            table.add_row(heading, *cells)
+    for heading, cells in (*_stop_rows([summary], [summary]), *_motor_rows([summary], [summary])):
+        table.add_row(heading, *cells)
+    console.print(table)
+    _print_warnings(console, {"": summary})
+
+
+def print_comparison(console: Console, summaries: Mapping[str, Summary]) -> None:
+    """All variants side by side, one column each; several tables where the terminal is too narrow for one."""
+    names = list(summaries)
+    cell = max([10, *map(len, names)]) + 2
+    across = max(1, (console.width - _HEADING_WIDTH) // cell)
+    for start in range(0, len(names), across):
+        _print_columns(console, summaries, names[start : start + across])
+    _print_warnings(console, summaries)
+
+
+def _print_columns(console: Console, summaries: Mapping[str, Summary], names: Sequence[str]) -> None:
+    table = Table(
+        title=escaped_line(next(iter(summaries.values()))["scenario"]), box=box.SIMPLE_HEAD, title_justify="left"
+    )
+    table.add_column("", no_wrap=True)
+    for name in names:
+        table.add_column(escaped_line(name), justify="right", no_wrap=True)
+    shown = [summaries[name] for name in names]
+    for heading, take, show in _ROWS:
+        if any(take(summary) is not None for summary in summaries.values()):
+            values = [take(summary) for summary in shown]
+            table.add_row(escaped_line(heading), *("–" if value is None else show(value) for value in values))
+    energies = [summary.get("electrical_energy_J") or 0.0 for summary in summaries.values()]
+    if min(energies) > 0.0:
+        ratios = (summary["electrical_energy_J"] / min(energies) for summary in shown)
+        table.add_row("energy, times the least", *(f"{ratio:.3g}" for ratio in ratios))
+    contacts = list(dict.fromkeys(c["name"] for s in summaries.values() for c in s.get("contacts", ())))
+    for contact in contacts:
+        by_variant = [next((c for c in s["contacts"] if c["name"] == contact), None) for s in shown]
+        for heading, cells in _contact_rows(contact, by_variant):
+            table.add_row(heading, *cells)
+    everything = list(summaries.values())
+    for heading, cells in (*_stop_rows(everything, shown), *_motor_rows(everything, shown)):
+        table.add_row(heading, *cells)
+    console.print(table)
+
+
+def print_choices(console: Terminal) -> None:
+    """Shipped scenarios and the members of every family, with the first line of what they say of themselves."""
+    from dynsim.library.families import FAMILIES, member, members
+    from dynsim.scenario import load_scenario, shipped_scenarios, variant_names
+
+    scenarios = []
+    for path in shipped_scenarios():
+        description = load_scenario(path).config.description
+        sentence = re.split(r"(?<!et al)\.\s", description, maxsplit=1)[0].strip().removesuffix(".")
+        scenarios.append((path.stem, ", ".join(variant_names(path)), sentence))
+    _print_choice(console, "scenarios", scenarios, ("name", "variants", "what"))
+    for family in FAMILIES:
+        firsts = [(name, (member(family, name).__doc__ or "").strip().partition("\n")[0]) for name in members(family)]
+        _print_choice(console, f"{family}s", firsts)
+
+
+def _print_choice(
+    console: Terminal, title: str, rows: Sequence[tuple[str, ...]], headings: tuple[str, ...] = ()
+) -> None:
+    """A table on a terminal; lines with tabs for programs."""
+    if console.unbounded:
+        lines = ["\t".join(plain(cell).replace("\n", "\\n") for cell in row) for row in [(title,), *rows, ()]]
+        # Not by the console, which would write the tabs out.
+        print("\n".join(lines), file=console.file)
+        return
+    table = Table(title=title, box=box.SIMPLE_HEAD, show_header=bool(headings), title_justify="left")
+    for k, heading in enumerate(headings):
+        table.add_column(heading, no_wrap=k == 0)
+    for row in rows:
+        table.add_row(*map(escaped_line, row))
+    console.print(table)
+
+
+def print_starts(console: Console, starts: Mapping[str, Start]) -> None:
+    """Per variant the positions of hand and contact points [m], as lists of YAML that read back to the same doubles.
+
+    Then how far contacts are from their surfaces, joints that on_surface has moved, and the margin of a base at rest.
+    """
+    for variant, start in starts.items():
+        values = {"hand": f"{_coordinates(start.hand)}"}
+        values |= {f"contact {name}": f"{_coordinates(point)}" for name, point in start.contacts.items()}
+        values |= {f"gap of {name}": f"{gap:+.4g} m" for name, gap in start.gaps.items()}
+        for joint, (to, was, unit) in start.solved.items():
+            values[joint] = f"{to!r} {unit}, by on_surface; was {was:.6g}"
+        if start.tip_margin is not None:
+            braced = ""
+            if start.tip_margin_braced is not None:
+                braced = f", {start.tip_margin_braced:.4g} with braces of least heat"
+            values["tip margin"] = f"{start.tip_margin:.4g} at rest{braced} (1: safest, 0: tips)"
+        width = max(map(len, values))
+        lines = [f"  {variant}{', ' if variant else ''}at the start [m]:"]
+        lines += [f"    {name:<{width}}  {value}" for name, value in values.items()]
+        if start.aloft:
+            lines += [f"    not on their surfaces; they would be with  {start.aloft}"]
+        console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+        _print_warnings(console, {variant: {"warnings": start.warnings}})
+
+
+def _coordinates(point: NDArray[np.float64]) -> list[float]:
+    """Coordinates [m]; 0.0 for what is rounding of zero, the others read back to the same doubles."""
+    return [0.0 if abs(x) <= ROUNDING else x for x in point.tolist()]
+
+
+def _pulling(contact: Summary) -> str:
+    from dynsim.record.measures import percent
+
+    pulling = contact["pulling_fraction"]
+    return f"[bold red]{percent(pulling).removesuffix(' %')}[/]" if pulling > 0.0 else "0"
+
+
+def _percent(key: str) -> Callable[[Summary], str]:
+    return lambda contact: f"{100.0 * contact[key]:.1f}" if 0.0 < contact[key] < 1.0 else f"{100.0 * contact[key]:.0f}"
+
+
+def _is_real(contact: Summary) -> bool:
+    """Whether it followed the unilateral law."""
+    return "sticking_fraction" in contact
+
+
+# Heading, how to show it, and whether it is said of contacts of the bilateral (False) or unilateral law (True) only.
+_CONTACT_ROWS: tuple[tuple[str, Callable[[Summary], str], bool | None], ...] = (
+    ("force, mean [N]", lambda c: _format(c["normal_force_mean_N"], ".2f"), None),
+    ("  min [N]", lambda c: _format(c["normal_force_min_N"], ".2f"), None),
+    ("  max [N]", lambda c: _format(c["normal_force_max_N"], ".2f"), None),
+    ("  pulling [% of time]", _pulling, False),
+    ("  closed [% of time]", _percent("closed_fraction"), True),
+    ("  sticking [% of time]", _percent("sticking_fraction"), True),
+    ("  lift-offs, landings", lambda c: f"{c['lift_offs']}, {c['landings']}", True),
+    ("  bounces, slip starts", lambda c: f"{c['bounces']}, {c['slip_starts']}", True),
+    ("  loss at its impacts [J]", lambda c: _number(c["impact_loss_J"], digits=3), True),
+)
+
+
+def _contact_rows(name: str, contacts: Sequence[Summary | None]) -> Iterator[tuple[str, list[str]]]:
+    """Rows of a contact, a cell for each run; None where a run does not have it.
+
+    No rows of a candidate that never touched; a declared point says how near it came.
+    """
+    having = [contact for contact in contacts if contact]
+    if not any(contact["closed_fraction"] > 0.0 or "gap_min_m" in contact for contact in having):
+        return
+    if not all(contact["closed_fraction"] > 0.0 for contact in having):
+        cells = [_number(c.get("gap_min_m"), 1e3, 3) if c and not c["closed_fraction"] else "–" for c in contacts]
+        yield escaped_line(_of(name, "never touches, least gap [mm]")), cells
+    if not any(contact["closed_fraction"] > 0.0 for contact in having):
+        return
+    for heading, show, real in _CONTACT_ROWS:
+        if real is None or any(_is_real(contact) == real for contact in having):
+            cells = [show(c) if c and real in (None, _is_real(c)) else "–" for c in contacts]
+            yield escaped_line(_of(name, heading)), cells
+
+
+# Heading, and how to show it, of a joint stop.
+_STOP_ROWS: tuple[tuple[str, Callable[[Summary], str]], ...] = (
+    ("hits", lambda s: str(s["hits"])),
+    ("  force, max [{force_unit}]", lambda s: _number(s["force_max"], digits=3)),
+    ("  closed [% of time]", _percent("closed_fraction")),
+    ("  loss at its impacts [J]", lambda s: _number(s["impact_loss_J"], digits=3)),
+)
+
+
+def _stop_rows(summaries: Sequence[Summary], shown: Sequence[Summary]) -> Iterator[tuple[str, list[str]]]:
+    """Rows of the joint stops that any run has touched, a cell for each run that is shown."""
+    stops = {_stop(one): one for summary in summaries for one in summary.get("joint_stops", ())}
+    for key, stop in stops.items():
+        cells = [{_stop(one): one for one in summary.get("joint_stops", ())}.get(key) for summary in shown]
+        joint, limit = key
+        place = f"{math.degrees(limit):.4g}°" if stop["unit"] == "rad" else f"{limit:.4g} {stop['unit']}"
+        for heading, show in _STOP_ROWS:
+            text = _of(f"{joint}, stop at {place}", heading.format(**stop))
+            yield escaped_line(text), ["–" if one is None else show(one) for one in cells]
+
+
+def _motor_rows(summaries: Sequence[Summary], shown: Sequence[Summary]) -> Iterator[tuple[str, list[str]]]:
+    """Rows of motors with ratings, root mean square of nominal, a cell for each run that is shown.
+
+    Of many motors the most loaded ones.
+    """
+    for quantity, unit, label in _RATED:
+        rms, nominal = f"{quantity}_rms_{unit}", f"nominal_{quantity}_{unit}"
+        rated = [m for summary in summaries for m in summary.get("motors", ()) if m.get(nominal) and rms in m]
+        load = {m["joint"]: 0.0 for m in rated}
+        for motor in rated:
+            load[motor["joint"]] = max(load[motor["joint"]], motor[rms] / motor[nominal])
+        heaviest = sorted(load, key=lambda joint: -load[joint])[:_MOST_MOTORS]
+        for joint in (joint for joint in load if joint in heaviest):
+            found: list[Summary] = [next((m for m in s.get("motors", ()) if m["joint"] == joint), {}) for s in shown]
+            cells = [f"{_loaded(m[rms], m[nominal])} of {m[nominal]:g}" if m.get(nominal) else "–" for m in found]
+            yield escaped_line(f"{joint}: {label}"), cells
+
+
+# Of motors: quantity and unit as in the keys of the summary, and how they are called in a table.
+_RATED = (
+    ("current", "A", "rms of nominal [A]"),
+    ("torque", "N_m", "rms of nominal [N m]"),
+    ("force", "N", "rms of nominal [N]"),
+)
+_MOST_MOTORS = 10
+
+
+def _loaded(rms: float, nominal: float) -> str:
+    return f"[bold red]{rms:.3g}[/]" if rms > nominal else f"{rms:.3g}"
+
+
+def _stop(stop: Summary) -> tuple[str, float]:
+    return stop["joint"], stop["limit"]
+
+
+def _of(contact: str, heading: str) -> str:
+    return heading if heading.startswith(" ") else f"{contact}: {heading}"
+
+
+def _print_warnings(console: Console, summaries: Mapping[str, Summary]) -> None:
+    for name, summary in summaries.items():
+        for warning in summary.get("warnings", ()):
+            prefix = f"{name}: " if name else ""
+            console.print(f"[yellow]warning:[/] {escaped_line(prefix + warning)}", highlight=False)

@@ -1,0 +1,127 @@
+"""The unilateral law of a robot's contacts and joint stops, compiled to the arrays of the kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.cone.socp import split_size
+from dynsim.dynamics.contact.unilateral import UnilateralArrays
+from dynsim.errors import ModelError
+from dynsim.jit.kernel import integers, reals
+from dynsim.model.description import Contact, Robot
+
+# A joint may start this far beyond its stop [rad or m].
+START_TOLERANCE = 1e-6
+# After an impact a point that leaves more slowly than this stays: bounces that accumulate come to an end [m/s]. More
+# than points reach that fall through the depth at which they count as landed (6e-5 under gravity): two points that rock
+# would give each other that speed for ever.
+SETTLE_SPEED = 1e-4
+
+
+@dataclass(frozen=True)
+class JointStop:
+    """What a joint comes up against: side 1 keeps q ≥ position, side −1 q ≤ position [rad or m]."""
+
+    joint: str
+    side: float
+    position: float
+
+
+def told(value: float, unit: str, digits: int = 5) -> str:
+    """A joint coordinate for a line of text; an angle in degrees first, which scenarios are written in."""
+    if unit != "rad":
+        return f"{value:.{digits}g} {unit}"
+    return f"{np.degrees(value):.{digits}g}° ({value:.{min(digits, 4)}g} rad)"
+
+
+def compile_unilateral(
+    robot: Robot, contacts: Sequence[Contact], stops: Sequence[JointStop], slow: float
+) -> UnilateralArrays:
+    """Tables of the unilateral law.
+
+    Parameters
+    ----------
+    stops : what joints come up against
+    slow : speed below which slip has no direction of its own [m/s]
+
+    Raises
+    ------
+    ModelError
+        Static friction below the kinetic one, negative numbers, or restitution above one.
+    """
+    c, s = len(contacts), len(stops)
+    p = ka.row_limit(c, len(robot.couplings) + s)
+    law = np.zeros((c, ku.LAW_SIZE))
+    for k, contact in enumerate(contacts):
+        static = contact.friction if contact.static_friction is None else contact.static_friction
+        if not static >= contact.friction:
+            raise ModelError(
+                f"contact {contact.name}: static friction {static:g} is less than the kinetic {contact.friction:g}"
+            )
+        if not 0.0 <= contact.restitution <= 1.0:
+            raise ModelError(f"contact {contact.name}: restitution {contact.restitution:g} is not between 0 and 1")
+        if not (contact.stribeck >= 0.0 and contact.viscous_friction >= 0.0):
+            raise ModelError(f"contact {contact.name}: Stribeck speed and viscous friction must not be negative")
+        law[k, [ku.STATIC, ku.STRIBECK]] = static, contact.stribeck
+        law[k, [ku.VISCOUS, ku.RESTITUTION]] = contact.viscous_friction, contact.restitution
+    stop_table, stop = np.zeros((s, ku.STOP_TABLE_SIZE), dtype=np.int64), np.zeros((s, ku.STOP_SIZE))
+    for k, limit in enumerate(stops):
+        stop_table[k, ku.STOP_JOINT] = robot.joint_names.index(limit.joint)
+        stop[k, ku.SIDE], stop[k, ku.LIMIT] = limit.side, limit.side * limit.position
+    slide = np.zeros((c, ku.SLIDE_SIZE))
+    slide[:, ku.LANDS_AT], slide[:, ku.LONGEST] = ku.DEPTH, np.inf
+    tally, number = np.zeros((c, ku.TALLY_SIZE)), np.zeros(ku.NUMBERS)
+    tally[:, ku.SETTLE], tally[:, ku.WINDOW_START], number[ku.LAST_CHANGE] = SETTLE_SPEED, -np.inf, -np.inf
+    number[ku.SLOW] = slow
+    return UnilateralArrays(
+        law=reals(law),
+        slide=reals(slide),
+        mode=integers(np.zeros((c, ku.MODE_SIZE))),
+        tally=reals(tally),
+        stop_table=integers(stop_table),
+        stop=reals(stop),
+        place=integers(np.zeros((ku.PLACES, max(p, c + 2)))),
+        vector=reals(np.zeros((ku.VECTORS, p))),
+        room=reals(np.zeros((ku.ROOM, p, p))),
+        split_room=reals(np.zeros(split_size(3 * c, c))),
+        number=reals(number),
+    )
+
+
+def compile_grips(robot: Robot, contacts: Sequence[Contact]) -> NDArray[np.float64]:
+    """Friction along an axis per that across, and the axis in the link's frame, (c, 4); 1 where it is isotropic."""
+    grips = np.ones((len(contacts), 4))
+    for row, contact in zip(grips, contacts, strict=True):
+        if contact.grip_axis is not None:
+            row[0], row[1:] = contact.grip, robot.attached_axes(contact.body) @ contact.grip_axis
+    return grips
+
+
+def joint_stops(robot: Robot) -> list[JointStop]:
+    """The stops of a robot's joints: their finite limits, the lower one first.
+
+    Raises
+    ------
+    ModelError
+        A joint starts beyond its stop.
+    """
+    found = []
+    for link, k in zip(robot.links, robot.position_index, strict=True):
+        for side, limit in ((1.0, link.lower), (-1.0, link.upper)):
+            if np.isfinite(limit):
+                beyond = side * (limit - robot.initial[k])
+                if beyond > START_TOLERANCE:
+                    raise ModelError(
+                        f"{link.joint}: starts at {told(robot.initial[k], link.units[0])}, beyond its stop at "
+                        f"{told(limit, link.units[0])}; "
+                        "contacts.law: unilateral enforces it: change its initial position or its limit",
+                        keys=("plant",),
+                    )
+                found.append(JointStop(link.joint, side, float(limit)))
+    return found

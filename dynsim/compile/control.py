@@ -1,0 +1,265 @@
+"""What a joint controller hands to the simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from dynsim.compile.references.operated import Operated
+from dynsim.compile.rolling import coordinates, rolled
+from dynsim.compile.splines import quintic_coefficients
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.tables import ReferenceArrays
+from dynsim.errors import ModelError
+from dynsim.jit.kernel import integers, reals
+from dynsim.model.base_pose import base_pose, base_row
+from dynsim.model.description import Robot
+from dynsim.model.drives import TorqueSource
+from dynsim.system.reuse import Reuse
+
+# Samples in a segment of the reference splines, and segments that are looked at together.
+_PER_SEGMENT = 4
+_PIECE = 4096
+# Knots that the longest steps of an implicit method straddle (of 20 ms; 55 ms in the published arm).
+_STRADDLED = 3.0
+
+# Keys of a controller that plan for a whole run, which an operator does not know.
+PLANNED = ("hand", "base", "joints", "torques", "feed_forward", "brace")
+
+# Positions of a joint: samples, (T,) [rad or m], or a function of times, (T,) [s], that gives them.
+JointMotion = ArrayLike | Callable[[NDArray[np.float64]], ArrayLike]
+
+
+@runtime_checkable
+class HandPath(Protocol):
+    """A path in space."""
+
+    def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Positions at times t [s], shape (T,) → (T, 3) [m]."""
+
+
+@runtime_checkable
+class BasePath(Protocol):
+    """A motion of a mobile base without side slip; the way to its place follows."""
+
+    def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distance ahead [m] and turn to the left [rad] since the start at times t [s], shape (T,) → (T, 2)."""
+
+
+def held_values(robot: Robot) -> NDArray[np.float64]:
+    """What motors without a moving reference hold, (na,): the initial position of the joint; no torque of a source."""
+    initial = dict(zip(robot.joint_names, robot.initial[list(robot.position_index)], strict=True))
+    return np.array([0.0 if isinstance(m, TorqueSource) else initial[m.joint] for m in robot.motors])
+
+
+@dataclass(frozen=True)
+class JointControl:
+    """Gains of the voltage PD per motor [V/rad, V s/rad], joint references, and the path the hand is to follow.
+
+    Only DC motors take the gains; ``k_p`` of a servo says whether it follows its position. References of a torque
+    source are its torques [N m]. ``sample_time`` is the period [s] at which commands are taken, to be held in between;
+    None: they follow the state continuously. Where there is ``operated``, an operator rewrites references on the way.
+    """
+
+    k_p: NDArray[np.float64]
+    k_d: NDArray[np.float64]
+    reference: ReferenceArrays
+    path: HandPath | None
+    sample_time: float | None = None
+    operated: Operated | None = None
+
+    @classmethod
+    def absent(cls, robot: Robot) -> JointControl:
+        """No controller: DC motors have zero volts and brake, servos hold where they start, torque sources rest."""
+        motors = len(robot.motors)
+        return cls(np.zeros(motors), np.zeros(motors), _reference(held_values(robot)), None)
+
+    @classmethod
+    def following(
+        cls,
+        robot: Robot,
+        k_p: ArrayLike,
+        k_d: ArrayLike,
+        times: ArrayLike = (),
+        positions: Mapping[str, JointMotion] | None = None,
+        path: HandPath | None = None,
+        sample_time: float | None = None,
+        voltages: ArrayLike | None = None,
+        reuse: Reuse | None = None,
+    ) -> JointControl:
+        """The voltage PD u = k_p (q_d − q) + k_d (v_d − v) on joint positions that are given as samples or functions.
+
+        q_d is a quintic spline through the samples, v_d its derivative. Joints without positions hold their first.
+
+        Parameters
+        ----------
+        robot : whose motors are controlled
+        k_p, k_d : one for all motors, or (na,) in their order [V/rad, V s/rad; V/m, V s/m at prismatic joints]
+        times : (T,) [s], equally spaced, T ≥ 6, from 0 to the end of the run
+        positions : by joint, (T,) positions [rad or m], or a function that gives them for ``times``
+        path : what the hand is to follow, for tracking errors in summary and figures
+        sample_time : period of a zero-order hold of the voltages [s]; None: continuous
+        voltages : (T, na), planned ones that are added to those of DC motors [V]; None: none
+        reuse : what other runs have computed
+
+        Raises
+        ------
+        ModelError
+            A joint that has no motor, or samples, times or gains whose shape or values do not fit.
+        """
+        positions = positions or {}
+        driven = [motor.joint for motor in robot.motors]
+        held = held_values(robot)
+        gains = _gains("k_p", k_p, len(driven)), _gains("k_d", k_d, len(driven))
+        for name in positions:
+            if name not in driven:
+                raise ModelError(f"{name!r} is no joint with a motor; those are: {', '.join(driven) or 'none'}")
+        if not positions and voltages is None:
+            return cls(*gains, _reference(held), path, sample_time)
+        grid = np.asarray(times, dtype=np.float64)
+        if grid.ndim != 1 or len(grid) < 6 or not np.allclose(np.diff(grid), grid[1] - grid[0], rtol=1e-6, atol=0.0):
+            raise ModelError("references need six or more equally spaced times [s]")
+        if not grid[1] > grid[0]:
+            raise ModelError("the times of references must increase")
+        columns = []
+        for name, motion in positions.items():
+            column = np.asarray(motion(grid) if callable(motion) else motion, dtype=np.float64)
+            if column.shape != grid.shape or not np.isfinite(column).all():
+                raise ModelError(f"the reference of {name} needs {len(grid)} finite positions, one for each time")
+            columns.append(column)
+        spline = np.full(len(driven), ka.HELD_POSITION)
+        for k, name in enumerate(positions):
+            spline[driven.index(name)] = k
+        spacing = float(grid[1]) - float(grid[0])
+        coefficients = np.zeros((len(grid) - 1, 0, 6))
+        if columns:
+            samples = np.stack(columns, axis=1)
+            coefficients = (reuse or Reuse()).of(
+                "splines", lambda: quintic_coefficients(spacing, samples), spacing, samples
+            )
+        reference = _reference(held, spline, (float(grid[0]), spacing), coefficients)
+        if voltages is not None:
+            planned = np.asarray(voltages, dtype=np.float64)
+            if planned.shape != (len(grid), len(driven)) or not np.isfinite(planned).all():
+                raise ModelError(f"voltages must be finite, one of each of {len(driven)} motors for each time")
+            reference = reference._replace(voltage=quintic_coefficients(spacing, planned))
+        return cls(*gains, reference, path, sample_time)
+
+    @property
+    def end(self) -> float:
+        """Time up to which the moving references are known [s]; infinite when all hold."""
+        begin, spacing = self.reference.grid
+        moving = bool((self.reference.spline >= 0).any())
+        return float(begin + spacing * len(self.reference.coefficients)) if moving else np.inf
+
+    def bends(self, rtol: float, atol: float) -> NDArray[np.float64]:
+        """Knots at which references bend within a long step [s], increasing: error control samples them too thinly.
+
+        The fifth derivative jumps there: three knots further on the polynomials of the segments before and behind
+        differ by more than ``atol`` + ``rtol`` × the spline's span. Commands that are taken at ticks bend nowhere.
+        """
+        spacing, found = float(self.reference.grid[1]), []
+        for splines in (self.reference.coefficients, self.reference.voltage):
+            if self.sample_time is not None or splines is None or len(splines) < 2:
+                continue
+            jumps = np.abs(np.diff(splines[:, :, 5], axis=0))  # (segments - 1, splines)
+            departure = jumps * (_STRADDLED * spacing) ** 5
+            values = splines[:, :, 0]  # at the knots
+            span = values.max(axis=0) - values.min(axis=0)
+            found.append((departure > atol + rtol * span).any(axis=1).nonzero()[0])
+        knots = np.unique(np.concatenate(found)) if found else np.zeros(0)
+        return np.asarray(self.reference.grid[0] + spacing * (knots + 1.0))
+
+    def positions(self, robot: Robot) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+        """Times, (T,) [s], and the coordinates, (T, nq), of the references, in pieces of some thousand samples.
+
+        Taken at the knots and at three times between two of them. Joints without a moving reference stay where they
+        start; a base is where its wheels roll it.
+
+        Parameters
+        ----------
+        robot : whose motors follow the references
+        """
+        reference, q, start = self.reference, robot.initial, None
+        begin, spacing = reference.grid
+        places = dict(zip(robot.joint_names, robot.position_index, strict=True))
+        moved = np.array([places[motor.joint] for motor in robot.motors])[reference.spline >= 0]
+        segments, columns = len(reference.coefficients), reference.spline[reference.spline >= 0]
+        x = spacing * np.arange(_PER_SEGMENT + 1) / _PER_SEGMENT
+        powers = x[:, None] ** np.arange(6)
+        for first in range(0, segments, _PIECE):
+            piece = reference.coefficients[first : first + _PIECE, columns]
+            times = begin + spacing * np.arange(first, first + len(piece))[:, None] + x
+            positions = np.tile(q, (times.size, 1))
+            positions[:, moved] = np.einsum("scp,xp->sxc", piece, powers).reshape(times.size, len(columns))
+            if robot.base is not None:
+                k, _ = base_row(robot)
+                angles = self._wheels(robot, slice(first, first + _PIECE))
+                way = rolled(robot.base, q[k + 2 : k + 4] if start is None else start, angles, spacing, _PER_SEGMENT)
+                positions[:, k + 2 : k + 4], start = way.reshape(-1, 2), way[-1, -1]
+            yield times.ravel(), positions
+
+    def _wheels(self, robot: Robot, segments: slice) -> NDArray[np.float64]:
+        """References of the wheels of a mobile base as splines, (segments, 2, 6); of one that holds, its angle."""
+        assert robot.base is not None
+        k, _ = base_row(robot)
+        driven = [motor.joint for motor in robot.motors]
+        pieces = self.reference.coefficients[segments]
+        angles = np.zeros((len(pieces), 2, 6))
+        angles[:, :, 0] = robot.initial[k : k + 2]
+        for wheel, joint in enumerate(robot.base.wheels):
+            column = self.reference.spline[driven.index(joint)] if joint in driven else ka.HELD_POSITION
+            if column >= 0:
+                angles[:, wheel] = pieces[:, column]
+        return angles
+
+    def base_target(self, robot: Robot, t: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Where the references of its wheels take a mobile base: x, y [m], heading [rad] at times t [s], (T, 3).
+
+        None without a base, or where a wheel follows nothing.
+        """
+        follows = {motor.joint for motor, k_p in zip(robot.motors, self.k_p, strict=True) if k_p > 0.0}
+        if robot.base is None or not follows.issuperset(robot.base.wheels):
+            return None
+        k, _ = base_row(robot)
+        q = np.tile(robot.initial, (len(t), 1))
+        wheels = self._wheels(robot, slice(None))
+        begin, spacing = self.reference.grid
+        q[:, k : k + 4] = coordinates(robot.base, robot.initial[k + 2 : k + 4], wheels, spacing, t - begin)
+        return base_pose(robot, q)
+
+    def target(self, t: NDArray[np.float64], reuse: Reuse | None = None) -> NDArray[np.float64] | None:
+        """Target of the hand at times t, (T, 3) [m]; None without a path."""
+        return None if self.path is None else targets_on(self.path, t, reuse or Reuse())
+
+
+def targets_on(path: HandPath, t: NDArray[np.float64], reuse: Reuse) -> NDArray[np.float64]:
+    """Positions on a path at times t [s], (T,) → (T, 3) [m], unless they are known."""
+    return reuse.of("targets", lambda: path.position(t), path, t)
+
+
+def _gains(name: str, value: ArrayLike, motors: int) -> NDArray[np.float64]:
+    """A gain for each motor, (na,)."""
+    gains = np.asarray(value, dtype=np.float64)
+    if gains.shape not in ((), (motors,)) or not (np.isfinite(gains).all() and (gains >= 0.0).all()):
+        raise ModelError(f"{name} must be one gain, or one for each of {motors} motors, finite and not negative")
+    return np.full(motors, gains) if gains.ndim == 0 else gains
+
+
+def _reference(
+    held: NDArray[np.float64],
+    spline: NDArray[np.int64] | None = None,
+    grid: tuple[float, float] = (0.0, 1.0),
+    coefficients: NDArray[np.float64] | None = None,
+) -> ReferenceArrays:
+    """References as the kernels take them: ``held``, (na,), where ``spline`` is HELD_POSITION, else that column."""
+    return ReferenceArrays(
+        spline=integers(np.full(len(held), ka.HELD_POSITION) if spline is None else spline),
+        held=reals(held),
+        grid=reals(grid),
+        coefficients=reals(np.zeros((1, 0, 6)) if coefficients is None else coefficients),
+    )

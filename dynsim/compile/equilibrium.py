@@ -1,0 +1,175 @@
+"""Torques of the motors that hold a posture at rest against weight, loads and braces, with the least heat.
+
+    τ = h + g − J_wᵀ W − J_cᵀ f,    minimise Σ R i²,  K_m i = τ
+
+with the forces f of the contacts that touch. The bilateral law has no friction at rest, and normal forces of either
+sign. Under the unilateral one f_n ≥ 0 and |f_t| ≤ μ_s f_n: first without friction, so that contacts stick with all they
+have in reserve, and only where nothing holds that way with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dynsim.compile.bracing import MIN_N, BracePlanner, brace_rows
+from dynsim.compile.model import Model
+from dynsim.compile.shapes import share_of_axis
+from dynsim.dynamics.contact.braces import tables as kb
+from dynsim.dynamics.contact.braces.statics import brace_statics
+from dynsim.errors import ModelError
+from dynsim.jit.kernel import reals
+from dynsim.model.description import Array, Contact, Load
+from dynsim.model.drives import Servo
+
+# Contacts nearer than this are closed at the start [m].
+TOUCHING = 1e-6
+KEYS = ("initial", "equilibrium")
+
+
+@dataclass(frozen=True)
+class Rest:
+    """A posture at rest.
+
+    Attributes
+    ----------
+    torques : (n,) of the motors [N m or N], zero of joints without one that can
+    normal_forces : of the contacts that touch, by name [N]; negative: the surface pulls
+    forces : of the same on the arm: index of the link, point in its frame [m], force in the world [N]
+    """
+
+    torques: Array
+    normal_forces: dict[str, float]
+    forces: list[tuple[int, Array, Array]]
+
+
+def rest(
+    model: Model, q: Array, contacts: Sequence[Contact], loads: Sequence[Load], able: Sequence[str], real: bool
+) -> Rest:
+    """Least-heat torques that hold a posture.
+
+    Parameters
+    ----------
+    q : (nq,) the posture
+    contacts : all of them; those that touch carry
+    loads : as they are at t = 0
+    able : joints whose motors can give a torque at rest
+    real : the unilateral law
+
+    Raises
+    ------
+    ModelError
+        Nothing holds it; the message names joints that would have to give more than they can. Coupled joints.
+    """
+    robot = model.robot
+    if robot.couplings:
+        raise ModelError("initial.equilibrium: not for robots with coupled joints, which share a motor", keys=KEYS)
+    touching = [(contact, *_touching_point(model, contact, q)) for contact in contacts]
+    touching = [one for one in touching if abs(one[-1]) <= TOUCHING or (real and one[-1] < 0.0)]
+    # Frictionless first, then all that Coulomb allows; with a least force first, so that what presses goes on to press.
+    attempts = [(0.0, MIN_N), (0.0, 0.0), (1.0, MIN_N), (1.0, 0.0)] if real and touching else [(0.0, 0.0)]
+    pushes = [
+        _row(link, point, push, 0.0, 0.0, float(np.linalg.norm(push)))
+        for link, point, push in load_forces(model, q, loads)
+    ]
+    driven = replace(robot, motors=tuple(motor for motor in robot.motors if motor.joint in able))
+    for share, least in attempts:
+        rows = []
+        for contact, link, point, normal, _ in touching:
+            static = contact.friction if contact.static_friction is None else contact.static_friction
+            rows.append(_row(link, point, normal, share * static, least))
+            if not real:
+                rows.append(_row(link, point, -normal, 0.0, 0.0))
+        planner = BracePlanner(driven, model.arrays, [link for link, _ in (*rows, *pushes)])
+        tables = np.array([table for _, table in (*rows, *pushes)]).reshape(1, -1, kb.BRACE_SIZE)
+        torques, still = np.zeros((1, model.n)), np.zeros((1, model.n))
+        arrays, workspace = planner.arrays, planner.workspace
+        if brace_statics(model.arrays, workspace, arrays, reals(q[None]), still, still, tables, torques, False) == 1:
+            found = arrays.found[: len(rows), kb.FORCES]
+            normal = found if real else found[::2] - found[1::2]
+            names = [contact.name for contact, *_ in touching]
+            forces = arrays.forces[: len(rows)] if real else arrays.forces[: len(rows)].reshape(-1, 2, 3).sum(axis=1)
+            places = [(link, point, force) for (_, link, point, *_), force in zip(touching, forces, strict=True)]
+            return Rest(torques[0], dict(zip(names, normal.tolist(), strict=True)), places)
+    raise ModelError(_why(model, arrays.motors, arrays.free, [one[0].name for one in touching]), keys=KEYS)
+
+
+def _touching_point(model: Model, contact: Contact, q: Array) -> tuple[int, Array, Array, float]:
+    """Link, point in its frame [m] where a contact touches, normal there in the world, and gap [m]."""
+    robot = model.robot
+    place, point = model.point_position(contact.body, contact.point, q), contact.point
+    if contact.tip is not None:
+        end = model.point_position(contact.body, contact.tip, q)
+        share = share_of_axis(contact, place, end)
+        place, point = place + share * (end - place), point + share * (contact.tip - point)
+    normal = np.asarray(contact.surface.normal(place), dtype=np.float64)
+    gap = contact.surface.gap(place) - contact.radius
+    link, on_link = robot.attach(contact.body, point)
+    if contact.radius > 0.0:
+        on_link = on_link - contact.radius * (model.body_pose(link, q)[0].T @ normal)
+    return link, on_link, normal, float(gap)
+
+
+def _row(
+    link: int, point: Array, normal: Array, friction: float, least: float, force: float = np.nan
+) -> tuple[int, Array]:
+    """A brace for the kernels, held: link and row of its table."""
+    return link, brace_rows(point, normal[None], np.array([friction]), least, force, np.zeros((1, 3)))[0]
+
+
+def load_torques(model: Model, q: Array, loads: Sequence[Load]) -> Array:
+    """What holds loads as they are at t = 0, −J_wᵀ W, (n,) [N m or N]."""
+    torques = np.zeros(model.n)
+    for link, point, force in load_forces(model, q, loads):
+        torques -= model.point_jacobian(link, point, q).T @ force
+    return torques
+
+
+def load_forces(model: Model, q: Array, loads: Sequence[Load]) -> list[tuple[int, Array, Array]]:
+    """Loads at t = 0 as forces alone: link, point in its frame [m], force in the world [N].
+
+    A torque M is the couple of M × d and −M × d at ±d/2, with d a unit vector across M.
+    """
+    found = []
+    for load in loads:
+        wrench = load.components(np.zeros(1))[0]
+        link, point = model.robot.attach(load.body, load.point)
+        axes, _ = model.body_pose(link, q)
+        force, torque = (axes @ part if load.in_body else part for part in (wrench[:3], wrench[3:]))
+        pushes = [(point, force)]
+        if torque.any():
+            across = np.cross(torque, np.eye(3)[np.abs(torque).argmin()])
+            across /= np.linalg.norm(across)
+            lever, couple = 0.5 * axes.T @ across, np.cross(torque, across)
+            pushes += [(point + lever, couple), (point - lever, -couple)]
+        found += [(link, at, push) for at, push in pushes if push.any()]
+    return found
+
+
+def _why(model: Model, limits: Array, needed: Array, braces: Sequence[str]) -> str:
+    """Which joints cannot give what weight and loads ask for."""
+    robot = model.robot
+    motors = {motor.joint: motor for motor in robot.motors}
+    weak = []
+    for link, (low, high), torque in zip(robot.links, limits[:, [kb.LOWER, kb.UPPER]], needed, strict=True):
+        if low - 1e-9 <= torque <= high + 1e-9:
+            continue
+        motor, unit = motors.get(link.joint), link.units[3]
+        if low < high:
+            reason = f"its motor gives {high:.4g} {unit}"
+        elif motor is None:
+            reason = "has no motor"
+        elif isinstance(motor, Servo):
+            reason = "its servo follows rates, not positions"
+        else:
+            reason = "nothing makes its motor hold: no controller, or k_p = 0"
+        weak.append((abs(torque), f"{link.joint} {torque:.4g} {unit} ({reason})"))
+    text = "initial.equilibrium: nothing holds this posture at rest"
+    if weak:
+        shown = [one for _, one in sorted(weak, key=lambda one: -one[0])[:4]]
+        more = f" and {len(weak) - len(shown)} more" if len(weak) > len(shown) else ""
+        text += f": weight and loads ask for {', '.join(shown)}{more}"
+    carries = f"; {', '.join(braces)} cannot carry it" if braces else "; no contact touches"
+    return f"{text}{carries}. Change the posture, let a brace carry it, or take initial.equilibrium away"

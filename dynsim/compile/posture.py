@@ -1,0 +1,84 @@
+"""Postures that put points of an arm on their surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from dynsim.compile.model import Model
+from dynsim.errors import ModelError
+from dynsim.model.description import Array, Contact
+
+HAND = "hand"
+
+# Distance from the surfaces that counts as none [m].
+TOLERANCE = 1e-13
+REACHED = 1e-12
+ITERATIONS = 300
+STEP_MAX = 0.3  # [rad or m] per iteration, so that the branch of the start is kept
+
+
+def gaps_and_rates(model: Model, contacts: Sequence[Contact], q: Array) -> tuple[Array, Array]:
+    """Distances of points and spheres from their surfaces, (c,) [m], and their rates by joint, (c, n) [m/rad]."""
+    gaps, rates = np.zeros(len(contacts)), np.zeros((len(contacts), model.n))
+    for k, contact in enumerate(contacts):
+        position, jacobian = model.point_position_and_jacobian(contact.body, contact.point, q)
+        gaps[k], rates[k] = contact.surface.gap(position) - contact.radius, contact.surface.normal(position) @ jacobian
+    return gaps, rates
+
+
+def on_surfaces(model: Model, contacts: Mapping[str, Contact], names: Sequence[str], keep: Sequence[str]) -> Array:
+    """The posture nearest to the initial one, |q − q_0| least, with the named points on their surfaces, (nq,).
+
+    Gauss–Newton steps q ← q_0 + J⁺ (J (q − q_0) − e), then Newton's without the pull to q_0 for the last digits.
+
+    Parameters
+    ----------
+    contacts : of the scenario, by name
+    names : contacts that are to be on their surfaces
+    keep : joints that do not move; ``hand``: the hand stays where it is
+
+    Raises
+    ------
+    ModelError
+        An unknown name, that of an axis, or surfaces that the points do not reach.
+    """
+    robot = model.robot
+    for name in names:
+        if name not in contacts:
+            raise ModelError(f"initial.on_surface: no contact {name!r}; those are: {', '.join(contacts) or 'none'}")
+        if contacts[name].tip is not None:
+            raise ModelError(f"initial.on_surface: {name!r} is the axis of a link; name the points at its ends")
+    fixed = [name for name in keep if name != HAND]
+    for name in fixed:
+        if name not in robot.joint_names:
+            raise ModelError(f"initial.keep: no joint {name!r}; joints: {', '.join(robot.joint_names)}, and {HAND}")
+    if robot.couplings:
+        raise ModelError("initial: not for robots with coupled joints; give their positions")
+    columns = [
+        k for k, link in enumerate(robot.links) if len(link.row.neutral) == 1 and robot.joint_names[k] not in fixed
+    ]
+    places = [robot.position_index[k] for k in columns]
+    points = [contacts[name] for name in names]
+    start = robot.initial
+    hand = model.point_position(*robot.hand, start)
+    q = start.copy()
+    for turn in range(ITERATIONS):
+        error, J = gaps_and_rates(model, points, q)
+        if HAND in keep:
+            position, jacobian = model.point_position_and_jacobian(*robot.hand, q)
+            error, J = np.concatenate([error, position - hand]), np.vstack([J, jacobian])
+        pull = start[places] - q[places] if turn < ITERATIONS - 5 else 0.0 * q[places]
+        step = pull - np.linalg.lstsq(J[:, columns], error + J[:, columns] @ pull, rcond=1e-10)[0]
+        longest = float(np.abs(step).max(initial=0.0))
+        if np.abs(error).max(initial=0.0) <= TOLERANCE and longest < 1e-10:
+            break
+        q[places] += step * min(1.0, STEP_MAX / max(longest, 1e-300))
+    worst = float(np.abs(error).max(initial=0.0))
+    if not worst <= REACHED:
+        raise ModelError(
+            f"initial: the joints that may move do not bring {', '.join(names)} onto the surfaces; {worst:.3g} m are "
+            "left: keep fewer joints, or start closer"
+        )
+    return q

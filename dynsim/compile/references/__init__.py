@@ -1,0 +1,1 @@
+"""Reference motions: inverse kinematics along paths, splines, feed-forward."""

@@ -1,0 +1,152 @@
+"""Planned voltages along joint references: gravity, the whole dynamics, and braces that press with given forces.
+
+    K_m i = M v̇ + h + g + J_m v̇ + (D + D_m) v − J_cᵀ f_d,    u = R i + L di/dt + K_m v
+
+f_d: normal forces as commanded, or those of least heat, and the friction of a point that slips along the references.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.compile.bracing import MIN_N, BracePlanner, brace_rows
+from dynsim.compile.model import Model
+from dynsim.compile.splines import quintic_rates
+from dynsim.dynamics.contact.braces import tables as kb
+from dynsim.errors import ModelError
+from dynsim.model.description import Contact
+from dynsim.model.drives import Motor
+
+Array = NDArray[np.float64]
+
+# Slip of the references [m/s] over which planned friction grows to its value: a jump would make the voltages ring.
+SLIP_SCALE = 5e-3
+# Slower than this it has no direction [m/s].
+SLIP_MIN = 1e-9
+# Further off its surface than this, by the references, a brace carries nothing [m].
+GAP_MAX = 2e-3
+
+
+def planned_voltages(
+    model: Model,
+    times: Array,
+    positions: Mapping[str, Array],
+    braces: Mapping[str, tuple[Contact, float | None]],
+    min_N: float = MIN_N,
+    whole: bool = True,
+) -> Array:
+    """Voltages of all motors, (T, na) [V].
+
+    Parameters
+    ----------
+    times : (T,) equally spaced [s]
+    positions : of the moving joints, (T,) [rad or m]; the others hold their initial ones
+    braces : contact and commanded normal force [N] by name; None: the one of least heat, at least ``min_N``
+    whole : the whole dynamics and the circuits; else what holds the weight at rest, i = g / K_m
+
+    Raises
+    ------
+    ModelError
+        Joints without DC motors, a brace that is no point or that the references take off its surface, or no forces
+        that carry the motion.
+    """
+    robot = model.robot
+    driven = [motor.joint for motor in robot.motors]
+    if sorted(driven) != sorted(robot.joint_names) or not all(isinstance(m, Motor) for m in robot.motors):
+        raise ModelError("controller: planned voltages need a DC motor on every joint", keys=("controller",))
+    q = np.tile(robot.initial, (len(times), 1))
+    for name, values in positions.items():
+        q[:, model.joint_names.index(name)] = values
+    spacing = float(times[1] - times[0])
+    v, vdot = quintic_rates(spacing, q)
+    if whole:
+        torques = _pressing_torques(model, times, q, v, vdot, braces, min_N)
+    else:
+        rest = np.zeros(model.n)
+        torques = np.array([model.bias_forces(row, rest) for row in q])
+    columns = [model.joint_names.index(joint) for joint in driven]
+    motors = [motor for motor in robot.motors if isinstance(motor, Motor)]
+    constant = np.array([motor.joint_constant for motor in motors])
+    resistance, inductance = (np.array([getattr(m, key) for m in motors]) for key in ("resistance", "inductance"))
+    current = torques[:, columns] / constant
+    if not whole:
+        return np.asarray(resistance * current)
+    rate, _ = quintic_rates(spacing, current)
+    return np.asarray(resistance * current + inductance * rate + constant * v[:, columns])
+
+
+def _pressing_torques(
+    model: Model,
+    times: Array,
+    q: Array,
+    v: Array,
+    vdot: Array,
+    braces: Mapping[str, tuple[Contact, float | None]],
+    min_N: float,
+) -> Array:
+    """Torques of the motors along the references, (T, n), with braces that press."""
+    attached = []
+    for name, (contact, _) in braces.items():
+        if contact.tip is not None:
+            raise ModelError(
+                f"controller.brace: {name} is the axis of a link; name points of contacts.points that are to press",
+                keys=("controller", "brace"),
+            )
+        attached.append(model.robot.attach(contact.body, contact.point))
+    planner = BracePlanner(model.robot, model.arrays, [link for link, _ in attached])
+    points = np.array([point for _, point in attached]).reshape(-1, 3)
+    positions, velocities = planner.motion(points, q, v)
+    tables = np.zeros((len(times), len(braces), kb.BRACE_SIZE))
+    for k, (name, (contact, force)) in enumerate(braces.items()):
+        _check_gaps(name, contact, times, contact.surface.gaps(positions[:, k]) - contact.radius)
+        normals = contact.surface.normals(positions[:, k])
+        touching, velocity = points[k], velocities[:, k]
+        if contact.radius > 0.0:
+            touching, velocity = _lowest_points(model, attached[k], -contact.radius * normals, q, v)
+        slip = velocity - np.sum(velocity * normals, axis=1, keepdims=True) * normals
+        speed = np.linalg.norm(slip, axis=1)
+        slip[speed <= SLIP_MIN] = 0.0
+        # A point at rest along the surface is planned without friction: what holds it then, its history decides.
+        friction = np.where(speed > SLIP_MIN, contact.friction * speed / np.hypot(speed, SLIP_SCALE), 0.0)
+        tables[:, k] = brace_rows(touching, normals, friction, min_N, np.nan if force is None else force, slip)
+    torques, solved = planner.torques(q, v, vdot, tables)
+    if solved < len(times):
+        raise ModelError(
+            f"controller.brace: at t = {times[solved]:.3f} s no forces of {', '.join(braces)} carry the motion within "
+            "the limits of the motors; ask for other forces, go slower, or raise voltage_limit_V",
+            keys=("controller", "brace"),
+        )
+    return torques
+
+
+def _lowest_points(
+    model: Model, attached: tuple[int, Array], offsets: Array, q: Array, v: Array
+) -> tuple[Array, Array]:
+    """Points of a body off one of its points by vectors in the world: in its frame [m], and their velocities [m/s].
+
+    Parameters
+    ----------
+    attached : link, and the point in its frame [m]
+    offsets : (T, 3) [m]
+    """
+    link, point = attached
+    planner = BracePlanner(model.robot, model.arrays, [link] * 4)
+    positions, velocities = planner.motion(point + np.vstack([np.zeros(3), np.eye(3)]), q, v)
+    axes = positions[:, 1:] - positions[:, :1]  # (T, 3, 3), a row for each axis of the body
+    shifts = np.einsum("tij,tj->ti", axes, offsets)
+    return point + shifts, velocities[:, 0] + np.einsum("ti,tij->tj", shifts, velocities[:, 1:] - velocities[:, :1])
+
+
+def _check_gaps(name: str, contact: Contact, times: Array, gaps: Array) -> None:
+    """Refuse a brace that the references take off its surface: nothing would carry what is planned for it."""
+    k = int(np.abs(gaps).argmax())
+    if abs(gaps[k]) > GAP_MAX:
+        raise ModelError(
+            f"controller.brace: the references take {name} {gaps[k]:+.4g} m off surface {contact.surface_name!r} at "
+            f"t = {times[k]:.3f} s (limit {GAP_MAX:g} m); let controller.hand.braces keep it there, or take "
+            "initial.on_surface",
+            keys=("controller", "brace"),
+        )

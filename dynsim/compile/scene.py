@@ -1,0 +1,231 @@
+"""From robots to scenes: what a record keeps of bodies, joints, surfaces and points, to be drawn and placed later."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dynsim.model.description import Array, Contact, Link, Robot
+from dynsim.model.mobile_base import SUPPORTS, MobileBase
+from dynsim.model.surfaces import Box, HeightField, Quadric
+from dynsim.model.surfaces import Surface as TouchedSurface
+from dynsim.record.quaternion import of_turn
+from dynsim.record.scene import (
+    HERE,
+    WORLD,
+    Body,
+    Joint,
+    JointKind,
+    Point,
+    Quaternion,
+    Scene,
+    Shape,
+    Surface,
+    quaternion,
+    vector3,
+)
+
+if TYPE_CHECKING:
+    from dynsim.snake.description import SnakeDescription
+
+# Of a height field: as many lines each way as a picture can show.
+GRID_LINES = 61
+# Of a wheel, in parts of its radius; a snake's description has no width.
+WHEEL_WIDTH = 0.48
+BASE_WHEEL_WIDTH = 0.5
+# Thickness of the snake's body, likewise.
+BODY_RADIUS = 0.5
+_ALONG_X: Quaternion = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)
+_ALONG_Y: Quaternion = (math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0)
+
+
+def robot_scene(robot: Robot, contacts: Sequence[Contact], surfaces: Mapping[str, TouchedSurface]) -> Scene | None:
+    """The scene of a tree of bodies whose joint positions are the signal ``q``; None where one has no kind for it."""
+    index = {link.name: k for k, link in enumerate(robot.links)}
+    bodies = []
+    for link in robot.links:
+        kind = link.row.drawn
+        if kind is None:
+            return None
+        parent = WORLD if link.parent is None else index[link.parent]
+        bodies.append(Body(link.name, parent, _joint(link, kind), link.shapes or _rod(link)))
+    hand_body, hand_point = robot.hand
+    points = [Point("hand", "hand", index[hand_body], vector3(hand_point))]
+    supports: tuple[Point, ...] = ()
+    if robot.base is not None:
+        bodies.extend(_wheels(robot.base, index[robot.base.body]))
+        supports = _supports(robot.base, index[robot.base.body])
+    for contact in contacts:
+        body, point = robot.attach(contact.body, contact.point)
+        points.append(Point(contact.name, "contact", body, vector3(point), contact.surface_name))
+    return Scene(
+        tuple(bodies),
+        tuple(_drawn(name, one) for name, one in surfaces.items()),
+        tuple(points),
+        robot.fixed_shapes,
+        supports,
+    )
+
+
+def _drawn(name: str, surface: TouchedSurface) -> Surface:
+    """A surface as a scene keeps it."""
+    nothing = np.zeros((3, 3))
+    if isinstance(surface, Box):
+        return replace(
+            Surface.of_quadric(name, nothing, np.zeros(3), 0.0),
+            kind="box",
+            position=vector3(surface.centre),
+            orientation=quaternion(surface.axes.T),
+            edges=vector3(surface.edges),
+            radius=float(surface.edge_radius),
+        )
+    if isinstance(surface, HeightField):
+        heights, (dx, dy) = surface.heights, surface.spacing.tolist()
+        heights, dx = _thinned(heights.T, dx)
+        heights, dy = _thinned(heights.T, dy)
+        return replace(
+            Surface.of_quadric(name, nothing, np.zeros(3), 0.0),
+            kind="height_field",
+            position=vector3([*surface.origin, 0.0]),
+            spacing=(dx, dy),
+            heights=tuple(tuple(row) for row in heights.tolist()),
+        )
+    assert isinstance(surface, Quadric)
+    return Surface.of_quadric(name, surface.Q, surface.b, surface.c)
+
+
+def _thinned(rows: Array, spacing: float) -> tuple[Array, float]:
+    """Rows at equal distances from the first to the last, no more than are drawn, and their distance [m]."""
+    count = len(rows)
+    if count <= GRID_LINES:
+        return rows, spacing
+    at = np.linspace(0.0, count - 1.0, GRID_LINES)
+    below = np.minimum(at.astype(int), count - 2)
+    share = (at - below)[:, None]
+    return (1.0 - share) * rows[below] + share * rows[below + 1], spacing * (count - 1) / (GRID_LINES - 1)
+
+
+def _wheels(base: MobileBase, body: int) -> list[Body]:
+    """Wheels as bodies of their own, which turn on the base."""
+    r, wheels = base.wheel_radius, []
+    for name, side in zip(base.wheels, (0.5, -0.5), strict=True):
+        place = (0.0, side * base.track, r)
+        joint = Joint(f"{name}.axle", "revolute", (0.0, 1.0, 0.0), place, HERE, "q", (name,))
+        wheels.append(
+            Body(f"{name}.wheel", body, joint, (Shape("cylinder", (r, BASE_WHEEL_WIDTH * r), orientation=_ALONG_Y),))
+        )
+    return wheels
+
+
+def _supports(base: MobileBase, body: int) -> tuple[Point, ...]:
+    """Where wheels and caster touch the ground, with the names of their loads."""
+    left, right = (vector3((0.0, side * base.track, 0.0)) for side in (0.5, -0.5))
+    places = zip(SUPPORTS, (left, right, vector3(base.caster)), strict=True)
+    return tuple(Point(name, "support", body, place) for name, place in places)
+
+
+def _joint(link: Link, kind: JointKind) -> Joint:
+    if link.kind == "left_wheel":  # its angles are not where it is
+        place, columns = (0.0, 0.0, 0.0), ("x", "y", "heading")
+        return Joint(
+            link.joint, kind, (0.0, 0.0, 1.0), place, HERE, "base_pose", columns, part_of=link.joint_of_rows or ""
+        )
+    return Joint(
+        name=link.joint,
+        kind=kind,
+        axis=vector3(link.axis),
+        position=vector3(link.p_PJ),
+        orientation=quaternion(link.R_PJ),
+        signal="q",
+        labels=link.coordinates,
+        lower=_limit(link.lower),
+        upper=_limit(link.upper),
+        part_of=link.joint_of_rows or "",
+    )
+
+
+def _limit(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _rod(link: Link) -> tuple[Shape, ...]:
+    """The cylinder about the body's axis; nothing where its radius or its end is not known."""
+    if link.tip is None or not link.radius > 0.0:
+        return ()
+    length = float(np.linalg.norm(link.tip))
+    if not length > 0.0:
+        return ()
+    turn = _from_z(link.tip / length)
+    return (Shape("cylinder", (link.radius, length), vector3(0.5 * link.tip), turn),)
+
+
+def _from_z(direction: Array) -> Quaternion:
+    """A turn that takes z to a unit vector."""
+    axis = np.cross([0.0, 0.0, 1.0], direction)
+    size = float(np.linalg.norm(axis))
+    if size == 0.0:
+        return HERE if direction[2] > 0.0 else (0.0, 1.0, 0.0, 0.0)
+    w, x, y, z = of_turn(axis / size, math.atan2(size, float(direction[2]))).tolist()
+    return w, x, y, z
+
+
+def snake_scene(description: SnakeDescription) -> Scene:
+    """The scene of an articulated mobile robot on the ground z = 0.
+
+    Its base part starts at wheel pair 1, which is placed by the signal ``base_pose``; joints are those of ``phi``, a
+    joint of the head part turns its head side by −phi. Active wheels turn by ``rho``. That a pair is lifted the model
+    has no height for ([T] II.A).
+    """
+    d, l, n_h = description, description.link_length, description.head_joints
+    base = Joint("base", "planar", (0.0, 0.0, 1.0), (0.0, 0.0, d.wheel_radius), HERE, "base_pose", ("x", "y", "yaw"))
+    bodies = [Body("pair1", WORLD, base, _passive_wheels(d, 0, 0.0))]
+    wheels = [_active_wheel(d, 0, 0, 0.0)]
+    for j in reversed(range(n_h)):
+        forward = 0.0 if j == n_h - 1 else l
+        axis = (0.0, -1.0, 0.0) if d.pitch[j] else (0.0, 0.0, -1.0)
+        joint = _snake_joint(d, j, axis, forward)
+        bodies.append(Body(f"head_{d.joint_names[j]}", len(bodies) - 1, joint, (_tube(d, 0.0, l),)))
+    head = len(bodies) - 1
+    for pair in range(1, d.pairs):
+        joint = _snake_joint(d, n_h + pair - 1, (0.0, 0.0, 1.0), -l if pair == 1 else -2.0 * l)
+        parent = 0 if pair == 1 else len(bodies) - 1
+        tube = _tube(d, -2.0 * l if pair < d.pairs - 1 else -l, 0.0)
+        bodies.append(Body(f"pair{pair + 1}", parent, joint, (tube, *_passive_wheels(d, pair, -l))))
+        wheels.append(_active_wheel(d, pair, len(bodies) - 1, -l))
+    if d.pairs > 1:
+        bodies[0] = Body("pair1", WORLD, base, (_tube(d, -l, 0.0), *bodies[0].shapes))
+    ground = Surface.of_quadric("ground", np.zeros((3, 3)), [0.0, 0.0, 1.0], 0.0)
+    hand = Point("controlled point", "hand", head, (l + d.point_offset, 0.0, 0.0))
+    return Scene((*bodies, *(wheel for wheel in wheels if wheel is not None)), (ground,), (hand,))
+
+
+def _snake_joint(d: SnakeDescription, j: int, axis: tuple[float, float, float], x: float) -> Joint:
+    name = d.joint_names[j]
+    lower, upper = float(d.lower[j]), float(d.upper[j])
+    return Joint(name, "revolute", axis, (x, 0.0, 0.0), HERE, "phi", (name,), lower, upper)
+
+
+def _tube(d: SnakeDescription, start: float, end: float) -> Shape:
+    return Shape("cylinder", (BODY_RADIUS * d.wheel_radius, end - start), (0.5 * (start + end), 0.0, 0.0), _ALONG_X)
+
+
+def _passive_wheels(d: SnakeDescription, pair: int, x: float) -> tuple[Shape, ...]:
+    """Wheels that follow the ground: their angle is not recorded."""
+    sides = [side for side in (1, -1) if side != d.driven_side[pair]]
+    size = (d.wheel_radius, WHEEL_WIDTH * d.wheel_radius)
+    return tuple(Shape("cylinder", size, (x, side * float(d.half_track[pair]), 0.0), _ALONG_Y) for side in sides)
+
+
+def _active_wheel(d: SnakeDescription, pair: int, parent: int, x: float) -> Body | None:
+    side = int(d.driven_side[pair])
+    if not side:
+        return None
+    name = d.wheel_names[int(np.count_nonzero(d.driven_side[:pair]))]
+    place = (x, side * float(d.half_track[pair]), 0.0)
+    joint = Joint(name, "revolute", (0.0, 1.0, 0.0), place, HERE, "rho", (name,))
+    shape = Shape("cylinder", (d.wheel_radius, WHEEL_WIDTH * d.wheel_radius), orientation=_ALONG_Y)
+    return Body(f"wheel_{name}", parent, joint, (shape,))

@@ -1,0 +1,396 @@
+"""Compile descriptions to the arrays of the kernels, checking all that no physics can be made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.tree import loads as kl
+from dynsim.dynamics.tree import support as ks
+from dynsim.dynamics.tree.loads import LoadArrays
+from dynsim.errors import ModelError, shown
+from dynsim.jit.kernel import integers, reals
+from dynsim.model.description import Contact, Coupling, Link, Load, Quadric, Robot
+from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
+from dynsim.model.servo import servo_row
+
+# Beyond it the reduction of an angle to a quarter turn leaves too few digits (dynsim.dynamics.tree.sweep.sine_cosine).
+ANGLE_LIMIT = 1e6
+# Further than this from its leader [rad or m] the initial position of a joint is another one, and no rounding of it.
+COUPLING_TOLERANCE = 1e-6
+
+_FRICTION = {"signed": ka.FRICTION_SIGNED, "dissipative": ka.FRICTION_DISSIPATIVE}
+
+
+def compile_model(robot: Robot) -> ka.ModelArrays:
+    """Tables of the tree of bodies.
+
+    Raises
+    ------
+    ModelError
+        Duplicate names, a parent that does not come first, an impossible inertia, a joint that nothing can accelerate,
+        a hand on a body that there is not, an impossible coupling or an initial configuration that breaks one, or
+        vectors of another shape or with what is no finite number.
+    """
+    links = robot.links
+    if not links:
+        raise ModelError(f"{robot.name}: a robot needs at least one link")
+    _check_couplings(robot)
+    _check_shapes(robot)
+    initial, position, unturned = robot.initial, robot.position_index, np.eye(3)
+    index: dict[str, int] = {}
+    joints: dict[str, int] = {}
+    tree = np.zeros((len(links), ka.TREE_SIZE), dtype=np.int64)
+    body = np.zeros((len(links), ka.BODY_SIZE))
+    compound = np.zeros((len(links), ka.COMPOUND_SIZE), dtype=np.int64)
+    for i, link in enumerate(links):
+        if link.kind == "revolute" and abs(initial[position[i]]) > ANGLE_LIMIT:
+            raise ModelError(
+                f"{link.joint}: an initial angle of {initial[position[i]]:.3g} rad; more than {ANGLE_LIMIT:g} rad "
+                "cannot be told from other angles, take it modulo a turn"
+            )
+        if link.kind == "ball_x":
+            length = float(np.linalg.norm(initial[position[i] : position[i] + 4]))
+            if not abs(length - 1.0) < 1e-9:
+                raise ModelError(f"{link.joint_of_rows}: the initial quaternion has length {length:.6g}; it must be 1")
+        if link.name in index or link.joint in joints:
+            raise ModelError(f"{link.name}: the name of a body or joint occurs twice")
+        if link.parent is not None and link.parent not in index:
+            raise ModelError(f"{link.name}: its parent {link.parent!r} must be a body that comes before it")
+        link.inertia.check(link.name)
+        if not link.damping >= 0.0:
+            raise ModelError(f"{link.joint}: damping {link.damping}; a loss must be zero or positive")
+        norm = float(np.linalg.norm(link.axis))
+        if not abs(norm - 1.0) < 1e-9:
+            raise ModelError(f"{link.joint}: the axis {link.axis} has length {norm:.6g}; it must be a unit vector")
+        R_PJ = np.asarray(link.R_PJ)
+        turned = not np.array_equal(R_PJ, unturned)
+        if turned and (np.abs(R_PJ @ R_PJ.T - unturned).max() > 1e-9 or np.linalg.det(R_PJ) < 0.0):
+            raise ModelError(f"{link.joint}: R_PJ is not a rotation")
+        parent = -1 if link.parent is None else index[link.parent]
+        index[link.name], joints[link.joint] = i, i
+        tree[i, ka.PARENT] = parent
+        tree[i, ka.KIND] = _joint_kind(link)
+        compound[i, ka.POSITION_INDEX] = position[i]
+        # Later rows of a joint are mounted where its first one is.
+        compound[i, ka.BASE] = parent if link.row.neutral else compound[parent, ka.BASE]
+        tree[i, ka.TURNED] = int(turned)
+        if parent >= 0 and parent != i - 1:
+            tree[parent, ka.BRANCHES] += 1
+        tensor = np.asarray(link.inertia.tensor)
+        body[i, ka.R_PJ : ka.R_PJ + 9] = R_PJ.ravel()
+        body[i, ka.P_PJ : ka.P_PJ + 3] = link.p_PJ
+        body[i, ka.AXIS : ka.AXIS + 3] = link.axis
+        body[i, ka.MASS] = link.inertia.mass
+        body[i, ka.COM : ka.COM + 3] = link.inertia.com
+        body[i, ka.INERTIA : ka.INERTIA + 6] = tensor[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+        body[i, ka.DAMPING] = link.damping
+        body[i, ka.PARAMETER] = link.parameter
+        body[i, ka.ARMATURE] = link.armature
+    names = set(index)
+    for frame in robot.frames:
+        if frame.name in names:
+            raise ModelError(f"{frame.name}: the name of a body or frame occurs twice")
+        if frame.body is not None and frame.body not in index:
+            raise ModelError(f"frame {frame.name}: no body {frame.body!r}")
+        names.add(frame.name)
+    by_joint = {link.joint: link for link in links}
+    for motor in robot.motors:
+        _check_motor(motor, by_joint)
+        i = joints[motor.joint]
+        if len(links[i].row.neutral) != 1 and not links[i].row.own_position:
+            raise ModelError(f"motor: {motor.joint} is one of several rates of a joint and has no position to control")
+        if not isinstance(motor, TorqueSource):
+            body[i, ka.ARMATURE] += motor.armature
+            body[i, ka.GEAR_DAMPING] += motor.reflected_damping
+    _check_movable(robot, tree, body)
+    check_couplings(robot, robot.initial)
+    return ka.ModelArrays(
+        tree=integers(tree),
+        body=reals(body),
+        gravity=reals(robot.gravity),
+        compound=integers(compound) if (tree[:, ka.KIND] > ka.PRISMATIC).any() else None,
+    )
+
+
+def compile_drives(
+    robot: Robot, *, k_p: Sequence[float], k_d: Sequence[float], sampled: bool = False
+) -> ka.DriveArrays:
+    """Tables of the motors.
+
+    Parameters
+    ----------
+    k_p, k_d : gains of the voltage PD, one per motor [V/rad, V s/rad]; only DC motors take them
+    sampled : commands are held between ticks, see :func:`dynsim.dynamics.drive.law.take_commands`
+    """
+    joints = {link.joint: i for i, link in enumerate(robot.links)}
+    table = np.zeros((len(robot.motors), ka.DRIVE_SIZE), dtype=np.int64)
+    motor = np.zeros((len(robot.motors), ka.MOTOR_SIZE))
+    given = np.zeros((len(robot.motors), ka.INPUT_SIZE))
+    circuits = 0
+    for a, m in enumerate(robot.motors):
+        table[a, ka.DRIVEN], table[a, ka.CIRCUIT], table[a, ka.SAMPLED] = (
+            joints[m.joint],
+            -1,
+            ka.AT_TICKS if sampled else ka.CONTINUOUS,
+        )
+        if isinstance(m, Motor):
+            table[a, ka.DRIVE_KIND], table[a, ka.CIRCUIT] = ka.DC_MOTOR, circuits
+            table[a, ka.CURRENT_LIMITED] = np.isfinite(m.current_limit)
+            circuits += 1
+            motor[a] = _dc_motor(m, k_p[a], k_d[a])
+        elif isinstance(m, Servo):
+            table[a, ka.DRIVE_KIND] = ka.POSITION_SERVO
+            table[a, ka.SERVO_MODE] = ka.VELOCITY_MODE if m.velocity_mode else ka.POSITION_MODE
+            motor[a] = servo_row(m)
+        else:
+            table[a, ka.DRIVE_KIND] = ka.OPEN_TORQUE
+            motor[a, ka.K_M], motor[a, ka.I_MAX], motor[a, ka.U_MAX] = 1.0, m.torque_limit, np.inf
+    return ka.DriveArrays(table=integers(table), motor=reals(motor), input=reals(given))
+
+
+def _dc_motor(m: Motor, k_p: float, k_d: float) -> np.ndarray:
+    row = np.zeros(ka.MOTOR_SIZE)
+    row[ka.K_M] = m.joint_constant
+    row[ka.RESISTANCE], row[ka.INDUCTANCE] = m.resistance, m.inductance
+    row[ka.J_M], row[ka.D_M] = m.armature, m.reflected_damping
+    row[ka.K_P], row[ka.K_D] = k_p, k_d
+    row[ka.U_MAX], row[ka.I_MAX] = m.voltage_limit, m.current_limit
+    return row
+
+
+def compile_contacts(robot: Robot, contacts: Sequence[Contact]) -> ka.ContactArrays:
+    """Tables of the contact points.
+
+    Raises
+    ------
+    ModelError
+        Unknown body, negative friction or smoothing speed.
+    """
+    link = np.zeros((len(contacts), ka.CONTACT_LINK_SIZE), dtype=np.int64)
+    point = np.zeros((len(contacts), ka.POINT_SIZE))
+    for k, contact in enumerate(contacts):
+        try:
+            body, on_body = robot.attach(contact.body, contact.point)
+        except ModelError as error:
+            raise ModelError(f"contact {contact.name}: {error}") from None
+        if not contact.friction >= 0.0:
+            raise ModelError(f"contact {contact.name}: friction {contact.friction} must be zero or positive")
+        if not contact.slip_smoothing > 0.0:
+            raise ModelError(f"contact {contact.name}: slip smoothing {contact.slip_smoothing} m/s must be positive")
+        surface = contact.surface
+        link[k, ka.LINK], link[k, ka.FRICTION_LAW] = body, _FRICTION[contact.pulling_friction]
+        point[k, ka.POINT : ka.POINT + 3] = on_body
+        point[k, ka.MU], point[k, ka.V_S] = contact.friction, contact.slip_smoothing
+        if not isinstance(surface, Quadric):  # any plane will do: its rows are overwritten
+            point[k, ka.QUADRIC + 8] = 1.0
+            continue
+        curved = bool(surface.Q.any())
+        scale = 1.0 if curved else 1.0 / float(np.linalg.norm(surface.b))
+        link[k, ka.CURVED] = curved
+        point[k, ka.QUADRIC : ka.QUADRIC + 6] = surface.Q[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+        point[k, ka.QUADRIC + 6 : ka.QUADRIC + 9] = scale * surface.b
+        point[k, ka.QUADRIC + 9] = scale * surface.c
+    return ka.ContactArrays(link=integers(link), point=reals(point))
+
+
+def compile_loads(robot: Robot, loads: Sequence[Load]) -> LoadArrays:
+    """Tables of the external wrenches.
+
+    Raises
+    ------
+    ModelError
+        A body that the robot does not have.
+    """
+    table = np.zeros((len(loads), kl.TABLE_SIZE), dtype=np.int64)
+    parts: list[np.ndarray] = []
+    place = 0
+    for k, load in enumerate(loads):
+        try:
+            body, on_body = robot.attach(load.body, load.point)
+        except ModelError as error:
+            raise ModelError(f"load {load.name}: {error}") from None
+        segments = np.column_stack([load.knots[:-1], load.coefficients.reshape(len(load.coefficients), 24)])
+        table[k] = body, load.in_body, load.hold, place, len(segments)
+        parts += [on_body, np.zeros(6), segments.ravel(), load.knots[-1:]]
+        place += kl.FIRST_SEGMENT + segments.size + 1
+    return LoadArrays(table=integers(table), data=reals(np.concatenate(parts) if parts else np.zeros(0)))
+
+
+def compile_couplings(robot: Robot) -> ka.CouplingArrays:
+    """Tables of the couplings of a robot that :func:`compile_model` has accepted."""
+    joints = {link.joint: i for i, link in enumerate(robot.links)}
+    joint = np.zeros((len(robot.couplings), ka.COUPLING_JOINT_SIZE), dtype=np.int64)
+    law = np.zeros((len(robot.couplings), ka.COUPLING_SIZE))
+    for k, coupling in enumerate(robot.couplings):
+        joint[k, ka.FOLLOWER], joint[k, ka.LEADER] = joints[coupling.joint], joints[coupling.leader]
+        law[k, ka.RATIO], law[k, ka.OFFSET] = coupling.ratio, coupling.offset
+    return ka.CouplingArrays(joint=integers(joint), law=reals(law))
+
+
+def compile_support(robot: Robot) -> ks.SupportArrays | None:
+    """Tables of the mobile base; None for a robot without one.
+
+    Raises
+    ------
+    ModelError
+        Its body or wheels are none of the robot's, or it has no triangle to stand on.
+    """
+    base = robot.base
+    if base is None:
+        return None
+    sizes = ks.BASE_SIZE, ks.STATE_SIZE, ks.LEAST_SIZE
+    arrays = ks.SupportArrays(integers(np.zeros(ks.INDEX_SIZE)), *(reals(np.full(size, np.inf)) for size in sizes))
+    bodies, joints = [link.name for link in robot.links], robot.joint_names
+    if base.body not in bodies or not set(base.wheels) <= set(joints):
+        raise ModelError(
+            f"{robot.name}: the mobile base is {base.body!r} on {', '.join(base.wheels)}, not of the robot"
+        )
+    if not (base.wheel_radius > 0.0 and base.track > 0.0 and base.wheel_friction > 0.0):
+        raise ModelError(f"{robot.name}: wheel radius, track and friction of the wheels must be positive")
+    x, y = (float(part) for part in base.caster[:2])
+    if x == 0.0:
+        raise ModelError(f"{robot.name}: the caster is below the axle, so that the base has no triangle to stand on")
+    arrays.index[[ks.BODY, ks.LEFT, ks.RIGHT]] = bodies.index(base.body), *map(joints.index, base.wheels)
+    arrays.base[[ks.TRACK, ks.CASTER_X, ks.CASTER_Y]] = base.track, x, y
+    arrays.base[[ks.SPIN_INERTIA, ks.FRICTION]] = base.spin_inertia, base.wheel_friction
+    half = 0.5 * base.track
+    sides = np.array([np.hypot(x, y + half), np.hypot(x, y - half), base.track])
+    arrays.base[ks.SHARE : ks.SHARE + 3] = sides.sum() / sides
+    return arrays
+
+
+def _check_couplings(robot: Robot) -> None:
+    """Refuse couplings of unknown joints, two of one joint, circles, and numbers that are none."""
+    joints = {link.joint: link for link in robot.links}
+    leads: dict[str, Coupling] = {}
+    for coupling in robot.couplings:
+        name = f"coupling of {coupling.joint}"
+        for joint in (coupling.joint, coupling.leader):
+            if joint not in joints:
+                raise ModelError(f"{name}: no joint {joint!r}; joints: {', '.join(joints)}")
+            if joints[joint].kind not in ("revolute", "prismatic"):
+                raise ModelError(
+                    f"{name}: {joint} is {joints[joint].kind}; only revolute and prismatic joints are coupled"
+                )
+        if coupling.joint in leads:
+            raise ModelError(
+                f"{name}: the joint follows {leads[coupling.joint].leader!r} already; it can follow only one"
+            )
+        for quantity in ("ratio", "offset"):
+            value = getattr(coupling, quantity)
+            if not (isinstance(value, (int, float, np.floating)) and np.isfinite(value)):
+                raise ModelError(f"{name}: {quantity} {shown(value)} must be a finite number")
+        leads[coupling.joint] = coupling
+    for start in leads:
+        circle, joint = [start], leads[start].leader
+        while joint in leads and joint not in circle:
+            circle.append(joint)
+            joint = leads[joint].leader
+        if joint in circle:
+            raise ModelError(
+                f"coupling of {start}: joints follow each other in a circle: {' → '.join([*circle, joint])}"
+            )
+
+
+def check_couplings(robot: Robot, initial: np.ndarray) -> None:
+    """Raise :class:`ModelError` for coordinates at the start, (nq,), that break a coupling."""
+    position = dict(zip(robot.joint_names, robot.position_index, strict=True))
+    for coupling in robot.couplings:
+        q, leader = (initial[position[joint]] for joint in (coupling.joint, coupling.leader))
+        wanted = coupling.ratio * leader + coupling.offset
+        if not abs(q - wanted) <= COUPLING_TOLERANCE:
+            raise ModelError(
+                f"coupling of {coupling.joint}: it starts at {q:.6g}, but {coupling.leader} at {leader:.6g} leads it "
+                f"to {coupling.ratio:g} · {leader:.6g} + {coupling.offset:g} = {wanted:.6g}; leave its position away"
+            )
+
+
+def _check_shapes(robot: Robot) -> None:
+    """Refuse what numpy would spread over the tables, or the kernels carry on as NaN."""
+    names = [link.name for link in robot.links]
+    body, point = robot.hand
+    if body not in names:
+        raise ModelError(f"{robot.name}: the hand is on {body!r}, which is no body; bodies: {', '.join(names)}")
+    quantities: list[tuple[str, object, tuple[int, ...]]] = [
+        (f"{robot.name}: gravity", robot.gravity, (3,)),
+        (f"{robot.name}: the hand's point", point, (3,)),
+        (f"{robot.name}: q0", robot.initial, (robot.nq,)),
+    ]
+    for link in robot.links:
+        inertia = link.inertia
+        quantities += [
+            (f"{link.joint}: axis", link.axis, (3,)),
+            (f"{link.joint}: R_PJ", link.R_PJ, (3, 3)),
+            (f"{link.joint}: p_PJ", link.p_PJ, (3,)),
+            (f"{link.name}: mass", inertia.mass, ()),
+            (f"{link.name}: centre of mass", inertia.com, (3,)),
+            (f"{link.name}: inertia tensor", inertia.tensor, (3, 3)),
+        ]
+    for what, value, shape in quantities:
+        try:
+            array = np.asarray(value)
+        except ValueError:  # rows of unequal length
+            array = np.array(None)
+        if array.dtype.kind not in "fiu" or array.shape != shape or not np.isfinite(array).all():
+            wanted = f"an array of shape {shape} of finite numbers" if shape else "a finite number"
+            raise ModelError(f"{what} is {shown(value)}; it must be {wanted}")
+
+
+def _joint_kind(link: Link) -> int:
+    if link.kind == "revolute":
+        for kind, axis in ((ka.REVOLUTE_X, (1, 0, 0)), (ka.REVOLUTE_Y, (0, 1, 0)), (ka.REVOLUTE_Z, (0, 0, 1))):
+            if np.array_equal(link.axis, axis):
+                return kind
+    return link.row.code
+
+
+# What must be positive, and what zero or positive, of each kind of motor.
+_POSITIVE: dict[type, dict[str, str]] = {
+    Motor: {"torque_constant": "N m/A", "resistance": "ohm", "gear_ratio": "1"},
+    Servo: {"torque_constant": "N m/A", "resistance": "ohm", "coulomb_speed": "rad/s", "current_limit": "A"},
+    TorqueSource: {},
+}
+_NOT_NEGATIVE: dict[type, tuple[str, ...]] = {
+    Motor: ("rotor_inertia", "gear_damping"),
+    Servo: ("k_p", "k_d", "k_v", "armature", "reflected_damping", "coulomb_friction", "free_drag"),
+    TorqueSource: (),
+}
+
+
+def _check_motor(motor: Drive, joints: dict[str, Link]) -> None:
+    if motor.joint not in joints:
+        raise ModelError(f"motor: no joint {motor.joint!r}; joints: {', '.join(joints)}")
+    for quantity, unit in _POSITIVE[type(motor)].items():
+        if not getattr(motor, quantity) > 0.0:
+            raise ModelError(f"motor of {motor.joint}: {quantity} {getattr(motor, quantity)} {unit} must be positive")
+    if isinstance(motor, Motor) and not motor.inductance > 0.0:
+        raise ModelError(
+            f"motor of {motor.joint}: inductance {motor.inductance} H must be positive; "
+            "for a circuit without inductance take a small one (1e-6 H) and integrator.method: auto or radau5"
+        )
+    for quantity in _NOT_NEGATIVE[type(motor)]:
+        if not getattr(motor, quantity) >= 0.0:
+            raise ModelError(f"motor of {motor.joint}: {quantity} {getattr(motor, quantity)} must be zero or positive")
+    if not isinstance(motor, TorqueSource) and not motor.voltage_limit > 0.0:
+        raise ModelError(f"motor of {motor.joint}: voltage limit {motor.voltage_limit} V must be positive")
+    if isinstance(motor, Motor) and not motor.current_limit > 0.0:
+        raise ModelError(f"motor of {motor.joint}: current limit {motor.current_limit} A must be positive")
+    if not isinstance(motor, Motor) and not motor.torque_limit > 0.0:
+        raise ModelError(f"motor of {motor.joint}: torque limit {motor.torque_limit} N m must be positive")
+    if isinstance(motor, Servo) and joints[motor.joint].units[0] != "rad":
+        raise ModelError(f"motor of {motor.joint}: a servo turns, the joint is {joints[motor.joint].kind}")
+
+
+def _check_movable(robot: Robot, tree: np.ndarray, body: np.ndarray) -> None:
+    """A joint with nothing heavy beyond it and no motor inertia has no equation of motion."""
+    carried = np.abs(body[:, ka.MASS]) + np.abs(body[:, ka.INERTIA : ka.INERTIA + 6]).sum(axis=1)
+    for i in range(len(tree) - 1, -1, -1):
+        if carried[i] + body[i, ka.ARMATURE] <= 0.0:
+            raise ModelError(
+                f"{robot.links[i].joint}: moves no mass and has no motor inertia, so it cannot be simulated"
+            )
+        if tree[i, ka.PARENT] >= 0:
+            carried[tree[i, ka.PARENT]] += carried[i]

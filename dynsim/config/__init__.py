@@ -1,0 +1,1 @@
+"""Base of configurations, and their problems in words."""

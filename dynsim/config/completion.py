@@ -1,0 +1,36 @@
+"""What the shell offers for a scenario and its variant; loads nothing heavy, since it runs at every tab."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import typer
+
+from dynsim.errors import ScenarioError
+from dynsim.system.shipped import shipped_scenario, shipped_scenarios
+
+
+def scenarios(incomplete: str) -> list[str]:
+    """Names of shipped scenarios, and YAML files of the folder that was begun."""
+    from glob import escape
+
+    folder, separator, _ = incomplete.rpartition("/")
+    files = sorted(Path(folder + separator).glob(f"{escape(incomplete.removeprefix(folder + separator))}*.yaml"))
+    names = [path.stem for path in shipped_scenarios()]
+    return [name for name in names if name.startswith(incomplete)] + [str(path) for path in files]
+
+
+def variants(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Variants of the scenario on the command line."""
+    # Imported here: the command line loads this module.
+    from dynsim.system.inputs import YamlMapping, is_file, parse_yaml, read_text
+
+    # While the option lacks its value, what stands before it is not parsed yet.
+    path = Path(ctx.params.get("scenario") or next(iter(ctx.args), ""))
+    try:
+        path = path if is_file(path, ScenarioError) else shipped_scenario(path) or path
+        data = parse_yaml(read_text(path, ScenarioError), ScenarioError, str(path))
+    except ScenarioError:
+        return []
+    names = data.get("variants") if isinstance(data, YamlMapping) else None
+    return [name for name in names if name.startswith(incomplete)] if isinstance(names, YamlMapping) else []

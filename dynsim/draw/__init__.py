@@ -1,0 +1,1 @@
+"""Pictures of records: figures, films and pages."""

@@ -1,0 +1,88 @@
+"""Figures of a record, or of several side by side: files in a folder, drawn from the records and nothing else.
+
+Matplotlib is loaded on the first drawing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+
+from dynsim.errors import DynsimError, RecordError
+from dynsim.record import Record
+
+MEASURED, SIMULATED = "dynsim.draw.figures.measured", "dynsim.draw.figures.arm"
+# Module with ``draw`` and ``draw_comparison`` → sets of signals, any of which tells its records; the first module that
+# finds one draws.
+MODULES: dict[str, tuple[set[str], ...]] = {
+    "dynsim.draw.figures.snake": ({"posture"}, {"base_pose", "mode"}, {"w", "w_target"}),
+    MEASURED: ({"q_goal"}, {"record_time"}, {"torque_estimate"}),
+    SIMULATED: ({"hand_position"}, {"current"}, {"energy_residual"}),
+}
+
+
+def draw(record: Record, folder: Path, kind: str = "png", part: tuple[int, int] = (0, 1)) -> list[Path]:
+    """Draw every figure that the record has data for, as files of a kind: "png", "pdf" or "svg".
+
+    ``part`` (first, many): only every ``many``-th figure from ``first`` on, for whoever shares the work.
+
+    Returns
+    -------
+    list of Path
+        The files written; empty for a record without samples.
+
+    Raises
+    ------
+    RecordError
+        Nobody draws records of such signals, the record lacks what the figures need, or a file cannot be written.
+    """
+    if not len(record):
+        return []
+    with _drawable():
+        return list(_module(record).draw(record, Path(folder), kind, part))
+
+
+def draw_comparison(
+    records: Mapping[str, Record], folder: Path, kind: str = "png", part: tuple[int, int] = (0, 1)
+) -> list[Path]:
+    """Draw variants over each other, in the order of ``records``; those without samples are left out.
+
+    Raises
+    ------
+    RecordError
+        See :func:`draw`; or the records are of different kinds.
+    """
+    drawn = {name: record for name, record in records.items() if len(record)}
+    modules = {_module(record) for record in drawn.values()}
+    if not modules:
+        return []
+    arms = {MEASURED, SIMULATED} & {module.__name__ for module in modules}
+    if len(arms) == len(modules) > 1:
+        # Measured beside simulated: what both have is drawn.
+        modules = {importlib.import_module(SIMULATED)}
+    if len(modules) > 1:
+        raise RecordError("records of different kinds cannot be drawn over each other")
+    with _drawable():
+        return list(modules.pop().draw_comparison(drawn, Path(folder), kind, part))
+
+
+@contextmanager
+def _drawable() -> Iterator[None]:
+    """A record may come from anywhere: what it lacks is its fault, and said in a line."""
+    try:
+        yield
+    except DynsimError:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        text = " ".join(str(error).split())
+        raise RecordError(f"the record cannot be drawn: {type(error).__name__}: {text}") from error
+
+
+def _module(record: Record) -> ModuleType:
+    for name, needed in MODULES.items():
+        if any(signals <= set(record) for signals in needed):
+            return importlib.import_module(name)
+    raise RecordError(f"no figures for a record of these signals: {', '.join(record) or 'none'}")

@@ -1,0 +1,45 @@
+"""All figures of an arm: one run, or variants over each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from dynsim.draw.figures import base, contacts, energy, hand, motors, posture, style, top_view
+from dynsim.record import Record
+
+# File name → figure, None where the record has no data for it.
+FIGURES: dict[str, Callable[[Record], Figure | None]] = {
+    "hand_path": hand.path,
+    "tracking_error": hand.error,
+    "energy": energy.energy,
+    "energy_ledger": energy.ledger,
+    "contact_forces": contacts.forces,
+    "motors": motors.motors,
+    "posture": posture.posture,
+    "base": top_view.top_view,
+    "overturning": base.overturning,
+    "base_tracking": base.tracking,
+}
+COMPARISONS: dict[str, Callable[[Mapping[str, Record]], Figure | None]] = {
+    "compare_hand_path": hand.path_comparison,
+    "compare_tracking_error": hand.error_comparison,
+    "compare_energy": energy.energy_comparison,
+    "compare_contact_forces": contacts.forces_comparison,
+    "compare_posture": posture.posture_comparison,
+    "compare_tip_margin": base.margin_comparison,
+}
+
+
+def draw(record: Record, folder: Path, kind: str = "png", part: style.Part = style.ALL) -> list[Path]:
+    """See :func:`dynsim.draw.figures.draw`."""
+    return style.save_all(FIGURES, record, folder, kind, part)
+
+
+def draw_comparison(
+    records: Mapping[str, Record], folder: Path, kind: str = "png", part: style.Part = style.ALL
+) -> list[Path]:
+    """See :func:`dynsim.draw.figures.draw_comparison`."""
+    return style.save_all(COMPARISONS, records, folder, kind, part)

@@ -1,0 +1,264 @@
+"""Normal forces of the contacts, with the region in which the surface would have to pull, or with what they do.
+
+Under the bilateral law a force may have either sign, and what lies below zero is shaded. Under the unilateral one
+there is a mode at each instant instead: bands show when a contact is open, slides and sticks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dynsim.draw.figures import events, style
+from dynsim.draw.figures.insets import inset_rows
+from dynsim.draw.figures.style import Array
+from dynsim.record import Record
+from dynsim.record.measures import percent
+
+# More rows than this do not fit a page; height of one [inch].
+ROWS, ROW = 8, 1.75
+# More samples than this are not drawn as dots.
+DOTS = 150
+# Modes by their number: what a contact does, the colour of its bands, and what of the summary says for how long.
+MODE = "contact_mode"
+MODES = (
+    ("open", "#EFEFEF", "closed_fraction"),
+    ("slides", "#FCE3B0", "sliding_fraction"),
+    ("sticks", "#BFE6D8", "sticking_fraction"),
+)
+
+
+def forces(record: Record) -> Figure | None:
+    """Normal force of each contact; None without contacts, or if none ever touched."""
+    names = touching_names([record])
+    if not names:
+        return None
+    chosen = _most_interesting(names, [record])
+    note = "" if len(chosen) == len(names) else f", {len(chosen)} of {len(names)} contacts ({_choice([record])})"
+    figure = style.new_figure(0.9 + ROW * len(chosen), style.title(record, f"normal contact forces{note}"))
+    real = is_real(record)
+    # An inset would lie on the bands of modes, with bands of its own.
+    arrange = style.time_rows if real else inset_rows
+    rows = arrange(figure, [_series(record, name) for name in chosen], style.settle_time(record))
+    for name, panels in zip(chosen, rows, strict=True):
+        force = _force(record, name)
+        # What the panel of the beginning shows would be a heap of marks in the other one.
+        begun = panels[0].get_xlim()[1] if len(panels) > 1 else -np.inf
+        for axes in panels:
+            style.line(axes, record.time, force, color=style.BLUE, label=force_label(record, name))
+            _draw_extremes(axes, record, name, style.BLUE)
+            if real:
+                _draw_modes(axes, record, name)
+                found = events.marked(record, [name])
+                events.mark(axes, [one for one in found if axes is panels[0] or one.time > begun])
+                continue
+            axes.fill_between(
+                *_thin_negative(record.time, force), 0.0, color=style.PULLING, alpha=0.3, linewidth=0, label="_pulling"
+            )
+            _mark_pulling(axes)
+        if len(panels) > 1:
+            _draw_samples(panels[0], record, name, style.BLUE)
+        panels[0 if real else -1].set_ylabel(f"{name}\nfₙ [N]")
+        style.legend_above(panels[-1], columns=4 if real else 3)
+    _note_sampling(rows, [record], insets=not real)
+    events.explain(rows[-1][-1], events.marked(record, chosen))
+    return figure
+
+
+def forces_comparison(records: Mapping[str, Record]) -> Figure | None:
+    """Normal force of each contact, all variants that have it over each other."""
+    names = touching_names(list(records.values()))
+    if not names:
+        return None
+    chosen = _most_interesting(names, list(records.values()))
+    having = {name: {v: r for v, r in records.items() if _touched(r, name)} for name in chosen}
+    title = style.comparison_title(list(records.values()), "normal contact forces")
+    # A legend has an entry for each variant and one for the shading.
+    more = sum(-(-(len(having[name]) + 1) // 2) - 1 for name in chosen) * style.LEGEND_ROW / 72.0
+    figure = style.new_figure(1.0 + ROW * len(chosen) + more, title)
+    series = [[one for r in having[name].values() for one in _series(r, name)] for name in chosen]
+    settle = max(style.settle_time(record) for record in records.values())
+    styles = style.told_apart(
+        style.variant_styles(list(records)),
+        *({v: (r.time, _force(r, name)) for v, r in having[name].items()} for name in chosen),
+    )
+    rows = inset_rows(figure, series, settle)
+    for name, panels in zip(chosen, rows, strict=True):
+        for axes in panels:
+            for variant, record in having[name].items():
+                label = f"{variant}: {_share(record, name)}{_within(record, name)}"
+                colour = str(styles[variant]["color"])
+                style.line(axes, record.time, _force(record, name), label=label, **styles[variant])
+                _draw_extremes(axes, record, name, colour)
+                events.mark(axes, events.marked(record, [name]), colour, row=list(having[name]).index(variant))
+            if not all(map(is_real, having[name].values())):
+                _mark_pulling(axes)
+        if len(panels) > 1:
+            for variant, record in having[name].items():
+                _draw_samples(panels[0], record, name, str(styles[variant]["color"]))
+        panels[-1].set_ylabel(f"{name}\nfₙ [N]")
+        style.legend_above(panels[-1], columns=2)
+    _note_sampling(rows, list(records.values()))
+    events.explain(rows[-1][-1], [event for record in records.values() for event in events.marked(record, chosen)])
+    return figure
+
+
+def contact_names(records: Sequence[Record]) -> list[str]:
+    """Names of all contacts, in the order in which they first appear."""
+    found: dict[str, None] = {}
+    for record in records:
+        found.update(dict.fromkeys(record.labels.get("contact_normal_force", ())))
+    return list(found)
+
+
+def touching_names(records: Sequence[Record]) -> list[str]:
+    """Those that touched: under the unilateral law many may, and most never do."""
+    return [name for name in contact_names(records) if any(_touched(record, name) for record in records)]
+
+
+def _touched(record: Record, name: str) -> bool:
+    return name in contact_names([record]) and _summary(record, name).get("closed_fraction", 1.0) > 0.0
+
+
+def is_real(record: Record) -> bool:
+    """Whether its contacts follow the unilateral law."""
+    return MODE in record
+
+
+def force_label(record: Record, name: str) -> str:
+    """Share of the run in which the contact pulls or, if real, is closed, and the extremes of its force."""
+    return f"{name}: {_share(record, name)} of the run{_within(record, name)}"
+
+
+def _share(record: Record, name: str) -> str:
+    what, key = ("closed", "closed_fraction") if is_real(record) else ("pulling", "pulling_fraction")
+    contact = _summary(record, name)
+    return f"{what} {percent(contact[key])}" if contact else f"{what} unknown part"
+
+
+def _within(record: Record, name: str) -> str:
+    extremes = _extremes(record, name)
+    return f"; all steps {style.number(extremes[0], 3)} … {style.number(extremes[1], 3)} N" if extremes.size else ""
+
+
+def _extremes(record: Record, name: str) -> Array:
+    """Lowest and highest force of all integration steps [N], which see peaks between the samples; empty if unknown."""
+    contact = _summary(record, name)
+    if not contact:
+        return np.empty(0)
+    values = np.array([contact["normal_force_min_N"], contact["normal_force_max_N"]], dtype=np.float64)
+    return values if np.isfinite(values).all() else np.empty(0)
+
+
+def _summary(record: Record, name: str) -> dict[str, Any]:
+    """The contact's part of the summary: over all integration steps, not over the samples. Empty if there is none."""
+    return next((contact for contact in record.summary.get("contacts", ()) if contact["name"] == name), {})
+
+
+def _series(record: Record, name: str) -> list[style.Series]:
+    """What must find room: the samples, and the extremes, which most often fall into the first milliseconds."""
+    extremes = _extremes(record, name)
+    return [(record.time, _force(record, name)), *([(record.time[[0, 0]], extremes)] if extremes.size else [])]
+
+
+def _draw_extremes(axes: Axes, record: Record, name: str, colour: str) -> None:
+    for value in _extremes(record, name):
+        axes.axhline(value, color=colour, linestyle=(0, (5, 3)), linewidth=0.7)
+
+
+def _draw_samples(axes: Axes, record: Record, name: str, colour: str) -> None:
+    """A dot at each sample of the transient, while they are few enough to be told apart."""
+    inside = record.time <= axes.get_xlim()[1]
+    if inside.sum() <= DOTS:
+        axes.plot(record.time[inside], _force(record, name)[inside], ".", color=colour, markersize=2.5)
+
+
+def _note_sampling(rows: Sequence[Sequence[Axes]], records: Sequence[Record], *, insets: bool = True) -> None:
+    """Under the last panel: how often the curves are sampled, what the dashed lines are, and the insets."""
+    steps = [float(np.median(np.diff(record.time))) for record in records if len(record) > 1]
+    if not steps:
+        return
+    note = f"sampled every {style.number(1e3 * max(steps), 3)} ms"
+    if any(line.get_marker() == "." for panels in rows for line in panels[0].get_lines()):
+        note += " (dots)"
+    note += "; dashed: extremes of all steps"
+    if insets and any(len(panels) > 1 for panels in rows):
+        note += "\naxes cut to the settled range; inset: the shaded beginning in full"
+    last = rows[-1][-1]
+    last.set_xlabel(f"{last.get_xlabel()}\n{note}")
+
+
+def _force(record: Record, name: str) -> Array:
+    column = record.labels["contact_normal_force"].index(name)
+    return np.asarray(record["contact_normal_force"][:, column], dtype=np.float64)
+
+
+def _most_interesting(names: list[str], records: Sequence[Record]) -> list[str]:
+    """All contacts, or ``ROWS`` of them, in their order: those that pull hardest, or if real press hardest."""
+    if len(names) <= ROWS:
+        return names
+    real = any(map(is_real, records))
+
+    def rank(name: str) -> float:
+        values = [_force(r, name) for r in records if name in contact_names([r])]
+        return -max(float(one.max()) for one in values) if real else min(float(one.min()) for one in values)
+
+    chosen = sorted(names, key=rank)[:ROWS]
+    return [name for name in names if name in chosen]
+
+
+def _choice(records: Sequence[Record]) -> str:
+    return "highest forces" if any(map(is_real, records)) else "lowest forces"
+
+
+def mode_bands(record: Record, name: str) -> list[tuple[float, float, int]]:
+    """Begin, end [s] and mode of each stretch of samples in one mode, cut at the contact's events if there are some."""
+    mode = np.rint(record[MODE][:, record.labels[MODE].index(name)]).astype(int)
+    changes = [event.time for event in events.marked(record, [name])]
+    time, bands, since = record.time, [], float(record.time[0])
+    for k in np.flatnonzero(np.diff(mode)):
+        between = [t for t in changes if time[k] < t <= time[k + 1]]
+        at = between[-1] if between else float(time[k + 1])
+        bands.append((since, at, int(mode[k])))
+        since = at
+    return [*bands, (since, float(time[-1]), int(mode[-1]))]
+
+
+def _draw_modes(axes: Axes, record: Record, name: str) -> None:
+    """Bands behind the curve: when the contact is open, slides and sticks, with the share of the run in the legend."""
+    bands, contact = mode_bands(record, name), _summary(record, name)
+    limits = axes.get_xlim()
+    for mode, (text, colour, key) in enumerate(MODES):
+        spans = [(begin, end - begin) for begin, end, which in bands if which == mode]
+        share = None if not contact else contact[key] if mode else 1.0 - contact[key]
+        if not spans and not share:
+            continue
+        label = text if share is None else f"{text} {percent(share)}"
+        axes.broken_barh(
+            spans, (0.0, 1.0), transform=axes.get_xaxis_transform(), color=colour, linewidth=0, zorder=0.2, label=label
+        )
+    axes.set_xlim(limits)
+
+
+def _thin_negative(time: Array, force: Array) -> tuple[Array, Array]:
+    """The line cut off at zero, with its zero crossings, so that the filled area ends where the line does."""
+    time, force = style.thin(time, force)
+    a, b = force[:-1], force[1:]
+    crossing = np.flatnonzero(a * b < 0.0)
+    at = time[crossing] + (time[crossing + 1] - time[crossing]) * a[crossing] / (a[crossing] - b[crossing])
+    time, force = np.insert(time, crossing + 1, at), np.insert(force, crossing + 1, 0.0)
+    return time, np.minimum(force, 0.0)
+
+
+def _mark_pulling(axes: Axes) -> None:
+    """Shade what lies below zero, if any of the axis does."""
+    axes.axhline(0.0, color=style.PULLING, linewidth=0.8)
+    low, high = axes.get_ylim()
+    if low >= 0.0:
+        return
+    axes.axhspan(low, 0.0, color=style.PULLING, alpha=0.13, linewidth=0, label="surface pulls")
+    axes.set_ylim(low, high)

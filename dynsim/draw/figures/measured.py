@@ -1,0 +1,226 @@
+"""Figures of a measured run: joints beside their goals, servos, and what their angles say of the arm."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from dynsim.draw.figures import arm, hand, posture, style
+from dynsim.draw.figures.motors import COLOURS, DASHES
+from dynsim.draw.figures.style import Array
+from dynsim.record import TIME, Record
+
+# More joints than this do not fit a page; those with the largest error are drawn.
+JOINTS = 24
+# Lines of one panel that are told apart.
+LINES = 12
+MILLI = 1e3
+
+
+def draw(record: Record, folder: Path, kind: str = "png", part: style.Part = style.ALL) -> list[Path]:
+    """See :func:`dynsim.draw.figures.draw`."""
+    return style.save_all(FIGURES, record, folder, kind, part)
+
+
+def draw_comparison(
+    records: Mapping[str, Record], folder: Path, kind: str = "png", part: style.Part = style.ALL
+) -> list[Path]:
+    """See :func:`dynsim.draw.figures.draw_comparison`: measured runs beside each other, and beside simulated ones."""
+    return arm.draw_comparison(records, folder, kind, part)
+
+
+def joints(record: Record) -> Figure | None:
+    """Every joint with its goal over time; None where no goal was recorded."""
+    found = _followed(record)
+    if not found:
+        return None
+    shown = _largest(found, JOINTS)
+    columns = 2 if len(shown) > 3 else 1
+    lines = -(-len(shown) // columns)
+    note = "" if len(shown) == len(found) else f"; {len(shown)} of {len(found)} with the largest error"
+    figure = style.new_figure(1.0 + 1.15 * lines, style.title(record, f"joints and their goals{note}"))
+    grid = figure.subplots(lines, columns, sharex=True, squeeze=False)
+    for axes, (label, unit, measured, goal) in zip(grid.T.ravel(), shown, strict=False):
+        style.line(axes, record.time, measured, color=style.BLUE, label="measured")
+        style.line(axes, record.time, goal, color=style.BLACK, linestyle=(0, (4, 2)), lw=0.9, label="goal")
+        axes.set_ylabel(f"{label}\n[{unit}]")
+        _at_least(axes, 0.02)
+        _mark_replay(axes, record)
+    for axes in grid.T.ravel()[len(shown) :]:
+        axes.set_axis_off()
+    _label_time(grid)
+    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return figure
+
+
+def following_error(record: Record) -> Figure | None:
+    """Measured minus goal of every joint over time, and how large it is; None where no goal was recorded."""
+    found = _followed(record)
+    if not found:
+        return None
+    shown = _largest(found, LINES)
+    note = "" if len(shown) == len(found) else f"; {len(shown)} of {len(found)} with the largest error"
+    figure = style.new_figure(3.4 + 0.12 * len(shown), style.title(record, f"following error{note}"))
+    over_time, largest = figure.subplots(2, 1, height_ratios=[1.6, 1.0])
+    units = {unit for _, unit, _, _ in shown}
+    one_unit = f" [m{units.pop()}]" if len(units) == 1 else ""
+    for place, (label, unit, measured, goal) in enumerate(shown):
+        name = label if one_unit else f"{label} [m{unit}]"
+        style.line(over_time, record.time, MILLI * (measured - goal), label=name, **_look(place))
+    over_time.set_ylabel(f"measured − goal{one_unit}")
+    over_time.set_xlabel("time [s]")
+    _mark_replay(over_time, record, named=True)
+    during = record.time >= 0.0 if (record.time >= 0.0).any() else slice(None)
+    errors = [MILLI * np.abs(measured - goal)[during] for _, _, measured, goal in shown]
+    places = np.arange(len(shown))
+    largest.bar(places, [_finite(np.nanmax, one) for one in errors], color="#CFCFCF", width=0.7, label="largest")
+    rms = [_finite(lambda e: np.sqrt(np.nanmean(e**2)), one) for one in errors]
+    largest.bar(places, rms, color=style.BLUE, width=0.4, label="rms")
+    largest.set_xticks(places, [label for label, *_ in shown], rotation=30 if len(shown) > 6 else 0, ha="center")
+    largest.set_ylabel(f"size in the replay{one_unit}")
+    largest.margins(x=0.02)
+    largest.grid(axis="x", visible=False)
+    style.legend_above(largest)
+    figure.legend(*over_time.get_legend_handles_labels(), loc="outside right upper")
+    return figure
+
+
+def servos(record: Record) -> Figure | None:
+    """What the servos say of themselves, and how the cycles kept their time; None where they said nothing."""
+    rows = [
+        (name, label)
+        for name, label in (
+            ("torque_estimate", "torque [N m],\nestimated"),
+            ("current", "current [A]"),
+            ("supply_voltage", "supply [V]"),
+            ("temperature", "temperature\n[°C]"),
+        )
+        if name in record and record[name].shape[1:] != (0,) and np.isfinite(record[name]).any()
+    ]
+    if not rows:
+        return None
+    # The same joints in every row: those of which the first row has most to say.
+    first, names = record[rows[0][0]], record.labels[rows[0][0]]
+    size = [_finite(np.nanmax, np.abs(column)) for column in first.T]
+    shown = [names[k] for k in np.sort(np.argsort(size)[::-1][:LINES])]
+    timed = "lateness" in record
+    note = "" if len(shown) == len(names) else f"; {len(shown)} of {len(names)} with the largest {rows[0][0]}"
+    title = style.title(record, f"servos{note.replace('_', ' ')}")
+    figure = style.new_figure(1.1 + 1.35 * (len(rows) + timed), title)
+    grid = figure.subplots(len(rows) + timed, 1, sharex=True, squeeze=False)
+    for (name, label), axes in zip(rows, grid[:, 0], strict=False):
+        columns = dict(zip(record.labels[name], record[name].T, strict=True))
+        for place, joint in enumerate(shown):
+            if joint in columns:
+                style.line(axes, record.times(name), columns[joint], label=joint, **_look(place))
+        axes.set_ylabel(label)
+        _at_least(axes, 0.5)
+        _mark_replay(axes, record, named=axes is grid[0, 0])
+    if timed:
+        _cycles(grid[-1, 0], record)
+    _label_time(grid)
+    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside right upper")
+    return figure
+
+
+def _cycles(axes: Axes, record: Record) -> None:
+    """Lateness of the cycles, and those in which a servo did not answer."""
+    style.line(axes, record.time, MILLI * record["lateness"], color=style.BLACK, lw=0.9)
+    if "exchange" in record:
+        style.line(axes, record.time, MILLI * record["exchange"], color=style.SKY, lw=0.9)
+        axes.set_ylabel("late (black),\non the bus [ms]")
+    else:
+        axes.set_ylabel("late [ms]")
+    if "missed" in record and (missed := record["missed"].any(axis=1)).any():
+        axes.plot(record.time[missed], np.zeros(missed.sum()), "x", color=style.PULLING, markersize=4)
+        axes.annotate(
+            f"× {missed.sum()} cycles with a servo that did not answer",
+            (0.01, 0.9),
+            xycoords="axes fraction",
+            color=style.PULLING,
+            fontsize=7,
+            va="top",
+        )
+    _mark_replay(axes, record)
+
+
+Followed = tuple[str, str, Array, Array]
+
+
+def _followed(record: Record) -> list[Followed]:
+    """Label, unit, measured and goal of everything that had goals: positions, and rates of what has no position."""
+    found: dict[str, Followed] = {}
+    own = [name for name, signal in record.signals.items() if signal.axis == TIME and signal.data.ndim == 2]
+    names = [name for name in own if f"{name}_goal" in own and name != "hand_position"]
+    for name in sorted(names, key=lambda name: record.units[name].endswith("/s")):
+        goals = dict(zip(record.labels[f"{name}_goal"], record[f"{name}_goal"].T, strict=True))
+        for label, measured in zip(record.labels[name], record[name].T, strict=True):
+            if label in goals and np.isfinite(goals[label]).any():
+                found.setdefault(label, (label, record.units[name], measured, goals[label]))
+    return list(found.values())
+
+
+def _largest(found: Sequence[Followed], count: int) -> list[Followed]:
+    """All, or those with the largest error, in their order."""
+    errors = [_finite(np.nanmax, np.abs(measured - goal)) for _, _, measured, goal in found]
+    kept = np.sort(np.argsort(errors)[::-1][:count])
+    return [found[k] for k in kept]
+
+
+def _finite(measure: Callable[[Array], float], values: Array) -> float:
+    """A measure of the values that are there; 0 where there are none."""
+    return float(measure(values)) if np.isfinite(values).any() else 0.0
+
+
+def _look(place: int) -> dict[str, object]:
+    row, colour = divmod(place, len(COLOURS))
+    return {"color": COLOURS[colour], "linestyle": DASHES[row % len(DASHES)], "lw": 1.0}
+
+
+def _at_least(axes: Axes, span: float) -> None:
+    """Do not blow up the steps of a sensor to the height of the panel."""
+    low, high = axes.get_ylim()
+    if high - low < span:
+        middle = 0.5 * (low + high)
+        axes.set_ylim(middle - 0.5 * span, middle + 0.5 * span)
+
+
+def _mark_replay(axes: Axes, record: Record, *, named: bool = False) -> None:
+    """Where the replay changed its state, as dotted lines; faults in red."""
+    start, end = float(record.time[0]), float(record.time[-1])
+    for event in record.events:
+        if event.kind not in ("state", "fault") or not start < event.time <= end:
+            continue
+        colour = style.PULLING if event.kind == "fault" else style.GREY
+        axes.axvline(event.time, color=colour, linestyle=":", linewidth=0.8, zorder=1)
+        # The first states may follow each other within milliseconds.
+        if named and (event.kind == "fault" or event.name == "REPLAY"):
+            axes.annotate(
+                event.name.lower(),
+                (event.time, 1.0),
+                xycoords=("data", "axes fraction"),
+                xytext=(3, -8),
+                textcoords="offset points",
+                color=colour,
+                fontsize=7,
+            )
+
+
+def _label_time(grid: np.ndarray) -> None:
+    for axes in grid[-1]:
+        axes.set_xlabel("time [s]")
+
+
+# File name → figure, None where the record has no data for it.
+FIGURES: dict[str, Callable[[Record], Figure | None]] = {
+    "joints": joints,
+    "following_error": following_error,
+    "servos": servos,
+    "hand_path": hand.path,
+    "tracking_error": hand.error,
+    "posture": posture.posture,
+}

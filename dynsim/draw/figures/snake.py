@@ -1,0 +1,312 @@
+"""Figures and animation of a snake run, from its record alone.
+
+Postures in top and side view with grounded and lifted wheels and the support polygon; controlled variable against its
+target; joint angles with their limits; cost, smallest singular value, support margin, modes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image
+
+from dynsim.draw.figures import style, tanaka2019
+from dynsim.draw.figures.snake_view import (
+    BODY,
+    GROUND,
+    HEAD,
+    LEAST_HEIGHT,
+    NUMBERED,
+    STYLE,
+    SYMBOLS,
+    TARGET,
+    View,
+    error_axis,
+    greek,
+    limits,
+    mode_chart,
+    mode_starts,
+    mode_steps,
+    moments,
+    posture_grid,
+    posture_strip,
+    relax,
+    turns,
+)
+from dynsim.record import Record
+from dynsim.snake.geometry import snake_geometry
+from dynsim.snake.published import used_limit
+from dynsim.system.files import replacing
+
+T = TypeVar("T")
+# Postures of an animation, in a row, and over each other in one picture.
+FRAMES, IN_A_ROW, IN_A_PICTURE = 50, 6, 7
+# Postures over time in grey: the lines beside them have the colours.
+SHADES = LinearSegmentedColormap.from_list("shades", ["#CFCFCF", "#000000"])
+
+
+def draw(record: Record, folder: Path, kind: str = "png", part: style.Part = style.ALL) -> list[Path]:
+    """Write all figures of one run and the animation into ``folder``; returns the files."""
+    folder = Path(folder)
+    with plt.rc_context(STYLE):
+        makers: dict[str, Callable[[Record], Figure]] = {
+            "postures": postures,
+            "overview": overview,
+            "tracking": tracking,
+            "joints": joints,
+            "redundancy": redundancy,
+        }
+        works = [
+            partial(_save, make, record, folder / f"{name}.{kind}")
+            for name, make in (makers | tanaka2019.figures_of_run(record)).items()
+        ]
+        works.append(partial(animate, record, folder / "animation.gif"))
+        return [work() for work in style.part_of(works, part)]
+
+
+def draw_comparison(
+    records: Mapping[str, Record], folder: Path, kind: str = "png", part: style.Part = style.ALL
+) -> list[Path]:
+    """Variants over each other, and figures and tables beside [T] where its experiments were run; returns the files."""
+    folder = Path(folder)
+    makers: dict[str, Callable[[Mapping[str, Record]], Figure]] = {
+        "comparison": comparison,
+        "postures": strips,
+    }
+    written = []
+    if len(names := {record.summary["scenario"] for record in records.values()}) == 1:
+        scenario = names.pop()
+        makers |= tanaka2019.figures(scenario, records)
+        if part[0] == 0:
+            written += tanaka2019.write_tables(scenario, records, folder)
+    with plt.rc_context(STYLE):
+        for name, make in style.part_of(list(makers.items()), part):
+            written.append(_save(make, records, folder / f"{name}.{kind}"))
+    return written
+
+
+def _save(make: Callable[[T], Figure], of: T, path: Path) -> Path:
+    figure = make(of)
+    figure.set_dpi(plt.rcParams["savefig.dpi"])
+    style.write(figure, path)
+    plt.close(figure)
+    return path
+
+
+def comparison(records: Mapping[str, Record]) -> Figure:
+    """Cost, largest yaw angle in parts of its limit, support margin and head error of all variants."""
+    figure, axes = plt.subplots(4, 1, figsize=(7.2, 7.0), sharex=True)
+    for name, record in records.items():
+        axes[0].plot(record.time, record["cost"], label=name)
+        axes[1].plot(record.time, used_limit(record), label=name)
+        axes[2].plot(record.time, 1e3 * record["support_margin"], label=name)
+        axes[3].semilogy(record.time, np.maximum(record["position_error"], 1e-16), label=name)
+    error_axis(axes[3], *(record["position_error"] for record in records.values()))
+    axes[1].axhline(1.0, color="black", ls="-.", lw=0.8)
+    axes[2].axhline(0.0, color="black", ls="-.", lw=0.8)
+    axes[0].set_ylim(bottom=0)
+    for axis, label in zip(
+        axes, ("cost V", "largest |θ| / limit", "support margin [mm]", "position error [m]"), strict=True
+    ):
+        axis.set_ylabel(label)
+    axes[0].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    axes[-1].set_xlabel("t [s]")
+    return figure
+
+
+def strips(records: Mapping[str, Record]) -> Figure:
+    """Postures of every variant over time, a line each."""
+    lines = {}
+    for name, record in records.items():
+        views = [View(record, row) for row in moments(record, IN_A_ROW)]
+        waiting = record.summary["waiting_s"]
+        label = name.replace("_", "\n") + (f"\n(waited {waiting:.0f} s)" if waiting >= 0.5 else "")
+        lines[label] = [(view, f"{view.time:.1f} s, mode {view.mode}") for view in views]
+    return posture_grid(lines, one_scale=False)
+
+
+def postures(record: Record) -> Figure:
+    """Postures over time: top view above, side view along the base's heading below."""
+    views = [View(record, row) for row in moments(record, IN_A_ROW)]
+    return posture_strip([(view, f"t = {view.time:.1f} s, mode {view.mode}") for view in views])
+
+
+def overview(record: Record) -> Figure:
+    """Top view of the whole run in one picture: postures over time, path of the controlled point and its target.
+
+    A robot that stays where it is, and works with its head, is a thin strip in it: below it then is the side view.
+    """
+    rows = moments(record, IN_A_PICTURE)
+    x0, x1, y0, y1 = limits([*record["posture"][rows][:, :, :2], record["w"][:, :2]], 0.06)
+    flat = y1 - y0 < LEAST_HEIGHT * (x1 - x0)
+    views = [View(record, row) for row in rows] if flat else []
+    width = 6.4 if flat else 5.0
+    high = width * (y1 - y0) / (x1 - x0)
+    side = limits([view.side for view in views], 0.06) if flat else (0.0, 1.0, 0.0, 0.0)
+    low = width * (side[3] - side[2]) / (side[1] - side[0])
+    figure, grid = plt.subplots(
+        1 + flat, 1, figsize=(width + 1.4, max(high + low, 1.0) + 0.9 + 0.5 * flat), squeeze=False,
+        height_ratios=[high, low] if flat else None,
+    )  # fmt: skip
+    axis = grid[0, 0]
+    shades = plt.cm.ScalarMappable(plt.Normalize(0.0, record.time[-1]), plt.colormaps["viridis_r"] if flat else SHADES)
+    body = {"lw": 1.6 if flat else 4.0, "solid_capstyle": "round"}
+    for row in rows:
+        points, shade = record["posture"][row], shades.to_rgba(record.time[row])
+        axis.plot(points[:, 0], points[:, 1], "-", color=shade, **body)
+        axis.plot(*points[0, :2], "o", color=shade, ms=4 if flat else 6)
+    for view in views:
+        shade = shades.to_rgba(record.time[view.row])
+        grid[1, 0].plot(*view.side.T, "-", color=shade, **body)
+        grid[1, 0].plot(*view.side[0], "o", color=shade, ms=4)
+    axis.plot(*record["w"][:, :2].T, color=HEAD, lw=1.0, label="controlled point")
+    axis.plot(*record["w_target"][:, :2].T, "--", color=TARGET, lw=1.0, label="target")
+    axis.plot(*record["base_pose"][:, :2].T, color=GROUND, lw=0.8, label="wheel pair 1")
+    axis.set(xlabel="x [m]", ylabel="y [m]", xlim=(x0, x1), ylim=(y0, y1))
+    axis.set_aspect("equal", adjustable="box")
+    if flat:
+        below = grid[1, 0]
+        below.axhline(0.0, color="#BBBBBB", lw=0.8, zorder=0)
+        below.set(xlabel="along the heading of the base part [m]", ylabel="height [m]")
+        below.set(xlim=side[:2], ylim=(min(side[2], -0.02), side[3]))
+        below.set_aspect("equal", adjustable="box")
+    figure.colorbar(shades, ax=grid.ravel().tolist(), label="posture at t [s]")
+    figure.legend(loc="outside upper center", ncols=3, frameon=False)
+    return figure
+
+
+def tracking(record: Record) -> Figure:
+    """Six coordinates of the controlled point with their targets, and the errors."""
+    figure, axes = plt.subplots(4, 2, figsize=(7.2, 6.0), sharex=True)
+    labels = record.labels["w"]
+    for i, (name, axis) in enumerate(zip(labels, axes[:3].T.ravel(), strict=True)):
+        axis.plot(record.time, record["w"][:, i], color=GROUND, label="controlled point")
+        axis.plot(record.time, record["w_target"][:, i], "--", color=HEAD, lw=0.9, label="target")
+        relax(axis, 1e-3)
+        axis.set_ylabel(f"{SYMBOLS.get(name, name)} [{'m' if i < 3 else 'rad'}]")
+        if record["gripper"].any():
+            closed = axis.get_xaxis_transform()
+            axis.fill_between(
+                record.time, 0, 1, where=record["gripper"] > 0, transform=closed, color="#EEEEEE", lw=0, zorder=0,
+                label="gripper closed",
+            )  # fmt: skip
+    # In a white box: what is grey shows on panels that are grey all over.
+    axes[0, 0].legend(facecolor="white", edgecolor="none")
+    tiny = 1e-16  # an error of exactly zero has no place on a logarithmic axis
+    axes[3, 0].semilogy(record.time, np.maximum(record["position_error"], tiny), color=BODY)
+    axes[3, 0].set_ylabel("position error [m]")
+    axes[3, 1].semilogy(record.time, np.maximum(record["attitude_error"], tiny), color=BODY)
+    axes[3, 1].set_ylabel("attitude error [rad]")
+    for axis, name in zip(axes[3], ("position_error", "attitude_error"), strict=True):
+        error_axis(axis, record[name])
+        axis.set_xlabel("t [s]")
+    return figure
+
+
+def joints(record: Record) -> Figure:
+    """Joint angles of head and base part with their limits; marks show where a joint left the allocation."""
+    geometry = snake_geometry(record)
+    n_h, pitch, upper, lower = geometry.head_joints, geometry.pitch, geometry.upper, geometry.lower
+    phi, labels = record["phi"], record.labels["phi"]
+    parts = [
+        ("head yaw", np.flatnonzero(~pitch[:n_h])),
+        ("head pitch", np.flatnonzero(pitch[:n_h])),
+        ("base yaw", np.arange(n_h, len(labels))),
+    ]
+    figure, axes = plt.subplots(3, 1, figsize=(7.2, 5.6), sharex=True)
+    for axis, (title, group) in zip(axes, parts, strict=True):
+        for j in group:
+            (line,) = axis.plot(record.time, phi[:, j], label=greek(labels[j]))
+            out = record["at_limit"][:, j] > 0
+            axis.plot(record.time[out], phi[out, j], ".", color=line.get_color(), ms=3)
+        for limit in {*upper[group], *lower[group]}:
+            axis.axhline(limit, color="black", ls="-.", lw=0.8)
+        axis.set_ylabel(f"{title} [rad]")
+        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    axes[-1].set_xlabel("t [s]      (dash-dotted: limits; dots: joint out of the allocation at its limit)")
+    return figure
+
+
+def redundancy(record: Record) -> Figure:
+    """Modes (grounded wheels), cost, smallest singular value and support margin over time."""
+    many = len(mode_starts(record)) > NUMBERED  # then the numbers have axes of their own
+    ratios = [1.3, *([0.8] if many else []), 1, 1, 1]
+    figure, axes = plt.subplots(
+        len(ratios), 1, figsize=(7.2, 6.4 + 1.1 * many), sharex=True, height_ratios=ratios, squeeze=False
+    )
+    cost, sigma, margin = axes[-3:, 0]
+    mode_chart(axes[0, 0], record)
+    if many:
+        mode_steps(axes[1, 0], record)
+    cost.plot(record.time, record["cost"], color=GROUND)
+    cost.set_ylabel("cost V")
+    cost.set_ylim(bottom=0)
+    _over_time(sigma, record, record["sigma_min"], many)
+    sigma.set_ylabel("σ_min of B̃")
+    sigma.set_ylim(bottom=0)
+    _over_time(margin, record, 1e3 * record["support_margin"], many)
+    margin.axhline(0.0, color=HEAD, ls="-.", lw=0.8)
+    margin.set_ylabel("support margin [mm]")
+    margin.set_ylim(bottom=min(0.0, 1e3 * float(record["support_margin"].min())) - 4)
+    margin.set_xlabel("t [s]      (margin below zero: the robot tips)")
+    return figure
+
+
+def _over_time(axis: Axes, record: Record, values: NDArray[np.float64], many: bool) -> None:
+    """A line; where ``many`` changes of mode would fill the panel with it, its range and its lowest value by turns."""
+    if not many:
+        axis.plot(record.time, values, color=GROUND)
+        return
+    starts = turns(len(values))
+    low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+    time = np.append(record.time[starts], record.time[-1])
+    axis.stairs(high, time, baseline=low, fill=True, color=GROUND, alpha=0.25, lw=0, label="range")
+    axis.plot(record.time[starts], low, color=GROUND, lw=1.0, label="lowest")
+    axis.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+
+
+def animate(record: Record, path: Path) -> Path:
+    """Animated GIF: top view and side view with grounded and lifted wheels."""
+    rows = moments(record, FRAMES)
+    views = [View(record, row) for row in rows]
+    top = limits([view.outline() for view in views], 0.08)
+    side = limits([np.vstack([view.side, view.side * [1, 0]]) for view in views], 0.08)
+    with plt.rc_context({"figure.constrained_layout.use": False, "font.size": 8}):
+        figure, (above, below) = plt.subplots(2, 1, figsize=(4.8, 4.8), dpi=90, height_ratios=[2.2, 1])
+        canvas = FigureCanvasAgg(figure)
+        figure.subplots_adjust(left=0.12, right=0.97, top=0.93, bottom=0.1, hspace=0.3)
+
+        above.set(xlim=top[:2], ylim=top[2:], xlabel="x [m]", ylabel="y [m]")
+        below.set(xlim=side[:2], ylim=(min(side[2], -0.02), side[3]), ylabel="height [m]")
+        below.set_xlabel("along the heading of the base part [m]")
+        for axis in (above, below):
+            axis.set_aspect("equal", adjustable="box")
+        above.plot(*record["w_target"][:, :2].T, "--", color=TARGET, lw=0.7)
+        canvas.draw()  # axes and target once; every frame adds only the robot
+        background = canvas.copy_from_bbox(figure.bbox)
+        images = []
+        for view in views:
+            drawn = [*view.draw_top(above), *view.draw_side(below)]
+            drawn += above.plot(*record["w"][: view.row + 1, :2].T, color=HEAD, lw=0.8, zorder=2)
+            drawn.append(above.set_title(f"t = {view.time:.1f} s, mode {view.mode}"))
+            canvas.restore_region(background)
+            for artist in sorted(drawn, key=lambda a: a.get_zorder()):
+                figure.draw_artist(artist)
+            image = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba(), "raw", "RGBA", 0, 1)
+            images.append(image.convert("RGB").quantize(32, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE))
+            for artist in drawn[:-1]:
+                artist.remove()
+        with replacing(path) as stream:
+            images[0].save(stream, format="GIF", save_all=True, append_images=images[1:], duration=100, loop=0)
+        plt.close(figure)
+    return path

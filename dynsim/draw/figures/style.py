@@ -1,0 +1,373 @@
+"""The look that all figures share: sizes, colours, time axes, saving."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import matplotlib
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
+from numpy.typing import NDArray
+
+from dynsim.draw.figures.canvas import Canvas, heed_fonts
+from dynsim.record import Record
+from dynsim.system.files import replacing
+from dynsim.system.terminal import plain
+
+T = TypeVar("T")
+Name = TypeVar("Name", str, int)
+Array = NDArray[np.float64]
+# A quantity over time, (T,) and (T,) or (T, k).
+Series = tuple[Array, Array]
+# Which figures of a record are drawn: every ``many``-th from ``first`` on, (first, many).
+Part = tuple[int, int]
+ALL: Part = (0, 1)
+
+# Okabe and Ito's colours, which colour-blind readers tell apart; yellow is too faint on white.
+BLUE, ORANGE, GREEN, PURPLE, SKY, BLACK = "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#000000"
+# Kept for pulling contacts in every figure, so no variant may have it.
+PULLING = "#D55E00"
+GREY = "#7F7F7F"
+VARIANT_COLOURS = (BLUE, GREEN, ORANGE, PURPLE, SKY, BLACK, "#8C6D31")
+AXIS_COLOURS = {"x": BLUE, "y": GREEN, "z": ORANGE}
+
+WIDTH = 7.2
+# Size of a figure's title [point], and how many characters of it fit.
+TITLE, TITLE_LONG = 10.0, 88
+DPI = 170
+_LOOK: Any = {
+    "font.size": 8.5,
+    "axes.titlesize": 8.5,
+    "axes.labelsize": 8.5,
+    "legend.fontsize": 7.5,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "figure.titlesize": TITLE,
+    "mathtext.fontset": "dejavusans",
+    "lines.linewidth": 1.2,
+    "lines.solid_capstyle": "round",
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.xmargin": 0.0,
+    "grid.color": "#E3E3E3",
+    "grid.linewidth": 0.5,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "legend.frameon": False,
+    "legend.handlelength": 1.8,
+    # A line of a million points overflows Agg's cell block unless it is drawn in pieces.
+    "agg.path.chunksize": 20_000,
+}
+# Lines of more points than this are thinned: a figure is some 1200 pixels wide.
+LINE_POINTS = 4000
+# A panel of the transient shows this times its length, and there is none where that is most of the run.
+TRANSIENT_ROOM, TRANSIENT_MOST = 1.2, 0.8
+# Curves that lie closer together than this share of a panel's height hide each other; those on top get these dashes.
+SAME = 0.012
+OVER = ((0, (5, 4)), (0, (2, 2.5)), (0, (6, 2, 1.5, 2)))
+# Height of a row of a legend [point].
+LEGEND_ROW = 12.5
+
+
+@contextmanager
+def look() -> Iterator[None]:
+    """Matplotlib settings of all dynsim figures, for a ``with`` block; the caller's settings come back after it."""
+    with matplotlib.rc_context(_LOOK):
+        heed_fonts()
+        yield
+
+
+def new_figure(height: float, title: str) -> Figure:
+    """An empty figure [inch] that belongs to no pyplot and needs no display."""
+    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    Canvas(figure)
+    # A long title is smaller: it would be cut off at both sides.
+    figure.suptitle(title, fontsize=TITLE * min(1.0, TITLE_LONG / max(len(title), 1)))
+    return figure
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write a figure as PNG, PDF or SVG, by the suffix of ``path``; see :func:`dynsim.system.files.replacing`.
+
+    Raises
+    ------
+    RecordError
+        The file cannot be written; an older one is left as it was.
+    """
+    # Names from files: no font has a picture for a control character.
+    for text in _texts(figure):
+        text.set_text(plain(text.get_text()))
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            if not axis.label.get_text():
+                # Else matplotlib measures all numbers again, several times, for the place of nothing.
+                axis.set_label_coords(0.5, 0.0)
+    figure.set_dpi(DPI)
+    return write(figure, path)
+
+
+def _texts(artist: Artist) -> Iterator[Text]:
+    """All texts but numbers at axes: to ask for those would make all ticks, for one more time."""
+    if isinstance(artist, Text):
+        yield artist
+    elif isinstance(artist, Axis) and not isinstance(artist.get_major_locator(), FixedLocator):
+        yield artist.label
+    else:
+        for child in artist.get_children():
+            yield from _texts(child)
+
+
+def save_all(
+    makers: Mapping[str, Callable[[T], Figure | None]], of: T, folder: Path, kind: str, part: Part = ALL
+) -> list[Path]:
+    """Every figure, by its name, that the record or records have data for, in dynsim's look; returns the files."""
+    with look():
+        return [
+            save(figure, folder / f"{name}.{kind}")
+            for name, make in part_of(list(makers.items()), part)
+            if (figure := make(of)) is not None
+        ]
+
+
+def part_of(of: Sequence[T], part: Part) -> Sequence[T]:
+    """What one of several processes draws."""
+    first, many = part
+    return of[first::many]
+
+
+def write(figure: Figure, path: Path) -> Path:
+    """Write a figure at its own resolution; the same figure gives the same bytes.
+
+    Raises
+    ------
+    RecordError
+        See :func:`save`.
+    """
+    kind = path.suffix.removeprefix(".")
+    with replacing(path) as stream, matplotlib.rc_context({"svg.hashsalt": path.stem}):
+        if kind == "png":
+            stream.write(Canvas(figure).png())
+        else:
+            date = {"pdf": "CreationDate", "svg": "Date"}[kind]
+            figure.savefig(stream, format=kind, dpi="figure", metadata={date: None})
+    return path
+
+
+def title(record: Record, what: str) -> str:
+    """``what`` with scenario and variant (of a measured run: the robot), and how far an incomplete run came."""
+    scenario = record.provenance.get("scenario", {})
+    robot = record.provenance.get("robot")
+    name = " / ".join(text for text in (scenario.get("name", ""), scenario.get("variant", "")) if text)
+    name = name or (f"{robot}, measured" if robot else "")
+    note = "" if record.complete else f" (incomplete: ends at {record.time[-1]:.3g} s)"
+    return f"{name or 'record'}: {what}{note}"
+
+
+def comparison_title(records: Sequence[Record], what: str) -> str:
+    """``what`` with the scenario that the variants share."""
+    return f"{records[0].provenance.get('scenario', {}).get('name', '') or 'comparison'}: {what}"
+
+
+def variant_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Colour and width (and, beyond seven variants, line style) of every variant, by position.
+
+    Later variants lie on top and are thinner, so that equal curves are still seen to be several.
+    """
+    many = len(VARIANT_COLOURS)
+    dashes = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)))
+    return {
+        name: {
+            "color": VARIANT_COLOURS[k % many],
+            "linestyle": dashes[(k // many) % len(dashes)],
+            "linewidth": 1.0 + 1.6 * 0.4**k if len(names) > 1 else 1.4,
+        }
+        for k, name in enumerate(names)
+    }
+
+
+def told_apart(looks: Mapping[Name, Mapping[str, Any]], *panels: Mapping[Name, Series]) -> dict[Name, dict[str, Any]]:
+    """The looks with dashes for curves that would hide an earlier one, in any of the panels that they share.
+
+    One hides another where it is within ``SAME`` of the panel's height for more than half of the time. What lies below
+    shows through the gaps.
+    """
+    found = {name: dict(look) for name, look in looks.items()}
+    over: dict[Name, int] = dict.fromkeys(looks, 0)
+    for curves in panels:
+        start, end = (pick(float(time[k]) for time, _ in curves.values()) for pick, k in ((max, 0), (min, -1)))
+        at = np.linspace(start, end, 200)
+        sampled = {name: np.interp(at, *curve) for name, curve in curves.items()}
+        values = np.concatenate(list(sampled.values()))
+        values = values[np.isfinite(values)]
+        near = SAME * float(np.ptp(values)) if values.size else 0.0
+        done: list[Name] = []
+        for name, one in sampled.items():
+            hidden: list[Name] = [other for other in done if np.mean(np.abs(one - sampled[other]) <= near) > 0.5]
+            over[name] = max([over[name], *(over[other] + 1 for other in hidden)])
+            done.append(name)
+    for name, depth in over.items():
+        if depth:
+            found[name]["linestyle"] = OVER[min(depth, len(OVER)) - 1]
+    return found
+
+
+def number(value: float, digits: int = 4) -> str:
+    """``value`` with a real minus sign, as on the axes."""
+    return f"{value:.{digits}g}".replace("-", "−")
+
+
+def log_axis(axes: Axes, which: str = "y") -> None:
+    """A logarithmic axis, "x" or "y", with plain numbers, also for ranges of less than a decade."""
+    axes.set(**{f"{which}scale": "log"})
+    low, high = axes.get_ylim() if which == "y" else axes.get_xlim()
+    near = high < 200.0 * low
+    axis = axes.yaxis if which == "y" else axes.xaxis
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if near else (1.0,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def legend_above(axes: Axes, columns: int = 3) -> None:
+    """The legend over the axes, where it hides nothing; room is kept for as many rows as it has."""
+    rows = -(-len(axes.get_legend_handles_labels()[1]) // columns)
+    legend = axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.0)
+    # It may reach over the panel to its left; the empty title keeps the room above.
+    legend.set_in_layout(False)
+    axes.set_title(" ", y=1.0, pad=6.0 + LEGEND_ROW * max(rows - 1, 0))
+
+
+def settle_time(record: Record) -> float:
+    """``metrics.settle_s`` of the record's scenario [s]."""
+    return float(record.provenance.get("scenario", {}).get("metrics", {}).get("settle_s", 0.0))
+
+
+def thin(time: Array, values: Array) -> Series:
+    """At most about ``LINE_POINTS`` points of a line: the smallest and the largest of each bin, so that peaks stay."""
+    size = -(-2 * len(time) // LINE_POINTS)
+    if len(time) <= LINE_POINTS:
+        return time, values
+    whole = len(time) // size * size
+    bins = values[:whole].reshape(-1, size)
+    first = np.arange(0, whole, size)
+    kept = np.concatenate([first + bins.argmin(axis=1), first + bins.argmax(axis=1), np.arange(whole, len(time))])
+    kept = np.unique(np.append(kept, len(time) - 1))
+    return time[kept], values[kept]
+
+
+def sparse(points: Array) -> Array:
+    """At most about ``LINE_POINTS`` points of a curve in space."""
+    kept = np.linspace(0, len(points) - 1, min(len(points), LINE_POINTS)).astype(int)
+    return points[kept]
+
+
+def line(axes: Axes, time: Array, values: Array, **options: Any) -> None:
+    """Plot a quantity over time; a single sample as a dot."""
+    axes.plot(*thin(time, values), marker="o" if len(time) == 1 else None, markersize=3, **options)
+
+
+def time_rows(
+    figure: Figure, rows: Sequence[Sequence[Series]], settle: float, *, compress: bool = False
+) -> list[tuple[Axes, ...]]:
+    """Axes for quantities over time, one row each, with a column for the initial transient where it needs one.
+
+    A transient that would squeeze the settled rest of some row to less than two thirds of the height gets an enlarged
+    panel on the left; the axes on the right are then cut to the settled range. A transient that lasts for most of the
+    run gets none, as that panel would show the run a second time.
+
+    Parameters
+    ----------
+    rows : for each row the series that will be drawn in it
+    settle : time from which on the values count as settled [s]
+    compress : draw what exceeds the settled range in the transient's panel on a logarithmic axis
+
+    Returns
+    -------
+    list of tuples of Axes
+        For each row (transient, whole run) or (whole run,); draw everything in all of them.
+    """
+    end = max(time[-1] for row in rows for time, _ in row)
+    found = [transient_of(row, settle, end) for row in rows]
+    window = max((one.end for one in found if one is not None), default=0.0)
+    split = window > 0.0
+    grid = figure.subplots(
+        len(rows), 1 + split, sharex="col", squeeze=False, width_ratios=[1.0, 2.4] if split else [1.0]
+    )
+    for one, axes in zip(found, grid, strict=True):
+        if end > 0.0:
+            axes[-1].set_xlim(0.0, end)
+        if split:
+            axes[0].set_xlim(0.0, TRANSIENT_ROOM * window)
+        if one is not None:
+            axes[-1].set_ylim(one.low, one.high)
+            if compress:
+                _compress(axes[0], one)
+    for axis in grid[-1]:
+        axis.set_xlabel("time [s]")
+    if split:
+        grid[-1, 0].set_xlabel("time [s]: initial transient")
+        grid[-1, 1].set_xlabel("time [s]: whole run, axes cut to the settled range")
+    return [tuple(axes) for axes in grid]
+
+
+@dataclass(frozen=True)
+class Transient:
+    """When a row settles [s], the range of its axis from then on, and the size of its largest value."""
+
+    end: float
+    low: float
+    high: float
+    largest: float
+
+
+def transient_of(row: Sequence[Series], settle: float, end: float) -> Transient | None:
+    """The transient of a row of a run up to ``end`` [s]; None where it lasts for most of it or nothing need be cut."""
+    found = _transient(row, settle)
+    return found if found is not None and found.end < TRANSIENT_MOST * end / TRANSIENT_ROOM else None
+
+
+def _transient(row: Sequence[Series], settle: float) -> Transient | None:
+    """The transient of a row; None when the axis need not be cut."""
+    settled = np.concatenate([values[time >= settle].ravel() for time, values in row])
+    everything = np.concatenate([values.ravel() for _, values in row])
+    settled, everything = settled[np.isfinite(settled)], everything[np.isfinite(everything)]
+    if settled.size < 2:
+        return None
+    low, high = min(float(settled.min()), 0.0), max(float(settled.max()), 0.0)
+    span = high - low
+    if span <= 0.0 or np.ptp(np.append(everything, [low, high])) < 1.5 * span:
+        return None
+    low, high = low - 0.12 * span, high + 0.12 * span
+    end = 0.0
+    for time, values in row:
+        beyond = ((values < low) | (values > high)).reshape(len(time), -1).any(axis=1)
+        if beyond.any():
+            end = max(end, float(time[beyond][-1]))
+    # Some of what follows belongs in the picture of the transient.
+    return Transient(max(1.5 * end, 0.02 * settle), low, high, float(np.abs(everything).max()))
+
+
+def _compress(axes: Axes, transient: Transient) -> None:
+    """Linear within the settled range and logarithmic beyond, where a peak would hide what follows it."""
+    settled = max(abs(transient.low), abs(transient.high))
+    if transient.largest > 3.0 * settled:
+        axes.set_yscale("symlog", linthresh=settled)
+        steps = [m * 10.0**k for k in range(-9, 10) for m in (1, 3)]
+        ticks = [step for step in steps if 0.5 * settled <= step <= transient.largest]
+        axes.set_yticks([-tick for tick in ticks[::-1]] + [0.0, *ticks])
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
+        axes.yaxis.set_minor_locator(NullLocator())
+        # Curves bend where the scale changes: say so.
+        text = f"logarithmic beyond ±{number(settled, 2)}"
+        axes.text(0.98, 0.03, text, transform=axes.transAxes, ha="right", color=GREY, fontsize=6.5)

@@ -1,0 +1,426 @@
+"""Many runs of one scenario: numbers over the grid, energy against error, distributions and sensitivities of samples.
+
+Drawn from the table alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+
+from dynsim.draw.figures import style
+from dynsim.draw.figures.style import Array
+from dynsim.record.sensitivity import LEVEL, sensitivities, spread
+
+ENERGY = "electrical_energy_J"
+# Label, and what the number is multiplied by for it. The first error that the table has is drawn.
+ENERGIES = {ENERGY: ("electrical energy [J]", 1.0)}
+ERRORS = {
+    "hand_error_rms_m": ("hand error, rms [mm]", 1e3),
+    "final_position_error_m": ("final position error [mm]", 1e3),
+}
+# What keys of a summary end with.
+UNITS = {"m", "s", "rad", "N", "A", "V", "W", "J", "kg", "per"}
+# Parameters of a tornado, and bars of a histogram.
+_BARS, _BINS = 12, 40
+# Values whose ratio is larger are of very different size.
+_WIDE = 8.0
+# Height of a panel, of a bar of a tornado, of what is about them, and of a bar of colours [inch].
+_PANEL, _BAR, _ROOM = 2.1, 0.22, 0.9
+_COLOURS = 0.5
+# A label of an axis, the title of a panel and a part of the figure's are not longer [characters].
+_LABEL, _HEAD, _PART = 34, 58, 70
+# Rows of distributions.
+_ROWS = 6
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A table of runs.
+
+    Attributes
+    ----------
+    name : of the scenario
+    rows : numbers and values by column; of runs that failed only what was varied
+    grid, sampled : columns that were varied
+    known : all variants of the scenario, in its order: their colours do not depend on which of them were run
+    plotted : columns of numbers that are drawn; none: energy and error
+    """
+
+    name: str
+    rows: Sequence[Mapping[str, Any]]
+    grid: Sequence[str]
+    sampled: Sequence[str]
+    known: Sequence[str] = ()
+    plotted: Sequence[str] = ()
+
+    @property
+    def variants(self) -> list[str]:
+        """In the order of the table; one without a name where there are none."""
+        return list(dict.fromkeys(str(row.get("variant", "")) for row in self.rows))
+
+    @property
+    def failed(self) -> str:
+        """How many have no numbers, for titles; nothing when all have."""
+        bad = sum(all(row.get(key) is None for key in self.metrics) for row in self.rows)
+        return f"; {bad} of {len(self.rows)} failed" if bad else ""
+
+    @property
+    def looks(self) -> dict[str, dict[str, Any]]:
+        """Colour and width of every variant."""
+        return style.variant_styles(list(dict.fromkeys([*self.known, *self.variants])))
+
+    @property
+    def metrics(self) -> dict[str, tuple[str, float]]:
+        """What is drawn, as far as the table has it: the numbers asked for, else energy and error."""
+        if self.plotted:
+            return {key: ENERGIES.get(key) or ERRORS.get(key) or named(key) for key in self.plotted if self._has(key)}
+        energies = {key: look for key, look in ENERGIES.items() if self._has(key)}
+        errors = [key for key in ERRORS if self._has(key)][:1]
+        return energies | {key: ERRORS[key] for key in errors}
+
+    def _has(self, key: str) -> bool:
+        return any(row.get(key) is not None for row in self.rows)
+
+    def of(self, variant: str) -> list[Mapping[str, Any]]:
+        """Rows of one variant."""
+        return [row for row in self.rows if str(row.get("variant", "")) == variant]
+
+
+def named(key: str) -> tuple[str, float]:
+    """Label of a number by its key, with the unit that is in it, and 1: ``base.tip_margin_min`` is drawn as it is."""
+    words = key.split("_")
+    units: list[str] = []
+    while len(words) > 1 and words[-1] in UNITS:
+        units.insert(0, words.pop())
+    per = units.index("per") if "per" in units else len(units)
+    unit = " ".join(units[:per]) + ("/" + " ".join(units[per + 1 :]) if per < len(units) else "")
+    return f"{' '.join(words)}{f' [{unit}]' if unit else ''}", 1.0
+
+
+def draw(sweep: Sweep, folder: Path, kind: str = "png") -> list[Path]:
+    """Every figure that the table has data for; returns the files.
+
+    Raises
+    ------
+    RecordError
+        A file cannot be written.
+    """
+    makers = {
+        "sweep_lines": lines,
+        "sweep_map": heat_map,
+        "sweep_pareto": pareto,
+        "sweep_samples": samples,
+        "sweep_tornado": tornado,
+    }
+    return style.save_all(makers, sweep, folder, kind) if sweep.rows and sweep.metrics else []
+
+
+def lines(sweep: Sweep) -> Figure | None:
+    """Energy and error over the only key of the grid, or else the first; None without a grid, or with two keys."""
+    if len(sweep.grid) != 1:
+        return None
+    (key,) = sweep.grid
+    styles, metrics = sweep.looks, sweep.metrics
+    figure = style.new_figure(_PANEL * len(metrics) + _ROOM, f"{sweep.name}: over {key}{sweep.failed}")
+    panels = figure.subplots(len(metrics), 1, sharex=True, squeeze=False)[:, 0]
+    levels = _levels(sweep.rows, key)
+    at = _places(levels)
+    for axes, (metric, (label, scale)) in zip(panels, metrics.items(), strict=True):
+        for variant in sweep.variants:
+            look, name = styles[variant], variant or None
+            groups = [_values(_at(sweep.of(variant), {key: level}), metric) * scale for level in levels]
+            means = np.array([group.mean() if len(group) else np.nan for group in groups])
+            axes.plot(at, means, marker="o", markersize=3, label=name, clip_on=False, **look)
+            if any(len(group) > 1 for group in groups):
+                limits = np.array(
+                    [np.quantile(group, [0.025, 0.975]) if len(group) else (np.nan,) * 2 for group in groups]
+                )
+                axes.fill_between(at, *limits.T, color=look["color"], alpha=0.15, linewidth=0)
+        axes.set_ylabel(label)
+        _scale(axes, "y", scale * _values(sweep.rows, metric))
+    _name_places(panels[-1], "x", key, levels)
+    if len(sweep.variants) > 1:
+        style.legend_above(panels[0], columns=4)
+    return figure
+
+
+def heat_map(sweep: Sweep) -> Figure | None:
+    """Energy and error over the first two keys of the grid, for each variant; the mean over all else."""
+    if len(sweep.grid) < 2:
+        return None
+    x, y = sweep.grid[:2]
+    metrics, variants = sweep.metrics, sweep.variants
+    others = [*sweep.grid[2:], *sweep.sampled]
+    note = f" (mean over {_short(', '.join(others), _PART)})" if others else ""
+    title = f"{sweep.name}: over {x} and {y}{note}{sweep.failed}"
+    figure = style.new_figure(_PANEL * len(variants) + _ROOM + _COLOURS, title)
+    panels = figure.subplots(len(variants), len(metrics), squeeze=False, sharex=True, sharey=True)
+    xs, ys = _levels(sweep.rows, x), _levels(sweep.rows, y)
+    for column, (metric, (label, scale)) in zip(panels.T, metrics.items(), strict=True):
+        tables = [np.full((len(ys), len(xs)), np.nan) for _ in variants]
+        for table, variant in zip(tables, variants, strict=True):
+            for j, b in enumerate(ys):
+                for i, a in enumerate(xs):
+                    found = _values(_at(sweep.of(variant), {x: a, y: b}), metric) * scale
+                    table[j, i] = found.mean() if len(found) else np.nan
+        low, high = np.nanmin(tables), np.nanmax(tables)
+        norm = LogNorm(low, high) if _is_wide(low, high) else Normalize(low, high)
+        for axes, table, variant in zip(column, tables, variants, strict=True):
+            image = axes.imshow(table, origin="lower", aspect="auto", cmap="viridis", norm=norm)
+            axes.grid(visible=False)
+            axes.set_facecolor(style.GREY)
+            axes.set_title(variant)
+            _name_cells(axes, "y", y, ys)
+            _name_cells(axes, "x", x, xs)
+        # Below its column: beside it, its label would stand at the next one.
+        bar = figure.colorbar(image, ax=list(column), label=label, location="bottom", aspect=30, pad=0.02)
+        if isinstance(norm, LogNorm):
+            style.log_axis(bar.ax, "x")
+    for axes in panels[:, 1:].flat:
+        axes.set_ylabel("")
+    for axes in panels[:-1].flat:
+        axes.set_xlabel("")
+    return figure
+
+
+def pareto(sweep: Sweep) -> Figure | None:
+    """Energy against error of all runs, and those that no other run beats in both; None without both."""
+    if sweep.plotted or len(sweep.metrics) < 2:
+        return None
+    (energy, (energy_label, _)), (error, (error_label, scale)) = sweep.metrics.items()
+    figure = style.new_figure(3.6, f"{sweep.name}: energy against error, {len(sweep.rows)} runs{sweep.failed}")
+    axes = figure.subplots()
+    styles, last = sweep.looks, max(len(sweep.variants) - 1, 1)
+    for k, variant in enumerate(sweep.variants):
+        found = [
+            (row[error], row[energy]) for row in sweep.of(variant) if None not in (row.get(error), row.get(energy))
+        ]
+        xs, ys = np.array(found, dtype=float).reshape(-1, 2).T
+        # Earlier ones are larger: equal runs of several variants are rings about each other.
+        larger = 1.0 + 1.8 * (len(sweep.variants) - 1 - k) / last
+        size = (14 if len(sweep.rows) < 500 else 4) * larger**2
+        axes.scatter(
+            scale * xs, ys, s=size, color=styles[variant]["color"], label=variant or None, linewidths=0, zorder=3
+        )
+    rows = [row for row in sweep.rows if None not in (row.get(error), row.get(energy))]
+    front = best([(scale * row[error], row[energy]) for row in rows])
+    axes.plot(
+        *front.T,
+        color=style.BLACK,
+        linewidth=0.7,
+        # What lies left of and below the steps, no run reaches.
+        drawstyle="steps-post",
+        marker="o",
+        markersize=5,
+        markerfacecolor="none",
+        label="no run is better in both",
+        zorder=4,
+    )
+    axes.margins(0.05)
+    axes.set(xlabel=error_label, ylabel=energy_label)
+    _scale(axes, "x", np.array([scale * row[error] for row in rows]))
+    _scale(axes, "y", np.array([row[energy] for row in rows]))
+    style.legend_above(axes, columns=len(sweep.variants) + 1)
+    return figure
+
+
+def best(points: Sequence[tuple[float, float]]) -> Array:
+    """Points that no other one is below in one coordinate and not above in the other, by the first, (k, 2)."""
+    found: list[tuple[float, float]] = []
+    for x, y in sorted(points):
+        if not found or y < found[-1][1]:
+            found.append((x, y))
+    return np.array(found).reshape(-1, 2)
+
+
+def samples(sweep: Sweep) -> Figure | None:
+    """Distribution of energy and error over the samples; None without samples.
+
+    A row for each variant and place of the grid: what the grid does is no law of the samples, and all places have the
+    same draws. Of many places, some that lie evenly among them.
+    """
+    if not sweep.sampled:
+        return None
+    metrics, variants, places = sweep.metrics, sweep.variants, _grid_places(sweep)
+    room = max(_ROWS // len(variants), 1)
+    shown = [places[k] for k in np.linspace(0, len(places) - 1, min(room, len(places))).round().astype(int)]
+    note = (
+        f"; {len(shown)} of {len(places)} places of the grid, all in statistics.json"
+        if len(shown) < len(places)
+        else ""
+    )
+    figure = style.new_figure(
+        _PANEL * len(variants) * len(shown) + _ROOM,
+        f"{sweep.name}: {len(sweep.rows)} runs by the law of their parameters{sweep.failed}{note}",
+    )
+    rows = [(variant, place) for variant in variants for place in shown]
+    ends = [key.split(".")[-1] for key in sweep.grid]
+    names = {key: end if ends.count(end) == 1 else key for key, end in zip(sweep.grid, ends, strict=True)}
+    panels = figure.subplots(len(rows), len(metrics), squeeze=False)
+    for row, (variant, place) in zip(panels, rows, strict=True):
+        here = list(_at(sweep.of(variant), place))
+        # Where there is one place, it goes without saying.
+        where = [f"{names[key]} = {_level(value)}" for key, value in place.items()] if len(places) > 1 else []
+        texts = [variant] * bool(variant) + [_short(", ".join(where), _HEAD - len(variant))] * bool(where)
+        head = f"{', '.join(texts)}\n" if texts else ""
+        for axes, (metric, (label, scale)) in zip(row, metrics.items(), strict=True):
+            _distribution(axes, _values(here, metric) * scale, head, sweep.looks[variant]["color"])
+            axes.set_xlabel(label)
+            axes.set_ylabel("runs")
+    return figure
+
+
+def _distribution(axes: Axes, values: Array, head: str, colour: str) -> None:
+    """Histogram of the draws at one place, with their mean and its interval, and that of the draws themselves."""
+    if len(values) < 2:
+        axes.set_title(f"{head}too few runs with numbers: {len(values)}", fontsize=7.5)
+        return
+    # Freedman and Diaconis: as narrow as the number of samples allows.
+    bins = min(_BINS, len(np.histogram_bin_edges(values, "fd")) - 1)
+    axes.hist(values, bins=bins, color=colour, alpha=0.7)
+    one = spread(values)
+    axes.axvline(one.mean, color=style.BLACK, linewidth=1.0)
+    for limit in (one.low, one.high):
+        axes.axvline(limit, color=style.BLACK, linewidth=0.8, linestyle=(0, (4, 2)))
+    of_all = (
+        f"{one.count} runs: mean {_with_interval(one.mean, one.mean_high - one.mean)}, "
+        f"{100 * LEVEL:g} % in {style.number(one.low)} … {style.number(one.high)}"
+    )
+    axes.set_title(f"{head}{of_all}", fontsize=7.5)
+    axes.margins(x=0.03)
+
+
+def tornado(sweep: Sweep) -> Figure | None:
+    """What one standard deviation of each sampled key does to energy and error; None where no line can be fitted."""
+    found = {
+        (variant, metric): fit
+        for variant in sweep.variants
+        for metric in sweep.metrics
+        if (fit := _fit(sweep, variant, metric)) is not None
+    }
+    if not found:
+        return None
+    variants, metrics = sweep.variants, sweep.metrics
+    bars = min(len(sweep.sampled), _BARS)
+    title = f"{sweep.name}: what one standard deviation of each does{sweep.failed}"
+    figure = style.new_figure((_BAR * bars + _ROOM) * len(variants) + 0.5, title)
+    panels = figure.subplots(len(variants), len(metrics), squeeze=False)
+    for row, variant in zip(panels, variants, strict=True):
+        for axes, (metric, (label, scale)) in zip(row, metrics.items(), strict=True):
+            axes.set_xlabel(f"change of {label}")
+            fit = found.get((variant, metric))
+            if fit is None:
+                axes.set_title(f"{variant}: no line fits")
+                continue
+            order = np.argsort(-np.abs(fit.effect), kind="stable")[:bars][::-1]
+            effect, half = scale * fit.effect[order], scale * fit.half_width[order]
+            colours = [style.BLUE if one > 0.0 else style.ORANGE for one in effect]
+            axes.barh(range(len(order)), effect, xerr=half, color=colours, height=0.7, error_kw={"elinewidth": 0.8})
+            axes.set_yticks(range(len(order)), [_short(sweep.sampled[k]) for k in order])
+            axes.axvline(0.0, color=style.BLACK, linewidth=0.6)
+            axes.grid(visible=False, axis="y")
+            axes.margins(x=0.05)
+            explained = f"a line explains {100.0 * fit.explained:.3g} % of the variance"
+            axes.set_title("\n".join([variant] * bool(variant) + [explained]), fontsize=7.5)
+    return figure
+
+
+def _fit(sweep: Sweep, variant: str, metric: str) -> Any:
+    rows = [row for row in sweep.of(variant) if row.get(metric) is not None]
+    if not rows or not sweep.sampled:
+        return None
+    values = np.array([row[metric] for row in rows], dtype=float)
+    # What the grid does is not what the samples do.
+    for here in _together(rows, sweep.grid).values():
+        values[here] -= values[here].mean()
+    # All places have the same draws: each counts once, or the intervals would be those of more than there are.
+    draws = list(_together(rows, sweep.sampled).values())
+    parameters = np.array([[rows[draw[0]][key] for key in sweep.sampled] for draw in draws], dtype=float)
+    return sensitivities(parameters, np.array([values[draw].mean() for draw in draws]))
+
+
+def _together(rows: Sequence[Mapping[str, Any]], keys: Sequence[str]) -> dict[tuple[str, ...], list[int]]:
+    """Which rows share the values of some keys, by those."""
+    found: dict[tuple[str, ...], list[int]] = {}
+    for k, row in enumerate(rows):
+        found.setdefault(tuple(str(row[key]) for key in keys), []).append(k)
+    return found
+
+
+def _grid_places(sweep: Sweep) -> list[dict[str, Any]]:
+    """Values of the grid's keys, each set of them once, in the order of the table."""
+    firsts = [found[0] for found in _together(sweep.rows, sweep.grid).values()]
+    return [{key: sweep.rows[k][key] for key in sweep.grid} for k in firsts]
+
+
+def _levels(rows: Sequence[Mapping[str, Any]], key: str) -> list[Any]:
+    """Values of a key of the grid: numbers by size, others as they come."""
+    found = list({str(row[key]): row[key] for row in rows}.values())
+    return sorted(found) if _numeric(found) else found
+
+
+def _numeric(levels: Sequence[Any]) -> bool:
+    return all(isinstance(level, (int, float)) and not isinstance(level, bool) for level in levels)
+
+
+def _places(levels: Sequence[Any]) -> Array:
+    return np.array(levels, dtype=float) if _numeric(levels) else np.arange(float(len(levels)))
+
+
+def _name_places(axes: Axes, which: str, key: str, levels: Sequence[Any]) -> None:
+    axes.set(**{f"{which}label": key})
+    if not _numeric(levels):
+        axes.set_xticks(range(len(levels)), list(map(str, levels)))
+
+
+def _name_cells(axes: Axes, which: str, key: str, levels: Sequence[Any]) -> None:
+    """Name the rows or columns of an image: at most about eight of them."""
+    shown = range(0, len(levels), -(-len(levels) // 8))
+    texts = [f"{levels[k]:.3g}" if _numeric(levels) else str(levels[k]) for k in shown]
+    axes.set(**{f"{which}ticks": list(shown), f"{which}ticklabels": texts, f"{which}label": _short(key)})
+
+
+def _at(rows: Sequence[Mapping[str, Any]], place: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    return (row for row in rows if all(row[key] == value for key, value in place.items()))
+
+
+def _values(rows: Sequence[Mapping[str, Any]] | Iterator[Mapping[str, Any]], metric: str) -> Array:
+    return np.array([row[metric] for row in rows if row.get(metric) is not None], dtype=float)
+
+
+def _scale(axes: Axes, which: str, values: Array) -> None:
+    """A logarithmic axis for positive values of very different size; else one from zero, unless that squeezes them."""
+    values = values[np.isfinite(values)]
+    low, high = values.min(initial=np.inf), values.max(initial=-np.inf)
+    if _is_wide(low, high):
+        style.log_axis(axes, which)
+    elif 0.0 <= low < 0.7 * high:
+        axes.set(**{f"{which}lim": (0.0, 1.05 * high)})
+
+
+def _with_interval(value: float, half: float) -> str:
+    """A value and its half width to two digits of that."""
+    places = max(1 - math.floor(math.log10(half)), 0) if half > 0.0 else 3
+    return f"{value:.{places}f} ± {half:.{places}f}".replace("-", "−")
+
+
+def _is_wide(low: float, high: float) -> bool:
+    """Whether values between these are positive and of very different size."""
+    return bool(low > 0.0 and high > _WIDE * low)
+
+
+def _level(value: Any) -> str:
+    return style.number(value) if _numeric([value]) else str(value)
+
+
+def _short(text: str, long: int = _LABEL) -> str:
+    return text if len(text) <= long else f"…{text[1 - long :]}"

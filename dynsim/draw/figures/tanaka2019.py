@@ -1,0 +1,228 @@
+"""Figures and tables laid out like those of [T], to be held beside the paper.
+
+[T]: M. Tanaka et al., "Task-Space Control of Articulated Mobile Robots With a Soft Gripper for Operations", IEEE
+Transactions on Robotics 35(1), 2019. Its curves are not copied; numbers that its text states are drawn in.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Mapping
+from itertools import pairwise
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from dynsim.draw.figures.snake_view import (
+    CYCLE,
+    GROUND,
+    HEAD,
+    SYMBOLS,
+    View,
+    greek,
+    mode_chart,
+    posture_grid,
+    posture_strip,
+    relax,
+)
+from dynsim.record import Record
+from dynsim.snake.geometry import snake_geometry
+from dynsim.snake.published import (
+    COORDINATES,
+    HEAD_ERROR,
+    POLICIES,
+    TABLE_III,
+    displacement,
+    mode_sequence,
+    tables,
+    used_limit,
+)
+from dynsim.system.files import write_text
+
+STOPPED = "joint at its limit"
+
+Maker = Callable[[Mapping[str, Record]], Figure]
+
+
+def figures(scenario: str, records: Mapping[str, Record]) -> dict[str, Maker]:
+    """Makers of the figures beside [T] by file name, as far as their variants were run."""
+    found: dict[str, Maker] = {}
+    if scenario == "snake_positioning" and set(records) & set(TABLE_III):
+        found["table_iii"] = positioning
+    if scenario == "snake_joint_limits":
+        if "cyclic" in records:
+            found |= {"fig_9": lambda r: head_and_cost(r["cyclic"]), "fig_10": lambda r: joint_angles(r["cyclic"])}
+        if {"cyclic", "eq20", "eq20_min"} <= set(records):
+            found["fig_8_and_16"] = motion
+        if set(POLICIES) <= set(records):
+            found["policies"] = policies
+    if scenario == "snake_door_arc" and "pull_switching" in records:
+        found["fig_14"] = lambda r: door(r["pull_switching"])
+    return found
+
+
+def figures_of_run(record: Record) -> dict[str, Callable[[Record], Figure]]:
+    """Makers of the figures beside [T] that one run is enough for."""
+    return {"fig_13": picking_up} if record.summary["scenario"] == "snake_operator" and record["gripper"].any() else {}
+
+
+def write_tables(scenario: str, records: Mapping[str, Record], folder: Path) -> list[Path]:
+    """Write the tables beside [T] as CSV; returns the files."""
+    written = []
+    for name, rows in tables(scenario, records).items():
+        stream = io.StringIO()
+        csv.writer(stream, lineterminator="\n").writerows(rows)
+        written.append(write_text(folder / f"{name}.csv", stream.getvalue()))
+    return written
+
+
+def positioning(records: Mapping[str, Record]) -> Figure:
+    """Table III of [T]: deviation from the target displacement, measured there and simulated here."""
+    moved = [name for name in TABLE_III if name in records]
+    figure, axes = plt.subplots(2, 1, figsize=(7.2, 4.4), sharex=True)
+    width = 0.8 / 3
+    for axis, part, unit in ((axes[0], range(3), "mm"), (axes[1], range(3, 6), "rad")):
+        scale = 1e3 if unit == "mm" else 1.0
+        for k, i in enumerate(part):
+            place = np.arange(len(moved)) + (k - 1) * width
+            published = [TABLE_III[m] for m in moved]
+            off = [scale * (p.mean[i] - p.target[i]) for p in published]
+            spread = [scale * p.deviation[i] for p in published]
+            name = SYMBOLS.get(COORDINATES[i], COORDINATES[i])
+            axis.bar(place, off, 0.9 * width, yerr=spread, capsize=2, color=CYCLE[k], alpha=0.6, label=f"Δ{name}, [T]")
+            ours = [scale * (displacement(records[m])[i] - TABLE_III[m].target[i]) for m in moved]
+            axis.plot(place, ours, "D", color="black", ms=3, label="simulated, no slip" if k == 2 else None)
+        axis.axhline(0.0, color="black", lw=0.6)
+        axis.set_ylabel(f"off target [{unit}]")
+        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    axes[1].set_xticks(range(len(moved)), [f"moving {SYMBOLS.get(m, m)}" for m in moved])
+    axes[1].set_xlim(-0.6, len(moved) - 0.4)
+    return figure
+
+
+def motion(records: Mapping[str, Record]) -> Figure:
+    """Figs 8 and 16: top views over time with the costs of eq 19 and eq 20."""
+    shown = {"cyclic": "eq 19\n(Fig 8)", "eq20": "eq 20 printed\n(Fig 16)", "eq20_min": "eq 20, 1/min d\n(Fig 16)"}
+    lines = {}
+    for name, label in shown.items():
+        record = records[name]
+        views = [_view_at(record, t) for t in (0.0, 2.0, 7.0, 12.0, 17.0, np.inf)]
+        area = record["support_area"]
+        lines[label] = [(v, f"{v.time:.0f} s, mode {v.mode}, {area[v.row]:.3f} m²") for v in views]
+    return posture_grid(lines, "; in the titles: area of the support polygon")
+
+
+def _view_at(record: Record, time: float) -> View:
+    return View(record, min(int(np.searchsorted(record.time, time)), len(record) - 1))
+
+
+def head_and_cost(record: Record) -> Figure:
+    """Fig 9: pose of the head, mode and V over time; lines as there, and the error that its text states."""
+    figure, axes = plt.subplots(4, 2, figsize=(7.2, 6.6), sharex=True)
+    time = record.time
+    for i, axis in enumerate(axes[:3].T.ravel()):
+        scale, error, unit = (1e3, HEAD_ERROR[0], "mm") if i < 3 else (1.0, HEAD_ERROR[1], "rad")
+        target = scale * record["w_target"][:, i]
+        band = axis.fill_between(time, target - scale * error, target + scale * error, color=CYCLE[4], alpha=0.25, lw=0)
+        (actual,) = axis.plot(time, scale * record["w"][:, i], color=GROUND)
+        (wanted,) = axis.plot(time, target, ":", color="red", lw=1.4)
+        relax(axis, 2 * scale * error)
+        axis.set_ylabel(f"{SYMBOLS.get(COORDINATES[i], COORDINATES[i])}$_h$ [{unit}]")
+        off = scale * np.abs(record["w"][:, i] - record["w_target"][:, i]).max()
+        axis.set_title(f"largest error {off:.1e} {unit}", fontsize=7)
+    axes[3, 0].step(time, record["mode"], where="post", color=GROUND)
+    axes[3, 0].set(ylabel="σ", ylim=(0.5, record["mode"].max() + 0.5), xlabel="t [s]")
+    axes[3, 0].set_yticks(np.unique(record["mode"]))
+    axes[3, 1].plot(time, record["cost"], color=GROUND)
+    axes[3, 1].set(ylabel="V", xlabel="t [s]")
+    axes[3, 1].set_ylim(bottom=0.0)
+    figure.legend(
+        [actual, wanted, band],
+        ["simulated", "target", "[T]: errors of about 30 mm and 0.1 rad"],
+        loc="outside upper center",
+        ncols=3,
+        frameon=False,
+    )
+    return figure
+
+
+def joint_angles(record: Record) -> Figure:
+    """Fig 10: every joint angle over time with its limits, lines as there."""
+    geometry, phi = snake_geometry(record), record["phi"]
+    names, count = record.labels["phi"], phi.shape[1]
+    figure, axes = plt.subplots(-(-count // 3), 3, figsize=(7.2, 1.55 * -(-count // 3) + 0.4), sharex=True)
+    for axis in axes.ravel()[count:]:
+        axis.set_visible(False)
+    for j, axis in enumerate(axes.ravel()[:count]):
+        (actual,) = axis.plot(record.time, phi[:, j], color=GROUND)
+        for bound in (geometry.lower[j], geometry.upper[j]):
+            limit = axis.axhline(bound, color="black", ls="-.", lw=0.8)
+        out = record["at_limit"][:, j] > 0
+        (held,) = axis.plot(record.time[out], phi[out, j], ".", color=HEAD, ms=3)
+        reach = 1.15 * geometry.upper[j]
+        axis.set(ylim=(-reach, reach), ylabel=f"{greek(names[j])} [rad]")
+    figure.supxlabel("t [s]", fontsize=8)
+    figure.legend(
+        [actual, limit, held],
+        ["simulated", "joint limit", "out of the allocation at its limit"],
+        loc="outside upper center",
+        ncols=3,
+        frameon=False,
+    )
+    return figure
+
+
+def policies(records: Mapping[str, Record]) -> Figure:
+    """Modes of the three policies over time, with V, the largest yaw angle and the support margin."""
+    figure, axes = plt.subplots(6, 1, figsize=(7.2, 9.0), sharex=True, height_ratios=[1, 1, 1, 1.2, 1, 1])
+    for axis, name in zip(axes, POLICIES, strict=False):
+        mode_chart(axis, records[name], f"{name}: mode")
+    for name in POLICIES:
+        record = records[name]
+        label = f"{name}, V at the end {record['cost'][-1]:.2f}"
+        axes[3].plot(record.time, record["cost"], label=label)
+        axes[4].plot(record.time, used_limit(record))
+        axes[5].plot(record.time, 1e3 * record["support_margin"])
+    axes[3].set(ylabel="cost V")
+    axes[3].set_ylim(bottom=0)
+    axes[3].legend(frameon=False)
+    axes[4].axhline(1.0, color="black", ls="-.", lw=0.8)
+    axes[4].set(ylabel="largest |θ| / limit")
+    axes[5].axhline(0.0, color="black", ls="-.", lw=0.8)
+    axes[5].set(ylabel="support margin [mm]", xlabel="t [s]      (margin below zero: the robot tips)")
+    return figure
+
+
+def door(record: Record) -> Figure:
+    """Fig 14: the pull with its stops at joint limits and the postures after switching modes, top view."""
+    fixing = record["mode"][0]
+    changes = mode_sequence(record)
+    # a stop ends with the first mode that is not the fixing one, a recovery with the return to it
+    stops = [
+        (t, STOPPED if mode != fixing else "after switching modes")
+        for (_, before), (t, mode) in pairwise(changes)
+        if (before == fixing) != (mode == fixing)
+    ]
+    closed = record.time[np.flatnonzero(record["gripper"])[0]]
+    shown = [(0.0, "initial"), (closed, "knob grasped"), *stops, (record.time[-1], "end")]
+    titled = []
+    for place, (time, what) in enumerate(shown):
+        view = _view_at(record, time)
+        if what == STOPPED:
+            view = View(record, max(view.row - 1, 0))  # before the change that ends the stop
+        opened = abs(np.rad2deg(record["w"][view.row, 5] - record["w"][0, 5]))
+        titled.append((view, f"({'abcdefghijklmnop'[place]}) {what}\n{view.time:.1f} s, {opened:.1f}°"))
+    lines = {" " * start: titled[start : start + 3] for start in range(0, len(titled), 3)}
+    return posture_grid(lines, "; green: arc of the knob; in the titles: time, angle of the door")
+
+
+def picking_up(record: Record) -> Figure:
+    """Fig 13: reaching, grasping, after picking up (there is no object in the simulation)."""
+    closed = np.flatnonzero(record["gripper"])
+    height = record["w"][closed, 2]
+    lifted = closed[np.argmax(height > height.max() - 1e-4)]  # the first time; later ones differ by rounding
+    shown = ((closed[0] // 2, "1: reaching"), (closed[0], "2: grasping"), (lifted, "3: after picking up"))
+    return posture_strip([(View(record, int(row)), f"{what}, t = {record.time[row]:.1f} s") for row, what in shown])

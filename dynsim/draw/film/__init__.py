@@ -1,0 +1,9 @@
+"""Films of records: without display, graphics card or browser.
+
+Record(s) → robots of :mod:`dynsim.draw.page.robot` → painted frames (:mod:`dynsim.draw.film.painter`) over a plot
+(:mod:`dynsim.draw.film.strip`) → file (:mod:`dynsim.draw.film.encode`)
+"""
+
+from dynsim.draw.film.film import Film, write
+
+__all__ = ["Film", "write"]

@@ -1,0 +1,430 @@
+"""Frames of one robot: what stands still is painted once, what moves from the farthest face to the nearest.
+
+Painted with Pillow at ``FINER`` times the size and then reduced, which smooths all edges. Depth is that of a face's
+middle: bodies that are small beside their distances need no more, and no graphics card is asked for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageColor, ImageDraw
+
+from dynsim.draw.figures.solids import outline
+from dynsim.draw.figures.style import BLACK, BLUE, GREEN, GREY, ORANGE, PULLING, SKY
+from dynsim.draw.film.camera import Camera
+from dynsim.draw.film.solids import grid_faces, solid
+from dynsim.draw.film.strokes import Box, arrow, dashes, font, labels, line, ring
+from dynsim.draw.page.meshes import Meshes, simplified
+from dynsim.draw.page.robot import Contact, Robot, Sunk, contacts, largest_force, paths, sunk
+from dynsim.draw.page.solids import body_shapes, drawn_shape, drawn_surface, gripper
+from dynsim.draw.page.wheels import cop_of, supports, wheel_groups
+from dynsim.record.poses import ORIENTATION, POSITION
+from dynsim.record.quaternion import rotated
+from dynsim.record.scene import HERE, WORLD, Surface
+from dynsim.record.surface_points import round_patch, surface_grids
+
+Array = NDArray[np.float64]
+FINER = 2
+# Triangles of all meshes at most: a film of a robot is some 500 pixels wide.
+TRIANGLES = 20_000
+PAPER, GROUND, LINES, FAINT, SURFACE = "#FFFFFF", "#F1F3F5", "#D3D8DE", "#ECEEF1", "#C9D3DE"
+BODY, HUB, WHEEL, SUPPORT = "#AEB7C4", "#4A5260", "#3A4048", "#D5EAF8"
+FRICTION = "#7A3E9D"
+# Friction of less than this share of the largest normal force has no arrow.
+FRICTION_SHOWN = 1e-3
+DEEP = "#882255"
+MODES = {0: GREY, 1: ORANGE, 2: GREEN}
+# Towards the light, seen by the viewer: right, up, near.
+LIGHT = np.array([-0.35, 0.75, 0.56]) / np.linalg.norm([-0.35, 0.75, 0.56])
+# A lower picture [pixel] has smaller texts.
+LOW = 200
+# Points of a path at most.
+WAY = 600
+# By an open and a closed gripper [m].
+_NOT_MOVED = np.zeros((2, 3))
+
+
+@dataclass(frozen=True)
+class _Solids:
+    """Faces of everything that moves: corners in the frames of their bodies, faces of four corners, colours.
+
+    ``aside``: how far the corners are moved by an open and a closed gripper, (2, n, 3) [m].
+    """
+
+    corners: Array
+    body: NDArray[np.int64]
+    faces: NDArray[np.int64]
+    colour: Array
+    wheel: NDArray[np.int64]
+    aside: Array
+
+
+class Painter:
+    """Paints a robot at instants of its record into an image of a size.
+
+    Parameters
+    ----------
+    camera : for the picture at ``FINER`` times its size
+    bounds : the box in which everything moves [m]
+    tint : colour of the hand's way
+    title : is written in it, and then hubs have it too: the robot is one of several
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        camera: Camera,
+        size: tuple[int, int],
+        bounds: tuple[Array, Array],
+        *,
+        tint: str = BLUE,
+        title: str = "",
+    ) -> None:
+        self.robot, self.camera, self.size, self.tint, self.title = robot, camera, size, tint, title
+        self._hub = tint if title else HUB
+        record = robot.record
+        self._time = record.time
+        self._position = record[POSITION].astype(np.float64)
+        self._turn = record[ORIENTATION].astype(np.float64)
+        found = Meshes()
+        found.of_robot(record)
+        shapes = body_shapes(robot.scene, robot.reach, found)
+        self._fixed = [shown for shape in robot.scene.fixed if (shown := drawn_shape(shape, found)) is not None]
+        self._meshes = simplified(found.found, TRIANGLES)
+        self._wheels = wheel_groups(record, robot.scene)
+        # The body that has a gripper.
+        hand = robot.scene.hand
+        self._gripped = hand.body if hand is not None and "gripper" in record else WORLD
+        self._solids = self._moving(shapes)
+        self._contacts = contacts(robot)
+        self._sunk = sunk(robot)
+        self._full = largest_force(self._contacts)
+        self._ways = dict(paths(record, robot.scene))
+        self._supports = supports(robot.scene, self._wheels)
+        self._pressure = cop_of(record)
+        # Of one robot among several it is as small as its part of the film.
+        self._font = font((13 if size[1] >= LOW else 11) * FINER)
+        self.labels: list[Box] = []
+        self._still = self._background(*bounds)
+
+    def frame(self, time: float) -> Image.Image:
+        """The robot at an instant [s], between samples in straight lines."""
+        row, share = self._place(time)
+        image = self._still.copy()
+        draw = ImageDraw.Draw(image)
+        place, turn = (_between(values, row, share) for values in (self._position, self._turn))
+        if np.isfinite(place).all() and np.isfinite(turn).all():
+            turn = turn / np.linalg.norm(turn, axis=1)[:, None]
+            hull = self._support(place, turn, row)
+            if len(hull) > 2:
+                corners = self.camera.project(np.column_stack([hull, np.zeros(len(hull))]))[:, :2]
+                draw.polygon([tuple(one) for one in corners.tolist()], fill=SUPPORT, outline=SKY)
+            self._paint_bodies(draw, place, turn, row)
+            self._paint_pressure(draw, hull, row)
+            self._paint_way(draw, time, row)
+            for one in self._sunk:
+                self._paint_sunk(draw, one, place, turn, row, share)
+            forces = [self._paint_contact(draw, contact, place, turn, row, share) for contact in self._contacts]
+            self._paint_hand(draw, place, turn)
+            # Last, so that nothing lies over a sign.
+            self.labels = labels(draw, [one for one in forces if one], self._font, image.size, PAPER)
+        return image.reduce(FINER)
+
+    def hand(self, time: float) -> tuple[float, float] | None:
+        """Where the hand's mark is in the picture [pixel]; None for a robot without a hand."""
+        row, share = self._place(time)
+        point = self.robot.scene.hand
+        if point is None:
+            return None
+        turn = _between(self._turn, row, share)
+        turn = turn / np.linalg.norm(turn, axis=1)[:, None]
+        where = _on(point.body, np.array(point.position), _between(self._position, row, share), turn)
+        x, y, _ = self.camera.project(where)
+        return float(x) / FINER, float(y) / FINER
+
+    def _place(self, time: float) -> tuple[int, float]:
+        """The sample before an instant, and how far it is to the next one."""
+        if len(self._time) < 2:
+            return 0, 0.0
+        row = int(np.clip(np.searchsorted(self._time, time, side="right") - 1, 0, len(self._time) - 2))
+        share = (time - self._time[row]) / max(self._time[row + 1] - self._time[row], 1e-12)
+        return row, float(np.clip(share, 0.0, 1.0))
+
+    def _moving(self, shapes: list[list[dict[str, Any]]]) -> _Solids:
+        group = {place: k for k, places in enumerate(self._wheels.places) for place in places}
+        corners, bodies, faces, colours, wheels = [np.zeros((0, 3))], [np.zeros(0, int)], [], [], []
+        aside, count = [np.zeros((2, 0, 3))], 0
+
+        def add(body: int, shape: dict[str, Any], plain: str, wheel: int = -1, moved: Array = _NOT_MOVED) -> None:
+            nonlocal count
+            points, cells = solid(shape, self._meshes)
+            corners.append(points)
+            bodies.append(np.full(len(points), body))
+            faces.append(cells + count)
+            colours.append(self._colours(shape, len(cells), plain))
+            wheels.append(np.full(len(cells), wheel))
+            aside.append(np.broadcast_to(moved[:, None, :], (2, len(points), 3)))
+            count += len(points)
+
+        for k, own in enumerate(shapes):
+            for j, shape in enumerate(own):
+                wheel = group.get((k, j), -1)
+                add(k, shape, WHEEL if wheel >= 0 else self._hub if shape.get("role") == "hub" else BODY, wheel)
+        for shape, moved in self._fingers(shapes):
+            add(self._gripped, shape, self.tint, moved=moved)
+        if not faces:
+            faces, colours, wheels = [np.zeros((0, 4), int)], [np.zeros((0, 3))], [np.zeros(0, int)]
+        return _Solids(
+            np.concatenate(corners),
+            np.concatenate(bodies),
+            np.concatenate(faces),
+            np.concatenate(colours),
+            np.concatenate(wheels),
+            np.concatenate(aside, axis=1),
+        )
+
+    def _fingers(self, shapes: list[list[dict[str, Any]]]) -> list[tuple[dict[str, Any], Array]]:
+        """Fingers of a gripper between open and closed, and where those states move them, (2, 3) [m]."""
+        hand = self.robot.scene.hand
+        if hand is None or self._gripped == WORLD:
+            return []
+        both = gripper(shapes, self.robot.reach)
+        place = np.array(hand.position) + np.array([both["ahead"], 0.0, 0.0])
+        shape = {"kind": "box", "size": both["size"], "p": place.tolist(), "q": list(HERE)}
+        return [(shape, side * np.outer(both["aside"], [0.0, 1.0, 0.0])) for side in (-1.0, 1.0)]
+
+    def _colours(self, shape: dict[str, Any], faces: int, plain: str) -> Array:
+        """Colours of a shape's faces, (n, 3): its own, those of its mesh's file, or a plain one."""
+        colours = np.tile(np.array(_rgb(plain), dtype=float), (faces, 1))
+        if "colour" in shape:
+            colours[:] = 255.0 * np.array(shape["colour"][:3])
+        elif "mesh" in shape and (own := self._meshes[shape["mesh"]].colours) is not None:
+            colours = np.where(np.isfinite(own), 255.0 * own, colours)
+        return colours
+
+    def _background(self, low: Array, high: Array) -> Image.Image:
+        image = Image.new("RGB", (self.size[0] * FINER, self.size[1] * FINER), PAPER)
+        draw = ImageDraw.Draw(image)
+        if not self.robot.scene.surfaces:
+            # To see by where things are.
+            self._paint_floor(draw, low, high, float(low[2]), real=False)
+        for surface in self.robot.scene.surfaces:
+            plane = surface.kind == "plane" and surface.direction is not None
+            if plane and abs((surface.direction or (0, 0, 1))[2]) > 1.0 - 1e-9:
+                self._paint_floor(draw, low, high, (surface.position or (0, 0, 0))[2])
+            else:
+                self._paint_surface(draw, surface, low, high)
+        for shape in self._fixed:
+            points, cells = solid(shape, self._meshes)
+            self._paint_faces(draw, points, cells, self._colours(shape, len(cells), HUB))
+        if (target := self._ways.get("target")) is not None:
+            dashes(draw, _apart(self.camera.project(target)[:, :2]), 6.0 * FINER, BLACK, FINER)
+        if (way := self._ways.get("hand")) is not None:
+            faint = tuple(int(0.65 * 255 + 0.35 * part) for part in _rgb(self.tint))
+            line(draw, _apart(self.camera.project(way)[:, :2]), faint, FINER)
+        if self.title:
+            draw.text((10 * FINER, 8 * FINER), self.title, fill=self.tint, font=self._font)
+        return image
+
+    def _paint_surface(self, draw: ImageDraw.ImageDraw, surface: Surface, low: Array, high: Array) -> None:
+        """A sphere or cylinder as a closed solid, or, if it is large, as the others: the part next to the robot."""
+        colour = np.array(_rgb(SURFACE))
+        round_one = surface.kind in ("sphere", "cylinder")
+        drawn = drawn_surface(surface, low, high) if round_one else {"kind": surface.kind}
+        if drawn["kind"] not in ("sphere", "cylinder"):
+            for grid in [round_patch(surface, low, high)] if round_one else surface_grids(surface, low, high):
+                self._paint_faces(draw, *grid_faces(grid), colour, both=True)
+            return
+        radius = float(drawn["radius"])
+        shape = {"q": HERE, **drawn, "size": [abs(radius), drawn.get("length", 0.0)]}
+        corners, faces = solid(shape, [], finer=3)
+        # Of one that holds the robot the far wall is seen.
+        self._paint_faces(draw, corners, faces if radius > 0.0 else faces[:, ::-1], colour)
+
+    def _paint_floor(self, draw: ImageDraw.ImageDraw, low: Array, high: Array, z: float, *, real: bool = True) -> None:
+        """A horizontal plane with a grid; from the side all below its line. What is not ``real`` is only a grid."""
+        width, height = (side * FINER for side in self.size)
+        up = float(self.camera.axes[2][2])
+        level = float(self.camera.project(np.array([*(0.5 * (low + high))[:2], z]))[1])
+        if up < 1e-6 and not real:
+            return
+        if up < 1e-6:
+            draw.rectangle([0, level, width, height], fill=GROUND)
+            draw.line([0, level, width, level], fill=GREY, width=FINER)
+            return
+        # What the picture shows of it, from the corners of the picture along the line of sight.
+        seen = np.array([[0.0, 0.0], [width, 0.0], [width, height], [0.0, height]])
+        flat = (seen - self.camera.middle) * np.array([1.0, -1.0]) / self.camera.scale
+        points = self.camera.centre + flat @ self.camera.axes[:2]
+        points += ((z - points[:, 2]) / up)[:, None] * self.camera.axes[2]
+        step = _round(float(np.linalg.norm(high - low)) / 10.0)
+        (x0, y0), (x1, y1) = np.floor(points[:, :2].min(axis=0) / step), np.ceil(points[:, :2].max(axis=0) / step)
+        x, y = step * np.arange(x0, x1 + 1), step * np.arange(y0, y1 + 1)
+        if real:
+            draw.rectangle([0, 0, width, height], fill=GROUND)
+        ends = [([a, y[0], z], [a, y[-1], z]) for a in x] + [([x[0], b, z], [x[-1], b, z]) for b in y]
+        for row in self.camera.project(np.array(ends))[..., :2]:
+            draw.line(row.ravel().tolist(), fill=LINES if real else FAINT, width=FINER)
+
+    def _paint_bodies(self, draw: ImageDraw.ImageDraw, place: Array, turn: Array, row: int) -> None:
+        solids = self._solids
+        if not len(solids.faces):
+            return
+        own = solids.corners
+        if self._gripped != WORLD:
+            own = own + solids.aside[int(self.robot.record["gripper"][row] > 0)]
+        corners = place[solids.body] + rotated(turn[solids.body].T, own.T).T
+        colour = solids.colour
+        if self._wheels.down is not None:
+            lifted = (solids.wheel >= 0) & (self._wheels.down[row][solids.wheel] == 0.0)
+            standing = (solids.wheel >= 0) & ~lifted
+            colour = np.where(lifted[:, None], np.array(_rgb("#F4F6F8")), colour)
+            colour = np.where(standing[:, None], np.array(_rgb(BLUE)), colour)
+        self._paint_faces(draw, corners, solids.faces, colour)
+
+    def _paint_faces(
+        self,
+        draw: ImageDraw.ImageDraw,
+        corners: Array,
+        faces: NDArray[np.int64],
+        colour: Array,
+        *,
+        both: bool = False,
+    ) -> None:
+        """Faces that turn to the viewer (or ``both`` sides), from the farthest on, lit from the upper left."""
+        seen = self.camera.project(corners)
+        shown = seen[faces]
+        # Area and direction from the diagonals, which a triangle that repeats a corner has as well.
+        a, b = shown[:, 2] - shown[:, 0], shown[:, 3] - shown[:, 1]
+        scale = np.array([1.0, -1.0, self.camera.scale])
+        normal = np.cross(a * scale, b * scale)
+        size = np.linalg.norm(normal, axis=1)
+        kept = (size > 1e-12) & ((normal[:, 2] > 0.0) | both)
+        shown, normal, size = shown[kept], normal[kept], size[kept]
+        normal = normal / size[:, None] * np.where(normal[:, 2:] < 0.0, -1.0, 1.0)
+        light = 0.58 + 0.42 * np.clip(normal @ LIGHT, 0.0, 1.0)
+        shades = np.broadcast_to(colour, (len(faces), 3))[kept] * light[:, None]
+        order = np.argsort(shown[..., 2].mean(axis=1))
+        points, fills = (
+            shown[order, :, :2].reshape(-1, 8).tolist(),
+            np.minimum(shades[order], 255.0).astype(int).tolist(),
+        )
+        for corner, fill in zip(points, fills, strict=True):
+            draw.polygon(corner, fill=tuple(fill))
+
+    def _support(self, place: Array, turn: Array, row: int) -> Array:
+        """Corners of what the robot stands on, (n, 2) [m], turning to the left."""
+        down = self._wheels.down
+        on = [one for one in self._supports if one["group"] < 0 or down is None or down[row][one["group"]] > 0.0]
+        points = [_on(one["body"], np.array(one["p"]), place, turn)[:2] for one in on]
+        return outline(np.array(points)) if points else np.zeros((0, 2))
+
+    def _paint_pressure(self, draw: ImageDraw.ImageDraw, hull: Array, row: int) -> None:
+        """Where the robot presses, a ring: orange outside of what it stands on."""
+        if self._pressure is None or not np.isfinite(self._pressure[1][row]).all():
+            return
+        at = self._pressure[1][row]
+        inside = False
+        if len(hull) > 2:
+            ahead, beside = np.roll(hull, -1, axis=0) - hull, at - hull
+            inside = bool((ahead[:, 0] * beside[:, 1] - ahead[:, 1] * beside[:, 0] >= 0.0).all())
+        x, y, _ = self.camera.project(np.array([*at, 0.0]))
+        ring(draw, x, y, 5.0 * FINER, BLACK if inside else PULLING, 2 * FINER)
+
+    def _paint_way(self, draw: ImageDraw.ImageDraw, time: float, row: int) -> None:
+        way = self._ways.get("hand")
+        if way is None or row < 1:
+            return
+        line(draw, _apart(self.camera.project(way[: row + 1])[:, :2]), _rgb(self.tint), 2 * FINER)
+
+    def _paint_contact(
+        self, draw: ImageDraw.ImageDraw, contact: Contact, place: Array, turn: Array, row: int, share: float
+    ) -> tuple[str, Array, str] | None:
+        """Arrows of the normal force, and of all of it with friction: away from the surface for a push, else to it.
+
+        Returns the force in words, where to write it [pixel], and its colour; None where there is none.
+        """
+        at = _on(contact.point.body, np.array(contact.point.position), place, turn)
+        force = float(_between(contact.force, row, share))
+        mode, text = None if contact.mode is None else int(contact.mode[row]), None
+        x, y, _ = self.camera.project(at)
+        colour = arrow_colour(force)
+        dot = colour if mode is None else MODES.get(mode, GREY)
+        if np.isfinite(force) and force != 0.0 and mode != 0:
+            normal = force * contact.normal[row]
+            friction = None if contact.tangent is None else _between(contact.tangent, row, share)
+            if friction is not None and np.linalg.norm(friction) > FRICTION_SHOWN * self._full:
+                self._paint_force(draw, at, normal + friction, force < 0.0, FRICTION, 2 * FINER)
+            end = self._paint_force(draw, at, normal, force < 0.0, colour, 3 * FINER)
+            text = f"{force:+.3g} N".replace("-", "−"), end - [0.0, 2.0 * FINER], colour
+        radius = 3.0 * FINER
+        draw.ellipse([x - radius, y - radius, x + radius, y + radius], fill=dot, outline=PAPER)
+        return text
+
+    def _paint_sunk(
+        self, draw: ImageDraw.ImageDraw, one: Sunk, place: Array, turn: Array, row: int, share: float
+    ) -> None:
+        """A ring about a joint that is below a surface, and by how much."""
+        depth = float(_between(one.depth, row, share))
+        if not depth > one.least:
+            return
+        x, y, _ = self.camera.project(_on(one.body, np.array(one.position), place, turn))
+        ring(draw, x, y, 6.0 * FINER, DEEP, 2 * FINER)
+        text = f"{1e3 * depth:.0f} mm" if depth >= 1e-3 else ""
+        draw.text((x, y + 8 * FINER), text, fill=DEEP, font=font(11 * FINER), anchor="mt")
+
+    def _paint_force(
+        self, draw: ImageDraw.ImageDraw, at: Array, force: Array, pulls: bool, colour: str, width: int
+    ) -> Array:
+        """The arrow of a force [N] at a contact, on the free side; returns its end away from the contact [pixel]."""
+        size = float(np.linalg.norm(force))
+        long = max(0.13 * self.robot.reach * min((size / self._full) ** 0.5, 1.6), 14.0 * FINER / self.camera.scale)
+        here = self.camera.project(at)[:2]
+        there = self.camera.project(at + (-long if pulls else long) / size * force)[:2]
+        arrow(draw, *((there, here) if pulls else (here, there)), colour, width)
+        return np.asarray(there)
+
+    def _paint_hand(self, draw: ImageDraw.ImageDraw, place: Array, turn: Array) -> None:
+        hand = self.robot.scene.hand
+        if hand is None or self._gripped != WORLD:
+            return
+        x, y, _ = self.camera.project(_on(hand.body, np.array(hand.position), place, turn))
+        radius = 4.0 * FINER
+        draw.ellipse([x - radius, y - radius, x + radius, y + radius], fill=self.tint, outline=PAPER, width=FINER)
+
+
+def arrow_colour(force: float) -> str:
+    """Of a normal force: blue where the surface pushes, orange where it pulls."""
+    return PULLING if force < 0.0 else BLUE
+
+
+def _rgb(colour: str) -> tuple[int, int, int]:
+    red, green, blue = ImageColor.getrgb(colour)[:3]
+    return red, green, blue
+
+
+def _between(values: Array, row: int, share: float) -> Array:
+    if share == 0.0:
+        return np.asarray(values[row])
+    return np.asarray(values[row] + share * (values[row + 1] - values[row]))
+
+
+def _on(body: int, point: Array, place: Array, turn: Array) -> Array:
+    """Where a point on a body is in the world, (3,) [m]."""
+    return point if body == WORLD else np.asarray(place[body] + rotated(turn[body], point))
+
+
+def _apart(points: Array) -> Array:
+    """Points of a path as they are known, at most ``WAY`` of them."""
+    points = points[np.isfinite(points).all(axis=1)]
+    return points[np.linspace(0, len(points) - 1, min(len(points), WAY)).astype(int)] if len(points) else points
+
+
+def _round(x: float) -> float:
+    """The next of 1, 2, 5 times a power of ten."""
+    power = 10.0 ** np.floor(np.log10(x))
+    return float(next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= 0.999 * x))

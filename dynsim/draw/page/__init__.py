@@ -1,0 +1,12 @@
+"""Records to look at: one page of HTML that holds scene, data and program, for any browser, without a network.
+
+    Record(s) → head and blocks (:mod:`dynsim.draw.page.content`) → text (:mod:`dynsim.draw.page.html`)
+
+It knows records and nothing of who made them: simulated and measured ones look the same.
+"""
+
+from dynsim.draw.page.content import viewable
+from dynsim.draw.page.html import page, write
+from dynsim.draw.page.inline import Inline
+
+__all__ = ["Inline", "page", "viewable", "write"]

@@ -1,0 +1,160 @@
+"""What stands still or moves with a body, as the page draws it: shapes, rods where a body has none, surfaces."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.draw.page.meshes import Meshes
+from dynsim.record.quaternion import of_turn
+from dynsim.record.scene import HERE, WORLD, Body, Scene, Shape, Surface
+from dynsim.record.surface_points import box_corners, surface_grids
+
+Array = NDArray[np.float64]
+# Radius of a rod drawn for a body without shapes, in parts of the robot's reach.
+ROD = 0.008
+# A sphere or cylinder of more than this many times what is shown is drawn only next to the robot.
+LARGE = 4.0
+
+
+def drawn_shape(shape: Shape, meshes: Meshes) -> dict[str, Any] | None:
+    """A shape as the page reads it; None for a mesh that was not found."""
+    found: dict[str, Any] = {
+        "kind": shape.kind,
+        "size": list(shape.size),
+        "p": list(shape.position),
+        "q": list(shape.orientation),
+    }
+    if shape.colour is not None:
+        found["colour"] = list(shape.colour)
+    if shape.kind == "mesh":
+        mesh = meshes.index(shape.file)
+        if mesh is None:
+            return None
+        found["mesh"] = mesh
+    return found
+
+
+def body_shapes(scene: Scene, reach: float, meshes: Meshes) -> list[list[dict[str, Any]]]:
+    """Shapes of every body; rods to what it carries where it has none, and a hub about the axis of its joint."""
+    radius = _radius(scene, ROD * reach)
+    base = set(scene.base)
+    found = []
+    for k, body in enumerate(scene.bodies):
+        shapes = [one for shape in body.shapes if (one := drawn_shape(shape, meshes)) is not None]
+        wanted = [child for child in scene.bodies if child.parent == k]
+        # A rod leads away from its joint, a wheel lies about it.
+        bare = not shapes or (_is_tube(body) and np.abs(body.shapes[0].position).max() > 1e-9)
+        if not shapes and k not in base:
+            ends = [np.array(child.joint.position) for child in wanted if not child.joint.part_of]
+            ends += [np.array(point.position) for point in scene.points if point.role == "hand" and point.body == k]
+            shapes = [_rod(end, radius) for end in ends if np.linalg.norm(end) > 2.0 * radius]
+        elif _is_tube(body):
+            shapes += _stems(scene, k)
+        if body.joint.kind == "revolute" and not body.joint.part_of and k not in base and bare:
+            shapes.append(_hub(body, 1.45 * radius))
+        found.append(shapes)
+    if not any(found):
+        hands = {point.body for point in scene.points if point.body != WORLD} or {len(scene.bodies) - 1}
+        for k in hands & set(range(len(scene.bodies))):
+            found[k] = [{"kind": "box", "size": 3 * [0.06 * reach], "p": [0.0, 0.0, 0.03 * reach], "q": list(HERE)}]
+    return found
+
+
+def _stems(scene: Scene, k: int) -> list[dict[str, Any]]:
+    """A thin rod to the hand of a body whose own one ends before it."""
+    tube = scene.bodies[k].shapes[0]
+    far = float(np.linalg.norm(tube.position)) + 0.5 * tube.size[1] + tube.size[0]
+    ends = [np.array(point.position) for point in scene.points if point.role == "hand" and point.body == k]
+    return [_rod(end, 0.5 * tube.size[0]) | {"role": "stem"} for end in ends if np.linalg.norm(end) > far]
+
+
+def thinnest(shapes: list[list[dict[str, Any]]]) -> float:
+    """The least radius of what is round [m], but for stems; 0 where nothing is."""
+    round_ones = (s for one in shapes for s in one if s["kind"] in ("cylinder", "capsule") and s.get("role") != "stem")
+    return min((shape["size"][0] for shape in round_ones), default=0.0)
+
+
+def gripper(shapes: list[list[dict[str, Any]]], reach: float) -> dict[str, Any]:
+    """Two fingers at the hand, boxes in its body's axes [m]: how far ahead, and aside when open and when closed."""
+    size = max(1.7 * thinnest(shapes), 0.012 * reach)
+    return {"size": [1.6 * size, 0.4 * size, 0.8 * size], "ahead": 0.5 * size, "aside": [0.8 * size, 0.28 * size]}
+
+
+def _radius(scene: Scene, default: float) -> float:
+    tubes = [shape.size[0] for body in scene.bodies if _is_tube(body) for shape in body.shapes[:1]]
+    return float(np.median(tubes)) if tubes else default
+
+
+def _is_tube(body: Body) -> bool:
+    """Whether it is drawn as a rod of dynsim's own: a cylinder without colour through the body's origin."""
+    return bool(body.shapes) and body.shapes[0].kind in ("cylinder", "capsule") and body.shapes[0].colour is None
+
+
+def _rod(end: Array, radius: float) -> dict[str, Any]:
+    length = float(np.linalg.norm(end))
+    return {
+        "kind": "capsule",
+        "size": [radius, length],
+        "p": (0.5 * end).tolist(),
+        "q": from_z(end / length).tolist(),
+        "role": "rod",
+    }
+
+
+def _hub(body: Body, radius: float) -> dict[str, Any]:
+    return {
+        "kind": "cylinder",
+        "size": [radius, 2.5 * radius],
+        "p": [0.0, 0.0, 0.0],
+        "q": from_z(np.array(body.joint.axis)).tolist(),
+        "role": "hub",
+    }
+
+
+def from_z(direction: Array) -> Array:
+    """A turn that takes z to a unit vector, (4,)."""
+    axis = np.cross([0.0, 0.0, 1.0], direction)
+    size = float(np.linalg.norm(axis))
+    if size < 1e-12:
+        return np.array(HERE if direction[2] > 0.0 else (0.0, 1.0, 0.0, 0.0))
+    return of_turn(axis / size, np.arctan2(size, direction[2]))
+
+
+def drawn_surface(surface: Surface, low: Array, high: Array) -> dict[str, Any]:
+    """A surface next to the box from ``low`` to ``high`` in which everything moves."""
+    found: dict[str, Any] = {"name": surface.name, "kind": surface.kind}
+    span = float((high - low).max())
+    near = abs(surface.radius or 0.0) <= LARGE * span
+    if surface.kind == "plane" and surface.direction is not None:
+        centre = 0.5 * (low + high)
+        normal = np.array(surface.direction)
+        return found | {
+            "p": (centre - surface.gap(centre) * normal).tolist(),
+            "q": from_z(normal).tolist(),
+            "half": 1.1 * float(np.linalg.norm(high - low)),
+        }
+    if surface.kind == "sphere" and near:
+        return found | {"p": list(surface.position or ()), "radius": surface.radius}
+    if surface.kind == "cylinder" and near and surface.direction is not None:
+        axis, place = np.array(surface.direction), np.array(surface.position)
+        along = [(corner - place) @ axis for corner in box_corners(low, high)]
+        start, end = min(along) - 0.1 * span, max(along) + 0.1 * span
+        return found | {
+            "p": (place + 0.5 * (start + end) * axis).tolist(),
+            "q": from_z(axis).tolist(),
+            "radius": surface.radius,
+            "length": end - start,
+        }
+    if surface.kind == "box":
+        return found | {
+            "p": list(surface.position or ()),
+            "q": list(surface.orientation or HERE),
+            "size": list(surface.edges or ()),
+        }
+    (grid,) = surface_grids(surface, low, high)
+    rows, columns, _ = grid.shape
+    numbers = [None if not np.isfinite(value) else round(float(value), 5) for value in grid.ravel()]
+    return found | {"kind": "grid", "rows": rows, "columns": columns, "points": numbers}

@@ -1,0 +1,1 @@
+"""Compiled mechanics: tables, trees of bodies, drives, contacts, and the derivative of the state."""

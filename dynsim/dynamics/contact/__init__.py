@@ -1,0 +1,1 @@
+"""Contacts: geometry, rows, the Delassus system, laws."""

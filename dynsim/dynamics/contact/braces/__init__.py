@@ -1,0 +1,1 @@
+"""Statics of braces: forces that hold a posture at least cost."""

@@ -1,0 +1,435 @@
+"""Forces of braces that realise a motion with the least heat in the motors: a cone program in the forces.
+
+    tau = M vdot + h + g + J_m vdot + (D + D_m) v − Bᵀ f,    minimise Σ w_j tau_j²,  w = R / K_m²
+
+with f = (f_n, f_1, f_2) of each brace and the rows of B the velocities of its point along n and two tangents;
+subject to lower ≤ tau ≤ upper (zero where there is no motor), |f_t| ≤ μ f_n and f_n ≥ min_N. A brace that slides has
+f_t = −μ f_n d instead, one whose normal force is commanded has f_n = that. The unknowns are what is left then: three
+forces of a brace that is held, f_n alone of one that slides or has no friction, and no normal force where that is
+commanded.
+"""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact.braces import tables as kb
+from dynsim.dynamics.contact.braces.tables import BraceArrays
+from dynsim.dynamics.contact.cone.program import ConeProgram, solve_cone_program
+from dynsim.dynamics.tables import ModelArrays, Workspace
+from dynsim.dynamics.tree.joints import read_positions
+from dynsim.dynamics.tree.points import point_jacobian, point_position
+from dynsim.dynamics.tree.sweep import kinematics, newton_euler
+from dynsim.jit.kernel import internal_kernel, kernel
+
+# How far forces violate the constraints, and how far apart the ends of an interval may be [1]: beyond it there is no
+# solution, and below it nothing but one.
+SLACK = 1e-9
+# Torques that are this part of the force scale within their limits need no program that looks for more room.
+AMPLE = 1e-6
+# Intervals are open where forces this many times their scale are still possible.
+FAR = 1e4
+# Weight of the forces beside the heat: keeps those finite that no motor feels.
+LEAST_WEIGHT = 1e-14
+
+
+@kernel
+def brace_motion(model: ModelArrays, ws: Workspace, braces: BraceArrays, q, v, positions, velocities):
+    """Positions and velocities of the points of braces along a motion.
+
+    Parameters
+    ----------
+    q, v : (T, nq), (T, n)
+    positions, velocities : (T, c, 3) [m, m/s], overwritten; points are those of ``braces.table``
+    """
+    jacobian, n = braces.jacobian, braces.free.shape[0]
+    for t in range(q.shape[0]):
+        set_motion(model, ws, q[t], v[t], v[t])
+        kinematics(model, ws)
+        for k in range(braces.link.shape[0]):
+            point_position(ws, braces.link[k], braces.table[k], positions[t, k])
+            point_jacobian(model, ws, braces.link[k], positions[t, k], jacobian)
+            for e in range(3):
+                rate = 0.0
+                for j in range(n):
+                    rate += jacobian[e, j] * v[t, j]
+                velocities[t, k, e] = rate
+
+
+@kernel
+def brace_statics(model: ModelArrays, ws: Workspace, braces: BraceArrays, q, v, vdot, tables, torques, intervals):
+    """Least-heat forces along a motion; the last instant's forces, and intervals if they are wanted, into ``braces``.
+
+    Returns the number of instants with a solution: it ends where nothing fulfils all constraints. Then ``certificate``
+    is a vector ω (n,) of joint rates that shows it: for all torques within their limits and all forces of the braces,
+    ω·(tau + Bᵀ f) < ω·free, which would have to be equal.
+
+    Parameters
+    ----------
+    q, v, vdot : (T, nq), (T, n), (T, n)
+    tables : (T, c, BRACE_SIZE), the braces at each instant
+    torques : (T, n) of the motors [N m], overwritten
+    """
+    for t in range(q.shape[0]):
+        for k in range(braces.link.shape[0]):
+            for e in range(kb.BRACE_SIZE):
+                braces.table[k, e] = tables[t, k, e]
+        set_motion(model, ws, q[t], v[t], vdot[t])
+        torque_limits(braces, ws)
+        if not least_heat_forces(model, ws, braces, intervals):
+            return t
+        for j in range(torques.shape[1]):
+            torques[t, j] = braces.torques[j]
+    return q.shape[0]
+
+
+@internal_kernel
+def set_motion(model: ModelArrays, ws: Workspace, q, v, vdot):
+    """Coordinates, rates and accelerations into the workspace."""
+    if model.compound is None:  # known to the compiler
+        for j in range(v.shape[0]):
+            ws.joints[j, ka.Q] = q[j]
+    else:
+        read_positions(model.compound, model, q, 0, ws)
+    for j in range(v.shape[0]):
+        ws.joints[j, ka.QD], ws.joints[j, ka.QDD] = v[j], vdot[j]
+
+
+@internal_kernel
+def torque_limits(braces: BraceArrays, ws: Workspace):
+    """Least and largest torque of each motor at a steady current: |R i + K_m v| ≤ U, |i| ≤ I.
+
+    A motor that is driven faster than its voltage allows brakes with all it has.
+    """
+    motors = braces.motors
+    for j in range(motors.shape[0]):
+        constant, resistance, current = motors[j, kb.CONSTANT], motors[j, kb.RESISTANCE], motors[j, kb.CURRENT_LIMIT]
+        low, high = -current, current
+        if resistance > 0.0:
+            induced = constant * ws.joints[j, ka.QD]
+            low = min(max(low, (-motors[j, kb.VOLTAGE_LIMIT] - induced) / resistance), current)
+            high = max(min(high, (motors[j, kb.VOLTAGE_LIMIT] - induced) / resistance), -current)
+        motors[j, kb.LOWER], motors[j, kb.UPPER] = constant * low, constant * high
+
+
+@internal_kernel
+def least_heat_forces(model: ModelArrays, ws: Workspace, braces: BraceArrays, intervals):
+    """Torques, forces and intervals of one instant into ``braces``; False, and a certificate, where there are none."""
+    found, table, motors = braces.found, braces.table, braces.motors
+    c, n, first, x = braces.link.shape[0], braces.free.shape[0], braces.first, braces.program.x
+    scale = brace_rows(model, ws, braces)
+    unknowns = first[c]
+    passive, limited = 0, False
+    for j in range(n):
+        passive += motors[j, kb.LOWER] == motors[j, kb.UPPER]
+        limited |= not (math.isinf(motors[j, kb.LOWER]) and math.isinf(motors[j, kb.UPPER]))
+    best = False
+    if passive == 0:
+        # The optimum without limits is that within them where it keeps them: mostly.
+        equations, cones = constraints(braces, scale, False, False)
+        middle_forces(braces, scale)
+        least_heat(braces, unknowns, equations, cones, scale)
+        keep(braces, scale)
+        best = not limited or ample(braces, scale)
+    if limited and (intervals or not best):
+        # Equations that contradict each other have no margin: first with torques of passive joints that may be off.
+        if passive > 0:
+            equations, cones = constraints(braces, scale, True, True)
+            if largest_margin(braces, equations, cones, scale) < -SLACK:
+                contradiction(braces, equations, cones, True)
+                return False
+        equations, cones = constraints(braces, scale, True, False)
+        inside = largest_margin(braces, equations, cones, scale)
+        if inside < -SLACK:
+            contradiction(braces, equations, cones, False)
+            return False
+        for k in range(unknowns):
+            braces.inside[k] = x[k]
+        if not best:
+            if inside > SLACK:
+                least_heat(braces, unknowns, equations, cones, scale)
+            keep(braces, scale)
+        for k in range(c):
+            for end in range(2):
+                if table[k, kb.COMMANDED] == table[k, kb.COMMANDED]:
+                    found[k, kb.LOW + end] = table[k, kb.COMMANDED]
+                elif inside <= SLACK:
+                    found[k, kb.LOW + end] = found[k, kb.FORCES]
+                elif intervals:
+                    found[k, kb.LOW + end] = extreme_force(braces, unknowns, equations, cones, k, end, scale)
+        return True
+    for k in range(c):
+        commanded = table[k, kb.COMMANDED] == table[k, kb.COMMANDED]
+        found[k, kb.LOW] = table[k, kb.COMMANDED] if commanded else table[k, kb.LEAST]
+        found[k, kb.HIGH] = table[k, kb.COMMANDED] if commanded else math.inf
+    return True
+
+
+@internal_kernel
+def keep(braces: BraceArrays, scale):
+    """Torques and forces of the unknowns x into ``braces``."""
+    for j in range(braces.free.shape[0]):
+        torque = braces.free[j]
+        for k in range(braces.first[braces.link.shape[0]]):
+            torque -= braces.B[k, j] * scale * braces.program.x[k]
+        braces.torques[j] = torque
+    for k in range(braces.link.shape[0]):
+        brace_forces(braces, k, scale)
+
+
+@internal_kernel
+def brace_forces(braces: BraceArrays, k, scale):
+    """The force of brace k from the unknowns, along its axes and in the world."""
+    table, found, x, at = braces.table, braces.found, braces.program.x, braces.first[k]
+    normal = table[k, kb.COMMANDED]
+    if normal != normal:
+        normal, at = scale * x[at], at + 1
+    found[k, kb.FORCES] = normal
+    for e in range(2):
+        directed = at == braces.first[k + 1]
+        found[k, kb.FORCES + 1 + e] = (
+            -table[k, kb.FRICTION] * normal * table[k, kb.SLIP + e] if directed else scale * x[at + e]
+        )
+    for i in range(3):
+        braces.forces[k, i] = 0.0
+        for e in range(ka.MOST_ROWS):
+            braces.forces[k, i] += found[k, kb.FORCES + e] * table[k, kb.AXES + 3 * e + i]
+
+
+@internal_kernel
+def ample(braces: BraceArrays, scale):
+    """Whether all torques keep their limits and there is room for more."""
+    for j in range(braces.free.shape[0]):
+        torque, room = braces.torques[j], AMPLE * scale
+        if torque - braces.motors[j, kb.LOWER] < room or braces.motors[j, kb.UPPER] - torque < room:
+            return False
+    return True
+
+
+@internal_kernel
+def middle_forces(braces: BraceArrays, scale):
+    """Forces to start from, along the normals: inside the cones of all braces."""
+    table, x, first = braces.table, braces.program.x, braces.first
+    for k in range(braces.link.shape[0]):
+        for i in range(first[k], first[k + 1]):
+            x[i] = 0.0
+        if table[k, kb.COMMANDED] != table[k, kb.COMMANDED]:
+            x[first[k]] = 1.0 + 2.0 * table[k, kb.LEAST] / scale
+
+
+@internal_kernel
+def largest_margin(braces: BraceArrays, equations, cones, scale):
+    """A point x inside all constraints; returns the worst margin there, the largest possible, at most 1."""
+    program, unknowns = braces.program, braces.first[braces.link.shape[0]]
+    x, rows = program.x, program.first[cones]
+    clear_objective(program, unknowns + 1)
+    program.g[unknowns], program.H[unknowns, unknowns] = -1.0, 0.0
+    program.G[rows, unknowns], program.h[rows], program.first[cones + 1] = -1.0, 1.0, rows + 1
+    for k in range(unknowns):
+        program.G[rows, k] = 0.0
+    middle_forces(braces, scale)
+    x[unknowns] = worst_margin(program, unknowns, cones) - 1.0
+    solve_cone_program(program, unknowns + 1, equations, cones + 1)
+    return x[unknowns]
+
+
+@internal_kernel
+def brace_rows(model: ModelArrays, ws: Workspace, braces: BraceArrays):
+    """Torques without the unknown forces, and the rows B of those; returns a scale of the forces [N]."""
+    newton_euler(model, ws, 1.0, 1.0, 1.0)
+    table, B, jacobian, first, n = braces.table, braces.B, braces.jacobian, braces.first, braces.free.shape[0]
+    torque, lever, scale = 0.0, 0.0, 1e-3
+    for j in range(n):
+        losses = model.body[j, ka.DAMPING] + model.body[j, ka.GEAR_DAMPING]
+        braces.free[j] = (
+            ws.joints[j, ka.BIAS] + model.body[j, ka.ARMATURE] * ws.joints[j, ka.QDD] + losses * ws.joints[j, ka.QD]
+        )
+        torque = max(torque, abs(braces.free[j]))
+    first[0] = 0
+    for k in range(braces.link.shape[0]):
+        point_position(ws, braces.link[k], table[k], braces.position)
+        point_jacobian(model, ws, braces.link[k], braces.position, jacobian)
+        scale = max(scale, table[k, kb.LEAST])
+        commanded, mu, at = table[k, kb.COMMANDED] == table[k, kb.COMMANDED], table[k, kb.FRICTION], first[k]
+        directed = mu == 0.0 or table[k, kb.SLIP] != 0.0 or table[k, kb.SLIP + 1] != 0.0
+        tangents = at + (0 if commanded else 1)
+        first[k + 1] = tangents + (0 if directed else 2)
+        for j in range(n):
+            rate = along(table, jacobian, k, j, 0)
+            one, other = along(table, jacobian, k, j, 1), along(table, jacobian, k, j, 2)
+            lever = max(lever, abs(rate), abs(one), abs(other))
+            if directed:
+                rate -= mu * (table[k, kb.SLIP] * one + table[k, kb.SLIP + 1] * other)
+            else:
+                B[tangents, j], B[tangents + 1, j] = one, other
+            if commanded:
+                braces.free[j] -= table[k, kb.COMMANDED] * rate
+            else:
+                B[at, j] = rate
+    return max(scale, torque / lever) if lever > 0.0 else scale
+
+
+@internal_kernel
+def along(table, jacobian, k, j, e):
+    """Velocity of the point of brace k along its axis e for each unit of rate j."""
+    at = kb.AXES + 3 * e
+    return table[k, at] * jacobian[0, j] + table[k, at + 1] * jacobian[1, j] + table[k, at + 2] * jacobian[2, j]
+
+
+@internal_kernel
+def constraints(braces: BraceArrays, scale, limits, relaxed):
+    """Equations and cones in the forces over ``scale``; their numbers.
+
+    ``limits`` : those of the torques are among them; ``relaxed`` : passive joints are in cones, not in equations
+    """
+    program, table, B, motors = braces.program, braces.table, braces.B, braces.motors
+    A, b, G, h, first = program.A, program.b, program.G, program.h, program.first
+    c, n = braces.link.shape[0], braces.free.shape[0]
+    unknowns, equations, cones, rows = braces.first[c], 0, 0, 0
+    for e in range(A.shape[0]):
+        A[e, unknowns] = 0.0
+    for i in range(4 * c):
+        for k in range(unknowns + 1):
+            G[i, k] = 0.0
+        h[i] = 0.0
+    for j in range(c):
+        k, mu, commanded = braces.first[j], table[j, kb.FRICTION], table[j, kb.COMMANDED] == table[j, kb.COMMANDED]
+        tangents = k + (0 if commanded else 1)
+        if not commanded:
+            G[rows, k], h[rows], first[cones] = 1.0, -table[j, kb.LEAST] / scale, rows
+            G[rows, unknowns] = -1.0
+            rows, cones = rows + 1, cones + 1
+        if tangents < braces.first[j + 1]:
+            first[cones] = rows
+            if commanded:
+                h[rows] = mu * table[j, kb.COMMANDED] / scale
+            else:
+                G[rows, k] = mu
+            G[rows + 1, tangents], G[rows + 2, tangents + 1], G[rows, unknowns] = 1.0, 1.0, -1.0
+            rows, cones = rows + 3, cones + 1
+    # Torques in units of the force scale.
+    for j in range(n if limits else 0):
+        low, high = motors[j, kb.LOWER], motors[j, kb.UPPER]
+        if low == high and not relaxed:
+            for k in range(unknowns):
+                A[equations, k] = B[k, j]
+            b[equations] = (braces.free[j] - low) / scale
+            equations += 1
+            continue
+        for side in range(2):
+            if not math.isinf(high if side == 0 else low):
+                first[cones] = rows
+                sign = 1.0 if side == 0 else -1.0
+                for k in range(unknowns):
+                    G[rows, k] = sign * B[k, j]
+                h[rows] = ((high - braces.free[j]) if side == 0 else (braces.free[j] - low)) / scale
+                G[rows, unknowns] = -1.0
+                rows, cones = rows + 1, cones + 1
+    first[cones] = rows
+    return equations, cones
+
+
+@internal_kernel
+def clear_objective(program: ConeProgram, unknowns):
+    """Nothing to minimise but, with little weight, the unknowns."""
+    for k in range(unknowns):
+        program.g[k] = 0.0
+        for m in range(unknowns):
+            program.H[k, m] = LEAST_WEIGHT if m == k else 0.0
+
+
+@internal_kernel
+def worst_margin(program: ConeProgram, unknowns, cones):
+    """Least distance of x to the boundary of a cone, negative outside."""
+    worst = math.inf
+    for c in range(cones):
+        head, square = 0.0, 0.0
+        for i in range(program.first[c], program.first[c + 1]):
+            slack = program.h[i]
+            for k in range(unknowns):
+                slack += program.G[i, k] * program.x[k]
+            if i == program.first[c]:
+                head = slack
+            else:
+                square += slack * slack
+        worst = min(worst, head - math.sqrt(square))
+    return min(worst, 1.0)
+
+
+@internal_kernel
+def contradiction(braces: BraceArrays, equations, cones, relaxed):
+    """The multipliers of torques as joint rates, from those of the margin that is negative at best."""
+    program, motors = braces.program, braces.motors
+    # Torques are the last of the equations and of the cones: backwards.
+    e, i = equations - 1, program.first[cones] - 1
+    for j in range(braces.free.shape[0] - 1, -1, -1):
+        low, high = motors[j, kb.LOWER], motors[j, kb.UPPER]
+        braces.certificate[j] = 0.0
+        if low == high and not relaxed:
+            braces.certificate[j] = -program.y[e]
+            e -= 1
+            continue
+        if not math.isinf(low):
+            braces.certificate[j] -= program.z[i]
+            i -= 1
+        if not math.isinf(high):
+            braces.certificate[j] += program.z[i]
+            i -= 1
+
+
+@internal_kernel
+def extreme_force(braces: BraceArrays, unknowns, equations, cones, j, end, scale):
+    """The least (end 0) or largest (end 1) normal force of brace j within all constraints [N], from a point inside."""
+    program, k, x = braces.program, braces.first[j], braces.program.x
+    if end == 0 and equations == 0 and holds_with_least(braces, j):
+        return braces.table[j, kb.LEAST]
+    rows, first = program.first[cones], program.first
+    clear_objective(program, unknowns)
+    sign = 1.0 if end == 0 else -1.0
+    program.g[k] = sign
+    for m in range(unknowns):
+        program.G[rows, m] = 0.0
+        x[m] = braces.inside[m]
+    program.G[rows, k], program.h[rows], first[cones + 1] = sign, FAR, rows + 1
+    solve_cone_program(program, unknowns, equations, cones + 1)
+    return math.inf if end == 1 and x[k] > 0.999 * FAR else scale * x[k]
+
+
+@internal_kernel
+def holds_with_least(braces: BraceArrays, j):
+    """Whether the forces found stay possible when that of brace j is shortened to the least that it may be."""
+    found, k, least = braces.found, braces.first[j], braces.table[j, kb.LEAST]
+    shorter = found[j, kb.FORCES] - least
+    share = shorter / found[j, kb.FORCES] if shorter > 0.0 else 0.0
+    for i in range(braces.free.shape[0]):
+        torque = braces.torques[i] + shorter * braces.B[k, i]
+        for e in range(k + 1, braces.first[j + 1]):
+            torque += share * found[j, kb.FORCES + e - k] * braces.B[e, i]
+        if not braces.motors[i, kb.LOWER] <= torque <= braces.motors[i, kb.UPPER]:
+            return False
+    return True
+
+
+@internal_kernel
+def least_heat(braces: BraceArrays, unknowns, equations, cones, scale):
+    """The forces of least heat, in units of it: H = B w Bᵀ, g = −B w free."""
+    program, B, motors, n = braces.program, braces.B, braces.motors, braces.free.shape[0]
+    clear_objective(program, unknowns)
+    largest = 0.0
+    for k in range(unknowns):
+        for m in range(k + 1):
+            total = 0.0
+            for j in range(n):
+                total += B[k, j] * motors[j, kb.HEAT] * B[m, j]
+            program.H[k, m], program.H[m, k] = total, total
+            largest = max(largest, abs(total))
+        for j in range(n):
+            program.g[k] -= B[k, j] * motors[j, kb.HEAT] * braces.free[j] / scale
+    unit = 1.0 / largest if largest > 0.0 else 1.0
+    for k in range(unknowns):
+        for m in range(unknowns):
+            program.H[k, m] *= unit
+        program.H[k, k] += LEAST_WEIGHT
+        program.g[k] *= unit
+    solve_cone_program(program, unknowns, equations, cones)

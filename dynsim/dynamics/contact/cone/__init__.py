@@ -1,0 +1,1 @@
+"""Contact problems: forces within friction cones, and cone programs."""

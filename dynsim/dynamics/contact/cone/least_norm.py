@@ -1,0 +1,161 @@
+"""Forces that the motion does not determine: of all that are admissible, those of least norm, as far as cones allow.
+
+The motion w = W f + b of a contact problem (dynsim.dynamics.contact.cone.problem) is determined, its forces f are not
+where rows depend on each other: four legs of a table, three elbows of a straight arm. On the faces of the cones where f
+is, f = S x with a column of S for each direction in which a force may change, of length one:
+
+    n, t1, t2 of a point that sticks (n alone without friction),   n − μ w_t/|w_t| of one that slides,   a one-way row
+
+G = Sᵀ W S is singular there, and x + (its null space) makes the same motion. The member of least norm is the projection
+of x on the range of G; where it leaves a cone, the way towards it ends at that cone.
+"""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.dynamics.contact.cone import problem as kc
+from dynsim.dynamics.contact.cone.steps import block_size
+from dynsim.jit.kernel import internal_kernel
+
+# Rooms: G, its factor, the columns S (their coefficients along the rows of their block), vectors in first rows.
+MATRIX, FACTOR, COLUMNS, NOW, GOAL, RIGHT, PIVOT, PLACE, SIZE = 0, 1, 2, 3, 4, 5, 6, 7, 8
+# A row that leaves faster than this has no force, and slower slip has no direction [m/s].
+STILL = 1e-9
+# A pivot below this times the mean of the diagonal: G is singular. The projection shifts by this times that mean, and
+# each of its refinements multiplies the error by as much.
+SINGULAR, SHIFT, REFINEMENTS = 1e-10, 1e-6, 4
+# Halvings of the way to a cone; what of the largest force may lie beyond it.
+HALVINGS, ROUNDING = 50, 1e-12
+
+
+@internal_kernel
+def select_least_norm(W, w, kind, mu, p, f, room):
+    """Move the forces f, (p,), with the motion w = W f + b towards their least norm. Uses ``room``, (CONE_ROOM, p, p).
+
+    Leaves f as it is where it is unique.
+    """
+    n = changeable(w, kind, mu, p, room)
+    if n < 2:
+        return
+    G, L, S, place, size = room[MATRIX], room[FACTOR], room[COLUMNS], room[PLACE, 0], room[SIZE, 0]
+    now, goal, right = room[NOW, 0], room[GOAL, 0], room[RIGHT, 0]
+    trace = 0.0
+    for i in range(n):
+        a, now[i] = int(place[i]), 0.0
+        for k in range(int(size[i])):
+            now[i] += S[i, k] * f[a + k]
+        for j in range(i + 1):
+            b, total = int(place[j]), 0.0
+            for k in range(int(size[i])):
+                for m in range(int(size[j])):
+                    total += S[i, k] * W[a + k, b + m] * S[j, m]
+            G[i, j], G[j, i] = total, total
+        trace += G[i, i]
+    if not trace > 0.0 or factored(G, L, room[PIVOT, 0], n, 0.0, SINGULAR * trace / n):
+        return
+    shift = SHIFT * trace / n
+    factored(G, L, room[PIVOT, 0], n, shift, 0.0)
+    # x = (G + ε)⁻¹ G x₀, refined: the error outside the range of G stays zero, that inside falls by ε each time.
+    for i in range(n):
+        goal[i] = 0.0
+    for _ in range(1 + REFINEMENTS):
+        for i in range(n):
+            right[i] = 0.0
+            for j in range(n):
+                right[i] += G[i, j] * (now[j] - goal[j])
+        substitute(L, room[PIVOT, 0], right, n)
+        for i in range(n):
+            goal[i] += right[i]
+    strongest = 0.0
+    for k in range(p):
+        strongest = max(strongest, abs(f[k]))
+    share = 1.0
+    if not inside(mu, n, room, 1.0, ROUNDING * strongest):
+        low, high = 0.0, 1.0
+        for _ in range(HALVINGS):
+            share = 0.5 * (low + high)
+            if inside(mu, n, room, share, ROUNDING * strongest):
+                low = share
+            else:
+                high = share
+        share = low
+    for i in range(n):
+        a = int(place[i])
+        for k in range(int(size[i])):
+            f[a + k] += share * (goal[i] - now[i]) * S[i, k]
+
+
+@internal_kernel
+def changeable(w, kind, mu, p, room):
+    """The columns S of the rows whose forces may change: coefficients, first row and size; returns their number."""
+    S, place, size = room[COLUMNS], room[PLACE, 0], room[SIZE, 0]
+    n, k = 0, 0
+    while k < p:
+        if kind[k] == kc.CONE and w[k] <= STILL:
+            slip = math.sqrt(w[k + 1] * w[k + 1] + w[k + 2] * w[k + 2])
+            if mu[k] > 0.0 and slip > STILL:
+                scale = 1.0 / math.sqrt(1.0 + mu[k] * mu[k])
+                place[n], size[n], S[n, 0] = k, 3.0, scale
+                S[n, 1], S[n, 2] = -scale * mu[k] * w[k + 1] / slip, -scale * mu[k] * w[k + 2] / slip
+                n += 1
+            else:
+                for m in range(3 if mu[k] > 0.0 else 1):
+                    place[n], size[n], S[n, 0] = k + m, 1.0, 1.0
+                    n += 1
+        elif kind[k] == kc.ONE_WAY and w[k] <= STILL:
+            place[n], size[n], S[n, 0] = k, 1.0, 1.0
+            n += 1
+        k += block_size(kind, k)
+    return n
+
+
+@internal_kernel
+def factored(G, L, pivot, n, shift, least):
+    """G + ``shift`` = L D Lᵀ, (n, n), D into ``pivot``; False where a pivot is not above ``least``."""
+    for j in range(n):
+        d = G[j, j] + shift
+        for k in range(j):
+            d -= L[j, k] * L[j, k] * pivot[k]
+        pivot[j] = d
+        if not d > least:
+            return False
+        for i in range(j + 1, n):
+            total = G[i, j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k] * pivot[k]
+            L[i, j] = total / d
+    return True
+
+
+@internal_kernel
+def substitute(L, pivot, x, n):
+    """x ← (L D Lᵀ)⁻¹ x."""
+    for i in range(n):
+        for k in range(i):
+            x[i] -= L[i, k] * x[k]
+    for i in range(n - 1, -1, -1):
+        x[i] /= pivot[i]
+        for k in range(i + 1, n):
+            x[i] -= L[k, i] * x[k]
+
+
+@internal_kernel
+def inside(mu, n, room, share, slack):
+    """True when the forces ``share`` of the way from NOW to GOAL lie in their cones."""
+    now, goal, place, size = room[NOW, 0], room[GOAL, 0], room[PLACE, 0], room[SIZE, 0]
+    i = 0
+    while i < n:
+        normal = now[i] + share * (goal[i] - now[i])
+        if normal < -slack:
+            return False
+        # Three columns of one row each, in a row: a point that sticks.
+        sticks = size[i] == 1.0 and i + 2 < n and place[i + 1] == place[i] + 1.0 and mu[int(place[i])] > 0.0
+        if sticks:
+            x = now[i + 1] + share * (goal[i + 1] - now[i + 1])
+            y = now[i + 2] + share * (goal[i + 2] - now[i + 2])
+            if math.sqrt(x * x + y * y) > mu[int(place[i])] * normal + slack:
+                return False
+            i += 2
+        i += 1
+    return True

@@ -1,0 +1,434 @@
+"""Small dense second-order-cone programs.
+
+    minimise ½ xᵀ H x + gᵀ x   subject to   A x = b,   s = G x + h ∈ K
+
+K is a product of cones {(s_0, s_1): |s_1| ≤ s_0} of any sizes; a cone of size 1 is s_0 ≥ 0. A primal–dual
+interior-point method with Nesterov–Todd scaling and Mehrotra's corrector (as in coneqp of CVXOPT), for a dozen
+unknowns. H must be positive semidefinite; A may have dependent rows. Optimal is what fulfils, with multipliers y and
+z ∈ K,
+
+    H x + g + Aᵀ y − Gᵀ z = 0,   A x = b,   G x + h = s,   s · z = 0
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from dynsim.jit.kernel import integers, internal_kernel, kernel, reals
+
+ITERATIONS = 60
+# Of what must vanish, in units of a program whose numbers are near 1: the rounding of some dozen operations.
+TOLERANCE = 1e-13
+# Products s · z of a cone that nothing is left of in double precision.
+GAP_MIN = 1e-16
+# Below CLOSE so many steps that do not halve what is left end the iteration.
+CLOSE, PATIENCE = 1e-9, 2
+# Keeps the Newton system regular along directions that nothing determines; the optimum is the same.
+REGULAR = 1e-13
+# Of unknowns whose pivots have lost all digits: this part of what they are the difference of.
+PIVOT_MIN = 1e-14
+# Pivots of equations below this part of what they are the difference of are dependent; and what they are replaced by.
+RANK_TOLERANCE, HUGE = 1e-10, 1e100
+# Part of the way to the boundary of the cones that a step leaves. With a hundredth of it steps end beside the central
+# path, on the edge of a cone, and the next ones creep along it.
+ASIDE = 2e-2
+
+
+class ConeProgram(NamedTuple):
+    """Data, solution and scratch of a program; leading parts are used by smaller ones. S is the sum of cone sizes."""
+
+    H: np.ndarray  # (n, n)
+    g: np.ndarray  # (n,)
+    A: np.ndarray  # (m, n)
+    b: np.ndarray  # (m,)
+    G: np.ndarray  # (S, n)
+    h: np.ndarray  # (S,)
+    first: np.ndarray  # (cones + 1,) int: where each cone begins in s, and the end
+    x: np.ndarray  # (n,) start and solution
+    y: np.ndarray  # (m,)
+    s: np.ndarray  # (S,)
+    z: np.ndarray  # (S,)
+    kkt: np.ndarray  # (n + m, n + m) scratch, as all below
+    step: np.ndarray  # (n + m,)
+    scaled: np.ndarray  # (S, n)
+    scaling: np.ndarray  # (S,) w of each cone, unit hyperbolic norm
+    size: np.ndarray  # (cones,) its factor
+    work: np.ndarray  # (7, S)
+    kept: np.ndarray  # (n + m + 2 S,) the best x, y, s and z so far
+
+
+LAMBDA, RESIDUAL, TARGET, DS, DZ, SCALED_DS, SCALED_DZ = 0, 1, 2, 3, 4, 5, 6
+
+
+def cone_program(n: int, m: int, cones: int, rows: int) -> ConeProgram:
+    """Allocate a :class:`ConeProgram` for n unknowns, m equations and so many cones of ``rows`` rows altogether."""
+    flat, first = reals(np.zeros(program_size(n, m, cones, rows))), integers(np.zeros(cones + 1))
+    return laid_out(flat, first, n, m, cones, rows)
+
+
+def program_size(n: int, m: int, cones: int, rows: int) -> int:
+    """Numbers that :func:`laid_out` needs for a program."""
+    return n * n + n + m * n + m + 3 * rows + n + m + (n + m) ** 2 + n + m + 2 * rows * n + 10 * rows + cones + n + m
+
+
+@internal_kernel
+def laid_out(flat, first, n, m, cones, rows):
+    """A :class:`ConeProgram` in one array: a table with many arrays would be handed through every function.
+
+    flat : (program_size(...),); first : (cones + 1,) int
+    """
+    a = n * n
+    b = a + n
+    c = b + m * n
+    d = c + m
+    e = d + rows * n
+    f = e + rows
+    g = f + n
+    h = g + m
+    i = h + rows
+    j = i + rows
+    k = j + (n + m) * (n + m)
+    o = k + n + m
+    p = o + rows * n
+    q = p + rows
+    r = q + cones
+    s = r + 7 * rows
+    return ConeProgram(
+        flat[:a].reshape((n, n)),
+        flat[a:b],
+        flat[b:c].reshape((m, n)),
+        flat[c:d],
+        flat[d:e].reshape((rows, n)),
+        flat[e:f],
+        first,
+        flat[f:g],
+        flat[g:h],
+        flat[h:i],
+        flat[i:j],
+        flat[j:k].reshape((n + m, n + m)),
+        flat[k:o],
+        flat[o:p].reshape((rows, n)),
+        flat[p:q],
+        flat[q:r],
+        flat[r:s].reshape((7, rows)),
+        flat[s : s + n + m + 2 * rows],
+    )
+
+
+@kernel
+def solve_cone_program(program: ConeProgram, n, m, cones):
+    """Solve the leading n unknowns, m equations and so many cones from ``program.x``, for which all s must be inside.
+
+    Solution and multipliers are left in x, y, s and z. Returns the largest error of the conditions of optimality, s · z
+    included; numbers near 1 make it the relative error of the optimum.
+    """
+    x, y, s, z, first = program.x, program.y, program.s, program.z, program.first
+    work, step = program.work, program.step
+    rows = first[cones]
+    start(program, n, m, cones)
+    least, since = math.inf, 0
+    for _ in range(ITERATIONS):
+        error = conditions(program, n, m, cones)
+        gap = 0.0
+        for i in range(rows):
+            gap += s[i] * z[i]
+        gap = gap / cones if cones > 0 else 1.0
+        # Close to the boundary of the cones rounding ends the progress, or NaN.
+        since += 1
+        if error < least:
+            if error < 0.5 * least:
+                since = 0
+            least = error
+            keep(program, n, m, cones, True)
+        if not least > TOLERANCE or not error < math.inf or gap <= GAP_MIN or (least < CLOSE and since >= PATIENCE):
+            break
+        scale_cones(program, cones)
+        factor_kkt(program, n, m, rows, cones)
+
+        # Predictor: all the way to complementarity.
+        for c in range(cones):
+            jordan(work, LAMBDA, LAMBDA, TARGET, first[c], first[c + 1], -1.0, 0.0)
+        newton_step(program, n, m, cones)
+        reach = longest_step(program, cones)
+        centring = (1.0 - reach) ** 3
+        for c in range(cones):
+            jordan(work, LAMBDA, LAMBDA, TARGET, first[c], first[c + 1], -1.0, 0.0)
+            jordan(work, SCALED_DS, SCALED_DZ, TARGET, first[c], first[c + 1], -1.0, 1.0)
+            work[TARGET, first[c]] += centring * gap
+        newton_step(program, n, m, cones)
+        reach = min(1.0, (1.0 - ASIDE) * longest_step(program, cones))
+        if not reach > 1e-9:
+            break
+        for k in range(n):
+            x[k] += reach * step[k]
+        for e in range(m):
+            y[e] += reach * step[n + e]
+        for i in range(rows):
+            s[i] += reach * work[DS, i]
+            z[i] += reach * work[DZ, i]
+    keep(program, n, m, cones, False)
+    return least
+
+
+@internal_kernel
+def keep(program: ConeProgram, n, m, cones, store):
+    """Store the present unknowns, or take back those that were stored."""
+    kept, rows = program.kept, program.first[cones]
+    place = 0
+    for table, size in ((program.x, n), (program.y, m), (program.s, rows), (program.z, rows)):
+        for i in range(size):
+            if store:
+                kept[place] = table[i]
+            else:
+                table[i] = kept[place]
+            place += 1
+
+
+@internal_kernel
+def start(program: ConeProgram, n, m, cones):
+    """The slacks of x, and multipliers on the central path beside them."""
+    s, z, first = program.s, program.z, program.first
+    for e in range(m):
+        program.y[e] = 0.0
+    for c in range(cones):
+        square = 0.0
+        for i in range(first[c], first[c + 1]):
+            s[i] = program.h[i]
+            for k in range(n):
+                s[i] += program.G[i, k] * program.x[k]
+            square += s[i] * s[i] * (1.0 if i == first[c] else -1.0)
+        for i in range(first[c], first[c + 1]):
+            z[i] = s[i] / square * (1.0 if i == first[c] else -1.0)
+
+
+@internal_kernel
+def slope(program: ConeProgram, n, m, k):
+    """(H x + g + Aᵀ y)_k."""
+    total = program.g[k]
+    for j in range(n):
+        total += program.H[k, j] * program.x[j]
+    for e in range(m):
+        total += program.A[e, k] * program.y[e]
+    return total
+
+
+@internal_kernel
+def equation(program: ConeProgram, n, e):
+    """(A x − b)_e."""
+    total = -program.b[e]
+    for k in range(n):
+        total += program.A[e, k] * program.x[k]
+    return total
+
+
+@internal_kernel
+def conditions(program: ConeProgram, n, m, cones):
+    """What is left of the conditions of optimality, the largest; that of the slacks into ``work``."""
+    x, s, z, rows = program.x, program.s, program.z, program.first[cones]
+    worst, gap = 0.0, 0.0
+    for k in range(n):
+        left = slope(program, n, m, k)
+        for i in range(rows):
+            left -= program.G[i, k] * z[i]
+        worst = max(worst, abs(left))
+    for e in range(m):
+        left = equation(program, n, e)
+        worst = max(worst, abs(left))
+    for i in range(rows):
+        left = program.h[i] - s[i]
+        for k in range(n):
+            left += program.G[i, k] * x[k]
+        program.work[RESIDUAL, i] = left
+        worst = max(worst, abs(left))
+        gap += s[i] * z[i]
+    return worst if gap <= worst else gap  # NaN stays
+
+
+@internal_kernel
+def scale_cones(program: ConeProgram, cones):
+    """Nesterov–Todd scaling W of every cone, W z = W⁻¹ s = λ: its vector w, its factor, and λ."""
+    s, z, first, w, work = program.s, program.z, program.first, program.scaling, program.work
+    for c in range(cones):
+        a, end = first[c], first[c + 1]
+        norm_s, norm_z = hyperbolic(s, a, end), hyperbolic(z, a, end)
+        product = 0.0
+        for i in range(a, end):
+            product += s[i] * z[i]
+        half = 0.5 / math.sqrt(0.5 * (1.0 + product / (norm_s * norm_z)))
+        for i in range(a, end):
+            w[i] = half * (s[i] / norm_s + (z[i] if i == a else -z[i]) / norm_z)
+        program.size[c] = math.sqrt(norm_s / norm_z)
+        for i in range(a, end):
+            work[LAMBDA, i] = s[i]
+        unscale(program, c, work[LAMBDA])
+
+
+@internal_kernel
+def hyperbolic(u, a, end):
+    """√(u_0² − |u_1|²) of the cone's part of u."""
+    square = 0.0
+    for i in range(a + 1, end):
+        square += u[i] * u[i]
+    length = math.sqrt(square)
+    return math.sqrt((u[a] - length) * (u[a] + length))
+
+
+@internal_kernel
+def unscale(program: ConeProgram, c, u):
+    """W⁻¹ u of cone c in place."""
+    w, a, end = program.scaling, program.first[c], program.first[c + 1]
+    factor, along, head = 1.0 / program.size[c], 0.0, u[a]
+    for i in range(a + 1, end):
+        along += w[i] * u[i]
+    u[a] = factor * (w[a] * head - along)
+    pull = along / (1.0 + w[a]) - head
+    for i in range(a + 1, end):
+        u[i] = factor * (u[i] + pull * w[i])
+
+
+@internal_kernel
+def factor_kkt(program: ConeProgram, n, m, rows, cones):
+    """L D Lᵀ of [H + Gᵀ W⁻² G + Aᵀ A, Aᵀ; A, 0], kept regular; D on the diagonal, L below it.
+
+    Aᵀ A, which the right-hand side makes up for, gives pivots to what only the equations determine.
+    An equation that depends on those before it gets a pivot that stops its multiplier.
+    """
+    kkt, scaled = program.kkt, program.scaled
+    column = program.work[TARGET]
+    for k in range(n):
+        for i in range(rows):
+            column[i] = program.G[i, k]
+        for c in range(cones):
+            unscale(program, c, column)
+        for i in range(rows):
+            scaled[i, k] = column[i]
+    for k in range(n):
+        for j in range(k + 1):
+            kkt[k, j] = program.H[k, j] + (REGULAR if j == k else 0.0)
+    for i in range(rows):
+        for k in range(n):
+            for j in range(k + 1):
+                kkt[k, j] += scaled[i, k] * scaled[i, j]
+    for e in range(m):
+        for k in range(n):
+            kkt[n + e, k] = program.A[e, k]
+            for j in range(k + 1):
+                kkt[k, j] += program.A[e, k] * program.A[e, j]
+        for j in range(e + 1):
+            kkt[n + e, n + j] = 0.0
+    for k in range(n + m):
+        for j in range(k):
+            for i in range(j):
+                kkt[k, j] -= kkt[k, i] * kkt[j, i]
+        # Until here the entries are L D.
+        removed = 0.0
+        least = PIVOT_MIN * kkt[k, k]
+        for j in range(k):
+            whole = kkt[k, j]
+            kkt[k, j] = whole / kkt[j, j]
+            kkt[k, k] -= whole * kkt[k, j]
+            removed += abs(whole * kkt[k, j])
+        if k < n:
+            kkt[k, k] = max(kkt[k, k], least)
+        elif -kkt[k, k] <= RANK_TOLERANCE * removed:
+            kkt[k, k] = -HUGE
+
+
+@internal_kernel
+def newton_step(program: ConeProgram, n, m, cones):
+    """Step of all unknowns for λ ∘ (W dz + W⁻¹ ds) = TARGET, which is overwritten."""
+    work, kkt, step, first = program.work, program.kkt, program.step, program.first
+    z, rows = program.z, first[cones]
+    target, ds, dz = work[TARGET], work[DS], work[DZ]
+    scaled_ds, scaled_dz = work[SCALED_DS], work[SCALED_DZ]
+    for i in range(rows):
+        scaled_ds[i] = work[RESIDUAL, i]
+    for c in range(cones):
+        divide(work, LAMBDA, TARGET, first[c], first[c + 1])
+        unscale(program, c, scaled_ds)
+    for k in range(n):
+        left = slope(program, n, m, k)
+        for i in range(rows):
+            left -= program.G[i, k] * z[i] + program.scaled[i, k] * (target[i] - scaled_ds[i])
+        step[k] = -left
+    for e in range(m):
+        left = equation(program, n, e)
+        step[n + e] = -left
+        for k in range(n):
+            step[k] -= program.A[e, k] * left
+    size = n + m
+    for k in range(size):
+        for j in range(k):
+            step[k] -= kkt[k, j] * step[j]
+    for k in range(size):
+        step[k] /= kkt[k, k]
+    for k in range(size - 1, -1, -1):
+        for j in range(k + 1, size):
+            step[k] -= kkt[j, k] * step[j]
+    for i in range(rows):
+        ds[i] = work[RESIDUAL, i]
+        for k in range(n):
+            ds[i] += program.G[i, k] * step[k]
+        scaled_ds[i] = ds[i]
+    for c in range(cones):
+        unscale(program, c, scaled_ds)
+    for i in range(rows):
+        scaled_dz[i] = target[i] - scaled_ds[i]
+        dz[i] = scaled_dz[i]
+    for c in range(cones):
+        unscale(program, c, dz)
+
+
+@internal_kernel
+def jordan(work, u, v, out, a, end, factor, keep):
+    """Row ``out`` becomes keep times itself plus factor (u · v, u_0 v_1 + v_0 u_1), in the cone from a to end."""
+    product = 0.0
+    for i in range(a, end):
+        product += work[u, i] * work[v, i]
+    for i in range(a + 1, end):
+        mixed = work[u, a] * work[v, i] + work[v, a] * work[u, i]
+        work[out, i] = keep * work[out, i] + factor * mixed
+    work[out, a] = keep * work[out, a] + factor * product
+
+
+@internal_kernel
+def divide(work, u, out, a, end):
+    """Row ``out`` becomes the r with u ∘ r = out, in the cone from a to end."""
+    along = 0.0
+    for i in range(a + 1, end):
+        along += work[u, i] * work[out, i]
+    norm = hyperbolic(work[u], a, end)
+    head = (work[u, a] * work[out, a] - along) / (norm * norm)
+    for i in range(a + 1, end):
+        work[out, i] = (work[out, i] - head * work[u, i]) / work[u, a]
+    work[out, a] = head
+
+
+@internal_kernel
+def longest_step(program: ConeProgram, cones):
+    """The longest step, at most 1, that keeps s and z in their cones."""
+    first, reach = program.first, 1.0
+    for c in range(cones):
+        reach = min(reach, way_out(program.s, program.work[DS], first[c], first[c + 1]))
+        reach = min(reach, way_out(program.z, program.work[DZ], first[c], first[c + 1]))
+    return reach
+
+
+@internal_kernel
+def way_out(u, du, a, end):
+    """Where u + α du leaves the cone, the smallest α > 0; infinite if nowhere."""
+    if end == a + 1:
+        return -u[a] / du[a] if du[a] < 0.0 else math.inf
+    square, product, norm = du[a] * du[a], u[a] * du[a], hyperbolic(u, a, end)
+    for i in range(a + 1, end):
+        square -= du[i] * du[i]
+        product -= u[i] * du[i]
+    constant = norm * norm
+    inner = product * product - square * constant
+    if inner < 0.0:
+        return math.inf
+    below = math.sqrt(inner) - product
+    return constant / below if below > 0.0 else math.inf

@@ -1,0 +1,291 @@
+"""The steps of a contact problem's solution: its residual, Newton's step, and a sweep of block Gauss–Seidel.
+
+The problem and its residual are those of dynsim.dynamics.contact.cone.problem; ``room`` is its scratch.
+"""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.jit.kernel import internal_kernel
+
+BOTH_WAYS, ONE_WAY, CONE, TANGENT = 0, 1, 2, 3
+
+# Blocks of the scratch: two matrices, then vectors in first rows.
+MATRIX, SHIFTED = 0, 1
+MOTION, MOBILITY, RIGHT, PLACE, FIRST, SECOND, BETA = 2, 3, 4, 5, 6, 7, 8
+BEST, SWEPT, START, GOAL = 9, 10, 11, 12
+SHIFTED_RIGHT, KEPT, LAST, ANCHOR, PROOF, NO_FRICTION = 13, 14, 15, 16, 17, 18
+CONE_ROOM = 19
+# PLACE of a block at its first row: no force, u = 0, slides.
+OFF, HOLDS, SLIDES = 0.0, 1.0, 2.0
+# The proximal term is this times the relative residual, but no less than what keeps elimination far from rounding.
+PROXIMAL_FACTOR, LEAST_PROXIMAL = 1e3, 1e-11
+ROOT_STEPS = 60
+
+
+@internal_kernel
+def block_size(kind, k):
+    """Rows of the block that begins at row k."""
+    return 3 if kind[k] == CONE else 1
+
+
+@internal_kernel
+def mobilities(W, kind, p, room):
+    """Own mobility of each block into ``room[MOBILITY, 0]``: the mean of its diagonal entries."""
+    mobility = room[MOBILITY, 0]
+    largest = 0.0
+    for k in range(p):
+        largest = max(largest, abs(W[k, k]))
+    k = 0
+    while k < p:
+        size = block_size(kind, k)
+        total = 0.0
+        for i in range(size):
+            total += abs(W[k + i, k + i])
+        # An immobile row has some mobility, so that what is divided by it stays finite.
+        total = max(total / size, 1e-14 * largest, 1e-300)
+        for i in range(size):
+            mobility[k + i] = total
+        k += size
+
+
+@internal_kernel
+def measure(W, b, kind, mu, p, f, room):
+    """u = W f + b into ``room[MOTION, 0]``; returns the residual, and the sum of the errors' squares / mobility."""
+    u, mobility = room[MOTION, 0], room[MOBILITY, 0]
+    for k in range(p):
+        total = b[k]
+        for m in range(p):
+            total += W[k, m] * f[m]
+        u[k] = total
+    residual, merit, k = 0.0, 0.0, 0
+    while k < p:
+        w = mobility[k]
+        error = abs(u[k]) if kind[k] == BOTH_WAYS else abs(min(w * f[k], u[k]))
+        merit += error * error / w
+        # Written so that NaN stays.
+        residual = residual if error <= residual else error
+        if kind[k] == CONE:
+            x, y, radius = w * f[k + 1] - u[k + 1], w * f[k + 2] - u[k + 2], mu[k] * w * max(f[k], 0.0)
+            length = math.sqrt(x * x + y * y)
+            scale = radius / length if length > radius else 1.0
+            x, y = w * f[k + 1] - scale * x, w * f[k + 2] - scale * y
+            error = math.sqrt(x * x + y * y)
+            merit += error * error / w
+            residual = residual if error <= residual else error
+        k += block_size(kind, k)
+    return residual, merit
+
+
+@internal_kernel
+def newton_step(W, b, kind, mu, p, f, room, relative, most):
+    """One step of f by Newton's method, from u of f in ``room[MOTION, 0]``.
+
+    Blocks that are off (z_n = w f_n − u_n ≤ 0) get f = 0 and have no unknown. The others have u_n' = 0, and with
+    z_t = w f_t − u_t inside the disc of radius μ z_n u_t' = 0. Outside, along d = z_t / |z_t| and e across it,
+
+        d·f_t' = μ f_n',    (1 − β) w e·f_t' + β e·u_t' = 0,    β = μ z_n / |z_t|,
+
+    so that such a block has the unknowns f_n and e·f_t. Rows n, e of the motion and columns n + μ d, e of the force
+    make the matrix. To each row comes a proximal term, w times a fraction of up to ``most`` that falls with the
+    ``relative`` residual.
+    """
+    mobility, A, x = room[MOBILITY, 0], room[MATRIX], room[RIGHT, 0]
+    place, first, second, beta = room[PLACE, 0], room[FIRST, 0], room[SECOND, 0], room[BETA, 0]
+    near = min(max(PROXIMAL_FACTOR * most * relative, LEAST_PROXIMAL), most)
+    find_places(kind, mu, p, f, room)
+    r, k = 0, 0
+    while k < p:
+        more = near * mobility[k]
+        if place[k] == HOLDS:
+            for i in range(k, k + block_size(kind, k)):
+                fill_row(W, kind, mu, p, i, i, 1.0, 0.0, room, r)
+                A[r, r] += more
+                x[r] = more * f[i] - b[i]
+                r += 1
+        elif place[k] == SLIDES:
+            fill_row(W, kind, mu, p, k, k, 1.0, 0.0, room, r)
+            A[r, r] += more
+            x[r] = more * f[k] - b[k]
+            r += 1
+            if beta[k] > 0.0:
+                ex, ey = -second[k], first[k]
+                fill_row(W, kind, mu, p, k + 1, k + 2, ex, ey, room, r)
+                A[r, r] += (1.0 - beta[k]) / beta[k] * mobility[k] + more
+                x[r] = more * (ex * f[k + 1] + ey * f[k + 2]) - (ex * b[k + 1] + ey * b[k + 2])
+                r += 1
+        k += block_size(kind, k)
+    eliminate(A, x, r)
+    r, k = 0, 0
+    while k < p:
+        if place[k] == SLIDES:
+            normal, across = x[r], 0.0
+            r += 1
+            if beta[k] > 0.0:
+                across = x[r]
+                r += 1
+            f[k] = normal
+            f[k + 1] = mu[k] * normal * first[k] - across * second[k]
+            f[k + 2] = mu[k] * normal * second[k] + across * first[k]
+        else:
+            for i in range(k, k + block_size(kind, k)):
+                f[i] = 0.0
+                if place[k] == HOLDS:
+                    f[i] = x[r]
+                    r += 1
+        k += block_size(kind, k)
+
+
+@internal_kernel
+def find_places(kind, mu, p, f, room):
+    """PLACE of each block, and of those that slide FIRST, SECOND = d and BETA."""
+    u, mobility = room[MOTION, 0], room[MOBILITY, 0]
+    place, first, second, beta = room[PLACE, 0], room[FIRST, 0], room[SECOND, 0], room[BETA, 0]
+    k = 0
+    while k < p:
+        w = mobility[k]
+        normal = w * f[k] - u[k]
+        place[k] = HOLDS if kind[k] == BOTH_WAYS or normal > 0.0 else OFF
+        if kind[k] == CONE and normal > 0.0:
+            x, y = w * f[k + 1] - u[k + 1], w * f[k + 2] - u[k + 2]
+            length = math.sqrt(x * x + y * y)
+            if length > mu[k] * normal:
+                place[k] = SLIDES
+                first[k], second[k], beta[k] = x / length, y / length, mu[k] * normal / length
+        k += block_size(kind, k)
+
+
+@internal_kernel
+def fill_row(W, kind, mu, p, i, j, alpha, gamma, room, r):
+    """Row r of Newton's matrix: the motion alpha u_i + gamma u_j over the unknowns."""
+    A, place, first, second, beta = room[MATRIX], room[PLACE, 0], room[FIRST, 0], room[SECOND, 0], room[BETA, 0]
+    c, m = 0, 0
+    while m < p:
+        if place[m] == HOLDS:
+            for s in range(m, m + block_size(kind, m)):
+                A[r, c] = alpha * W[i, s] + gamma * W[j, s]
+                c += 1
+        elif place[m] == SLIDES:
+            normal = alpha * W[i, m] + gamma * W[j, m]
+            x = alpha * W[i, m + 1] + gamma * W[j, m + 1]
+            y = alpha * W[i, m + 2] + gamma * W[j, m + 2]
+            A[r, c] = normal + mu[m] * (first[m] * x + second[m] * y)
+            c += 1
+            if beta[m] > 0.0:
+                A[r, c] = first[m] * y - second[m] * x
+                c += 1
+        m += block_size(kind, m)
+
+
+@internal_kernel
+def eliminate(A, x, size):
+    """Solve the leading ``size`` rows of A y = x in place, with partial pivoting."""
+    for k in range(size):
+        best = k
+        for i in range(k + 1, size):
+            if abs(A[i, k]) > abs(A[best, k]):
+                best = i
+        if best != k:
+            x[k], x[best] = x[best], x[k]
+            for j in range(k, size):
+                A[k, j], A[best, j] = A[best, j], A[k, j]
+        inverse = 1.0 / A[k, k]
+        for i in range(k + 1, size):
+            factor = A[i, k] * inverse
+            if factor != 0.0:
+                for j in range(k + 1, size):
+                    A[i, j] -= factor * A[k, j]
+                x[i] -= factor * x[k]
+    for i in range(size - 1, -1, -1):
+        total = x[i]
+        for j in range(i + 1, size):
+            total -= A[i, j] * x[j]
+        x[i] = total / A[i, i]
+
+
+@internal_kernel
+def sweep(W, b, kind, mu, p, f, room):
+    """One sweep of block Gauss–Seidel: each block solved exactly with the others' forces as they are."""
+    mobility = room[MOBILITY, 0]
+    k = 0
+    while k < p:
+        if kind[k] == CONE:
+            n, x, y = b[k], b[k + 1], b[k + 2]
+            for m in range(p):
+                n += W[k, m] * f[m]
+                x += W[k + 1, m] * f[m]
+                y += W[k + 2, m] * f[m]
+            n -= W[k, k] * f[k] + W[k, k + 1] * f[k + 1] + W[k, k + 2] * f[k + 2]
+            x -= W[k + 1, k] * f[k] + W[k + 1, k + 1] * f[k + 1] + W[k + 1, k + 2] * f[k + 2]
+            y -= W[k + 2, k] * f[k] + W[k + 2, k + 1] * f[k + 1] + W[k + 2, k + 2] * f[k + 2]
+            solve_block(W, k, n, x, y, mu[k], f, 1e-12 * mobility[k])
+            k += 3
+            continue
+        total = b[k]
+        for m in range(p):
+            total += W[k, m] * f[m]
+        new = f[k] - total / max(W[k, k], 1e-12 * mobility[k]) if W[k, k] > 0.0 else 0.0
+        f[k] = new if kind[k] == BOTH_WAYS else max(new, 0.0)
+        k += 1
+
+
+@internal_kernel
+def solve_block(W, k, n, x, y, mu, f, least):
+    """Forces of the block at row k alone, whose motion without them is (n, x, y).
+
+    Off when n ≥ 0. Else u_n = 0 makes f_n = −(n + w·f_t) / W_nn, and what is left is (S + α) f_t = g with the Schur
+    complement S of W_nn, g = w n / W_nn − (x, y). It sticks when α = 0 lies in the cone; else α is the root of
+    |f_t| − μ f_n, which is positive at 0 and negative far out.
+    """
+    f[k], f[k + 1], f[k + 2] = 0.0, 0.0, 0.0
+    normal = W[k, k]
+    if n >= 0.0 or not normal > least:
+        return
+    if mu == 0.0:
+        f[k] = -n / normal
+        return
+    wx, wy = W[k, k + 1] / normal, W[k, k + 2] / normal
+    a = W[k + 1, k + 1] - wx * W[k + 1, k] + least
+    c = W[k + 1, k + 2] - wx * W[k + 2, k]
+    d = W[k + 2, k + 2] - wy * W[k + 2, k] + least
+    gx, gy = wx * n - x, wy * n - y
+    fn, fx, fy, excess = slid(a, c, d, gx, gy, wx, wy, n / normal, mu, 0.0)
+    if excess > 0.0:
+        low, high, at_low = 0.0, a + d, excess
+        at_high = at_low
+        for _ in range(200):
+            fn, fx, fy, at_high = slid(a, c, d, gx, gy, wx, wy, n / normal, mu, high)
+            if at_high <= 0.0:
+                break
+            low, at_low = high, at_high
+            high *= 4.0
+        side = 0
+        for _ in range(ROOT_STEPS):
+            if at_high == 0.0 or high - low <= 1e-15 * high:
+                break
+            middle = low + (high - low) * at_low / (at_low - at_high)
+            if not (middle > low and middle < high):
+                middle = 0.5 * (low + high)
+            fn, fx, fy, excess = slid(a, c, d, gx, gy, wx, wy, n / normal, mu, middle)
+            if abs(excess) <= 1e-15 * mu * abs(fn):
+                break
+            if excess > 0.0:
+                low, at_low = middle, excess
+                at_high = 0.5 * at_high if side == 1 else at_high
+                side = 1
+            else:
+                high, at_high = middle, excess
+                at_low = 0.5 * at_low if side == -1 else at_low
+                side = -1
+    f[k], f[k + 1], f[k + 2] = fn, fx, fy
+
+
+@internal_kernel
+def slid(a, c, d, gx, gy, wx, wy, n, mu, alpha):
+    """(f_n, f_t, |f_t| − μ f_n) of ((a, c), (c, d)) + α."""
+    determinant = (a + alpha) * (d + alpha) - c * c
+    fx = ((d + alpha) * gx - c * gy) / determinant
+    fy = ((a + alpha) * gy - c * gx) / determinant
+    fn = -(n + wx * fx + wy * fy)
+    return fn, fx, fy, math.sqrt(fx * fx + fy * fy) - mu * fn

@@ -1,0 +1,309 @@
+"""Signed distances φ from surfaces, with unit normal n = ∇φ and curvature H = ∂²φ, and the nearest point of an axis.
+
+Plane, sphere, cylinder: exact everywhere. Box: with edges rounded by a radius, exact outside and down to that radius
+inside; n is continuous, H jumps where a flat face meets its round edge (φ is C¹). Height field z = h(x, y), a bicubic
+C² spline: exact along the normal through the foot point, n and H are continuous.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from dynsim.jit.kernel import internal_kernel, kernel
+
+# ShapeArrays.kind, int
+SURFACE = 0  # one of the kinds below
+MOVES = 1  # 1: the point of the axis that is nearest to the surface touches, 0: its beginning
+FIELD = 2  # of a height field: where its coefficients begin in ShapeArrays.fields
+COUNT = 3  # 2: its numbers of grid lines along x and y
+SHAPE_KIND_SIZE = 5
+# Surfaces; AS_POINT: a point on the quadric of ContactArrays
+AS_POINT, PLANE, SPHERE, CYLINDER, BOX, HEIGHT_FIELD = 0, 1, 2, 3, 4, 5
+# ShapeArrays.data
+RADIUS = 0  # ρ [m]
+D = 1  # 3: axis from its beginning to its end, in the body's frame [m]
+PLACE = 4  # 3: a point of a plane or an axis, a centre, the first point of a grid (without height) [m]
+AXES = 7  # 9: normal of a plane, axis of a cylinder; axes of a box in W, one after the other
+SIZE = 16  # 3: radius, negative where inside is free; half edges of a box without its rounding; spacing of a grid [m]
+EDGE = 19  # radius of the edges of a box [m]
+SHAPE_SIZE = 20
+
+# Steps to the foot point on a height field; from a few spacings away three to five are enough.
+FOOT_STEPS = 40
+# A step of that many spacings is the last one: convergence is quadratic.
+FOOT_TOLERANCE = 1e-9
+# Bisections of an axis over a box, of which most are Newton's steps.
+AXIS_STEPS = 60
+
+
+class ShapeArrays(NamedTuple):
+    """Candidates by their shapes and their surfaces."""
+
+    kind: np.ndarray  # (c, SHAPE_KIND_SIZE) int
+    data: np.ndarray  # (c, SHAPE_SIZE)
+    fields: np.ndarray  # coefficients of the B-splines of all height fields, (nx + 2) (ny + 2) each, x after x
+
+
+@internal_kernel
+def distance(shapes: ShapeArrays, k, x, y, z):
+    """φ [m], n (3 numbers) and H (xx xy xz yy yz zz) [1/m] at a point of W, for the surface of candidate k."""
+    kind, data = shapes.kind[k, SURFACE], shapes.data
+    if kind == HEIGHT_FIELD:
+        return field_distance(shapes, k, x, y, z)
+    x, y, z = x - data[k, PLACE], y - data[k, PLACE + 1], z - data[k, PLACE + 2]
+    nx, ny, nz = data[k, AXES], data[k, AXES + 1], data[k, AXES + 2]
+    if kind == PLANE:
+        return nx * x + ny * y + nz * z, nx, ny, nz, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    if kind == BOX:
+        return box_distance(shapes, k, x, y, z)
+    # Sphere and cylinder: H = (1 − n nᵀ)/r, without what lies along the axis of a cylinder.
+    if kind == CYLINDER:
+        along = nx * x + ny * y + nz * z
+        x, y, z = x - along * nx, y - along * ny, z - along * nz
+    else:
+        nx, ny, nz = 0.0, 0.0, 0.0
+    r, size = math.sqrt(x * x + y * y + z * z), data[k, SIZE]
+    sign = math.copysign(1.0, size)
+    scale = 1.0 / max(r, 1e-300)
+    x, y, z, h = x * scale, y * scale, z * scale, sign * scale
+    return (
+        sign * r - size,
+        sign * x,
+        sign * y,
+        sign * z,
+        h * (1.0 - x * x - nx * nx),
+        h * (-x * y - nx * ny),
+        h * (-x * z - nx * nz),
+        h * (1.0 - y * y - ny * ny),
+        h * (-y * z - ny * nz),
+        h * (1.0 - z * z - nz * nz),
+    )
+
+
+@internal_kernel
+def box_distance(shapes: ShapeArrays, k, x, y, z):
+    """As :func:`distance` for a box whose centre is the origin.
+
+    With p in its axes, b its half edges without the rounding r, and o = max(|p| − b, 0): φ = |o| − r outside the core
+    b, n and H those of a plane, a cylinder or a sphere by how many components o has. Within the core: the nearest face.
+    """
+    data = shapes.data
+    px = data[k, AXES] * x + data[k, AXES + 1] * y + data[k, AXES + 2] * z
+    py = data[k, AXES + 3] * x + data[k, AXES + 4] * y + data[k, AXES + 5] * z
+    pz = data[k, AXES + 6] * x + data[k, AXES + 7] * y + data[k, AXES + 8] * z
+    ox, oy, oz = abs(px) - data[k, SIZE], abs(py) - data[k, SIZE + 1], abs(pz) - data[k, SIZE + 2]
+    inside = max(ox, max(oy, oz))
+    if inside <= 0.0:
+        ox, oy, oz = (1.0, 0.0, 0.0) if ox == inside else ((0.0, 1.0, 0.0) if oy == inside else (0.0, 0.0, 1.0))
+        far, r = inside, 1.0
+    else:
+        ox, oy, oz = max(ox, 0.0), max(oy, 0.0), max(oz, 0.0)
+        r = math.sqrt(ox * ox + oy * oy + oz * oz)
+        far = r
+    # Axes along which φ is bent: those with a component, when there are several.
+    fx, fy, fz = 1.0 if ox > 0.0 else 0.0, 1.0 if oy > 0.0 else 0.0, 1.0 if oz > 0.0 else 0.0
+    h = 1.0 / r if fx + fy + fz > 1.0 else 0.0
+    ox, oy, oz = math.copysign(ox, px) / r, math.copysign(oy, py) / r, math.copysign(oz, pz) / r
+    # In the axes of the box H = h (diag(f) − o oᵀ); to W with the axes as rows.
+    x0, x1, x2 = data[k, AXES], data[k, AXES + 1], data[k, AXES + 2]
+    y0, y1, y2 = data[k, AXES + 3], data[k, AXES + 4], data[k, AXES + 5]
+    z0, z1, z2 = data[k, AXES + 6], data[k, AXES + 7], data[k, AXES + 8]
+    nx, ny, nz = x0 * ox + y0 * oy + z0 * oz, x1 * ox + y1 * oy + z1 * oz, x2 * ox + y2 * oy + z2 * oz
+    return (
+        far - data[k, EDGE],
+        nx,
+        ny,
+        nz,
+        h * (fx * x0 * x0 + fy * y0 * y0 + fz * z0 * z0 - nx * nx),
+        h * (fx * x0 * x1 + fy * y0 * y1 + fz * z0 * z1 - nx * ny),
+        h * (fx * x0 * x2 + fy * y0 * y2 + fz * z0 * z2 - nx * nz),
+        h * (fx * x1 * x1 + fy * y1 * y1 + fz * z1 * z1 - ny * ny),
+        h * (fx * x1 * x2 + fy * y1 * y2 + fz * z1 * z2 - ny * nz),
+        h * (fx * x2 * x2 + fy * y2 * y2 + fz * z2 * z2 - nz * nz),
+    )
+
+
+@internal_kernel
+def field_distance(shapes: ShapeArrays, k, x, y, z):
+    """As :func:`distance` for a height field, by the foot point c = (u, v, h(u, v)) at which the point lies along n.
+
+    Newton's method on ½ |r − c|², from the point of the field straight below; with e = z − h, X = ∂c/∂(u, v), G = XᵀX
+    its second derivative is G − e ∂²h. Halved steps where the distance grows. Then φ = n·(r − c) and
+
+        H = X G⁻¹ B (G + φ B)⁻¹ Xᵀ,   B = −∂²h / √(1 + |∇h|²):
+
+    a step of r moves c by X (G + φ B)⁻¹ Xᵀ dr, and n by X G⁻¹ B times that. Valid within the radius of curvature.
+    """
+    data = shapes.data
+    size = min(data[k, SIZE], data[k, SIZE + 1])
+    u, v, from_u, from_v, step_u, step_v, best = x, y, x, y, 0.0, 0.0, math.inf
+    last = False
+    h, p, q, a, b, c = field_height(shapes, k, u, v)
+    for _ in range(FOOT_STEPS):
+        e = z - h
+        square = (x - u) * (x - u) + (y - v) * (y - v) + e * e
+        if last:
+            break
+        if square > best * (1.0 + 1e-12):
+            step_u, step_v = 0.5 * step_u, 0.5 * step_v
+        else:
+            best, from_u, from_v = square, u, v
+            gu, gv = x - u + e * p, y - v + e * q
+            guu, guv, gvv = 1.0 + p * p, p * q, 1.0 + q * q
+            muu, muv, mvv = guu - e * a, guv - e * b, gvv - e * c
+            det = muu * mvv - muv * muv
+            if not (muu > 0.0 and det > 1e-3 * guu * gvv):  # not a minimum nearby: Gauss and Newton's step
+                muu, muv, mvv = guu, guv, gvv
+                det = muu * mvv - muv * muv
+            step_u, step_v = (mvv * gu - muv * gv) / det, (muu * gv - muv * gu) / det
+        last = step_u * step_u + step_v * step_v <= FOOT_TOLERANCE * FOOT_TOLERANCE * size * size
+        u, v = from_u + step_u, from_v + step_v
+        h, p, q, a, b, c = field_height(shapes, k, u, v)
+    steep = 1.0 / math.sqrt(1.0 + p * p + q * q)
+    nx, ny, nz = -p * steep, -q * steep, steep
+    far = nx * (x - u) + ny * (y - v) + nz * (z - h)
+    # B, G⁻¹ B and (G + φ B)⁻¹.
+    a, b, c = -a * steep, -b * steep, -c * steep
+    guu, guv, gvv = 1.0 + p * p, p * q, 1.0 + q * q
+    det = 1.0 / (guu * gvv - guv * guv)
+    k00, k01 = det * (gvv * a - guv * b), det * (gvv * b - guv * c)
+    k10, k11 = det * (guu * b - guv * a), det * (guu * c - guv * b)
+    guu, guv, gvv = guu + far * a, guv + far * b, gvv + far * c
+    det = 1.0 / (guu * gvv - guv * guv)
+    m00, m01 = det * (k00 * gvv - k01 * guv), det * (k01 * guu - k00 * guv)
+    m11 = det * (k11 * guu - k10 * guv)
+    # X = ((1, 0, p), (0, 1, q)) as columns.
+    xz, yz = m00 * p + m01 * q, m01 * p + m11 * q
+    return far, nx, ny, nz, m00, m01, xz, m11, yz, p * xz + q * yz
+
+
+@internal_kernel
+def field_height(shapes: ShapeArrays, k, x, y):
+    """h and its derivatives x, y, xx, xy, yy at a point of the field; beyond its grid it goes on straight."""
+    fields, data, kind = shapes.fields, shapes.data, shapes.kind
+    nx, ny = kind[k, COUNT], kind[k, COUNT + 1]
+    i, x0, x1, x2, x3, dx0, dx1, dx2, dx3, ex0, ex1, ex2, ex3 = spline_weights(
+        (x - data[k, PLACE]) / data[k, SIZE], 1.0 / data[k, SIZE], nx
+    )
+    j, y0, y1, y2, y3, dy0, dy1, dy2, dy3, ey0, ey1, ey2, ey3 = spline_weights(
+        (y - data[k, PLACE + 1]) / data[k, SIZE + 1], 1.0 / data[k, SIZE + 1], ny
+    )
+    h, p, q, a, b, c = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for s in range(4):
+        w, dw, ew = (
+            (y0, dy0, ey0) if s == 0 else (y1, dy1, ey1) if s == 1 else (y2, dy2, ey2) if s == 2 else (y3, dy3, ey3)
+        )
+        f = kind[k, FIELD] + (j + s) * (nx + 2) + i
+        f0, f1, f2, f3 = fields[f], fields[f + 1], fields[f + 2], fields[f + 3]
+        value = x0 * f0 + x1 * f1 + x2 * f2 + x3 * f3
+        slope = dx0 * f0 + dx1 * f1 + dx2 * f2 + dx3 * f3
+        bend = ex0 * f0 + ex1 * f1 + ex2 * f2 + ex3 * f3
+        h, p, q = h + w * value, p + w * slope, q + dw * value
+        a, b, c = a + w * bend, b + dw * slope, c + ew * value
+    return h, p, q, a, b, c
+
+
+@internal_kernel
+def spline_weights(x, per, count):
+    """Cell of x in units of the grid, and the weights of its four uniform cubic B-splines with two derivatives.
+
+    ``per``: 1 / spacing. Beyond the first and last of ``count`` grid points the weights go on straight.
+    """
+    held = min(max(x, 0.0), count - 1.0)
+    # NaN as an integer is anything.
+    i = max(min(int(held), count - 2), 0)
+    t, beyond = held - i, x - held
+    s = 1.0 - t
+    d0, d1, d2, d3 = -0.5 * s * s, (1.5 * t - 2.0) * t, (1.0 - 1.5 * t) * t + 0.5, 0.5 * t * t
+    w0, w1 = s * s * s / 6.0 + beyond * d0, (0.5 * t - 1.0) * t * t + 2.0 / 3.0 + beyond * d1
+    w2, w3 = ((1.0 - t) * t + 1.0) * 0.5 * t + 1.0 / 6.0 + beyond * d2, t * t * t / 6.0 + beyond * d3
+    square = per * per if beyond == 0.0 else 0.0
+    return (
+        i,
+        w0,
+        w1,
+        w2,
+        w3,
+        per * d0,
+        per * d1,
+        per * d2,
+        per * d3,
+        square * s,
+        square * (3.0 * t - 2.0),
+        square * (1.0 - 3.0 * t),
+        square * t,
+    )
+
+
+@internal_kernel
+def nearest(shapes: ShapeArrays, k, x, y, z, dx, dy, dz):
+    """u in [0, 1] at which x + u d is nearest to the surface of candidate k: sphere, cylinder or box from outside.
+
+    In closed form for the first two. Of a box φ is convex, so n·d grows with u: Newton's method kept within brackets.
+    In the middle of where the distance does not change.
+    """
+    kind, data = shapes.kind[k, SURFACE], shapes.data
+    if kind == BOX:
+        return nearest_to_box(shapes, k, x, y, z, dx, dy, dz)
+    x, y, z = data[k, PLACE] - x, data[k, PLACE + 1] - y, data[k, PLACE + 2] - z
+    length = dx * dx + dy * dy + dz * dz
+    if kind == CYLINDER:
+        nx, ny, nz = data[k, AXES], data[k, AXES + 1], data[k, AXES + 2]
+        along = nx * dx + ny * dy + nz * dz
+        dx, dy, dz = dx - along * nx, dy - along * ny, dz - along * nz
+    across = dx * dx + dy * dy + dz * dz
+    if across <= 1e-14 * length:
+        return 0.5
+    return min(max((x * dx + y * dy + z * dz) / across, 0.0), 1.0)
+
+
+@internal_kernel
+def nearest_to_box(shapes: ShapeArrays, k, x, y, z, dx, dy, dz):
+    """:func:`nearest` of a box."""
+    low, high, u = 0.0, 1.0, 0.5
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    for step in range(AXIS_STEPS):
+        # Both ends first: most axes do not pass over an edge.
+        at = 0.0 if step == 0 else 1.0 if step == 1 else u
+        _, nx, ny, nz, hxx, hxy, hxz, hyy, hyz, hzz = distance(shapes, k, x + at * dx, y + at * dy, z + at * dz)
+        slope = nx * dx + ny * dy + nz * dz
+        if step == 0:
+            if slope > 1e-14 * length:
+                return 0.0
+        elif step == 1:
+            if slope < -1e-14 * length:
+                return 1.0
+        else:
+            if abs(slope) <= 1e-15 * length:
+                return u
+            if slope < 0.0:
+                low = u
+            else:
+                high = u
+            bend = dx * (hxx * dx + 2.0 * (hxy * dy + hxz * dz)) + dy * (hyy * dy + 2.0 * hyz * dz) + dz * hzz * dz
+            trial = u - slope / bend if bend > 0.0 else low
+            # Newton's step in the limit of rounding moves nothing; along a flat face there is none.
+            if bend > 0.0 and trial == u:
+                return u
+            u = trial if low < trial < high else 0.5 * (low + high)
+            if high - low <= 1e-15:
+                return u
+    return u
+
+
+@kernel
+def surface_distances(shapes: ShapeArrays, points, gaps, normals):
+    """φ [m] and n of the surface of candidate 0 at points, (T, 3), into ``gaps``, (T,), and ``normals``, (T, 3)."""
+    for t in range(points.shape[0]):
+        found = distance(shapes, 0, points[t, 0], points[t, 1], points[t, 2])
+        gaps[t], normals[t, 0], normals[t, 1], normals[t, 2] = found[0], found[1], found[2], found[3]
+
+
+@kernel
+def nearest_points(shapes: ShapeArrays, starts, along, u):
+    """:func:`nearest` of candidate 0 for axes from ``starts`` along ``along``, (T, 3), into ``u``, (T,)."""
+    for t in range(starts.shape[0]):
+        u[t] = nearest(shapes, 0, starts[t, 0], starts[t, 1], starts[t, 2], along[t, 0], along[t, 1], along[t, 2])

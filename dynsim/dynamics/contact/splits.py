@@ -1,0 +1,137 @@
+"""Forces of points that stick where their rows depend on each other: the split that real friction can carry.
+
+Two braces that stick on a planar arm share their lateral row, points along one body their radial one: M v̇ knows the sum
+of their forces only. Such a set holds while any split lies in all cones |f_t| ≤ μ_s f_n. Where that of least norm does
+not, the forces become those of least norm among the splits that do; where none does, those with the best worst margin.
+"""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.cone.socp import best_split, split_room_in
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, note_stop_forces
+from dynsim.dynamics.tables import Workspace
+from dynsim.jit.kernel import apart_kernel, internal_kernel
+
+# A pivot below this fraction of the largest is a row that depends on the others.
+NULL_TOLERANCE = 1e-10
+
+
+@internal_kernel
+def margin(unilateral: UnilateralArrays, ws: Workspace, k):
+    """μ_s f_n − |f_t| of candidate k, which sticks [N]."""
+    r, rows = ws.active[k, ka.FIRST_ROW], ws.rows
+    a, b = rows[r + 1, ka.FORCE], rows[r + 2, ka.FORCE]
+    return unilateral.law[k, ku.STATIC] * rows[r, ka.FORCE] - math.sqrt(a * a + b * b)
+
+
+@internal_kernel
+def admissible_forces(unilateral: UnilateralArrays | None, ws: Workspace):
+    """Replace the forces of dependent rows that stick where they do not lie in their cones; note those of stops.
+
+    Accelerations do not change: the rows are their own directions, so what they cannot tell apart moves nothing.
+    """
+    if unilateral is None:  # known to the compiler
+        return
+    # Small, because it is merged into the right-hand side.
+    if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] > 0:
+        look_at_forces(unilateral, ws)
+
+
+@apart_kernel
+def look_at_forces(unilateral: UnilateralArrays, ws: Workspace):
+    """:func:`admissible_forces` where there are dependent rows or stops."""
+    note_stop_forces(unilateral, ws)
+    unilateral.number[ku.SPLIT] = 0.0
+    if unilateral.number[ku.REDUNDANT] == 1.0:
+        for k in range(ws.contacts.shape[0]):
+            if ws.active[k, ka.MODE] == ka.STICKING and margin(unilateral, ws, k) < 0.0:
+                split_forces(unilateral, ws)
+                return
+
+
+@apart_kernel
+def split_forces(unilateral: UnilateralArrays, ws: Workspace):
+    """The best split of the forces of all that sticks, into FORCE of its rows; its worst margin into BEST_MARGIN."""
+    room, place, mu, rows = unilateral.room, unilateral.place, unilateral.vector[0], ws.rows
+    first, row = place[0], place[1]
+    count, p = 0, 0
+    for k in range(ws.contacts.shape[0]):
+        if ws.active[k, ka.MODE] == ka.STICKING:
+            first[count], mu[count] = p, unilateral.law[k, ku.STATIC]
+            for s in range(3):
+                row[p] = ws.active[k, ka.FIRST_ROW] + s
+                p += 1
+            count += 1
+    force, out = unilateral.vector[1], unilateral.vector[2]
+    for i in range(p):
+        force[i] = rows[row[i], ka.FORCE]
+        for j in range(p):
+            room[ku.SPLIT_MATRIX, i, j] = ws.small[0, row[i], row[j]]
+    width = null_space(room[ku.SPLIT_MATRIX], p, room[ku.NULL_SPACE], place[2])
+    unilateral.number[ku.SPLIT] = 1.0
+    programs = split_room_in(unilateral.split_room, place[3], width, count)
+    worst = best_split(force[:p], room[ku.NULL_SPACE], width, first, mu, count, out[:p], programs)
+    unilateral.number[ku.BEST_MARGIN] = worst
+    for i in range(p):
+        rows[row[i], ka.FORCE] = out[i]
+
+
+@internal_kernel
+def null_space(W, p, N, order):
+    """Orthonormal basis of the null space of W, (p, p), symmetric and positive semidefinite, into N, (p, width).
+
+    Cholesky with pivoting, Π W Πᵀ = [L1; L2] [L1; L2]ᵀ; the columns (−L1⁻ᵀ L2ᵀ; 1), orthonormalised. W is overwritten.
+
+    Returns
+    -------
+    width : p minus the rank
+    """
+    largest, rank = 0.0, 0
+    for i in range(p):
+        order[i] = i
+        largest = max(largest, W[i, i])
+    while rank < p:
+        best = rank
+        for i in range(rank + 1, p):
+            if W[order[i], order[i]] > W[order[best], order[best]]:
+                best = i
+        if not W[order[best], order[best]] > NULL_TOLERANCE * largest:
+            break
+        order[rank], order[best] = order[best], order[rank]
+        a = order[rank]
+        pivot = math.sqrt(W[a, a])
+        W[a, a] = pivot
+        for i in range(rank + 1, p):
+            W[order[i], a] /= pivot
+        for i in range(rank + 1, p):
+            for j in range(rank + 1, p):
+                W[order[i], order[j]] -= W[order[i], a] * W[order[j], a]
+        rank += 1
+    for c in range(p - rank):
+        free = order[rank + c]
+        for i in range(p):
+            N[i, c] = 0.0
+        N[free, c] = 1.0
+        for k in range(rank - 1, -1, -1):
+            total = -W[free, order[k]]
+            for i in range(k + 1, rank):
+                total -= W[order[i], order[k]] * N[order[i], c]
+            N[order[k], c] = total / W[order[k], order[k]]
+        # Twice is enough (Kahan, Parlett).
+        for _ in range(2):
+            for b in range(c):
+                part = 0.0
+                for i in range(p):
+                    part += N[i, b] * N[i, c]
+                for i in range(p):
+                    N[i, c] -= part * N[i, b]
+        size = 0.0
+        for i in range(p):
+            size += N[i, c] * N[i, c]
+        for i in range(p):
+            N[i, c] /= math.sqrt(size)
+    return p - rank

@@ -1,0 +1,144 @@
+"""The unilateral law: tables of candidates and joint stops that only push, and the direction in which a point slides.
+
+0 ≤ f_n ⟂ gap ≥ 0; a point that slides is driven by n − μ(s) t along t = v_t/|v_t|, one that is at rest is held while
+|f_t| ≤ μ_s f_n. Which candidates are open, slide or stick is constant within a step
+(:mod:`dynsim.dynamics.contact.contact_modes` chooses); this module is what a right-hand side needs of the law.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact.cone import problem as kc
+from dynsim.dynamics.tables import ContactArrays, Workspace
+from dynsim.jit.kernel import internal_kernel
+
+# UnilateralArrays.law; the kinetic coefficient is ContactArrays.point[:, MU].
+STATIC = 0  # static coefficient μ_s ≥ μ_k
+STRIBECK = 1  # speed v_s [m/s] of μ_k + (μ_s − μ_k) exp(−(s/v_s)²); 0: μ_k from the first slip on
+VISCOUS = 2  # [s/m]: adds c s to the coefficient
+RESTITUTION = 3
+LAW_SIZE = 4
+# UnilateralArrays.slide
+REFERENCE = 0  # 3: direction of slip at the start of the step, or since it began while FROZEN; 0 before any
+FROZEN = 3  # 1: slip is too slow to have a direction of its own, that of REFERENCE stands
+SPEED = 4  # v_t · REFERENCE [m/s]
+NEXT = 5  # 3: direction at the end of the step
+NEXT_SPEED = 8  # |v_t| there [m/s]
+LANDS_AT = 9  # depth below its surface at which a candidate that is off it has landed [m]
+HEADWAY = 10  # what it began to slip with against its direction, because the rows could not take it away [m/s]
+MOBILITY = 11  # along its tangents, when modes were last chosen with it: the sum over both [1/kg]
+LONGEST = 12  # step in which friction turns its slip by no more than RK4 can follow [s]
+SLIDE_SIZE = 13
+# It lands at DEPTH until it has been higher than that, because projection leaves closed ones within half of it on
+# either side; then at the root itself.
+DEPTH, AT_ROOT = 2e-10, 1e-13
+# UnilateralArrays.tally, of a candidate
+TIME_OPEN, TIME_SLIDING, TIME_STICKING = 0, 1, 2  # in the order of the modes [s]
+LIFT_OFFS, LANDINGS, SLIP_STARTS, BOUNCES = 3, 4, 5, 6
+LOSS = 7  # energy that impacts have taken [J]
+SETTLE = 8  # slower than that a touching point counts as at rest along the normal [m/s]
+WINDOW_START, WINDOW_COUNT = 9, 10  # of the count of events that tells chatter
+CHATTERED = 11  # how often SETTLE was raised because of it
+DEEPEST = 12  # largest depth below the surface [m]
+TALLY_SIZE = 13
+# UnilateralArrays.stop_table, int
+STOP_JOINT = 0  # link whose joint it stops
+STOP_CLOSED = 1
+STOP_ROW = 2  # its row while it is closed
+STOP_BEFORE = 3  # scratch of the choice of modes
+STOP_TABLE_SIZE = 4
+# UnilateralArrays.stop
+SIDE = 0  # 1 for a lower limit, −1 for an upper one
+LIMIT = 1  # SIDE times the limit [rad or m]: the gap is SIDE q − LIMIT
+STOP_FORCE = 2  # [N m or N], ≥ 0
+HITS = 3
+STOP_LOSS = 4  # [J]
+CLOSED_TIME = 5  # [s]
+STOP_SIZE = 6
+# UnilateralArrays.mode, int: columns
+WANTED, BEFORE, TOUCHING, STRUCK = 0, 1, 2, 3
+GIVES_WAY = 4  # 1: it has come to its static cone, and the kinetic coefficient holds from now on
+MODE_SIZE = 5
+# UnilateralArrays.vector: three of the splits of forces, then those of the problem that chooses modes
+OFFSET, SOLUTION, CONE_FRICTION, FIRST_PART, SECOND_PART = 3, 4, 5, 6, 7
+VECTORS = 8
+# UnilateralArrays.place, int: four of the splits of forces; kinds of the problem's rows, and which of the table's
+KINDS, TABLE_ROW = 4, 5
+PLACES = 6
+# UnilateralArrays.room
+SPLIT_MATRIX, NULL_SPACE, PROBLEM, SCRATCH = 0, 1, 2, 3
+ROOM = SCRATCH + kc.CONE_ROOM
+# UnilateralArrays.number
+REDUNDANT = 0  # 1: the rows of what sticks depend on each other
+BEST_MARGIN = 1  # the worst margin of the best split of their forces [N], where the least norm fits no cones
+SPLIT = 2  # 1: BEST_MARGIN counts at this evaluation
+SLOW = 3  # below this speed the direction of slip is frozen [m/s]
+LAST_CHANGE, CHANGES = 4, 5  # time of the last change of modes, and how many there were at that time
+NUMBERS = 6
+
+
+class UnilateralArrays(NamedTuple):
+    """c candidates and s joint stops under the unilateral law; p is the most rows that there can be."""
+
+    law: np.ndarray  # (c, LAW_SIZE)
+    slide: np.ndarray  # (c, SLIDE_SIZE)
+    mode: np.ndarray  # (c, MODE_SIZE) int
+    tally: np.ndarray  # (c, TALLY_SIZE)
+    stop_table: np.ndarray  # (s, STOP_TABLE_SIZE) int
+    stop: np.ndarray  # (s, STOP_SIZE)
+    place: np.ndarray  # (PLACES, p or c + 2) int
+    vector: np.ndarray  # (VECTORS, p)
+    room: np.ndarray  # (ROOM, p, p) two matrices of the splits, one of the problem that chooses modes, its scratch
+    split_room: np.ndarray  # scratch of the splits
+    number: np.ndarray  # (NUMBERS,)
+
+
+@internal_kernel
+def slide_direction(unilateral: UnilateralArrays, contacts: ContactArrays, k, x, y, z):
+    """Direction of slip of candidate k at tangential velocity (x, y, z), and its coefficient of friction there.
+
+    While FROZEN the direction is that of REFERENCE. Else v_t/|v_t|, with the sign of v_t · REFERENCE: through zero it
+    goes on as it was, so that a step that passes the end of slip is smooth, and the end of slip is where
+    v_t · REFERENCE is zero.
+    """
+    slide, law = unilateral.slide, unilateral.law
+    a, b, c = slide[k, REFERENCE], slide[k, REFERENCE + 1], slide[k, REFERENCE + 2]
+    along = x * a + y * b + z * c
+    size = math.sqrt(x * x + y * y + z * z)
+    slide[k, SPEED] = along
+    speed = along
+    if slide[k, FROZEN] == 0.0 and size > 0.0:
+        scale = 1.0 / size if along >= 0.0 else -1.0 / size
+        a, b, c = x * scale, y * scale, z * scale
+        speed = size if along >= 0.0 else -size
+    return a, b, c, sliding_friction(law, k, contacts.point[k, ka.MU], speed)
+
+
+@internal_kernel
+def stop_gap(unilateral: UnilateralArrays, ws: Workspace, k):
+    """What joint stop k leaves its joint to go, ≥ 0 [rad or m]."""
+    stop = unilateral.stop
+    return stop[k, SIDE] * ws.joints[unilateral.stop_table[k, STOP_JOINT], ka.Q] - stop[k, LIMIT]
+
+
+@internal_kernel
+def note_stop_forces(unilateral: UnilateralArrays, ws: Workspace):
+    """Forces of the joint stops from their rows; none where they are open."""
+    table = unilateral.stop_table
+    for k in range(table.shape[0]):
+        closed = table[k, STOP_CLOSED] == 1
+        unilateral.stop[k, STOP_FORCE] = ws.rows[table[k, STOP_ROW], ka.FORCE] if closed else 0.0
+
+
+@internal_kernel
+def sliding_friction(law, k, mu, speed):
+    """Coefficient of friction of candidate k that slides at this speed, mu being the kinetic one."""
+    if law[k, STRIBECK] > 0.0:
+        ratio = speed / law[k, STRIBECK]
+        mu += (law[k, STATIC] - mu) * math.exp(-ratio * ratio)
+    return mu + law[k, VISCOUS] * speed

@@ -1,0 +1,138 @@
+"""The coupled system of bodies, motors and contacts as one right-hand side dy/dt ([WM] eqs 28–35).
+
+Positions, rates, currents and integrals lie in the state as dynsim.dynamics.state says.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact.delassus import solve_small
+from dynsim.dynamics.contact.distance import ShapeArrays
+from dynsim.dynamics.contact.m_star import solve_m_star
+from dynsim.dynamics.contact.quadrics import contact_rows, sign_changed
+from dynsim.dynamics.contact.rows import set_modes
+from dynsim.dynamics.contact.shapes import shaped_rows
+from dynsim.dynamics.contact.splits import admissible_forces
+from dynsim.dynamics.contact.unilateral import UnilateralArrays
+from dynsim.dynamics.drive.law import drive
+from dynsim.dynamics.ledger import ledger_rates
+from dynsim.dynamics.state import StateLayout
+from dynsim.dynamics.tables import (
+    ContactArrays,
+    CouplingArrays,
+    DriveArrays,
+    ModelArrays,
+    ReferenceArrays,
+    Workspace,
+    workspace,
+)
+from dynsim.dynamics.tree.articulated import accelerate, add_row_forces, factor, row_system
+from dynsim.dynamics.tree.joints import position_rates, read_positions
+from dynsim.dynamics.tree.loads import LoadArrays, add_loads
+from dynsim.dynamics.tree.sweep import forward_sweep
+from dynsim.jit.kernel import integers, internal_kernel, kernel, reals
+
+
+class System(NamedTuple):
+    """All constant data of a simulation."""
+
+    layout: StateLayout
+    model: ModelArrays
+    drives: DriveArrays
+    reference: ReferenceArrays
+    contacts: ContactArrays
+    loads: LoadArrays
+    dense: np.ndarray | None  # room for M* and b, see constraint.m_star; None for the articulated solve alone
+    couplings: CouplingArrays = CouplingArrays(
+        integers(np.zeros((0, ka.COUPLING_JOINT_SIZE))), reals(np.zeros((0, ka.COUPLING_SIZE)))
+    )
+    unilateral: UnilateralArrays | None = None  # candidates are glued to their surfaces, and joints have no stops
+    shapes: ShapeArrays | None = None  # of candidates that are not points on quadrics; None: all are
+
+
+def new_workspace(system: System) -> Workspace:
+    """The workspace of a system: couplings hold, candidates slide, under the unilateral law they are open."""
+    contacts, couplings, unilateral = system.contacts, system.couplings, system.unilateral
+    c, joint_rows = contacts.link.shape[0], couplings.joint.shape[0]
+    if unilateral is not None:
+        joint_rows += unilateral.stop.shape[0]
+    ws = workspace(system.model.tree.shape[0], system.drives.table.shape[0], c, joint_rows)
+    set_modes(contacts, couplings, unilateral, ws, integers(np.full(c, ka.SLIDING if unilateral is None else ka.OPEN)))
+    return ws
+
+
+@internal_kernel
+def constrained_acceleration(model: ModelArrays, ws: Workspace):
+    """vdot and row forces of the applied forces, by the articulated solve, into ``ws.joints`` and ``ws.rows``."""
+    factor(model, ws)
+    p, passes = ws.counts[ka.ROWS], 0
+    while p > 0:
+        passes += 1
+        row_system(model, ws)
+        ws.counts[ka.DEPENDENT] += solve_small(ws.small, ws.rows, ws.active, p)
+        if not sign_changed(ws, passes):
+            break
+    add_row_forces(model, ws)
+    accelerate(model, ws)
+
+
+@internal_kernel
+def m_star_acceleration(dense, model: ModelArrays, drives: DriveArrays, ws: Workspace, found):
+    """The same unknowns by the dense M*, where ``dense`` has room for it.
+
+    The articulated solve has run before, because projection uses its factors; its rank findings (``found`` before it)
+    are not counted twice.
+    """
+    if dense is None:  # known to the compiler, which then leaves M* out of the default program
+        return
+    ws.counts[ka.DEPENDENT] = found
+    passes = 1
+    solve_m_star(dense, model, drives, ws)
+    while sign_changed(ws, passes):
+        passes += 1
+        solve_m_star(dense, model, drives, ws)
+
+
+@kernel
+def derivative(system: System, t, y, ws: Workspace, dy):
+    """dy/dt of the whole coupled system at time t; y, dy: see dynsim.dynamics.state."""
+    model, drives, contacts, layout = system.model, system.drives, system.contacts, system.layout
+    joints, motors = ws.joints, ws.motors
+    n, na = joints.shape[0], motors.shape[0]
+    # Most robots have a position for each rate; the others read and write their positions by kind of joint.
+    plain = layout.extra == 0
+    if not plain:
+        read_positions(model.compound, model, y, layout.q, ws)
+    for i in range(n):
+        if plain:
+            joints[i, ka.Q] = y[layout.q + i]
+        joints[i, ka.QD] = y[layout.v + i]
+        # The sweep multiplies it by zero, which would keep a NaN of a state without solution for ever.
+        joints[i, ka.QDD] = 0.0
+        joints[i, ka.APPLIED] = -(model.body[i, ka.DAMPING] + model.body[i, ka.GEAR_DAMPING]) * joints[i, ka.QD]
+    drive(drives, system.reference, t, y, layout, ws)
+
+    forward_sweep(model, ws, 1.0, 0.0, 1.0)
+    if system.loads.table.shape[0] > 0:
+        add_loads(model, system.loads, t, ws, dy, layout.load)
+    contact_rows(model, contacts, system.unilateral, ws)
+    shaped_rows(system.shapes, system.unilateral, model, contacts, ws)
+    found = ws.counts[ka.DEPENDENT]
+    constrained_acceleration(model, ws)
+    m_star_acceleration(system.dense, model, drives, ws, found)
+    admissible_forces(system.unilateral, ws)
+
+    if not plain:
+        position_rates(model.compound, model, ws, dy, layout.q)
+    for i in range(n):
+        if plain:
+            dy[layout.q + i] = joints[i, ka.QD]
+        dy[layout.v + i] = joints[i, ka.QDD]
+    for a in range(na):
+        if drives.table[a, ka.CIRCUIT] >= 0:
+            dy[layout.current + drives.table[a, ka.CIRCUIT]] = motors[a, ka.DIDT]
+    ledger_rates(model, drives, ws, dy, layout)

@@ -1,0 +1,234 @@
+"""All drives of a system, told apart by kind: references, commands, torques, and the linear blocks of implicit methods.
+
+A drive kind is a constant in ``kernels.arrays``, a file of plain functions, a branch in each function below, and a
+line of ``model.arrays.compile_drives``.
+"""
+
+from __future__ import annotations
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.drive.dc import at_current_limit, dc_balance, dc_block, dc_command, dc_torque, within_current
+from dynsim.dynamics.drive.limit import clipped
+from dynsim.dynamics.drive.servo import (
+    servo_block,
+    servo_block_on,
+    servo_circuit,
+    servo_circuit_on,
+    servo_command,
+    servo_drag,
+    servo_segment,
+    servo_torque,
+)
+from dynsim.dynamics.drive.torque import open_torque
+from dynsim.dynamics.state import StateLayout
+from dynsim.dynamics.tables import DriveArrays, ReferenceArrays, Workspace
+from dynsim.jit.kernel import apart_kernel, internal_kernel
+
+for _law in (at_current_limit, clipped, dc_balance, dc_block, dc_command, dc_torque, open_torque):
+    internal_kernel(_law)
+for _law in (servo_segment, servo_circuit_on, servo_circuit, servo_block_on, servo_block):
+    internal_kernel(_law)
+for _law in (servo_command, servo_drag, servo_torque):
+    internal_kernel(_law)
+# Few motors have it: merged, its product K_m v would be that of the balance too, whose last bits depend on that.
+apart_kernel(within_current)
+
+
+@internal_kernel
+def evaluate_reference(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace):
+    """References q_d and rates v_d of all drives at time t, into ``ws.motors`` [rad, rad/s; N m of an open torque]."""
+    motors, c, line = ws.motors, reference.coefficients, drives.input
+    spacing = reference.grid[1]
+    x = t - reference.grid[0]
+    segment = min(max(int(x / spacing), 0), c.shape[0] - 1)
+    x -= segment * spacing
+    for a in range(motors.shape[0]):
+        s = reference.spline[a]
+        if s == ka.REWRITTEN:
+            motors[a, ka.Q_REF] = line[a, ka.LINE_START] + line[a, ka.LINE_RATE] * (t - line[a, ka.LINE_SINCE])
+            motors[a, ka.V_REF] = line[a, ka.LINE_RATE]
+        elif s < 0:
+            motors[a, ka.Q_REF] = reference.held[a]
+            motors[a, ka.V_REF] = 0.0
+        else:
+            c0, c1, c2 = c[segment, s, 0], c[segment, s, 1], c[segment, s, 2]
+            c3, c4, c5 = c[segment, s, 3], c[segment, s, 4], c[segment, s, 5]
+            motors[a, ka.Q_REF] = c0 + x * (c1 + x * (c2 + x * (c3 + x * (c4 + x * c5))))
+            motors[a, ka.V_REF] = c1 + x * (2.0 * c2 + x * (3.0 * c3 + x * (4.0 * c4 + x * 5.0 * c5)))
+
+
+@internal_kernel
+def command(drives: DriveArrays, ws: Workspace, a):
+    """What drive a is told to do, by its law at the present state, before limits [V; N m for an open torque]."""
+    motor, i, kind = drives.motor, drives.table[a, ka.DRIVEN], drives.table[a, ka.DRIVE_KIND]
+    q_ref, v_ref = ws.motors[a, ka.Q_REF], ws.motors[a, ka.V_REF]
+    if kind == ka.DC_MOTOR:
+        return dc_command(motor, a, q_ref, v_ref, ws.joints[i, ka.Q], ws.joints[i, ka.QD])
+    if kind == ka.POSITION_SERVO:
+        return servo_command(
+            motor, a, drives.table[a, ka.SERVO_MODE], q_ref, v_ref, ws.joints[i, ka.Q], ws.joints[i, ka.QD]
+        )
+    return q_ref
+
+
+@internal_kernel
+def fed_forward(voltage, grid, t, a, asked):
+    """The command of a drive with its planned voltage, where there are any."""
+    if voltage is None:  # known to the compiler
+        return asked
+    x = t - grid[0]
+    k = min(max(int(x / grid[1]), 0), voltage.shape[0] - 1)
+    x -= k * grid[1]
+    total = 0.0
+    for power in range(5, -1, -1):
+        total = total * x + voltage[k, a, power]
+    return asked + total
+
+
+@internal_kernel
+def drive_dc(drives: DriveArrays, asked, i, ws: Workspace, a):
+    """The DC motor a at a command [V] and a current [A]."""
+    motors, motor, j = ws.motors, drives.motor, drives.table[a, ka.DRIVEN]
+    u = clipped(drives.input[a, ka.COMMAND] if drives.table[a, ka.SAMPLED] else asked, motor[a, ka.U_MAX])
+    if drives.table[a, ka.CURRENT_LIMITED] != 0:
+        u = within_current(motor, a, u, ws.joints[j, ka.QD])
+    motors[a, ka.CURRENT], motors[a, ka.VOLTAGE] = i, u
+    motors[a, ka.DIDT] = dc_balance(motor, a, u, ws.joints[j, ka.QD], i) / motor[a, ka.INDUCTANCE]
+    ws.joints[j, ka.APPLIED] += dc_torque(motor, a, i)
+
+
+@internal_kernel
+def drive(drives: DriveArrays, reference: ReferenceArrays, t, y, layout: StateLayout, ws: Workspace):
+    """Currents, voltages and rates of current of all drives into ``ws.motors``; their torques onto ``ws.joints``.
+
+    Positions and rates of the joints must be in ``ws.joints``, and the other applied forces.
+    """
+    table, motor, motors, joints = drives.table, drives.motor, ws.motors, ws.joints
+    na = motors.shape[0]
+    evaluate_reference(drives, reference, t, ws)
+    if layout.circuits == na:  # every drive has a circuit, its own: the loop that most robots take
+        for a in range(na):
+            j = table[a, ka.DRIVEN]
+            asked = dc_command(motor, a, motors[a, ka.Q_REF], motors[a, ka.V_REF], joints[j, ka.Q], joints[j, ka.QD])
+            asked = fed_forward(reference.voltage, reference.grid, t, a, asked)
+            drive_dc(drives, asked, y[layout.current + a], ws, a)
+        return
+    for a in range(na):
+        j, kind = table[a, ka.DRIVEN], table[a, ka.DRIVE_KIND]
+        v = joints[j, ka.QD]
+        asked = drives.input[a, ka.COMMAND] if table[a, ka.SAMPLED] else command(drives, ws, a)
+        if kind == ka.DC_MOTOR:
+            asked = fed_forward(reference.voltage, reference.grid, t, a, asked)
+            drive_dc(drives, asked, y[layout.current + table[a, ka.CIRCUIT]], ws, a)
+        elif kind == ka.POSITION_SERVO:
+            mode = drives.table[a, ka.SERVO_MODE]
+            motors[a, ka.VOLTAGE], motors[a, ka.CURRENT] = servo_circuit(motor, a, mode, asked, v)
+            motors[a, ka.DRAG] = servo_drag(motor, a, mode, v)
+            joints[j, ka.APPLIED] += motor[a, ka.K_M] * motors[a, ka.CURRENT] - motors[a, ka.DRAG]
+        else:
+            motors[a, ka.VOLTAGE], motors[a, ka.CURRENT] = v, open_torque(motor, a, asked)
+            joints[j, ka.APPLIED] += motors[a, ka.CURRENT]
+
+
+@internal_kernel
+def take_commands(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace):
+    """At a tick: the commands of all sampled drives at the state in ``ws.joints``, held from now on."""
+    evaluate_reference(drives, reference, t, ws)
+    for a in range(ws.motors.shape[0]):
+        if drives.table[a, ka.SAMPLED] == ka.AT_TICKS:
+            asked = command(drives, ws, a)
+            drives.input[a, ka.COMMAND] = fed_forward(reference.voltage, reference.grid, t, a, asked)
+
+
+@internal_kernel
+def drive_block(drives: DriveArrays, ws: Workspace, a, block):
+    """∂τ/∂(q, v, i) and ∂(di/dt)/∂(q, v, i) of drive a, into the row ``block``, (BLOCK_SIZE,).
+
+    After ``derivative``: references, voltages and states are those in the workspace.
+    """
+    motors, motor, kind, mode = ws.motors, drives.motor, drives.table[a, ka.DRIVE_KIND], drives.table[a, ka.SERVO_MODE]
+    sampled = drives.table[a, ka.SAMPLED] != 0
+    for s in range(block.shape[0]):
+        block[s] = 0.0
+    if kind == ka.DC_MOTOR:
+        u, v = motors[a, ka.VOLTAGE], ws.joints[drives.table[a, ka.DRIVEN], ka.QD]
+        limited = drives.table[a, ka.CURRENT_LIMITED] != 0 and at_current_limit(motor, a, u, v)
+        fill_dc_block(motor, a, 1.0 if not sampled and abs(u) < motor[a, ka.U_MAX] else 0.0, block)
+        if limited:
+            block[ka.RATE_Q], block[ka.RATE_V] = 0.0, 0.0
+    elif kind == ka.POSITION_SERVO:
+        asked = drives.input[a, ka.COMMAND] if sampled else command(drives, ws, a)
+        v = ws.joints[drives.table[a, ka.DRIVEN], ka.QD]
+        block[ka.TORQUE_Q], block[ka.TORQUE_V] = servo_block(motor, a, mode, sampled, asked, v)
+
+
+@internal_kernel
+def fill_dc_block(motor, a, follows, block):
+    """:func:`dc_block` into the row ``block``."""
+    slopes = dc_block(motor, a, follows)
+    block[ka.TORQUE_Q], block[ka.TORQUE_V], block[ka.TORQUE_I] = slopes[0], slopes[1], slopes[2]
+    block[ka.RATE_Q], block[ka.RATE_V], block[ka.RATE_I] = slopes[3], slopes[4], slopes[5]
+
+
+@internal_kernel
+def asked_of(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace, a):
+    """What drive a is asked for at the present state and time t, before limits, after ``evaluate_reference``."""
+    if drives.table[a, ka.SAMPLED] != 0:
+        return drives.input[a, ka.COMMAND]
+    asked = command(drives, ws, a)
+    if drives.table[a, ka.DRIVE_KIND] == ka.DC_MOTOR:
+        return fed_forward(reference.voltage, reference.grid, t, a, asked)
+    return asked
+
+
+@internal_kernel
+def segment_of(drives: DriveArrays, reference: ReferenceArrays, t, ws: Workspace, a):
+    """Which limit holds drive a at the present state: 0 none, ±1 the voltage's, ±2 the current's; as above."""
+    motor, asked = drives.motor, asked_of(drives, reference, t, ws, a)
+    if drives.table[a, ka.DRIVE_KIND] == ka.POSITION_SERVO:
+        v = ws.joints[drives.table[a, ka.DRIVEN], ka.QD]
+        return servo_segment(motor, a, drives.table[a, ka.SERVO_MODE], asked, v)
+    if drives.table[a, ka.DRIVE_KIND] == ka.DC_MOTOR:
+        u = clipped(asked, motor[a, ka.U_MAX])
+        over = u - motor[a, ka.K_M] * ws.joints[drives.table[a, ka.DRIVEN], ka.QD]
+        if drives.table[a, ka.CURRENT_LIMITED] != 0 and abs(over) > motor[a, ka.RESISTANCE] * motor[a, ka.I_MAX]:
+            return 2 if over > 0.0 else -2
+        return 1 if asked > motor[a, ka.U_MAX] else -1 if asked < -motor[a, ka.U_MAX] else 0
+    return 0
+
+
+@internal_kernel
+def drive_on_segments(
+    drives: DriveArrays, reference: ReferenceArrays, t, y, layout: StateLayout, segment, ws: Workspace, linear
+):
+    """:func:`drive` and :func:`drive_block` with given limits holding, (na,), whatever the state says of them.
+
+    linear : (na, BLOCK_SIZE), the blocks
+    """
+    table, motor, motors, joints = drives.table, drives.motor, ws.motors, ws.joints
+    evaluate_reference(drives, reference, t, ws)
+    for a in range(motors.shape[0]):
+        j, kind, mode, limit = table[a, ka.DRIVEN], table[a, ka.DRIVE_KIND], table[a, ka.SERVO_MODE], segment[a]
+        v, asked, sampled = joints[j, ka.QD], asked_of(drives, reference, t, ws, a), table[a, ka.SAMPLED] != 0
+        for s in range(linear.shape[1]):
+            linear[a, s] = 0.0
+        if kind == ka.DC_MOTOR:
+            i, u = y[layout.current + table[a, ka.CIRCUIT]], asked
+            if limit == 1 or limit == -1:
+                u = motor[a, ka.U_MAX] * limit
+            elif limit != 0:
+                u = motor[a, ka.K_M] * v + 0.5 * limit * motor[a, ka.RESISTANCE] * motor[a, ka.I_MAX]
+            motors[a, ka.CURRENT], motors[a, ka.VOLTAGE] = i, u
+            motors[a, ka.DIDT] = dc_balance(motor, a, u, v, i) / motor[a, ka.INDUCTANCE]
+            joints[j, ka.APPLIED] += dc_torque(motor, a, i)
+            fill_dc_block(motor, a, 1.0 if limit == 0 and not sampled else 0.0, linear[a])
+            if limit == 2 or limit == -2:
+                linear[a, ka.RATE_Q], linear[a, ka.RATE_V] = 0.0, 0.0
+        elif kind == ka.POSITION_SERVO:
+            motors[a, ka.VOLTAGE], motors[a, ka.CURRENT] = servo_circuit_on(motor, a, mode, limit, asked, v)
+            motors[a, ka.DRAG] = servo_drag(motor, a, mode, v)
+            joints[j, ka.APPLIED] += motor[a, ka.K_M] * motors[a, ka.CURRENT] - motors[a, ka.DRAG]
+            linear[a, ka.TORQUE_Q], linear[a, ka.TORQUE_V] = servo_block_on(motor, a, mode, limit, sampled, v)
+        else:
+            motors[a, ka.VOLTAGE], motors[a, ka.CURRENT] = v, open_torque(motor, a, asked)
+            joints[j, ka.APPLIED] += motors[a, ka.CURRENT]

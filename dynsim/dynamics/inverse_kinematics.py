@@ -1,0 +1,209 @@
+"""Positions of joints that take a point of a body along a path and keep others on their surfaces."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import distance as kd
+from dynsim.dynamics.contact.distance import ShapeArrays, distance
+from dynsim.dynamics.contact.quadrics import hessian_product, surface_distance
+from dynsim.dynamics.tables import ContactArrays, ModelArrays, Workspace
+from dynsim.dynamics.tree.joints import read_positions
+from dynsim.dynamics.tree.points import point_jacobian, point_position
+from dynsim.dynamics.tree.sweep import kinematics
+from dynsim.jit.kernel import internal_kernel, kernel
+
+ITERATIONS = 200
+STEP_MAX = 0.3  # [rad or m] per iteration, so that the branch of the start is kept
+
+
+class PathArrays(NamedTuple):
+    """What follows a path, and room for one step. r = 3 + braces, c joints that move, n joints."""
+
+    link: int  # that carries the point
+    point: np.ndarray  # (3,) in its frame [m]
+    braces: ContactArrays
+    shapes: ShapeArrays | None  # of the braces; None: all are points on quadrics
+    column: np.ndarray  # (c,) int, rows of the joints
+    place: np.ndarray  # (c,) int, their coordinates
+    lower: np.ndarray  # (c,) limits that hold on the way [rad or m], infinite for none
+    upper: np.ndarray  # (c,)
+    jacobian: np.ndarray  # (3, n)
+    rates: np.ndarray  # (r, c)
+    system: np.ndarray  # (r, r)
+    error: np.ndarray  # (r,)
+    change: np.ndarray  # (c,)
+    position: np.ndarray  # (3,)
+
+
+@kernel
+def follow_path(
+    model: ModelArrays, ws: Workspace, path: PathArrays, targets, base, carried, begin, end, tolerance, q, result
+):
+    """Positions of the joints for the targets from ``begin`` up to ``end``, into ``result``.
+
+    Damped Gauss–Newton from the solution before, dq = Jᵀ (J Jᵀ + λ 1)⁻¹ e, λ falling with the error e. A joint at a
+    limit that Jᵀ e would push beyond it is left out of a step, and what a step takes beyond a limit is cut off.
+
+    Parameters
+    ----------
+    targets : (T, 3) of the point [m]
+    base, carried : (T, 4) coordinates of a mobile base, and where in q they begin; (T, 0): none
+    tolerance : distance that counts as reached [m]
+    q : (nq,) of the solution before; overwritten with the last one
+    result : (T, c) [rad or m]; those before ``begin`` are there already
+
+    Returns
+    -------
+    k, best : the target that is not reached, or ``end``, and the distance that is left [m]
+    """
+    moving, rows = path.column.shape[0], path.error.shape[0]
+    limited = is_limited(path)
+    for k in range(begin, end):
+        for e in range(base.shape[1]):
+            q[carried + e] = base[k, e]
+        if k >= 3 and moving <= rows:
+            # The parabola through the last three solutions leaves one iteration to do. Not for redundant joints: what
+            # the hand does not determine would run away along it.
+            for j in range(moving):
+                q[path.place[j]] = 3.0 * result[k - 1, j] - 3.0 * result[k - 2, j] + result[k - 3, j]
+        if limited:
+            cut_off(path, q)
+        best = math.inf
+        for _ in range(ITERATIONS):
+            left = errors(model, ws, path, targets[k], q)
+            best = min(best, left)
+            # Two orders below the tolerance: the references shall be smooth, not just close.
+            if left < 1e-4 * tolerance:
+                break
+            if limited:
+                leave_out(path, q)
+            step(path, 1e-12 + 0.1 * left * left, q)
+            if limited:
+                cut_off(path, q)
+        if not best <= tolerance:
+            return k, best
+        for j in range(moving):
+            result[k, j] = q[path.place[j]]
+    return end, 0.0
+
+
+@internal_kernel
+def is_limited(path: PathArrays):
+    """Whether any joint has a limit."""
+    for j in range(path.column.shape[0]):  # noqa: SIM110 (kernels have no generators)
+        if path.lower[j] > -math.inf or path.upper[j] < math.inf:
+            return True
+    return False
+
+
+@internal_kernel
+def leave_out(path: PathArrays, q):
+    """Joints at limits that a step downhill would take beyond them have no rates, so that it does not move them."""
+    for j in range(path.column.shape[0]):
+        pull = 0.0
+        for e in range(path.error.shape[0]):
+            pull += path.rates[e, j] * path.error[e]
+        at = q[path.place[j]]
+        if (at >= path.upper[j] and pull > 0.0) or (at <= path.lower[j] and pull < 0.0):
+            for e in range(path.error.shape[0]):
+                path.rates[e, j] = 0.0
+
+
+@internal_kernel
+def cut_off(path: PathArrays, q):
+    """Joints beyond a limit are put on it."""
+    for j in range(path.column.shape[0]):
+        at = q[path.place[j]]
+        if at > path.upper[j]:
+            q[path.place[j]] = path.upper[j]
+        elif at < path.lower[j]:
+            q[path.place[j]] = path.lower[j]
+
+
+@internal_kernel
+def errors(model: ModelArrays, ws: Workspace, path: PathArrays, target, q):
+    """What is missing to the target and the surfaces, and how the joints change it; returns its length [m]."""
+    if model.compound is None:  # known to the compiler
+        for j in range(ws.joints.shape[0]):
+            ws.joints[j, ka.Q] = q[j]
+    else:
+        read_positions(model.compound, model, q, 0, ws)
+    for j in range(ws.joints.shape[0]):
+        ws.joints[j, ka.QD] = 0.0
+    kinematics(model, ws)
+    position, jacobian, error = path.position, path.jacobian, path.error
+    point_position(ws, path.link, path.point, position)
+    point_jacobian(model, ws, path.link, position, jacobian)
+    for e in range(3):
+        error[e] = target[e] - position[e]
+        for j in range(path.column.shape[0]):
+            path.rates[e, j] = jacobian[e, path.column[j]]
+    for b in range(path.braces.link.shape[0]):
+        link = path.braces.link[b, ka.LINK]
+        point_position(ws, link, path.braces.point[b, ka.POINT : ka.POINT + 3], position)
+        gap, nx, ny, nz = gap_and_normal(path.shapes, path.braces, b, position[0], position[1], position[2])
+        point_jacobian(model, ws, link, position, jacobian)
+        error[3 + b] = -gap
+        for j in range(path.column.shape[0]):
+            i = path.column[j]
+            path.rates[3 + b, j] = nx * jacobian[0, i] + ny * jacobian[1, i] + nz * jacobian[2, i]
+    square = 0.0
+    for e in range(error.shape[0]):
+        square += error[e] * error[e]
+    return math.sqrt(square)
+
+
+@internal_kernel
+def gap_and_normal(shapes: ShapeArrays | None, braces: ContactArrays, b, x, y, z):
+    """Distance of brace b at a point of W from its surface [m], and the normal there (3 numbers)."""
+    if shapes is not None:  # noqa: SIM102 (known to the compiler)
+        if shapes.kind[b, kd.SURFACE] != kd.AS_POINT:
+            found = distance(shapes, b, x, y, z)
+            return found[0] - shapes.data[b, kd.RADIUS], found[1], found[2], found[3]
+    table, s = braces.point, ka.QUADRIC
+    qx = table[b, s] * x + table[b, s + 1] * y + table[b, s + 2] * z
+    qy = table[b, s + 1] * x + table[b, s + 3] * y + table[b, s + 4] * z
+    qz = table[b, s + 2] * x + table[b, s + 4] * y + table[b, s + 5] * z
+    bx, by, bz = table[b, s + 6], table[b, s + 7], table[b, s + 8]
+    value = bx * x + by * y + bz * z + table[b, s + 9] + 0.5 * (qx * x + qy * y + qz * z)
+    nx, ny, nz = bx + qx, by + qy, bz + qz
+    slope = math.sqrt(nx * nx + ny * ny + nz * nz)
+    nx, ny, nz = nx / slope, ny / slope, nz / slope
+    return surface_distance(value, slope, hessian_product(table, b, (nx, ny, nz))), nx, ny, nz
+
+
+@internal_kernel
+def step(path: PathArrays, damping, q):
+    """Take the damped step: (J Jᵀ + λ 1) y = e by Cholesky, dq = Jᵀ y, no entry longer than ``STEP_MAX``."""
+    rates, system, y, change = path.rates, path.system, path.error, path.change
+    rows, moving = rates.shape
+    for a in range(rows):
+        for b in range(a + 1):
+            total = damping if a == b else 0.0
+            for j in range(moving):
+                total += rates[a, j] * rates[b, j]
+            for c in range(b):
+                total -= system[a, c] * system[b, c]
+            system[a, b] = math.sqrt(max(total, damping)) if a == b else total / system[b, b]
+    for a in range(rows):
+        for b in range(a):
+            y[a] -= system[a, b] * y[b]
+        y[a] /= system[a, a]
+    for a in range(rows - 1, -1, -1):
+        for b in range(a + 1, rows):
+            y[a] -= system[b, a] * y[b]
+        y[a] /= system[a, a]
+    longest = 0.0
+    for j in range(moving):
+        change[j] = 0.0
+        for a in range(rows):
+            change[j] += rates[a, j] * y[a]
+        longest = max(longest, abs(change[j]))
+    scale = min(1.0, STEP_MAX / max(longest, 1e-300))
+    for j in range(moving):
+        q[path.place[j]] += scale * change[j]

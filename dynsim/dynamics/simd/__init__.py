@@ -1,0 +1,1 @@
+"""SIMD variants of the derivative: several states at once."""

@@ -1,0 +1,158 @@
+"""Forms for lanes of the kernels that branch on data: selects, or the kernel itself lane by lane.
+
+They stand in for the kernels wherever those are compiled for lanes; numbers never see them. Everything else is the
+kernels' own source.
+"""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact import uniqueness as kq
+from dynsim.dynamics.contact.delassus import solve_small
+from dynsim.dynamics.contact.quadrics import sign_changed, surface_distance
+from dynsim.dynamics.contact.splits import admissible_forces, look_at_forces
+from dynsim.dynamics.contact.unilateral import slide_direction, sliding_friction
+from dynsim.dynamics.contact.uniqueness import clearly_unique
+from dynsim.dynamics.drive.law import evaluate_reference, fed_forward
+from dynsim.dynamics.drive.limit import clipped
+from dynsim.dynamics.drive.servo import servo_circuit
+from dynsim.dynamics.simd.tables import lane, lane_count, with_lane
+from dynsim.dynamics.tree.loads import add_loads
+from dynsim.jit.compiler import form_of
+from dynsim.jit.simd import every, lanes_of, select
+
+
+def any_lanes(*kinds):
+    """Where any argument has lanes."""
+    return lanes_of(*kinds) > 0
+
+
+def times(*kinds):
+    """Where lanes have times of their own: t is the third argument."""
+    return lanes_of(kinds[2]) > 0
+
+
+@form_of(clipped, any_lanes)
+def clipped_lanes(x, limit):
+    """A lane within its limits; NaN stays NaN."""
+    return select(x > limit, limit, select(x < -limit, -limit, x))
+
+
+@form_of(servo_circuit, any_lanes)
+def servo_circuit_lanes(motor, a, mode, command, v):
+    """Voltage and current; lanes at the limit of current have another voltage."""
+    if mode == ka.OFF:
+        return motor[a, ka.K_M] * v, 0.0 * v
+    u = clipped(command, motor[a, ka.U_MAX])
+    wanted = (u - motor[a, ka.K_M] * v) / motor[a, ka.RESISTANCE]
+    i = clipped(wanted, motor[a, ka.I_MAX])
+    return select(i != wanted, motor[a, ka.RESISTANCE] * i + motor[a, ka.K_M] * v, u), i
+
+
+@form_of(surface_distance, any_lanes)
+def surface_distance_lanes(value, slope, curvature):
+    """Lanes without a root along the normal take the distance of first order."""
+    inner = 1.0 - 2.0 * curvature * value / (slope * slope)
+    return select(inner <= 0.0, value / slope, 2.0 * value / (slope * (1.0 + math.sqrt(inner))))
+
+
+@form_of(solve_small, any_lanes)
+def solve_small_lanes(small, state, active, p):
+    """The closed forms where they hold for all lanes; else the kernel's choice for each of them, added up."""
+    if p == 1 and every(small[0, 0, 0] != 0.0):
+        state[0, ka.FORCE] = state[0, ka.RHS] / small[0, 0, 0]
+        return 0
+    if p == 2:
+        a, b, c, d = small[0, 0, 0], small[0, 0, 1], small[0, 1, 0], small[0, 1, 1]
+        determinant = a * d - b * c
+        if every(abs(determinant) > 1e-3 * (abs(a * d) + abs(b * c))):
+            x, y = state[0, ka.RHS] / determinant, state[1, ka.RHS] / determinant
+            state[0, ka.FORCE], state[1, ka.FORCE] = d * x - b * y, a * y - c * x
+            return 0
+    dependent = 0
+    for k in range(lane_count(small)):
+        dependent += solve_small(lane(small, k), lane(state, k), active, p)
+    return dependent
+
+
+@form_of(clearly_unique, any_lanes)
+def all_clearly_unique(ws):
+    """True when it is so of every lane."""
+    small, p = ws.small, ws.counts[ka.ROWS]
+    if p == 0 or p > 2:
+        return p == 0
+    for k in range(p):
+        if ws.active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE or not every(small[0, k, k] > 0.0):
+            return False
+    if p == 1:
+        return True
+    straight, crossed = small[0, 0, 0] * small[0, 1, 1], small[0, 0, 1] * small[0, 1, 0]
+    return every(straight - crossed > kq.CLEAR * (straight + abs(crossed)))
+
+
+@form_of(slide_direction, any_lanes)
+def slide_direction_lanes(unilateral, contacts, k, x, y, z):
+    """Each lane's own direction; ``unilateral.slide`` keeps the speed of the last state that was evaluated alone."""
+    slide, law = unilateral.slide, unilateral.law
+    a, b, c = slide[k, ku.REFERENCE], slide[k, ku.REFERENCE + 1], slide[k, ku.REFERENCE + 2]
+    along = x * a + y * b + z * c
+    speed = along
+    if slide[k, ku.FROZEN] == 0.0:
+        size = math.sqrt(x * x + y * y + z * z)
+        moves, on = size > 0.0, along >= 0.0
+        scale = select(on, 1.0 / size, -1.0 / size)
+        a, b, c = select(moves, x * scale, a), select(moves, y * scale, b), select(moves, z * scale, c)
+        speed = select(moves, select(on, size, -size), along)
+    return a, b, c, sliding_friction(law, k, contacts.point[k, ka.MU], speed)
+
+
+@form_of(admissible_forces, any_lanes)
+def admissible_forces_lanes(unilateral, ws):
+    """One by one, where there is something to look at."""
+    if unilateral is None:  # known to the compiler
+        return
+    if unilateral.number[ku.REDUNDANT] == 1.0 or unilateral.stop.shape[0] > 0:
+        for k in range(lane_count(ws)):
+            look_at_forces(unilateral, lane(ws, k))
+
+
+@form_of(sign_changed, any_lanes)
+def sign_changed_lanes(ws, passes):
+    """True when any lane's signs have changed. The others keep theirs: once they agree they go on agreeing."""
+    one_way = False
+    for k in range(ws.counts[ka.ROWS]):
+        if ws.active[k, ka.LAW] == ka.FRICTION_DISSIPATIVE:
+            one_way = True
+    changed = False
+    if one_way:
+        for k in range(lane_count(ws)):
+            if sign_changed(lane(ws, k), passes):
+                changed = True
+    return changed
+
+
+@form_of(evaluate_reference, times)
+def evaluate_reference_lanes(drives, reference, t, ws):
+    """At times of their own, which may lie in different segments."""
+    for k in range(lane_count(t)):
+        evaluate_reference(lane(drives, k), lane(reference, k), lane(t, k), lane(ws, k))
+
+
+@form_of(fed_forward, times)
+def fed_forward_lanes(voltage, grid, t, a, asked):
+    """The same of planned voltages."""
+    if voltage is None:  # known to the compiler
+        return asked
+    for k in range(lane_count(t)):
+        asked = with_lane(asked, k, fed_forward(lane(voltage, k), grid, lane(t, k), a, lane(asked, k)))
+    return asked
+
+
+@form_of(add_loads, times)
+def add_loads_lanes(model, loads, t, ws, power, start):
+    """The same of external wrenches."""
+    for k in range(lane_count(t)):
+        add_loads(model, loads, lane(t, k), lane(ws, k), lane(power, k), start)

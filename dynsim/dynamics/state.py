@@ -1,0 +1,107 @@
+"""Where what lies in the state vector and in a row of recorded outputs: the one place that knows.
+
+State y, all in one vector, blocks in this order:
+
+    q        (nq,)  joint positions [rad or m; quaternions]
+    v        (n,)   joint rates
+    current  (k,)   currents of the motors that have a circuit [A]
+    ledger   (LEDGER_SIZE,) integrals of power [J], see dynsim.dynamics.ledger
+    contact  (2 c,) impulse of the normal force [N s] and slip [m] of each contact point
+    load     (l,)   work of each external wrench [J]
+    loss     (2,)   what impacts of contacts and of joint stops take [J]; only under the unilateral law
+    scheme   (1,)   what time steps take of the energy [J]; only of time stepping, see its discretisation_energy
+
+The first three are what error control looks at; the rest are integrals that nothing depends on.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+# Integrals of the ledger, all in joules. DRAWN, MECHANICAL and SUPPLY are reported, not part of the balance.
+ELECTRICAL, DRAWN, JOULE, GEAR, JOINT, FRICTION, CONSTRAINT, MECHANICAL, SUPPLY = 0, 1, 2, 3, 4, 5, 6, 7, 8
+LEDGER_SIZE = 9
+# Per contact: impulse of the normal force [N s], slip distance [m].
+IMPULSE, SLIP = 0, 1
+CONTACT_SIZE = 2
+# Losses of impacts [J].
+IMPACT_LOSS, JOINT_STOP_LOSS = 0, 1
+LOSSES = 2
+
+
+class StateLayout(NamedTuple):
+    """First index of each block of the state, and what else kernels need to know of it."""
+
+    q: int
+    v: int
+    current: int
+    ledger: int
+    contact: int
+    load: int
+    loss: int
+    scheme: int
+    size: int
+    tracked: int  # how many entries, from the first on, error control looks at: all that derivatives depend on
+    extra: int  # nq − n
+    circuits: int  # currents among the states
+
+
+def state_layout(
+    nq: int, n: int, circuits: int, contacts: int, loads: int = 0, losses: int = 0, scheme: int = 0
+) -> StateLayout:
+    """The layout for nq positions, n rates, and so many of circuits, contact points, wrenches, losses, schemes."""
+    starts = np.cumsum([0, nq, n, circuits, LEDGER_SIZE, CONTACT_SIZE * contacts, loads, losses, scheme])
+    q, v, current, ledger, contact, load, loss, scheme_start, size = (int(start) for start in starts)
+    return StateLayout(
+        q,
+        v,
+        current,
+        ledger,
+        contact,
+        load,
+        loss,
+        scheme_start,
+        size,
+        tracked=ledger,
+        extra=nq - n,
+        circuits=circuits,
+    )
+
+
+class OutputLayout(NamedTuple):
+    """First column of each recorded output that is no state; ``contact`` has OUTPUTS_PER_CONTACT for each point.
+
+    ``support`` is there for robots with a mobile base, see dynsim.dynamics.tree.support.
+    """
+
+    vdot: int
+    current: int
+    voltage: int
+    torque: int
+    hand: int
+    energy: int
+    contact: int
+    support: int
+    stop: int
+    size: int
+
+
+def block(layout: StateLayout | OutputLayout, name: str) -> slice:
+    """Where a block lies, by its name: up to where the next one begins."""
+    names = layout._fields
+    return slice(getattr(layout, name), getattr(layout, names[names.index(name) + 1]))
+
+
+# Kinetic, potential and magnetic energy.
+ENERGIES = 3
+# Per contact: f_n, force vector (3), gap, slip velocity (3), mode.
+OUT_FORCE, OUT_VECTOR, OUT_GAP, OUT_SLIP, OUT_MODE = 0, 1, 4, 5, 8
+OUTPUTS_PER_CONTACT = 9
+
+
+def output_layout(n: int, motors: int, contacts: int, support: int = 0, stops: int = 0) -> OutputLayout:
+    """The columns for n joints, so many motors, contact points and joint stops, and so many of a base's support."""
+    starts = np.cumsum([0, n, motors, motors, motors, 3, ENERGIES, OUTPUTS_PER_CONTACT * contacts, support, stops])
+    return OutputLayout(*(int(start) for start in starts))

@@ -1,0 +1,260 @@
+"""What the kernels read and write: a few flat tables per concept, in SI units and the world frame W.
+
+n links (one velocity each), na drives (motors), c contact points, p constraint rows. A link is one joint and the body
+it carries; links are ordered so that a parent comes before its children. Spatial vectors are (angular, linear) at the
+world origin, so inertias and forces of different bodies simply add.
+
+A table is one array whose columns are named by the constants below. Few arrays matter: every array of an argument
+costs copying in each compiled call, and what belongs to one link lies together.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+# Joint kinds. The three axis-aligned revolute joints are special cases of REVOLUTE, for speed.
+REVOLUTE_X, REVOLUTE_Y, REVOLUTE_Z, REVOLUTE, PRISMATIC = 0, 1, 2, 3, 4
+# Rows of joints with several velocities, or with a motion of their own: dynsim.dynamics.tree.joints.
+BALL_X, BALL_Y, BALL_Z, ROLL, TURN, LEFT_WHEEL, RIGHT_WHEEL = 5, 6, 7, 8, 9, 10, 11
+# Friction of a contact under a negative (pulling) normal force, see dynsim.dynamics.contact.quadrics.
+FRICTION_SIGNED, FRICTION_DISSIPATIVE = 0, 1
+# What a candidate is at present: off its surface (no row), sliding (one row, friction in its direction), or held at its
+# anchor (three rows). Constant within a step.
+OPEN, SLIDING, STICKING = 0, 1, 2
+MOST_ROWS = 3  # of one candidate
+
+# ModelArrays.tree, int
+PARENT = 0  # index of the parent link, -1 for the world
+KIND = 1  # joint kind
+TURNED = 2  # 0 when R_PJ is the identity, so that one product can be skipped
+BRANCHES = 3  # number of children other than link i + 1
+TREE_SIZE = 4
+# ModelArrays.compound, int
+POSITION_INDEX = 0  # where the row's coordinates begin in the block of positions
+BASE = 1  # index of the link that the row's joint is mounted on: that of its first row's parent, -1 for the world
+COMPOUND_SIZE = 2
+# ModelArrays.body
+R_PJ = 0  # 9: rotation of the joint frame at q = 0 in the parent's frame, row-major
+P_PJ = 9  # 3: origin of the joint frame in the parent's frame [m]
+AXIS = 12  # 3: joint axis in the body's frame, unit length
+MASS = 15  # [kg]
+COM = 16  # 3: centre of mass in B [m]
+INERTIA = 19  # 6: about the centre of mass, in B, xx xy xz yy yz zz [kg m^2]
+ARMATURE = 25  # reflected motor inertia J_m [kg m^2 or kg]
+DAMPING = 26  # viscous joint loss D [N m s/rad or N s/m]
+GEAR_DAMPING = 27  # viscous gear loss D_m, reflected [N m s/rad or N s/m]
+PARAMETER = 28  # what else a kind of joint needs, such as the lead of a screw
+BODY_SIZE = 29
+# Drive kinds, see dynsim.dynamics.drive.
+DC_MOTOR, POSITION_SERVO, OPEN_TORQUE = 0, 1, 2
+# DriveArrays.table, int
+DRIVEN = 0  # index of the link whose joint the drive moves
+DRIVE_KIND = 1
+CIRCUIT = 2  # index of its current among those of the state, -1 for none
+SAMPLED = 3  # CONTINUOUS: the command follows the state; else it is held, taken AT_TICKS or GIVEN by the caller
+SERVO_MODE = 4  # POSITION_MODE, VELOCITY_MODE or OFF; may be written between steps
+CURRENT_LIMITED = 5  # 1: of a DC motor whose driver limits the current to I_MAX
+DRIVE_SIZE = 6
+CONTINUOUS, AT_TICKS, GIVEN = 0, 1, 2
+# DriveArrays.motor
+K_M = 0  # K k [N m/A = V s/rad]
+RESISTANCE = 1  # [ohm]
+INDUCTANCE = 2  # [H]
+J_M = 3  # I_m k^2 [kg m^2]
+D_M = 4  # d_m k^2 [N m s/rad]
+K_P = 5  # [V/rad]
+K_D = 6  # [V s/rad]
+U_MAX = 7  # voltage limit [V], inf for none
+I_MAX = 8  # current limit of a servo or DC motor [A], torque limit of an open torque [N m]; inf for none
+K_V = 9  # gain of a servo's velocity loop [V s/rad]
+COULOMB = 10  # gear friction of a servo at speed [N m]
+COULOMB_SPEED = 11  # below which it fades [rad/s]
+FREE_DRAG = 12  # viscous drag of a servo's gear while it is off [N m s/rad]
+MOTOR_SIZE = 16  # whole cache lines
+# DriveArrays.input
+COMMAND = 0  # command of a sampled drive between ticks [V; N m for an open torque]
+LINE_START = 1  # a rewritten reference: its value [rad; N m for an open torque]
+LINE_RATE = 2  # [rad/s; N m/s]
+LINE_SINCE = 3  # time at which it has that value [s]
+INPUT_SIZE = 4
+# Modes of a servo
+POSITION_MODE, VELOCITY_MODE, OFF = 0, 1, 2
+# ReferenceArrays.spline, instead of a row of coefficients: held, and the line of DriveArrays.input
+HELD_POSITION, REWRITTEN = -1, -2
+# Linear block of a drive, see dynsim.dynamics.drive.law.drive_block
+TORQUE_Q, TORQUE_V, TORQUE_I, RATE_Q, RATE_V, RATE_I = 0, 1, 2, 3, 4, 5
+BLOCK_SIZE = 6
+# ContactArrays.link, int
+LINK = 0
+FRICTION_LAW = 1
+CURVED = 2  # 0 for a plane: Q = 0, and then b is its unit normal
+CONTACT_LINK_SIZE = 3
+# ContactArrays.point
+POINT = 0  # 3: in the body's frame [m]
+QUADRIC = 3  # 10: C(r) = r.Q r/2 + b.r + c: Q xx xy xz yy yz zz, b, c
+MU = 13  # kinetic friction coefficient
+V_S = 14  # smoothing speed of the slip direction [m/s]
+POINT_SIZE = 15
+# CouplingArrays.joint, int
+FOLLOWER = 0  # link whose joint follows
+LEADER = 1
+COUPLING_JOINT_SIZE = 2
+# CouplingArrays.law
+RATIO = 0  # [1, or m/rad and the like]
+OFFSET = 1  # [rad or m]
+COUPLING_SIZE = 2
+
+# Workspace.links
+R = 0  # 9: R_WB, row-major
+P = 9  # 3: p_WB [m]
+S = 12  # 6: joint axis as a motion vector at the world origin
+V = 18  # 6: spatial velocity
+A = 24  # 6: spatial acceleration minus gravity
+F = 30  # 6: wrench through the joint; scratch of the solves
+U_OVER_D = 36  # 6: IA S / D, D = S.IA S + J_m
+INVERSE_D = 42  # 1 / D
+IA = 43  # 21: articulated inertia handed down by branches: angular block 6, coupling 9 row-major, linear block 6
+LINK_SIZE = 64
+# Workspace.joints
+Q = 0  # [rad or m]
+QD = 1  # v [rad/s or m/s]
+QDD = 2  # vdot
+BIAS = 3  # h + g, or the result of newton_euler
+APPLIED = 4  # applied generalised force
+EXTRA = 5  # second coordinate of a row that has two
+JOINT_SIZE = 6
+# Workspace.motors
+CURRENT = 0  # [A]
+VOLTAGE = 1  # [V]
+Q_REF = 2  # [rad; N m for an open torque]
+V_REF = 3  # [rad/s]
+DIDT = 4  # [A/s]
+DRAG = 5  # gear friction that is not part of GEAR_DAMPING, against v [N m]
+MOTOR_STATE_SIZE = 6
+# Workspace.contacts: what is known of each candidate, whether it has rows or not
+NORMAL = 0  # 3: surface normal in W
+TANGENT = 3  # 3: smoothed slip direction in W
+POSITION = 6  # 3: in W [m]
+SLIP_VELOCITY = 9  # 3: tangential velocity [m/s]
+GAP = 12  # signed distance from the surface [m]
+GAP_RATE = 13  # [m/s]
+NORMAL_FORCE = 14  # f_n [N], zero without rows
+FORCE_VECTOR = 15  # 3: normal and friction force in W [N]
+ANCHOR = 18  # 3: where a sticking point is held, in W [m]
+FIRST_TANGENT = 21  # 3: directions of a sticking point's tangential rows in W
+SECOND_TANGENT = 24  # 3
+CONTACT_STATE_SIZE = 27
+# Workspace.rows: one scalar constraint each, and its force
+ROW = 0  # 6: the constraint's motion is ROW . (V_A - V_B); of a joint row the coefficients of its two joints
+DIRECTION = 6  # 6: wrench of a unit force on A, its negative on B; of a joint row as ROW
+TARGET = 12  # J vdot must equal this [m/s^2]
+RHS = 13  # right-hand side of the small system
+FORCE = 14  # [N]
+SIGN = 15  # sign of the force that DIRECTION was built for
+ROW_MU = 16  # friction that DIRECTION carries
+ROW_GAP = 17  # what projection takes away from the positions [m or rad], see dynsim.dynamics.contact.rows
+ROW_RATE = 18  # and from the rates [m/s or rad/s]
+ROW_OFFSET = 19  # of a joint row: what its two joints, times its coefficients, must add up to [rad or m]
+ROW_STATE_SIZE = 20
+# Workspace.active, int: of each row
+ROW_KIND = 0
+OWNER = 1  # candidate, coupling or, counted on behind the couplings, joint stop
+BODY_A = 2  # link, or the following joint of a joint row
+BODY_B = 3  # link at the other end, -1 for the world; the leading joint of a joint row
+LAW = 4  # FRICTION_SIGNED unless the sign of the force decides about DIRECTION
+ORDER = 5  # scratch of the solve: columns as they were exchanged
+# and, in the same array, of each candidate
+MODE = 6  # OPEN, SLIDING or STICKING
+FIRST_ROW = 7
+ACTIVE_SIZE = 8
+# Kinds of rows: of a point that slides on its surface or is held there, between two bodies, between two joints.
+SLIDING_ROW, STICKING_ROW, BODY_ROW, JOINT_ROW = 0, 1, 2, 3
+# Workspace.counts, int
+ROWS = 0  # active rows p
+DEPENDENT = 1  # right-hand sides whose constraint forces were not unique
+CONTRADICTORY = 2  # right-hand sides for which no signs of the forces agreed with friction
+COUPLED = 3  # joint rows, the first of the active ones
+HELD = 4  # candidates that stick
+COUNTS_SIZE = 5
+
+
+class ModelArrays(NamedTuple):
+    """The tree of bodies."""
+
+    tree: np.ndarray  # (n, TREE_SIZE) int
+    body: np.ndarray  # (n, BODY_SIZE)
+    gravity: np.ndarray  # (3,) in W [m/s^2]
+    # (n, COMPOUND_SIZE) int: of robots with a joint beyond one angle or one sliding distance, see
+    # dynsim.dynamics.tree.joints. None for the others, whose programs are compiled without what such joints need.
+    compound: np.ndarray | None = None
+
+
+class DriveArrays(NamedTuple):
+    """What drives the joints, each of one kind, with the law of its command. ``input`` may be written between steps."""
+
+    table: np.ndarray  # (na, DRIVE_SIZE) int
+    motor: np.ndarray  # (na, MOTOR_SIZE)
+    input: np.ndarray  # (na, INPUT_SIZE)
+
+
+class ReferenceArrays(NamedTuple):
+    """Joint references q_d(t): held angles, and quintic splines on one uniform grid for the moving ones."""
+
+    spline: np.ndarray  # (na,) int: row of coefficients, HELD_POSITION or REWRITTEN
+    held: np.ndarray  # (na,) constant angle of a held joint
+    grid: np.ndarray  # (2,) time of the first knot, knot distance [s]
+    coefficients: np.ndarray  # (segments, splines, 6) ascending powers of t - t_knot
+    voltage: np.ndarray | None = None  # (segments, na, 6) added to the commands of DC motors [V]; None for none
+
+
+class ContactArrays(NamedTuple):
+    """Candidates: points on bodies, each with the surface that may hold it, a quadric C(r) = r.Q r / 2 + b.r + c."""
+
+    link: np.ndarray  # (c, CONTACT_LINK_SIZE) int
+    point: np.ndarray  # (c, POINT_SIZE)
+
+
+class CouplingArrays(NamedTuple):
+    """Joints that follow others, q_follower = ratio q_leader + offset."""
+
+    joint: np.ndarray  # (couplings, COUPLING_JOINT_SIZE) int
+    law: np.ndarray  # (couplings, COUPLING_SIZE)
+
+
+class Workspace(NamedTuple):
+    """Everything a right-hand side computes on its way; allocated once. p is the most rows that there can be."""
+
+    links: np.ndarray  # (n, LINK_SIZE)
+    joints: np.ndarray  # (n, JOINT_SIZE)
+    trig: np.ndarray  # (3, n or more) sine, cosine and q; padded to whole vectors of four, which have no slow remainder
+    motors: np.ndarray  # (na, MOTOR_STATE_SIZE)
+    contacts: np.ndarray  # (c, CONTACT_STATE_SIZE)
+    rows: np.ndarray  # (p, ROW_STATE_SIZE) the active ones first: couplings, then contacts
+    active: np.ndarray  # (p, ACTIVE_SIZE) int
+    column: np.ndarray  # (n, 1 + 2p) eliminated right-hand sides: applied force, then per row itself and its direction
+    small: np.ndarray  # (4, p, p) the system J M^-1 F of the active rows and the scratch of its solve
+    counts: np.ndarray  # (COUNTS_SIZE,) int
+
+
+def row_limit(c: int, couplings: int) -> int:
+    """The most rows that c candidates and so many couplings can have."""
+    return MOST_ROWS * c + couplings
+
+
+def workspace(n: int, na: int, c: int, couplings: int = 0) -> Workspace:
+    """Allocate a :class:`Workspace` for n links, na motors, c candidates and so many couplings; no row is active."""
+    p = row_limit(c, couplings)
+    return Workspace(
+        links=np.zeros((n, LINK_SIZE)),
+        joints=np.zeros((n, JOINT_SIZE)),
+        trig=np.zeros((3, 4 * -(-n // 4))),
+        motors=np.zeros((na, MOTOR_STATE_SIZE)),
+        contacts=np.zeros((c, CONTACT_STATE_SIZE)),
+        rows=np.zeros((p, ROW_STATE_SIZE)),
+        active=np.zeros((p, ACTIVE_SIZE), dtype=np.int64),
+        column=np.zeros((n, 1 + 2 * p)),
+        small=np.zeros((4, p, p)),
+        counts=np.zeros(COUNTS_SIZE, dtype=np.int64),
+    )

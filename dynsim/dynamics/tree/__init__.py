@@ -1,0 +1,1 @@
+"""Trees of bodies: recursive sweeps, articulated inertias, joints, loads."""

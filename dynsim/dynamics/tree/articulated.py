@@ -1,0 +1,263 @@
+"""The O(n) solve: articulated-body elimination with several right-hand sides (M is never formed).
+
+Eliminating the joints from the tips to the root factors M + J_m. For a right-hand side b let column(b) be what is left
+at each joint after the elimination; then a·(M + J_m)⁻¹ b = Σ_i column(a)_i column(b)_i / D_i. So the p×p matrix of the
+constraints needs only dot products of columns, and one forward sweep gives vdot.
+"""
+
+from __future__ import annotations
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.tables import ModelArrays, Workspace
+from dynsim.dynamics.tree.spatial import (
+    ZERO_INERTIA,
+    ZERO_SIX,
+    body_in_world,
+    dot,
+    dot_plus,
+    inertia,
+    minus_outer,
+    minus_scaled,
+    negative,
+    plus,
+    plus_inertia,
+    plus_scaled,
+    put_six,
+    scaled,
+    six,
+    times,
+)
+from dynsim.dynamics.tree.sweep import body_inertia, forward_sweep, inertial_wrench
+from dynsim.jit.kernel import apart_kernel, internal_kernel, kernel
+
+
+@internal_kernel
+def factor(model: ModelArrays, ws: Workspace):
+    """Tips to root, after ``forward_sweep``: articulated inertias, and what the applied forces leave at each joint.
+
+    I^A_i = I_i + Σ_children (I^A − U Uᵀ/D), U = I^A S, D = S·U + J_m (Featherstone, world frame, one origin).
+    F^A_i = F_i + Σ_children (F^A + U w/D), w = applied − S·F^A, into ``ws.column[:, 0]``. The inertial wrenches F are
+    those of the sweep: velocity products and weight come in here, so the bias forces need no pass of their own.
+    """
+    tree, body, links, joints, column = model.tree, model.body, ws.links, ws.joints, ws.column
+    n = tree.shape[0]
+    for i in range(n):
+        if tree[i, ka.BRANCHES] != 0:
+            for k in range(21):
+                links[i, ka.IA + k] = 0.0
+            for k in range(6):
+                links[i, ka.F + k] = 0.0
+    # What link i + 1 hands down, kept in registers while the chain is serial; only links with further children
+    # collect in memory.
+    I, F = ZERO_INERTIA, ZERO_SIX
+    for i in range(n - 1, -1, -1):
+        m, c, I_c = body_inertia(model, ws, i)
+        I = plus_inertia(I, body_in_world(m, c, I_c))
+        F = plus(F, inertial_wrench(ws, i, m, c, I_c))
+        if tree[i, ka.BRANCHES] != 0:
+            I = plus_inertia(I, inertia(links, i, ka.IA))
+            F = plus(F, six(links, i, ka.F))
+        S = six(links, i, ka.S)
+        U = times(I, S)
+        d = 1.0 / dot_plus(S, U, body[i, ka.ARMATURE])
+        w = joints[i, ka.APPLIED] - dot(S, F)
+        U_over_D = scaled(U, d)
+        put_six(links, i, ka.U_OVER_D, U_over_D)
+        links[i, ka.INVERSE_D] = d
+        column[i, 0] = w
+        F = plus_scaled(F, U_over_D, w)
+        I = minus_outer(I, U_over_D, U)
+        j = tree[i, ka.PARENT]
+        if j != i - 1 or j < 0:
+            if j >= 0:
+                for k in range(21):
+                    links[j, ka.IA + k] += I[k]
+                for k in range(6):
+                    links[j, ka.F + k] += F[k]
+            I, F = ZERO_INERTIA, ZERO_SIX
+
+
+@internal_kernel
+def row_system(model: ModelArrays, ws: Workspace):
+    """The p×p system J M⁻¹ F f = target − J M⁻¹ applied, into ``ws.small[0]`` and the RHS column, after :func:`factor`.
+
+    Row k and its force direction leave the columns ``ws.column[:, 1 + 2 k]`` and ``ws.column[:, 2 + 2 k]``. Only joints
+    between its links and the world feel a row; the rest of a column is zero from the start. Entry (k, m) is
+    Σ column_k column_m / D over the joints that both rows feel.
+    """
+    tree, links, small, state = model.tree, ws.links, ws.small, ws.rows
+    for k in range(ws.counts[ka.ROWS]):
+        if ws.active[k, ka.ROW_KIND] != ka.SLIDING_ROW:
+            if ws.active[k, ka.BODY_B] >= 0:
+                two_ended_row(model, ws, k)
+                continue
+            if ws.active[k, ka.ROW_KIND] == ka.STICKING_ROW:
+                if k == ws.active[ws.active[k, ka.OWNER], ka.FIRST_ROW]:
+                    sticking_columns(model, ws, k)
+                continue
+        # What elimination has left of the row and of its force direction.
+        row, direction = six(state, k, ka.ROW), six(state, k, ka.DIRECTION)
+        for m in range(k):
+            small[0, k, m] = 0.0
+            small[0, m, k] = 0.0
+        own, total = 0.0, state[k, ka.TARGET]
+        i = ws.active[k, ka.BODY_A]
+        while i >= 0:
+            S, U_over_D = six(links, i, ka.S), six(links, i, ka.U_OVER_D)
+            r, w = dot(S, row), dot(S, direction)
+            own, total = enter_column(ws, i, k, r, w, own, total)
+            row, direction = minus_scaled(row, U_over_D, r), minus_scaled(direction, U_over_D, w)
+            i = tree[i, ka.PARENT]
+        small[0, k, k] = own
+        state[k, ka.RHS] = total
+
+
+@internal_kernel
+def enter_column(ws: Workspace, i, k, r, w, own, total):
+    """Put row and direction of row k at joint i into its columns and into the system; its own entry and right-hand side
+    so far."""
+    column, small = ws.column, ws.small
+    column[i, 1 + 2 * k] = r
+    column[i, 2 + 2 * k] = w
+    d = ws.links[i, ka.INVERSE_D]
+    x = d * r
+    for m in range(k):
+        small[0, k, m] += x * column[i, 2 + 2 * m]
+        small[0, m, k] += d * w * column[i, 1 + 2 * m]
+    return own + x * w, total - x * column[i, 0]
+
+
+@apart_kernel
+def sticking_columns(model: ModelArrays, ws: Workspace, k):
+    """:func:`row_system` for the three rows of a point that sticks, k and the next two: their own directions.
+
+    One walk for all of them. What they have in common with the rows before is the same on both sides of the diagonal
+    unless the other one slides.
+    """
+    tree, links, column, small, state = model.tree, ws.links, ws.column, ws.small[0], ws.rows
+    b, c = k + 1, k + 2
+    row_a, row_b, row_c = six(state, k, ka.ROW), six(state, b, ka.ROW), six(state, c, ka.ROW)
+    for r in range(3):
+        for m in range(k):
+            small[k + r, m] = 0.0
+            small[m, k + r] = 0.0
+    aa, ab, ac, bb, bc, cc = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    ta, tb, tc = state[k, ka.TARGET], state[b, ka.TARGET], state[c, ka.TARGET]
+    i = ws.active[k, ka.BODY_A]
+    while i >= 0:
+        S, U_over_D = six(links, i, ka.S), six(links, i, ka.U_OVER_D)
+        x, y, z = dot(S, row_a), dot(S, row_b), dot(S, row_c)
+        column[i, 1 + 2 * k], column[i, 2 + 2 * k] = x, x
+        column[i, 1 + 2 * b], column[i, 2 + 2 * b] = y, y
+        column[i, 1 + 2 * c], column[i, 2 + 2 * c] = z, z
+        d = links[i, ka.INVERSE_D]
+        dx, dy, dz = d * x, d * y, d * z
+        aa, ab, ac, bb, bc, cc = aa + dx * x, ab + dx * y, ac + dx * z, bb + dy * y, bc + dy * z, cc + dz * z
+        applied = column[i, 0]
+        ta, tb, tc = ta - dx * applied, tb - dy * applied, tc - dz * applied
+        for m in range(k):
+            w = column[i, 2 + 2 * m]
+            small[k, m] += dx * w
+            small[b, m] += dy * w
+            small[c, m] += dz * w
+            if ws.active[m, ka.ROW_KIND] == ka.SLIDING_ROW:
+                r = column[i, 1 + 2 * m]
+                small[m, k] += dx * r
+                small[m, b] += dy * r
+                small[m, c] += dz * r
+        row_a, row_b = minus_scaled(row_a, U_over_D, x), minus_scaled(row_b, U_over_D, y)
+        row_c = minus_scaled(row_c, U_over_D, z)
+        i = tree[i, ka.PARENT]
+    for m in range(k):
+        if ws.active[m, ka.ROW_KIND] != ka.SLIDING_ROW:
+            for r in range(3):
+                small[m, k + r] = small[k + r, m]
+    small[k, k], small[b, b], small[c, c] = aa, bb, cc
+    small[k, b], small[b, k], small[k, c], small[c, k], small[b, c], small[c, b] = ab, ab, ac, ac, bc, bc
+    state[k, ka.RHS], state[b, ka.RHS], state[c, ka.RHS] = ta, tb, tc
+
+
+@apart_kernel
+def two_ended_row(model: ModelArrays, ws: Workspace, k):
+    """Column, own entry and right-hand side of a row with two ends, as :func:`row_system` does them for one end.
+
+    Two accumulators climb from the two ends, the one with the larger index first, so that both meet in the first common
+    ancestor and go on as one. A joint row has no wrench: its coefficients enter at its two joints.
+    """
+    tree, links, small, state = model.tree, ws.links, ws.small, ws.rows
+    first, last = ws.active[k, ka.BODY_A], ws.active[k, ka.BODY_B]
+    jointed = ws.active[k, ka.ROW_KIND] == ka.JOINT_ROW
+    # Of the sides A and B: what elimination has left of row and direction.
+    row_a, direction_a = ZERO_SIX, ZERO_SIX
+    if not jointed:
+        row_a, direction_a = six(state, k, ka.ROW), six(state, k, ka.DIRECTION)
+    row_b, direction_b = negative(row_a), negative(direction_a)
+    for m in range(k):
+        small[0, k, m] = 0.0
+        small[0, m, k] = 0.0
+    own, total = 0.0, state[k, ka.TARGET]
+    # i is the end that moves next, j the other one.
+    i, j = first, last
+    while i >= 0 or j >= 0:
+        if j > i:
+            i, j = j, i
+            row_a, row_b, direction_a, direction_b = row_b, row_a, direction_b, direction_a
+        if i == j:
+            row_a, direction_a = plus(row_a, row_b), plus(direction_a, direction_b)
+            j = -1
+        S, U_over_D = six(links, i, ka.S), six(links, i, ka.U_OVER_D)
+        r, w = dot(S, row_a), dot(S, direction_a)
+        if jointed and i == first:
+            r, w = r + state[k, ka.ROW], w + state[k, ka.DIRECTION]
+        elif jointed and i == last:
+            r, w = r + state[k, ka.ROW + 1], w + state[k, ka.DIRECTION + 1]
+        own, total = enter_column(ws, i, k, r, w, own, total)
+        row_a, direction_a = minus_scaled(row_a, U_over_D, r), minus_scaled(direction_a, U_over_D, w)
+        i = tree[i, ka.PARENT]
+    small[0, k, k] = own
+    state[k, ka.RHS] = total
+
+
+@internal_kernel
+def add_row_forces(model: ModelArrays, ws: Workspace):
+    """Add the solved forces of all rows to the eliminated applied forces in ``ws.column[:, 0]``."""
+    tree, column, state = model.tree, ws.column, ws.rows
+    for k in range(ws.counts[ka.ROWS]):
+        f = state[k, ka.FORCE]
+        i = ws.active[k, ka.BODY_A]
+        j = ws.active[k, ka.BODY_B]
+        if j >= 0:
+            for m in range(max(i, j) + 1):
+                column[m, 0] += f * column[m, 2 + 2 * k]
+            continue
+        while i >= 0:
+            column[i, 0] += f * column[i, 2 + 2 * k]
+            i = tree[i, ka.PARENT]
+
+
+@internal_kernel
+def accelerate(model: ModelArrays, ws: Workspace):
+    """Forward sweep: vdot = (M + J_m)⁻¹ b from the eliminated b in ``ws.column[:, 0]``. Uses F as scratch.
+
+    vdot_i = column_i / D − (U/D)·a_p, a_i = a_p + S vdot_i.
+    """
+    tree, links, joints, column = model.tree, ws.links, ws.joints, ws.column
+    # The acceleration of link i − 1 stays in registers; it is read back only where the tree branches.
+    A = ZERO_SIX
+    for i in range(tree.shape[0]):
+        j = tree[i, ka.PARENT]
+        if j != i - 1:
+            A = six(links, j, ka.F) if j >= 0 else ZERO_SIX
+        x = column[i, 0] * links[i, ka.INVERSE_D] - dot(six(links, i, ka.U_OVER_D), A)
+        joints[i, ka.QDD] = x
+        A = plus_scaled(A, six(links, i, ka.S), x)
+        if tree[i, ka.BRANCHES] != 0:
+            put_six(links, i, ka.F, A)
+
+
+@kernel
+def forward_dynamics(model: ModelArrays, ws: Workspace):
+    """vdot = (M + J_m)⁻¹ (applied − h − g) without contacts: sweep, factor, accelerate. In and out: ``ws.joints``."""
+    forward_sweep(model, ws, 1.0, 0.0, 1.0)
+    factor(model, ws)
+    accelerate(model, ws)

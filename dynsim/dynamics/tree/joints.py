@@ -1,0 +1,325 @@
+"""Joints beyond one angle or one sliding distance: what their coordinates mean, row by row.
+
+Every joint is a sequence of one-velocity rows. A row is a link of the tree with a motion axis S and one velocity; all
+rows of a joint but the last are massless. The axes of a joint with several rows are fixed in the body that it carries,
+so with V_J = Σ S_k v_k and V the velocity of that body, d/dt(S_k) = V × S_k, and the bias of the joint is
+V × V_J = V_P × V_J: each row has the bias V_P × S_k v_k, V_P the velocity of what the *joint* is mounted on (``BASE``),
+not of the row before. The sweeps need nothing else.
+
+Positions are not the integrals of such velocities: q̇ = N(q) v, and there may be more of them than velocities. The
+first row takes its pose from the coordinates of the whole joint; the others copy it.
+
+=====================  ===============================  ==================================================
+joint                  coordinates                      rows
+=====================  ===============================  ==================================================
+ball                   quaternion w, x, y, z            angular velocity about the body's x, y, z
+rolling base           x, y, heading in the ground      unit speed along the heading; unit rate of turning
+wheeled base           angles of its left and right     rates of the wheels: each moves the axle's middle by r/2 ahead
+                       wheel; x, y in the ground        and turns it by r/T, the left one to the right
+=====================  ===============================  ==================================================
+
+The heading of a wheeled base is (r/T)(right − left): r/T is the parameter of its first row, r/2 that of its second.
+
+A free body is three prismatic rows and a ball; a planar joint two prismatic rows and a revolute one.
+"""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.tables import ModelArrays, Workspace
+from dynsim.dynamics.tree.angles import sine_cosine_of
+from dynsim.dynamics.tree.spatial import (
+    ZERO_SIX,
+    ZERO_VECTOR,
+    compose,
+    cross_motion,
+    first_axis,
+    put_rotation,
+    put_six,
+    put_vector,
+    rotation,
+    second_axis,
+    six,
+    third_axis,
+    times_number,
+    transform,
+    turn_z,
+    vector,
+)
+from dynsim.jit.kernel import apart_kernel, internal_kernel, kernel
+
+
+@internal_kernel
+def row_motion(model: ModelArrays, ws: Workspace, i, B, p):
+    """Pose and motion axis of row i of a joint with several rows.
+
+    Parameters
+    ----------
+    model : tables of the joints' placements, axes and parameters
+    B, p : rotation and origin of the joint's frame at q = 0 in the world; of a later row the pose that its predecessor
+        has left
+
+    Returns
+    -------
+    tuple
+        Rotation and origin of the body, axis as a motion at the world origin.
+    """
+    kind, joints, trig = model.tree[i, ka.KIND], ws.joints, ws.trig
+    # Of a unit rate: the angular velocity s, and the velocity l of the body's origin.
+    s, l = ZERO_VECTOR, ZERO_VECTOR
+    if kind == ka.BALL_X:
+        B = compose(B, turned(joints[i, ka.Q], joints[i, ka.EXTRA], joints[i + 1, ka.Q], joints[i + 2, ka.Q]))
+        s = first_axis(B)
+    elif kind == ka.BALL_Y:
+        s = second_axis(B)
+    elif kind == ka.BALL_Z or kind == ka.TURN:
+        s = third_axis(B)
+    elif kind == ka.ROLL:
+        p = transform(p, B, (joints[i, ka.Q], joints[i, ka.EXTRA], 0.0))
+        B = turn_z(B, trig[0, i + 1], trig[1, i + 1])
+        l = first_axis(B)
+    elif kind == ka.LEFT_WHEEL:
+        rate, ahead = model.body[i, ka.PARAMETER], model.body[i + 1, ka.PARAMETER]
+        sine, cosine = sine_cosine_of(rate * (joints[i + 1, ka.Q] - joints[i, ka.Q]))
+        p = transform(p, B, (joints[i, ka.EXTRA], joints[i + 1, ka.EXTRA], 0.0))
+        B = turn_z(B, sine, cosine)
+        s, l = times_number(third_axis(B), -rate), times_number(first_axis(B), ahead)
+    elif kind == ka.RIGHT_WHEEL:
+        rate, ahead = model.body[i - 1, ka.PARAMETER], model.body[i, ka.PARAMETER]
+        s, l = times_number(third_axis(B), rate), times_number(first_axis(B), ahead)
+    # As a motion at the world origin.
+    return (
+        B,
+        p,
+        (
+            s[0],
+            s[1],
+            s[2],
+            l[0] + p[1] * s[2] - p[2] * s[1],
+            l[1] + p[2] * s[0] - p[0] * s[2],
+            l[2] + p[0] * s[1] - p[1] * s[0],
+        ),
+    )
+
+
+@internal_kernel
+def turned(w, x, y, z):
+    """Rotation of a quaternion of any length: between two normalisations it drifts."""
+    s = 2.0 / (w * w + x * x + y * y + z * z)
+    return (
+        1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y),
+        s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x),
+        s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y),
+    )  # fmt: skip
+
+
+@internal_kernel
+def row_rates(compound, model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
+    """V and A of link i from its axis S, for every kind of joint: V = V_p + S v, A = A_p + V_b × S v + S vdot.
+
+    p is the parent, b what the joint is mounted on. ``forward_sweep`` writes this out for joints of one row.
+    """
+    links, j, m = ws.links, model.tree[i, ka.PARENT], compound[i, ka.BASE]
+    bias = cross_motion(six(links, m, ka.V), six(links, i, ka.S)) if m >= 0 else ZERO_SIX
+    # The world's acceleration is −g.
+    root = (0.0, 0.0, 0.0, -gx, -gy, -gz)
+    for s in range(6):
+        links[i, ka.V + s] = links[i, ka.S + s] * v + (links[j, ka.V + s] if j >= 0 else 0.0)
+        links[i, ka.A + s] = links[i, ka.S + s] * vdot + bias[s] * v + (links[j, ka.A + s] if j >= 0 else root[s])
+
+
+@apart_kernel
+def sweep_row(compound, model: ModelArrays, ws: Workspace, i, v, vdot, gx, gy, gz):
+    """R, p, S, V and A of row i into ``ws.links``: what ``forward_sweep`` does for a link (dynsim.dynamics.tree.sweep).
+
+    v, vdot : rate and acceleration of the row with the sweep's factors; g : gravity likewise
+    """
+    if compound is None:  # known to the compiler
+        return
+    body, links, j = model.body, ws.links, model.tree[i, ka.PARENT]
+    B, p = rotation(body, i, ka.R_PJ), vector(body, i, ka.P_PJ)
+    if j >= 0:
+        A = rotation(links, j, ka.R)
+        B, p = compose(A, B), transform(vector(links, j, ka.P), A, p)
+    B, p, S = row_motion(model, ws, i, B, p)
+    put_rotation(links, i, ka.R, B)
+    put_vector(links, i, ka.P, p)
+    put_six(links, i, ka.S, S)
+    row_rates(compound, model, ws, i, v, vdot, gx, gy, gz)
+
+
+@kernel
+def read_positions(compound, model: ModelArrays, y, start, ws: Workspace):
+    """Coordinates of all joints from y[start:] into the workspace."""
+    if compound is None:  # known to the compiler
+        return
+    tree, joints = model.tree, ws.joints
+    for i in range(tree.shape[0]):
+        k = start + compound[i, ka.POSITION_INDEX]
+        joints[i, ka.Q] = y[k]
+        if tree[i, ka.KIND] == ka.BALL_X or tree[i, ka.KIND] == ka.ROLL:
+            joints[i, ka.EXTRA] = y[k + 1]
+        elif tree[i, ka.KIND] == ka.LEFT_WHEEL or tree[i, ka.KIND] == ka.RIGHT_WHEEL:
+            joints[i, ka.EXTRA] = y[k + 2]
+
+
+@internal_kernel
+def quaternion_rate(w, x, y, z, a, b, c):
+    """q̇ = ½ q ∘ (0, ω) of q = (w, x, y, z), from the angular velocity ω = (a, b, c) in the body."""
+    a, b, c = 0.5 * a, 0.5 * b, 0.5 * c
+    return -(x * a + y * b + z * c), w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a
+
+
+@internal_kernel
+def quaternion_turn(w, x, y, z, dw, dx, dy, dz):
+    """vec(q̄ ∘ δq) of q = (w, x, y, z): half the turn, in the body, that changes a unit quaternion q by δq."""
+    return w * dx - x * dw - y * dz + z * dy, w * dy - y * dw - z * dx + x * dz, w * dz - z * dw - x * dy + y * dx
+
+
+@apart_kernel
+def position_rates(compound, model: ModelArrays, ws: Workspace, dy, start):
+    """q̇ = N(q) v into dy[start:]. Ball: ½ q ∘ (0, ω) with ω in the body; rolling: V (cos ψ, sin ψ), ω.
+
+    Wheels: their own rates, and V = (r/2)(left + right) along the heading as of a rolling base.
+    """
+    if compound is None:  # known to the compiler
+        return
+    tree, joints = model.tree, ws.joints
+    for i in range(tree.shape[0]):
+        k, kind = start + compound[i, ka.POSITION_INDEX], tree[i, ka.KIND]
+        if kind == ka.BALL_X:
+            w, x, y, z = joints[i, ka.Q], joints[i, ka.EXTRA], joints[i + 1, ka.Q], joints[i + 2, ka.Q]
+            rate = quaternion_rate(w, x, y, z, joints[i, ka.QD], joints[i + 1, ka.QD], joints[i + 2, ka.QD])
+            for s in range(4):
+                dy[k + s] = rate[s]
+        elif kind == ka.ROLL:
+            dy[k] = joints[i, ka.QD] * ws.trig[1, i + 1]
+            dy[k + 1] = joints[i, ka.QD] * ws.trig[0, i + 1]
+        elif kind == ka.LEFT_WHEEL:
+            heading = model.body[i, ka.PARAMETER] * (joints[i + 1, ka.Q] - joints[i, ka.Q])
+            speed = model.body[i + 1, ka.PARAMETER] * (joints[i, ka.QD] + joints[i + 1, ka.QD])
+            dy[k], dy[k + 1] = joints[i, ka.QD], joints[i + 1, ka.QD]
+            s, c = sine_cosine_of(heading)
+            dy[k + 2], dy[k + 3] = speed * c, speed * s
+        elif kind != ka.BALL_Y and kind != ka.BALL_Z and kind != ka.RIGHT_WHEEL:
+            dy[k] = joints[i, ka.QD]
+
+
+@internal_kernel
+def displace(compound, model: ModelArrays, ws: Workspace, y, start):
+    """Move the positions y[start:] by the small displacement in the QDD column, taken as velocities for a unit time."""
+    if compound is None:  # known to the compiler
+        return
+    tree, joints = model.tree, ws.joints
+    for i in range(tree.shape[0]):
+        k, kind = start + compound[i, ka.POSITION_INDEX], tree[i, ka.KIND]
+        if kind == ka.BALL_X:
+            w, x, y0, z = y[k], y[k + 1], y[k + 2], y[k + 3]
+            change = quaternion_rate(w, x, y0, z, joints[i, ka.QDD], joints[i + 1, ka.QDD], joints[i + 2, ka.QDD])
+            for s in range(4):
+                y[k + s] += change[s]
+        elif kind == ka.ROLL:
+            y[k] += joints[i, ka.QDD] * ws.trig[1, i + 1]
+            y[k + 1] += joints[i, ka.QDD] * ws.trig[0, i + 1]
+        elif kind == ka.LEFT_WHEEL:
+            left, right = joints[i, ka.QDD], joints[i + 1, ka.QDD]
+            # Along the heading halfway: what is left of the displacement's square is then no first-order error.
+            heading = model.body[i, ka.PARAMETER] * (y[k + 1] - y[k] + 0.5 * (right - left))
+            shift = model.body[i + 1, ka.PARAMETER] * (left + right)
+            y[k] += left
+            y[k + 1] += right
+            s, c = sine_cosine_of(heading)
+            y[k + 2] += shift * c
+            y[k + 3] += shift * s
+        elif kind != ka.BALL_Y and kind != ka.BALL_Z and kind != ka.RIGHT_WHEEL:
+            y[k] += joints[i, ka.QDD]
+
+
+@internal_kernel
+def normalise(compound, model: ModelArrays, y, start):
+    """Give every quaternion in y[start:] unit length."""
+    if compound is None:  # known to the compiler
+        return
+    tree = model.tree
+    for i in range(tree.shape[0]):
+        if tree[i, ka.KIND] == ka.BALL_X:
+            k = start + compound[i, ka.POSITION_INDEX]
+            scale = 1.0 / math.sqrt(y[k] * y[k] + y[k + 1] * y[k + 1] + y[k + 2] * y[k + 2] + y[k + 3] * y[k + 3])
+            for s in range(4):
+                y[k + s] *= scale
+
+
+@internal_kernel
+def position_error(compound, model: ModelArrays, y, y_new, error, start, rtol, atol):
+    """Sum of squares of the errors of the positions, each per its tolerance, and their number: for the step control.
+
+    The error of a quaternion counts as the three angles 2 vec(q̄ ∘ δq) of the rotation that undoes it, against
+    atol + rtol [rad]: what a revolute joint one radian from zero is held to.
+    """
+    if compound is None:  # known to the compiler
+        return 0.0, 0
+    tree, total, count = model.tree, 0.0, 0
+    for i in range(tree.shape[0]):
+        k, kind = start + compound[i, ka.POSITION_INDEX], tree[i, ka.KIND]
+        if kind == ka.BALL_X:
+            w, x, y0, z = y_new[k], y_new[k + 1], y_new[k + 2], y_new[k + 3]
+            dw, dx, dy, dz = error[k], error[k + 1], error[k + 2], error[k + 3]
+            scale = 2.0 / ((w * w + x * x + y0 * y0 + z * z) * (atol + rtol))
+            ex, ey, ez = quaternion_turn(w, x, y0, z, dw, dx, dy, dz)
+            ex, ey, ez = scale * ex, scale * ey, scale * ez
+            total += ex * ex + ey * ey + ez * ez
+            count += 3
+        elif kind != ka.BALL_Y and kind != ka.BALL_Z and kind != ka.RIGHT_WHEEL:
+            for s in range(2 if kind == ka.ROLL else 4 if kind == ka.LEFT_WHEEL else 1):
+                e = error[k + s] / (atol + rtol * max(abs(y[k + s]), abs(y_new[k + s])))
+                total += e * e
+                count += 1
+    return total, count
+
+
+@internal_kernel
+def positions_along(compound, model: ModelArrays, y, start, u, out):
+    """out[start:] ← out[start:] + N(q) u, positions of y[start:], rates u (n,); both may be complex."""
+    if compound is None:  # known to the compiler
+        return
+    tree = model.tree
+    for i in range(tree.shape[0]):
+        k, kind = start + compound[i, ka.POSITION_INDEX], tree[i, ka.KIND]
+        if kind == ka.BALL_X:
+            change = quaternion_rate(y[k], y[k + 1], y[k + 2], y[k + 3], u[i], u[i + 1], u[i + 2])
+            for s in range(4):
+                out[k + s] += change[s]
+        elif kind == ka.ROLL:
+            s, c = sine_cosine_of(y[start + compound[i + 1, ka.POSITION_INDEX]])
+            out[k] += c * u[i]
+            out[k + 1] += s * u[i]
+        elif kind == ka.LEFT_WHEEL:
+            s, c = sine_cosine_of(model.body[i, ka.PARAMETER] * (y[k + 1] - y[k]))
+            shift = model.body[i + 1, ka.PARAMETER] * (u[i] + u[i + 1])
+            out[k] += u[i]
+            out[k + 1] += u[i + 1]
+            out[k + 2] += shift * c
+            out[k + 3] += shift * s
+        elif kind != ka.BALL_Y and kind != ka.BALL_Z and kind != ka.RIGHT_WHEEL:
+            out[k] += u[i]
+
+
+@internal_kernel
+def rates_across(compound, model: ModelArrays, y, start, d, out):
+    """Rates out (n,) whose positions change as d[start:] does, as far as rates can: N⁺ d; both may be complex."""
+    if compound is None:  # known to the compiler
+        return
+    tree = model.tree
+    for i in range(tree.shape[0]):
+        k, kind = start + compound[i, ka.POSITION_INDEX], tree[i, ka.KIND]
+        if kind == ka.BALL_X:
+            turn = quaternion_turn(y[k], y[k + 1], y[k + 2], y[k + 3], d[k], d[k + 1], d[k + 2], d[k + 3])
+            for s in range(3):
+                out[i + s] = 2.0 * turn[s]
+        elif kind == ka.ROLL:
+            s, c = sine_cosine_of(y[start + compound[i + 1, ka.POSITION_INDEX]])
+            out[i] = c * d[k] + s * d[k + 1]
+        elif kind != ka.BALL_Y and kind != ka.BALL_Z:
+            out[i] = d[k]

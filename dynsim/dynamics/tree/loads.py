@@ -1,0 +1,107 @@
+"""External wrenches on points of bodies: constant, by splines over time, or rewritten between steps."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.tables import ModelArrays, Workspace
+from dynsim.dynamics.tree.spatial import dot, rotate, rotation, six, transform, vector, wrench_at
+from dynsim.jit.kernel import apart_kernel, internal_kernel
+
+# LoadArrays.table, int
+LINK, IN_BODY, HOLDS, DATA, SEGMENTS = 0, 1, 2, 3, 4
+TABLE_SIZE = 5
+# Of LoadArrays.data, from table[l, DATA] on: point in the body's frame [m], wrench that is added to that of the
+# segments: force [N] and moment [N m]. Then the segments: first time [s], then ascending powers of t − that time, four
+# for each component of force and moment. At last the time at which the last segment ends.
+POINT, WRENCH, FIRST_SEGMENT = 0, 3, 9
+SEGMENT_SIZE = 25
+
+
+class LoadArrays(NamedTuple):
+    """External wrenches."""
+
+    table: np.ndarray  # (l, TABLE_SIZE) int: link, axes of the wrench, held beyond its times, place in data, segments
+    data: np.ndarray  # (…,) see POINT, WRENCH, FIRST_SEGMENT
+
+
+@internal_kernel
+def segment_start(loads: LoadArrays, k, t):
+    """Place in ``loads.data`` of the segment of load k that t lies in, and the time to evaluate it at; −1 for none.
+
+    Depends on time alone, so it is the same for all states that are evaluated together.
+    """
+    count = loads.table[k, SEGMENTS]
+    first = loads.table[k, DATA] + FIRST_SEGMENT
+    if count == 0:
+        return -1, t
+    end = loads.data[first + count * SEGMENT_SIZE]
+    # From the right at both ends: the steps end there (Run.breaks).
+    if t < loads.data[first] or t >= end:
+        if loads.table[k, HOLDS] == 0:
+            return -1, t
+        t = min(max(t, loads.data[first]), end)
+    low, high = 0, count
+    while high - low > 1:
+        middle = (low + high) // 2
+        if loads.data[first + middle * SEGMENT_SIZE] <= t:
+            low = middle
+        else:
+            high = middle
+    return first + low * SEGMENT_SIZE, t
+
+
+@internal_kernel
+def load_wrench(loads: LoadArrays, k, t, ws: Workspace):
+    """Moment about the world origin and force of load k at time t in W [N m, N], after ``forward_sweep``."""
+    links, table, data = ws.links, loads.table, loads.data
+    i, place = table[k, LINK], table[k, DATA]
+    force, moment = segment_vector(data, place + WRENCH), segment_vector(data, place + WRENCH + 3)
+    segment, at = segment_start(loads, k, t)
+    if segment >= 0:
+        x, c = at - data[segment], segment + 1
+        force = (
+            force[0] + cubic(data, c, x),
+            force[1] + cubic(data, c + 4, x),
+            force[2] + cubic(data, c + 8, x),
+        )
+        moment = (
+            moment[0] + cubic(data, c + 12, x),
+            moment[1] + cubic(data, c + 16, x),
+            moment[2] + cubic(data, c + 20, x),
+        )
+    R = rotation(links, i, ka.R)
+    if table[k, IN_BODY] != 0:
+        force, moment = rotate(R, force), rotate(R, moment)
+    return wrench_at(transform(vector(links, i, ka.P), R, segment_vector(data, place + POINT)), force, moment)
+
+
+@internal_kernel
+def segment_vector(data, c):
+    """Three numbers of the data from place c on."""
+    return data[c], data[c + 1], data[c + 2]
+
+
+@internal_kernel
+def cubic(data, c, x):
+    """Polynomial of degree three in x with its ascending coefficients from place c on."""
+    return data[c] + x * (data[c + 1] + x * (data[c + 2] + x * data[c + 3]))
+
+
+@apart_kernel
+def add_loads(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, power, start):
+    """Add S·W of every external wrench W to the applied forces of the joints that carry it, after ``forward_sweep``.
+
+    Its power W·V goes to power[start:] [W].
+    """
+    links, joints, table = ws.links, ws.joints, loads.table
+    for k in range(table.shape[0]):
+        i = table[k, LINK]
+        W = load_wrench(loads, k, t, ws)
+        power[start + k] = dot(W, six(links, i, ka.V))
+        while i >= 0:
+            joints[i, ka.APPLIED] += dot(W, six(links, i, ka.S))
+            i = model.tree[i, ka.PARENT]

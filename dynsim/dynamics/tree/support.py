@@ -1,0 +1,157 @@
+"""What the ground carries of a mobile base: loads of wheels and caster, centre of pressure, how far it is from tipping.
+
+The base stands on the contact points of its left wheel L = (0, T/2), its right wheel R = (0, −T/2) and its caster
+C = (c_x, c_y), in the plane z = 0 of its frame, whose z is the normal of the ground. Three normal forces N balance the
+force along z and the moments about x and y, so they are determined; side slip and rolling take their forces along y and
+x there. The loads are those of a base that is held down: N < 0 pulls.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.tables import ModelArrays, Workspace
+from dynsim.dynamics.tree.joints import row_rates
+from dynsim.dynamics.tree.loads import LoadArrays, load_wrench
+from dynsim.dynamics.tree.spatial import (
+    ZERO_SIX,
+    cross,
+    minus_scaled,
+    plus,
+    rotate_back,
+    rotation,
+    second_axis,
+    six,
+    transform,
+    vector,
+)
+from dynsim.dynamics.tree.sweep import body_inertia, inertial_wrench
+from dynsim.jit.kernel import apart_kernel, internal_kernel
+
+# SupportArrays.index, int: the body, and the rows of the wheels' rates
+BODY, LEFT, RIGHT = 0, 1, 2
+INDEX_SIZE = 3
+# SupportArrays.base
+TRACK, CASTER_X, CASTER_Y, SPIN_INERTIA, FRICTION = 0, 1, 2, 3, 4
+# Perimeter of the support triangle by the length of the side opposite to L, R and C: the largest margins there.
+SHARE = 5
+BASE_SIZE = 8
+# SupportArrays.state: what is recorded of it
+LOADS = 0  # 3: of left wheel, right wheel, caster [N]
+PRESSURE = 3  # 2: centre of pressure in W [m], NaN for no load
+MARGIN = 5
+TRACTION = 6  # 2: |F| / (μ N) of left and right wheel, NaN for N <= 0
+OUTPUTS = 8
+# and what it follows from: the forces of the wheels along x, the sum of those along y [N]
+LONGITUDINAL, LATERAL = 8, 10
+STATE_SIZE = 11
+# SupportArrays.least: loads as in state, then the margin
+LEAST_MARGIN = 3
+LEAST_SIZE = 4
+
+
+class SupportArrays(NamedTuple):
+    """The mobile base of a robot."""
+
+    index: np.ndarray  # (INDEX_SIZE,) int
+    base: np.ndarray  # (BASE_SIZE,)
+    state: np.ndarray  # (STATE_SIZE,) written by ground_reaction
+    least: np.ndarray  # (LEAST_SIZE,) of the loads and of the margin at accepted steps, see watch_support
+
+
+@apart_kernel
+def ground_reaction(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, support: SupportArrays):
+    """Loads, centre of pressure, tip margin and traction demand at time t into ``support.state``.
+
+    To be called right after ``derivative``; overwrites V with what it is and A with the accelerations minus gravity.
+
+    Balance of momentum of all bodies about the world origin: W = Σ (İV − weight) + İ_a − Σ W_contact − Σ W_load. The
+    inertia I_a of the wheels about their axle y is not in the tensors of the bodies but on the rows of the wheels; its
+    momentum I_a (φ̇_L + φ̇_R) y changes by I_a ((φ̈_L + φ̈_R) y + (φ̇_L + φ̇_R) ω × y). Momentum of rotors and gears is left
+    out, as it is of all joints. Moved to the base's frame, M_x = (N_L − N_R) T/2 + N_C c_y, M_y = −N_C c_x,
+    F_z = ΣN; M_z = (F_R − F_L) T/2 and F_x = F_L + F_R give the forces along x that roll the wheels.
+
+    The margin is min_i d_i/ρ, d_i the distance of the centre of pressure Σ N_i p_i / ΣN from side i (negative beyond
+    it), ρ the inradius. N_i/ΣN are its barycentric coordinates, so d_i/ρ = (N_i/ΣN) (perimeter / side i): 1 at the
+    incentre. ΣN <= 0 counts as −1. Loaded wheels share the lateral force, by load.
+    """
+    links, joints, gravity = ws.links, ws.joints, model.gravity
+    index, base, state = support.index, support.base, support.state
+    W = ZERO_SIX
+    for i in range(joints.shape[0]):
+        row_rates(model.compound, model, ws, i, joints[i, ka.QD], joints[i, ka.QDD], gravity[0], gravity[1], gravity[2])
+        mass, centre, inertia = body_inertia(model, ws, i)
+        W = plus(W, inertial_wrench(ws, i, mass, centre, inertia))
+    for k in range(ws.counts[ka.ROWS]):
+        # What joins two bodies or two joints is no force from outside.
+        if ws.active[k, ka.ROW_KIND] != ka.JOINT_ROW and ws.active[k, ka.BODY_B] < 0:
+            W = minus_scaled(W, six(ws.rows, k, ka.DIRECTION), ws.rows[k, ka.FORCE])
+    for k in range(loads.table.shape[0]):
+        W = minus_scaled(W, load_wrench(loads, k, t, ws), 1.0)
+    b, left, right = index[BODY], index[LEFT], index[RIGHT]
+    R, p = rotation(links, b, ka.R), vector(links, b, ka.P)
+    axle, w = second_axis(R), vector(links, b, ka.V)
+    spin = base[SPIN_INERTIA] * (joints[left, ka.QD] + joints[right, ka.QD])
+    rate = base[SPIN_INERTIA] * (joints[left, ka.QDD] + joints[right, ka.QDD])
+    turning, force = cross(w, axle), (W[3], W[4], W[5])
+    at_base = cross(p, force)
+    # About the base, in its frame.
+    mx, my, mz = rotate_back(
+        R,
+        (
+            W[0] + rate * axle[0] + spin * turning[0] - at_base[0],
+            W[1] + rate * axle[1] + spin * turning[1] - at_base[1],
+            W[2] + rate * axle[2] + spin * turning[2] - at_base[2],
+        ),
+    )
+    fx, fy, fz = rotate_back(R, force)
+
+    caster = -my / base[CASTER_X]
+    difference = 2.0 * (mx - caster * base[CASTER_Y]) / base[TRACK]
+    state[LOADS] = 0.5 * (fz - caster + difference)
+    state[LOADS + 1] = 0.5 * (fz - caster - difference)
+    state[LOADS + 2] = caster
+    state[LONGITUDINAL] = 0.5 * fx - mz / base[TRACK]
+    state[LONGITUDINAL + 1] = 0.5 * fx + mz / base[TRACK]
+    state[LATERAL] = fy
+    state[MARGIN] = -1.0
+    state[PRESSURE], state[PRESSURE + 1] = math.nan, math.nan
+    if fz > 0.0:
+        x, y = -my / fz, mx / fz
+        pressure = transform(p, R, (x, y, 0.0))
+        state[PRESSURE], state[PRESSURE + 1] = pressure[0], pressure[1]
+        state[MARGIN] = math.inf
+        for k in range(3):
+            state[MARGIN] = min(state[MARGIN], state[LOADS + k] / fz * base[SHARE + k])
+    carried = max(state[LOADS], 0.0) + max(state[LOADS + 1], 0.0)
+    for k in range(2):
+        load = state[LOADS + k]
+        state[TRACTION + k] = math.nan
+        if load > 0.0:
+            lateral = fy * load / carried
+            force = math.sqrt(state[LONGITUDINAL + k] ** 2 + lateral * lateral)
+            state[TRACTION + k] = force / (base[FRICTION] * load)
+
+
+@internal_kernel
+def tip_margin(model: ModelArrays, loads: LoadArrays, t, ws: Workspace, support: SupportArrays | None):
+    """The tip margin by :func:`ground_reaction`; a robot without a mobile base does not tip."""
+    if support is None:  # known to the compiler
+        return math.inf
+    ground_reaction(model, loads, t, ws, support)
+    return support.state[MARGIN]
+
+
+@internal_kernel
+def watch_support(support: SupportArrays | None):
+    """Least loads and margin so far, after :func:`ground_reaction` at the end of an accepted step."""
+    if support is None:  # known to the compiler
+        return
+    state, least = support.state, support.least
+    for k in range(3):
+        least[k] = min(least[k], state[LOADS + k])
+    least[LEAST_MARGIN] = min(least[LEAST_MARGIN], state[MARGIN])

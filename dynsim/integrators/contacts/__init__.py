@@ -1,0 +1,1 @@
+"""Contacts of the event-driven integrators: events, modes, impacts."""

@@ -1,0 +1,397 @@
+"""Events of the unilateral law: landing, lift-off, begin and end of slip, joint stops; what each of them changes.
+
+Each candidate has two guards, each stop one. Off its surface the guard is the gap, closed it is the normal force; of a
+point that sticks the second guard is its margin μ_s f_n − |f_t|, of one that slides its speed along the direction that
+it began the step with. All of them fall through zero.
+
+Lift-off and the begin of slip leave forces as they are, so that the one candidate is switched by hand: its
+complementarity problem is degenerate there. Everything else, and whatever this leaves inconsistent, is solved anew.
+"""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.rows import set_modes
+from dynsim.dynamics.contact.splits import margin
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, stop_gap
+from dynsim.dynamics.derivative import System
+from dynsim.dynamics.tables import Workspace
+from dynsim.integrators import run as ki
+from dynsim.integrators.contacts.impacts import evaluate, slip_speed
+from dynsim.integrators.contacts.modes import begin_slip, drops, resolve, slip_on
+from dynsim.integrators.contacts.slow_slip import note_turning
+from dynsim.integrators.run import Run
+from dynsim.jit.kernel import apart_kernel, internal_kernel
+
+# Kinds of guards, behind those of dynsim.integrators.events.
+NORMAL_GUARD, SLIP_GUARD, STOP_GUARD = 10, 11, 12
+# What is logged of a candidate, and of a stop.
+LANDING, LIFT_OFF, SLIP_START, SLIP_STOP, BOUNCE, CHATTERS, STOP_HIT, STOP_LEFT = 0, 1, 2, 3, 4, 5, 6, 7
+LOG_KINDS = 8
+
+# Run.gaps: what a candidate was like at the start of the step.
+GAP_THEN, RATE_THEN, NORMAL_THEN, PLACE_THEN = 0, 1, 2, 5
+
+# A candidate that starts, or comes to rest, this close to its surface touches it [m].
+TOUCH = 1e-9
+# More events of a candidate than MOST_EVENTS in WINDOW [s] are chatter; SETTLE grows tenfold then, up to MOST_SETTLE.
+WINDOW, MOST_EVENTS, MOST_SETTLE = 1.0, 200, 1e-2
+# So many changes at one instant, or chatter so often at one candidate, end the run.
+MOST_CHANGES, MOST_CHATTER = 60, 100
+INSTANT = 1e-11
+# A point that slips against its direction at less than this has not stopped yet [m/s]: of what begins to slip with next
+# to no acceleration the speed is rounding.
+BACKWARD = 2e-11
+# Forces that contradict their modes by less than this, absolute [N] and of the largest, are rounding.
+FORCE_SLACK = 1e-9
+# Of the largest force: what counts as none where a point that sticks gives way.
+NO_FORCE = 1e-8
+
+
+@internal_kernel
+def contact_guard(unilateral: UnilateralArrays | None, ws: Workspace, kind, k):
+    """Value of a guard of the unilateral law, right after ``derivative``."""
+    if unilateral is None:  # known to the compiler
+        return 1.0
+    if kind == STOP_GUARD:
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
+            return unilateral.stop[k, ku.STOP_FORCE]
+        return stop_gap(unilateral, ws, k) + ku.DEPTH
+    mode = ws.active[k, ka.MODE]
+    if kind == NORMAL_GUARD:
+        return (
+            ws.contacts[k, ka.GAP] + unilateral.slide[k, ku.LANDS_AT]
+            if mode == ka.OPEN
+            else ws.contacts[k, ka.NORMAL_FORCE]
+        )
+    if mode == ka.SLIDING and unilateral.law[k, ku.STATIC] > 0.0:
+        return unilateral.slide[k, ku.SPEED] + unilateral.slide[k, ku.HEADWAY] + BACKWARD
+    if mode == ka.STICKING:
+        best = unilateral.number[ku.BEST_MARGIN]
+        # Dependent rows, where the least norm fits no cones: the forces are the least that do, on some cone, and say
+        # nothing of what is left. Once none fit, those of the best margin show which contacts give way.
+        if unilateral.number[ku.SPLIT] == 1.0 and best > 0.0:
+            return best
+        return margin(unilateral, ws, k)
+    return 1.0
+
+
+@internal_kernel
+def too_long(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
+    """The fraction of a step to take instead, where it has passed over something; else 1.
+
+    An open candidate may dip below its surface and be out again at the end: the minimum of the cubic through gaps and
+    their rates at both ends, ``gaps``, (c, GAPS_SIZE), at the start. It may have gone through a body: out at its other
+    side, and as far as both gaps together. Or a frozen direction of slip has stood for too long.
+    """
+    found = 1.0
+    if unilateral is None:  # known to the compiler
+        return found
+    for k in range(gaps.shape[0]):
+        slow = unilateral.number[ku.SLOW]
+        if (
+            ws.active[k, ka.MODE] == ka.SLIDING
+            and unilateral.slide[k, ku.FROZEN] == 1.0
+            and unilateral.law[k, ku.STATIC] > 0.0
+        ):
+            speed = slip_speed(ws, k)
+            if speed > 2.0 * slow:
+                found = min(found, max(1.5 * slow / speed, 0.01))
+        if passes_through(ws, gaps, k):
+            found = min(found, 0.5)
+        if ws.active[k, ka.MODE] != ka.OPEN or gaps[k, RATE_THEN] >= 0.0 or ws.contacts[k, ka.GAP_RATE] <= 0.0:
+            continue
+        g0, g1 = gaps[k, GAP_THEN], ws.contacts[k, ka.GAP]
+        d0, d1 = h * gaps[k, RATE_THEN], h * ws.contacts[k, ka.GAP_RATE]
+        # Hermite: g0 + d0 x + a x² + b x³.
+        a, b = 3.0 * (g1 - g0) - 2.0 * d0 - d1, 2.0 * (g0 - g1) + d0 + d1
+        root = a * a - 3.0 * b * d0
+        if root <= 0.0 or a + math.sqrt(root) == 0.0:
+            continue
+        x = -d0 / (a + math.sqrt(root))
+        if 0.0 < x < 1.0 and g0 + x * (d0 + x * (a + x * b)) < -ku.DEPTH:
+            found = min(found, x)
+    return found
+
+
+@internal_kernel
+def passes_through(ws: Workspace, gaps, k):
+    """True when open candidate k may have gone through a body within the step.
+
+    A distance changes by no more than what the point has gone, so that has to be both gaps at least; a way that bends
+    by half a turn is π/2 as long as it looks.
+    """
+    state = ws.contacts[k]
+    g0, g1 = gaps[k, GAP_THEN], state[ka.GAP]
+    if ws.active[k, ka.MODE] != ka.OPEN or g0 <= 0.0 or g1 <= 0.0:
+        return False
+    turned, square = 0.0, 0.0
+    for s in range(3):
+        turned += gaps[k, NORMAL_THEN + s] * state[ka.NORMAL + s]
+        way = state[ka.POSITION + s] - gaps[k, PLACE_THEN + s]
+        square += way * way
+    return turned < 0.0 and 2.5 * square >= (g0 + g1) * (g0 + g1)
+
+
+@internal_kernel
+def note_gaps(ws: Workspace, gaps):
+    """Gaps, their rates, normals and places at the start of a step, for :func:`too_long`."""
+    for k in range(gaps.shape[0]):
+        gaps[k, GAP_THEN], gaps[k, RATE_THEN] = ws.contacts[k, ka.GAP], ws.contacts[k, ka.GAP_RATE]
+        for s in range(3):
+            gaps[k, NORMAL_THEN + s], gaps[k, PLACE_THEN + s] = (
+                ws.contacts[k, ka.NORMAL + s],
+                ws.contacts[k, ka.POSITION + s],
+            )
+
+
+@internal_kernel
+def watch_modes(unilateral: UnilateralArrays | None, ws: Workspace, h, gaps):
+    """At an accepted step, before its samples: times in each mode, depths, gaps and directions of slip at its end."""
+    if unilateral is None:
+        return
+    note_gaps(ws, gaps)
+    state, tally, slide = ws.contacts, unilateral.tally, unilateral.slide
+    for k in range(state.shape[0]):
+        tally[k, ku.TIME_OPEN + ws.active[k, ka.MODE]] += h
+        tally[k, ku.DEEPEST] = max(tally[k, ku.DEEPEST], -state[k, ka.GAP])
+        if ws.active[k, ka.MODE] != ka.OPEN:
+            slide[k, ku.LANDS_AT] = ku.DEPTH
+        elif state[k, ka.GAP] > ku.DEPTH:
+            slide[k, ku.LANDS_AT] = ku.AT_ROOT
+        speed = slip_speed(ws, k)
+        slide[k, ku.NEXT_SPEED] = speed
+        for s in range(3):
+            slide[k, ku.NEXT + s] = (
+                state[k, ka.SLIP_VELOCITY + s] / speed if speed > 0.0 else slide[k, ku.REFERENCE + s]
+            )
+        if ws.active[k, ka.MODE] == ka.SLIDING:
+            note_turning(unilateral, ws, k, speed)
+    for k in range(unilateral.stop.shape[0]):
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
+            unilateral.stop[k, ku.CLOSED_TIME] += h
+
+
+@internal_kernel
+def take_directions(unilateral: UnilateralArrays | None, ws: Workspace, run: Run):
+    """After the samples of a step: freeze directions of what has become slow, free those of what is fast again."""
+    if unilateral is None:
+        return
+    slide, slow = unilateral.slide, unilateral.number[ku.SLOW]
+    for k in range(slide.shape[0]):
+        if ws.active[k, ka.MODE] != ka.SLIDING:
+            continue
+        fast = slide[k, ku.NEXT_SPEED] >= slow
+        if fast and slide[k, ku.FROZEN] == 1.0:
+            # The direction turns a little: the next step starts anew.
+            run.count[ki.STARTED] = 0
+        if fast or slide[k, ku.FROZEN] == 0.0:
+            for s in range(3):
+                slide[k, ku.REFERENCE + s] = slide[k, ku.NEXT + s]
+        slide[k, ku.FROZEN] = 0.0 if fast else 1.0
+        if not fast:
+            stay_tangential(slide, ws, k)
+
+
+@internal_kernel
+def stay_tangential(slide, ws: Workspace, k):
+    """Keep a frozen direction along the surface, whose normal turns as the point moves on.
+
+    A point without friction may never have slipped, and has none then, or rounding that was along the normal: zero.
+    """
+    state, size, along = ws.contacts, 0.0, 0.0
+    for s in range(3):
+        along += slide[k, ku.REFERENCE + s] * state[k, ka.NORMAL + s]
+    for s in range(3):
+        slide[k, ku.REFERENCE + s] -= along * state[k, ka.NORMAL + s]
+        size += slide[k, ku.REFERENCE + s] ** 2
+    # Without friction there may be none yet.
+    if size > 0.0:
+        for s in range(3):
+            slide[k, ku.REFERENCE + s] /= math.sqrt(size)
+
+
+@internal_kernel
+def at_limit(unilateral: UnilateralArrays, ws: Workspace, k):
+    """True when candidate k, whose guard of slip has fallen through zero, is one that gives way.
+
+    The guards of dependent rows fall together, with the best worst margin. Those with a better one hold.
+    """
+    slack = FORCE_SLACK * (1.0 + abs(ws.contacts[k, ka.NORMAL_FORCE]))
+    return unilateral.number[ku.SPLIT] == 0.0 or margin(unilateral, ws, k) <= unilateral.number[ku.BEST_MARGIN] + slack
+
+
+@internal_kernel
+def consistent(system: System, ws: Workspace):
+    """True when all forces agree with their modes, right after ``derivative``."""
+    unilateral, table = system.unilateral, system.unilateral.stop_table
+    slack = 0.0
+    for k in range(ws.contacts.shape[0]):
+        slack = max(slack, abs(ws.contacts[k, ka.NORMAL_FORCE]))
+    slack = FORCE_SLACK * (1.0 + slack)
+    for k in range(table.shape[0]):
+        if table[k, ku.STOP_CLOSED] == 1 and unilateral.stop[k, ku.STOP_FORCE] < -slack:
+            return False
+    for k in range(ws.contacts.shape[0]):
+        mode = ws.active[k, ka.MODE]
+        if mode != ka.OPEN and ws.contacts[k, ka.NORMAL_FORCE] < -slack:
+            return False
+        if mode == ka.STICKING and contact_guard(unilateral, ws, SLIP_GUARD, k) < -slack:
+            return False
+    return True
+
+
+@apart_kernel
+def solve_modes(system: System, ws: Workspace, run: Run, first):
+    """Choose all modes anew, and log what that changes; ``first``: nothing of it is an event."""
+    before = ws.counts[ka.DEPENDENT]
+    resolve(system, ws, run, TOUCH)
+    # Of rows that were held together only to see what they do.
+    ws.counts[ka.DEPENDENT] = before
+    if not first:
+        log_changes(system, ws, run)
+    rearm(run)
+    count_changes(system, run)
+
+
+@internal_kernel
+def rearm(run: Run):
+    """All guards of the unilateral law are on their positive side."""
+    for e in range(run.event.shape[0]):
+        if run.event_table[e, ki.EVENT_KIND] >= NORMAL_GUARD:
+            run.event[e, ki.SIDE], run.event[e, ki.VALUE] = 1.0, 1.0
+
+
+@internal_kernel
+def count_changes(system: System, run: Run):
+    """End a run whose modes go on changing without time passing."""
+    number = system.unilateral.number
+    number[ku.CHANGES] = number[ku.CHANGES] + 1.0 if run.clock[ki.TIME] - number[ku.LAST_CHANGE] <= INSTANT else 1.0
+    number[ku.LAST_CHANGE] = run.clock[ki.TIME]
+    if number[ku.CHANGES] > MOST_CHANGES:
+        run.count[ki.STATUS] = ki.CHATTER
+
+
+@internal_kernel
+def log(run: Run, code):
+    """Write an event to the log; what finds no room is lost to the log alone."""
+    count = run.count
+    if count[ki.LOGGED] < run.log_time.shape[0]:
+        run.log_time[count[ki.LOGGED]], run.log_event[count[ki.LOGGED]] = run.clock[ki.TIME], code
+        count[ki.LOGGED] += 1
+
+
+@internal_kernel
+def tell(system: System, run: Run, k, kind):
+    """Log an event of candidate k, count it, and watch for chatter."""
+    tally = system.unilateral.tally
+    log(run, ki.CONTACT_LOG + LOG_KINDS * k + kind)
+    if kind == LANDING:
+        tally[k, ku.LANDINGS] += 1.0
+    elif kind == LIFT_OFF:
+        tally[k, ku.LIFT_OFFS] += 1.0
+    elif kind == SLIP_START:
+        tally[k, ku.SLIP_STARTS] += 1.0
+    elif kind == BOUNCE:
+        tally[k, ku.BOUNCES] += 1.0
+    if run.clock[ki.TIME] - tally[k, ku.WINDOW_START] > WINDOW:
+        tally[k, ku.WINDOW_START], tally[k, ku.WINDOW_COUNT] = run.clock[ki.TIME], 0.0
+    tally[k, ku.WINDOW_COUNT] += 1.0
+    if tally[k, ku.WINDOW_COUNT] > MOST_EVENTS:
+        if tally[k, ku.CHATTERED] == 0.0:
+            log(run, ki.CONTACT_LOG + LOG_KINDS * k + CHATTERS)
+        tally[k, ku.CHATTERED] += 1.0
+        tally[k, ku.SETTLE] = min(10.0 * tally[k, ku.SETTLE], MOST_SETTLE)
+        tally[k, ku.WINDOW_START], tally[k, ku.WINDOW_COUNT] = run.clock[ki.TIME], 0.0
+        if tally[k, ku.CHATTERED] > MOST_CHATTER:
+            run.count[ki.STATUS] = ki.CHATTER
+
+
+@internal_kernel
+def log_changes(system: System, ws: Workspace, run: Run):
+    """Log what a choice of modes has changed."""
+    unilateral, table = system.unilateral, system.unilateral.stop_table
+    for k in range(ws.contacts.shape[0]):
+        before, now = unilateral.mode[k, ku.BEFORE], ws.active[k, ka.MODE]
+        if before == ka.OPEN:
+            if now != ka.OPEN:
+                tell(system, run, k, LANDING)
+            elif unilateral.mode[k, ku.STRUCK] == 1:
+                # It flies off from where it has landed, below its surface: there it is not to land again at once.
+                unilateral.slide[k, ku.LANDS_AT] = ku.AT_ROOT + max(0.0, -ws.contacts[k, ka.GAP])
+                tell(system, run, k, BOUNCE)
+        elif now == ka.OPEN:
+            tell(system, run, k, LIFT_OFF)
+        elif before == ka.STICKING and now == ka.SLIDING:
+            tell(system, run, k, SLIP_START)
+        elif before == ka.SLIDING and now == ka.STICKING:
+            tell(system, run, k, SLIP_STOP)
+    for k in range(table.shape[0]):
+        if table[k, ku.STOP_CLOSED] != table[k, ku.STOP_BEFORE]:
+            hit = table[k, ku.STOP_CLOSED] == 1
+            unilateral.stop[k, ku.HITS] += 1.0 if hit else 0.0
+            log(run, ki.STOP_LOG + LOG_KINDS * k + (STOP_HIT if hit else STOP_LEFT))
+
+
+@apart_kernel
+def switch_contacts(unilateral: UnilateralArrays | None, system: System, ws: Workspace, run: Run):
+    """Do what the contact events at the end of the accepted step ask for; the next step starts anew."""
+    if unilateral is None:
+        return
+    mode, table = unilateral.mode, unilateral.stop_table
+    happened, by_hand = 0, True
+    for e in range(run.event.shape[0]):
+        if run.event_table[e, ki.EVENT_KIND] >= NORMAL_GUARD and run.event[e, ki.VALUE] <= 0.0:
+            happened += 1
+    if happened == 0:
+        return
+    # Samples may have left another state in the workspace.
+    evaluate(system, ws, run)
+    strongest = 0.0
+    for k in range(mode.shape[0]):
+        mode[k, ku.WANTED] = ws.active[k, ka.MODE]
+        strongest = max(strongest, ws.contacts[k, ka.NORMAL_FORCE])
+    for e in range(run.event.shape[0]):
+        kind, k = run.event_table[e, ki.EVENT_KIND], run.event_table[e, ki.EVENT_INDEX]
+        if kind < NORMAL_GUARD or run.event[e, ki.VALUE] > 0.0:
+            continue
+        if kind == STOP_GUARD:
+            if table[k, ku.STOP_CLOSED] == 1:
+                table[k, ku.STOP_CLOSED] = 0
+                log(run, ki.STOP_LOG + LOG_KINDS * k + STOP_LEFT)
+            else:
+                by_hand = False
+        elif ws.active[k, ka.MODE] == ka.OPEN:
+            by_hand = False
+        elif kind == NORMAL_GUARD:
+            mode[k, ku.WANTED] = ka.OPEN
+            tell(system, run, k, LIFT_OFF)
+        elif mode[k, ku.WANTED] == ka.STICKING:
+            if not at_limit(unilateral, ws, k):
+                continue
+            r = ws.active[k, ka.FIRST_ROW]
+            if ws.rows[r, ka.FORCE] <= NO_FORCE * strongest:
+                # At the apex of its cone it leaves; there is no direction in which it could slip.
+                mode[k, ku.WANTED] = ka.OPEN
+                tell(system, run, k, LIFT_OFF)
+                continue
+            if drops(system, k):
+                # Forces jump, and with them the direction of slip.
+                mode[k, ku.GIVES_WAY], by_hand = 1, False
+                continue
+            begin_slip(system, ws, k, ws.rows[r + 1, ka.FORCE], ws.rows[r + 2, ka.FORCE])
+            mode[k, ku.WANTED] = ka.SLIDING
+            tell(system, run, k, SLIP_START)
+        elif mode[k, ku.WANTED] == ka.SLIDING:
+            # Either slip has only turned, or all is to be looked at.
+            by_hand = slip_on(unilateral, ws, k, 10.0 * unilateral.number[ku.SLOW]) and by_hand
+    if by_hand:
+        set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
+        rearm(run)
+        count_changes(system, run)
+    else:
+        solve_modes(system, ws, run, False)
+    run.count[ki.STARTED] = 0

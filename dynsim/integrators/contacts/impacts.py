@@ -1,0 +1,233 @@
+"""What touches is brought onto its surface, and stopped by impulses where it approaches.
+
+Moreau's law with Newton's restitution and Coulomb's cone on impulses, for everything that touches at once.
+"""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.dynamics import state as kst
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.cone import problem as kc
+from dynsim.dynamics.contact.cone.problem import approach, solve_cones
+from dynsim.dynamics.contact.rows import row_errors, set_modes
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, stop_gap
+from dynsim.dynamics.derivative import System, derivative
+from dynsim.dynamics.tables import Workspace
+from dynsim.dynamics.tree.articulated import accelerate
+from dynsim.integrators import project as kp
+from dynsim.integrators import run as ki
+from dynsim.integrators.project import project_level
+from dynsim.integrators.run import Run
+from dynsim.jit.kernel import internal_kernel
+
+# A point that approaches faster than this many tolerances of projected rates strikes.
+STRIKE = 3.0
+# Impacts at one instant, of which each is the cause of the next, before restitution is none.
+MOST_BOUNCES = 30.0
+# Starts of an impact problem with restitution, which has no solution where that contradicts friction.
+BOUNCE_STARTS = 40
+# What begins to touch is brought this close to its surface [m].
+FOOT_TOLERANCE = 1e-13
+# Of a solution of the cones: residual by the largest entry, and what of the largest force is none.
+CONE_TOLERANCE, FORCE_TOLERANCE = 1e-9, 1e-9
+# Where nothing is faster, or accelerated by more, residuals are not compared with it: behind closed brakes a point has
+# motions of 1e-30, and no force upon it is better than none [m/s, m/s²].
+IMMOBILE = 1e-3
+
+
+@internal_kernel
+def slip_speed(ws: Workspace, k):
+    """|v_t| of candidate k [m/s]."""
+    state = ws.contacts
+    x, y, z = state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2]
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@internal_kernel
+def evaluate(system: System, ws: Workspace, run: Run):
+    """The right-hand side at the present state, with the present modes, and how its rows are off."""
+    derivative(system, run.clock[ki.TIME], run.y, ws, run.stage[0])
+    run.count[ki.EVALUATIONS] += 1
+    row_errors(ws)
+
+
+@internal_kernel
+def find_touching(unilateral: UnilateralArrays, ws: Workspace, touch):
+    """Note what touches and does not leave; True when some of it approaches."""
+    state, mode, table, stop = ws.contacts, unilateral.mode, unilateral.stop_table, unilateral.stop
+    strikes = False
+    for k in range(mode.shape[0]):
+        limit = STRIKE * kp.RATE_TOLERANCE * (1.0 + slip_speed(ws, k))
+        closed = ws.active[k, ka.MODE] != ka.OPEN
+        near = closed or (state[k, ka.GAP] <= touch and state[k, ka.GAP_RATE] <= limit)
+        mode[k, ku.TOUCHING] = 1 if near else 0
+        if near and state[k, ka.GAP_RATE] < -limit:
+            mode[k, ku.STRUCK] = 1
+        # What lands ever so slowly is stopped too: nothing else would, should it stay open.
+        strikes = strikes or (near and state[k, ka.GAP_RATE] < (-limit if closed else 0.0))
+    for k in range(table.shape[0]):
+        rate = stop[k, ku.SIDE] * ws.joints[table[k, ku.STOP_JOINT], ka.QD]
+        limit = STRIKE * kp.RATE_TOLERANCE
+        near = table[k, ku.STOP_CLOSED] == 1 or (stop_gap(unilateral, ws, k) <= touch and rate <= limit)
+        table[k, ku.STOP_CLOSED] = 1 if near else 0
+        strikes = strikes or (near and rate < -limit)
+    return strikes
+
+
+@internal_kernel
+def keep_touching(unilateral: UnilateralArrays, ws: Workspace):
+    """After an impact: what leaves faster than SETTLE touches no more."""
+    state, mode, table, stop = ws.contacts, unilateral.mode, unilateral.stop_table, unilateral.stop
+    for k in range(mode.shape[0]):
+        if state[k, ka.GAP_RATE] > unilateral.tally[k, ku.SETTLE]:
+            mode[k, ku.TOUCHING] = 0
+    for k in range(table.shape[0]):
+        if stop[k, ku.SIDE] * ws.joints[table[k, ku.STOP_JOINT], ka.QD] > STRIKE * kp.RATE_TOLERANCE:
+            table[k, ku.STOP_CLOSED] = 0
+
+
+@internal_kernel
+def come_down(system: System, ws: Workspace, run: Run):
+    """Bring what touches onto its surface, to rounding, before it is held where it is.
+
+    A point lands a little below its surface. Where rows depend on each other, as those of a point on a body with one
+    degree of freedom, there might be no state at which its normal row and the tangential ones of a foot found above it
+    all vanish. What is about to bounce is not held: lifted at each bounce, it would go on for ever.
+    """
+    unilateral = system.unilateral
+    mode = unilateral.mode
+    for k in range(mode.shape[0]):
+        fast = mode[k, ku.STRUCK] == 1 and ws.contacts[k, ka.GAP_RATE] < -unilateral.tally[k, ku.SETTLE]
+        bounces = fast and mode[k, ku.BEFORE] == ka.OPEN and unilateral.law[k, ku.RESTITUTION] > 0.0
+        held = mode[k, ku.TOUCHING] == 1 and not bounces
+        mode[k, ku.WANTED] = (
+            ka.OPEN if not held else ka.STICKING if ws.active[k, ka.MODE] == ka.STICKING else ka.SLIDING
+        )
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
+    for _ in range(kp.PROJECTION_LIMIT):
+        evaluate(system, ws, run)
+        worst = 0.0
+        for r in range(ws.counts[ka.ROWS]):
+            worst = max(worst, abs(ws.rows[r, ka.ROW_GAP]))
+        if worst <= FOOT_TOLERANCE:
+            return
+        project_level(system, ws, run.y, 0)
+
+
+@internal_kernel
+def gather(system: System, ws: Workspace, run: Run):
+    """Rows along normal and tangents of everything that touches, and their system, into the workspace.
+
+    Kinds and table rows of the rows into ``unilateral.place``; returns how many there are.
+    """
+    unilateral = system.unilateral
+    mode, place = unilateral.mode, unilateral.place
+    come_down(system, ws, run)
+    for k in range(mode.shape[0]):
+        mode[k, ku.WANTED] = ka.STICKING if mode[k, ku.TOUCHING] == 1 else ka.OPEN
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
+    evaluate(system, ws, run)
+    couplings, p = system.couplings.joint.shape[0], ws.counts[ka.ROWS]
+    for r in range(p):
+        place[ku.KINDS, r] = kc.BOTH_WAYS if r < couplings else kc.ONE_WAY
+    for k in range(mode.shape[0]):
+        if mode[k, ku.WANTED] == ka.STICKING:
+            r = ws.active[k, ka.FIRST_ROW]
+            place[ku.KINDS, r], place[ku.KINDS, r + 1], place[ku.KINDS, r + 2] = kc.CONE, kc.TANGENT, kc.TANGENT
+    return p
+
+
+@internal_kernel
+def solve_problem(unilateral: UnilateralArrays, W, size, largest, starts):
+    """Solve the contact problem of ``unilateral.vector`` and W, (size, size), into SOLUTION; False when that fails.
+
+    Parameters
+    ----------
+    largest : of the rates or accelerations that it is to bring to zero
+    starts : of Newton's method, before a problem that may well have no solution is given up; 0: as many as it takes
+    """
+    vector, room, kind = unilateral.vector, unilateral.room[ku.SCRATCH :], unilateral.place[ku.KINDS]
+    b, mu, f, good = vector[ku.OFFSET], vector[ku.CONE_FRICTION], vector[ku.SOLUTION], 1e-2 * CONE_TOLERANCE
+    good *= max(largest, IMMOBILE)
+    if starts > 0:
+        residual = approach(W, b, kind, mu, size, f, room, good, starts)
+    else:
+        residual = solve_cones(W, b, kind, mu, size, f, room, good)
+    return 0.0 <= residual <= CONE_TOLERANCE * (1.0 + largest)
+
+
+@internal_kernel
+def impulses(system: System, ws: Workspace, p, largest, share):
+    """Solve for the impulses of :func:`impact` with so much of the restitutions; the loss of each row into FORCE [J].
+
+    False when there is no solution, or one that would create energy.
+    """
+    unilateral, rows = system.unilateral, ws.rows
+    vector, mode = unilateral.vector, unilateral.mode
+    for r in range(p):
+        vector[ku.OFFSET, r], vector[ku.SOLUTION, r] = rows[r, ka.ROW_RATE], 0.0
+    for k in range(mode.shape[0]):
+        if mode[k, ku.TOUCHING] == 1:
+            r = ws.active[k, ka.FIRST_ROW]
+            vector[ku.CONE_FRICTION, r] = system.contacts.point[k, ka.MU]
+            # What was closed had no speed to turn round: a brake or another impact has just given it this one.
+            falls = mode[k, ku.STRUCK] == 1 and mode[k, ku.BEFORE] == ka.OPEN
+            if falls and -rows[r, ka.ROW_RATE] > unilateral.tally[k, ku.SETTLE]:
+                vector[ku.OFFSET, r] *= 1.0 + share * unilateral.law[k, ku.RESTITUTION]
+    if not solve_problem(unilateral, ws.small[0], p, largest, BOUNCE_STARTS if share > 0.0 else 0):
+        return False
+    f, total, turnover = vector[ku.SOLUTION], 0.0, 0.0
+    for r in range(p):
+        after = rows[r, ka.ROW_RATE]
+        for s in range(p):
+            after += ws.small[0, r, s] * f[s]
+        # FORCE is free until the next evaluation.
+        rows[r, ka.FORCE] = -0.5 * f[r] * (rows[r, ka.ROW_RATE] + after)
+        total += rows[r, ka.FORCE]
+        turnover += abs(rows[r, ka.FORCE])
+    return total >= -CONE_TOLERANCE * turnover or share == 0.0
+
+
+@internal_kernel
+def impact(system: System, ws: Workspace, run: Run):
+    """Impulses that stop what approaches: u = W P + b with b = J v and, of normals that strike, (1 + e) n·v.
+
+    Then v += M⁻¹ Jᵀ P, and the energy −½ P·(J v₋ + J v₊) is booked as impact loss.
+    """
+    unilateral, y, layout = system.unilateral, run.y, system.layout
+    vector, mode, rows, column = unilateral.vector, unilateral.mode, ws.rows, ws.column
+    p = gather(system, ws, run)
+    largest = 0.0
+    for r in range(p):
+        largest = max(largest, abs(rows[r, ka.ROW_RATE]))
+    # Newton's restitution may contradict friction: a point that is wedged cannot leave, and some would gain energy.
+    # Those impacts are without restitution, which always has a solution, and a loss. So are those of points that throw
+    # each other back and forth at one instant: what accumulates ends in contact.
+    bouncing = unilateral.number[ku.CHANGES] <= MOST_BOUNCES and impulses(system, ws, p, largest, 1.0)
+    if not bouncing and not impulses(system, ws, p, largest, 0.0):
+        run.count[ki.STATUS], run.clock[ki.NOT_UNIQUE] = ki.NO_CONTACT_FORCES, run.clock[ki.TIME]
+        return
+    f = vector[ku.SOLUTION]
+    for i in range(ws.joints.shape[0]):
+        column[i, 0] = 0.0
+        for r in range(p):
+            column[i, 0] += f[r] * column[i, 1 + 2 * r]
+    accelerate(system.model, ws)
+    for i in range(ws.joints.shape[0]):
+        y[layout.v + i] += ws.joints[i, ka.QDD]
+    for k in range(mode.shape[0]):
+        if mode[k, ku.TOUCHING] == 1:
+            r = ws.active[k, ka.FIRST_ROW]
+            loss = rows[r, ka.FORCE] + rows[r + 1, ka.FORCE] + rows[r + 2, ka.FORCE]
+            unilateral.tally[k, ku.LOSS] += loss
+            y[layout.loss + kst.IMPACT_LOSS] += loss
+            y[layout.contact + kst.CONTACT_SIZE * k + kst.IMPULSE] += f[r]
+    r = system.couplings.joint.shape[0]
+    for k in range(unilateral.stop_table.shape[0]):
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
+            unilateral.stop[k, ku.STOP_LOSS] += rows[r, ka.FORCE]
+            y[layout.loss + kst.JOINT_STOP_LOSS] += rows[r, ka.FORCE]
+            r += 1

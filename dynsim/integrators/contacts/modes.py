@@ -1,0 +1,298 @@
+"""Which candidates are open, slide or stick: impacts, and the complementarity problem of the accelerations.
+
+At a start, a landing and the end of slip, forces may jump and all that touches is looked at anew. First what
+approaches is stopped by impulses (Moreau's law with Newton's restitution and Coulomb's cone on impulses); then
+
+    0 ≤ f_n ⟂ n·r̈ ≥ 0,   |f_t| ≤ μ_s f_n, and f_t = −μ_s f_n a_t/|a_t| where a_t ≠ 0
+
+is solved for what is at rest along its surface, with one unknown, f_n (n − μ t), for each point that slides already.
+The solution says which points leave, which stick, and where slip begins, in which direction.
+
+Long because: impacts and the choice of modes share the rows, the system and the scratch of one gathered problem.
+"""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.dynamics import state as kst
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.cone import problem as kc
+from dynsim.dynamics.contact.rows import set_modes
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, slide_direction
+from dynsim.dynamics.derivative import System
+from dynsim.dynamics.tables import Workspace
+from dynsim.integrators import run as ki
+from dynsim.integrators.contacts.impacts import (
+    FORCE_TOLERANCE,
+    evaluate,
+    find_touching,
+    gather,
+    impact,
+    keep_touching,
+    slip_speed,
+    solve_problem,
+)
+from dynsim.integrators.project import project_level
+from dynsim.integrators.run import Run
+from dynsim.jit.kernel import internal_kernel
+
+# An acceleration along the surface below this fraction of the largest right-hand side is none.
+SLIP_TOLERANCE = 1e-8
+# A friction force this close to the cone, as a fraction, is on it.
+ON_CONE = 1e-7
+
+
+@internal_kernel
+def resolve(system: System, ws: Workspace, run: Run, touch):
+    """Stop what strikes, and choose the modes of everything that touches: closed, or no further than ``touch`` [m] off.
+
+    ``unilateral.mode`` has the modes BEFORE, and what was STRUCK. Sets STATUS where there is no solution.
+    """
+    unilateral = system.unilateral
+    mode, table = unilateral.mode, unilateral.stop_table
+    evaluate(system, ws, run)
+    for k in range(mode.shape[0]):
+        mode[k, ku.BEFORE], mode[k, ku.STRUCK] = ws.active[k, ka.MODE], 0
+    for k in range(table.shape[0]):
+        table[k, ku.STOP_BEFORE] = table[k, ku.STOP_CLOSED]
+    if find_touching(unilateral, ws, touch):
+        impact(system, ws, run)
+        if run.count[ki.STATUS] == ki.NO_CONTACT_FORCES:
+            return
+        evaluate(system, ws, run)
+        keep_touching(unilateral, ws)
+    choose(system, ws, run)
+
+
+@internal_kernel
+def choose(system: System, ws: Workspace, run: Run):
+    """Modes by the accelerations of all that touches; the rates of what is closed are brought to zero."""
+    unilateral = system.unilateral
+    mode = unilateral.mode
+    p = gather(system, ws, run)
+    largest = 0.0
+    for r in range(p):
+        largest = max(largest, abs(ws.rows[r, ka.RHS]))
+    for k in range(mode.shape[0]):
+        if mode[k, ku.TOUCHING] == 1:
+            mode[k, ku.WANTED] = ka.SLIDING if begins_sliding(system, ws, k) else ka.STICKING
+            mode[k, ku.GIVES_WAY] = 1 if mode[k, ku.GIVES_WAY] == 1 and drops(system, k) else 0
+            r, W = ws.active[k, ka.FIRST_ROW], ws.small[0]
+            unilateral.slide[k, ku.MOBILITY] = W[r + 1, r + 1] + W[r + 2, r + 2]
+    solved = False
+    # Where static friction gives way to a smaller kinetic one, the others' forces change.
+    for _ in range(1 + mode.shape[0]):
+        size = reduce_rows(system, ws, run, p)
+        if run.count[ki.STATUS] == ki.FORCES_REVERSED:
+            break
+        solved = solve_problem(unilateral, unilateral.room[ku.PROBLEM], size, largest, 0)
+        if not solved or not give_way(system, ws, size, largest):
+            break
+        solved = False
+    if not solved:
+        if run.count[ki.STATUS] != ki.FORCES_REVERSED:
+            run.count[ki.STATUS] = ki.NO_CONTACT_FORCES
+        run.clock[ki.NOT_UNIQUE] = run.clock[ki.TIME]
+        # Whoever looks for the cause finds the rows that contradict the law.
+        set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
+        evaluate(system, ws, run)
+        return
+    take_solution(system, ws, size, largest)
+    # What is left of rates after an impact that was let settle, and of points that were solved for as if at rest: those
+    # that begin to slip would else go against the direction that they are given, and stop, and begin again.
+    for k in range(mode.shape[0]):
+        starts = mode[k, ku.WANTED] == ka.SLIDING and unilateral.slide[k, ku.FROZEN] == 1.0
+        rests = starts and slip_speed(ws, k) <= 2.0 * unilateral.number[ku.SLOW]
+        mode[k, ku.TOUCHING] = ka.STICKING if rests else mode[k, ku.WANTED]
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.TOUCHING])
+    # What was split before says nothing of these modes.
+    unilateral.number[ku.REDUNDANT], unilateral.number[ku.SPLIT] = 0.0, 0.0
+    evaluate(system, ws, run)
+    loss = project_level(system, ws, run.y, 1)
+    run.y[system.layout.loss + kst.IMPACT_LOSS] += loss
+    evaluate(system, ws, run)
+    set_modes(system.contacts, system.couplings, unilateral, ws, mode[:, ku.WANTED])
+    before = ws.counts[ka.DEPENDENT]
+    evaluate(system, ws, run)
+    unilateral.number[ku.REDUNDANT] = 1.0 if ws.counts[ka.DEPENDENT] > before else 0.0
+    for k in range(mode.shape[0]):
+        mode[k, ku.GIVES_WAY] = 0
+        starts = mode[k, ku.WANTED] == ka.SLIDING and mode[k, ku.TOUCHING] == ka.STICKING
+        unilateral.slide[k, ku.HEADWAY] = max(0.0, -unilateral.slide[k, ku.SPEED]) if starts else 0.0
+
+
+@internal_kernel
+def begins_sliding(system: System, ws: Workspace, k):
+    """True for a candidate that slides already, or has no friction to stick with; sets its direction."""
+    unilateral = system.unilateral
+    # An impact may have turned it.
+    if slip_on(unilateral, ws, k, 2.0 * unilateral.number[ku.SLOW]):
+        return True
+    if unilateral.law[k, ku.STATIC] == 0.0:
+        unilateral.slide[k, ku.FROZEN] = 0.0
+        return True
+    return False
+
+
+@internal_kernel
+def slip_on(unilateral: UnilateralArrays, ws: Workspace, k, least):
+    """Let candidate k slide along its own slip, v_t/|v_t|, where that is faster than ``least`` [m/s]; True if it is."""
+    slide, speed = unilateral.slide, slip_speed(ws, k)
+    if speed > least:
+        slide[k, ku.FROZEN] = 0.0
+        for s in range(3):
+            slide[k, ku.REFERENCE + s] = ws.contacts[k, ka.SLIP_VELOCITY + s] / speed
+    return speed > least
+
+
+@internal_kernel
+def reduce_rows(system: System, ws: Workspace, run: Run, p):
+    """The problem of accelerations in ``unilateral``: a point that slides keeps its normal row alone; returns its size.
+
+    Column of such a row: W (n − μ t). One whose own force would accelerate it against itself sets STATUS (Painlevé).
+    """
+    unilateral, W = system.unilateral, ws.small[0]
+    place, vector, mode, state = unilateral.place, unilateral.vector, unilateral.mode, ws.contacts
+    size, first = 0, p
+    for k in range(mode.shape[0] - 1, -1, -1):
+        if mode[k, ku.TOUCHING] == 1:
+            first = ws.active[k, ka.FIRST_ROW]
+    for r in range(first):
+        place[ku.KINDS, r] = kc.BOTH_WAYS if r < system.couplings.joint.shape[0] else kc.ONE_WAY
+        place[ku.TABLE_ROW, r], vector[ku.FIRST_PART, r], vector[ku.SECOND_PART, r] = r, 0.0, 0.0
+    size = first
+    for k in range(mode.shape[0]):
+        if mode[k, ku.TOUCHING] == 0:
+            continue
+        r = ws.active[k, ka.FIRST_ROW]
+        place[ku.TABLE_ROW, size], vector[ku.FIRST_PART, size], vector[ku.SECOND_PART, size] = r, 0.0, 0.0
+        if mode[k, ku.WANTED] == ka.SLIDING:
+            x, y, z = state[k, ka.SLIP_VELOCITY], state[k, ka.SLIP_VELOCITY + 1], state[k, ka.SLIP_VELOCITY + 2]
+            tx, ty, tz, mu = slide_direction(unilateral, system.contacts, k, x, y, z)
+            a, b = ka.FIRST_TANGENT, ka.SECOND_TANGENT
+            vector[ku.FIRST_PART, size] = -mu * (tx * state[k, a] + ty * state[k, a + 1] + tz * state[k, a + 2])
+            vector[ku.SECOND_PART, size] = -mu * (tx * state[k, b] + ty * state[k, b + 1] + tz * state[k, b + 2])
+            place[ku.KINDS, size] = kc.ONE_WAY
+            size += 1
+        else:
+            vector[ku.CONE_FRICTION, size] = friction_at_rest(system, k)
+            for s in range(3):
+                place[ku.KINDS, size] = kc.CONE if s == 0 else kc.TANGENT
+                place[ku.TABLE_ROW, size], vector[ku.FIRST_PART, size], vector[ku.SECOND_PART, size] = r + s, 0.0, 0.0
+                size += 1
+    for i in range(size):
+        a = place[ku.TABLE_ROW, i]
+        vector[ku.OFFSET, i], vector[ku.SOLUTION, i] = -ws.rows[a, ka.RHS], 0.0
+        for j in range(size):
+            b = place[ku.TABLE_ROW, j]
+            value = W[a, b]
+            if vector[ku.FIRST_PART, j] != 0.0 or vector[ku.SECOND_PART, j] != 0.0:
+                value += vector[ku.FIRST_PART, j] * W[a, b + 1] + vector[ku.SECOND_PART, j] * W[a, b + 2]
+            unilateral.room[ku.PROBLEM, i, j] = value
+        if place[ku.KINDS, i] == kc.ONE_WAY and W[a, a] > 0.0 and unilateral.room[ku.PROBLEM, i, i] <= 1e-12 * W[a, a]:
+            run.count[ki.STATUS] = ki.FORCES_REVERSED
+    return size
+
+
+@internal_kernel
+def acceleration(unilateral: UnilateralArrays, i, size):
+    """Acceleration along row i of the reduced problem."""
+    total = unilateral.vector[ku.OFFSET, i]
+    for j in range(size):
+        total += unilateral.room[ku.PROBLEM, i, j] * unilateral.vector[ku.SOLUTION, j]
+    return total
+
+
+@internal_kernel
+def slips(system: System, i, size, largest, mu):
+    """True when the contact at row i of the reduced problem, on its cone, is accelerated along its surface."""
+    unilateral = system.unilateral
+    f = unilateral.vector[ku.SOLUTION]
+    friction = math.sqrt(f[i + 1] * f[i + 1] + f[i + 2] * f[i + 2])
+    if friction < mu * f[i] * (1.0 - ON_CONE):
+        return False
+    a, b = acceleration(unilateral, i + 1, size), acceleration(unilateral, i + 2, size)
+    return math.sqrt(a * a + b * b) > SLIP_TOLERANCE * largest
+
+
+@internal_kernel
+def begin_slip(system: System, ws: Workspace, k, fx, fy):
+    """Candidate k begins to slip against (fx, fy) along its two tangents: its friction force, or its acceleration."""
+    slide, state = system.unilateral.slide, ws.contacts
+    size = math.sqrt(fx * fx + fy * fy)
+    slide[k, ku.FROZEN] = 1.0
+    for s in range(3):
+        slide[k, ku.REFERENCE + s] = (
+            -(fx * state[k, ka.FIRST_TANGENT + s] + fy * state[k, ka.SECOND_TANGENT + s]) / size
+        )
+        slide[k, ku.NEXT + s] = slide[k, ku.REFERENCE + s]
+    slide[k, ku.NEXT_SPEED] = 0.0
+
+
+@internal_kernel
+def drops(system: System, k):
+    """True for a candidate whose friction falls from a static coefficient to a smaller kinetic one when it slips."""
+    law = system.unilateral.law
+    return law[k, ku.STRIBECK] == 0.0 and law[k, ku.STATIC] > system.contacts.point[k, ka.MU]
+
+
+@internal_kernel
+def friction_at_rest(system: System, k):
+    """Coefficient of the cone of candidate k, which is at rest along its surface."""
+    gives_way = system.unilateral.mode[k, ku.GIVES_WAY] == 1
+    return system.contacts.point[k, ka.MU] if gives_way else system.unilateral.law[k, ku.STATIC]
+
+
+@internal_kernel
+def give_way(system: System, ws: Workspace, size, largest):
+    """Give what slips over a static coefficient the smaller kinetic one; True if something does.
+
+    It stays a cone: the direction in which it begins to slip is not that of the larger force, unless its mobility is
+    the same in all directions.
+    """
+    unilateral = system.unilateral
+    place, mode, f = unilateral.place, unilateral.mode, unilateral.vector[ku.SOLUTION]
+    changed, i = False, 0
+    for k in range(mode.shape[0]):
+        if mode[k, ku.TOUCHING] == 0:
+            continue
+        while place[ku.TABLE_ROW, i] != ws.active[k, ka.FIRST_ROW]:
+            i += 1
+        holds = mode[k, ku.WANTED] == ka.STICKING and mode[k, ku.GIVES_WAY] == 0 and f[i] > 0.0
+        if holds and drops(system, k) and slips(system, i, size, largest, unilateral.law[k, ku.STATIC]):
+            mode[k, ku.GIVES_WAY] = 1
+            changed = True
+    return changed
+
+
+@internal_kernel
+def take_solution(system: System, ws: Workspace, size, largest):
+    """Modes from the forces of the reduced problem, into WANTED; stops that carry nothing open."""
+    unilateral = system.unilateral
+    place, mode, f = unilateral.place, unilateral.mode, unilateral.vector[ku.SOLUTION]
+    strongest = 0.0
+    for i in range(size):
+        strongest = max(strongest, abs(f[i]))
+    i = system.couplings.joint.shape[0]
+    for k in range(unilateral.stop_table.shape[0]):
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
+            unilateral.stop_table[k, ku.STOP_CLOSED] = 1 if f[i] > FORCE_TOLERANCE * strongest else 0
+            i += 1
+    for k in range(mode.shape[0]):
+        if mode[k, ku.TOUCHING] == 0:
+            mode[k, ku.WANTED] = ka.OPEN
+            continue
+        while place[ku.TABLE_ROW, i] != ws.active[k, ka.FIRST_ROW]:
+            i += 1
+        if not f[i] > FORCE_TOLERANCE * strongest:
+            # It touches without a force, maybe a little below its surface: only if it goes on does it land.
+            mode[k, ku.WANTED], unilateral.slide[k, ku.LANDS_AT] = ka.OPEN, ku.DEPTH
+        elif mode[k, ku.WANTED] == ka.STICKING and slips(system, i, size, largest, friction_at_rest(system, k)):
+            fx, fy = f[i + 1], f[i + 2]
+            if fx == 0.0 and fy == 0.0:
+                # Kinetic friction of zero: nothing holds it where static friction gives way.
+                fx, fy = -acceleration(unilateral, i + 1, size), -acceleration(unilateral, i + 2, size)
+            begin_slip(system, ws, k, fx, fy)
+            mode[k, ku.WANTED] = ka.SLIDING

@@ -1,0 +1,218 @@
+"""Dense output: the state anywhere within a step, and the samples of the record from it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba.core import types
+
+from dynsim.dynamics.contact.unilateral import UnilateralArrays
+from dynsim.dynamics.derivative import System
+from dynsim.dynamics.simd.system import FOUR
+from dynsim.dynamics.simd.tables import as_lanes, lane, tables_as_lanes
+from dynsim.dynamics.tables import Workspace
+from dynsim.dynamics.tree.joints import normalise
+from dynsim.integrators import run as ki
+from dynsim.integrators.output import fill_output, write_output
+from dynsim.integrators.project import off_surface, settle
+from dynsim.integrators.radau5 import newton as kn
+from dynsim.integrators.radau5.newton import NewtonArrays, StageLanes
+from dynsim.integrators.radau5.stages import evaluate_four
+from dynsim.integrators.run import Run
+from dynsim.integrators.tableaux import NODE_RADAU
+from dynsim.jit.compiler import form_of
+from dynsim.jit.kernel import internal_kernel, kernel, merged_kernel
+
+
+@internal_kernel
+def collocated(newton: NewtonArrays | None, j, whole):
+    """The two bends of entry j, of the cubic through y, the stages and y_new = y + ``whole``."""
+    if newton is None:  # known to the compiler
+        return 0.0, 0.0
+    c0, c1 = NODE_RADAU[0], NODE_RADAU[1]
+    first = (newton.z[0, j] / c0 - whole) / (1.0 - c0)
+    bend = ((newton.z[1, j] / c1 - whole) / (1.0 - c1) - first) / (c1 - c0)
+    return first - c0 * bend, bend
+
+
+@internal_kernel
+def fill_dense(run: Run):
+    """Coefficients of the dense output over the step from y to y_new, see ``Run.dense``."""
+    h, y, y_new, k, d = run.clock[ki.STEP], run.y, run.y_new, run.stage, run.dense
+    for j in range(y.shape[0]):
+        d[0, j] = y_new[j] - y[j]
+        d[3, j] = 0.0
+        if run.method == ki.TIME_STEPPING:
+            d[1, j], d[2, j] = 0.0, 0.0
+        elif run.method == ki.RADAU5:
+            d[1, j], d[2, j] = collocated(run.newton, j, d[0, j])
+        else:
+            d[1, j] = h * k[0, j] - d[0, j]
+            d[2, j] = d[0, j] - h * k[6, j] - d[1, j]
+            if run.method == ki.DOPRI5:
+                d[3, j] = h * (
+                    -12715105075.0 / 11282082432.0 * k[0, j]
+                    + 87487479700.0 / 32700410799.0 * k[2, j]
+                    - 10690763975.0 / 1880347072.0 * k[3, j]
+                    + 701980252875.0 / 199316789632.0 * k[4, j]
+                    - 1453857185.0 / 822651844.0 * k[5, j]
+                    + 69997945.0 / 29380423.0 * k[6, j]
+                )
+
+
+@internal_kernel
+def interpolate(run: Run, t, out):
+    """State at time t by ``Run.dense`` into out: (m,); of the rounding beyond the step's end nothing is made."""
+    d, x = run.dense, min((t - run.clock[ki.TIME]) / run.clock[ki.STEP], 1.0)
+    z = 1.0 - x
+    for j in range(out.shape[0]):
+        out[j] = run.y[j] + x * (d[0, j] + z * (d[1, j] + x * (d[2, j] + z * d[3, j])))
+
+
+@kernel
+def state_within(run: Run, t, out):
+    """State at a time within the step that is pending, by the dense output, into out: (m,)."""
+    fill_dense(run)
+    interpolate(run, t, out)
+
+
+@merged_kernel
+def sample_step(system: System, ws: Workspace, run: Run):
+    """Record every sample time within the step from TIME to TIME + STEP, from the dense output.
+
+    Samples are projected like steps are, so that recorded gaps hold the promised tolerance too.
+    """
+    t, h = run.clock[ki.TIME], run.clock[ki.STEP]
+    first = run.count[ki.SAMPLE] + waiting_samples(run.newton)
+    last = first
+    # A sample at END must not be lost to the rounding of t + h.
+    until = run.clock[ki.END] if t + h >= run.clock[ki.END] - 1e-12 * max(1.0, run.clock[ki.END]) else t + h
+    if last >= run.sample_time.shape[0] or run.sample_time[last] > until:
+        return
+    fill_dense(run)
+    while last < run.sample_time.shape[0] and run.sample_time[last] <= until:
+        interpolate(run, run.sample_time[last], run.sample[last])
+        if system.layout.extra > 0:
+            normalise(system.model.compound, system.model, run.sample[last], system.layout.q)
+        last += 1
+    write_samples(run.newton, system, ws, run, last - first)
+
+
+@internal_kernel
+def write_sample(system: System, ws: Workspace, run: Run):
+    """Project the next sample and record it, whose state is there."""
+    s = run.count[ki.SAMPLE]
+    settle(system, run.sample_time[s], run.sample[s], ws, run.stage[7], run)
+    write_output(system, ws, run, s)
+    run.count[ki.SAMPLE] = s + 1
+
+
+@internal_kernel
+def write_samples(newton: NewtonArrays | None, system: System, ws: Workspace, run: Run, more):
+    """Record so many ``more`` samples, whose states are there; on lanes up to three of them wait for the next ones."""
+    for _ in range(more):
+        write_sample(system, ws, run)
+
+
+@internal_kernel
+def write_waiting(newton: NewtonArrays | None, system: System, ws: Workspace, run: Run):
+    """Record the samples that wait for others: something else than a step comes next."""
+
+
+@internal_kernel
+def waiting_samples(newton: NewtonArrays | None):
+    """Samples whose states are there and that are not recorded yet."""
+    if newton is None:  # known to the compiler
+        return 0
+    return newton.count[kn.WAITING]
+
+
+def samples_on_lanes(newton: Any, system: Any, ws: Any, run: Any, *_: Any) -> bool:
+    """Where there are lanes, by types; what the ground carries is computed one by one."""
+    lanes = newton != types.none and newton[newton.fields.index("lanes")] != types.none
+    return bool(lanes and run[run.fields.index("support")] == types.none)
+
+
+@internal_kernel
+def may_wait(unilateral: UnilateralArrays | None, run: Run):
+    """True where nothing but steps happens between two samples: modes, commands and loads go on as they are."""
+    if unilateral is None:  # known to the compiler
+        return run.event.shape[0] + run.tick.shape[0] + run.breaks.shape[0] == 0
+    return False
+
+
+@internal_kernel
+def has_stops(unilateral: UnilateralArrays | None):
+    """True where joints have stops, whose forces are kept for one state alone."""
+    if unilateral is None:  # known to the compiler
+        return False
+    return unilateral.stop.shape[0] > 0
+
+
+@form_of(write_samples, samples_on_lanes)
+def write_samples_on_lanes(newton, system, ws, run, more):
+    """Four at a time; those that cannot wait by fewer, and one is done sooner alone."""
+    newton.count[kn.WAITING] += more
+    wait, alone = may_wait(system.unilateral, run), has_stops(system.unilateral)
+    while newton.count[kn.WAITING] >= 4 or (newton.count[kn.WAITING] > 0 and not wait):
+        if alone or newton.count[kn.WAITING] == 1:
+            newton.count[kn.WAITING] -= 1
+            write_sample(system, ws, run)
+        else:
+            write_together(newton, system, ws, run)
+
+
+@form_of(write_waiting, samples_on_lanes)
+def write_waiting_on_lanes(newton, system, ws, run):
+    """As lanes, even one: how a sample is computed does not depend on where a caller has looked."""
+    if newton.count[kn.WAITING] > 0:
+        write_together(newton, system, ws, run)
+
+
+@internal_kernel
+def write_together(newton: NewtonArrays, system: System, ws: Workspace, run: Run):
+    """Record up to four samples that wait, as lanes."""
+    count = load_samples(newton, run, 0)
+    fill_lanes(newton.lanes, run, count)
+    evaluate_four(newton.lanes, system)
+    take_samples(newton, system, ws, run, 0, count)
+
+
+@internal_kernel
+def load_samples(newton: NewtonArrays, run: Run, begin):
+    """Samples that wait into the lanes from ``begin`` on; returns how many."""
+    lanes, first, count = newton.lanes, run.count[ki.SAMPLE], min(newton.count[kn.WAITING], 4 - begin)
+    for k in range(count):
+        lanes.t[begin + k] = run.sample_time[first + k]
+        for j in range(run.y.shape[0]):
+            lanes.y[j, begin + k] = run.sample[first + k, j]
+    return count
+
+
+@internal_kernel
+def fill_lanes(lanes: StageLanes, run: Run, begin):
+    """The first lane into those from ``begin`` on, for which there is nothing else."""
+    for k in range(begin, 4):
+        lanes.t[k] = lanes.t[0]
+        for j in range(run.y.shape[0]):
+            lanes.y[j, k] = lanes.y[j, 0]
+
+
+@internal_kernel
+def take_samples(newton: NewtonArrays, system: System, ws: Workspace, run: Run, begin, count):
+    """Record so many samples from the lanes, from ``begin`` on; what has left its surfaces is projected, alone."""
+    if count == 0:
+        return
+    lanes = newton.lanes
+    tables = tables_as_lanes(lanes.ws, FOUR)
+    fill_output(system, tables, run, as_lanes(lanes.output, FOUR))
+    run.count[ki.EVALUATIONS] += count
+    newton.count[kn.WAITING] -= count
+    for k in range(begin, begin + count):
+        if off_surface(lane(tables, k)):
+            write_sample(system, ws, run)
+        else:
+            row = run.output[run.count[ki.SAMPLE]]
+            for j in range(lanes.output.shape[0]):
+                row[j] = lanes.output[j, k]
+            run.count[ki.SAMPLE] += 1

@@ -1,0 +1,238 @@
+"""Time integration of the coupled system: one step per call of a method, error control, projection, sampling.
+
+Methods, all with dense output (so that records do not force steps):
+
+- ``RK43``: the classical method of order 4 with an embedded order 3, adaptive, four evaluations a step; cubic Hermite
+  dense output. The first choice: the motors of an arm hold the step at the stability limit (rates of −450 ± 1900i 1/s
+  in the published one), whatever the tolerance, and there the fewest evaluations per second win;
+- ``DOPRI5``: Dormand–Prince 5(4), adaptive, six evaluations a step; dense output of order 4 (Hairer, Nørsett, Wanner:
+  Solving Ordinary Differential Equations I, II.5–II.6). Better where accuracy sets the step;
+- ``RK4``: the classical method at a fixed step; cubic Hermite dense output;
+- ``RADAU5``: implicit, three stages of order 5 (order 3 in themselves), error estimate of order 3, adaptive: steps as
+  long as accuracy allows, however fast the motors are, see ``radau``; dense output of order 3;
+- ``TIME_STEPPING``: contacts that open and close within fixed steps, see ``time_stepping``; linear between their ends.
+
+After each accepted step q and v are projected onto the active rows when they have left them by more than
+``GAP_TOLERANCE`` or ``RATE_TOLERANCE``.
+"""
+
+from __future__ import annotations
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact.unilateral import UnilateralArrays
+from dynsim.dynamics.derivative import System
+from dynsim.dynamics.drive.law import take_commands
+from dynsim.dynamics.tables import Workspace
+from dynsim.dynamics.tree.joints import normalise
+from dynsim.dynamics.tree.support import watch_support
+from dynsim.integrators import run as ki
+from dynsim.integrators.contacts.events import consistent, solve_modes, switch_contacts, take_directions, watch_modes
+from dynsim.integrators.contacts.slow_slip import longest_step
+from dynsim.integrators.dense import sample_step, write_waiting
+from dynsim.integrators.events import arm_events, cut_step, fire_events, take_ticks
+from dynsim.integrators.explicit import step_explicit
+from dynsim.integrators.project import settle
+from dynsim.integrators.radau5.ends import end_accepted
+from dynsim.integrators.radau5.newton import forget
+from dynsim.integrators.radau5.step import after_step, step_radau5
+from dynsim.integrators.run import Run
+from dynsim.integrators.stepping.step import advance_moreau
+from dynsim.integrators.steps import choose_step, finished, finite, first_step, next_step, rejected, stalled
+from dynsim.integrators.watch import forces_unique, watch
+from dynsim.jit.kernel import apart_kernel, free_kernel, internal_kernel, merged_kernel
+
+
+@internal_kernel
+def start(system: System, ws: Workspace, run: Run):
+    """First derivative, on the contacts, and a first step size where none is given. Sets STATUS when there is none."""
+    if not start_contacts(system.unilateral, system, ws, run):
+        run.count[ki.STATUS] = ki.NOT_PROJECTED if run.count[ki.STATUS] == ki.RUNNING else run.count[ki.STATUS]
+    elif not finite(run.stage[0]):
+        run.count[ki.STATUS] = ki.NO_FORCES if ws.counts[ka.CONTRADICTORY] > 0 else ki.NOT_FINITE
+    elif forces_unique(system, ws, run, run.clock[ki.TIME]):
+        watch(ws, run, 0.0)
+        if run.clock[ki.STEP] <= 0.0:
+            first_step(system, ws, run)
+    forget(run.newton, run.count[ki.STEPS])
+    run.count[ki.STARTED] = 1
+
+
+@internal_kernel
+def start_contacts(unilateral: UnilateralArrays | None, system: System, ws: Workspace, run: Run):
+    """Derivative at the start of a step, on the constraints; under the unilateral law with modes that agree with it."""
+    if unilateral is None:  # known to the compiler, as it is below: system.unilateral would not be
+        return settle(system, run.clock[ki.TIME], run.y, ws, run.stage[0], run)
+    due, first = run.count[ki.MODES_DUE] > 0, run.count[ki.MODES_DUE] == ki.AT_START
+    if due:
+        run.count[ki.MODES_DUE] = 0
+        solve_modes(system, ws, run, first)
+    if run.count[ki.STATUS] != ki.RUNNING or not settle(system, run.clock[ki.TIME], run.y, ws, run.stage[0], run):
+        return False
+    if consistent(system, ws):
+        return True
+    solve_modes(system, ws, run, first)
+    return run.count[ki.STATUS] == ki.RUNNING and settle(system, run.clock[ki.TIME], run.y, ws, run.stage[0], run)
+
+
+@merged_kernel
+def accept(system: System, ws: Workspace, run: Run):
+    """Project y_new, record, and make it the new y. Sets STATUS when contacts cannot be met or forces not be known."""
+    t, h = run.clock[ki.TIME], run.clock[ki.STEP]
+    if not end_accepted(run.newton, system, ws, run):
+        return
+    watch_modes(system.unilateral, ws, h, run.gaps)
+    # The event of tipping has asked for the ground's reaction at the end of this step.
+    if run.event.shape[0] > 0:
+        watch_support(run.support)
+    if system.layout.extra > 0:
+        normalise(system.model.compound, system.model, run.y_new, system.layout.q)
+    sample_step(system, ws, run)
+    take_directions(system.unilateral, ws, run)
+    for j in range(run.y.shape[0]):
+        run.y[j] = run.y_new[j]
+        run.stage[0, j] = run.stage[6, j]
+    run.clock[ki.TIME] = t + h
+    run.count[ki.STEPS] += 1
+
+
+@merged_kernel
+def take_step(system: System, ws: Workspace, run: Run, error):
+    """What becomes of a step that has been taken: True when it is accepted by error control, events and HOLD."""
+    clock, count = run.clock, run.count
+    if run.event.shape[0] > 0 and cut_step(system, ws, run):
+        return False
+    clock[ki.ERROR] = error
+    if clock[ki.TIME] + clock[ki.STEP] > clock[ki.HOLD]:
+        count[ki.PENDING] = 1
+        return False
+    return True
+
+
+@internal_kernel
+def propose(system: System, ws: Workspace, run: Run):
+    """The step to try next; while a root is searched it is given."""
+    if run.count[ki.SEARCHING] == 0:
+        # What was passed over shortens one step of RK4, not all that follow: nothing would make them long again.
+        if run.method != ki.RK4 or run.count[ki.GRAZING] == 0:
+            run.clock[ki.PROPOSED] = run.clock[ki.STEP]
+        if run.method == ki.RK4:
+            run.clock[ki.STEP] = min(run.clock[ki.STEP], longest_step(system.unilateral, ws))
+        choose_step(run)
+
+
+@internal_kernel
+def go_on(run: Run, order, beta):
+    """The step size after an accepted step."""
+    clock, count = run.clock, run.count
+    if run.method == ki.RK4 or count[ki.FIRED] == 1:
+        clock[ki.STEP] = clock[ki.PROPOSED]
+    else:
+        next_step(run, clock[ki.ERROR], order, beta)
+        # A step that was cut short says nothing against the one proposed before.
+        if count[ki.TRIMMED] == 1:
+            clock[ki.STEP] = max(clock[ki.STEP], clock[ki.PROPOSED])
+
+
+@internal_kernel
+def ready(system: System, ws: Workspace, run: Run):
+    """Start or restart where that is due, and do what is due at this time; False when the caller is to look."""
+    count = run.count
+    due = take_ticks(run)
+    if due & ki.TAKE_COMMANDS:
+        settle(system, run.clock[ki.TIME], run.y, ws, run.stage[0], run)
+        take_commands(system.drives, system.reference, run.clock[ki.TIME], ws)
+        count[ki.STARTED] = 0
+    if count[ki.STARTED] == 0:
+        start(system, ws, run)
+        arm_events(system, ws, run)
+    count[ki.TICKED] = due & ~ki.TAKE_COMMANDS
+    return count[ki.TICKED] == 0
+
+
+@merged_kernel
+def waiting(system: System, ws: Workspace, run: Run):
+    """True when a step can be taken; False when the caller is to look first."""
+    # Most runs have nothing to do between two steps.
+    idle = run.count[ki.STARTED] == 1 and run.tick.shape[0] + run.breaks.shape[0] == 0
+    return idle or ready(system, ws, run)
+
+
+@merged_kernel
+def conclude(system: System, ws: Workspace, run: Run, error, order):
+    """Accept or refuse the step just taken, or that was kept back; True when the caller is to look."""
+    count = run.count
+    if count[ki.PENDING] == 0:
+        if rejected(ws, run, error, order):
+            count[ki.SEARCHING] = 0
+            return False
+        if not take_step(system, ws, run, error):
+            return count[ki.PENDING] == 1
+    count[ki.PENDING] = 0
+    accept(system, ws, run)
+    go_on(run, order, 0.04)
+    if count[ki.FIRED] == 1 and count[ki.STATUS] == ki.RUNNING:
+        switch_contacts(system.unilateral, system, ws, run)
+    return run.event.shape[0] > 0 and fire_events(run)
+
+
+@free_kernel
+def advance_explicit(system: System, ws: Workspace, run: Run, limit):
+    """:func:`advance` of the explicit methods."""
+    order = 5.0 if run.method == ki.DOPRI5 else 4.0
+    taken, error = 0, 0.0
+    if limit < 0:
+        return
+    while waiting(system, ws, run):
+        if taken >= limit or finished(run) or stalled(run):
+            return
+        taken += 1
+        if run.count[ki.PENDING] == 0:
+            propose(system, ws, run)
+            error = step_explicit(system, ws, run)
+        if conclude(system, ws, run, error, order):
+            return
+
+
+@apart_kernel
+def conclude_apart(system: System, ws: Workspace, run: Run, error, order):
+    """:func:`conclude`, compiled apart: what a step of RADAU5 calls takes long, and functions as small as this compile
+    in less than half the time of one that has them all."""
+    return conclude(system, ws, run, error, order)
+
+
+@free_kernel
+def advance_radau5(system: System, ws: Workspace, run: Run, limit):
+    """:func:`advance` of RADAU5. Samples wait on, with three others at most, where only ``limit`` has ended it: which
+    ones are computed together must not depend on how fast the machine is."""
+    taken, error = 0, 0.0
+    if limit < 0:
+        return
+    while waiting(system, ws, run) and not finished(run):
+        if taken >= limit:
+            return
+        if stalled(run):
+            break
+        taken += 1
+        if run.count[ki.PENDING] == 0:
+            propose(system, ws, run)
+            error = step_radau5(system, ws, run)
+        steps, h = run.count[ki.STEPS], run.clock[ki.STEP]
+        done = conclude_apart(system, ws, run, error, 4.0)
+        if run.count[ki.STEPS] > steps:
+            after_step(run, h)
+        if done:
+            break
+    write_waiting(run.newton, system, ws, run)
+
+
+def advance(system: System, ws: Workspace, run: Run, limit: int) -> None:
+    """Take up to ``limit`` steps towards END; run.count[STATUS] says how it ended. Fewer than 0: only be loaded.
+
+    Returns before that when an event or a tick wants the caller to look (LOGGED, TICKED), when the next step would end
+    beyond HOLD: it is kept, PENDING, and accepted by the next call unless the caller drops it; and when another thread
+    has set ASKED.
+
+    Three compiled functions behind one name, so that each is only compiled when it is used.
+    """
+    methods = {ki.RADAU5: advance_radau5, ki.TIME_STEPPING: advance_moreau}
+    methods.get(run.method, advance_explicit)(system, ws, run, limit)

@@ -1,0 +1,219 @@
+"""Events: a step is cut where a guard passes zero, and the next one starts there. Ticks: steps end at given times.
+
+The event table has a guard for each event, its value at the last accepted step and the side of zero it was on. After a
+step that error control has accepted the guards are evaluated from what the right-hand side has left in the workspace;
+where one has passed zero the step is repeated, shorter, until it ends within ``event_tolerance`` beyond the root. The
+root is that of the method's own solution, of its full order; that of the dense output, of lower order, would have to be
+followed by such a step anyway.
+"""
+
+from __future__ import annotations
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.derivative import System
+from dynsim.dynamics.tables import Workspace
+from dynsim.dynamics.tree.points import point_position
+from dynsim.dynamics.tree.support import tip_margin
+from dynsim.integrators import run as ki
+from dynsim.integrators.contacts import events as kev
+from dynsim.integrators.contacts.events import contact_guard, note_gaps, too_long
+from dynsim.integrators.run import Run
+from dynsim.jit.kernel import internal_kernel
+
+# Kinds of guards. A new one is a number here, a branch in ``guard`` and a name in GUARDS of dynsim.engine.stepped.
+# Those of the unilateral law, from NORMAL_GUARD on, are in dynsim.integrators.contacts.events.
+JOINT_POSITION, JOINT_RATE, MOTOR_CURRENT, MOTOR_VOLTAGE, CONTACT_FORCE, CONTACT_GAP = 0, 1, 2, 3, 4, 5
+HAND_X, HAND_Y, HAND_Z = 6, 7, 8
+TIP_MARGIN = 9
+
+# Steps that a root may take; regula falsi with halving (Illinois) needs about eight. Guards that jump, as forces do
+# where another split of them begins, are bisected in the end. Once there were too many the next one is the last.
+SEARCH_LIMIT, FALSI_LIMIT = 60, 16
+
+
+@internal_kernel
+def guard(system: System, t, ws: Workspace, run: Run, e):
+    """Value of event e, zero where it happens, right after ``derivative`` at time t."""
+    kind, k, value = run.event_table[e, ki.EVENT_KIND], run.event_table[e, ki.EVENT_INDEX], 0.0
+    if kind == JOINT_POSITION:
+        value = ws.joints[k, ka.Q]
+    elif kind == JOINT_RATE:
+        value = ws.joints[k, ka.QD]
+    elif kind == MOTOR_CURRENT:
+        value = ws.motors[k, ka.CURRENT]
+    elif kind == MOTOR_VOLTAGE:
+        value = ws.motors[k, ka.VOLTAGE]
+    elif kind == CONTACT_FORCE:
+        value = ws.contacts[k, ka.NORMAL_FORCE]
+    elif kind == CONTACT_GAP:
+        value = ws.contacts[k, ka.GAP]
+    elif kind == TIP_MARGIN:
+        value = tip_margin(system.model, system.loads, t, ws, run.support)
+    elif kind >= kev.NORMAL_GUARD:
+        value = contact_guard(system.unilateral, ws, kind, k)
+    else:
+        point_position(ws, run.hand_link, run.hand_point, run.hand)
+        value = run.hand[kind - HAND_X]
+    return value - run.event[e, ki.EVENT_LEVEL]
+
+
+@internal_kernel
+def arm_events(system: System, ws: Workspace, run: Run):
+    """Values and sides of all guards at the start of a step, right after ``derivative`` there.
+
+    An event that has just happened keeps the side it has gone to, whatever rounding says of its guard.
+    """
+    for e in range(run.event.shape[0]):
+        value = guard(system, run.clock[ki.TIME], ws, run, e)
+        run.event[e, ki.START_VALUE] = value
+        if run.event[e, ki.SIDE] == 0.0:
+            run.event[e, ki.SIDE] = 1.0 if value > 0.0 else (-1.0 if value < 0.0 else 0.0)
+    note_gaps(ws, run.gaps)
+
+
+@internal_kernel
+def happened(run: Run, e, value):
+    """True when the guard of event e has passed zero in its direction once it has this value."""
+    side, direction = run.event[e, ki.SIDE], run.event_table[e, ki.DIRECTION]
+    return side != 0.0 and value * side <= 0.0 and (direction == 0 or direction * side < 0.0)
+
+
+@internal_kernel
+def event_tolerance(t):
+    """Bracket of a root that is narrow enough [s]: some roundings of the time."""
+    return 1e-13 + 1e-15 * abs(t)
+
+
+@internal_kernel
+def cut_step(system: System, ws: Workspace, run: Run):
+    """True when the step just taken must be repeated because an event lies within it: STEP is then the next trial.
+
+    False leaves FIRED at 1 when the step ends at an event.
+    """
+    clock, count, event = run.clock, run.count, run.event
+    h, hit = clock[ki.STEP], False
+    for e in range(event.shape[0]):
+        event[e, ki.VALUE] = guard(system, clock[ki.TIME] + h, ws, run, e)
+        hit = happened(run, e, event[e, ki.VALUE]) or hit
+    if count[ki.SEARCHING] == 0:
+        if not hit:
+            return passes_over(system, ws, run)
+        clock[ki.LOW], clock[ki.HIGH], count[ki.TURNED_BACK] = 0.0, h, 0
+        for e in range(event.shape[0]):
+            event[e, ki.AT_LOW], event[e, ki.AT_HIGH] = event[e, ki.START_VALUE], event[e, ki.VALUE]
+    else:
+        side = 1 if hit else -1
+        repeated = count[ki.TURNED_BACK] == side
+        count[ki.TURNED_BACK] = side
+        if hit:
+            clock[ki.HIGH] = h
+        else:
+            clock[ki.LOW] = h
+        for e in range(event.shape[0]):
+            if hit:
+                event[e, ki.AT_HIGH] = event[e, ki.VALUE]
+                event[e, ki.AT_LOW] *= 0.5 if repeated else 1.0
+            else:
+                event[e, ki.AT_LOW] = event[e, ki.VALUE]
+                event[e, ki.AT_HIGH] *= 0.5 if repeated else 1.0
+    count[ki.SEARCHING] += 1
+    low, high = clock[ki.LOW], clock[ki.HIGH]
+    if high - low <= event_tolerance(clock[ki.TIME]) or count[ki.SEARCHING] > SEARCH_LIMIT:
+        # A step of RADAU5 taken again is not the same to the bit, since its Newton method goes by how the last one has
+        # contracted: at HIGH it may miss what had passed zero there, some times or for ever.
+        if h == high and (hit or count[ki.SEARCHING] > SEARCH_LIMIT):
+            if not hit:
+                keep_passed(run)
+            count[ki.SEARCHING], count[ki.FIRED] = 0, 1
+            return False
+        clock[ki.STEP] = high
+        return True
+    trial = high
+    for e in range(event.shape[0]):
+        a, b = event[e, ki.AT_LOW], event[e, ki.AT_HIGH]
+        if happened(run, e, b) and not happened(run, e, a):
+            trial = min(trial, low + (high - low) * a / (a - b))
+    if not low < trial < high or count[ki.SEARCHING] > FALSI_LIMIT:
+        trial = 0.5 * (low + high)
+    clock[ki.STEP] = trial
+    return True
+
+
+@internal_kernel
+def keep_passed(run: Run):
+    """Events that had passed zero at HIGH keep the value that they had there: whoever does as they say looks at it."""
+    for e in range(run.event.shape[0]):
+        if happened(run, e, run.event[e, ki.AT_HIGH]):
+            run.event[e, ki.VALUE] = run.event[e, ki.AT_HIGH]
+
+
+@internal_kernel
+def passes_over(system: System, ws: Workspace, run: Run):
+    """True when a contact has been passed over within the step: STEP is then the one to take instead."""
+    part = too_long(system.unilateral, ws, run.clock[ki.STEP], run.gaps)
+    # What is none, after all, does not shorten steps for ever, nor to nothing.
+    shorter = part * run.clock[ki.STEP] > event_tolerance(run.clock[ki.TIME])
+    if part < 1.0 and shorter and run.count[ki.GRAZING] < SEARCH_LIMIT:
+        run.count[ki.GRAZING] += 1
+        run.clock[ki.STEP] *= part
+        return True
+    run.count[ki.GRAZING] = 0
+    return False
+
+
+@internal_kernel
+def fire_events(run: Run):
+    """Log the events that the accepted step ends at, and do as they say; True when the caller is to look."""
+    count, event, look = run.count, run.event, False
+    for e in range(event.shape[0]):
+        if count[ki.FIRED] == 1 and happened(run, e, event[e, ki.VALUE]):
+            action = run.event_table[e, ki.ON_EVENT]
+            if count[ki.LOGGED] < run.log_time.shape[0]:
+                run.log_time[count[ki.LOGGED]] = run.clock[ki.TIME]
+                run.log_event[count[ki.LOGGED]] = e
+                count[ki.LOGGED] += 1
+            event[e, ki.SIDE] = -event[e, ki.SIDE]
+            if action == ki.STOP:
+                count[ki.STATUS] = ki.STOPPED
+            look = look or action == ki.RETURN
+        elif event[e, ki.VALUE] != 0.0:
+            event[e, ki.SIDE] = 1.0 if event[e, ki.VALUE] > 0.0 else -1.0
+        event[e, ki.START_VALUE] = event[e, ki.VALUE]
+    count[ki.FIRED] = 0
+    return look or count[ki.LOGGED] == run.log_time.shape[0]
+
+
+@internal_kernel
+def next_tick(run: Run, until):
+    """The earliest tick or break, or ``until`` when that comes first [s].
+
+    A step to a break ends some roundings before it, so that its last stage lies on the near side of a jump.
+    """
+    for k in range(run.tick.shape[0]):
+        until = min(until, run.tick[k, ki.TICK_NEXT])
+    k = run.count[ki.NEXT_BREAK]
+    if k < run.breaks.shape[0]:
+        until = min(until, run.breaks[k] - 1e-14 * max(1.0, abs(run.breaks[k])))
+    return until
+
+
+@internal_kernel
+def take_ticks(run: Run):
+    """Kinds of the ticks that are due, as a sum of their bits; moves them on and TIME exactly to where they are.
+
+    At a break the next step starts anew.
+    """
+    due, clock, tick, k = 0, run.clock, run.tick, run.count[ki.NEXT_BREAK]
+    while k < run.breaks.shape[0] and run.breaks[k] - clock[ki.TIME] <= 1e-12 * max(1.0, abs(clock[ki.TIME])):
+        clock[ki.TIME] = max(clock[ki.TIME], run.breaks[k])
+        run.count[ki.STARTED] = 0
+        k += 1
+    run.count[ki.NEXT_BREAK] = k
+    for k in range(tick.shape[0]):
+        if tick[k, ki.TICK_NEXT] - clock[ki.TIME] <= 1e-12 * max(1.0, abs(clock[ki.TIME])):
+            clock[ki.TIME] = tick[k, ki.TICK_NEXT]
+            run.tick_table[k, ki.TICK_COUNT] += 1
+            # Not a sum of periods, whose roundings would add up.
+            tick[k, ki.TICK_NEXT] = tick[k, ki.TICK_PHASE] + run.tick_table[k, ki.TICK_COUNT] * tick[k, ki.TICK_PERIOD]
+            due |= run.tick_table[k, ki.TICK_KIND]
+    return due

@@ -1,0 +1,76 @@
+"""What is recorded of a sample besides its state."""
+
+from __future__ import annotations
+
+from dynsim.dynamics import state as kst
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.rows import force_vectors
+from dynsim.dynamics.contact.unilateral import UnilateralArrays
+from dynsim.dynamics.derivative import System
+from dynsim.dynamics.ledger import kinetic_energy, magnetic_energy, potential_energy
+from dynsim.dynamics.tables import Workspace
+from dynsim.dynamics.tree import support as ks
+from dynsim.dynamics.tree.points import point_position
+from dynsim.dynamics.tree.support import SupportArrays, ground_reaction
+from dynsim.integrators.run import Run
+from dynsim.jit.kernel import internal_kernel
+
+
+@internal_kernel
+def write_output(system: System, ws: Workspace, run: Run, row):
+    """Everything worth recording that is not a state, after ``derivative``, into the columns of OutputLayout."""
+    fill_output(system, ws, run, run.output[row])
+    write_support(system, ws, run, row, run.support)
+
+
+@internal_kernel
+def fill_output(system: System, ws: Workspace, run: Run, out):
+    """The same but for what the ground carries, into out (columns.size,); also of lanes."""
+    joints, motors, motor, state, columns = ws.joints, ws.motors, system.drives.motor, ws.contacts, run.columns
+    force_vectors(ws)
+    for i in range(joints.shape[0]):
+        out[columns.vdot + i] = joints[i, ka.QDD]
+    for a in range(motors.shape[0]):
+        i = system.drives.table[a, ka.DRIVEN]
+        out[columns.current + a] = motors[a, ka.CURRENT]
+        out[columns.voltage + a] = motors[a, ka.VOLTAGE]
+        out[columns.torque + a] = (
+            motor[a, ka.K_M] * motors[a, ka.CURRENT]
+            - motor[a, ka.J_M] * joints[i, ka.QDD]
+            - motor[a, ka.D_M] * joints[i, ka.QD]
+            - motors[a, ka.DRAG]
+        )
+    point_position(ws, run.hand_link, run.hand_point, out[columns.hand : columns.hand + 3])
+    out[columns.energy] = kinetic_energy(system.model, ws)
+    out[columns.energy + 1] = potential_energy(system.model, ws)
+    out[columns.energy + 2] = magnetic_energy(system.drives, ws)
+    k = columns.contact
+    for c in range(state.shape[0]):
+        out[k + kst.OUT_FORCE] = state[c, ka.NORMAL_FORCE]
+        out[k + kst.OUT_GAP] = state[c, ka.GAP]
+        out[k + kst.OUT_MODE] = ws.active[c, ka.MODE]
+        for s in range(3):
+            out[k + kst.OUT_VECTOR + s] = state[c, ka.FORCE_VECTOR + s]
+            out[k + kst.OUT_SLIP + s] = state[c, ka.SLIP_VELOCITY + s]
+        k += kst.OUTPUTS_PER_CONTACT
+    stop_forces(system.unilateral, out[columns.stop :])
+
+
+@internal_kernel
+def stop_forces(unilateral: UnilateralArrays | None, out):
+    """Forces of the joint stops, (s,) or more."""
+    if unilateral is None:  # known to the compiler
+        return
+    for k in range(unilateral.stop.shape[0]):
+        out[k] = unilateral.stop[k, ku.STOP_FORCE]
+
+
+@internal_kernel
+def write_support(system: System, ws: Workspace, run: Run, row, support: SupportArrays | None):
+    """What the ground carries of a mobile base, into the columns ``support``."""
+    if support is None:  # known to the compiler
+        return
+    ground_reaction(system.model, system.loads, run.sample_time[row], ws, support)
+    for s in range(ks.OUTPUTS):
+        run.output[row, run.columns.support + s] = support.state[s]

@@ -1,0 +1,266 @@
+"""RADAU5, Radau IIA of order 5 with three stages: one step by simplified Newton, circuits and positions eliminated.
+
+Stages Z_i = h Σ a_ij f(t + c_j h, y + Z_j), and y_new = y + Z_3 (Hairer, Wanner: Solving Ordinary Differential
+Equations II, IV.8). With W = T⁻¹ Z the linear systems of Newton's method fall apart into a real one and a complex one
+of the size of the state, g I − J with g = γ/h or (α + iβ)/h, and these into ones of the size of the rates. Of
+
+    q̇ = N v,    v̇ = f(q, v, i),    di/dt = a q + b v + c i + …
+
+the first and the last rows are solved by hand, u_q = (r_q + N u_v)/g and u_i = (r_i + a u_q + b u_v)/(g − c), so
+
+    (g − ∂f/∂v − ∂f/∂θ/g − ∂f/∂i (a/g + b)/(g − c)) u_v = r_v + ∂f/∂θ N⁺ r_q/g + ∂f/∂i (r_i + a r_q/g)/(g − c),
+
+θ being displacements along the rates. The change of N along q is left out of the Jacobian, which costs Newton's method
+some contraction where a body tumbles, not accuracy. Jacobian and factors are kept for as long as it contracts.
+"""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.dynamics import state as kst
+from dynsim.dynamics.derivative import System, derivative
+from dynsim.dynamics.drive.law import drive_block
+from dynsim.dynamics.tables import Workspace
+from dynsim.integrators import run as ki
+from dynsim.integrators.radau5 import newton as kn
+from dynsim.integrators.radau5.ends import evaluate_end
+from dynsim.integrators.radau5.linear_systems import factor_both, solve_both
+from dynsim.integrators.radau5.stages import columns, evaluate_stages
+from dynsim.integrators.run import Run
+from dynsim.integrators.steps import error_norm
+from dynsim.integrators.tableaux import (
+    A_RADAU,
+    ALPHA_RADAU,
+    BETA_RADAU,
+    ERROR_RADAU,
+    GAMMA_RADAU,
+    NODE_RADAU,
+    T_INVERSE_RADAU,
+    T_RADAU,
+)
+from dynsim.jit.kernel import apart_kernel, internal_kernel
+
+# Newton's method: most iterations, and the contraction below which the Jacobian stays.
+MOST_ITERATIONS, GOOD_CONTRACTION = 8, 0.05
+# In steps shorter than this errors of rates and currents that are near zero count by what they do until its end [s].
+# Less where rtol is smaller than this: there all steps are short.
+SHORT, SLACK_RTOL = 0.005, 1e-6
+# What a step whose Newton's method diverges is said to be in error by: half of it is tried next.
+NO_STAGES = 10.5
+
+
+@apart_kernel
+def differentiate(system: System, ws: Workspace, run: Run):
+    """Finite differences of v̇ along the rates' displacements, the rates and the currents, at (TIME, y).
+
+    The stiff electrical rows are not taken from here but are the drives' own; v̇ is linear in the currents.
+    """
+    t, y, x, base, r = run.clock[ki.TIME], run.y, run.stage[6], run.stage[7], run.newton
+    # The workspace may still hold a sample or a rejected step.
+    derivative(system, t, y, ws, base)
+    for a in range(ws.motors.shape[0]):
+        drive_block(system.drives, ws, a, r.linear[a])
+    columns(r.lanes, system, ws, t, y, x, base, r)
+    run.count[ki.EVALUATIONS] += r.along.shape[0] + 1
+    r.count[kn.JACOBIANS] += 1
+    r.count[kn.STALE], r.count[kn.MADE_AT], r.clock[kn.FACTORED] = 0, run.count[ki.STEPS], 0.0
+    # Nothing is known of how Newton's method contracts with it.
+    r.clock[kn.CONTRACTION] = 0.0
+
+
+@internal_kernel
+def keep_stages(run: Run):
+    """The stages of the step accepted last, as a polynomial for the first guess of the next ones, and its error."""
+    r, c0, c1 = run.newton, NODE_RADAU[0], NODE_RADAU[1]
+    if r.count[kn.SEEN] == run.count[ki.STEPS]:
+        return
+    r.count[kn.SEEN], r.count[kn.EXTRAPOLATES], r.clock[kn.KEPT] = run.count[ki.STEPS], 1, r.clock[kn.TRIED]
+    for j in range(r.kept.shape[1]):
+        z0, z1, z2 = r.z[0, j], r.z[1, j], r.z[2, j]
+        slope, middle = (z1 - z2) / (c1 - 1.0), (z0 - z1) / (c0 - c1)
+        bend = (middle - slope) / (c0 - 1.0)
+        r.kept[0, j], r.kept[1, j], r.kept[2, j] = slope, bend, bend - (middle - z0 / c0) / c1
+        r.kept[3, j] = r.error[j]
+
+
+@internal_kernel
+def missed(x):
+    """P(x) = ∫ Π (s − c_i) ds from 0 to x; c_3 = 1 is a double root."""
+    return x * (x - 1.0) * (x - 1.0) * (0.25 * x - 0.1)
+
+
+@internal_kernel
+def guess_stages(run: Run, h):
+    """First guess of the stages: where the last ones lead to, and what these and the new ones miss.
+
+    Stages are of order 3. With P(x) = ∫ Π (s − c_i) ds from 0 to x, and D = h⁴ y⁗/6, the collocation polynomial of the
+    last step is y − D P(x), x = 1 + c ρ in the next one, ρ times as long, whose stages are y − ρ⁴ D P(c). The error
+    estimate of the last step was −D/(10 γ): so its stages lead to the next ones but for h⁵.
+    """
+    r, c0, c1 = run.newton, NODE_RADAU[0], NODE_RADAU[1]
+    ahead = h / r.clock[kn.KEPT] if r.count[kn.EXTRAPOLATES] == 1 else 0.0
+    for s in range(3):
+        x = NODE_RADAU[s] * ahead
+        more = -10.0 * GAMMA_RADAU * (missed(1.0 + x) - ahead**4 * missed(NODE_RADAU[s]))
+        for j in range(r.kept.shape[1]):
+            r.z[s, j] = x * (r.kept[0, j] + (x - (c1 - 1.0)) * (r.kept[1, j] + (x - (c0 - 1.0)) * r.kept[2, j]))
+            r.z[s, j] += more * r.kept[3, j]
+    for j in range(r.kept.shape[1]):
+        for s in range(3):
+            r.w[s, j] = (
+                T_INVERSE_RADAU[s, 0] * r.z[0, j]
+                + T_INVERSE_RADAU[s, 1] * r.z[1, j]
+                + T_INVERSE_RADAU[s, 2] * r.z[2, j]
+            )
+
+
+@apart_kernel
+def solve_stages(system: System, ws: Workspace, run: Run, h):
+    """Newton's method for the stages of a step of length h; True when it has converged."""
+    t, y, x, r = run.clock[ki.TIME], run.y, run.y_new, run.newton
+    tracked, before, contraction = r.kept.shape[1], 0.0, 0.0
+    g, c = GAMMA_RADAU / h, complex(ALPHA_RADAU / h, BETA_RADAU / h)
+    guess_stages(run, h)
+    lever, least = max(r.clock[kn.LEVER], 1e-16) ** 0.8, 1 - r.count[kn.EXTRAPOLATES]
+    for k in range(MOST_ITERATIONS):
+        evaluate_stages(r.lanes, system, ws, t, h, y, x, r)
+        run.count[ki.EVALUATIONS] += 3
+        r.count[kn.ITERATIONS] += 1
+        for j in range(tracked):
+            f0, f1, f2 = r.f[0, j], r.f[1, j], r.f[2, j]
+            r.one[j] = T_INVERSE_RADAU[0, 0] * f0 + T_INVERSE_RADAU[0, 1] * f1 + T_INVERSE_RADAU[0, 2] * f2
+            r.one[j] -= g * r.w[0, j]
+            r.two[j] = complex(
+                T_INVERSE_RADAU[1, 0] * f0 + T_INVERSE_RADAU[1, 1] * f1 + T_INVERSE_RADAU[1, 2] * f2,
+                T_INVERSE_RADAU[2, 0] * f0 + T_INVERSE_RADAU[2, 1] * f1 + T_INVERSE_RADAU[2, 2] * f2,
+            ) - c * complex(r.w[1, j], r.w[2, j])
+        solve_both(system, ws, y, r, h)
+        total = 0.0
+        for j in range(tracked):
+            d0, d1, d2 = r.one[j], r.two[j].real, r.two[j].imag
+            total += (d0 * d0 + d1 * d1 + d2 * d2) * r.weight[j] * r.weight[j]
+        change = math.sqrt(total / (3 * tracked))
+        if not change < 1e30:
+            return False
+        if k > 0:
+            ratio = change / before
+            contraction = ratio if k == 1 else math.sqrt(ratio * contraction)
+            if contraction >= 0.99:
+                return False
+            lever = contraction / (1.0 - contraction)
+            if lever * change * contraction ** (MOST_ITERATIONS - 2 - k) >= r.clock[kn.CLOSE]:
+                return False
+            r.clock[kn.CONTRACTION] = contraction
+        before = max(change, 1e-16)
+        for j in range(tracked):
+            r.w[0, j] += r.one[j]
+            r.w[1, j] += r.two[j].real
+            r.w[2, j] += r.two[j].imag
+            for s in range(3):
+                r.z[s, j] = T_RADAU[s, 0] * r.w[0, j] + T_RADAU[s, 1] * r.w[1, j] + T_RADAU[s, 2] * r.w[2, j]
+        # The ledger adds up the derivatives of the last iterate but one: where nothing was known before, one more.
+        if lever * change <= r.clock[kn.CLOSE] and k >= least:
+            r.clock[kn.LEVER] = lever
+            return True
+    return False
+
+
+@internal_kernel
+def slack(system: System, h, rtol):
+    """How many atol rates and currents may be off by in a step of length h.
+
+    An error e of a rate moves a joint by h e within the step. Circuits that ring after a start do so for milliseconds
+    in steps of 0.1 ms: a rate that is wrong by 50 atol there moves its joint no further than one that is wrong by atol
+    in a step of 5 ms, and motors damp it. Where there are none it would stay. So would, for a while, what impacts make
+    of it, after which steps are shorter still: who asks for an rtol below 1e-6 has less slack, at 1e-8 as good as none.
+    """
+    if system.layout.circuits == 0:
+        return 1.0
+    return max(1.0, SHORT / h * min(rtol / SLACK_RTOL, 1.0) ** 2)
+
+
+@internal_kernel
+def estimate(system: System, ws: Workspace, run: Run, h, slope):
+    """Norm of the error (γ/h − J)⁻¹ (f + Σ e_s Z_s / h), of order 3, into stage[7]; f is ``slope``."""
+    r, error = run.newton, run.stage[7]
+    for j in range(r.one.shape[0]):
+        r.one[j] = slope[j] + (ERROR_RADAU[0] * r.z[0, j] + ERROR_RADAU[1] * r.z[1, j] + ERROR_RADAU[2] * r.z[2, j]) / h
+        r.two[j] = 0.0
+    solve_both(system, ws, run.y, r, h)
+    for j in range(error.shape[0]):
+        error[j] = r.one[j] if j < r.one.shape[0] else 0.0
+    for j in range(r.one.shape[0]):
+        r.error[j] = r.one[j]
+    return error_norm(system, ws, run, error, slack(system, h, run.clock[ki.RTOL]))
+
+
+@internal_kernel
+def energy_error(system: System, run: Run, h):
+    """Norm of the error of electrical energy and Joule heat, by the formula of :func:`estimate` without a Jacobian.
+
+    Where motors push against what holds, only currents move, and those of long steps are right at their ends though the
+    heat between them is not.
+    """
+    r, largest = run.newton, 0.0
+    for e in range(2):
+        j = system.layout.ledger + (kst.ELECTRICAL if e == 0 else kst.JOULE)
+        error = h * run.stage[0, j]
+        for s in range(3):
+            error += ERROR_RADAU[s] * r.z[s, j]
+        allowed = run.clock[ki.ATOL] + run.clock[ki.RTOL] * (abs(run.y_new[j]) + abs(r.z[2, j]))
+        largest = max(largest, abs(error) / (GAMMA_RADAU * allowed))
+    return largest
+
+
+@apart_kernel
+def step_radau5(system: System, ws: Workspace, run: Run):
+    """One RADAU5 step; returns the error norm. stage[6] is the derivative at y_new."""
+    t, h, y, y_new, r = run.clock[ki.TIME], run.clock[ki.STEP], run.y, run.y_new, run.newton
+    tracked = r.kept.shape[1]
+    keep_stages(run)
+    for j in range(tracked):
+        r.weight[j] = 1.0 / (run.clock[ki.ATOL] + run.clock[ki.RTOL] * abs(y[j]))
+    solved = False
+    while not solved:
+        if r.count[kn.STALE] == 1:
+            differentiate(system, ws, run)
+        if r.clock[kn.FACTORED] != h:
+            factor_both(system, r, h)
+            r.clock[kn.FACTORED] = h
+            r.count[kn.FACTORS] += 1
+        if solve_stages(system, ws, run, h):
+            solved = True
+        elif r.count[kn.MADE_AT] == run.count[ki.STEPS]:
+            r.count[kn.DIVERGED] += 1
+            r.clock[kn.LEVER] = 1.0
+            for j in range(y.shape[0]):
+                y_new[j], run.stage[6, j] = y[j], run.stage[0, j]
+            return NO_STAGES
+        else:
+            r.count[kn.STALE] = 1
+    r.clock[kn.TRIED] = h
+    for j in range(y.shape[0]):
+        if j >= tracked:
+            for s in range(3):
+                r.z[s, j] = h * (A_RADAU[s, 0] * r.f[0, j] + A_RADAU[s, 1] * r.f[1, j] + A_RADAU[s, 2] * r.f[2, j])
+        y_new[j] = y[j] + r.z[2, j]
+    error = estimate(system, ws, run, h, run.stage[0])
+    if error >= 1.0:
+        for j in range(y.shape[0]):
+            run.stage[6, j] = y[j] + run.stage[7, j]
+        derivative(system, t, run.stage[6], ws, r.f[0])
+        run.count[ki.EVALUATIONS] += 1
+        error = estimate(system, ws, run, h, r.f[0])
+    evaluate_end(r, system, ws, run)
+    return max(error, energy_error(system, run, h))
+
+
+@internal_kernel
+def after_step(run: Run, h):
+    """Whether the Jacobian stays, and the factors, after a step of length h was accepted."""
+    r, clock = run.newton, run.clock
+    if r.clock[kn.CONTRACTION] > GOOD_CONTRACTION:
+        r.count[kn.STALE] = 1
+    elif h <= clock[ki.STEP] <= 1.2 * h:
+        clock[ki.STEP] = h

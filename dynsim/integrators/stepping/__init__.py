@@ -1,0 +1,1 @@
+"""Time stepping: contacts and limits of drives within fixed steps."""

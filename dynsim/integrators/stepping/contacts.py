@@ -1,0 +1,380 @@
+"""The contact law of time stepping: Coulomb's cone on the rates of a step's end, turned to the geometry there.
+
+The rows J of a step are those of its midpoint. Along geometry that turns, J(q_m) v' = 0 would take ½ m (h κ v²)² in
+each step from a body that only follows its surface. The rows of the end are known without another sweep: on the same
+rates v the rows of this step give r = J_k v, those of the last one gave s = J_{k−1} v, so that to O(h²)
+J(q') v' = J_k v' + c h/(h + h_last) with c = r − s. The law is on
+
+    w = J_k v' + a,    a = c h/(h + h_last),    0 ≤ p_n ⟂ w_n ≥ 0,  |p_t| ≤ μ p_n,  w_t = −λ p_t
+
+W = J M⁻¹ Jᵀ stays symmetric and there is one problem a step. A contact that has slid, and cannot stop in this step,
+takes the direction of its mean slip: w_t = u_t + u_t'. One that strikes has no past: a = 0, or Newton's e u_n. What its
+landing has left of depth is taken back slowly, no more of it than the energy of the landing allows.
+
+The mean law on all rows, J (v + v') = 0, would be simpler: its factor of disturbances is −1, rates alternate for ever.
+"""
+
+from __future__ import annotations
+
+import math
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import distance as kd
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.cone import problem as kc
+from dynsim.dynamics.contact.cone.least_norm import select_least_norm
+from dynsim.dynamics.contact.cone.problem import approach
+from dynsim.dynamics.contact.rows import point_row, set_modes
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, sliding_friction, stop_gap
+from dynsim.dynamics.tables import Workspace
+from dynsim.dynamics.tree.spatial import times_number, vector
+from dynsim.integrators.stepping import tables as kt
+from dynsim.integrators.stepping.tables import SteppingArrays, geometry, place_joints
+from dynsim.jit.kernel import internal_kernel
+
+# cos of the angle by which a row may turn in a step and still be the same row: more is a kink, an edge, another place.
+SAME_ROW = 0.95
+# A place of contact that has moved by more than this times the way of the body there is another one; by less than the
+# second, which the body may have gone as it turned back, it is the same [m].
+SAME_PLACE, SHORT_WAY = 4.0, 1e-4
+# What is no further from its surface touches when a run begins, or its rates have jumped [m].
+TOUCHES = 1e-9
+# A gap is closed, and depth taken back, within this time, and no shorter one than so many steps [s]; not faster than
+# this [m/s]. Shorter times bounce.
+RETURN_TIME, RETURN_STEPS, RETURN_SPEED = 0.02, 10.0, 0.02
+# Gaps by which the scheme itself sways, in units of h |a_n|, are none: feedback on them would feed energy.
+SWAY = 2.0
+
+
+@internal_kernel
+def recall(system, s: SteppingArrays, ws: Workspace, y):
+    """Where the rates of y are not those of the last step's end: begin anew, with what touches at y.
+
+    Its rows at y, half a step before the midpoint, stand for those of the last step: h/(h + 0) of what turns. Sweeps.
+    """
+    layout, same = system.layout, s.grid[kt.LENGTH_LAST] > 0.0
+    for i in range(s.before.shape[1]):
+        same = same and s.before[kt.V_LAST, i] == y[layout.v + i]
+    if same:
+        return
+    s.grid[kt.LENGTH_LAST] = 0.0
+    place_joints(system, ws, y)
+    for i in range(s.before.shape[1]):
+        ws.joints[i, ka.QD], ws.joints[i, ka.QDD] = y[layout.v + i], 0.0
+    geometry(system, system.model, s, ws)
+    for k in range(ws.contacts.shape[0]):
+        last, state, link = s.memory[kt.LAST, k], ws.contacts[k], ws.links[system.contacts.link[k, ka.LINK]]
+        for m in range(kt.MEMORY_SIZE):
+            last[m] = 0.0
+        if state[ka.GAP] > TOUCHES:
+            continue
+        note_place(system, state, k, last)
+        velocity_at(link, state[ka.POSITION], state[ka.POSITION + 1], state[ka.POSITION + 2], last[kt.END_RATE :])
+        x, y_, z = last[kt.END_RATE], last[kt.END_RATE + 1], last[kt.END_RATE + 2]
+        for m in range(3):
+            d = ka.NORMAL if m == 0 else ka.FIRST_TANGENT if m == 1 else ka.SECOND_TANGENT
+            last[kt.END_RATE + m] = x * state[d] + y_ * state[d + 1] + z * state[d + 2]
+        last[kt.END_RATE + 1] *= s.law[k, kt.GRIP]
+        if last[kt.END_RATE] >= -kt.BAD:
+            slip = slip_of_rates(s, k, last[kt.END_RATE + 1], last[kt.END_RATE + 2])
+            last[kt.LISTED], last[kt.CLOSED], last[kt.SLID] = 1.0, 1.0, 1.0 if slip > kt.BAD else 0.0
+
+
+@internal_kernel
+def velocity_at(link, x, y, z, out):
+    """Velocity of a body at a point [m/s], into out, (3,) or more, after a sweep."""
+    out[0] = link[ka.V + 3] + link[ka.V + 1] * z - link[ka.V + 2] * y
+    out[1] = link[ka.V + 4] + link[ka.V + 2] * x - link[ka.V] * z
+    out[2] = link[ka.V + 5] + link[ka.V] * y - link[ka.V + 1] * x
+
+
+@internal_kernel
+def note_place(system, state, k, note):
+    """Directions and place of candidate k, by which the next step knows its rows again."""
+    for m in range(3):
+        note[kt.NORMAL_THEN + m], note[kt.TANGENT_THEN + m] = state[ka.NORMAL + m], state[ka.FIRST_TANGENT + m]
+    note[kt.CENTRE], note[kt.CENTRE + 1], note[kt.CENTRE + 2] = centre(system.shapes, state, k)
+
+
+@internal_kernel
+def remember(s: SteppingArrays, y, first, h):
+    """The step has been accepted, and its rates are those of y."""
+    for i in range(s.before.shape[1]):
+        s.before[kt.V_LAST, i] = y[first + i]
+    for k in range(s.memory.shape[1]):
+        for m in range(kt.MEMORY_SIZE):
+            s.memory[kt.LAST, k, m] = s.memory[kt.NOW, k, m]
+    if s.grid[kt.LENGTH_LAST] > 0.0:
+        s.found[kt.HALF_STEP] += 0.5 * h * abs(s.grid[kt.POWER_NOW] - s.grid[kt.POWER_LAST])
+    s.grid[kt.LENGTH_LAST], s.grid[kt.POWER_LAST] = h, s.grid[kt.POWER_NOW]
+
+
+@internal_kernel
+def list_contacts(system, s: SteppingArrays, ws: Workspace, h):
+    """Rows for the candidates that touch; the table of rows is rebuilt, and True returned, when these change.
+
+    What was closed stays on the list while its place goes on: over convex surfaces the midpoint is above them.
+    """
+    changed = close_stops(system.unilateral, ws)
+    for k in range(ws.contacts.shape[0]):
+        last = s.memory[kt.LAST, k]
+        known = last[kt.LISTED] == 1.0 and goes_on(system, s, last, ws, k, h)
+        s.turn[k, kt.KNOWN] = 1.0 if known else 0.0
+        listed = ws.contacts[k, ka.GAP] <= kt.MARGIN or (known and last[kt.CLOSED] == 1.0)
+        mode = ka.STICKING if listed else ka.OPEN
+        changed = changed or mode != s.modes[k]
+        s.modes[k] = mode
+    if changed:
+        set_modes(system.contacts, system.couplings, system.unilateral, ws, s.modes)
+    return changed
+
+
+@internal_kernel
+def goes_on(system, s: SteppingArrays, last, ws: Workspace, k, h):
+    """True when the normal of candidate k has turned a little, and its place has gone about as far as its body."""
+    state, turned = ws.contacts[k], 0.0
+    for m in range(3):
+        turned += state[ka.NORMAL + m] * last[kt.NORMAL_THEN + m]
+    if turned <= SAME_ROW:
+        return False
+    return place_goes_on(system.shapes, s, last, state, ws.links[system.contacts.link[k, ka.LINK]], k, h)
+
+
+@internal_kernel
+def place_goes_on(shapes, s: SteppingArrays, last, state, link, k, h):
+    """True unless the place of candidate k has jumped, as that of a capsule may from one of its ends to the other."""
+    if shapes is None:  # known to the compiler
+        return True
+    if shapes.kind[k, kd.MOVES] == 0:
+        return True
+    x, y, z = centre(shapes, state, k)
+    way = (x - last[kt.CENTRE]) ** 2 + (y - last[kt.CENTRE + 1]) ** 2 + (z - last[kt.CENTRE + 2]) ** 2
+    v = s.b
+    velocity_at(link, x, y, z, v)
+    speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    return math.sqrt(way) <= SAME_PLACE * h * speed + SHORT_WAY
+
+
+@internal_kernel
+def centre(shapes, state, k):
+    """Centre of the sphere with which candidate k touches [m]."""
+    radius = 0.0
+    if shapes is not None:
+        radius = shapes.data[k, kd.RADIUS]
+    return (
+        state[ka.POSITION] + radius * state[ka.NORMAL],
+        state[ka.POSITION + 1] + radius * state[ka.NORMAL + 1],
+        state[ka.POSITION + 2] + radius * state[ka.NORMAL + 2],
+    )
+
+
+@internal_kernel
+def close_stops(unilateral: UnilateralArrays, ws: Workspace):
+    """Close the joint stops whose gap is not open, open the others; True when one has changed."""
+    table, changed = unilateral.stop_table, False
+    for k in range(table.shape[0]):
+        closed = 1 if stop_gap(unilateral, ws, k) <= kt.MARGIN else 0
+        changed = changed or closed != table[k, ku.STOP_CLOSED]
+        table[k, ku.STOP_CLOSED] = closed
+    return changed
+
+
+@internal_kernel
+def tangent_rows(system, s: SteppingArrays, ws: Workspace):
+    """Rows of the listed candidates and the kinds of the contact problem; TARGET is the acceleration zero.
+
+    The second tangent is scaled by GRIP, friction along the axis being that times friction across: the ellipse of
+    admissible forces is a disc then, and slip opposes friction as the ellipse's normal does.
+    """
+    state, rows, active = ws.contacts, ws.rows, ws.active
+    for r in range(ws.counts[ka.COUPLED]):
+        # Behind the couplings come joint stops.
+        s.kind[r] = kc.BOTH_WAYS if r < system.couplings.joint.shape[0] else kc.ONE_WAY
+        s.mu[r], rows[r, ka.TARGET] = 0.0, 0.0
+    for k in range(state.shape[0]):
+        if active[k, ka.MODE] != ka.STICKING:
+            continue
+        first = active[k, ka.FIRST_ROW]
+        at = vector(state, k, ka.POSITION)
+        for m in range(ka.MOST_ROWS):
+            r, d = first + m, ka.NORMAL if m == 0 else ka.FIRST_TANGENT if m == 1 else ka.SECOND_TANGENT
+            scale = s.law[k, kt.GRIP] if m == 1 else 1.0
+            point_row(rows, r, at, times_number(vector(state, k, d), scale))
+            rows[r, ka.TARGET] = 0.0
+            for j in range(6):
+                rows[r, ka.DIRECTION + j] = rows[r, ka.ROW + j]
+            s.kind[r] = kc.CONE if m == 0 else kc.TANGENT
+
+
+@internal_kernel
+def slip_of_rates(s: SteppingArrays, k, x, y):
+    """Slip of candidate k from the rates x, y of its tangents [m/s]."""
+    x = x / s.law[k, kt.GRIP] if s.law[k, kt.GRIP] > 0.0 else 0.0
+    return math.sqrt(x * x + y * y)
+
+
+@internal_kernel
+def friction_of(unilateral: UnilateralArrays, s: SteppingArrays, k, r):
+    """Coefficient of friction of candidate k, first row r: at the slip with which the step begins.
+
+    A point that sticks has tangential rates too where its rows turn: whether it has slid decides.
+    """
+    last, speed = s.memory[kt.LAST, k], slip_of_rates(s, k, s.rate[0, r + 1], s.rate[0, r + 2])
+    if speed <= kt.BAD or (last[kt.CLOSED] == 1.0 and last[kt.SLID] == 0.0):
+        return unilateral.law[k, ku.STATIC]
+    return sliding_friction(unilateral.law, k, s.law[k, kt.FRICTION_OF], speed)
+
+
+@internal_kernel
+def turn_rows(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, k, h):
+    """What the law adds to the end rates of listed candidate k, into ``s.turn``; its friction is in ``s.mu``."""
+    turn, last, state, r = s.turn[k], s.memory[kt.LAST, k], ws.contacts[k], ws.active[k, ka.FIRST_ROW]
+    share = h / (h + s.grid[kt.LENGTH_LAST]) if turn[kt.KNOWN] == 1.0 else 0.0
+    along = 0.0
+    for m in range(3):
+        turn[kt.TURNED + m] = share * (s.rate[0, r + m] - last[kt.END_RATE + m])
+        along += state[ka.FIRST_TANGENT + m] * last[kt.TANGENT_THEN + m]
+    if along < SAME_ROW:
+        turn[kt.TURNED + 1], turn[kt.TURNED + 2] = 0.0, 0.0
+    for m in range(3):
+        turn[kt.ADDED + m] = turn[kt.TURNED + m]
+    turn[kt.PUSH], turn[kt.MEAN] = 0.0, 0.0
+    if last[kt.CLOSED] == 0.0:
+        if s.rate[0, r] < 0.0 and s.law[k, kt.RESTITUTION] > 0.0:
+            turn[kt.ADDED] = s.law[k, kt.RESTITUTION] * s.rate[0, r]
+        return
+    turn[kt.PUSH] = return_rate(state[ka.GAP], turn[kt.TURNED], last[kt.BUDGET], h)
+    turn[kt.ADDED] -= turn[kt.PUSH]
+    if last[kt.SLID] == 1.0:
+        slip = math.sqrt(s.rate[0, r + 1] ** 2 + s.rate[0, r + 2] ** 2)
+        # Of a start nothing is known.
+        impulse = s.mu[r] * last[kt.NORMAL_IMPULSE]
+        if impulse > 0.0:
+            impulse *= h / s.grid[kt.LENGTH_LAST]
+        if slip > impulse * largest_mobility(ws.small[0], r):
+            turn[kt.MEAN] = 1.0
+            turn[kt.ADDED + 1], turn[kt.ADDED + 2] = s.rate[0, r + 1], s.rate[0, r + 2]
+
+
+@internal_kernel
+def return_rate(gap, turned, budget, h):
+    """Rate at which a closed contact is brought back onto its surface: positive out of it, negative down to it [m/s].
+
+    gap : at the midpoint [m]; turned : of its normal rate [m/s]; budget : what it may take [J]
+    """
+    gap -= 0.25 * h * turned
+    off = max(0.0, abs(gap) - SWAY * h * abs(turned))
+    rate = min(off / max(RETURN_TIME, RETURN_STEPS * h), RETURN_SPEED)
+    if gap > 0.0:
+        return -rate
+    return rate if budget > 0.0 else 0.0
+
+
+@internal_kernel
+def largest_mobility(W, r):
+    """Larger eigenvalue of the block of W of the two tangents behind row r."""
+    a, b, c = W[r + 1, r + 1], W[r + 1, r + 2], W[r + 2, r + 2]
+    return 0.5 * (a + c) + math.sqrt(0.25 * (a - c) ** 2 + b * b)
+
+
+@internal_kernel
+def solve_contacts(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, h):
+    """Impulses of all rows, by the last ones as a start, and their mean forces into ``ws.rows``; then ``s.memory``.
+
+    Where the slip of a contact that was to slide on ends, or turns back, the law is that of the end after all: at most
+    once for each contact.
+    """
+    p, coupled, rows = ws.counts[ka.ROWS], ws.counts[ka.COUPLED], ws.rows
+    start = 3 * ws.contacts.shape[0]
+    for r in range(p):
+        # RHS = − J M⁻¹ (applied − bias), TARGET being zero.
+        s.b[r] = s.rate[0, r] - h * rows[r, ka.RHS]
+        s.right[r] = s.b[r]
+        s.f[r] = s.impulse[start + r] if r < coupled else 0.0
+    for k in range(ws.contacts.shape[0]):
+        if ws.active[k, ka.MODE] == ka.STICKING:
+            r = ws.active[k, ka.FIRST_ROW]
+            s.mu[r] = friction_of(unilateral, s, k, r)
+            turn_rows(unilateral, s, ws, k, h)
+            for m in range(ka.MOST_ROWS):
+                s.f[r + m] = s.impulse[3 * k + m]
+    for _ in range(1 + ws.contacts.shape[0]):
+        for k in range(ws.contacts.shape[0]):
+            if ws.active[k, ka.MODE] == ka.STICKING:
+                for m in range(ka.MOST_ROWS):
+                    r = ws.active[k, ka.FIRST_ROW] + m
+                    s.right[r] = s.b[r] + s.turn[k, kt.ADDED + m]
+        solve_problem(s, ws.small[0], p)
+        if not slip_ends(s, ws):
+            break
+    for r in range(p):
+        rows[r, ka.FORCE] = s.f[r] / h
+        if r < coupled:
+            s.impulse[start + r] = s.f[r]
+    for k in range(ws.contacts.shape[0]):
+        listed, r = ws.active[k, ka.MODE] == ka.STICKING, ws.active[k, ka.FIRST_ROW]
+        for m in range(ka.MOST_ROWS):
+            s.impulse[3 * k + m] = s.f[r + m] if listed else 0.0
+
+
+@internal_kernel
+def solve_problem(s: SteppingArrays, W, p):
+    """Impulses f and law rates w of the problem W f + ``s.right``; where f is not unique, that of least norm."""
+    residual = approach(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD, kt.QUICK_ROUNDS)
+    s.found[kt.SOLVES] += 1.0
+    if not residual <= kt.BAD:
+        s.found[kt.LONG_SOLVES] += 1.0
+        residual = approach(W, s.right, s.kind, s.mu, p, s.f, s.room, kt.GOOD, kt.LAST_ROUNDS)
+    if not residual <= kt.BAD:
+        s.found[kt.CAPPED] += 1.0
+    s.found[kt.WORST] = max(s.found[kt.WORST], residual)
+    for r in range(p):
+        s.w[r] = s.right[r]
+        for m in range(p):
+            s.w[r] += W[r, m] * s.f[m]
+    if residual <= kt.BAD:
+        select_least_norm(W, s.w, s.kind, s.mu, p, s.f, s.room)
+
+
+@internal_kernel
+def slip_ends(s: SteppingArrays, ws: Workspace):
+    """Give contacts that were to slide on, and have not, the law of the end; True when there are such."""
+    ends = False
+    for k in range(ws.contacts.shape[0]):
+        if ws.active[k, ka.MODE] != ka.STICKING or s.turn[k, kt.MEAN] == 0.0:
+            continue
+        r, on = ws.active[k, ka.FIRST_ROW], 0.0
+        for m in range(1, 3):
+            on += (s.w[r + m] - s.turn[k, kt.ADDED + m]) * s.rate[0, r + m]
+        if on <= 0.0:
+            s.turn[k, kt.MEAN], ends = 0.0, True
+            for m in range(1, 3):
+                s.turn[k, kt.ADDED + m] = s.turn[k, kt.TURNED + m]
+    return ends
+
+
+@internal_kernel
+def note_contacts(system, s: SteppingArrays, ws: Workspace):
+    """What the step has made of each candidate, into ``s.memory`` and ``s.motion``; its end rates are in ``s.rate``.
+
+    Closed is what presses, or does not leave: a force that has become zero alone is no event.
+    """
+    for k in range(ws.contacts.shape[0]):
+        now, last, state = s.memory[kt.NOW, k], s.memory[kt.LAST, k], ws.contacts[k]
+        for m in range(kt.MEMORY_SIZE):
+            now[m] = 0.0
+        s.motion[k] = ka.OPEN
+        if ws.active[k, ka.MODE] != ka.STICKING:
+            continue
+        r = ws.active[k, ka.FIRST_ROW]
+        now[kt.LISTED], now[kt.NORMAL_IMPULSE] = 1.0, s.f[r]
+        note_place(system, state, k, now)
+        for m in range(3):
+            now[kt.END_RATE + m] = s.rate[1, r + m]
+        if s.f[r] > 0.0 or s.w[r] <= kt.BAD:
+            now[kt.CLOSED] = 1.0
+            now[kt.SLID] = 1.0 if slip_of_rates(s, k, s.w[r + 1], s.w[r + 2]) > kt.BAD else 0.0
+            s.motion[k] = ka.SLIDING if now[kt.SLID] == 1.0 else ka.STICKING
+            now[kt.BUDGET] = last[kt.BUDGET] - s.f[r] * max(s.turn[k, kt.PUSH], 0.0)
+            if last[kt.CLOSED] == 0.0:
+                now[kt.BUDGET] -= 0.5 * s.f[r] * (s.rate[0, r] + s.rate[1, r])

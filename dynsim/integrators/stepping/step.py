@@ -1,0 +1,357 @@
+"""One step of time stepping, its ledger, its samples, and the driver; the method is that of ``time_stepping``."""
+
+from __future__ import annotations
+
+from dynsim.dynamics import state as kst
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.unilateral import UnilateralArrays, note_stop_forces
+from dynsim.dynamics.derivative import System
+from dynsim.dynamics.drive.law import drive, take_commands
+from dynsim.dynamics.ledger import drive_powers
+from dynsim.dynamics.tables import ModelArrays, Workspace
+from dynsim.dynamics.tree.angles import sine_cosine
+from dynsim.dynamics.tree.articulated import accelerate, add_row_forces, factor, row_system
+from dynsim.dynamics.tree.joints import normalise
+from dynsim.dynamics.tree.loads import add_loads
+from dynsim.integrators import run as ki
+from dynsim.integrators.contacts import events as kev
+from dynsim.integrators.events import take_ticks
+from dynsim.integrators.output import write_output
+from dynsim.integrators.run import Run
+from dynsim.integrators.stepping import tables as kt
+from dynsim.integrators.stepping.contacts import (
+    list_contacts,
+    note_contacts,
+    recall,
+    remember,
+    slip_of_rates,
+    solve_contacts,
+    tangent_rows,
+)
+from dynsim.integrators.stepping.discretisation_energy import begin_energy, drive_work, midpoint_work, stored_energy
+from dynsim.integrators.stepping.drives import MOST_TRIES, drive_at_theta, eliminate_currents, limits_agree
+from dynsim.integrators.stepping.tables import SteppingArrays, constraint_rates, geometry, moved, place_joints
+from dynsim.integrators.steps import choose_step, finished, finite, stalled
+from dynsim.integrators.watch import watch
+from dynsim.jit.kernel import free_kernel, internal_kernel
+
+
+@internal_kernel
+def step_moreau(system: System, ws: Workspace, run: Run):
+    """One step from y to y_new; mean accelerations and forces stay in the workspace."""
+    s, y, layout = run.stepping, run.y, system.layout
+    v0, v_bias, last = s.before[kt.V_START], s.before[kt.V_BIAS], s.before[kt.ACCELERATION]
+    model = ModelArrays(system.model.tree, s.body, system.model.gravity, system.model.compound)
+    begin_energy(system, ws, run)
+    recall(system, s, ws, y)
+    for i in range(ws.joints.shape[0]):
+        v0[i] = y[layout.v + i]
+        v_bias[i] = v0[i] + s.theta * run.clock[ki.STEP] * last[i]
+    for tries in range(1, MOST_TRIES + 1):
+        take_drives(system, ws, run)
+        place_midpoint(system, model, ws, run)
+        if tries == 1 and list_contacts(system, s, ws, run.clock[ki.STEP]):
+            # The last acceleration tells nothing of the next one.
+            for i in range(ws.joints.shape[0]):
+                v_bias[i], ws.joints[i, ka.QD] = v0[i], v0[i]
+            geometry(system, model, s, ws)
+        solve_step(system, model, ws, run)
+        drive_at_theta(system, ws, run)
+        if limits_agree(system, ws, run, tries):
+            break
+        if tries == MOST_TRIES:
+            s.found[kt.UNSETTLED] += 1.0
+    note_contacts(system, s, ws)
+    book(system, ws, run)
+
+
+@internal_kernel
+def take_drives(system: System, ws: Workspace, run: Run):
+    """The drives at (q + h θ v, v), as they go into the step; its torques without loads stay in ``s.before``."""
+    s, y, layout, joints, body = run.stepping, run.y, system.layout, ws.joints, system.model.body
+    place_joints(system, ws, y)
+    if layout.extra > 0:  # rolling bases move along their heading, whatever was swept last
+        sine_cosine(joints, ws.trig)
+    for i in range(joints.shape[0]):
+        v = s.before[kt.V_START, i]
+        joints[i, ka.Q] += run.clock[ki.STEP] * s.theta * v
+        joints[i, ka.QD], joints[i, ka.QDD] = v, v
+        joints[i, ka.APPLIED] = -(body[i, ka.DAMPING] + body[i, ka.GEAR_DAMPING]) * v
+    eliminate_currents(system, ws, run)
+    for i in range(joints.shape[0]):
+        s.before[kt.APPLIED_THEN, i] = joints[i, ka.APPLIED]
+
+
+@internal_kernel
+def place_midpoint(system: System, model: ModelArrays, ws: Workspace, run: Run):
+    """Geometry at q + h v/2, and velocity products of the rates that the last acceleration leads to."""
+    moved(system, ws, run.y, 0.5 * run.clock[ki.STEP], run.y_new)
+    place_joints(system, ws, run.y_new)
+    for i in range(ws.joints.shape[0]):
+        ws.joints[i, ka.QD], ws.joints[i, ka.QDD] = run.stepping.before[kt.V_BIAS, i], 0.0
+    geometry(system, model, run.stepping, ws)
+
+
+@internal_kernel
+def solve_step(system: System, model: ModelArrays, ws: Workspace, run: Run):
+    """Impulses and accelerations at the midpoint, and the state that they lead to, into y_new."""
+    s, t, h, y, y_new, layout = run.stepping, run.clock[ki.TIME], run.clock[ki.STEP], run.y, run.y_new, system.layout
+    joints, v0, last = ws.joints, s.before[kt.V_START], s.before[kt.ACCELERATION]
+    if system.loads.table.shape[0] > 0:
+        add_loads(model, system.loads, t + s.theta * h, ws, run.stage[1], layout.load)
+    tangent_rows(system, s, ws)
+    factor(model, ws)
+    constraint_rates(model, ws, y, layout.v, s.rate[0])
+    if ws.counts[ka.ROWS] > 0:
+        row_system(model, ws)
+        solve_contacts(system.unilateral, s, ws, h)
+        note_stop_forces(system.unilateral, ws)
+        add_row_forces(model, ws)
+    accelerate(model, ws)
+    run.count[ki.EVALUATIONS] += 1
+    for i in range(joints.shape[0]):
+        last[i] = joints[i, ka.QDD]
+        joints[i, ka.QDD] = v0[i] + s.theta * h * last[i]
+    moved(system, ws, y, h, y_new)
+    for i in range(joints.shape[0]):
+        y_new[layout.v + i] = v0[i] + h * last[i]
+        joints[i, ka.QDD] = last[i]
+    constraint_rates(model, ws, y_new, layout.v, s.rate[1])
+    for a in range(ws.motors.shape[0]):
+        k, j = system.drives.table[a, ka.CIRCUIT], system.drives.table[a, ka.DRIVEN]
+        if k >= 0:
+            y_new[layout.current + k] = (
+                y[layout.current + k] + s.eliminated[a, kt.FREE] + s.eliminated[a, kt.PER] * h * last[j]
+            )
+
+
+@internal_kernel
+def book(system: System, ws: Workspace, run: Run):
+    """The ledger of the step into y_new, after :func:`drive_at_theta`: power at x_θ, and what contacts have done."""
+    s, t, h, y_new, layout = run.stepping, run.clock[ki.TIME], run.clock[ki.STEP], run.y_new, system.layout
+    joints, body, start = ws.joints, system.model.body, system.layout.ledger
+    # Of the sweep at the midpoint, before others overwrite it.
+    stored = -midpoint_work(system.model, ws, s.before[kt.V_START], s.before[kt.ACCELERATION], h)
+    stored += drive_work(system, ws, run)
+    if system.loads.table.shape[0] > 0:
+        # Once more, for their powers at the mean velocities that are in the links now.
+        add_loads(system.model, system.loads, t + s.theta * h, ws, run.stage[1], layout.load)
+    gear, joint = 0.0, 0.0
+    for i in range(joints.shape[0]):
+        gear += body[i, ka.GEAR_DAMPING] * joints[i, ka.QD] ** 2
+        joint += body[i, ka.DAMPING] * joints[i, ka.QD] ** 2
+    electrical, drawn, joule, mechanical, drag = drive_powers(system.drives, ws)
+    for r in range(ws.counts[ka.ROWS]):
+        y_new[start + kst.CONSTRAINT] += work_of_row(s, ws, r, h)
+    y_new[start + kst.ELECTRICAL] += h * electrical
+    y_new[start + kst.DRAWN] += h * drawn
+    y_new[start + kst.JOULE] += h * joule
+    y_new[start + kst.GEAR] += h * (gear + drag)
+    y_new[start + kst.JOINT] += h * joint
+    y_new[start + kst.MECHANICAL] += h * mechanical
+    y_new[start + kst.SUPPLY] += h * max(electrical, 0.0)
+    s.grid[kt.POWER_NOW] = electrical
+    for k in range(system.loads.table.shape[0]):
+        y_new[layout.load + k] += h * run.stage[1, layout.load + k]
+        s.grid[kt.POWER_NOW] += run.stage[1, layout.load + k]
+    book_stops(system.unilateral, system, s, ws, y_new, h)
+    book_contacts(system, s, ws, y_new, h)
+    stored_energy(system, ws, y_new, s.energy[kt.STOP])
+    y_new[layout.scheme] -= stored + (s.energy[kt.STOP, kt.MECHANICAL] - s.energy[kt.START, kt.MECHANICAL])
+    if abs(y_new[layout.scheme]) > abs(s.found[kt.TAKEN]):
+        s.found[kt.TAKEN] = y_new[layout.scheme]
+
+
+@internal_kernel
+def work_of_row(s: SteppingArrays, ws: Workspace, r, h):
+    """Work of the force of row r on its motion, p (u + u')/2 [J]."""
+    return 0.5 * h * ws.rows[r, ka.FORCE] * (s.rate[0, r] + s.rate[1, r])
+
+
+@internal_kernel
+def book_stops(unilateral: UnilateralArrays, system: System, s: SteppingArrays, ws: Workspace, y_new, h):
+    """What joint stops take is a loss, not an error of the constraints."""
+    for k in range(unilateral.stop.shape[0]):
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 0:
+            continue
+        work = work_of_row(s, ws, unilateral.stop_table[k, ku.STOP_ROW], h)
+        y_new[system.layout.loss + kst.JOINT_STOP_LOSS] -= work
+        y_new[system.layout.ledger + kst.CONSTRAINT] -= work
+
+
+@internal_kernel
+def book_contacts(system: System, s: SteppingArrays, ws: Workspace, y_new, h):
+    """What contacts take: normals of what strikes as impact loss, tangents of what slides, or comes to stick, as
+    friction. What is left of held rows is the scheme's; what pushes out of the surface comes from the impact losses."""
+    layout, first = system.layout, system.layout.contact
+    for k in range(ws.contacts.shape[0]):
+        now, last = s.memory[kt.NOW, k], s.memory[kt.LAST, k]
+        ws.contacts[k, ka.NORMAL_FORCE], s.turn[k, kt.STRUCK] = 0.0, 0.0
+        if now[kt.LISTED] == 1.0:
+            r = ws.active[k, ka.FIRST_ROW]
+            force = ws.rows[r, ka.FORCE]
+            ws.contacts[k, ka.NORMAL_FORCE] = force
+            normal = work_of_row(s, ws, r, h)
+            tangential = work_of_row(s, ws, r + 1, h) + work_of_row(s, ws, r + 2, h)
+            struck, friction = normal, tangential
+            if last[kt.CLOSED] == 1.0:
+                struck = min(h * force * max(s.turn[k, kt.PUSH], 0.0), max(last[kt.BUDGET], 0.0))
+                if now[kt.SLID] == 0.0 and last[kt.SLID] == 0.0:
+                    friction = 0.0
+            if friction != 0.0 or now[kt.SLID] == 1.0:
+                x, z = 0.5 * (s.rate[0, r + 1] + s.rate[1, r + 1]), 0.5 * (s.rate[0, r + 2] + s.rate[1, r + 2])
+                y_new[first + kst.SLIP] += h * slip_of_rates(s, k, x, z)
+            y_new[first + kst.IMPULSE] += h * force
+            y_new[layout.loss + kst.IMPACT_LOSS] -= struck
+            s.turn[k, kt.STRUCK] = -struck
+            y_new[layout.ledger + kst.FRICTION] -= friction
+            y_new[layout.scheme] -= (normal - struck) + (tangential - friction)
+            y_new[layout.ledger + kst.CONSTRAINT] -= normal + tangential
+        first += kst.CONTACT_SIZE
+
+
+@internal_kernel
+def count_step(unilateral: UnilateralArrays, s: SteppingArrays, ws: Workspace, h):
+    """Times, depths and losses of candidates and joint stops in the step that is accepted."""
+    for k in range(unilateral.stop.shape[0]):
+        if unilateral.stop_table[k, ku.STOP_CLOSED] == 1:
+            unilateral.stop[k, ku.CLOSED_TIME] += h
+            unilateral.stop[k, ku.STOP_LOSS] -= work_of_row(s, ws, unilateral.stop_table[k, ku.STOP_ROW], h)
+    for k in range(ws.contacts.shape[0]):
+        tally = unilateral.tally[k]
+        tally[s.motion[k]] += h  # the times in the order of the modes
+        if s.memory[kt.NOW, k, kt.LISTED] == 1.0:
+            tally[ku.LOSS] += s.turn[k, kt.STRUCK]
+            tally[ku.DEEPEST] = max(tally[ku.DEEPEST], -ws.contacts[k, ka.GAP])
+            s.found[kt.PENETRATION] = max(s.found[kt.PENETRATION], -ws.contacts[k, ka.GAP])
+
+
+@internal_kernel
+def tell_changes(unilateral: UnilateralArrays, s: SteppingArrays, run: Run):
+    """Log and count what the accepted step has changed, at its end; True when the caller is to empty the kev.log.
+
+    What a contact begins with is no event.
+    """
+    tally, table, stop = unilateral.tally, unilateral.stop_table, unilateral.stop
+    for k in range(s.told.shape[0]):
+        before, now = s.told[k], s.motion[k]
+        s.told[k] = now
+        if before < 0 or before == now:
+            continue
+        if now == ka.OPEN:
+            kind = kev.LIFT_OFF
+            tally[k, ku.LIFT_OFFS] += 1.0
+        elif before == ka.OPEN:
+            kind = kev.LANDING
+            tally[k, ku.LANDINGS] += 1.0
+        elif now == ka.SLIDING:
+            kind = kev.SLIP_START
+            tally[k, ku.SLIP_STARTS] += 1.0
+        else:
+            kind = kev.SLIP_STOP
+        kev.log(run, ki.CONTACT_LOG + kev.LOG_KINDS * k + kind)
+    for k in range(table.shape[0]):
+        closed = table[k, ku.STOP_CLOSED] == 1
+        if run.count[ki.STEPS] > 1 and table[k, ku.STOP_CLOSED] != table[k, ku.STOP_BEFORE]:
+            stop[k, ku.HITS] += 1.0 if closed else 0.0
+            kev.log(run, ki.STOP_LOG + kev.LOG_KINDS * k + (kev.STOP_HIT if closed else kev.STOP_LEFT))
+        table[k, ku.STOP_BEFORE] = table[k, ku.STOP_CLOSED]
+    return run.count[ki.LOGGED] + s.told.shape[0] + table.shape[0] > run.log_time.shape[0]
+
+
+@internal_kernel
+def sample_moreau(system: System, ws: Workspace, run: Run):
+    """Record every sample time within the step, the state linear in between; forces are the means of the step."""
+    t, h, last, clock = run.clock[ki.TIME], run.clock[ki.STEP], run.count[ki.SAMPLE], run.clock
+    s = run.stepping
+    until = t + h + 1e-12 * max(1.0, clock[ki.END])
+    while last < run.sample_time.shape[0] and run.sample_time[last] <= until:
+        x = min(max((run.sample_time[last] - t) / h, 0.0), 1.0)
+        row = run.sample[last]
+        for j in range(row.shape[0]):
+            row[j] = run.y[j] + x * (run.y_new[j] - run.y[j])
+        if system.layout.extra > 0:
+            normalise(system.model.compound, system.model, row, system.layout.q)
+        place_joints(system, ws, row)
+        for i in range(ws.joints.shape[0]):
+            ws.joints[i, ka.QD], ws.joints[i, ka.APPLIED] = row[system.layout.v + i], 0.0
+        drive(system.drives, system.reference, run.sample_time[last], row, system.layout, ws)
+        geometry(system, system.model, s, ws)
+        write_output(system, ws, run, last)
+        # What lies between the ends of a step is linear, energy is not.
+        between = -(1.0 - x) * (s.energy[kt.START, kt.MECHANICAL] + s.energy[kt.START, kt.MAGNETIC])
+        between -= x * (s.energy[kt.STOP, kt.MECHANICAL] + s.energy[kt.STOP, kt.MAGNETIC])
+        for k in range(kst.ENERGIES):
+            between += run.output[last, run.columns.energy + k]
+        row[system.layout.scheme] -= between
+        for k in range(ws.contacts.shape[0]):
+            # The rows are those of sticking even where it slides.
+            run.output[last, run.columns.contact + k * kst.OUTPUTS_PER_CONTACT + kst.OUT_MODE] = s.motion[k]
+        last += 1
+    run.count[ki.SAMPLE] = last
+
+
+@internal_kernel
+def commands_due(system: System, ws: Workspace, run: Run):
+    """Take sampled commands where they are due; True when the caller is to look."""
+    due = take_ticks(run)
+    if due & ki.TAKE_COMMANDS:
+        place_joints(system, ws, run.y)
+        for i in range(ws.joints.shape[0]):
+            ws.joints[i, ka.QD] = run.y[system.layout.v + i]
+        take_commands(system.drives, system.reference, run.clock[ki.TIME], ws)
+    run.count[ki.TICKED] = due & ~ki.TAKE_COMMANDS
+    if run.count[ki.STARTED] == 0:
+        run.count[ki.STARTED] = 1
+        for i in range(ws.joints.shape[0]):
+            run.stepping.before[kt.ACCELERATION, i] = 0.0
+    return run.count[ki.TICKED] != 0
+
+
+@internal_kernel
+def advance_time(s: SteppingArrays, clock):
+    """TIME at the end of the accepted step: the start of the steps of one length and so many of them, not a sum of
+    roundings. A step that was trimmed, and a tick, begin anew."""
+    grid, whole = s.grid, clock[ki.PROPOSED]
+    if grid[kt.GRID_START] + grid[kt.GRID_STEPS] * whole != clock[ki.TIME]:
+        grid[kt.GRID_START], grid[kt.GRID_STEPS] = clock[ki.TIME], 0.0
+    if clock[ki.STEP] == whole:
+        grid[kt.GRID_STEPS] += 1.0
+        clock[ki.TIME] = grid[kt.GRID_START] + grid[kt.GRID_STEPS] * whole
+    else:
+        clock[ki.TIME] += clock[ki.STEP]
+    clock[ki.STEP] = whole
+
+
+@free_kernel
+def advance_moreau(system: System, ws: Workspace, run: Run, limit):
+    """``advance`` of time stepping."""
+    clock, count, taken = run.clock, run.count, 0
+    if limit < 0:
+        return
+    while not commands_due(system, ws, run):
+        if finished(run) or taken >= limit or stalled(run):
+            return
+        taken += 1
+        if count[ki.PENDING] == 0:
+            clock[ki.PROPOSED] = clock[ki.STEP]
+            choose_step(run)
+            step_moreau(system, ws, run)
+            if not finite(run.y_new):
+                count[ki.STATUS] = ki.NOT_FINITE
+                return
+            if clock[ki.TIME] + clock[ki.STEP] > clock[ki.HOLD]:
+                count[ki.PENDING] = 1
+                return
+        count[ki.PENDING] = 0
+        watch(ws, run, clock[ki.STEP])
+        count_step(system.unilateral, run.stepping, ws, clock[ki.STEP])
+        sample_moreau(system, ws, run)
+        for j in range(run.y.shape[0]):
+            run.y[j] = run.y_new[j]
+        remember(run.stepping, run.y, system.layout.v, clock[ki.STEP])
+        advance_time(run.stepping, clock)
+        count[ki.STEPS] += 1
+        if tell_changes(system.unilateral, run.stepping, run):
+            return

@@ -1,0 +1,234 @@
+"""Time stepping: contacts that open, close, stick and slide within steps of one length, without locating anything.
+
+Moreau's and Jean's θ method for the whole coupled system. From (q, v, i) over a step h, with geometry at the midpoint
+q_m = q + h v / 2 and x_θ = x + θ (x' − x):
+
+    M (v' − v) = h (τ_θ + Q − bias) + Jᵀ p,    L (i' − i) = h (u_θ − R i_θ − K_m v_θ),    q' = q + h v_θ
+
+Drives are implicit, by their linear blocks: i' is eliminated, and what is left of voltage loops, back-EMF and damping
+comes to the diagonal of M (``step_drives``). The impulses p solve one contact problem over all candidates that touch at
+q_m; its law is on the rates at the end, turned to the geometry of the end (``step_contacts``).
+
+θ = 1 damps and is of first order; θ = 1/2 is of second order between events, and keeps the energy of linear systems,
+contacts aside, to rounding. A landing leaves a penetration of up to h times its speed, which is taken back.
+
+The ledger holds what the scheme does: power at x_θ, friction −p_t·(u + u')/2, and of rows that hold p_n (u_n + u_n')/2.
+This module has the tables, and the geometry of a step.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from dynsim.dynamics import tables as ka
+from dynsim.dynamics.contact import unilateral as ku
+from dynsim.dynamics.contact.cone import problem as kc
+from dynsim.dynamics.contact.quadrics import contact_rows
+from dynsim.dynamics.contact.shapes import shaped_rows
+from dynsim.dynamics.contact.unilateral import UnilateralArrays
+from dynsim.dynamics.tables import ContactArrays, ModelArrays, Workspace, row_limit
+from dynsim.dynamics.tree.joints import displace, normalise, read_positions
+from dynsim.dynamics.tree.sweep import forward_sweep
+from dynsim.jit.kernel import integers, internal_kernel, reals
+
+# A residual that is good enough, and one above which a solve counts as capped [m/s]; starts before it is. Below the
+# second what touches does not leave, and what sticks does not slip.
+GOOD, BAD = 1e-11, 1e-8
+QUICK_ROUNDS, LAST_ROUNDS = 2, 12
+# A gap that counts as closed: far above rounding [m].
+MARGIN = 1e-10
+# SteppingArrays.law
+FRICTION_OF, RESTITUTION, GRIP, GRIP_AXIS = 0, 1, 2, 3
+LAW_SIZE = 6
+# SteppingArrays.memory: of the last accepted step, and of the one that is tried; its columns, of a candidate
+LAST, NOW = 0, 1
+LISTED = 0  # 1: it had rows
+CLOSED = 1  # 1: it pressed, or touched without leaving
+SLID = 2  # 1: it slid
+NORMAL_IMPULSE = 3  # [N s]
+END_RATE = 4  # 3: rates of its rows at the end of that step
+NORMAL_THEN, TANGENT_THEN = 7, 10  # 3 each: directions of its first two rows
+CENTRE = 13  # 3: of the sphere that touches [m]
+BUDGET = 16  # energy that its landing has taken, and that pushing it out of its surface may give back [J]
+MEMORY_SIZE = 17
+# SteppingArrays.turn, of a candidate with rows
+ADDED = 0  # 3: what the law adds to the end rates of its rows [m/s]
+TURNED = 3  # 3: the share of that which is due to rows that turn
+PUSH = 6  # rate at which it is pushed out of its surface; negative: let into it [m/s]
+MEAN = 7  # 1: it slides on, along the mean of its rates
+KNOWN = 8  # 1: its rows are those of the last step, turned
+STRUCK = 9  # what the step books as its impact loss [J]
+TURN_SIZE = 10
+# SteppingArrays.found: largest residual [m/s], solves above BAD, largest penetration [m]; solves, and those that took
+# more than the quick rounds; most of what steps have taken of the energy, or made (negative), at any time [J]; steps
+# whose limits of drives contradict each other; energy that would be another one if all came half a step later [J].
+WORST, CAPPED, PENETRATION, SOLVES, LONG_SOLVES, TAKEN, UNSETTLED, HALF_STEP = 0, 1, 2, 3, 4, 5, 6, 7
+FOUND_SIZE = 8
+# SteppingArrays.before: rates at the start; rates of the velocity products; acceleration of the last step, and then of
+# this one; what is applied at the start, without loads; rates at the end of the last accepted step.
+V_START, V_BIAS, ACCELERATION, APPLIED_THEN, V_LAST = 0, 1, 2, 3, 4
+BEFORE_SIZE = 5
+# SteppingArrays.eliminated
+FREE, PER, DIDT_THEN = 0, 1, 2
+# SteppingArrays.energy
+START, STOP = 0, 1
+MECHANICAL, MAGNETIC = 0, 1
+# SteppingArrays.grid: time from which steps of one length are counted [s], how many have been since; length of the last
+# accepted step [s], the power of drives and loads in it, and in the step that is tried [W].
+GRID_START, GRID_STEPS, LENGTH_LAST, POWER_LAST, POWER_NOW = 0, 1, 2, 3, 4
+GRID_SIZE = 5
+
+
+class SteppingArrays(NamedTuple):
+    """What time stepping reads and writes beside ``Run``; p is the most rows that there can be."""
+
+    theta: float
+    law: np.ndarray  # (c, LAW_SIZE) friction, restitution, and friction along GRIP_AXIS per that across (1: isotropic)
+    body: np.ndarray  # (n, BODY_SIZE) as that of the model, its ARMATURE with what is implicit
+    linear: np.ndarray  # (na, BLOCK_SIZE)
+    segment: np.ndarray  # (na,) int: which limit holds each drive, see dynsim.dynamics.drive.law.segment_of
+    eliminated: np.ndarray  # (na, 3) i' − i at v' = v, what v' − v adds to it; di/dt at the start
+    before: np.ndarray  # (BEFORE_SIZE, n) see V_START and what follows it
+    energy: np.ndarray  # (2, 2) at START and STOP of the step: MECHANICAL and MAGNETIC [J]
+    rate: np.ndarray  # (2, p) row rates at the start and the end
+    impulse: np.ndarray  # (p,) of the rows of candidate k at 3 k, then couplings: the next start
+    f: np.ndarray  # (p,)
+    b: np.ndarray  # (p,) row rates at the end without impulses
+    w: np.ndarray  # (p,) what the law is on
+    right: np.ndarray  # (p,) of the contact problem
+    mu: np.ndarray  # (p,)
+    kind: np.ndarray  # (p,) int
+    modes: np.ndarray  # (c,) int: OPEN, or STICKING for three rows
+    motion: np.ndarray  # (c,) int: OPEN, SLIDING or STICKING at the end of the step
+    told: np.ndarray  # (c,) int: that of the last accepted step; −1 before the first
+    memory: np.ndarray  # (2, c, MEMORY_SIZE) LAST and NOW
+    turn: np.ndarray  # (c, TURN_SIZE)
+    room: np.ndarray  # (CONE_ROOM, p, p)
+    found: np.ndarray  # (FOUND_SIZE,)
+    grid: np.ndarray  # (GRID_SIZE,)
+
+
+def stepping_arrays(
+    model: ModelArrays,
+    contacts: ContactArrays,
+    na: int,
+    joint_rows: int,
+    theta: float,
+    unilateral: UnilateralArrays,
+) -> SteppingArrays:
+    """Allocate :class:`SteppingArrays`: friction of the contacts and the law's restitution; isotropic."""
+    n, c = model.body.shape[0], contacts.link.shape[0]
+    p = row_limit(c, joint_rows)
+    law = np.zeros((c, LAW_SIZE))
+    law[:, FRICTION_OF], law[:, GRIP], law[:, GRIP_AXIS] = contacts.point[:, ka.MU], 1.0, 1.0
+    law[:, RESTITUTION] = unilateral.law[:, ku.RESTITUTION]
+    return SteppingArrays(
+        theta=float(theta),
+        law=law,
+        body=reals(model.body),
+        linear=np.zeros((na, ka.BLOCK_SIZE)),
+        segment=integers(np.zeros(na)),
+        eliminated=np.zeros((na, 3)),
+        before=np.zeros((BEFORE_SIZE, n)),
+        energy=np.full((2, 2), np.nan),
+        rate=np.zeros((2, p)),
+        impulse=np.zeros(p),
+        f=np.zeros(p),
+        b=np.zeros(p),
+        w=np.zeros(p),
+        right=np.zeros(p),
+        mu=np.zeros(p),
+        kind=integers(np.zeros(p)),
+        modes=integers(np.full(c, -1)),
+        motion=integers(np.full(c, ka.OPEN)),
+        told=integers(np.full(c, -1)),
+        memory=np.zeros((2, c, MEMORY_SIZE)),
+        turn=np.zeros((c, TURN_SIZE)),
+        room=np.zeros((kc.CONE_ROOM, p, p)),
+        found=np.zeros(FOUND_SIZE),
+        grid=np.zeros(GRID_SIZE),
+    )
+
+
+@internal_kernel
+def moved(system, ws: Workspace, y, scale, out):
+    """Positions of y moved by ``scale`` times the ka.QDD column, into out; its other entries as in y."""
+    layout = system.layout
+    for j in range(y.shape[0]):
+        out[j] = y[j]
+    for i in range(ws.joints.shape[0]):
+        ws.joints[i, ka.QDD] *= scale
+    if layout.extra == 0:
+        for i in range(ws.joints.shape[0]):
+            out[layout.q + i] += ws.joints[i, ka.QDD]
+    else:
+        displace(system.model.compound, system.model, ws, out, layout.q)
+        normalise(system.model.compound, system.model, out, layout.q)
+
+
+@internal_kernel
+def place_joints(system, ws: Workspace, y):
+    """Positions of y into ``ws.joints``."""
+    layout = system.layout
+    if layout.extra > 0:
+        read_positions(system.model.compound, system.model, y, layout.q, ws)
+        return
+    for i in range(ws.joints.shape[0]):
+        ws.joints[i, ka.Q] = y[layout.q + i]
+
+
+@internal_kernel
+def geometry(system, model: ModelArrays, s: SteppingArrays, ws: Workspace):
+    """Poses, gaps and rows at the positions and rates in ``ws.joints``; tangents along and across the grip axis."""
+    forward_sweep(model, ws, 1.0, 0.0, 1.0)
+    contact_rows(model, system.contacts, system.unilateral, ws)
+    shaped_rows(system.shapes, system.unilateral, model, system.contacts, ws)
+    state = ws.contacts
+    for k in range(state.shape[0]):
+        i, nx, ny, nz = (
+            system.contacts.link[k, ka.LINK],
+            state[k, ka.NORMAL],
+            state[k, ka.NORMAL + 1],
+            state[k, ka.NORMAL + 2],
+        )
+        x, y, z = s.law[k, GRIP_AXIS], s.law[k, GRIP_AXIS + 1], s.law[k, GRIP_AXIS + 2]
+        ax = ws.links[i, ka.R] * x + ws.links[i, ka.R + 1] * y + ws.links[i, ka.R + 2] * z
+        ay = ws.links[i, ka.R + 3] * x + ws.links[i, ka.R + 4] * y + ws.links[i, ka.R + 5] * z
+        az = ws.links[i, ka.R + 6] * x + ws.links[i, ka.R + 7] * y + ws.links[i, ka.R + 8] * z
+        across = ax * nx + ay * ny + az * nz
+        ax, ay, az = ax - across * nx, ay - across * ny, az - across * nz
+        length = math.sqrt(ax * ax + ay * ay + az * az)
+        if not length > 1e-6:  # the axis is along the normal: any direction does
+            ax, ay, az = (0.0, nz, -ny) if abs(nx) < 0.7 else (-nz, 0.0, nx)
+            length = math.sqrt(ax * ax + ay * ay + az * az)
+        ax, ay, az = ax / length, ay / length, az / length
+        state[k, ka.FIRST_TANGENT], state[k, ka.FIRST_TANGENT + 1], state[k, ka.FIRST_TANGENT + 2] = ax, ay, az
+        state[k, ka.SECOND_TANGENT] = ny * az - nz * ay
+        state[k, ka.SECOND_TANGENT + 1] = nz * ax - nx * az
+        state[k, ka.SECOND_TANGENT + 2] = nx * ay - ny * ax
+
+
+@internal_kernel
+def constraint_rates(model: ModelArrays, ws: Workspace, y, first, out):
+    """J v of all rows, v from ``first`` on in y. A row's rate climbs from its link to the world."""
+    rows, links, active = ws.rows, ws.links, ws.active
+    for r in range(ws.counts[ka.ROWS]):
+        if r < ws.counts[ka.COUPLED]:
+            out[r] = (
+                rows[r, ka.ROW] * y[first + active[r, ka.BODY_A]]
+                + rows[r, ka.ROW + 1] * y[first + active[r, ka.BODY_B]]
+            )
+            continue
+        a, b, c = rows[r, ka.ROW], rows[r, ka.ROW + 1], rows[r, ka.ROW + 2]
+        d, e, f = rows[r, ka.ROW + 3], rows[r, ka.ROW + 4], rows[r, ka.ROW + 5]
+        total, i = 0.0, active[r, ka.BODY_A]
+        while i >= 0:
+            total += y[first + i] * (
+                ((a * links[i, ka.S] + b * links[i, ka.S + 1]) + (c * links[i, ka.S + 2] + d * links[i, ka.S + 3]))
+                + (e * links[i, ka.S + 4] + f * links[i, ka.S + 5])
+            )
+            i = model.tree[i, ka.PARENT]
+        out[r] = total

@@ -1,0 +1,1 @@
+"""All that touches numba: compilation, its cache, struct types, SIMD."""

@@ -1,0 +1,252 @@
+"""The one place that compiles: ``@kernel`` on plain module-level functions.
+
+How is in dynsim.jit.compiler. Here is the cache, because results must not depend on what a process has done before:
+numba's checks only the file that holds the function (an edit in a callee elsewhere silently runs old machine code) and
+believes whatever bytes it finds, see :class:`_KernelCache`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import pickle
+import stat
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import llvmlite
+import numba
+import numpy as np
+from numba.core import config, serialize
+from numba.core.caching import _Cache
+from numba.core.compiler import CompileResult
+
+from dynsim.jit.compiler import ApartCompiler, KernelCompiler, PartCompiler, as_part, register_part
+from dynsim.jit.parallel_compile import by_address, provide
+
+# Packs the scalar formulas of 3-vectors and wrenches into vector instructions (numba leaves it off): a right-hand side
+# takes 8 % less time. Global, and read when numba compiles its first function in the process.
+config.SLP_VECTORIZE = 1
+
+_OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}, "_nrt": False}
+
+# The packages whose functions are compiled into each other: an edit in one makes all compiled code stale.
+_PACKAGES = tuple(Path(__file__).parents[1] / name for name in ("jit", "dynamics", "integrators", "snake"))
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+class _KernelCache(_Cache):
+    """Machine code on disk, a file for each function and signature: SHA-256 of the rest, then numba's own pickle.
+
+    A file that is damaged or cannot be written costs a compilation, never the run: LLVM aborts the process on broken
+    machine code, so nothing is handed to it before its digest is right. Unlike numba's own cache it loads none of the
+    rules by which code is compiled (0.4 s): machine code needs none, and the compiler loads them when it is asked to.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+
+    @property
+    def cache_path(self) -> str:
+        return str(cache_folder())
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        path = self._path(sig, target_context.codegen())
+        try:
+            content = path.read_bytes()
+        except FileNotFoundError:
+            for tell in list(_listeners):
+                tell()
+            return None
+        except OSError as error:
+            _warn(f"{path}: cannot be read ({error.strerror}); compiling it anew")
+            return None
+        digest, payload = content[:_DIGEST_SIZE], content[_DIGEST_SIZE:]
+        if hashlib.sha256(payload).digest() != digest:
+            _warn(f"{path}: damaged machine code; compiling it anew")
+            return None
+        *reduced, needs = pickle.loads(payload)
+        for need in needs:
+            provide(need)
+        return CompileResult._rebuild(target_context, *reduced)
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        if data.library.has_dynamic_globals:  # addresses of this process, which NUMBA_OPT=0 leaves in
+            return
+        path = self._path(sig, data.codegen)
+        payload = serialize.dumps((*data._reduce(), data.library.needs))
+        try:
+            with tempfile.NamedTemporaryFile(
+                dir=path.parent, prefix=f"{path.name}.", suffix=".tmp", delete=False
+            ) as file:
+                try:
+                    file.write(hashlib.sha256(payload).digest())
+                    file.write(payload)
+                    file.close()
+                    os.replace(file.name, path)
+                except BaseException:
+                    os.unlink(file.name)
+                    raise
+        except OSError as error:
+            _warn(f"{path}: cannot be kept ({error.strerror}); the next run compiles it again")
+
+    def _path(self, sig: Any, codegen: Any) -> Path:
+        """Named by what may differ for the same sources: processor, signature, and a function of another package."""
+        source = Path(self._function.__code__.co_filename)
+        content = b"" if _names_the_folder(source) else source.read_bytes()
+        key = repr((sig, codegen.magic_tuple())).encode() + content
+        name = f"{self._function.__module__}.{self._function.__qualname__}"
+        return cache_folder() / f"{name}-{hashlib.sha256(key).hexdigest()[:16]}{_SUFFIX}"
+
+    def enable(self) -> None: ...
+
+    def disable(self) -> None: ...
+
+    def flush(self) -> None: ...
+
+
+def _names_the_folder(source: Path) -> bool:
+    """Whether the source is in the name of :func:`cache_folder` already."""
+    return any(source.is_relative_to(package) for package in _PACKAGES)
+
+
+_SUFFIX = ".kernel"
+_DIGEST_SIZE = hashlib.sha256().digest_size
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, UserWarning, stacklevel=3)
+
+
+@lru_cache(maxsize=1)
+def cache_folder() -> Path:
+    """Folder of the compiled kernels: this user's own and writable, named by what would make its content stale.
+
+    Loading machine code runs it, so a folder that belongs to somebody else, or that others can write to, is not used.
+    """
+    digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__} {np.__version__}".encode())
+    for source in (file for package in _PACKAGES for file in sorted(package.rglob("*.py"))):
+        digest.update(source.read_bytes())
+    name = Path("dynsim", digest.hexdigest()[:16])
+    roots = [os.environ.get(variable) for variable in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")]
+    home = os.path.expanduser(next((root for root in roots if root), "~/.cache"))
+    temporary = Path(tempfile.gettempdir(), f"cache-{os.getuid()}")
+    # A user without a home keeps the tilde.
+    for root in (temporary,) if home.startswith("~") else (Path(home), temporary):
+        folder = root / name
+        try:
+            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            status = folder.lstat()
+        except OSError:
+            continue
+        writable_by_others = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+        if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or writable_by_others:
+            _warn(f"{folder}: not used for compiled kernels, because others own it or can write to it")
+        elif os.access(folder, os.W_OK | os.X_OK):
+            return folder
+    return Path(tempfile.mkdtemp(prefix="dynsim-"))
+
+
+@contextmanager
+def told_of_compilation(tell: Callable[[], None]) -> Iterator[None]:
+    """Call ``tell`` once when a kernel is not on disk, before it is compiled in this process: that takes long."""
+
+    def once() -> None:
+        _listeners.remove(once)
+        tell()
+
+    _listeners.append(once)
+    try:
+        yield
+    finally:
+        with suppress(ValueError):
+            _listeners.remove(once)
+
+
+_listeners: list[Callable[[], None]] = []
+
+
+def kernel(function: F) -> F:
+    """Compile ``function`` on first call and keep the machine code on disk.
+
+    Of fast-math only contraction (a·b + c in one rounding) is allowed: reordering would let the compiler assume that
+    there are no NaNs, and NaN must stay NaN so that divergence is seen. ``error_model="numpy"``: a division by zero
+    gives inf or NaN and does not branch. Kernels allocate nothing, so numba's reference counting of arrays is switched
+    off (``_nrt``): its atomic operations cost a tenth of a right-hand side.
+    """
+    return _compile(function)
+
+
+def free_kernel(function: F) -> F:
+    """As :func:`kernel`, without the interpreter's lock while it runs: others can listen meanwhile.
+
+    For what takes long, and only Python calls: see dynsim.engine.attended.
+    """
+    return _compile(function, nogil=True)
+
+
+def merged_kernel(function: F) -> F:
+    """As :func:`kernel`, for callers of the right-hand side: merged into their caller before compilation.
+
+    A compiled function carries the code of all it calls, so each extra level would compile the right-hand side again.
+    """
+    return _compile(function, inline="always")
+
+
+def internal_kernel(function: F) -> F:
+    """For what only kernels call: compiled as part of them. From Python it is the plain function that it was.
+
+    Unpacking the tables of a model from Python objects would take longer to compile than most of these functions.
+    """
+    return register_part(function, PartCompiler, _OPTIONS)
+
+
+def apart_kernel(function: F) -> F:
+    """As :func:`internal_kernel`, for what is rarely called from the right-hand side: a call, never merged.
+
+    Merged, it would take registers from what runs every time.
+    """
+    return register_part(function, ApartCompiler, _OPTIONS)
+
+
+def exact_kernel(function: F) -> F:
+    """As :func:`internal_kernel`, with every product rounded: for what is merged into several places.
+
+    Which products of a sum are contracted depends on the place, and so would the last bits of what it computes.
+    """
+    return register_part(function, PartCompiler, {**_OPTIONS, "fastmath": False, "forceinline": True})
+
+
+def separate_kernel(function: F) -> F:
+    """For what several parts of a large kernel call and returns nothing: a kernel of its own, called by address.
+
+    It is compiled by a process of its own while its caller is, see dynsim.jit.parallel_compile. For kernels only.
+    """
+    compiled = _compile(function)
+    return function if config.DISABLE_JIT else by_address(function, compiled)
+
+
+def _compile(function: F, **options: Any) -> F:
+    compiled = numba.njit(pipeline_class=KernelCompiler, no_cfunc_wrapper=True, **_OPTIONS, **options)(function)
+    if not config.DISABLE_JIT:
+        compiled._cache = _KernelCache(function)
+        if not options:  # other kernels bring it along: they need no entry of its own
+            part = as_part(function, _OPTIONS)
+            compiled.get_call_template, compiled.get_overload = part.get_call_template, part.get_overload
+    return compiled
+
+
+def reals(values: Any) -> np.ndarray:
+    """The canonical float array of every kernel argument: float64, C order, writable, a copy."""
+    return np.array(values, dtype=np.float64, order="C")
+
+
+def integers(values: Any) -> np.ndarray:
+    """The canonical integer array of every kernel argument: int64, C order, writable, a copy."""
+    return np.array(values, dtype=np.int64, order="C")

@@ -1,1 +1,0 @@
-"""Constraint rows: points on surfaces, joints coupled to joints, and the forces of both."""

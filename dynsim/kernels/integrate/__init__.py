@@ -1,1 +1,0 @@
-"""Time integration: methods, error control, projection, dense output, samples, and the driver of it all."""

@@ -1,1 +1,0 @@
-"""Trees of rigid bodies: joints, recursive Newton–Euler sweeps, the articulated solve."""

@@ -1,0 +1,1 @@
+"""What a scenario names by type: plants, motors, surfaces, controllers, paths."""

@@ -1,0 +1,103 @@
+"""A base motion from a CSV file: places t_s, x_m, y_m, or rates t_s, V_m_s, omega_rad_s."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, PrivateAttr, model_validator
+from scipy.interpolate import PchipInterpolator
+
+from dynsim.compile.control import BasePath
+from dynsim.compile.protocols import BuildContext
+from dynsim.config.base import StrictConfig, error_at
+from dynsim.errors import ModelError
+from dynsim.record.csv_rows import read_table
+from dynsim.snake.plane_curve import AlongCurve, PlaneCurve, seen_from_start
+
+PLACES = ("t_s", "x_m", "y_m")
+RATES = ("t_s", "V_m_s", "omega_rad_s")
+# Rows nearer than this to the last one of the curve say how fast it is gone along, not where it leads [m].
+SPACING = 1e-3
+# A corner between two rows that far apart; rows of a smooth path turn less [rad].
+TURN_LIMIT = np.deg2rad(15.0)
+
+
+class Config(StrictConfig):
+    """Along the places, or with the rates, of ``file``; at rest beyond its ends."""
+
+    type: Literal["csv"]
+    file: str = Field(
+        description="CSV file, relative to the scenario file, with a header t_s,x_m,y_m or t_s,V_m_s,omega_rad_s"
+    )
+    frame: Literal["world", "start"] | None = Field(
+        default=None, description="of x_m and y_m (default: world); start: that of the base at its start, x ahead"
+    )
+    # Read once: an edit of the file does not change a scenario that is already loaded, only the next one.
+    _rows: NDArray[np.float64] = PrivateAttr()
+    _are_rates: bool = PrivateAttr()
+
+    @model_validator(mode="after")
+    def _read(self) -> Self:
+        columns, rows = read_table(self.file, PLACES, RATES, what="a path")
+        self._rows, self._are_rates = np.array(rows), columns == RATES
+        if self._rows[0, 0] < 0.0:
+            raise ValueError(f"{self.file}: begins at {self._rows[0, 0]:g} s, before the run")
+        if not np.abs(self._rows).max() < 1e9 or np.diff(self._rows[:, 0]).min() < 1e-9:
+            raise ValueError(f"{self.file}: numbers too large, or rows too close in time, for a curve through them")
+        if self._are_rates and self.frame is not None:
+            raise error_at("frame", "has no effect on rates")
+        return self
+
+
+@dataclass(frozen=True)
+class Rates:
+    """V and ω, shape-preserving cubics of time."""
+
+    rates: PchipInterpolator
+
+    def motion(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Their integrals, distance [m] and turn [rad], at times t [s], (T, 2)."""
+        return np.asarray(self.rates.antiderivative()(np.clip(t, *self.rates.x[[0, -1]])))
+
+
+def build(config: Config, context: BuildContext) -> BasePath:
+    """The motion that the rows describe.
+
+    Raises
+    ------
+    ModelError
+        The places start elsewhere or sideways, or have a corner: with the row.
+    """
+    times, rows = config._rows[:, 0], config._rows[:, 1:]
+    if config._are_rates:
+        return Rates(PchipInterpolator(times, rows))
+    points = seen_from_start(context.model.robot, rows, config.frame or "world")
+    kept, way = _along(points)
+    if len(kept) < 2:
+        raise ModelError(f"{config.file}: no row is {SPACING:g} m from the first; for a base that stands take hold")
+    names = [f"row {k + 1} ({rows[k, 0]:g}, {rows[k, 1]:g}) m, t = {times[k]:g} s" for k in kept]
+    try:
+        curve = PlaneCurve(points[kept], names, start_limit=TURN_LIMIT, turn_limit=TURN_LIMIT, samples=8)
+    except ModelError as error:
+        raise ModelError(f"{config.file}: {error}") from error
+    return AlongCurve(curve, PchipInterpolator(times, way))
+
+
+def _along(points: NDArray[np.float64]) -> tuple[list[int], NDArray[np.float64]]:
+    """Rows that the curve goes through, and the way along their chords at every row [m]; it never goes back."""
+    kept = [0]
+    begin, *others = points.tolist()
+    for k, point in enumerate(others, 1):
+        if math.dist(begin, point) >= SPACING:
+            begin = point
+            kept.append(k)
+    # It ends at the last row, however near.
+    kept[1:] = [*kept[1:-1], len(points) - 1] if len(kept) > 1 else []
+    chords = np.append(np.hypot(*np.diff(points[kept], axis=0).T), 0.0)
+    last = np.searchsorted(kept, np.arange(len(points)), side="right") - 1
+    beyond = np.minimum(np.hypot(*(points - points[kept][last]).T), chords[last])
+    return kept, np.maximum.accumulate(np.cumsum(chords)[last] - chords[last] + beyond)

@@ -1,0 +1,339 @@
+"""Continuous voltage PD on joint references (Wang and Minami, eq 56): u = k_p (q_d − q) + k_d (v_d − v)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator, model_validator
+
+from dynsim.compile.bracing import MIN_N
+from dynsim.compile.control import PLANNED, BasePath, HandPath, JointControl, targets_on
+from dynsim.compile.model import Model
+from dynsim.compile.protocols import BuildContext
+from dynsim.compile.references.feed_forward import planned_voltages
+from dynsim.compile.references.inverse_kinematics import follow
+from dynsim.compile.references.operated import Operated
+from dynsim.compile.rolling import rolled, wheel_angles
+from dynsim.compile.splines import clamped_cubic, quintic_coefficients
+from dynsim.config.base import NonNegative, Positive, StrictConfig, check_waypoints, error_at
+from dynsim.errors import ModelError
+from dynsim.library import families
+from dynsim.library.controllers.operator import Operator
+from dynsim.model.base_pose import base_row
+from dynsim.model.description import Contact, Robot
+from dynsim.model.drives import Motor, Servo, TorqueSource
+
+ENGINE = "dynamics"
+
+PathChoice: Any = families.union("path")
+BasePathChoice: Any = families.union("base_path")
+
+# Of the reference splines: half a gigabyte for each joint.
+SEGMENTS_MAX = 10_000_000
+# Of a base between two knots [rad]: more is no longer the motion that the path describes.
+TURN_MAX = 0.2
+
+
+class HandReference(StrictConfig):
+    """A path of the hand, turned into references of ``joints`` by inverse kinematics."""
+
+    path: PathChoice
+    joints: list[str] = Field(min_length=1, description="joints that follow the path; the others hold")
+    braces: list[str] = Field(default=[], description="contact points that the joints keep on their surfaces meanwhile")
+    tolerance_m: Positive = Field(default=1e-6, description="a target further off than this is unreachable")
+
+
+class BaseReference(StrictConfig):
+    """A path of the mobile base, turned into references of its wheels."""
+
+    path: BasePathChoice
+
+
+class JointPath(StrictConfig):
+    """Waypoints of one joint: a cubic spline, at rest at both ends and held beyond them."""
+
+    times_s: list[float] = Field(min_length=2)
+    angles_deg: list[float] = Field(min_length=2)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        check_waypoints(self.times_s, self.angles_deg, "angles_deg")
+        return self
+
+
+class TorquePath(StrictConfig):
+    """Waypoints of one torque: a cubic spline with level ends, held beyond them."""
+
+    times_s: list[float] = Field(min_length=2)
+    torques_N_m: list[float] = Field(min_length=2, description="N at a prismatic joint")
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        check_waypoints(self.times_s, self.torques_N_m, "torques_N_m")
+        return self
+
+
+class Config(StrictConfig):
+    """Gains for all DC motors or one per DC motor; joints without a reference hold their initial position.
+
+    Servos follow the same references with gains of their own; torque sources have ``torques``.
+    """
+
+    type: Literal["joint_pd"]
+    k_p_V_per_rad: NonNegative | list[NonNegative] = Field(default=500.0, description="V/m at a prismatic joint")
+    k_d_V_s_per_rad: NonNegative | list[NonNegative] = Field(default=20.0, description="V s/m at a prismatic joint")
+    hand: HandReference | None = Field(default=None, description="a path for the hand")
+    base: BaseReference | None = Field(default=None, description="a path for the mobile base; none: it holds")
+    operator: Operator | None = Field(default=None, description="velocities for hand and mobile base, instead of paths")
+    joints: dict[str, JointPath] = Field(default={}, description="waypoints by joint name")
+    torques: dict[str, TorquePath] = Field(default={}, description="torques of motors of type torque by joint name")
+    feed_forward: Literal["none", "gravity", "dynamics"] = Field(
+        default="none", description="planned voltages of DC motors along the references, beside the PD"
+    )
+    brace: Literal["optimal"] | dict[str, Positive] | None = Field(
+        default=None,
+        description="normal forces [N] by contact, or `optimal`: planned as `dynamics`, with these braces pressing",
+    )
+    min_N: NonNegative = Field(default=MIN_N, description="least normal force of every brace under brace: optimal")
+    sample_time_s: Positive | None = Field(
+        default=None, description="commands are taken at this period and held in between; default: continuous"
+    )
+    knot_spacing_s: Positive = Field(default=0.02, description="distance of the knots of the reference splines")
+
+    @field_validator("brace", mode="before")
+    @classmethod
+    def _check_brace(cls, value: Any) -> Any:
+        """One message for what is neither of the two, and one that names the force that is none."""
+        if isinstance(value, Mapping) and value:
+            for name, force in value.items():
+                if isinstance(force, bool) or not isinstance(force, int | float) or not 0.0 < force < np.inf:
+                    raise error_at(
+                        str(name), "must be a normal force above 0 N; leave out a contact that shall not press"
+                    )
+        elif value not in (None, "optimal"):
+            raise ValueError("must be `optimal`, or normal forces [N] by contact, such as {elbow_4: 3.0}")
+        return value
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        both = [name for name in self.joints if self.hand is not None and name in self.hand.joints]
+        if both:
+            raise ValueError(f"{both[0]} cannot follow both the hand path and waypoints of its own")
+        if self.operator is not None:
+            planned = [name for name in PLANNED if name in self.model_fields_set and getattr(self, name)]
+            planned = [name for name in planned if getattr(self, name) != "none"]
+            if planned:
+                raise error_at(planned[0], f"an operator rewrites references on the way; remove {planned[0]}")
+        if self.brace is not None and self.feed_forward != "none":
+            raise error_at("feed_forward", "brace plans the whole dynamics; leave feed_forward away")
+        if self.min_N != MIN_N and self.brace != "optimal":
+            raise error_at("min_N", "min_N is for brace: optimal; commanded forces are what they are; remove it")
+        return self
+
+
+def build(config: Config, context: BuildContext) -> JointControl:
+    """Resolve gains and references for the model of the context; long inverse kinematics report to its ``progress``.
+
+    Raises
+    ------
+    ModelError
+        A named joint does not exist or has no motor, or there are not as many gains as motors.
+    UnreachableReference
+        The hand cannot follow its path.
+    """
+    model = context.model
+    robot = model.robot
+    _check_names(config, model)
+    path, reuse = None, context.reuse
+    if config.hand is not None:
+        path_config = config.hand.path
+        path = reuse.of(
+            "path", lambda: families.build("path", path_config, context, HandPath), path_config, context.duration
+        )
+    base_path = None if config.base is None else _base_path(config.base, context)
+    times, positions = np.zeros(0), dict[str, NDArray[np.float64]]()
+    planned = config.brace is not None or config.feed_forward != "none"
+    if config.joints or config.torques or path is not None or base_path is not None or planned:
+        times = _knots(config.knot_spacing_s, context.duration)
+        for name, joint in config.joints.items():
+            positions[name] = clamped_cubic(joint.times_s, np.deg2rad(joint.angles_deg), times)
+        for name, torque in config.torques.items():
+            positions[name] = clamped_cubic(torque.times_s, np.array(torque.torques_N_m), times)
+        if base_path is not None:
+            positions |= _wheel_angles(robot, base_path, times)
+        if config.hand is not None and path is not None:
+            hand, targets = config.hand, targets_on(path, times, reuse)
+            base = _base_coordinates(robot, positions, times)
+            braces = [_contact(context, name, "hand.braces") for name in hand.braces]
+            start, tolerance = robot.initial, hand.tolerance_m
+            followed = follow(
+                model, times, targets, hand.joints, start, tolerance, context.progress, base, braces, reuse
+            )
+            positions |= dict(zip(hand.joints, followed.T, strict=True))
+    control = JointControl.following(
+        robot,
+        k_p=_gains(config, robot, "k_p"),
+        k_d=_gains(config, robot, "k_d"),
+        times=times,
+        positions=positions,
+        path=path,
+        sample_time=config.sample_time_s,
+        voltages=_planned(config, context, times, positions) if planned else None,
+        reuse=reuse,
+    )
+    return control if config.operator is None else replace(control, operated=_operated(config.operator, context))
+
+
+def _operated(operator: Operator, context: BuildContext) -> Operated:
+    robot = context.model.robot
+    if any(command.base is not None for command in operator.commands):
+        _check_base(robot, ("controller", "operator"))
+    return Operated(
+        rate=operator.rate_hz,
+        joints=tuple(operator.joints),
+        braces=tuple(_contact(context, name, "operator.braces") for name in operator.braces),
+        rate_limit=operator.rate_limit_rad_s,
+        acceleration_limit=operator.acceleration_limit_rad_s2,
+        hand_acceleration=operator.hand_acceleration_m_s2,
+        base_acceleration=(operator.base_acceleration_m_s2, operator.base_acceleration_rad_s2),
+        tolerance=operator.tolerance_m,
+        script=operator.script(),
+    )
+
+
+def _planned(
+    config: Config, context: BuildContext, times: NDArray[np.float64], positions: dict[str, NDArray[np.float64]]
+) -> NDArray[np.float64]:
+    """Voltages of the motors along the references, (T, na)."""
+    if config.brace is None:
+        return planned_voltages(context.model, times, positions, {}, whole=config.feed_forward == "dynamics")
+    forces = dict.fromkeys(context.declared) if config.brace == "optimal" else dict(config.brace)
+    braces = {name: (_contact(context, name, "brace"), force) for name, force in forces.items()}
+    return planned_voltages(context.model, times, positions, braces, config.min_N)
+
+
+def _contact(context: BuildContext, name: str, key: str) -> Contact:
+    if name not in context.contacts:
+        known = ", ".join(context.contacts) or "none"
+        raise ModelError(f"controller.{key}: no contact {name!r}; those are: {known}", keys=("controller",))
+    return context.contacts[name]
+
+
+def _check_names(config: Config, model: Model) -> None:
+    """Refuse references of what is no joint, has no motor, or one of another kind."""
+    robot = model.robot
+    driven = [motor.joint for motor in robot.motors]
+    in_hand = config.hand.joints if config.hand else config.operator.joints if config.operator else []
+    for name in [*config.joints, *config.torques, *in_hand]:
+        if name not in driven:
+            raise ModelError(f"controller: {name!r} is no joint with a motor; those are: {', '.join(driven) or 'none'}")
+    sources = {motor.joint for motor in robot.motors if isinstance(motor, TorqueSource)}
+    for name in [*config.joints, *in_hand]:
+        if name in sources:
+            raise ModelError(f"controller: {name!r} has a motor of type torque; give it controller.torques.{name}")
+    for name in config.torques:
+        if name not in sources:
+            raise ModelError(f"controller: torques.{name}: only motors of type torque take torques")
+    for name in config.joints:
+        if robot.links[model.joint_names.index(name)].units[0] != "rad":
+            raise ModelError(f"controller: {name!r} is prismatic; waypoints in angles_deg are for revolute joints")
+    wheels = () if robot.base is None else robot.base.wheels
+    for wheel in wheels:
+        if wheel in in_hand:
+            raise ModelError(f"controller: {wheel!r} is a wheel; the hand's path is for joints of the arm")
+    if config.base is None:
+        return
+    _check_base(robot, ("controller", "base"))
+    for wheel in wheels:
+        if wheel in config.joints:
+            raise ModelError(f"controller: {wheel!r} cannot follow both the base's path and waypoints of its own")
+
+
+def _check_base(robot: Robot, keys: tuple[str, ...]) -> None:
+    """Refuse to move a base that there is not, or whose wheels follow no reference."""
+    key, motors = ".".join(keys), {motor.joint: motor for motor in robot.motors}
+    if robot.base is None:
+        raise ModelError(f"{key}: the plant has no mobile base; pws_arm has one", keys=keys)
+    for wheel in robot.base.wheels:
+        if wheel not in motors:
+            raise ModelError(f"{key}: {wheel!r} has no motor; set plant.base.wheel.motor", keys=keys)
+        if isinstance(motors[wheel], TorqueSource):
+            raise ModelError(f"{key}: {wheel!r} has a motor of type torque, which follows no path", keys=keys)
+
+
+def _knots(spacing: float, duration: float) -> NDArray[np.float64]:
+    """Times of the samples of the reference splines [s]."""
+    segments = duration / spacing
+    if segments > SEGMENTS_MAX:
+        raise ModelError(
+            f"controller.knot_spacing_s = {spacing:g}: {segments:.3g} knots in {duration:g} s, "
+            f"at most {SEGMENTS_MAX:g} are made; {duration / SEGMENTS_MAX:.3g} would fit"
+        )
+    # A quintic spline needs six knots.
+    return np.linspace(0.0, duration, max(int(np.ceil(segments)), 6) + 1)
+
+
+def _base_path(base: BaseReference, context: BuildContext) -> BasePath:
+    try:
+        return families.build("base_path", base.path, context, BasePath)
+    except ModelError as error:
+        raise ModelError(f"controller.base.path: {error}", keys=("controller", "base", "path")) from error
+
+
+def _wheel_angles(robot: Robot, path: BasePath, times: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """References of the two wheels [rad]; none where the base does not move, so that they hold."""
+    assert robot.base is not None
+    keys = ("controller", "base", "path")
+    motion = np.asarray(path.motion(times), dtype=np.float64)
+    if motion.shape != (len(times), 2) or not np.isfinite(motion).all():
+        raise ModelError(f"controller.base.path: needs {len(times)} finite distances and turns", keys=keys)
+    if not motion.any():
+        return {}
+    turns = np.abs(np.diff(motion[:, 1]))
+    if turns.max() > TURN_MAX:
+        raise ModelError(
+            f"controller.base.path: at t = {times[turns.argmax()]:.3f} s the heading turns by {turns.max():.3g} rad "
+            f"from one knot of the references to the next, {times[1]:.3g} s later (limit {TURN_MAX:g} rad); go slower, "
+            "round it off, or lower controller.knot_spacing_s",
+            keys=keys,
+        )
+    first, _ = base_row(robot)
+    angles = robot.initial[first : first + 2] + wheel_angles(robot.base, motion)
+    return dict(zip(robot.base.wheels, angles.T, strict=True))
+
+
+def _base_coordinates(
+    robot: Robot, positions: dict[str, NDArray[np.float64]], times: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """Wheel angles [rad], x and y [m] of the base at the times of its references, (T, 4); None where it holds."""
+    if robot.base is None or not any(wheel in positions for wheel in robot.base.wheels):
+        return None
+    first, _ = base_row(robot)
+    start = robot.initial[first : first + 4]
+    angles = np.tile(start[:2], (len(times), 1))
+    for k, wheel in enumerate(robot.base.wheels):
+        angles[:, k] = positions.get(wheel, angles[:, k])
+    spacing = float(times[1] - times[0])
+    ways = rolled(robot.base, start[2:], quintic_coefficients(spacing, angles), spacing)
+    return np.hstack([angles, np.vstack([start[2:], ways[:, -1]])])
+
+
+_KEYS = {"k_p": "k_p_V_per_rad", "k_d": "k_d_V_s_per_rad"}
+
+
+def _gains(config: Config, robot: Robot, name: str) -> NDArray[np.float64]:
+    """One gain of every motor: the controller's for DC motors, a servo's own, none of a torque source."""
+    key, motors = _KEYS[name], robot.motors
+    gain, circuits = getattr(config, key), [isinstance(motor, Motor) for motor in motors]
+    if key in config.model_fields_set and motors and not any(circuits):
+        raise ModelError(f"controller: {key} has no effect: it is for DC motors, servos have gains of their own")
+    if isinstance(gain, list) and len(gain) != sum(circuits):
+        kind = "motors" if all(circuits) else "DC motors"
+        raise ModelError(f"controller: {key} has {len(gain)} values, there are {sum(circuits)} {kind}")
+    found = np.array([getattr(motor, name) if isinstance(motor, Servo) else 0.0 for motor in motors])
+    found[np.array(circuits, dtype=bool)] = gain
+    return found

@@ -1,0 +1,187 @@
+"""Where the target comes from: the operator's velocity commands and generated target paths ([T] IV.C).
+
+A script is a :class:`dynsim.snake.description.CommandSource` that knows its future; a joystick is one that does not,
+and a script that a live operator has left is told as it was.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator, model_validator
+
+from dynsim.config.base import NonNegative, Positive, StrictConfig
+from dynsim.snake.description import FIXING, SWITCHING, CommandBlock, Feedback
+
+Coordinates = tuple[float, float, float, float, float, float]
+Profile = Literal["linear", "smooth"]
+
+STATES = {"switching": SWITCHING, "fixing": FIXING}
+
+
+class Command(StrictConfig):
+    """One entry of the operator's list; what it does not name stays as it was."""
+
+    at_s: NonNegative
+    velocity: Coordinates | None = Field(
+        None, description="rates of x, y, z [m/s], alpha, beta, gamma [rad/s]; held until the next command"
+    )
+    mode: int | Literal["switching", "fixing"] | None = Field(
+        None, description="fix a mode by its number, or enter the switching or the fixing state"
+    )
+    gripper: Literal["open", "closed"] | None = None
+
+    @field_validator("mode", mode="before")
+    @classmethod
+    def _state_or_number(cls, value: Any) -> Any:
+        """A state or a whole number; whether the table has the number is for the controller to say."""
+        text = value if isinstance(value, str) else ""
+        if value is None or text in STATES or (isinstance(value, int) and not isinstance(value, bool)):
+            return value
+        near = difflib.get_close_matches(text, STATES, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise ValueError(f"no such mode{hint}; known: {', '.join(STATES)}, or the number of a mode")
+
+
+class Ramp(StrictConfig):
+    """Displacement of the target in a straight line of the six coordinates."""
+
+    type: Literal["ramp"]
+    start_s: NonNegative = 0.0
+    duration_s: Positive
+    displacement: Coordinates
+    profile: Profile = "linear"
+
+    def offset(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Displacement at progress s in [0, 1], shape (T, 6)."""
+        return s[:, None] * np.array(self.displacement)
+
+
+class Circle(StrictConfig):
+    """Circle of the target in world axes: on the floor plan, starting along +x, or in the vertical yz plane."""
+
+    type: Literal["circle"]
+    start_s: NonNegative = 0.0
+    duration_s: Positive
+    radius_m: Positive
+    turns: float = Field(1.0, description="plane xy: > 0 to the left; plane yz: from the top, > 0 first to the left")
+    plane: Literal["xy", "yz"] = "xy"
+    backward: bool = Field(False, description="plane xy: leave the start point tail first")
+    turn_head: bool = Field(True, description="plane xy: the yaw follows the tangent")
+    profile: Profile = "smooth"
+
+    def offset(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Displacement at progress s in [0, 1], shape (T, 6)."""
+        angle = 2.0 * np.pi * self.turns * s
+        out = np.zeros((len(s), 6))
+        if self.plane == "yz":
+            out[:, 1] = self.radius_m * np.sin(angle)
+            out[:, 2] = self.radius_m * (np.cos(angle) - 1.0)
+            return out
+        way = -1.0 if self.backward else 1.0
+        out[:, 0] = way * self.radius_m * np.sin(np.abs(angle))
+        out[:, 1] = self.radius_m * np.sign(self.turns) * (1.0 - np.cos(angle))
+        if self.turn_head:
+            out[:, 5] = way * angle
+        return out
+
+
+class DoorArc(StrictConfig):
+    """Arc of a door's knob about its hinge, the yaw kept perpendicular to the door ([T] V.D.3).
+
+    The robot faces the door along +x; the hinge is ``radius_m`` to the left or right of the target's start.
+    """
+
+    type: Literal["door_arc"]
+    start_s: NonNegative = 0.0
+    duration_s: Positive
+    radius_m: Positive = Field(description="hinge to knob [m]")
+    angle_deg: Annotated[float, Field(gt=0, le=180)] = 60.0
+    hinge: Literal["left", "right"] = "left"
+    opening: Literal["pull", "push"] = "pull"
+    profile: Profile = "smooth"
+
+    def offset(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Displacement at progress s in [0, 1], shape (T, 6)."""
+        angle = np.deg2rad(self.angle_deg) * s
+        left = 1.0 if self.hinge == "left" else -1.0
+        away = 1.0 if self.opening == "push" else -1.0
+        out = np.zeros((len(s), 6))
+        out[:, 0] = away * self.radius_m * np.sin(angle)
+        out[:, 1] = left * self.radius_m * (1.0 - np.cos(angle))
+        out[:, 5] = left * away * angle
+        return out
+
+
+Path = Annotated[Ramp | Circle | DoorArc, Field(discriminator="type")]
+
+
+class Script(StrictConfig):
+    """Operator's list and target paths of a scenario; their velocities add."""
+
+    commands: list[Command] = Field(default_factory=list)
+    paths: list[Path] = Field(default_factory=list)
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Script:
+        times = [command.at_s for command in self.commands]
+        if times != sorted(times):
+            raise ValueError("commands must be in the order of their at_s")
+        return self
+
+
+@dataclass(frozen=True)
+class ScriptedSource:
+    """A command source that knows its future."""
+
+    commands: Sequence[Command]
+    paths: Sequence[Ramp | Circle | DoorArc]
+
+    def read(self, first: int, count: int, period: float, feedback: Feedback | None = None) -> CommandBlock:
+        """Commands of periods ``first`` to ``first + count - 1``; a script does not look at the robot.
+
+        A command takes effect at the first period that begins at or after its time.
+        """
+        ticks = first + np.arange(count + 1)
+        block = CommandBlock(np.zeros((count, 6)), np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64))
+        for path in self.paths:
+            s = np.clip((ticks * period - path.start_s) / path.duration_s, 0.0, 1.0)
+            if path.profile == "smooth":
+                s = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+            # The mean rate of a period makes the integrated target exact at every tick.
+            block.velocity[...] += np.diff(path.offset(s), axis=0) / period
+        held, gripper = np.zeros(6), 0
+        pieces = []
+        for command in self.commands:
+            tick = int(np.ceil(command.at_s / period - 1e-9))
+            held = held if command.velocity is None else np.array(command.velocity)
+            gripper = gripper if command.gripper is None else int(command.gripper == "closed")
+            pieces.append((tick, held, gripper))
+            if command.mode is not None and 0 <= tick - first < count:
+                block.request[tick - first] = STATES[command.mode] if isinstance(command.mode, str) else command.mode
+        for i, (tick, velocity, closed) in enumerate(pieces):
+            end = pieces[i + 1][0] if i + 1 < len(pieces) else first + count
+            part = slice(max(tick - first, 0), max(end - first, 0))
+            block.velocity[part] += velocity
+            block.gripper[part] = closed
+        return block
+
+
+@dataclass
+class Timed:
+    """A script whose commands keep their times: told period by period, as a live operator tells them."""
+
+    script: ScriptedSource
+    _all: CommandBlock | None = None
+
+    def read(self, first: int, count: int, period: float, feedback: Feedback | None = None) -> CommandBlock:
+        """The commands of one period."""
+        if self._all is None:
+            self._all = self.script.read(0, first + count, period)
+        here = slice(first, first + 1)
+        return CommandBlock(self._all.velocity[here], self._all.request[here], self._all.gripper[here])

@@ -1,0 +1,280 @@
+"""Task-space controller of the articulated mobile robot (Tanaka et al. 2019, III.B, IV.C).
+
+[T]: M. Tanaka et al., "Task-Space Control of Articulated Mobile Robots With a Soft Gripper for Operations", IEEE
+Transactions on Robotics 35(1), 2019. Values that [T] does not give are marked "assumed".
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, StrictInt, field_validator, model_validator
+
+from dynsim.compile.protocols import BuildContext
+from dynsim.config.base import NonNegative, Positive, error_at
+from dynsim.errors import ModelError
+from dynsim.jit.kernel import integers, reals
+from dynsim.library.controllers.snake_commands import STATES as MODE_STATES
+from dynsim.library.controllers.snake_commands import Script, ScriptedSource, Timed
+from dynsim.snake import controller as sc
+from dynsim.snake import state as ss
+from dynsim.snake import support as ssup
+from dynsim.snake.controller import Law, control_input, new_work
+from dynsim.snake.description import ModeTable, SnakeDescription, TaskSpaceController, conditioning
+from dynsim.snake.kinematics import SnakeModel, pose_of_point
+from dynsim.snake.modes import TABLE_II, Switching
+from dynsim.snake.state import Schedule
+from dynsim.snake.support import Cost
+
+ENGINE = "kinematic"
+
+COSTS = {"eq19": ssup.COST_ANGLES, "eq20": ssup.COST_SUPPORT_NORM, "eq20_min": ssup.COST_SUPPORT_MIN}
+LIMIT_POLICIES = {"none": sc.LIMITS_NONE, "saturate": sc.LIMITS_SATURATE, "allocate": sc.LIMITS_ALLOCATE}
+STATES = {"measured": ss.MEASURED, "estimated": ss.ESTIMATED, "feedforward": ss.FEEDFORWARD}
+FORMS = {"paper": sc.NULL_PAPER, "safe": sc.NULL_SAFE}
+
+
+class Config(Script):
+    """The ``controller:`` section of a scenario; SI units where the key names no other."""
+
+    type: Literal["task_space"] = "task_space"
+    period_s: Positive = Field(0.005, description="control period (assumed)")
+    rates_at: Literal["middle", "start"] = Field(
+        "middle", description="which point of the period the held rates are computed for (assumed)"
+    )
+    plant_substeps: int = Field(1, ge=1, le=100)
+    state: Literal["measured", "estimated", "feedforward"] = "measured"
+    gain: Positive | list[Positive] = Field(
+        2.0, description="K [1/s]: one for all, or one per controlled variable (six, then shape points)"
+    )
+    null_gain: NonNegative = Field(0.1, description="k_eta")
+    null_form: Literal["safe", "paper"] = Field(
+        "safe", description="paper: eq 14; safe: eq 14 with W^-1 eta, which cannot raise the cost whatever the weights"
+    )
+    null_start_s: NonNegative = 0.0
+    weight_joint: Positive | list[Positive] = Field(1.0, description="W: one for all joints, or one per joint")
+    weight_wheel: Positive = Field(0.01, description="W of the active wheels; small, or the joint rates chatter")
+    cost: Literal["eq19", "eq20", "eq20_min"] = Field(
+        "eq19", description="eq20: 1/norm of the signed distances, as printed; eq20_min: 1/smallest distance, smoothed"
+    )
+    cost_matrix: list[NonNegative] | None = Field(
+        None, description="diagonal of K_V; default [T] V.B: head yaw 15, head pitch 0.015, base 9.6, 4.8, 2.4, ..."
+    )
+    cost_angle_weight: NonNegative = Field(1.0, description="a_1 of eq 20 (assumed)")
+    cost_support_weight_m: NonNegative = Field(1.0, description="a_2 of eq 20 [m] (assumed)")
+    limit_policy: Literal["none", "saturate", "allocate"] = Field(
+        "allocate",
+        description="allocate: a joint at its limit leaves the allocation, and when that is impossible the target "
+        "waits; saturate: joints are clamped; none: limits are ignored",
+    )
+    rate_limit_rad_s: Positive = Field(
+        4.7, description="fastest joint rate [rad/s]: no-load speed of the MX-106 at 12 V, 45 rpm (data sheet)"
+    )
+    limit_rate_per_s: Positive = Field(
+        20.0, description="a joint approaches its limit no faster than this [1/s] times the angle left (assumed)"
+    )
+    damping_sigma: NonNegative = Field(
+        0.2,
+        description="part of the smallest singular value of B W^-1/2 in the reference posture (head raised, base "
+        "straight) below which the weakest direction is damped (assumed)",
+    )
+    damping_factor: NonNegative = Field(
+        0.4, description="its damping at the singularity, in parts of the same singular value (assumed)"
+    )
+    shape_points_rad: dict[str, float] | None = Field(
+        None, description="shape controllable points: joint name -> target [rad]; default the last head joint, 110 deg"
+    )
+    modes: dict[int, list[int]] | None = Field(None, description="mode number -> lifted wheel pairs; default Table II")
+    fixing_mode: StrictInt = 1
+    commands_wait: bool = Field(
+        True,
+        description="commands wait while the target waits; false: they keep their times, and what the target cannot "
+        "follow is lost, as of a live operator",
+    )
+    switching: Switching = Field(default_factory=Switching)
+
+    @field_validator("cost", mode="before")
+    @classmethod
+    def _cost_by_number(cls, value: Any) -> Any:
+        return f"eq{value}" if value in (19, 20) and not isinstance(value, bool) else value
+
+    @model_validator(mode="after")
+    def _known_modes(self) -> Config:
+        """Every mode that a command asks for is in the table, also after the end of the run."""
+        table = TABLE_II if self.modes is None else self.modes
+        for i, command in enumerate(self.commands):
+            if isinstance(command.mode, int) and command.mode not in table:
+                known = ", ".join(map(str, [*MODE_STATES, *table]))
+                raise error_at(f"commands.{i}.mode", f"no mode {command.mode}; known: {known}")
+        return self
+
+
+def build(config: Config, context: BuildContext) -> TaskSpaceController:
+    """Controller for the snake of the context.
+
+    Raises
+    ------
+    ModelError
+        Lists or names that do not fit the robot, or a mode in which the robot cannot be controlled (see
+        :func:`check_controllable`).
+    """
+    plant = context.snake
+    model = plant.arrays()
+    joints, inputs = len(plant.joint_names), len(plant.joint_names) + model.wheels
+    shape_joints, shape_target = _shape_points(config, plant, model)
+    needed = max(pair for lifted in TABLE_II.values() for pair in lifted)
+    if config.modes is None and plant.pairs < needed:
+        raise ModelError(
+            f"controller.modes is not given, and the default table ([T] Table II) needs {needed} wheel pairs; this "
+            f"robot has {plant.pairs}: write its own controller.modes, e.g. {{1: []}}, and controller.switching.order, "
+            "e.g. [1]"
+        )
+    modes = ModeTable.from_lifted(TABLE_II if config.modes is None else config.modes, plant.pairs)
+    fixing_row = modes.row(config.fixing_mode, "controller.fixing_mode")
+    order = tuple(modes.row(number, "controller.switching.order") for number in config.switching.order)
+
+    diagonal = config.cost_matrix
+    if diagonal is None:
+        head = [0.015 if j % 2 else 15.0 for j in range(model.head_joints)]
+        diagonal = head + [9.6 / 2**i for i in range(model.base_joints)]
+    weights = np.ones(inputs) * config.weight_wheel
+    weights[:joints] = _per_entry("weight_joint", config.weight_joint, joints)
+    law = Law(
+        gain=reals(_per_entry("gain", config.gain, 6 + len(shape_joints))),
+        null_gain=config.null_gain,
+        null_form=FORMS[config.null_form],
+        root_weight_inverse=reals(1.0 / np.sqrt(weights)),
+        shape_joints=integers(shape_joints),
+        shape_target=reals(shape_target),
+        grounded=integers(modes.grounded),
+        limit_policy=LIMIT_POLICIES[config.limit_policy],
+        rate_limit=config.rate_limit_rad_s,
+        limit_rate=min(config.limit_rate_per_s, 1.0 / config.period_s),
+        damping_sigma=config.damping_sigma,
+        damping_factor=config.damping_factor,
+        cost=Cost(
+            kind=COSTS[config.cost],
+            diagonal=reals(_per_entry("cost_matrix", diagonal, joints)),
+            angle_weight=config.cost_angle_weight,
+            support_weight=config.cost_support_weight_m,
+            distance_floor=1e-3,
+            smoothing=1e-3,
+        ),
+    )
+    check_controllable(model, law, modes, fixing_row, plant)
+    scale = reference_sigma(model, law, fixing_row, plant)
+    law = law._replace(damping_sigma=config.damping_sigma * scale, damping_factor=config.damping_factor * scale)
+
+    script = ScriptedSource(config.commands, config.paths)
+    switch_ticks = max(1, round(config.switching.period_s / config.period_s))
+    prediction_ticks = max(1, round(config.switching.period_s / config.switching.prediction_step_s))
+    schedule = Schedule(
+        period=config.period_s,
+        midpoint=int(config.rates_at == "middle"),
+        substeps=config.plant_substeps,
+        state_source=STATES[config.state],
+        null_start_tick=round(config.null_start_s / config.period_s),
+    )
+    return TaskSpaceController(
+        law=law,
+        schedule=schedule,
+        prediction=schedule._replace(period=switch_ticks * config.period_s / prediction_ticks, midpoint=0, substeps=1),
+        prediction_ticks=prediction_ticks,
+        modes=modes,
+        fixing_row=fixing_row,
+        order=order,
+        switch_ticks=switch_ticks,
+        policy=config.switching.policy,
+        least_margin=config.switching.least_margin_m,
+        when_blocked=config.switching.when_blocked,
+        release_fraction=config.switching.release_fraction,
+        source=script if config.commands_wait else Timed(script),
+    )
+
+
+def reference_sigma(model: SnakeModel, law: Law, row: int, plant: SnakeDescription) -> float:
+    """Smallest singular value of B~ W^(-1/2) with the head raised and the base straight.
+
+    It falls with the length of the chain, the links and the weights; damping is measured by it, not in metres.
+    """
+    work, pose, joints = new_work(model), np.zeros(6), reals(plant.reference_joints)
+    pose_of_point(model, np.zeros(3), joints, work.frame, pose)
+    return float(control_input(model, law, work, pose, joints, pose, np.zeros(6), row, 0.0))
+
+
+def check_controllable(model: SnakeModel, law: Law, modes: ModeTable, fixing_row: int, plant: SnakeDescription) -> None:
+    """Refuse a table with a mode in which A~ w~' = B~ u ([T] eq 9) has no solution for every w~'.
+
+    The side-slip row of wheel pair 1 and the three ground-contact rows contain head joints only. Every shape
+    controllable point of the head part takes one of these joints away, so n_h >= 4 ([T] eq 1) becomes
+    n_h - m_h >= 4 (3 in a mode that lifts pair 1). Every other loss of rank is found numerically, at seeded random
+    postures: a rank that is low at all of them is low everywhere.
+
+    Raises
+    ------
+    ModelError
+        With mode, equation and numbers.
+    """
+    n_h, n_b, names = model.head_joints, model.base_joints, plant.joint_names
+    head_shape = [names[j] for j in law.shape_joints if j < n_h]
+    random = np.random.default_rng(0)
+    for row in range(len(modes.numbers)):
+        mode, down = f"mode {modes.numbers[row]}", modes.grounded[row]
+        lifted = int(np.sum(down == 0))
+        lifted_active = int(np.sum((down == 0) & (model.wheel >= 0)))
+        if n_b - lifted + model.wheels - lifted_active < 2:
+            raise ModelError(
+                f"{mode}: n_b - lifted pairs + n_w - lifted active wheels = {n_b} - {lifted} + {model.wheels} - "
+                f"{lifted_active} < 2: A loses its full column rank ([T] eq 16); lift fewer wheels"
+            )
+        needed = 4 if down[0] else 3
+        if n_h - len(head_shape) < needed:
+            raise ModelError(
+                f"{mode}: with shape controllable points {', '.join(head_shape)} only {n_h - len(head_shape)} of the "
+                f"n_h = {n_h} head joints are free, but the ground-contact and side-slip rows that contain head joints "
+                f"only need {needed} (more than [T] eq 1 asks); raise head_joints or drop shape points"
+            )
+        redundancy = n_h + lifted + lifted_active - 4 - len(law.shape_joints)
+        if redundancy < 0:
+            raise ModelError(
+                f"{mode}: {-redundancy} more rows than inputs (n_h + lifted pairs + lifted active wheels - 4 - shape "
+                f"points = {redundancy}): no joint and wheel rates satisfy every row; lift wheels or drop shape points"
+            )
+        postures = [random.uniform(0.4 * model.lower, 0.4 * model.upper) for _ in range(4)]
+        found = [conditioning(model, law, row, np.zeros(3), phi) for phi in postures]
+        rank_a, rank_b = max(c.rank_A for c in found), max(c.rank_B for c in found)
+        if rank_a < 6 + len(law.shape_joints) or rank_b < found[0].rows:
+            raise ModelError(
+                f"{mode}: rank of A is {rank_a} of {6 + len(law.shape_joints)}, rank of B is {rank_b} of "
+                f"{found[0].rows} at random postures: the controlled variables are not independent"
+            )
+    start = conditioning(model, law, fixing_row, plant.initial_base_pose, plant.initial_joints)
+    if start.rank_B < start.rows or start.rank_A < 6 + len(law.shape_joints):
+        raise ModelError(
+            f"mode {modes.numbers[fixing_row]}: the initial posture is singular (rank of A {start.rank_A}, rank of B "
+            f"{start.rank_B} of {start.rows}): change plant.initial_joints_rad or the shape points"
+        )
+
+
+def _shape_points(config: Config, plant: SnakeDescription, model: SnakeModel) -> tuple[list[int], list[float]]:
+    names = plant.joint_names
+    points = config.shape_points_rad
+    if points is None:
+        points = {names[model.head_joints - 1]: float(np.deg2rad(110.0))}  # [T] IV.C.3
+    for name, target in points.items():
+        if name not in names:
+            raise ModelError(f"controller.shape_points_rad: no joint {name!r}; the joints are {', '.join(names)}")
+        j = names.index(name)
+        if not model.lower[j] <= target <= model.upper[j]:
+            raise ModelError(
+                f"controller.shape_points_rad: {name} = {target:.4f} is beyond its limit of {model.upper[j]:.4f} rad"
+            )
+    return [names.index(name) for name in points], list(points.values())
+
+
+def _per_entry(key: str, value: float | list[float], count: int) -> NDArray[np.float64]:
+    if isinstance(value, list) and len(value) != count:
+        raise ModelError(f"controller.{key} has {len(value)} entries, {count} are needed")
+    return np.ones(count) * np.asarray(value)

@@ -1,0 +1,28 @@
+"""A torque that the controller gives directly: no circuit, no gear; an ideal source whose power is τ v."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from dynsim.compile.protocols import BuildContext
+from dynsim.config.base import Positive
+from dynsim.model.drives import TorqueSource
+from dynsim.model.motor_parameters import DriveParameters, limit
+
+
+class Config(DriveParameters):
+    """The torque is the reference of the motor (``controller.torques``), within the limit."""
+
+    type: Literal["torque"]
+    limit_N_m: Positive | None = Field(default=None, description="N at a prismatic joint")
+
+    def motor(self, joint: str) -> TorqueSource:
+        """The torque on the joint of that name."""
+        return TorqueSource(joint, limit(self.limit_N_m), self.mass_kg, self.mass_point, self.nominal_torque)
+
+
+def build(config: Config, context: BuildContext) -> TorqueSource:
+    """The torque on ``context.joint``."""
+    return config.motor(context.joint)

@@ -1,0 +1,49 @@
+"""A circle about a centre in a plane of any normal."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from dynsim.compile.control import HandPath
+from dynsim.compile.protocols import BuildContext
+from dynsim.config.base import Positive, StrictConfig, Vector3, unit_vector
+
+
+class Config(StrictConfig):
+    """Counter-clockwise about ``normal``, beginning at the centre plus ``radius_m`` along ``start``."""
+
+    type: Literal["circle"]
+    center_m: Vector3
+    radius_m: Positive
+    normal: Vector3 = [0.0, 0.0, 1.0]
+    start: Vector3 = Field(default=[1.0, 0.0, 0.0], description="direction from the centre; its part in the plane")
+    period_s: Positive = 10.0
+    clockwise: bool = False
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        self._directions()
+        return self
+
+    def _directions(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        normal = unit_vector(self.normal, "normal")
+        start = np.array(self.start)
+        first = unit_vector(list(start - normal * float(normal @ start)), "start, seen along the normal,")
+        return first, np.cross(normal, first)
+
+    def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """c + R (e₁ cos ωt ± e₂ sin ωt) at times t [s], shape (T, 3) [m]."""
+        first, second = self._directions()
+        angle = 2.0 * np.pi / self.period_s * np.asarray(t) * (-1.0 if self.clockwise else 1.0)
+        return np.array(self.center_m) + self.radius_m * (
+            np.outer(np.cos(angle), first) + np.outer(np.sin(angle), second)
+        )
+
+
+def build(config: Config, context: BuildContext) -> HandPath:
+    """The path, which its configuration is."""
+    return config

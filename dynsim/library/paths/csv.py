@@ -1,0 +1,60 @@
+"""A hand path from a CSV file with the columns t_s, x_m, y_m, z_m."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, PrivateAttr, model_validator
+from scipy.interpolate import PchipInterpolator
+
+from dynsim.compile.control import HandPath
+from dynsim.compile.protocols import BuildContext
+from dynsim.config.base import StrictConfig
+from dynsim.record.csv_rows import read_rows
+
+COLUMNS = ("t_s", "x_m", "y_m", "z_m")
+
+
+class Config(StrictConfig):
+    """Shape-preserving cubic through the rows of ``file``, held beyond its ends."""
+
+    type: Literal["csv"]
+    file: str = Field(description="CSV file, relative to the scenario file, with a header t_s,x_m,y_m,z_m")
+    # Read once: an edit of the file does not change a scenario that is already loaded, only the next one.
+    _rows: list[list[float]] = PrivateAttr()
+
+    @model_validator(mode="after")
+    def _read(self) -> Self:
+        self._rows = read_rows(self.file, COLUMNS, what="a path")
+        _check_curve(self._rows, self.file)
+        return self
+
+    def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The curve at times t [s], shape (T, 3) [m]."""
+        curve = _curve(self._rows)
+        return curve(np.clip(t, curve.x[0], curve.x[-1]))
+
+
+def build(config: Config, context: BuildContext) -> HandPath:
+    """The path, which its configuration is."""
+    return config
+
+
+def _curve(rows: list[list[float]]) -> PchipInterpolator:
+    table = np.array(rows)
+    return PchipInterpolator(table[:, 0], table[:, 1:])
+
+
+def _check_curve(rows: list[list[float]], file: str) -> None:
+    """ValueError unless rounding leaves the curve finite and on its rows."""
+    table = np.array(rows)
+    try:
+        with np.errstate(all="ignore"):
+            curve = _curve(rows)
+            met = np.allclose(curve(table[:, 0]), table[:, 1:], rtol=1e-9, atol=1e-12)
+    except ValueError:  # slopes that overflow
+        met = False
+    if not (met and np.isfinite(curve.c).all()):
+        raise ValueError(f"{file}: numbers too large, or rows too close in time, for a curve through them")

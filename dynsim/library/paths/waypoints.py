@@ -1,0 +1,36 @@
+"""A smooth curve through points at given times."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from dynsim.compile.control import HandPath
+from dynsim.compile.protocols import BuildContext
+from dynsim.compile.splines import clamped_cubic
+from dynsim.config.base import StrictConfig, Vector3, check_waypoints
+
+
+class Config(StrictConfig):
+    """Cubic spline through ``points_m`` at ``times_s``, at rest at both ends and held beyond them."""
+
+    type: Literal["waypoints"]
+    times_s: list[float] = Field(min_length=2)
+    points_m: list[Vector3] = Field(min_length=2)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        check_waypoints(self.times_s, self.points_m, "points_m")
+        return self
+
+    def position(self, t: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The spline at times t [s], shape (T, 3) [m]."""
+        return clamped_cubic(self.times_s, np.array(self.points_m), t)
+
+
+def build(config: Config, context: BuildContext) -> HandPath:
+    """The path, which its configuration is."""
+    return config

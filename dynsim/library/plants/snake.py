@@ -1,0 +1,147 @@
+"""Articulated mobile robot that raises its head: T2 Snake-3 by default (Tanaka et al. 2019, Table I).
+
+[T]: M. Tanaka et al., "Task-Space Control of Articulated Mobile Robots With a Soft Gripper for Operations", IEEE
+Transactions on Robotics 35(1), 2019. Values that [T] does not give are marked "assumed".
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from dynsim.compile.protocols import BuildContext
+from dynsim.config.base import NonNegative, Positive, StrictConfig
+from dynsim.errors import ModelError
+from dynsim.snake.description import SnakeDescription
+
+ENGINE = "kinematic"
+
+DrivenSide = Literal["left", "right", "none"]
+
+
+class Limits(StrictConfig):
+    """Joint limits, symmetric about zero ([T] Table I)."""
+
+    yaw: Positive = Field(65.0, lt=180, description="[deg]")
+    pitch: Positive = Field(113.0, lt=180, description="[deg]")
+
+
+class Config(StrictConfig):
+    """The ``plant:`` section of a scenario; SI units where the key names no other."""
+
+    type: Literal["snake"] = "snake"
+    level: Literal["kinematic"] = "kinematic"
+    yaw_joints: int = Field(9, ge=2, le=200, description="n: yaw joints of the whole robot")
+    head_joints: int = Field(6, ge=0, description="n_h: joints of the raised head part, yaw, pitch, yaw, ..., even")
+    link_length_m: Positive = Field(0.0905, description="l [m], between neighbouring joint axes")
+    wheel_radius_m: Positive = Field(0.05, description="r [m]")
+    wheel_gap_m: Positive | list[Positive] | None = Field(
+        None,
+        description="distance between the wheels of a pair [m]: one for all, or one per pair of the base part. "
+        "Default (assumed): 0.15 m for pairs 1, 3, 5, which carry batteries, and 0.12 m for the others",
+    )
+    driven_side: DrivenSide | list[DrivenSide] | None = Field(
+        None, description="side of the active wheel of each pair. Default (assumed): left, right, left, ..."
+    )
+    limits_deg: Limits = Field(default_factory=Limits)
+    gripper_length_m: NonNegative = Field(0.09, description="gripper tip ahead of the head point [m] ([T] IV.B)")
+    mass_kg: Positive = Field(10.0, description="of the whole robot [kg], spread evenly over its links (assumed)")
+    controlled_point: Literal["head", "gripper"] = Field(
+        "head", description="head point ([T] V.A) or gripper tip ([T] V.D)"
+    )
+    initial_joints_rad: list[float] | None = Field(
+        None,
+        description="theta_1, psi_1, ... [rad] at t = 0, the base's yaw joints may be left out when zero. Default: "
+        "[T] V.A, where it fits",
+    )
+    initial_base_pose: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0), description="x [m], y [m] of wheel pair 1 and yaw [rad] of the base part"
+    )
+
+
+def build(config: Config, context: BuildContext) -> SnakeDescription:
+    """Description of the configured robot.
+
+    Raises
+    ------
+    ModelError
+        The head part cannot be controlled in six coordinates (n_h odd or n_h < 4, [T] eq 1), too few wheel rows
+        (n_b + n_w >= 2, [T] eq 16 with every wheel on the ground), or lists that do not fit the number of joints or
+        wheel pairs. What depends on the wheels lifted and on shape controllable points is checked by the controller.
+    """
+    n, n_h = config.yaw_joints, config.head_joints
+    if n_h % 2:
+        raise ModelError(f"plant.head_joints = {n_h}: yaw and pitch joints alternate, n_h must be even")
+    if n_h < 4:
+        raise ModelError(
+            f"plant.head_joints = {n_h}: six coordinates of the head need n_h >= 4 ([T] eq 1), because the three "
+            "ground-contact rows and the side-slip row of wheel pair 1 contain no other joints"
+        )
+    n_b = n - n_h // 2
+    if n_b < 1:
+        raise ModelError(f"plant: yaw_joints = {n} and head_joints = {n_h} leave no base part (n_b = {n_b})")
+    pairs, joints = n_b + 1, n_h + n_b
+
+    gap = config.wheel_gap_m
+    if gap is None:
+        gap = [0.15 if i in (0, 2, 4) else 0.12 for i in range(pairs)]
+    gaps = _per_pair("wheel_gap_m", gap, pairs)
+    side = config.driven_side
+    if side is None:
+        side = ["left" if i % 2 == 0 else "right" for i in range(pairs)]
+    driven_side = np.array([{"left": 1, "right": -1, "none": 0}[s] for s in _per_pair("driven_side", side, pairs)])
+    n_w = int(np.count_nonzero(driven_side))
+    if n_b + n_w < 2:
+        raise ModelError(
+            f"plant: n_b + n_w = {n_b} + {n_w} < 2: with so few wheel rows A loses its full column rank and the head "
+            "cannot be tracked ([T] eq 16)"
+        )
+
+    pitch = np.array([j < n_h and j % 2 == 1 for j in range(joints)])
+    upper = np.deg2rad(np.where(pitch, config.limits_deg.pitch, config.limits_deg.yaw))
+    names = tuple(f"{'psi' if j % 2 else 'theta'}{j // 2 + 1}" for j in range(n_h))
+    names += tuple(f"theta{n_h // 2 + i + 1}" for i in range(n_b))
+
+    # [T] V.A; a head part of another length starts with a similar S that keeps the head level
+    raised = [0.0, -0.8, 0.0, -1.1, 0.0, 1.9] if n_h == 6 else [0.0, 0.0] * (n_h // 2 - 2) + [0.0, -0.8, 0.0, 0.8]
+    given = raised if config.initial_joints_rad is None else config.initial_joints_rad
+    if len(given) not in (n_h, joints):
+        raise ModelError(
+            f"plant.initial_joints_rad has {len(given)} angles; give n_h = {n_h} (base straight) or all {joints}: "
+            f"{', '.join(names)}"
+        )
+    initial = np.concatenate([given, np.zeros(joints - len(given))])
+    for name, angle, limit in zip(names, initial, upper, strict=True):
+        if abs(angle) > limit:
+            raise ModelError(
+                f"plant.initial_joints_rad: {name} = {angle:.4f} rad is beyond its limit of {limit:.4f} rad "
+                f"({np.rad2deg(limit):g} deg, plant.limits_deg)"
+            )
+    links = n_h + 2 * n_b
+    return SnakeDescription(
+        head_joints=n_h,
+        base_joints=n_b,
+        link_length=config.link_length_m,
+        wheel_radius=config.wheel_radius_m,
+        point_offset=config.gripper_length_m if config.controlled_point == "gripper" else 0.0,
+        reference_joints=np.concatenate([raised, np.zeros(n_b)]),
+        joint_names=names,
+        pitch=pitch,
+        lower=-upper,
+        upper=upper,
+        half_track=np.array(gaps) / 2.0,
+        driven_side=driven_side,
+        link_mass=np.full(links, config.mass_kg / links),
+        initial_joints=initial,
+        initial_base_pose=np.array(config.initial_base_pose),
+    )
+
+
+def _per_pair(key: str, value: object, pairs: int) -> list:
+    if not isinstance(value, list):
+        return [value] * pairs
+    if len(value) != pairs:
+        raise ModelError(f"plant.{key} has {len(value)} entries, the base part has {pairs} wheel pairs")
+    return value

@@ -1,0 +1,161 @@
+"""An arm on a fixed base whose bodies and joints come from a URDF file; motors are added by the scenario."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from dynsim.compile.protocols import BuildContext
+from dynsim.config.base import BodyPoint, NonNegative, StrictConfig, Vector3, error_at
+from dynsim.errors import ModelError
+from dynsim.library import families
+from dynsim.model.description import Array, Robot
+from dynsim.model.drives import Drive
+
+ENGINE = "dynamics"
+
+MotorChoice: Any = families.union("motor")
+
+
+class Pose(StrictConfig):
+    """Place and attitude of a body in the frame of its joint, R = Rz(yaw) Ry(pitch) Rx(roll)."""
+
+    position_m: Vector3 = [0.0, 0.0, 0.0]
+    rpy_deg: Vector3 = [0.0, 0.0, 0.0]
+
+
+class Config(StrictConfig):
+    """A robot from ``file`` (relative to the scenario), one motor model for all joints or one per joint."""
+
+    type: Literal["urdf_arm"]
+    file: str = Field(description="URDF file, relative to the scenario file")
+    gravity_m_s2: Vector3 = [0.0, 0.0, -9.81]
+    motor: MotorChoice | None = Field(
+        default=None, description="motor of every joint that `motors` does not name and that follows no other"
+    )
+    motors: dict[str, MotorChoice] = Field(default={}, description="motors by joint name")
+    damping_N_m_s_per_rad: NonNegative | None = Field(
+        default=None, description="loss of every revolute joint; default: the URDF's"
+    )
+    damping_N_s_per_m: NonNegative | None = Field(
+        default=None, description="loss of every prismatic joint; default: the URDF's"
+    )
+    initial_deg: dict[str, float] = Field(
+        default={}, description="initial angles of revolute joints by name; others 0, or where a leader has them"
+    )
+    initial_m: dict[str, float] = Field(default={}, description="initial positions of prismatic joints; others 0")
+    initial_pose: dict[str, Pose] = Field(
+        default={}, description="initial poses of the bodies of floating and planar joints, by joint name"
+    )
+    lock_deg: dict[str, float] = Field(default={}, description="revolute joints that are fixed, at these angles")
+    lock_m: dict[str, float] = Field(default={}, description="prismatic joints that are fixed, at these positions")
+    hand: BodyPoint | None = Field(
+        default=None, description="controlled point on a body or in a frame; default: the tip of the longest chain"
+    )
+
+    @model_validator(mode="after")
+    def _check_joints(self) -> Self:
+        """Names and kinds of joints: here, where an error knows its line. Other errors of the file come from build."""
+        from dynsim.model.urdf.reader import MOVING, SEVERAL, read_tree, suggestion
+
+        try:
+            joints = read_tree(Path(self.file)).joints
+        except ModelError:
+            return self
+        locked = {*self.lock_deg, *self.lock_m}
+        units = {"revolute": "deg", "prismatic": "m"}
+        for key in ("motors", "initial_deg", "initial_m", "initial_pose", "lock_deg", "lock_m"):
+            for name in getattr(self, key):
+                place = f"{key}.{name}"
+                if name not in joints:
+                    moving = ", ".join(joint.name for joint in joints.values() if joint.kind != "fixed")
+                    raise error_at(place, f"no joint {name!r}{suggestion(name, joints)}; joints of the file: {moving}")
+                kind = MOVING.get(joints[name].kind, joints[name].kind)
+                if kind in SEVERAL:
+                    if key == "initial_pose":
+                        continue
+                    start = "" if key == "motors" else f"; it starts where plant.initial_pose.{name} says"
+                    raise error_at(place, f"{name!r} is {kind}: it has no motor, angle or distance{start}")
+                if kind not in units:
+                    raise error_at(place, f"{name!r} is {kind}: it has no motor and no position")
+                if key == "initial_pose":
+                    raise error_at(place, f"{name!r} is {kind}; give it in plant.initial_{units[kind]}")
+                family, _, unit = key.partition("_")
+                if unit and unit != units[kind]:
+                    raise error_at(place, f"{name!r} is {kind}; give it in plant.{family}_{units[kind]}")
+                if name in locked and family != "lock":
+                    raise error_at(place, f"{name!r} is locked by plant.lock_{units[kind]}; remove one of the two")
+        return self
+
+
+def build(config: Config, context: BuildContext) -> Robot:
+    """The robot of the file with the scenario's motors.
+
+    Raises
+    ------
+    ModelError
+        A file that is refused (see :func:`dynsim.model.urdf.build.read_urdf`), or a hand on a body that it
+        does not have.
+    """
+    from dynsim.model.urdf.build import read_urdf
+
+    lock = {**{name: float(np.deg2rad(angle)) for name, angle in config.lock_deg.items()}, **config.lock_m}
+    robot = read_urdf(Path(config.file), lock)
+    initial = {**{name: np.deg2rad(angle) for name, angle in config.initial_deg.items()}, **config.initial_m}
+    given = {"revolute": config.damping_N_m_s_per_rad, "prismatic": config.damping_N_s_per_m}
+    # Joints with several rates have neither losses nor motors.
+    single = [link for link in robot.links if link.joint_of_rows is None]
+    links = tuple(
+        dataclasses.replace(link, damping=loss)
+        if link.joint_of_rows is None and (loss := given[link.kind]) is not None
+        else link
+        for link in robot.links
+    )
+    followers = {coupling.joint for coupling in robot.couplings}
+    chosen = {
+        link.joint: config.motors.get(link.joint, None if link.joint in followers else config.motor) for link in single
+    }
+    hand = robot.hand
+    if config.hand is not None:
+        try:
+            body, point = robot.attach(config.hand.body, np.array(config.hand.point_m))
+        except ModelError as error:
+            raise ModelError(f"plant.hand.body: {error}") from None
+        hand = robot.links[body].name, point
+    return dataclasses.replace(
+        robot,
+        links=links,
+        motors=tuple(
+            families.build("motor", motor, context.at_joint(joint), Drive)
+            for joint, motor in chosen.items()
+            if motor is not None
+        ),
+        hand=hand,
+        gravity=np.array(config.gravity_m_s2),
+        q0=_initial(robot, initial, config.initial_pose),
+    )
+
+
+def _initial(robot: Robot, positions: dict[str, float], poses: dict[str, Pose]) -> Array:
+    """Coordinates of all joints, (nq,); those of floating and planar joints from the poses of their bodies."""
+    from dynsim.model.urdf.reader import rotation
+    from dynsim.record.scene import quaternion
+
+    q, index = robot.configuration(positions), robot.position_index
+    for name, pose in poses.items():
+        rows = [i for i, link in enumerate(robot.links) if link.joint_of_rows == name]
+        p, R = np.array(pose.position_m), rotation(*np.deg2rad(pose.rpy_deg))
+        if len(rows) == 6:
+            q[index[rows[0]] : index[rows[0]] + 7] = *p, *quaternion(R)
+            continue
+        x, y, normal = (robot.links[i].axis for i in rows)
+        place = f"plant.initial_pose.{name}"
+        for key, off in (("position_m", abs(normal @ p)), ("rpy_deg", float(np.abs(R @ normal - normal).max()))):
+            if off > 1e-9:
+                raise ModelError(f"{place}.{key}: leaves the plane of the joint, whose normal is {normal.tolist()}")
+        q[index[rows[0]] : index[rows[0]] + 3] = x @ p, y @ p, np.arctan2(y @ R @ x, x @ R @ x)
+    return q

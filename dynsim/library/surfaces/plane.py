@@ -1,0 +1,31 @@
+"""A plane: C(r) = n·(r − r_0)."""
+
+from __future__ import annotations
+
+from typing import Literal, Self
+
+import numpy as np
+from pydantic import model_validator
+
+from dynsim.compile.protocols import BuildContext
+from dynsim.config.base import StrictConfig, Vector3, unit_vector
+from dynsim.model.description import Quadric
+
+
+class Config(StrictConfig):
+    """Plane through ``point_m``; the free side is where ``normal`` points."""
+
+    type: Literal["plane"]
+    point_m: Vector3 = [0.0, 0.0, 0.0]
+    normal: Vector3 = [0.0, 0.0, 1.0]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        unit_vector(self.normal, "normal")
+        return self
+
+
+def build(config: Config, context: BuildContext) -> Quadric:
+    """The plane as a quadric with Q = 0."""
+    normal = unit_vector(config.normal, "normal")
+    return Quadric(np.zeros((3, 3)), normal, -float(normal @ config.point_m))

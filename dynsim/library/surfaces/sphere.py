@@ -1,0 +1,28 @@
+"""A sphere: C(r) = (|r − c|² − R²)/(2R)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from dynsim.compile.protocols import BuildContext
+from dynsim.config.base import Positive, StrictConfig, Vector3
+from dynsim.model.description import Quadric
+
+
+class Config(StrictConfig):
+    """Sphere about ``center_m``; ``inside: true`` makes it a bowl (the free side is within)."""
+
+    type: Literal["sphere"]
+    center_m: Vector3
+    radius_m: Positive
+    inside: bool = False
+
+
+def build(config: Config, context: BuildContext) -> Quadric:
+    """The sphere as a quadric with |∇C| = 1 on it."""
+    sign = -1.0 if config.inside else 1.0
+    center, radius = np.array(config.center_m), config.radius_m
+    scale = sign / radius
+    return Quadric(scale * np.eye(3), -scale * center, 0.5 * scale * float(center @ center - radius**2))

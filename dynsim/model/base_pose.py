@@ -1,0 +1,26 @@
+"""Pose of a mobile base from the coordinates of its robot."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dynsim.model.description import Array, Link, Robot
+
+
+def base_row(robot: Robot) -> tuple[int, Link]:
+    """Where the base's coordinates (left, right, x, y) begin in q, and its first row."""
+    assert robot.base is not None
+    i = robot.joint_names.index(robot.base.wheels[0])
+    return robot.position_index[i], robot.links[i]
+
+
+def base_pose(robot: Robot, q: Array) -> Array:
+    """x, y [m] and heading [rad, not wrapped] of the base in the world at coordinates q, (T, nq) → (T, 3).
+
+    heading = heading_0 + r (φ_r − φ_l)/T ([WM] II.E: ω_0 T = r (φ̇_r − φ̇_l)).
+    """
+    k, link = base_row(robot)
+    left, right, x, y = q[:, k : k + 4].T
+    place = link.p_PJ[:, None] + link.R_PJ @ np.stack([x, y, np.zeros_like(x)])
+    start = np.arctan2(link.R_PJ[1, 0], link.R_PJ[0, 0])
+    return np.stack([place[0], place[1], start + link.parameter * (right - left)], axis=1)

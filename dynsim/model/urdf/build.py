@@ -1,0 +1,365 @@
+"""URDF in: the tree of bodies, their joints, limits and viscous losses.
+
+Files are read strictly (:mod:`dynsim.model.urdf.reader`); everything behind fixed and locked joints is merged into the
+moving body that carries it. Pinocchio reads every file too, and both must have found the same bodies and joints.
+Motors, gears, contacts and gravity are not part of a URDF file; they belong to the scenario.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dynsim.errors import ModelError
+from dynsim.model.description import Array, Coupling, Frame, Inertia, Link, Robot
+from dynsim.model.joints.ball import floating
+from dynsim.model.joints.planar import planar
+from dynsim.model.urdf.reader import MOVING, SEVERAL, UrdfJoint, UrdfTree, read_tree, suggestion
+from dynsim.record.scene import Shape, quaternion
+
+HAND = "hand"
+# Makers of the rows of joints that have several.
+ROWS = {"floating": floating, "planar": planar}
+# Two readers of the same decimals differ by roundings: of the sines of angles, and of sums over merged bodies.
+_AGREEMENT = 1e-9
+
+
+@dataclass(frozen=True)
+class _Place:
+    """The moving body that carries a link (None: the world), the link's frame there, and its distance from the root."""
+
+    body: str | None
+    R: Array
+    p: Array
+    moving: int
+    joints: int
+
+
+def read_urdf(path: Path, lock: Mapping[str, float] | None = None) -> Robot:
+    """Read the bodies and joints of a URDF file.
+
+    Joints keep their names and the order of the file (a parent still comes first); each body is named after the link
+    at its moving joint, and every other link is a frame of the body that carries it. Floating and planar joints become
+    their rows (:mod:`dynsim.model.joints`). The hand is the link named
+    ``hand``, else the tip of the chain with the most moving joints: the last link fixed to its last body, or that
+    body's origin when nothing is fixed to it. The root link is the world. A mimic joint is a coupling to its leader; a
+    locked leader locks it too.
+
+    Parameters
+    ----------
+    path : file
+    lock : positions [rad or m] of joints that are to be fixed, by name
+
+    Raises
+    ------
+    ModelError
+        No such file, not URDF, a number that is none, a mass without inertia and the like; a mimic joint whose leader
+        there is not; no joint of a name in ``lock``, or one without a single position; or Pinocchio reads the file
+        differently. The message names file, line, link or joint, value and what to do.
+
+    Warns
+    -----
+    UserWarning
+        The file states Coulomb friction of joints, which is not simulated; a link with a shape has no mass; moments of
+        inertia of a link are not those of a body; a joint is locked beyond its limits.
+    """
+    tree = read_tree(path)
+    locked = _locked(tree, {**_locked_followers(tree, lock or {}), **(lock or {})})
+    _compare_with_pinocchio(tree)
+    places = _places(locked)
+    links = _links(locked, places)
+    if not links:
+        raise ModelError(f"{path}: no moving joint")
+    _warn(locked, places, links)
+    frames = [Frame(name, place.body, place.R, place.p) for name, place in places.items() if place.body != name]
+    rows = tuple(row for link in links for row in (ROWS[link.kind](link) if link.kind in ROWS else (link,)))
+    for joint in locked.joints.values():
+        for name in (joint.name, joint.mimics or joint.name):
+            if joint.mimics is not None and locked.joints[name].kind in SEVERAL:
+                raise tree.error(
+                    joint.line, f"joint {joint.name!r} mimics {joint.mimics!r}, and {name!r} has several positions"
+                )
+    couplings = tuple(
+        Coupling(joint.name, joint.mimics, joint.multiplier, joint.offset)
+        for joint in locked.joints.values()
+        if joint.mimics is not None and joint.kind in MOVING
+    )
+    return Robot(
+        name=tree.name,
+        links=rows,
+        motors=(),
+        hand=_hand(tree, places),
+        frames=tuple(frames),
+        couplings=couplings,
+        fixed_shapes=_shapes(locked, places).get(None, ()),
+        fixed_inertia=_fixed(locked, places),
+    )
+
+
+def _fixed(tree: UrdfTree, places: Mapping[str, _Place]) -> Inertia:
+    """Mass properties of all that is fixed to the root, in its frame."""
+    parts = [
+        inertia.placed(place.R, place.p)
+        for name, place in places.items()
+        if place.body is None and (inertia := tree.links[name].inertia) is not None
+    ]
+    return Inertia.merged(parts) if parts else Inertia(0.0)
+
+
+def _locked_followers(tree: UrdfTree, lock: Mapping[str, float]) -> dict[str, float]:
+    """Positions of the mimic joints whose leader is locked or fixed, directly or through others [rad or m]."""
+    found: dict[str, float] = {}
+    for follower in tree.joints.values():
+        chain, joint = [], follower
+        while joint.mimics is not None and joint.name not in lock and joint.kind != "fixed":
+            if joint.mimics not in tree.joints:
+                raise tree.error(
+                    joint.line,
+                    f"joint {joint.name!r} mimics joint {joint.mimics!r}, which is not in the file"
+                    f"{suggestion(joint.mimics, tree.joints)}",
+                )
+            if joint in chain:
+                raise tree.error(joint.line, f"joint {joint.name!r} mimics itself, by way of {joint.mimics!r}")
+            chain.append(joint)
+            joint = tree.joints[joint.mimics]
+        if chain and (joint.name in lock or joint.kind == "fixed"):
+            q = lock.get(joint.name, 0.0)
+            for link in reversed(chain):
+                q = link.multiplier * q + link.offset
+            found[follower.name] = q
+    return found
+
+
+def _locked(tree: UrdfTree, lock: Mapping[str, float]) -> UrdfTree:
+    """The tree with joints fixed at positions: T_PC = T_PJ · Rot(a, q), or T_PJ · Trans(a q) for a prismatic one."""
+    joints = dict(tree.joints)
+    for name, value in lock.items():
+        if name not in joints:
+            raise ModelError(
+                f"{tree.path}: lock: no joint {name!r}{suggestion(name, joints)}; joints: {', '.join(joints)}"
+            )
+        joint = joints[name]
+        if joint.kind not in MOVING:
+            fix = "; make it fixed in the file" if joint.kind in SEVERAL else ""
+            raise tree.error(
+                joint.line, f"lock: joint {name!r} is {joint.kind}, which has no position to lock it at{fix}"
+            )
+        if not math.isfinite(value):
+            raise ModelError(f"{tree.path}: lock: {name} = {value} is not a finite number")
+        if not joint.lower - 1e-9 <= value <= joint.upper + 1e-9:
+            warnings.warn(
+                f"{tree.path}: joint {name} is locked at {value:g}, its limits are {joint.lower:g} and {joint.upper:g}",
+                stacklevel=3,
+            )
+        if joint.kind == "prismatic":
+            joints[name] = replace(joint, kind="fixed", p=joint.p + joint.R @ joint.axis * value)
+        else:
+            joints[name] = replace(joint, kind="fixed", R=joint.R @ _turn(joint.axis, value))
+    return replace(tree, joints=joints)
+
+
+def _turn(axis: Array, angle: float) -> Array:
+    """Rotation about a unit axis, R = 1 + sin q [a]× + (1 − cos q) [a]×² (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
+
+
+def _places(tree: UrdfTree) -> dict[str, _Place]:
+    """Where every link is; a parent comes before its children, of those that could come next the first of the file."""
+    below: dict[str, list[tuple[int, UrdfJoint]]] = {name: [] for name in tree.links}
+    for order, joint in enumerate(tree.joints.values()):
+        below[joint.parent].append((order, joint))
+    places = {tree.root: _Place(None, np.eye(3), np.zeros(3), 0, 0)}
+    # Fixed joints first: what is behind them belongs to a body that is there, and may carry joints early in the file.
+    pending: list[tuple[bool, int, str]] = []
+    joints = tree.joints
+
+    def open_up(link: str) -> None:
+        for order, joint in below[link]:
+            heapq.heappush(pending, (joint.kind != "fixed", order, joint.name))
+
+    open_up(tree.root)
+    while pending:
+        moves, _, name = heapq.heappop(pending)
+        joint, parent = joints[name], places[joints[name].parent]
+        if moves:
+            places[joint.child] = _Place(joint.child, np.eye(3), np.zeros(3), parent.moving + 1, parent.joints + 1)
+        else:
+            R, p = parent.R @ joint.R, parent.p + parent.R @ joint.p
+            places[joint.child] = _Place(parent.body, R, p, parent.moving, parent.joints + 1)
+        open_up(joint.child)
+    return places
+
+
+def _links(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[Link, ...]:
+    """The moving bodies, with all that is fixed to them; a floating or planar joint is still one, of this kind."""
+    parts: dict[str | None, list[Inertia]] = {}
+    for name, place in places.items():
+        inertia = tree.links[name].inertia
+        if inertia is not None and place.body is not None:
+            own = name == place.body
+            parts.setdefault(place.body, []).append(inertia if own else inertia.placed(place.R, place.p))
+    joint_to = {joint.child: joint for joint in tree.joints.values()}
+    shapes = _shapes(tree, places)
+    links = []
+    for name, place in places.items():
+        if place.body != name:
+            continue
+        joint = joint_to[name]
+        parent = places[joint.parent]
+        links.append(
+            Link(
+                name=name,
+                joint=joint.name,
+                parent=parent.body,
+                kind=MOVING.get(joint.kind, joint.kind),
+                axis=joint.axis,
+                inertia=Inertia.merged(parts.get(name, [Inertia(0.0)])),
+                R_PJ=parent.R @ joint.R,
+                p_PJ=parent.p + parent.R @ joint.p,
+                damping=joint.damping,
+                lower=joint.lower,
+                upper=joint.upper,
+                velocity_limit=joint.velocity_limit,
+                effort_limit=joint.effort_limit,
+                shapes=shapes.get(name, ()),
+            )
+        )
+    return tuple(links)
+
+
+def _shapes(tree: UrdfTree, places: Mapping[str, _Place]) -> dict[str | None, tuple[Shape, ...]]:
+    """What each moving body, and the world (None), looks like, with all that is fixed to it."""
+    found: dict[str | None, tuple[Shape, ...]] = {}
+    for name, place in places.items():
+        turn = quaternion(place.R)
+        shapes = tuple(shape.placed(place.p, turn) for shape in tree.links[name].shapes)
+        found[place.body] = (*found.get(place.body, ()), *shapes)
+    return found
+
+
+def _hand(tree: UrdfTree, places: Mapping[str, _Place]) -> tuple[str, Array]:
+    """The controlled point: the link ``hand`` if it moves, else the tip of the deepest chain, the first of equals."""
+    tip = max(tree.links, key=lambda name: (places[name].moving, places[name].joints))
+    if HAND in places and places[HAND].moving > 0:
+        tip = HAND
+    return str(places[tip].body), places[tip].p
+
+
+def _warn(tree: UrdfTree, places: Mapping[str, _Place], links: tuple[Link, ...]) -> None:
+    """Refuse bodies that cannot be; warn of masses that are missing and of what is not simulated."""
+    for link in links:
+        link.inertia.check(
+            f"{tree.path}:{tree.links[link.name].line}: link {link.name!r}, with all that is fixed to it"
+        )
+    rubbing = [joint.name for joint in tree.joints.values() if joint.friction != 0.0 and joint.kind != "fixed"]
+    if rubbing:
+        warnings.warn(f"{tree.path}: Coulomb friction of joints is not simulated ({', '.join(rubbing)})", stacklevel=3)
+    loaded: set[str | None] = set()
+    for link in reversed(links):
+        if link.name in loaded or link.inertia.mass > 0.0 or link.inertia.tensor.any():
+            loaded |= {link.name, link.parent}
+    empty = [link.joint for link in links if link.name not in loaded and (link.parent in loaded or not link.parent)]
+    if empty:
+        warnings.warn(f"{tree.path}: nothing beyond these joints has a mass ({', '.join(empty)})", stacklevel=3)
+    moving = [tree.links[name] for name, place in places.items() if place.body is not None]
+    bare = [link.name for link in moving if link.inertia is None and link.shaped]
+    if bare:
+        warnings.warn(
+            f"{tree.path}: links with a shape but without <inertial> have no mass ({', '.join(bare)})", stacklevel=3
+        )
+    odd = []
+    for part in moving:
+        try:
+            (part.inertia or Inertia(0.0)).check(part.name)
+        except ModelError:
+            odd.append(part.name)
+    if odd:
+        warnings.warn(
+            f"{tree.path}: moments of inertia that no body can have, taken as they stand because the bodies that these "
+            f"links are fixed to can have the sum ({', '.join(odd)})",
+            stacklevel=3,
+        )
+
+
+def _compare_with_pinocchio(tree: UrdfTree) -> None:
+    """Raise :class:`ModelError` unless Pinocchio finds the same joints and bodies in the file, before any is locked."""
+    # Imported here: Pinocchio takes a second to load, and only URDF files need it.
+    import pinocchio
+
+    try:
+        model = pinocchio.buildModelFromXML(tree.text)
+    except (ValueError, RuntimeError) as error:
+        raise ModelError(f"{tree.path}: not a valid URDF model: {' '.join(str(error).split())}") from error
+    neutral = pinocchio.neutral(model)
+    places = _places(tree)
+    links = _links(tree, places)
+    ours, theirs = {link.joint for link in links}, set(list(model.names)[1:])
+    if ours != theirs:
+        raise ModelError(
+            f"{tree.path}: two readers of the file differ in its moving joints: {', '.join(sorted(ours ^ theirs))}"
+        )
+    joint_of = {link.name: link.joint for link in links}
+    for link in links:
+        joint, j = tree.joints[link.joint], model.getJointId(link.joint)
+        inertia, placement = model.inertias[j], model.jointPlacements[j]
+        parent = "universe" if link.parent is None else joint_of[link.parent]
+        if model.names[model.parents[j]] != parent:
+            raise _difference(tree, link, "parent joint", parent, model.names[model.parents[j]])
+        length = max(1.0, float(np.abs(link.p_PJ).max()), float(np.abs(link.inertia.com).max()))
+        pairs: list[tuple[str, Any, Any, float]] = [
+            ("rotation of the joint", link.R_PJ, placement.rotation, 1.0),
+            ("position of the joint", link.p_PJ, placement.translation, length),
+            ("mass", link.inertia.mass, inertia.mass, link.inertia.mass),
+        ]
+        if link.inertia.mass > 0.0:
+            pairs.append(("centre of mass", link.inertia.com, inertia.lever, length))
+        size = float(np.abs(link.inertia.tensor).max()) + link.inertia.mass * length**2
+        pairs.append(("inertia", link.inertia.tensor, inertia.inertia, size))
+        pairs.append(("damping", link.damping, model.damping[model.joints[j].idx_v], link.damping))
+        if link.kind in SEVERAL:
+            # Of a plane Pinocchio does not read the normal: it takes z.
+            pairs.append(("number of rates", len(ROWS[link.kind](link)), model.joints[j].nv, 0.0))
+        else:
+            # Motion of the body per unit rate in its own frame: (0, a) of a revolute joint, (a, 0) of a prismatic one.
+            in_joint = model.joints[j].createData()
+            model.joints[j].calc(in_joint, neutral)
+            zero, revolute = np.zeros(3), link.kind == "revolute"
+            motion = np.concatenate([zero, link.axis] if revolute else [link.axis, zero])
+            pairs.append(("joint motion", motion, in_joint.S, 1.0))
+        if joint.kind not in ("continuous", *SEVERAL):
+            k = model.joints[j].idx_q
+            for name, value, limits in (
+                ("lower limit", link.lower, model.lowerPositionLimit),
+                ("upper limit", link.upper, model.upperPositionLimit),
+            ):
+                if math.isfinite(value):
+                    pairs.append((name, value, limits[k], abs(value)))
+        for name, value, limits in (
+            ("velocity limit", link.velocity_limit, model.velocityLimit),
+            ("effort limit", link.effort_limit, model.effortLimit),
+        ):
+            if math.isfinite(value):
+                pairs.append((name, value, limits[model.joints[j].idx_v], value))
+        for name, own, other, scale in pairs:
+            if not np.allclose(own, other, rtol=0.0, atol=_AGREEMENT * scale):
+                raise _difference(tree, link, name, own, other)
+
+
+def _difference(tree: UrdfTree, link: Link, name: str, own: Any, other: Any) -> ModelError:
+    def text(value: Any) -> str:
+        return " ".join(np.array2string(np.asarray(value), precision=12).split()) if np.ndim(value) else str(value)
+
+    return tree.error(
+        tree.links[link.name].line,
+        f"link {link.name!r} (joint {link.joint!r}): {name} is {text(own)} as written, but Pinocchio reads "
+        f"{text(other)}; write the numbers of this link and joint more plainly",
+    )

@@ -1,0 +1,340 @@
+"""Task-space controller with weighted redundancy resolution ([T] eqs 9-17).
+
+With M = B~ W^(-1/2) and its factorisation M = L Q^T (Householder reflections of the rows, one row at a time), the
+weighted pseudo inverse is B~^(W+) v = W^(-1/2) Q L^-1 v, and I - Q Q^T projects on the null space. Rows can be added
+one by one, which is how a joint is taken out of the allocation while it sits at its limit.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from dynsim.jit.kernel import internal_kernel, kernel
+from dynsim.snake.kinematics import (
+    Chain,
+    SnakeModel,
+    active_rows,
+    constraint_matrices,
+    new_chain,
+    pose_of_point,
+    walk_chain,
+    wrap_angle,
+)
+from dynsim.snake.support import Cost, Support, cost_gradient, new_support
+
+LIMITS_NONE, LIMITS_SATURATE, LIMITS_ALLOCATE = 0, 1, 2
+NULL_PAPER, NULL_SAFE = 0, 1
+
+
+class Law(NamedTuple):
+    """Constants of the controller; SI units, rates [1/s]."""
+
+    gain: np.ndarray  # (6 + m,) diagonal of K
+    null_gain: float  # k_eta
+    null_form: int
+    root_weight_inverse: np.ndarray  # (n_phi + n_w,) diagonal of W^(-1/2)
+    shape_joints: np.ndarray  # (m,) joints of the shape controllable points, rows of S
+    shape_target: np.ndarray  # (m,) [rad]
+    grounded: np.ndarray  # (modes, n_b + 1) 1 where a pair is on the ground
+    limit_policy: int
+    rate_limit: float  # fastest joint rate [rad/s]; a command that asks for more is not carried out
+    limit_rate: float  # a joint approaches its limit no faster than this rate times the remaining angle
+    damping_sigma: float  # damp when the smallest singular value of M falls below it
+    damping_factor: float  # at sigma = 0, in the same unit as sigma
+    cost: Cost
+
+
+class Work(NamedTuple):
+    """Workspace and results of one controller evaluation."""
+
+    frame: np.ndarray  # (3, 3)
+    chain: Chain
+    support: Support
+    A: np.ndarray  # (n_b + 4 + n_w, 6)
+    B: np.ndarray  # (n_b + 4 + n_w, n_u)
+    rows: np.ndarray  # (n_b + 4 + n_w,)
+    row: np.ndarray  # (n_u,)
+    ones: np.ndarray  # (n_u,)
+    lower: np.ndarray  # (n_u, n_u) L
+    reflector: np.ndarray  # (n_u, n_u)
+    beta: np.ndarray  # (n_u,)
+    rhs: np.ndarray  # (n_u,)
+    solution: np.ndarray  # (n_u,)
+    singular: np.ndarray  # (n_u,) left singular vector of the smallest singular value
+    error: np.ndarray  # (6,)
+    gradient: np.ndarray  # (n_u,) eta
+    null_part: np.ndarray  # (n_u,) Q^T of the scaled gradient
+    u: np.ndarray  # (n_u,) result: joint rates, wheel rates [rad/s]
+    withheld: np.ndarray  # (1,) part of the command that damping has taken away [m/s, rad/s]
+    at_limit: np.ndarray  # (n_phi,) 1 where a joint was taken out of the allocation, 2 where it could not be
+
+
+def new_work(model: SnakeModel) -> Work:
+    """Empty workspace of :func:`control_input`."""
+    joints = model.head_joints + model.base_joints
+    rows, inputs = model.base_joints + 4 + model.wheels, joints + model.wheels
+    return Work(
+        frame=np.zeros((3, 3)),
+        chain=new_chain(model),
+        support=new_support(model),
+        A=np.zeros((rows, 6)),
+        B=np.zeros((rows, inputs)),
+        rows=np.zeros(rows, dtype=np.int64),
+        row=np.zeros(inputs),
+        ones=np.ones(inputs),
+        lower=np.zeros((inputs, inputs)),
+        reflector=np.zeros((inputs, inputs)),
+        beta=np.zeros(inputs),
+        rhs=np.zeros(inputs),
+        solution=np.zeros(inputs),
+        singular=np.zeros(inputs),
+        error=np.zeros(6),
+        gradient=np.zeros(inputs),
+        null_part=np.zeros(inputs),
+        u=np.zeros(inputs),
+        withheld=np.zeros(1),
+        at_limit=np.zeros(joints, dtype=np.int64),
+    )
+
+
+@internal_kernel
+def append_row(k, row, tolerance, lower, reflector, beta):
+    """Extend M = L Q^T by one row (destroyed); row k of L and reflector k are written.
+
+    Returns False, and leaves k rows, when the part of ``row`` outside the space of the earlier rows is shorter than
+    ``tolerance``. With tolerance 0 even a dependent row is taken: its pivot is tiny and damping has to deal with it.
+    """
+    n = row.shape[0]
+    for j in range(k):
+        s = 0.0
+        for i in range(j, n):
+            s += reflector[j, i] * row[i]
+        s *= beta[j]
+        for i in range(j, n):
+            row[i] -= s * reflector[j, i]
+    norm = 0.0
+    for i in range(k, n):
+        norm += row[i] * row[i]
+    norm = math.sqrt(norm)
+    if k >= n or norm < tolerance:
+        return False
+    pivot = -math.copysign(max(norm, 1e-14), row[k])
+    for j in range(k):
+        lower[k, j] = row[j]
+        reflector[k, j] = 0.0
+    lower[k, k] = pivot
+    for i in range(k, n):
+        reflector[k, i] = row[i]
+    reflector[k, k] -= pivot
+    square = 0.0
+    for i in range(k, n):
+        square += reflector[k, i] * reflector[k, i]
+    beta[k] = 2.0 / square
+    return True
+
+
+@internal_kernel
+def reflect(j, reflector, beta, vector):
+    """Apply reflection j to a vector in place."""
+    s = 0.0
+    for i in range(j, vector.shape[0]):
+        s += reflector[j, i] * vector[i]
+    s *= beta[j]
+    for i in range(j, vector.shape[0]):
+        vector[i] -= s * reflector[j, i]
+
+
+@internal_kernel
+def smallest_singular_value(count, tolerance, lower, u, y):
+    """Smallest singular value of L (count x count, lower triangular) by inverse iteration.
+
+    ``u`` becomes the left singular vector, ``y`` is workspace, ``tolerance`` the relative change that ends the
+    iteration. The first vector has entries of one size; their signs are chosen one by one such that y grows (Cline,
+    Moler, Stewart, Wilkinson 1979). A fixed one is orthogonal to the wanted vector at some postures, and the iteration
+    then ends at the second smallest value. It converges by the square of the ratio of the two smallest singular
+    values: near a singularity, where value and vector matter, in two or three steps; and when the two are close, any
+    mixture of their vectors will do.
+    """
+    sigma = math.inf
+    for iteration in range(60):
+        norm = 0.0
+        for i in range(count):
+            s = 0.0
+            for j in range(i):
+                s += lower[i, j] * y[j]
+            if iteration == 0:
+                u[i] = -math.copysign(1.0 / math.sqrt(count), s)
+            y[i] = (u[i] - s) / lower[i, i]
+            norm += y[i] * y[i]
+        previous, sigma = sigma, 1.0 / math.sqrt(norm)
+        norm = 0.0
+        for i in range(count - 1, -1, -1):
+            s = y[i]
+            for j in range(i + 1, count):
+                s -= lower[j, i] * u[j]
+            u[i] = s / lower[i, i]
+            norm += u[i] * u[i]
+        norm = math.sqrt(norm)
+        for i in range(count):
+            u[i] /= norm
+        if abs(previous - sigma) <= tolerance * sigma:
+            break
+    return sigma
+
+
+@internal_kernel
+def factor_rows(B, rows, count, shape_joints, scale, row, lower, reflector, beta):
+    """L Q^T = B~ diag(scale) of a mode: rows ``rows[:count]`` of B, then S; returns the number of rows."""
+    total = count + shape_joints.shape[0]
+    for k in range(total):
+        for i in range(row.shape[0]):
+            row[i] = B[rows[k], i] * scale[i] if k < count else 0.0
+        if k >= count:
+            row[shape_joints[k - count]] = scale[shape_joints[k - count]]
+        append_row(k, row, 0.0, lower, reflector, beta)
+    return total
+
+
+@kernel
+def sigma_min(model, law, work, grounded):
+    """Smallest singular value of the unweighted B~ of a mode; needs ``work.B`` of the present state."""
+    lower = work.lower
+    count = active_rows(model, grounded, work.rows)
+    k = factor_rows(work.B, work.rows, count, law.shape_joints, work.ones, work.row, lower, work.reflector, work.beta)
+    return smallest_singular_value(k, 1e-6, lower, work.singular, work.solution)
+
+
+@internal_kernel
+def solve_input(law, work, rows, null_gain):
+    """u = W^(-1/2) (Q L^-1 rhs - k_eta (I - Q Q^T) W^(1/2) n), n = eta (eq 14) or W^-1 eta (safe form)."""
+    y, u, g, rhs = work.solution, work.u, work.null_part, work.rhs
+    lower, reflector, beta, root = work.lower, work.reflector, work.beta, law.root_weight_inverse
+    n = u.shape[0]
+    for i in range(rows):
+        s = rhs[i]
+        for j in range(i):
+            s -= lower[i, j] * y[j]
+        y[i] = s / lower[i, i]
+    for i in range(rows, n):
+        y[i] = 0.0
+    if null_gain != 0.0:
+        gradient, safe = work.gradient, law.null_form == NULL_SAFE
+        for i in range(n):
+            g[i] = gradient[i] * (root[i] if safe else 1.0 / root[i])
+        for j in range(rows):
+            reflect(j, reflector, beta, g)
+        for i in range(rows, n):
+            y[i] = -null_gain * g[i]
+    for j in range(rows - 1, -1, -1):
+        reflect(j, reflector, beta, y)
+    for i in range(n):
+        u[i] = root[i] * y[i]
+
+
+@internal_kernel
+def worst_limit_violation(model, law, work, phi):
+    """Joint whose rate breaks its bound most, and that bound; (-1, 0) when all rates are allowed."""
+    u, at_limit, upper, lower, rate = work.u, work.at_limit, model.upper, model.lower, law.limit_rate
+    worst, joint, bound = 1e-12, -1, 0.0
+    for j in range(phi.shape[0]):
+        up = rate * (upper[j] - phi[j])
+        down = rate * (lower[j] - phi[j])
+        excess = max(u[j] - up, down - u[j])
+        if at_limit[j] == 0 and excess > worst:
+            worst, joint, bound = excess, j, up if u[j] > up else down
+    return joint, bound
+
+
+@kernel
+def control_input(model, law, work, w, phi, w_target, velocity, mode, null_gain):
+    """One evaluation of the controller: joint and wheel rates u of [T] eqs 12-14, in ``work.u``.
+
+    u = B~^(W+) A~ (w~_d' - K (w~ - w~_d)) - k_eta (I - B~^(W+) B~) n, with n = eta (the paper's eq 14) or W^-1 eta
+    (safe: eta . u_ker <= 0 for every W). Near a singular B~ the part of the command along its weakest direction alone
+    is scaled by sigma^2 / (sigma^2 + lambda^2), lambda^2 = (1 - (sigma/damping_sigma)^2) damping_factor^2; the
+    null-space part is an exact projection even there.
+
+    Parameters
+    ----------
+    w, phi : (6,), (n_phi,) pose of the controlled point and joints as the controller believes them.
+    w_target, velocity : (6,), (6,) target pose and its rate.
+    mode : int, row of ``law.grounded``.
+    null_gain : float, k_eta or 0 to switch the null-space term off.
+
+    Returns
+    -------
+    sigma : float
+        Smallest singular value of B~ W^(-1/2).
+    """
+    chain, A, B, kept, row, rhs = work.chain, work.A, work.B, work.rows, work.row, work.rhs
+    lower, reflector, beta, error, singular = work.lower, work.reflector, work.beta, work.error, work.singular
+    at_limit, grounded = work.at_limit, law.grounded[mode]
+    gain, root, shape_joints, shape_target = law.gain, law.root_weight_inverse, law.shape_joints, law.shape_target
+
+    walk_chain(model, w, phi, work.frame, chain)
+    constraint_matrices(model, chain, w, A, B)
+    count = active_rows(model, grounded, kept)
+    rows = factor_rows(B, kept, count, shape_joints, root, row, lower, reflector, beta)
+
+    for i in range(6):
+        deviation = w[i] - w_target[i]
+        error[i] = velocity[i] - gain[i] * (deviation if i < 3 else wrap_angle(deviation))
+    for r in range(count):
+        s = 0.0
+        for i in range(6):
+            s += A[kept[r], i] * error[i]
+        rhs[r] = s
+    for s in range(shape_joints.shape[0]):
+        rhs[count + s] = -gain[6 + s] * (phi[shape_joints[s]] - shape_target[s])
+
+    sigma = smallest_singular_value(rows, 1e-3, lower, singular, work.solution)
+    work.withheld[0] = 0.0
+    if sigma < law.damping_sigma:
+        ratio = sigma / law.damping_sigma
+        damping = (1.0 - ratio * ratio) * law.damping_factor**2
+        along = 0.0
+        for i in range(rows):
+            along += singular[i] * rhs[i]
+        along *= damping / (sigma * sigma + damping)
+        for i in range(rows):
+            rhs[i] -= along * singular[i]
+        work.withheld[0] = abs(along)
+
+    if null_gain != 0.0:
+        cost_gradient(model, law.cost, chain, phi, grounded, work.support, work.gradient)
+    for j in range(phi.shape[0]):
+        at_limit[j] = 0
+    joint = 0
+    while joint >= 0:
+        solve_input(law, work, rows, null_gain)
+        if law.limit_policy != LIMITS_ALLOCATE:
+            break
+        joint, bound = worst_limit_violation(model, law, work, phi)
+        while joint >= 0:
+            for i in range(row.shape[0]):
+                row[i] = 0.0
+            row[joint] = root[joint]
+            # A joint that the task fixes almost alone would throw its share onto others at 1/tolerance its rate.
+            if append_row(rows, row, 1e-3 * root[joint], lower, reflector, beta):
+                rhs[rows] = bound
+                rows += 1
+                at_limit[joint] = 1
+                break
+            at_limit[joint] = 2
+            joint, bound = worst_limit_violation(model, law, work, phi)
+    return sigma
+
+
+@internal_kernel
+def estimate_from_joints(model, phi, frame, base, w_hat, w):
+    """[T] IV.C.1: z, alpha, beta from the joints of the head part with the base level; x, y, gamma as integrated.
+
+    ``base`` and ``w`` are workspace; ``w_hat`` (6,) keeps its x, y, gamma.
+    """
+    base[0], base[1], base[2] = 0.0, 0.0, 0.0
+    pose_of_point(model, base, phi, frame, w)
+    for i in range(2, 5):
+        w_hat[i] = w[i]

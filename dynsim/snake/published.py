@@ -1,0 +1,263 @@
+"""Measured values and statements of [T], to be set beside simulated ones.
+
+[T]: M. Tanaka et al., "Task-Space Control of Articulated Mobile Robots With a Soft Gripper for Operations", IEEE
+Transactions on Robotics 35(1), 2019.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from dynsim.record import Record
+from dynsim.snake.geometry import snake_geometry
+
+Table = list[list[str]]  # head line first
+
+COORDINATES = ("x", "y", "z", "alpha", "beta", "gamma")
+
+
+class Displacement(NamedTuple):
+    """Relative displacement of the head, x, y, z [m], alpha, beta, gamma [rad]."""
+
+    target: tuple[float, ...]
+    mean: tuple[float, ...]
+    deviation: tuple[float, ...]  # standard deviation of five runs
+
+
+# [T] Table III, by the coordinate that is moved.
+TABLE_III: dict[str, Displacement] = {
+    "x": Displacement(
+        (0.20, 0, 0, 0, 0, 0),
+        (0.20, 0.0052, 0.0024, 0.0092, -0.0047, -0.012),
+        (0.0025, 0.0015, 0.00082, 0.0061, 0.015, 0.0059),
+    ),
+    "y": Displacement(
+        (0, 0.1, 0, 0, 0, 0),
+        (-0.069, 0.066, 0.014, -0.055, -0.055, -0.075),
+        (0.0036, 0.0033, 0.00071, 0.0053, 0.0047, 0.0039),
+    ),
+    "z": Displacement(
+        (0, 0, -0.1, 0, 0, 0),
+        (-0.011, 0.0040, -0.10, 0.013, -0.013, 0.0075),
+        (0.0017, 0.00081, 0.00090, 0.0042, 0.0050, 0.0033),
+    ),
+    "alpha": Displacement(
+        (0, 0, 0, np.pi / 2, 0, 0),
+        (-0.054, -0.035, 0.030, 1.54, -0.060, -0.063),
+        (0.0042, 0.0018, 0.0011, 0.014, 0.0051, 0.0037),
+    ),
+    "beta": Displacement(
+        (0, 0, 0, 0, -np.pi / 6, 0),
+        (0.00062, 0.0015, 0.0061, 0.019, -0.55, -0.0060),
+        (0.0013, 0.0011, 0.00094, 0.0061, 0.0063, 0.0047),
+    ),
+    "gamma": Displacement(
+        (0, 0, 0, 0, 0, np.pi / 4),
+        (-0.018, 0.00032, 0.027, 0.050, -0.12, 0.79),
+        (0.0020, 0.0016, 0.00057, 0.0073, 0.0070, 0.0084),
+    ),
+}
+
+
+def displacement(record: Record) -> np.ndarray:
+    """Relative displacement of the controlled point as [T] V.A takes it, (6,).
+
+    Mean over the last second of the run minus mean over its first.
+    """
+    first, last = record.time <= 1.0, record.time >= record.time[-1] - 1.0
+    return record["w"][last].mean(axis=0) - record["w"][first].mean(axis=0)
+
+
+def table_iii(records: Mapping[str, Record]) -> Table:
+    """Table III: target, measured in [T], simulated. Only manoeuvres that were run."""
+    rows = [["moved", "what", *COORDINATES]]
+    for moved, published in TABLE_III.items():
+        if moved in records:
+            rows.append([moved, "target", *(f"{v:.4g}" for v in published.target)])
+            rows.append([moved, "[T] mean", *(f"{v:.3g}" for v in published.mean)])
+            rows.append([moved, "[T] standard deviation", *(f"{v:.2g}" for v in published.deviation)])
+            rows.append([moved, "simulated", *(f"{v:.6f}" for v in displacement(records[moved]) + 0.0)])
+    return rows
+
+
+class Statement(NamedTuple):
+    """What [T] says, and how to take the same from a record."""
+
+    where: str
+    what: str
+    published: str
+    variant: str
+    simulated: Callable[[Record], str]
+
+
+# [T] V.B: error of the head during mode switching, "about 30 mm and 0.1 rad".
+HEAD_ERROR = (0.030, 0.1)  # [m], [rad]
+
+
+def base_joints(record: Record) -> np.ndarray:
+    """Joint angles of the base part, (T, n_b) [rad]."""
+    return record["phi"][:, snake_geometry(record).head_joints :]
+
+
+def mode_sequence(record: Record) -> list[tuple[float, int]]:
+    """(time [s], mode number) at the start and at every change."""
+    mode = record["mode"]
+    starts = np.flatnonzero(np.diff(mode, prepend=mode[0] - 1))
+    return [(float(record.time[i]), int(mode[i])) for i in starts]
+
+
+def used_limit(record: Record) -> np.ndarray:
+    """Largest yaw angle of each sample in parts of its limit, (T,); pitch is mostly set by the shape point."""
+    geometry = snake_geometry(record)
+    yaw = ~geometry.pitch
+    return np.asarray(np.abs(record["phi"][:, yaw] / geometry.upper[yaw]).max(axis=1))
+
+
+def _largest_base_angle(record: Record) -> str:
+    angle = np.abs(base_joints(record)).max(axis=1)
+    return f"{angle[0]:.3f} -> {angle[-1]:.3f}"
+
+
+def _straightening(record: Record) -> str:
+    """Base joints in the order in which they fall below half of their first angle for good, with the time [s]."""
+    angle, names = np.abs(base_joints(record)), record.labels["phi"][-base_joints(record).shape[1] :]
+    rows, said = len(angle), []
+    # first row of the rest of the run in which the joint stays below; the number of rows: none
+    below = [int(np.append(-1, np.flatnonzero(column > 0.5 * column[0]))[-1]) + 1 for column in angle.T]
+    for j in np.argsort(below, kind="stable"):
+        said.append(f"{names[j]} " + (f"{record.time[below[j]]:.1f}" if below[j] < rows else "never"))
+    return ", ".join(said)
+
+
+def _same_wheels(record: Record) -> str:
+    shown = {
+        (int(m), tuple(np.flatnonzero(g == 0) + 1)) for m, g in zip(record["mode"], record["grounded"], strict=True)
+    }
+    return "; ".join(f"mode {m}: {', '.join(map(str, pairs))}" for m, pairs in sorted(shown) if pairs)
+
+
+def _cost(record: Record) -> str:
+    return f"{record['cost'][0]:.2f} -> {record['cost'][-1]:.2f}; largest rise in a sample {_rise(record):.1e}"
+
+
+def _rise(record: Record) -> float:
+    """Largest rise of V from sample to sample within a mode; below zero: it always falls."""
+    return float(np.diff(record["cost"])[np.diff(record["mode"]) == 0].max())
+
+
+def _error(name: str, scale: float) -> Callable[[Record], str]:
+    return lambda record: f"{scale * record[name].max():.2g}"
+
+
+def _summary(key: str, form: str = "") -> Callable[[Record], str]:
+    return lambda record: format(record.summary[key], form)
+
+
+def _rms_base_angle(record: Record) -> str:
+    return f"{np.sqrt((base_joints(record)[-1] ** 2).mean()):.3f}"
+
+
+# [T] V.B (Figs 8 to 10), IV.C.5 (Table II) and V.E (Fig 16), sentence by sentence.
+JOINT_LIMITS: tuple[Statement, ...] = (
+    Statement("V.B", "largest |theta| of the base part, start -> end [rad]",
+              "near the limit (1.1), decreased with time", "cyclic", _largest_base_angle),
+    Statement("V.B", "fixing state for t < 2 s, then the switching state: t [s] (mode)",
+              "mode 1; at t >= 2: 2, 3, ..., 6, 2, 3, ... every 1 s", "cyclic",
+              lambda r: ", ".join(f"{t:.0f} ({m})" for t, m in mode_sequence(r))),
+    Statement("IV.C.5, Table II", "lifted pairs of every mode that was used",
+              "mode 1: 3, 6; 2: 6, 7; 3: 5, 6; 4: 4, 5; 5: 3, 4; 6: 2, 3", "cyclic", _same_wheels),
+    Statement("IV.C.5, Table II", "wheel pairs on the ground, fewest and most", "5 of 7", "cyclic",
+              lambda r: f"{r['grounded'].sum(axis=1).min()} and {r['grounded'].sum(axis=1).max()}"),
+    Statement("V.B, Fig 9", "cost V", "decreased with time", "cyclic", _cost),
+    Statement("V.B, Fig 9", "position error of the head, largest [mm]", f"about {1e3 * HEAD_ERROR[0]:.0f}", "cyclic",
+              _error("position_error", 1e3)),
+    Statement("V.B, Fig 9", "attitude error of the head, largest [rad]", f"about {HEAD_ERROR[1]}", "cyclic",
+              _error("attitude_error", 1.0)),
+    Statement("V.B, Fig 10", "largest yaw angle in parts of its limit", "the joint limit was avoided", "cyclic",
+              lambda r: f"{used_limit(r).max():.6f}"),
+    Statement("V.B, Fig 10", "below half the first angle for good, t [s]", "in order from the tail to the head",
+              "cyclic", _straightening),
+    Statement("IV.C.5", "the same without switching", "switching makes the robot operable again", "fixed",
+              _straightening),
+    Statement("IV.C.5, V.E", "V at the end, predictive switching", "better than the prescribed order", "predictive",
+              _cost),
+    Statement("V.E, Fig 15", "smallest support margin [mm]", "hardly falls", "cyclic",
+              lambda r: f"{1e3 * r['support_margin'].min():.1f}"),
+    *(
+        Statement("V.E, Fig 16", f"{what}, end", published, variant, take)
+        for what, reference, published_20, take in (
+            ("rms |theta| of the base part [rad]", "straight (Fig 8)", "not straight", _rms_base_angle),
+            ("area of the support polygon [m^2]", "(Fig 8)", "greater than in Fig 8",
+             _summary("support_area_final_m2", ".4f")),
+            ("support margin [mm]", "", "", lambda r: f"{1e3 * r['support_margin'][-1]:.1f}"),
+        )
+        for variant, published in (("cyclic", reference), ("eq20", published_20), ("eq20_min", published_20))
+    ),
+)  # fmt: skip
+
+# [T] V.D.3, Fig 14.
+DOOR: tuple[Statement, ...] = tuple(
+    Statement("V.D.3, Fig 14", what, published, variant, take)
+    for what, take, texts in (
+        ("opened to [deg]", lambda r: f"{abs(np.rad2deg(r['w'][-1, 5] - r['w'][0, 5])):.2f}",
+         ("(d), (f): the robot could not move backward", "(e), (g): able to resume moving backward", "")),
+        ("largest yaw angle in parts of its limit", lambda r: f"{used_limit(r).max():.4f}",
+         ("(d), (f): the joint reached the limit angle", "changed posture", "")),
+        ("target waited [s]", _summary("waiting_s", ".2f"), ("", "", "")),
+        ("mode switches", _summary("mode_switches"), ("fixing state", "mode switching", "")),
+        ("gripper off its target, largest [mm]", _error("position_error", 1e3),
+         ("", "maintaining the position and attitude", "")),
+        ("gripper off its target, largest [rad]", _error("attitude_error", 1.0),
+         ("", "maintaining the position and attitude", "")),
+    )
+    for variant, published in zip(("pull", "pull_switching", "pull_predictive", "push"),
+                                  (texts[0], texts[1], texts[1], texts[2]), strict=True)
+)  # fmt: skip
+
+
+def statements(listed: tuple[Statement, ...], records: Mapping[str, Record]) -> Table:
+    """What [T] says beside what was simulated; only variants that were run."""
+    rows = [["[T]", "what", "published", "variant", "simulated"]]
+    rows += [[*s[:4], s.simulated(records[s.variant])] for s in listed if s.variant in records]
+    return rows
+
+
+POLICIES = ("fixed", "cyclic", "predictive")
+
+
+def policies(records: Mapping[str, Record]) -> Table:
+    """The mode switching policies side by side, one column each."""
+    shown = {name: records[name] for name in POLICIES if name in records}
+    lines: tuple[tuple[str, Callable[[Record], str]], ...] = (
+        ("V, start -> end", lambda r: f"{r['cost'][0]:.2f} -> {r['cost'][-1]:.2f}"),
+        ("V at half time", lambda r: f"{r['cost'][len(r.time) // 2]:.2f}"),
+        ("largest |theta| of the base part, start -> end [rad]", _largest_base_angle),
+        ("joints that were taken out at their limits", lambda r: " ".join(r.summary["joints_taken_out"]) or "none"),
+        ("largest yaw angle in parts of its limit", lambda r: f"{used_limit(r).max():.6f}"),
+        ("position error of the head, largest [mm]", _error("position_error", 1e3)),
+        ("attitude error of the head, largest [rad]", _error("attitude_error", 1.0)),
+        ("smallest support margin [mm]", lambda r: f"{1e3 * r['support_margin'].min():.1f}"),
+        ("support area, end [m^2]", _summary("support_area_final_m2", ".4f")),
+        ("mode switches", _summary("mode_switches")),
+        ("modes refused", _summary("modes_refused")),
+        ("modes", lambda r: " ".join(str(m) for _, m in mode_sequence(r))),
+        ("wall time [s]", _summary("integration_wall_s", ".3f")),
+    )
+    return [["", *shown], *([what, *(take(record) for record in shown.values())] for what, take in lines)]
+
+
+def tables(scenario: str, records: Mapping[str, Record]) -> dict[str, Table]:
+    """Tables beside [T] for the variants of a shipped scenario, by file name; empty where [T] has nothing to say."""
+    if scenario == "snake_positioning":
+        found = {"table_iii": table_iii(records)}
+    elif scenario == "snake_joint_limits":
+        found = {"joint_limits": statements(JOINT_LIMITS, records), "policies": policies(records)}
+    elif scenario == "snake_door_arc":
+        found = {"door": statements(DOOR, records)}
+    else:
+        found = {}
+    # a head line alone: none of its variants was run
+    return {name: rows for name, rows in found.items() if len(rows) > 1 and len(rows[0]) > 1}

@@ -1,0 +1,1 @@
+"""Files, YAML, signals, streams, terminal, memo."""

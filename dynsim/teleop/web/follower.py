@@ -1,0 +1,324 @@
+"""A simulation in a process of its own, driven by a pilot and followed by servos: what that process does.
+
+    loop of the servos                                 this process
+    ------------------                                 ------------
+    tells its time in shared memory        ──▶         Follower.ready: the next tick may be simulated
+    reads a pipe without ever waiting      ◀──         Follower.hear: a posture for every tick
+
+Nothing that happens here, a compiler, a browser, a disk, can delay the servos: they have an interpreter of their own.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import struct
+import threading
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dynsim.engine.results import save_drive
+from dynsim.errors import DynsimError, RecordError
+from dynsim.hardware.errors import CheckRefused
+from dynsim.hardware.replay.drive import lead
+from dynsim.hardware.replay.growing import Sample
+from dynsim.hardware.replay.held_back import HeldBack
+from dynsim.hardware.replay.lifting import SIGNAL as LIFTED
+from dynsim.hardware.replay.signals import ignore_stops
+from dynsim.hardware.replay.trajectory import column_of
+from dynsim.hardware.servo_map import ServoMap
+from dynsim.record import Record
+from dynsim.scenario import Scenario
+from dynsim.teleop.drive import drive
+from dynsim.teleop.driven import Array, Driven, Pace
+from dynsim.teleop.web.session import Account, Session
+
+NOT_YET = -math.inf
+"""Time that the servos tell before they are where the simulation begins."""
+NICENESS = 5
+REGULAR, BROKEN, NOT_LIFTED = 0.0, 1.0, 2.0
+"""What is said behind a time that is no number: that the drive has ended, and how."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A drive that is to be."""
+
+    scenario: Scenario
+    servo_map: ServoMap
+    pace: Pace
+    longest: float
+    http_port: int
+    until_closed: bool
+    folder: Path
+
+
+@dataclass(frozen=True)
+class Ready:
+    """What the servos must know before they move; ``step`` is that of the samples [s]."""
+
+    address: str
+    still: Record
+    first: Sample
+    step: float
+
+
+@dataclass(frozen=True)
+class Done:
+    """How the drive went; ``saved`` is false where there was nothing to save, ``failure`` says why it was not."""
+
+    account: Account
+    driven: float
+    saved: bool
+    failure: DynsimError | None
+
+
+def frame_of(servos: int, lifting: int) -> struct.Struct:
+    """A sample in the pipe: time, angles, rates, and what lifting adds to both at the joints that lift wheels."""
+    return struct.Struct(f"={1 + 2 * (servos + lifting)}d")
+
+
+def lifting_columns(servo_map: ServoMap) -> list[int]:
+    """Joints that lift wheel pairs, by their place in the map."""
+    return [servo_map.joints.index(joint) for joint in servo_map.lifts.joints] if servo_map.lifts else []
+
+
+class Columns:
+    """Which of a simulation's joints the servos of a map follow.
+
+    Raises
+    ------
+    CheckRefused
+        There is no such signal or column, a live drive does not have it, or the robot lifts wheels and the map does
+        not say how.
+    """
+
+    def __init__(self, still: Record, servo_map: ServoMap, driven: Driven) -> None:
+        known = driven.joints()
+        if servo_map.lifts is None and LIFTED in known:
+            raise CheckRefused(
+                "the robot lifts wheel pairs and the servo map does not say how: without it they would drag over the "
+                "floor. Add an entry `lifts` to the map"
+            )
+        self._lifts = servo_map.lifts
+        if self._lifts is not None and self._lifts.signal not in known:
+            raise CheckRefused(f"lifts.signal: a live drive has no {self._lifts.signal!r}; it has {', '.join(known)}")
+        self._driven = driven
+        self._position = np.array([servo.hold_at or 0.0 for servo in servo_map.servos])
+        self._velocity = np.zeros(len(self._position))
+        self._sources: list[tuple[int, str, int, str | None, int]] = []
+        for index, servo in enumerate(servo_map.servos):
+            if servo.hold_at is not None:
+                continue
+            follows = servo.kind.follows
+            column_of(still, follows.position, servo, "rad")
+            rates = None
+            if follows.rates == "continuous":
+                column_of(still, follows.velocity, servo, "rad/s")
+                rates = follows.velocity
+            missing = [name for name in (follows.position, rates) if name is not None and name not in known]
+            if missing:
+                raise CheckRefused(
+                    f"{servo.joint} follows the signal {missing[0]!r}, which a live drive does not have; it has "
+                    f"{', '.join(known)}. Rates of a sampled controller are `rates: held`"
+                )
+            column = still.labels[follows.position].index(servo.label)
+            self._sources.append(
+                (index, follows.position, column, rates, still.labels[rates].index(servo.label) if rates else 0)
+            )
+
+    def now(self) -> tuple[Array, Array]:
+        """Angles [rad] and rates [rad/s] in the order of the map, shape (N,)."""
+        joints = self._driven.joints()
+        for index, signal, column, rates, of_rates in self._sources:
+            self._position[index] = joints[signal][column]
+            if rates is not None:
+                self._velocity[index] = joints[rates][of_rates]
+        return self._position, self._velocity
+
+    def sample(self) -> Sample:
+        """The same, at the time of the simulation."""
+        position, velocity = self.now()
+        return Sample(self._driven.time, position.copy(), velocity.copy())
+
+    def base(self, yaw: tuple[str, list[int]]) -> tuple[Array, Array]:
+        """Yaw angles of the base part, from columns of a signal [rad], and which wheel pairs are on the ground."""
+        assert self._lifts is not None
+        joints = self._driven.joints()
+        signal, columns = yaw
+        return joints[signal][columns], joints[self._lifts.signal]
+
+
+class ServoFollower:
+    """A :class:`~dynsim.teleop.web.session.Follower` behind a pipe.
+
+    Parameters
+    ----------
+    driven : the simulation
+    columns : what of it the servos follow
+    ahead : by how much it may be ahead of them [s], besides what is held back
+    samples : the pipe
+    heard : shared memory with the time of the servos [s]
+    lifting : which of the servos lift wheel pairs
+    held_back : where they do
+    """
+
+    def __init__(
+        self,
+        driven: Driven,
+        columns: Columns,
+        ahead: float,
+        samples: Connection,
+        heard: Any,
+        lifting: list[int],
+        held_back: HeldBack | None,
+    ) -> None:
+        self._driven, self._columns = driven, columns
+        self._ahead = ahead + (held_back.delay if held_back is not None else 0.0)
+        self._samples, self._heard = samples, heard
+        self._lifting, self._held_back = lifting, held_back
+        self.first = columns.sample()
+        self._frame = frame_of(len(self.first.position), len(lifting))
+        if held_back is not None:
+            self.first = held_back.begin(self.first, *columns.base(held_back.yaw))
+
+    @property
+    def begun(self) -> bool:
+        return self._heard[0] > NOT_YET
+
+    @property
+    def ready(self) -> bool:
+        return (self._driven.ticks + 1) * self._driven.period <= self._heard[0] + self._ahead
+
+    @property
+    def steady(self) -> bool:
+        return self._held_back is None or self._held_back.steady(self._driven.time)
+
+    def hear(self) -> None:
+        sample = self._columns.sample()
+        if self._held_back is None:
+            self._tell(sample)
+            return
+        for whole in self._held_back.add(sample, *self._columns.base(self._held_back.yaw)):
+            self._tell(whole)
+
+    def finish(self) -> None:
+        """There was no tick that is not to be followed: what is held back goes on."""
+        for sample in self._held_back.rest() if self._held_back is not None else []:
+            self._tell(sample)
+
+    def end(self, how: float) -> None:
+        """There are no more samples."""
+        self._write(math.nan, how, *[0.0] * (self._frame.size // 8 - 2))
+        self._samples.close()
+
+    def _tell(self, sample: Sample) -> None:
+        added: list[float] = []
+        for one in (sample.lift, sample.lift_rate) if self._lifting else ():
+            added += np.asarray(one)[self._lifting].tolist()
+        self._write(sample.time, *sample.position, *sample.velocity, *added)
+
+    def _write(self, *numbers: float) -> None:
+        # Servos that are gone are told of elsewhere.
+        with suppress(OSError):
+            os.write(self._samples.fileno(), self._frame.pack(*numbers))
+
+
+def simulate(wanted: Wanted, control: Connection, samples: Connection, heard: Any) -> None:
+    """What the process does: says Ready or an error, drives, saves, and says Done.
+
+    It ends when it is told to by any word, or when whoever would tell it is gone.
+    """
+    # A terminal sends these to all processes of a group; only the one with the servos heeds them.
+    ignore_stops()
+    # On a busy computer the servos come first.
+    with suppress(AttributeError, OSError):
+        os.nice(NICENESS)
+    ending = _Ending(control)
+    try:
+        driven = drive(wanted.scenario, pace=wanted.pace, limit=wanted.longest)
+        still = driven.still()
+        columns = Columns(still, wanted.servo_map, driven)
+        held_back = HeldBack(still, wanted.servo_map, driven.period) if wanted.servo_map.lifts else None
+        lifting = lifting_columns(wanted.servo_map)
+        follower = ServoFollower(driven, columns, lead(wanted.servo_map), samples, heard, lifting, held_back)
+        session = Session(driven, wanted.scenario.variant or wanted.scenario.name, follower)
+        address = session.open(wanted.http_port)
+    except Exception as error:
+        _say(control, error if isinstance(error, DynsimError) else DynsimError(f"the simulation failed: {error!r}"))
+        return
+    how = BROKEN
+    refused: CheckRefused | None = None
+    try:
+        ending.of(session)
+        _say(control, Ready(address, still, follower.first, driven.period))
+        account = session.run(until_closed=wanted.until_closed)
+        if account.stop is None:
+            follower.finish()
+            how = REGULAR
+    except CheckRefused as error:
+        how, refused, account = NOT_LIFTED, error, session.account
+        account.ended = str(error)
+    except DynsimError as error:
+        account = session.account
+        account.ended = str(error)
+    finally:
+        follower.end(how)
+        session.close()
+    _say(control, _saved(driven, account, wanted.folder, refused))
+
+
+def _saved(driven: Driven, account: Account, folder: Path, refused: CheckRefused | None) -> Done:
+    time = driven.ticks * driven.period
+    stop, account.stop = account.stop, None  # it holds a record, which need not go through the pipe
+    if driven.ticks == 0:
+        return Done(account, time, saved=False, failure=stop)
+    failure: DynsimError | None = refused if stop is None else type(stop)(str(stop))
+    try:
+        save_drive(driven.record() if stop is None or stop.record is None else stop.record, folder)
+    except DynsimError as error:
+        return Done(account, time, saved=False, failure=error)
+    except Exception as error:
+        return Done(account, time, saved=False, failure=RecordError(f"the drive was not saved: {error!r}"))
+    return Done(account, time, saved=True, failure=failure)
+
+
+def _say(control: Connection, message: Any) -> None:
+    with suppress(OSError):
+        control.send(message)
+
+
+class _Ending:
+    """Hears in a thread of its own that the drive is to end."""
+
+    def __init__(self, control: Connection) -> None:
+        self._session: Session | None = None
+        self._why = ""
+        self._lock = threading.Lock()
+        self._control = control
+        threading.Thread(target=self._listen, name="dynsim ending", daemon=True).start()
+
+    def of(self, session: Session) -> None:
+        """Whose end it is."""
+        with self._lock:
+            self._session = session
+            if self._why:
+                session.end(self._why, at_once=True)
+
+    def _listen(self) -> None:
+        try:
+            why = str(self._control.recv())
+        except (EOFError, OSError):
+            why = "the process with the servos has gone"
+            if self._session is None:
+                # Nothing has begun, and nobody waits for it.
+                os._exit(1)
+        with self._lock:
+            self._why = why
+            if self._session is not None:
+                self._session.end(why, at_once=True)
