@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-_CHECKOUT = Path(__file__).resolve().parent.parent / "scenarios"
-SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else Path(__file__).resolve().parent / "shipped_scenarios"
+_CHECKOUT = Path(__file__).resolve().parents[2] / "scenarios"
+SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else Path(__file__).resolve().parents[1] / "shipped_scenarios"
 
 
 def shipped_scenarios() -> list[Path]:

@@ -106,12 +106,12 @@ def test_what_a_page_names_exists(name: str) -> None:
 @pytest.mark.parametrize(
     "wrong",
     [
-        "`kernels/nowhere.py`",
+        "`dynamics/nowhere.py`",
         "`nowhere/`",
         "`dynamics/derivative.py` (`derivative`, `nothing`)",
         "(`dynamics/derivative.py`, `nothing`)",
         "`derivative` and\n`nothing` in `dynamics/derivative.py`",
-        "`families.nothing`",
+        "`engine.nothing`",
         "`dynsim.Simulation.nothing`",
         "`Simulation.nothing(0.1)`",
     ],

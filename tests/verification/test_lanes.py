@@ -60,7 +60,7 @@ FALLBACK = {
     Place(
         "contact/quadrics.py",
         "sign_changed",
-        "if agreement < -NO_FORCE * largest or (agreement <= NO_FORCE * largest and rows[k, SIGN] < 0.0):",
+        "if agreement < -NO_FORCE * largest or (agreement <= NO_FORCE * largest and rows[k, ka.SIGN] < 0.0):",
     ): "search for the signs of dissipative friction",
 }
 # Branches on time, which is one number for all lanes. Lanes at times of their own must lie in one segment.
@@ -80,8 +80,9 @@ NEVER = {
     Place(
         "contact/quadrics.py",
         "contact_rows",
-        "sx, sy, sz, mu = slide_direction(unilateral, contacts, k, tx, ty, tz)",
+        "x, y, z, mu = slide_direction(unilateral, contacts, k, slip[0], slip[1], slip[2])",
     ): UNILATERAL,
+    Place("contact/quadrics.py", "contact_rows", "t = x, y, z"): UNILATERAL,
     Place("contact/quadrics.py", "contact_rows", "rows[m, ka.ROW_MU] = mu"): UNILATERAL,
     Place("tree/joints.py", "read_positions", "return"): COMPOUND,
     Place("tree/joints.py", "position_rates", "return"): COMPOUND,
