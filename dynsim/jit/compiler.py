@@ -2,30 +2,46 @@
 
 - It keeps every callee twice, as a library of its own and as a copy in its caller, see :class:`_OwnCallees`.
 - It compiles a function again for each set of options that it is called from, see :func:`register_part`.
-- It looks the same things up again and again, see dynsim.jit.numba_patches.
+- It takes named tuples apart wherever a function is called, see dynsim.jit.struct_types.
+- It looks the same things up again and again, see :func:`_quick_look_ups`.
+
+All of it acts in dynsim's own compilations alone; what it replaces is in dynsim.dynamics.numba_version.
 """
 
 from __future__ import annotations
 
 import gc
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
+from dynsim.jit.numba_version import check_sources
+
+# isort: split
 import numba
 from llvmlite.binding import Linkage, parse_assembly
 from numba import _dynfunc
-from numba.core import typed_passes, types, untyped_passes
+from numba.core import config, ir, typed_passes, types, untyped_passes
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.compiler_machinery import PassManager
+from numba.core.types.functions import BaseFunction
 from numba.core.typing.templates import infer, infer_global, make_overload_template
 
-from dynsim.jit import struct_types as by_reference  # noqa: F401
-from dynsim.jit.parallel_compile import Need, needed_by, provide
+from dynsim.jit.struct_types import Lowering, constructors
 
 _NO_ENTRY: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+
+def packs_formulas() -> bool:
+    """Whether LLVM packs the scalar formulas of 3-vectors and wrenches into vector instructions.
+
+    A right-hand side takes 8 % less time then. numba leaves it off; who sets NUMBA_SLP_VECTORIZE has the last word.
+    """
+    return bool(config.SLP_VECTORIZE) or "NUMBA_SLP_VECTORIZE" not in os.environ
 
 
 class _OwnCallees(JITCodeLibrary):
@@ -49,14 +65,8 @@ class _OwnCallees(JITCodeLibrary):
             if function.linkage == Linkage.linkonce_odr and not function.is_declaration:
                 function.linkage = Linkage.internal
         # numba runs a cheaper set of passes before, for the sake of reference counting, which kernels do without.
-        passes, builder = self._codegen._module_pass_manager()
+        passes, builder = self._codegen._module_pass_manager(slp_vectorize=packs_formulas())
         passes.run(self._final_module, builder)
-
-    def _finalize_final_module(self) -> None:
-        self.needs: list[Need] = needed_by(self._final_module)
-        for need in self.needs:
-            provide(need)
-        super()._finalize_final_module()
 
     def serialize_using_object_code(self) -> tuple[str, str, tuple[bytes, bytes]]:
         """For the cache: machine code, and the names by which it is found; not the code to merge into further kernels.
@@ -86,6 +96,10 @@ class _LeanCompiler(Compiler):
         passes.finalize()
         return [passes]
 
+    def compile_extra(self, func: Callable[..., Any]) -> Any:
+        constructors(func, self.state.typingctx)
+        return super().compile_extra(func)
+
 
 _PASSES = (
     untyped_passes.TranslateByteCode,
@@ -98,7 +112,7 @@ _PASSES = (
     typed_passes.NopythonTypeInference,
     typed_passes.PreLowerStripPhis,
     typed_passes.IRLegalization,
-    typed_passes.NativeLowering,
+    Lowering,
     typed_passes.NoPythonBackend,
 )
 
@@ -107,16 +121,77 @@ class KernelCompiler(_LeanCompiler):
     """numba's compiler, into :class:`_OwnCallees`."""
 
     def compile_extra(self, func: Callable[..., Any]) -> Any:
+        check_sources()
         self.state.library = _OwnCallees(self.state.targetctx.codegen(), func.__qualname__)
         self.state.library.enable_object_caching()
         # What is compiled is still in use: collecting garbage meanwhile finds none, and takes an eighth of the time.
         collecting = gc.isenabled()
         gc.disable()
         try:
-            return super().compile_extra(func)
+            with _quick_look_ups():
+                return super().compile_extra(func)
         finally:
             if collecting:
                 gc.enable()
+
+
+@contextmanager
+def _quick_look_ups() -> Iterator[None]:
+    """Two look-ups of numba that take a quarter of the time, mended while a kernel is compiled.
+
+    What is compiled is the same. Others compile before or after, as numba holds its lock of the compiler meanwhile.
+    """
+    replaced = (BaseFunction, "get_call_type", _remembered()), (ir.Inst, "_rec_list_vars", _variables)
+    originals = [getattr(owner, name) for owner, name, _ in replaced]
+    try:
+        for owner, name, function in replaced:
+            setattr(owner, name, function)
+        yield
+    finally:
+        for (owner, name, _), function in zip(replaced, originals, strict=True):
+            setattr(owner, name, function)
+
+
+def _remembered() -> Callable[..., Any]:
+    """``get_call_type`` that remembers the signatures of operators: numba tries some forty rules for each ``+``.
+
+    Only those found among numba's own: what is compiled on demand (``max``) depends on the options of its caller.
+    """
+    look_up, found = BaseFunction.get_call_type, {}
+
+    def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
+        if kws:
+            return look_up(self, context, args, kws)
+        key = self, context, *args
+        if key not in found:
+            signature = look_up(self, context, args, kws)
+            if self._impl_keys[signature.args] is not self.typing_key:
+                return signature
+            found[key] = signature
+        return found[key]
+
+    return get_call_type
+
+
+def _variables(self: Any, value: Any) -> list[ir.Var]:
+    """The variables in a value, in order; numba asks for those of a whole function some forty times."""
+    if isinstance(value, ir.Var):
+        return [value]
+    if isinstance(value, ir.Inst):
+        return value.list_vars()
+    if isinstance(value, dict):
+        value = value.values()
+    elif not isinstance(value, (list, tuple)):
+        return []
+    return [
+        variable
+        for one in value
+        for variable in ((one,) if type(one) is ir.Var else () if type(one) in _PLAIN else _variables(self, one))
+    ]
+
+
+# What instructions hold besides variables.
+_PLAIN = {str, int, float, type(None), ir.Loc, ir.Const, ir.Global, ir.FreeVar, ir.Arg, type(ir.UNDEFINED), type(len)}
 
 
 class _ToLink(JITCodeLibrary):

@@ -7,11 +7,16 @@ believes whatever bytes it finds, see :class:`_KernelCache`.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import pickle
+import re
+import shutil
 import stat
+import sys
 import tempfile
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -26,12 +31,7 @@ from numba.core import config, serialize
 from numba.core.caching import _Cache
 from numba.core.compiler import CompileResult
 
-from dynsim.jit.compiler import ApartCompiler, KernelCompiler, PartCompiler, as_part, register_part
-from dynsim.jit.parallel_compile import by_address, provide
-
-# Packs the scalar formulas of 3-vectors and wrenches into vector instructions (numba leaves it off): a right-hand side
-# takes 8 % less time. Global, and read when numba compiles its first function in the process.
-config.SLP_VECTORIZE = 1
+from dynsim.jit.compiler import ApartCompiler, KernelCompiler, PartCompiler, as_part, packs_formulas, register_part
 
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract"}, "_nrt": False}
 
@@ -71,16 +71,13 @@ class _KernelCache(_Cache):
         if hashlib.sha256(payload).digest() != digest:
             _warn(f"{path}: damaged machine code; compiling it anew")
             return None
-        *reduced, needs = pickle.loads(payload)
-        for need in needs:
-            provide(need)
-        return CompileResult._rebuild(target_context, *reduced)
+        return CompileResult._rebuild(target_context, *pickle.loads(payload))
 
     def save_overload(self, sig: Any, data: Any) -> None:
         if data.library.has_dynamic_globals:  # addresses of this process, which NUMBA_OPT=0 leaves in
             return
         path = self._path(sig, data.codegen)
-        payload = serialize.dumps((*data._reduce(), data.library.needs))
+        payload = serialize.dumps(data._reduce())
         try:
             with tempfile.NamedTemporaryFile(
                 dir=path.parent, prefix=f"{path.name}.", suffix=".tmp", delete=False
@@ -97,10 +94,12 @@ class _KernelCache(_Cache):
             _warn(f"{path}: cannot be kept ({error.strerror}); the next run compiles it again")
 
     def _path(self, sig: Any, codegen: Any) -> Path:
-        """Named by what may differ for the same sources: processor, signature, and a function of another package."""
+        """Named by what may differ for the same sources: processor, signature, what the user asks of numba, and a
+        function of another package."""
         source = Path(self._function.__code__.co_filename)
         content = b"" if _names_the_folder(source) else source.read_bytes()
-        key = repr((sig, codegen.magic_tuple())).encode() + content
+        asked = config.OPT, config.LOOP_VECTORIZE, packs_formulas(), config.BOUNDSCHECK, config.DEBUGINFO_DEFAULT
+        key = repr((sig, codegen.magic_tuple(), *asked)).encode() + content
         name = f"{self._function.__module__}.{self._function.__qualname__}"
         return cache_folder() / f"{name}-{hashlib.sha256(key).hexdigest()[:16]}{_SUFFIX}"
 
@@ -126,11 +125,13 @@ def _warn(text: str) -> None:
 
 @lru_cache(maxsize=1)
 def cache_folder() -> Path:
-    """Folder of the compiled kernels: this user's own and writable, named by what would make its content stale.
+    """Folder of the compiled kernels, named by what would make its content stale; only this user can write to it.
 
-    Loading machine code runs it, so a folder that belongs to somebody else, or that others can write to, is not used.
+    In NUMBA_CACHE_DIR, else XDG_CACHE_HOME, else ~/.cache; where that cannot be, in the temporary directory; where
+    strangers can write there too, a folder for this process alone. A new one removes those beside it that no process
+    has asked for in :data:`UNUSED_S`: younger ones may belong to a dynsim in another environment.
     """
-    digest = hashlib.sha256(f"{numba.__version__} {llvmlite.__version__} {np.__version__}".encode())
+    digest = hashlib.sha256(f"{sys.version} {numba.__version__} {llvmlite.__version__} {np.__version__}".encode())
     for source in (file for package in _PACKAGES for file in sorted(package.rglob("*.py"))):
         digest.update(source.read_bytes())
     name = Path("dynsim", digest.hexdigest()[:16])
@@ -139,18 +140,58 @@ def cache_folder() -> Path:
     temporary = Path(tempfile.gettempdir(), f"cache-{os.getuid()}")
     # A user without a home keeps the tilde.
     for root in (temporary,) if home.startswith("~") else (Path(home), temporary):
-        folder = root / name
         try:
-            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-            status = folder.lstat()
-        except OSError:
+            folder = (root / name).resolve()
+            new = not folder.exists()
+            _make_private(folder)
+            os.utime(folder)  # in use
+        except OSError as error:
+            _warn(f"{root / name}: not used for compiled kernels: {error.strerror}")
             continue
-        writable_by_others = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-        if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or writable_by_others:
-            _warn(f"{folder}: not used for compiled kernels, because others own it or can write to it")
-        elif os.access(folder, os.W_OK | os.X_OK):
-            return folder
-    return Path(tempfile.mkdtemp(prefix="dynsim-"))
+        if new:
+            _remove_unused(folder)
+        return folder
+    _warn("every process compiles its kernels anew; name a folder of your own in XDG_CACHE_HOME")
+    folder = Path(_of_this_process().name, name)
+    folder.mkdir(parents=True)
+    return folder
+
+
+# Kernels that nobody has asked for in so long are removed [s]: 30 days.
+UNUSED_S = 30 * 86400.0
+
+
+def _make_private(folder: Path) -> None:
+    """Make the folder where it is not; raises OSError where others than this user and root can change what is in it.
+
+    Loading machine code runs it. Who can write to a folder above can put another one in its place, unless it is sticky.
+    """
+    trusted = 0, os.getuid()
+    for part in (*reversed(folder.parents), folder):
+        with suppress(FileExistsError):
+            part.mkdir(mode=0o700)
+        status = part.lstat()
+        # By a group of the user's own number, or root's, nobody else.
+        writable = status.st_mode & (stat.S_IWOTH if status.st_gid in trusted else stat.S_IWOTH | stat.S_IWGRP)
+        sticky = part != folder and status.st_mode & stat.S_ISVTX
+        if not stat.S_ISDIR(status.st_mode) or status.st_uid not in trusted or (writable and not sticky):
+            raise OSError(errno.EPERM, f"others own {part} or can write to it")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise OSError(errno.EACCES, os.strerror(errno.EACCES))
+
+
+def _remove_unused(folder: Path) -> None:
+    """Remove the folders of kernels beside this one that have been unused for :data:`UNUSED_S`."""
+    with suppress(OSError):
+        for other in folder.parent.iterdir():
+            if re.fullmatch("[0-9a-f]{16}", other.name) and time.time() - other.lstat().st_mtime > UNUSED_S:
+                shutil.rmtree(other, ignore_errors=True)
+
+
+@lru_cache(maxsize=1)
+def _of_this_process() -> tempfile.TemporaryDirectory[str]:
+    """Removed when the process ends."""
+    return tempfile.TemporaryDirectory(prefix="dynsim-")
 
 
 @contextmanager
@@ -221,15 +262,6 @@ def exact_kernel(function: F) -> F:
     Which products of a sum are contracted depends on the place, and so would the last bits of what it computes.
     """
     return register_part(function, PartCompiler, {**_OPTIONS, "fastmath": False, "forceinline": True})
-
-
-def separate_kernel(function: F) -> F:
-    """For what several parts of a large kernel call and returns nothing: a kernel of its own, called by address.
-
-    It is compiled by a process of its own while its caller is, see dynsim.jit.parallel_compile. For kernels only.
-    """
-    compiled = _compile(function)
-    return function if config.DISABLE_JIT else by_address(function, compiled)
 
 
 def _compile(function: F, **options: Any) -> F:

@@ -13,22 +13,31 @@ what is kept from one turn of a loop to the next stays what it was. Fields are r
 from __future__ import annotations
 
 import hashlib
+import inspect
+from abc import ABC
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property, partial
 from typing import Any
 
+from dynsim.jit import numba_version  # noqa: F401
+
+# isort: split
 from llvmlite import ir
 from numba.core import cgutils, debuginfo, types
 from numba.core import ir as numba_ir
-from numba.core.base import BaseContext
 from numba.core.boxing import box_namedtuple
+from numba.core.compiler_machinery import register_pass
 from numba.core.datamodel import models, registry
 from numba.core.imputils import impl_ret_borrowed, lower_builtin, lower_getattr_generic
 from numba.core.lowering import Lower
 from numba.core.pythonapi import NativeValue, box, unbox
 from numba.core.registry import cpu_target
-from numba.core.types.containers import BaseTuple
+from numba.core.targetconfig import ConfigStack
+from numba.core.typed_passes import NativeLowering
+from numba.core.typing.collections import NamedTupleClassAttribute
+from numba.core.typing.templates import make_callable_template
+from numba.core.typing.typeof import typeof_impl
 
 _BYTE, _WORD = ir.IntType(8), ir.IntType(64)
 _ADDRESS = _BYTE.as_pointer()
@@ -57,17 +66,48 @@ class Tables(types.NamedTuple):  # type: ignore[misc]
         return self is other or (isinstance(other, Tables) and self.key == other.key)
 
 
-_from_types = BaseTuple.from_types.__func__  # type: ignore[attr-defined]
+class _OfDynsim(ABC):  # noqa: B024
+    """The classes of named tuples in dynsim's own modules, for ``typeof``: all others are numba's."""
+
+    @classmethod
+    def __subclasshook__(cls, kind: type) -> bool:
+        return issubclass(kind, tuple) and hasattr(kind, "_asdict") and kind.__module__.startswith("dynsim.")
 
 
-def _kind_of_tuple(cls: Any, kinds: Sequence[Any], pyclass: Any = None) -> Any:
-    """numba's choice of a type for a tuple, with dynsim's named tuples as :class:`Tables`."""
-    if pyclass is not None and hasattr(pyclass, "_asdict") and pyclass.__module__.startswith("dynsim."):
-        return Tables([types.unliteral(kind) for kind in kinds], pyclass)
-    return _from_types(cls, kinds, pyclass)
+@typeof_impl.register(_OfDynsim)
+def _typeof(value: Any, context: Any) -> Tables | None:
+    kinds = [typeof_impl(part, context) for part in value]
+    return None if None in kinds else Tables(kinds, type(value))
 
 
-BaseTuple.from_types = classmethod(_kind_of_tuple)
+def constructors(function: Callable[..., Any], typing: Any) -> None:
+    """Let kernels call the classes of dynsim's named tuples that a function names; other compiled code sees numba's."""
+    for name in function.__code__.co_names:
+        cls = function.__globals__.get(name)
+        if isinstance(cls, type) and issubclass(cls, _OfDynsim):
+            kind = types.NamedTupleClass(cls)
+            if kind not in typing._attributes:
+                typing.insert_attributes(type("Constructor", (_Constructor,), {"key": kind})(typing))
+
+
+class _TablesClass(types.NamedTupleClass):  # type: ignore[misc]
+    """To lowering, a class whose instances are :class:`Tables`."""
+
+    def get_impl_key(self, sig: Any) -> Any:
+        return _TablesClass
+
+
+class _Constructor(NamedTupleClassAttribute):  # type: ignore[misc]
+    def resolve___call__(self, kind: Any) -> Any:
+        if ConfigStack().top().nrt:  # not a kernel: they do not count references
+            return super().resolve___call__(kind)
+        cls = kind.instance_class
+
+        def typer(*args: Any, **kws: Any) -> Tables:
+            return Tables(map(types.unliteral, typer.pysig.bind(*args, **kws).args), cls)
+
+        typer.pysig = inspect.signature(cls)  # type: ignore[attr-defined]
+        return types.Function(make_callable_template(_TablesClass, typer))
 
 
 @registry.register_default(Tables)
@@ -180,53 +220,61 @@ def parts_of(context: Any, builder: Any, kind: Any, value: Any) -> list[Any]:
     return [model.part(builder, value, k) for k in range(len(kind))]
 
 
-_make_tuple = BaseContext.make_tuple
-
-
-def _made(self: Any, builder: Any, typ: Any, values: Sequence[Any]) -> Any:
-    """numba's ``make_tuple``, into a block for :class:`Tables`."""
-    if not isinstance(typ, Tables):
-        return _make_tuple(self, builder, typ, values)
-    model = self.data_model_manager[typ]
+def made(context: Any, builder: Any, kind: Tables, values: Sequence[Any]) -> Any:
+    """A named tuple of these parts, in the frame of the function."""
+    model = context.data_model_manager[kind]
     block = model.room(builder)
     for k, value in enumerate(values):
         model.put(builder, block, k, value)
     return block
 
 
-BaseContext.make_tuple = _made
+@lower_builtin(_TablesClass, types.VarArg(types.Any))
+def _constructed(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    kind = sig.return_type
+    values = [context.cast(builder, *one) for one in zip(args, sig.args, kind, strict=True)]
+    return impl_ret_borrowed(context, builder, kind, made(context, builder, kind, values))
 
 
-_load, _store = Lower.loadvar, Lower.storevar
+class _Lower(Lower):  # type: ignore[misc]
+    """numba's, with constructors of :class:`Tables`, and copies of those that are assigned in several places."""
 
+    def _lower_call_normal(self, fnty: Any, expr: Any, signature: Any) -> Any:
+        if isinstance(fnty, types.NamedTupleClass) and isinstance(signature.return_type, Tables):
+            fnty = _TablesClass(fnty.instance_class)
+        return super()._lower_call_normal(fnty, expr, signature)
 
-def _assigned_again(self: Any, name: str) -> bool:
-    """Whether a variable is a tuple that is assigned in several places."""
-    if not isinstance(self.typeof(name), Tables):
-        return False
-    again = self.__dict__.get("_again")
-    if again is None:
+    @cached_property
+    def _again(self) -> set[str]:
+        """Names of those."""
         assigned = (one.target.name for block in self.blocks.values() for one in block.find_insts(numba_ir.Assign))
-        again = self._again = {target for target, times in Counter(assigned).items() if times > 1}
-    return name in again
+        return {
+            name for name, times in Counter(assigned).items() if times > 1 and isinstance(self.typeof(name), Tables)
+        }
+
+    def loadvar(self, name: str) -> Any:
+        """The tuple outlives the next assignment."""
+        return self._copied(super().loadvar(name), name)
+
+    def storevar(self, value: Any, name: str, argidx: int | None = None) -> None:
+        """The variable outlives the next tuple that is made where this one was."""
+        super().storevar(self._copied(value, name), name, argidx)
+
+    def _copied(self, value: Any, name: str) -> Any:
+        if name not in self._again:
+            return value
+        return self.context.data_model_manager[self.typeof(name)].copied(self.builder, value)
 
 
-def _loaded(self: Any, name: str) -> Any:
-    """numba's ``loadvar``; the tuple outlives the next assignment."""
-    value = _load(self, name)
-    if not _assigned_again(self, name):
-        return value
-    return self.context.data_model_manager[self.typeof(name)].copied(self.builder, value)
+@register_pass(mutates_CFG=True, analysis_only=False)
+class Lowering(NativeLowering):  # type: ignore[misc]
+    """numba's, by :class:`_Lower`."""
 
+    _name = "dynsim_lowering"
 
-def _stored(self: Any, value: Any, name: str, argidx: int | None = None) -> None:
-    """numba's ``storevar``; the variable outlives the next tuple that is made where this one was."""
-    if _assigned_again(self, name):
-        value = self.context.data_model_manager[self.typeof(name)].copied(self.builder, value)
-    _store(self, value, name, argidx)
-
-
-Lower.loadvar, Lower.storevar = _loaded, _stored
+    @property
+    def lowering_class(self) -> type[Lower]:
+        return _Lower
 
 
 @lower_builtin("static_getitem", Tables, types.IntegerLiteral)

@@ -9,13 +9,17 @@ import shutil
 import struct
 import subprocess
 import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
+import numba
 import pytest
 from llvmlite.binding import ObjectFileRef
 
 import dynsim
 from dynsim.dynamics.tree.sweep import newton_euler
+from dynsim.jit import compiler
 from dynsim.jit import kernel as jit
 
 pytestmark = pytest.mark.long
@@ -81,16 +85,13 @@ def test_no_function_can_be_replaced_by_one_loaded_earlier() -> None:
 MACHINE_CODE = """
 import hashlib, pickle, sys
 import numpy as np
-from types import ModuleType
-
-if "unmended" in sys.argv:
-    sys.modules["dynsim.jit.numba_patches"] = ModuleType("numba_habits")
-import numba.core.types.functions as functions
-from dynsim.jit import kernel as jit
+from contextlib import nullcontext
+from dynsim.jit import compiler, kernel as jit
 from dynsim.dynamics.tree.sweep import kinematics
 from tests.random_robots import bench, random_robot
 
-print(functions.BaseFunction.get_call_type.__module__)
+if "numba's" in sys.argv:
+    compiler._quick_look_ups = nullcontext
 b = bench(random_robot(np.random.default_rng(1), 3))
 kinematics(b.system.model, b.ws)
 (file,) = jit.cache_folder().glob("*.kinematics-*")
@@ -98,23 +99,19 @@ print(hashlib.sha256(pickle.loads(file.read_bytes()[32:])[0][2][0]).hexdigest())
 """
 
 
-def _machine_code(folder: Path, *how: str) -> list[str]:
-    """Where numba's rules are looked up, and a hash of a kernel compiled in an empty cache."""
+def _machine_code(folder: Path, *how: str) -> str:
+    """A hash of a kernel compiled in an empty cache."""
     environment = {**os.environ, "XDG_CACHE_HOME": str(folder), "PYTHONPATH": os.pathsep.join(sys.path)}
     environment.pop("NUMBA_CACHE_DIR", None)
     done = subprocess.run(
         [sys.executable, "-c", MACHINE_CODE, *how],
         capture_output=True, text=True, check=True, timeout=300, env=environment,
     )  # fmt: skip
-    return done.stdout.split()
+    return done.stdout
 
 
-def test_mended_habits_of_numba_change_no_machine_code(tmp_path: Path) -> None:
-    where, mended = _machine_code(tmp_path / "mended")
-    assert where == "dynsim.jit.numba_patches"
-    where, unmended = _machine_code(tmp_path / "unmended", "unmended")
-    assert where == "numba.core.types.functions"
-    assert mended == unmended
+def test_quick_look_ups_change_no_machine_code(tmp_path: Path) -> None:
+    assert _machine_code(tmp_path / "quick") == _machine_code(tmp_path / "slow", "numba's")
 
 
 @pytest.fixture
@@ -178,27 +175,120 @@ def test_machine_code_that_cannot_be_kept_costs_no_run(kernel_files: Path, monke
     assert list(kernel_files.iterdir()) == []
 
 
-def test_folders_of_others_are_not_used(tmp_path: Path, monkeypatch) -> None:
-    mine = jit.cache_folder.__wrapped__
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "first"))
+@pytest.fixture
+def roots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+    """Folders for caches and for what is temporary, which are not there yet."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "above" / "first"))
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path / "second"))
-    folder = mine()
-    assert folder.is_relative_to(tmp_path / "first")
-    folder.chmod(0o777)
-    with pytest.warns(UserWarning, match=f"{folder}: not used"):
-        assert mine().is_relative_to(tmp_path / "second")
-    folder.chmod(0o700)
-    folder.rename(folder.with_name("elsewhere"))
-    folder.symlink_to(folder.with_name("elsewhere"))
-    with pytest.warns(UserWarning, match=f"{folder}: not used"):
-        assert mine().is_relative_to(tmp_path / "second")
-    # Somebody else's: this process becomes somebody else.
-    folder.unlink()
-    mine()
-    monkeypatch.setattr(os, "getuid", lambda: folder.stat().st_uid + 1)
-    with pytest.warns(UserWarning, match="not used"):
-        assert not mine().is_relative_to(tmp_path / "first")
+    return tmp_path / "above" / "first", tmp_path / "second"
+
+
+def _given_to(monkeypatch: pytest.MonkeyPatch, place: Path) -> None:
+    """As if another user owned a folder."""
+    lstat = Path.lstat
+
+    def changed(path: Path) -> os.stat_result:
+        status = lstat(path)
+        if path != place:
+            return status
+        return os.stat_result((*status[:4], os.getuid() + 12345, *status[5:]))
+
+    monkeypatch.setattr(Path, "lstat", changed)
+
+
+@pytest.mark.parametrize("level", range(4))
+@pytest.mark.parametrize("danger", ["writable", "a stranger's"])
+def test_a_folder_is_not_used_where_others_can_write(
+    roots: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, level: int, danger: str
+) -> None:
+    """Nor one below it: it could be replaced."""
+    find = jit.cache_folder.__wrapped__
+    folder = find()
+    assert folder.is_relative_to(roots[0])
+    assert folder.stat().st_mode & 0o777 == 0o700
+    place = (folder, *folder.parents)[level]
+    if danger == "writable":
+        place.chmod(0o777)
+    else:
+        _given_to(monkeypatch, place)
+    with pytest.warns(UserWarning, match=f"{folder}: not used .* others own {place} or can write to it"):
+        assert find().is_relative_to(roots[1])
+
+
+def test_sticky_folders_hold_folders_of_their_own_for_everybody(roots: tuple[Path, Path]) -> None:
+    roots[0].mkdir(parents=True)
+    roots[0].chmod(0o1777)
+    assert jit.cache_folder.__wrapped__().is_relative_to(roots[0])
+
+
+def test_a_link_leads_to_a_folder_that_is_looked_at(roots: tuple[Path, Path]) -> None:
+    elsewhere = roots[1] / "elsewhere"
+    elsewhere.mkdir(parents=True)
+    roots[0].parent.mkdir()
+    roots[0].symlink_to(elsewhere)
+    assert jit.cache_folder.__wrapped__().is_relative_to(elsewhere)
+    elsewhere.chmod(0o777)
+    with pytest.warns(UserWarning, match=f"others own {elsewhere} or can write to it"):
+        assert not jit.cache_folder.__wrapped__().is_relative_to(elsewhere)
+
+
+def test_without_a_home_and_with_a_stranger_in_the_temporary_folder_each_process_has_its_own(
+    roots: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)
+    shared = roots[1] / f"cache-{os.getuid()}"
+    shared.mkdir(parents=True)
+    _given_to(monkeypatch, shared)
+    own = roots[1] / "own"
+    own.mkdir()
+    monkeypatch.setattr(jit, "_of_this_process", lambda: SimpleNamespace(name=str(own)))
+    with pytest.warns(UserWarning, match="compiled|compiles") as warned:
+        folder = jit.cache_folder.__wrapped__()
+    assert folder.is_relative_to(own)
+    # What is written beside the folder is out of reach as well.
+    assert folder.parent != own
+    assert "others own" in str(warned[0].message)
+    assert "name a folder of your own in XDG_CACHE_HOME" in str(warned[1].message)
+    assert not list(shared.iterdir())
+
+
+def test_a_new_folder_removes_those_that_are_unused(roots: tuple[Path, Path]) -> None:
+    beside, now = roots[0] / "dynsim", time.time()
+    for name, age in {"0" * 16: 31, "1" * 16: 29, "notes": 400, "2" * 15: 400}.items():
+        (beside / name).mkdir(parents=True)
+        (beside / name / "a.kernel").touch()
+        os.utime(beside / name, times=(now - age * 86400,) * 2)
+    folder = jit.cache_folder.__wrapped__()
+    assert {one.name for one in beside.iterdir()} == {"1" * 16, "notes", "2" * 15, folder.name}
+    # Use is a touch.
+    os.utime(folder, times=(0, 0))
+    assert jit.cache_folder.__wrapped__() == folder
+    assert folder.stat().st_mtime >= now - 60
+
+
+def test_another_python_has_another_folder(roots: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = jit.cache_folder.__wrapped__()
+    monkeypatch.setattr(sys, "version", sys.version.replace("3.", "3.9"))
+    assert jit.cache_folder.__wrapped__() != folder
+
+
+@pytest.mark.parametrize("option", ["OPT", "LOOP_VECTORIZE", "BOUNDSCHECK"])
+def test_what_is_asked_of_numba_has_machine_code_of_its_own(
+    kernel_files: Path, monkeypatch: pytest.MonkeyPatch, option: str
+) -> None:
+    assert _double() == 6
+    monkeypatch.setattr(numba.config, option, 1 if option != "LOOP_VECTORIZE" else 0)
+    assert _double() == 6
+    assert len(list(kernel_files.iterdir())) == 2
+
+
+def test_formulas_are_packed_unless_the_user_says_no(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NUMBA_SLP_VECTORIZE", raising=False)
+    assert compiler.packs_formulas()
+    monkeypatch.setenv("NUMBA_SLP_VECTORIZE", "0")
+    assert not compiler.packs_formulas()
 
 
 def test_every_kernel_is_compiled_by_the_one_place_that_knows_how() -> None:
@@ -229,7 +319,7 @@ def test_an_edit_of_any_compiled_source_names_another_folder(tmp_path: Path, mon
 
 def test_every_file_with_kernels_is_in_a_package_that_names_the_folder() -> None:
     """Or holds none that another file compiles in: the benchmark's loop, whose file names its machine code."""
-    decorators = re.compile(r"^@((merged|internal|exact|apart|separate)_)?kernel$", re.MULTILINE)
+    decorators = re.compile(r"^@((merged|internal|exact|apart|free)_)?kernel$", re.MULTILINE)
     package = Path(dynsim.__file__).parent
     elsewhere = {
         str(source.relative_to(package))

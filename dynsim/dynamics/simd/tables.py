@@ -13,7 +13,7 @@ from numba.np.arrayobj import make_array, populate_array
 
 from dynsim.dynamics.tables import ContactArrays, DriveArrays, ModelArrays, ReferenceArrays, Workspace
 from dynsim.jit.simd import INT32, Lanes, lanes_of
-from dynsim.jit.struct_types import Tables, parts_of
+from dynsim.jit.struct_types import Tables, made, parts_of
 
 # Axes of the float tables that may have lanes: one more, and the last one is the lanes. The others are shared by all.
 AXES: dict[type, dict[str, int]] = {
@@ -125,9 +125,8 @@ def _lane(context: Any, builder: Any, value: Any, kind: Any, index: Any) -> Any:
         return builder.extract_element(value, builder.trunc(index, INT32))
     if isinstance(kind, Tables):
         parts = parts_of(context, builder, kind, value)
-        return context.make_tuple(
-            builder, result, [_lane(context, builder, x, part, index) for x, part in zip(parts, kind, strict=True)]
-        )
+        lanes = [_lane(context, builder, x, part, index) for x, part in zip(parts, kind, strict=True)]
+        return made(context, builder, result, lanes)
     source, view = make_array(kind)(context, builder, value), make_array(result)(context, builder)
     start = builder.gep(builder.bitcast(source.data, view.data.type), [index])
     return _viewed(context, builder, view, start, source.shape, source.strides, 8)
@@ -204,7 +203,8 @@ def _tables(context: Any, builder: Any, value: Any, kind: Any, result: Any) -> A
     if isinstance(kind, types.Array):
         return _as_lanes(context, builder, value, kind, result)
     parts = parts_of(context, builder, kind, value)
-    return context.make_tuple(
+    return made(
+        context,
         builder,
         result,
         [_tables(context, builder, x, a, b) for x, a, b in zip(parts, kind, result, strict=True)],

@@ -19,7 +19,7 @@ from dynsim.integrators.radau5 import newton as kn
 from dynsim.integrators.radau5.newton import NewtonArrays, StageLanes
 from dynsim.integrators.tableaux import NODE_RADAU
 from dynsim.jit.compiler import form_of
-from dynsim.jit.kernel import internal_kernel, separate_kernel
+from dynsim.jit.kernel import apart_kernel, internal_kernel
 
 
 @internal_kernel
@@ -64,7 +64,7 @@ def _given(lanes: Any, *_: Any) -> bool:
     return bool(lanes != types.none)
 
 
-@separate_kernel
+@apart_kernel
 def evaluate_four(lanes: StageLanes, system: System):
     """The derivative of all lanes, one program for both of its callers."""
     derivative_lanes(
