@@ -13,12 +13,12 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
-from dynsim.draw.figures.canvas import Canvas, heed_fonts
 from dynsim.record import Record
 from dynsim.system.files import replacing
 from dynsim.system.terminal import plain
@@ -85,14 +85,13 @@ LEGEND_ROW = 12.5
 def look() -> Iterator[None]:
     """Matplotlib settings of all dynsim figures, for a ``with`` block; the caller's settings come back after it."""
     with matplotlib.rc_context(_LOOK):
-        heed_fonts()
         yield
 
 
 def new_figure(height: float, title: str) -> Figure:
     """An empty figure [inch] that belongs to no pyplot and needs no display."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
-    Canvas(figure)
+    FigureCanvasAgg(figure)
     # A long title is smaller: it would be cut off at both sides.
     figure.suptitle(title, fontsize=TITLE * min(1.0, TITLE_LONG / max(len(title), 1)))
     return figure
@@ -158,7 +157,8 @@ def write(figure: Figure, path: Path) -> Path:
     kind = path.suffix.removeprefix(".")
     with replacing(path) as stream, matplotlib.rc_context({"svg.hashsalt": path.stem}):
         if kind == "png":
-            stream.write(Canvas(figure).png())
+            # Drawn once; ``savefig`` draws twice, the first time for the layout.
+            FigureCanvasAgg(figure).print_png(stream)
         else:
             date = {"pdf": "CreationDate", "svg": "Date"}[kind]
             figure.savefig(stream, format=kind, dpi="figure", metadata={date: None})

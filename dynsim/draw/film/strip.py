@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw
 
 from dynsim.draw.figures import style
-from dynsim.draw.figures.canvas import Canvas
 from dynsim.errors import RecordError
 from dynsim.record import TIME, Record
 from dynsim.system.terminal import plain
@@ -64,7 +64,7 @@ class Strip:
 
     def _draw(self, records: Mapping[str, Record], name: str) -> None:
         figure = Figure(figsize=(self._size[0] / DPI, self._size[1] / DPI), dpi=DPI, layout="constrained")
-        canvas = Canvas(figure)
+        canvas = FigureCanvasAgg(figure)
         axes = figure.add_subplot()
         colours = style.variant_styles(list(records))
         for label, record in records.items():
