@@ -6,8 +6,10 @@ import ctypes
 import logging
 import os
 import signal
+import sys
 import time
 from pathlib import Path
+from typing import Any
 
 from dynsim.engine import Progress
 from dynsim.system import interruption
@@ -70,6 +72,27 @@ def leaves(number: int, look: Progress) -> int:
     if number == DEADLY:
         interruption.leave()
     return os.getpid()
+
+
+def pid(number: int, look: Progress) -> int:
+    """Of the process."""
+    return os.getpid()
+
+
+def named(thing: Any, look: Progress) -> str:
+    """What a thing is called."""
+    return str(thing.name)
+
+
+def unsendable(thing: Any, look: Progress) -> Any:
+    """A result that no other process can have."""
+    return open(os.devnull)
+
+
+def says(number: int, look: Progress) -> str:
+    """Prints, and reads what is there to be read."""
+    os.write(1, b"printed\n")
+    return sys.stdin.read()
 
 
 DEADLY, REFUSED = 5, 7

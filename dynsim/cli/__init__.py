@@ -12,11 +12,6 @@ def main() -> None:
 
     with interruption.heeded() as received:
         try:
-            # Before the other commands are there: what workers load takes longest of all before the first run.
-            if sys.argv[1:2] == ["sweep"]:
-                from dynsim.cli.workers import begin_workers
-
-                begin_workers(sys.argv[2:])
             from dynsim.cli.entry import main
         except KeyboardInterrupt:
             sys.exit(interruption.exit_code(received))

@@ -22,7 +22,7 @@ from dynsim.cli.app import (
     parsed_overrides,
 )
 from dynsim.cli.display import console, errors, labelled, progress, record_files, told_in
-from dynsim.cli.drawing import Figures, Page, begin_drawing, draw, draw_all
+from dynsim.cli.drawing import Figures, Page, draw, draw_all
 from dynsim.cli.hardware import export, hw
 from dynsim.cli.hw_drive import EXAMPLE, hw_drive
 from dynsim.cli.sweep import sweep
@@ -65,8 +65,6 @@ def run(
     loaded = load_scenario(scenario, variant, parsed_overrides(overrides))
     folder = out or Path("results", loaded.name, loaded.variant)
     check_writable(folder, RUN_FILES)
-    if not no_figures:
-        begin_drawing()
     from dynsim.engine import simulate
 
     try:
@@ -119,8 +117,6 @@ def compare(
     check_writable(folder, COMPARISON_FILES[:2])
     for one in loaded:
         check_writable(folder / one.variant, RUN_FILES)
-    if not no_figures:
-        begin_drawing()
     from dynsim.studies.compare import compare as compare_variants
     from dynsim.studies.compare import save_comparison
 

@@ -63,14 +63,6 @@ def draw(figures: Figures, quiet: bool) -> None:
         figures.draw()
 
 
-def begin_drawing() -> None:
-    """Load what :func:`draw_all` needs in a process of its own, meanwhile: its workers are copies of that."""
-    from dynsim.studies.processes import begin_early, cores
-
-    if cores() > 1:
-        begin_early("dynsim.cli.drawing", "dynsim.draw.figures.arm", "dynsim.draw.page")
-
-
 def draw_all(wanted: Sequence[Figures], page: Page, quiet: bool) -> Path | None:
     """Draw, and write a page, in several processes if there are several cores; returns the file of the page.
 

@@ -16,7 +16,7 @@ import typer
 from dynsim.cli.commands import app
 from dynsim.cli.display import errors
 from dynsim.errors import DynsimError, SimulationInterrupted
-from dynsim.system import garbage, interruption
+from dynsim.system import interruption
 from dynsim.system.standard_streams import lenient_streams
 from dynsim.system.terminal import escaped
 
@@ -26,14 +26,12 @@ def main(received: Sequence[int]) -> None:
 
     ``received`` : what :func:`dynsim.system.interruption.heeded` gives, within which this runs
     """
-    garbage.look_rarely()
     with lenient_streams() as output, _plain_warnings():
         code = _exit_code()
         if output is not None:
             output.flush()
             if code == 0 and output.failure is not None:
                 code = _explain_lost_output(output.failure)
-    garbage.keep_all()
     code = interruption.exit_code(received) if code == SimulationInterrupted.exit_code else code
     if interruption.is_left():
         # The interpreter would take down what a thread in compiled code still works on.

@@ -27,8 +27,8 @@ from dynsim.errors import ScenarioError, SimulationStopped
 from dynsim.system.terminal import escaped
 
 if TYPE_CHECKING:
+    from dynsim.studies.journal import Row
     from dynsim.studies.plan import Plan
-    from dynsim.studies.sweep import Row
 
 # Reasons of failed runs that are printed.
 _SHOWN = 5
@@ -86,19 +86,17 @@ def sweep(
 
     A run that fails is a row with its reason. Exit codes: 0 some run ended well, 2 bad input, 3 none did, 130 Ctrl-C.
     """
-    from dynsim.cli.workers import load_workers
-    from dynsim.studies.processes import cores, keep_memory
+    from dynsim.studies.processes import cores
+    from dynsim.studies.worker import keep_memory
 
     if jobs is not None and scheduler is not None:
         raise ScenarioError("--jobs are processes of this machine, --scheduler has its own workers: give one of them")
     if plot and no_figures:
         raise ScenarioError("--plot says what is drawn, --no-figures that nothing is: give one of them")
-    if scheduler is None and (jobs or cores()) > 1:
-        load_workers()
     from dynsim.scenario import read_scenario
+    from dynsim.studies.journal import OK
     from dynsim.studies.plan import Axis, Law, Plan
-    from dynsim.studies.sweep import JOURNAL, OK, PLAN, STATISTICS, TABLES, has_parquet, run_sweep
-    from dynsim.system.files import check_writable
+    from dynsim.studies.sweep import TABLES, has_parquet, run_sweep
 
     file = read_scenario(scenario)
     axes, laws = tuple(map(Axis.parse, grid or ())), tuple(map(Law.parse, sample or ()))
@@ -106,7 +104,6 @@ def sweep(
     # Which values make no scenario is known here, before processes and threads have work.
     name = plan.scenario(next(plan.points())).name
     folder = out or Path("results", name, "sweep")
-    check_writable(folder, (PLAN, JOURNAL, *TABLES, STATISTICS))
     others = scheduler is not None or min(jobs or cores(), plan.runs) > 1
     if not others:
         keep_memory()
@@ -194,7 +191,8 @@ def _draw(
     name: str, rows: Sequence[Row], plan: Plan, folder: Path, quiet: bool, format_: str, plotted: Sequence[str] = ()
 ) -> None:
     from dynsim.draw.figures.sweep import Sweep, draw
-    from dynsim.studies.sweep import OK, TABLES
+    from dynsim.studies.journal import OK
+    from dynsim.studies.sweep import TABLES
 
     known = dict.fromkeys(key for row in rows for key in row.numbers)
     for number in plotted:

@@ -5,16 +5,18 @@ Whatever else a cluster does (start, retries after a worker's death, adaptive sc
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from dynsim._version import __version__
 from dynsim.engine import SIMULATION, Progress
 from dynsim.errors import DynsimError
 from dynsim.studies.batch import LOST, RunResult
-from dynsim.studies.processes import keep_memory
+from dynsim.studies.worker import keep_memory
 from dynsim.system import interruption
 
 Task = TypeVar("Task")
@@ -51,13 +53,17 @@ def run_on_cluster(
     Raises
     ------
     ClusterError
-        Dask is not installed, no scheduler answers at the address, or a worker has no dynsim or another version.
+        Dask is not installed, no scheduler answers at the address (any more), or a worker has no dynsim or another
+        version.
     """
     try:
-        from distributed import Client, KilledWorker, as_completed
+        from distributed import CancelledError, Client, KilledWorker, as_completed
+        from distributed.comm import resolve_address
     except ImportError as error:
         raise ClusterError("a scheduler needs Dask: pip install 'dynsim[cluster]'") from error
     try:
+        # A client that cannot even try would tell of itself when it is forgotten.
+        resolve_address(address)
         client: Any = Client(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError, RuntimeError) as error:
         raise ClusterError(f"no Dask scheduler answers at {address} ({' '.join(str(error).split())})") from error
@@ -79,7 +85,7 @@ def run_on_cluster(
             futures.append(submit([waiting.popleft() for _ in range(min(size, len(waiting)))]))
         return futures
 
-    with client:
+    with _quiet(), client:
         try:
             queue = as_completed(hand_out(), loop=client.loop)
             for future in queue:
@@ -92,6 +98,8 @@ def run_on_cluster(
                         take(piece[0], RunResult({}, f"{LOST}, on several workers", lost=True))
                     else:
                         queue.update([submit([task]) for task in piece])
+                except CancelledError as error:
+                    raise ClusterError(f"the Dask scheduler at {address} answers no more") from error
                 except ImportError as error:
                     raise ClusterError(
                         f"a worker of {address} cannot load dynsim ({error}); install it there"
@@ -109,6 +117,20 @@ def run_on_cluster(
             client.cancel(list(out))
             return True
     return False
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """What goes wrong is one error here: Dask does not log it as well; afterwards it logs as before."""
+    # Those to which Dask gives a level of their own.
+    before = {logger: logger.level for logger in map(logging.getLogger, ("distributed", "distributed.client"))}
+    for logger in before:
+        logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        for logger, level in before.items():
+            logger.setLevel(level)
 
 
 def _work_through(

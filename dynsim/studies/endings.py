@@ -367,7 +367,8 @@ def noted(journal: Path | None) -> list[Ending]:
     return found
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Run the scenes, print what became of them, and keep it."""
     given = _options()
     wanted = range(given.first, given.first + given.count)
     earlier = [one for one in noted(given.journal) if one.scene in wanted]
@@ -380,3 +381,10 @@ if __name__ == "__main__":
     if not stopped:
         given.out.parent.mkdir(parents=True, exist_ok=True)
         write_json(given.out, {"dynsim_version": __version__, "seed": SEED, **result})
+
+
+if __name__ == "__main__":
+    # By its name: other processes find it by that.
+    from dynsim.studies import endings as module
+
+    module.main()

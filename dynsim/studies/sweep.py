@@ -5,61 +5,25 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from dynsim._version import __version__
 from dynsim.engine.provenance import commit
 from dynsim.engine.results import save_run
-from dynsim.errors import RecordError, ScenarioError, SimulationInterrupted
+from dynsim.errors import RecordError, SimulationInterrupted
 from dynsim.studies.batch import Keep, RunResult, Work, run_all, shares_lanes
-from dynsim.studies.columns import numbers
+from dynsim.studies.cluster import ClusterError
+from dynsim.studies.journal import JOURNAL, OK, PLAN, Journal, Row, earlier_rows
 from dynsim.studies.plan import Plan, Point
 from dynsim.studies.sweep_statistics import statistics
-from dynsim.system.files import json_text, replacing, write_text
+from dynsim.studies.worker import WorkerError
+from dynsim.system.files import check_writable, held, json_text, replacing, write_text
 
-PLAN, JOURNAL = "sweep.json", "runs.jsonl"
 TABLES = ("sweep.csv", "sweep.parquet")
-STATISTICS = "statistics.json"
-OK, FAILED, LOST = "ok", "failed", "lost"
-
-
-@dataclass(frozen=True)
-class Row:
-    """One run of the table: its numbers, or why there are none.
-
-    Attributes
-    ----------
-    run, variant, values : see :class:`dynsim.studies.plan.Point`
-    status : ``ok``, ``failed`` (and would again) or ``lost`` with its process
-    reason : why it failed
-    numbers : of its summary, see :func:`dynsim.studies.columns.numbers`
-    warnings : of its summary, in a line
-    """
-
-    run: int
-    variant: str | None
-    values: Mapping[str, Any]
-    status: str
-    reason: str
-    numbers: Mapping[str, Any]
-    warnings: str
-
-    @classmethod
-    def of(cls, point: Point, result: RunResult) -> Row:
-        """A result as a row."""
-        status = OK if result.ok else LOST if result.lost else FAILED
-        warnings = "; ".join(result.summary.get("warnings", ()))
-        return cls(point.run, point.variant, point.values, status, result.reason, numbers(result.summary), warnings)
-
-    def cells(self) -> dict[str, Any]:
-        """By column."""
-        variant = {} if self.variant is None else {"variant": self.variant}
-        ended = {"status": self.status, "reason": self.reason}
-        return {"run": self.run, **variant, **self.values, **ended, **self.numbers, "warnings": self.warnings}
+STATISTICS, RECORDS = "statistics.json", "records"
 
 
 def run_sweep(
@@ -94,43 +58,58 @@ def run_sweep(
     SimulationInterrupted
         Ctrl-C; tables of what was done are written.
     RecordError
-        A file cannot be written.
+        A file cannot be written, or one of the sweep that is gone on with is damaged; another process is at work there.
+    WorkerError, ClusterError
+        No process can be started; see :func:`dynsim.studies.cluster.run_on_cluster`.
     """
     points = list(plan.points())
-    header = _header(plan)
-    earlier = _earlier(folder, header, resume)
-    rows = {point.run: _renumbered(earlier[point.identity], point) for point in points if point.identity in earlier}
-    left = [point for point in points if point.run not in rows]
+    check_writable(folder, (PLAN, JOURNAL, *TABLES, STATISTICS))
+    if keep_records != "none":
+        check_writable(folder / RECORDS)
     # A key that no scenario has would fail in every run: the first of each variant tells.
-    firsts = [plan.scenario(point) for point in {point.variant: point for point in reversed(left)}.values()]
+    firsts = [plan.scenario(point) for point in {point.variant: point for point in reversed(points)}.values()]
     lanes = any(map(shares_lanes, firsts))
-    folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / PLAN, json_text(header))
-    failed = sum(row.status != OK for row in rows.values())
+    header = _header(plan)
+    with held(folder):
+        earlier = earlier_rows(folder, header, resume, TABLES)
+        rows = {point.run: earlier[point.identity].placed(point) for point in points if point.identity in earlier}
+        left = [point for point in points if point.run not in rows]
+        failed = sum(row.status != OK for row in rows.values())
+        with _goes_on(folder):
+            write_text(folder / PLAN, json_text(header))
+            with Journal(folder, rows.values()) as journal:
 
-    with _journal(folder, rows.values()) as journal:
+                def take(point: Point, result: RunResult) -> None:
+                    nonlocal failed
+                    # Before its row: a run that has one is not run again.
+                    if result.record is not None:
+                        save_run(result.record, folder / RECORDS / f"{point.run:06d}")
+                    row = rows[point.run] = Row.of(point, result)
+                    journal.add(row)
+                    failed += row.status != OK
+                    if progress is not None:
+                        progress(len(rows), failed)
 
-        def take(point: Point, result: RunResult) -> None:
-            nonlocal failed
-            row = rows[point.run] = Row.of(point, result)
-            journal.write(_line(row))
-            journal.flush()
-            if result.record is not None:
-                save_run(result.record, folder / "records" / f"{point.run:06d}")
-            failed += row.status != OK
-            if progress is not None:
-                progress(len(rows), failed)
-
-        if progress is not None:
-            progress(len(rows), failed)
-        interrupted = run_all(Work(plan.scenario, keep_records), left, take, lanes, jobs=jobs, scheduler=scheduler)
-    done = [rows[run] for run in sorted(rows)]
-    write_tables(done, plan, folder)
-    if plan.laws:
-        write_text(folder / STATISTICS, json_text(statistics(done, plan)))
+                if progress is not None:
+                    progress(len(rows), failed)
+                work = Work(plan.scenario, keep_records)
+                interrupted = run_all(work, left, take, lanes, jobs=jobs, scheduler=scheduler)
+            done = [rows[run] for run in sorted(rows)]
+            write_tables(done, plan, folder)
+            if plan.laws:
+                write_text(folder / STATISTICS, json_text(statistics(done, plan)))
     if interrupted:
         raise SimulationInterrupted(f"interrupted when {len(done)} of {len(points)} runs were done; --resume goes on")
     return done
+
+
+@contextmanager
+def _goes_on(folder: Path) -> Iterator[None]:
+    """A full disk, no process or no cluster costs none of the runs that are done."""
+    try:
+        yield
+    except (RecordError, WorkerError, ClusterError) as error:
+        raise type(error)(f"{error}; --resume goes on with the runs that are in {folder / JOURNAL}") from error
 
 
 def _header(plan: Plan) -> dict[str, Any]:
@@ -149,50 +128,6 @@ def _header(plan: Plan) -> dict[str, Any]:
             "runs": plan.runs,
         },
     }
-
-
-def _earlier(folder: Path, header: Mapping[str, Any], resume: bool) -> dict[str, Row]:
-    """Runs of the journal by their identity, but for lost ones."""
-    journal, plan = folder / JOURNAL, folder / PLAN
-    if not journal.exists():
-        return {}
-    if not resume:
-        raise ScenarioError(f"{folder} holds a sweep: --resume goes on with it; or give another --out, or remove it")
-    try:
-        before = json.loads(plan.read_text("utf-8"))
-        lines = journal.read_text("utf-8").splitlines()
-    except (OSError, ValueError) as error:
-        raise RecordError(f"{folder}: its sweep cannot be read ({error}); remove it, or give another --out") from error
-    now = json.loads(json_text(header))
-    for key in ("scenario", "overrides", "dynsim_version", "commit"):
-        if before.get(key) != now[key]:
-            raise ScenarioError(
-                f"{folder} holds a sweep of another {key}, which cannot be gone on with: give another --out"
-            )
-    rows = {}
-    for line in lines:
-        # A process that was killed may have left the last one unfinished.
-        with suppress(ValueError, TypeError):
-            row = Row(**json.loads(line))
-            if row.status != LOST:
-                rows[Point(row.run, row.variant, row.values).identity] = row
-    return rows
-
-
-def _renumbered(row: Row, point: Point) -> Row:
-    """A row of an earlier plan, in the place that this one has for it."""
-    return Row(point.run, point.variant, point.values, row.status, row.reason, row.numbers, row.warnings)
-
-
-def _line(row: Row) -> str:
-    return json.dumps(vars(row)) + "\n"
-
-
-def _journal(folder: Path, rows: Iterable[Row]) -> Any:
-    """The journal, with what is known written anew, open for what comes."""
-    path = folder / JOURNAL
-    write_text(path, "".join(map(_line, rows)))
-    return path.open("a", encoding="utf-8")
 
 
 def columns(rows: Sequence[Row]) -> list[str]:
@@ -243,7 +178,7 @@ def _write_parquet(rows: Sequence[Row], names: Sequence[str], path: Path, plan: 
             column = [float(value) if isinstance(value, int) else value for value in column]
         try:
             arrays.append(pyarrow.array(column))
-        except (pyarrow.ArrowInvalid, pyarrow.ArrowTypeError):
+        except (pyarrow.ArrowInvalid, pyarrow.ArrowTypeError, OverflowError):
             # A grid of numbers and texts.
             arrays.append(pyarrow.array([None if value is None else json.dumps(value) for value in column]))
     table = pyarrow.table(arrays, names=list(names))

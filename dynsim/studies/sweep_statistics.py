@@ -13,7 +13,7 @@ from dynsim.record.sensitivity import sensitivities, spread
 from dynsim.studies.plan import Plan
 
 if TYPE_CHECKING:
-    from dynsim.studies.sweep import Row
+    from dynsim.studies.journal import Row
 
 
 def statistics(rows: Sequence[Row], plan: Plan) -> list[dict[str, Any]]:

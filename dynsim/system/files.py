@@ -68,6 +68,37 @@ def check_writable(folder: Path, names: Iterable[str] = ()) -> None:
         raise RecordError(f"cannot write to {folder}: no permission to write in {existing}")
 
 
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Make a folder, if need be; within, no other process holds it. File systems without locks, and Windows, let it.
+
+    Raises
+    ------
+    RecordError
+        Another process holds it, or it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = None if fcntl is None else os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise RecordError(f"cannot write to {folder}: {_reason(error)}") from error
+    if descriptor is None:
+        yield
+        return
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RecordError(
+                f"{folder}: another process is at work there; wait until it ends, or give another --out"
+            ) from error
+        except OSError:  # a file system without locks
+            pass
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def discard(folder: Path, patterns: Iterable[str]) -> None:
     """Delete the files of a folder that match, if there are any; what cannot be deleted stays."""
     for pattern in patterns:

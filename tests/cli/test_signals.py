@@ -27,14 +27,13 @@ LONG += ["--set", "controller.hand.path.period_s=5000", "--no-figures"]
 # Many knots: the inverse kinematics take minutes.
 PLANNING = ["--set", "duration_s=50000", "--set", "record.rate_hz=1"]
 
-# The command line, in a process that leaves files which say what it does. Spawned workers run this module too.
+# What every Python process begins with here, workers too: it leaves files which say what the process does.
 WATCHED = """
-import ctypes, os, sys
+import ctypes, os
 from pathlib import Path
 
 import dynsim.library.controllers.joint_pd as joint_pd
 import dynsim.integrators.driver as driver
-from dynsim.cli import main
 
 def mark(what, function):
     def marked(*arguments):
@@ -54,9 +53,6 @@ def advance(*arguments):
 
 compiled, driver.advance = driver.advance, advance
 joint_pd.follow = mark("planning", joint_pd.follow)
-
-if __name__ == "__main__":
-    main()
 """
 
 
@@ -71,9 +67,12 @@ def started(
     folder: Path, *arguments: str, stdout: int | IO[Any] = subprocess.PIPE, stands: bool = False
 ) -> Iterator[subprocess.Popen[str]]:
     """A watched process of its own group, of which nothing is left after the block; ``stands``: in a step for ever."""
-    (folder / "watched.py").write_text(WATCHED)
+    (folder / "begins").mkdir(exist_ok=True)
+    (folder / "begins" / "sitecustomize.py").write_text(WATCHED)
+    path = os.pathsep.join([str(folder / "begins"), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
     process = subprocess.Popen(
-        [sys.executable, "watched.py", *arguments], env=os.environ | ({"STANDS": "1"} if stands else {}),
+        [sys.executable, "-m", "dynsim", *arguments],
+        env=os.environ | {"PYTHONPATH": path} | ({"STANDS": "1"} if stands else {}),
         cwd=folder, stdout=stdout, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=prepare_child,
     )  # fmt: skip
     try:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import signal
-import subprocess
-import sys
 
 import pytest
 from llvmlite.binding import ExecutionEngine
@@ -47,23 +45,3 @@ def test_elsewhere_it_does_not():
 def test_the_compiler_has_these_callbacks():
     assert interruption._OF_THE_COMPILER
     assert all(hasattr(ExecutionEngine, name) for name in interruption._OF_THE_COMPILER)
-
-
-EARLY = """
-import signal
-from multiprocessing import forkserver
-from pathlib import Path
-from dynsim.studies.processes import begin_early
-
-begin_early("json")
-status = Path(f"/proc/{forkserver._forkserver._forkserver_pid}/status").read_text()
-blocked = int(next(line for line in status.splitlines() if line.startswith("SigBlk")).split()[1], 16)
-print(bool(blocked >> (signal.SIGINT - 1) & 1))
-"""
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="only there processes begin early")
-def test_ctrl_c_does_not_reach_a_process_that_is_begun_early() -> None:
-    """Python's resource tracker, started on the way, lets SIGINT through again for whoever starts it."""
-    done = subprocess.run([sys.executable, "-c", EARLY], capture_output=True, text=True, timeout=60)
-    assert done.stdout.split() == ["True"], done.stderr

@@ -34,6 +34,7 @@ from dynsim.scenario import SetOptions, read_scenario
 from dynsim.studies import batch, processes
 from dynsim.studies import sweep as module
 from dynsim.studies.columns import numbers
+from dynsim.studies.journal import JOURNAL, LOST, Row
 from dynsim.studies.plan import Axis, Law, Plan
 from dynsim.studies.processes import WorkerInterrupted, WorkerLost, WorkerSilent, run_in_processes
 from dynsim.studies.sweep import run_sweep
@@ -321,7 +322,7 @@ def test_a_silent_process_is_a_row_with_its_reason(tmp_path: Path, monkeypatch: 
 
     def run(work: Any, tasks: Any, jobs: int, take: Any, *, attempts: int) -> bool:
         for k, task in enumerate(tasks):
-            take(task, processes._raise_silent if k == 1 else partial(work, task, None))
+            take(task, partial(processes._raise, WorkerSilent) if k == 1 else partial(work, task, None))
         return False
 
     monkeypatch.setattr(batch, "run_in_processes", run)
@@ -408,12 +409,12 @@ def test_parquet_is_the_table(tmp_path: Path):
 def test_resuming_runs_what_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     swept = plan(Axis.parse(f"{LENGTH}=0.5:1:5"))
     whole = run_sweep(swept, tmp_path)
-    table, journal = (tmp_path / "sweep.csv").read_bytes(), tmp_path / module.JOURNAL
+    table, journal = (tmp_path / "sweep.csv").read_bytes(), tmp_path / JOURNAL
     with pytest.raises(ScenarioError, match="--resume goes on"):
         run_sweep(swept, tmp_path)
     # As a process leaves it that is killed while it writes the third line; the second run was lost.
     lines = journal.read_text().splitlines(keepends=True)
-    lost = json.dumps(json.loads(lines[1]) | {"status": module.LOST}) + "\n"
+    lost = json.dumps(json.loads(lines[1]) | {"status": LOST}) + "\n"
     journal.write_text(lines[0] + lost + lines[2][:40])
     ran: list[int] = []
 
@@ -593,7 +594,7 @@ def command(*arguments: str) -> list[str]:
 
 
 def done(folder: Path) -> int:
-    journal = folder / module.JOURNAL
+    journal = folder / JOURNAL
     return journal.read_text().count("\n") if journal.exists() else 0
 
 
@@ -633,14 +634,9 @@ def test_a_killed_worker_costs_nothing_but_time(tmp_path: Path, whole: bytes):
 
 
 def workers_of(pid: int) -> list[int]:
-    """Worker processes of a parent: its own, or copies of the process that has loaded everything."""
-
-    def children(of: int, kind: str) -> list[int]:
-        found = map(int, Path(f"/proc/{of}/task/{of}/children").read_text().split())
-        return [child for child in found if kind in Path(f"/proc/{child}/cmdline").read_text()]
-
-    servers = children(pid, "forkserver")
-    return children(servers[0], "forkserver") if servers else children(pid, "spawn_main")
+    """Worker processes of a parent."""
+    children = map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())
+    return [child for child in children if "dynsim.studies.worker" in Path(f"/proc/{child}/cmdline").read_text()]
 
 
 def _hears() -> None:
@@ -668,11 +664,39 @@ def test_a_cluster_gives_the_same_and_outlives_a_worker(tmp_path: Path, whole: b
     assert (out / "sweep.csv").read_bytes() == whole
 
 
+def test_a_scheduler_that_dies_is_one_line(tmp_path: Path):
+    pytest.importorskip("distributed")
+    file, out = tmp_path / "scheduler.json", tmp_path / "out"
+    dask = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
+    with started([*dask, "--no-dashboard", "--scheduler-file", str(file)], tmp_path / "scheduler") as scheduler:
+        wait_for(lambda: file.exists() and file.stat().st_size > 0)
+        address = json.loads(file.read_text())["address"]
+        arguments = ["sweep", *GRID, *LONG[:-2], "--out", str(out), "--scheduler", address]
+        with started([sys.executable, "-m", "dynsim", *arguments], tmp_path / "errors") as child:
+            wait_for((out / JOURNAL).exists)
+            scheduler.wait_for("Starting established connection")
+            scheduler.process.kill()
+            assert child.end() == 2, child.stderr
+    said = " ".join(child.stderr.split())
+    assert said.startswith(f"error: the Dask scheduler at {address} answers no more; --resume goes on")
+    assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("address", ["nowhere", "nonsense://host:1"])
+def test_what_is_no_address_is_one_line(tmp_path: Path, address: str):
+    pytest.importorskip("distributed")
+    arguments = ["sweep", *GRID, *LONG[:-2], "--out", str(tmp_path / "out"), "--scheduler", address]
+    ended = subprocess.run([sys.executable, "-m", "dynsim", *arguments], capture_output=True, text=True, timeout=120)
+    assert ended.returncode == 2
+    assert f"no Dask scheduler answers at {address}" in " ".join(ended.stderr.split())
+    assert "Traceback" not in ended.stderr
+
+
 def test_runs_that_failed_are_counted_and_not_drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A base that tips after 5 s has taken a tenth of the energy: beside whole runs it looked like the best of all."""
     numbers = {pictures.ENERGY: 1.0, "hand_error_rms_m": 0.1}
     status = ["ok", "failed", "ok"]
-    rows = [module.Row(k, None, {"duration_s": k + 1}, one, "", numbers, "") for k, one in enumerate(status)]
+    rows = [Row(k, None, {"duration_s": k + 1}, one, "", numbers, "") for k, one in enumerate(status)]
     seen: list[pictures.Sweep] = []
     monkeypatch.setattr(pictures, "draw", lambda sweep, *_: seen.append(sweep))
     sweep_command._draw("tipping", rows, plan(Axis("duration_s", (1, 2, 3))), tmp_path, True, "png")

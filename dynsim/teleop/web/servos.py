@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from contextlib import suppress
-from multiprocessing import get_context
+from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from types import TracebackType
 from typing import Any
@@ -115,6 +115,9 @@ class SimulationProcess:
         context: Any = get_context("spawn")
         self._control, control = context.Pipe()
         samples, there = context.Pipe(duplex=False)
+        if os.name == "posix":
+            # Python's own helper lets signals through again when it is started: not while they are held.
+            resource_tracker.ensure_running()
         with signals_held():
             heard = context.RawArray("d", [NOT_YET])
             self._process = context.Process(

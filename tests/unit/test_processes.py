@@ -1,0 +1,184 @@
+"""Workers: started from any script, gone at any time, and what is said of those that cannot work."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+from processes import wait_for
+from sweep_work import pid, says, square, unsendable
+
+from dynsim.studies import processes
+from dynsim.studies.processes import run_in_processes
+from dynsim.studies.worker import START, WorkerError
+
+BATCH = """
+import json, os, sys
+import dynsim
+
+before = dict(os.environ), list(sys.path), sys.modules["__main__"]
+pendulums = [dynsim.load_scenario("single_pendulum", overrides={"duration_s": 0.1 * k}) for k in (2, 3)]
+runs = dynsim.simulate_batch(pendulums, jobs=2)
+variants = dynsim.compare("elbow_comparison", overrides={"duration_s": 0.05}, jobs=2)
+assert before == (dict(os.environ), list(sys.path), sys.modules["__main__"])
+print(json.dumps([[run.reason or run.summary["duration_s"] for run in runs], list(variants)]))
+"""
+# Of a batch, whatever starts it.
+DONE = [[0.2, 0.3], ["two_elbows", "elbow_7", "elbow_4", "no_elbow"]]
+
+
+@pytest.mark.parametrize("from_file", [True, False], ids=["a file", "standard input"])
+def test_a_script_needs_no_guard(tmp_path: Path, from_file: bool):
+    """Once: workers run nothing of it."""
+    (tmp_path / "script.py").write_text(BATCH)
+    with (tmp_path / "script.py").open() as script:
+        ended = subprocess.run(
+            [sys.executable, "script.py" if from_file else "-"],
+            cwd=tmp_path, stdin=script, capture_output=True, text=True, timeout=300,
+        )  # fmt: skip
+    assert ended.returncode == 0, ended.stderr
+    assert json.loads(ended.stdout) == DONE
+    assert ended.stderr == ""
+
+
+# What has loaded dynsim before the folder is searched, as notebooks do.
+NOTEBOOK = """
+import sys
+import dynsim.studies.batch
+sys.path.insert(0, "")
+exec(sys.stdin.read())
+"""
+
+
+def test_a_notebook_has_its_folder_first_and_workers_do_not(tmp_path: Path):
+    for name in ("signal", "json", "pickle", "numpy"):
+        (tmp_path / f"{name}.py").write_text("raise RuntimeError('not this one')\n")
+    ended = subprocess.run(
+        [sys.executable, "-P", "-c", NOTEBOOK], input=BATCH, cwd=tmp_path, capture_output=True, text=True, timeout=300
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert json.loads(ended.stdout) == DONE
+
+
+SCRIPT = """
+import helper
+from sweep_work import named
+from dynsim.studies.processes import run_in_processes
+
+class Here:
+    name = "here"
+
+for thing in (helper.There(), Here()):
+    try:
+        run_in_processes(named, [thing], 2, lambda thing, result: print(result()))
+    except Exception as error:
+        print(type(error).__name__, error)
+"""
+
+
+def test_what_is_defined_in_a_module_is_sent_and_what_is_in_the_script_is_refused(tmp_path: Path):
+    (tmp_path / "helper.py").write_text("class There:\n    name = 'there'\n")
+    (tmp_path / "script.py").write_text(SCRIPT)
+    tests = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+    ended = subprocess.run(
+        [sys.executable, str(tmp_path / "script.py")],
+        env=os.environ | {"PYTHONPATH": tests}, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    there, here = ended.stdout.splitlines()
+    assert there == "there"
+    assert here.startswith("WorkerError Here is defined in the script or notebook itself")
+    assert "put it into a module" in here
+    assert ended.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("begins", "said"),
+    [
+        ("raise ImportError('no such thing')", ["ended with exit code 1 before", "ImportError: no such thing"]),
+        ("import os; os.kill(os.getpid(), 9)", ["was ended by signal 9 before", "is memory short?"]),
+    ],
+    ids=["fails", "killed"],
+)
+def test_a_worker_that_cannot_start_ends_the_batch(monkeypatch: pytest.MonkeyPatch, begins: str, said: list[str]):
+    monkeypatch.setattr(processes, "START", f"{begins}\n{START}")
+    with pytest.raises(WorkerError) as caught:
+        run_in_processes(square, range(100), 2, lambda number, result: pytest.fail("nothing was done"), attempts=2)
+    assert all(text in str(caught.value) for text in said)
+
+
+def test_no_process_at_all_is_one_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    for executable, said in (("", "no Python is known"), (str(tmp_path / "python"), "no process can be started")):
+        monkeypatch.setattr(sys, "executable", executable)
+        with pytest.raises(WorkerError, match=said):
+            run_in_processes(square, range(3), 2, lambda number, result: None)
+
+
+@pytest.mark.parametrize(
+    ("work", "said"), [(square, "cannot be loaded in another process: ModuleNotFoundError"), (unsendable, "be sent")]
+)
+def test_what_cannot_travel_is_an_error_of_its_task(
+    work: Callable[..., Any], said: str, monkeypatch: pytest.MonkeyPatch
+):
+    module = ModuleType("only_here")
+    exec("class Thing: ...", module.__dict__)
+    monkeypatch.setitem(sys.modules, "only_here", module)
+    taken: list[str] = []
+
+    def take(task: Any, result: Callable[[], Any]) -> None:
+        with pytest.raises(WorkerError) as caught:
+            result()
+        taken.append(str(caught.value))
+
+    run_in_processes(work, [module.Thing() if work is square else 1], 2, take)
+    assert len(taken) == 1
+    assert said in taken[0]
+
+
+def test_what_work_prints_and_reads_is_not_what_it_is_sent(capfd: pytest.CaptureFixture[str]):
+    taken: dict[int, Any] = {}
+    run_in_processes(says, range(3), 1, lambda number, result: taken.update({number: result()}))
+    assert taken == dict.fromkeys(range(3), "")
+    printed = capfd.readouterr()
+    assert printed.out == ""
+    assert printed.err.count("printed") == 3
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="no signal stops a process here")
+def test_a_worker_that_is_stopped_when_all_is_done_is_not_waited_for():
+    pids: list[int] = []
+
+    def take(number: int, result: Callable[[], int]) -> None:
+        pids.append(result())
+        if number == 3:
+            os.kill(pids[-1], signal.SIGSTOP)
+
+    run_in_processes(pid, range(4), 1, take)
+    assert len(pids) == 4
+
+
+WAITS = """
+from sweep_work import deaf
+from dynsim.studies.processes import run_in_processes
+import sys
+run_in_processes(deaf, [(k, sys.argv[1]) for k in range(2)], 2, print)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at processes in /proc")
+def test_workers_end_with_a_parent_that_is_killed(tmp_path: Path):
+    tests = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+    parent = subprocess.Popen([sys.executable, "-c", WAITS, str(tmp_path)], env=os.environ | {"PYTHONPATH": tests})
+    try:
+        wait_for(lambda: len(list(tmp_path.glob("begun_*"))) == 2)
+        children = Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()
+    finally:
+        parent.kill()
+        parent.wait()
+    assert len(children) == 2
+    wait_for(lambda: not any(Path(f"/proc/{child}/cmdline").exists() for child in children))
