@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from dynsim.cli.app import QuietOption
+from dynsim.cli.app import QuietOption, TrustOption
 from dynsim.cli.display import console, film_progress, labelled
 from dynsim.errors import RecordError
 from dynsim.system.terminal import escaped
@@ -41,6 +41,7 @@ def animate(
         typer.Option(metavar="SIGNAL", help="Signal to plot below; default: one that suits, none: no plot."),
     ] = None,
     quiet: QuietOption = False,
+    trust: TrustOption = False,
 ) -> None:
     """Write a film of records, without display or browser: bodies, forces, time, and a plot with a cursor."""
     from dynsim.draw.film import write
@@ -48,7 +49,7 @@ def animate(
 
     wanted = _size(size)
     check(out.suffix.lower().removeprefix("."), fps)
-    named = labelled(records)
+    named = labelled(records, trust=trust)
     with film_progress(quiet) as report:
         write(
             named,

@@ -33,6 +33,10 @@ SetOption = Annotated[
     list[str] | None, typer.Option("--set", metavar="a.b.c=VALUE", help="Override a value; may be repeated.")
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+TrustOption = Annotated[
+    bool,
+    typer.Option("--trust", help="Also read records without a right digest: other programs wrote or changed them."),
+]
 FiguresOption = Annotated[bool, typer.Option("--no-figures", help="Do not draw figures.")]
 
 

@@ -18,6 +18,7 @@ from dynsim.cli.app import (
     QuietOption,
     ScenarioArgument,
     SetOption,
+    TrustOption,
     app,
     parsed_overrides,
 )
@@ -226,13 +227,14 @@ def plot(
     records: Annotated[list[Path], typer.Argument(metavar="RECORD", help="Records (HDF5), or folders of runs.")],
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="For the figures; default: draw/figures/ beside each record."),
+        typer.Option(metavar="FOLDER", help="For the figures; default: figures/ beside each record."),
     ] = None,
     format_: FormatOption = FigureFormat.png,
+    trust: TrustOption = False,
 ) -> None:
     """Draw the figures of records; two or more are also laid over each other."""
     files = record_files(records)
-    named = labelled(files)
+    named = labelled(files, trust=trust)
     for path, (label, record) in zip(files, named.items(), strict=True):
         folder = path.parent / "figures" if out is None else out if len(files) == 1 else out / label
         try:

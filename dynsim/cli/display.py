@@ -33,7 +33,7 @@ _COMPILED_S = 90.0
 RECORD, COMPARISON = "record.h5", "comparison.json"
 
 
-def labelled(paths: Sequence[Path]) -> dict[str, Record]:
+def labelled(paths: Sequence[Path], *, trust: bool = False) -> dict[str, Record]:
     """Records, or those of folders, by names for them: their variants, numbered where another has the same.
 
     Raises
@@ -46,7 +46,7 @@ def labelled(paths: Sequence[Path]) -> dict[str, Record]:
 
     found: dict[str, Record] = {}
     for path in record_files(paths):
-        record = Record.load(path)
+        record = Record.load(path, trust=trust)
         name = file_name(record.summary.get("variant") or path.parent.name or path.stem)
         label = next(one for k in itertools.count(1) if (one := name if k == 1 else f"{name}_{k}") not in found)
         found[label] = record

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from dynsim.cli.app import TrustOption
 from dynsim.errors import DynsimError
 from dynsim.system.files import file_name, json_text, write_json
 from dynsim.system.terminal import Terminal, plain
@@ -116,18 +117,20 @@ def _compare_with_map(found: list[Any], servo_map: Any) -> None:
 
 
 @hw.command(epilog="Example: dynsim hw check results/elbow_comparison/two_elbows/record.h5 --map arm")
-def check(record: RecordFile, map_file: MapFile, rate: Rate = None, speed: Speed = 1.0) -> None:
+def check(
+    record: RecordFile, map_file: MapFile, rate: Rate = None, speed: Speed = 1.0, trust: TrustOption = False
+) -> None:
     """Check a whole record against a robot's limits; needs no port."""
-    _, servo_map, motion = _checked(record, map_file, rate, speed)
+    _, servo_map, motion = _checked(record, map_file, rate, speed, trust)
     _print_check(motion, servo_map)
 
 
-def _checked(record_file: Path, map_file: Path, rate: float | None, speed: float) -> tuple[Any, Any, Any]:
+def _checked(record_file: Path, map_file: Path, rate: float | None, speed: float, trust: bool) -> tuple[Any, Any, Any]:
     from dynsim.hardware.replay.check import check_motion
     from dynsim.hardware.servo_map import load_servo_map
     from dynsim.record import Record
 
-    record, servo_map = Record.load(record_file), load_servo_map(map_file)
+    record, servo_map = Record.load(record_file, trust=trust), load_servo_map(map_file)
     return record, servo_map, check_motion(record, servo_map, rate=rate, speed=speed)
 
 
@@ -165,6 +168,7 @@ def replay(
     plant: Annotated[str | None, typer.Option("--plant", help="Scenario whose robot the virtual servos move.")] = None,
     variant: Annotated[str | None, typer.Option("--variant", help="Variant of that scenario.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar.")] = False,
+    trust: TrustOption = False,
 ) -> None:
     """Check, verify, arm, move to the start, replay, and keep the measured run.
 
@@ -182,7 +186,7 @@ def replay(
 
         if (faults or plant) and port != VIRTUAL:
             raise ServoMapError("--faults and --plant are for virtual servos: --port virtual")
-        simulated, servo_map, motion = _checked(record, map_file, rate, speed)
+        simulated, servo_map, motion = _checked(record, map_file, rate, speed, trust)
         script = load_fault_script(faults, servo_map.ids) if faults else None
         robot = _plant(plant, variant, servo_map, motion) if plant else None
         folder = out or Path("results") / file_name(f"{servo_map.robot}_replay")
@@ -263,13 +267,14 @@ def compare(
     joints: Annotated[
         list[str] | None, typer.Option("--joint", help="In colour in the figure; may be repeated; default: the worst.")
     ] = None,
+    trust: TrustOption = False,
 ) -> None:
     """Delay, rms and largest error between a simulated and a measured run, joints and wheels, with a figure."""
     from dynsim.hardware.replay.compare import check_gate, compare_records, draw_comparison, load_gate
     from dynsim.record import Record
 
     bounds = load_gate(gate) if gate else None
-    comparison = compare_records(Record.load(record), Record.load(measured))
+    comparison = compare_records(Record.load(record, trust=trust), Record.load(measured, trust=trust))
     folder = out or measured.parent
     # First, because it refuses joints that are not there.
     figure = draw_comparison(comparison, folder / "comparison.png", joints or ())
@@ -421,10 +426,11 @@ def export(
     ],
     rate: Annotated[float | None, typer.Option("--rate", help="Resample [Hz]; default: the record's samples.")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="File; default: beside the record.")] = None,
+    trust: TrustOption = False,
 ) -> None:
     """Write the joint motion of a record for other programs."""
     from dynsim.hardware.export import SUFFIX, export_record
     from dynsim.record import Record
 
     target = out or record.with_suffix(SUFFIX[format_.value])
-    console.print(f"written: {export_record(Record.load(record), target, format_.value, rate=rate)}")
+    console.print(f"written: {export_record(Record.load(record, trust=trust), target, format_.value, rate=rate)}")

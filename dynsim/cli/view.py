@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dynsim.cli.app import TrustOption
 from dynsim.cli.display import console, labelled, record_files
 from dynsim.cli.drawing import Page
 from dynsim.system.terminal import escaped
@@ -33,12 +34,13 @@ def view(
             help="For the page; default: view.html beside the record or in the folder, here for several.",
         ),
     ] = None,
+    trust: TrustOption = False,
 ) -> None:
     """Write a page that shows records in 3D, with plots and forces over time, for any browser and without a network."""
     from dynsim.draw.page import write
     from dynsim.engine.results import VIEW
 
-    named = labelled(record_files(records))
+    named = labelled(record_files(records), trust=trust)
     first = records[0] if records[0].is_dir() else records[0].parent
     page = out or (first if len(records) == 1 else Path()) / VIEW
     with console.status(f"writing {escaped(page)}"):

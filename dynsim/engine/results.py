@@ -13,7 +13,7 @@ RUN_FILES = ("record.h5", "summary.json", "scenario.yaml")
 # What only describes records, and is drawn or written anew from them.
 FIGURE_FORMATS = ("png", "pdf", "svg")
 VIEW = "view.html"
-FIGURES = (*(f"draw/figures/*.{kind}" for kind in FIGURE_FORMATS), "figures/animation.gif", VIEW)
+FIGURES = (*(f"figures/*.{kind}" for kind in FIGURE_FORMATS), "figures/animation.gif", VIEW)
 COMPARISON_FILES = ("comparison.json", "comparison.csv", *(f"compare_*.{kind}" for kind in FIGURE_FORMATS), VIEW)
 
 

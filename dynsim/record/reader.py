@@ -1,23 +1,19 @@
-"""Records as HDF5 files, the reading half: read as if they came from an enemy.
+"""Records as HDF5 files, the reading half.
 
 A file is HDF5 and, after its end, one line with the SHA-256 of all bytes before it. HDF5 ignores the line; with it,
 damage is found before the HDF5 library, which may crash or never return on a damaged file, has seen it. A file without
-that line (dynsim 0.1, or changed by another program) is read in a process of its own. The attribute ``sha256`` is a
-checksum of the content: of times, signals and texts, however they are stored.
+that line, or with another digest, is read only where the caller trusts it. The attribute ``sha256`` is a checksum of
+the content: of times, signals and texts, however they are stored. Sizes are limited in both cases, before anything is
+unpacked.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
-import itertools
 import json
 import math
 import os
 import re
-import signal
-import sys
-import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -25,10 +21,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.errors import RecordError
+from dynsim.errors import RecordError, shown
 from dynsim.record.content import (
     FORMAT,
-    OLDER,
     TIME,
     Content,
     Event,
@@ -39,29 +34,30 @@ from dynsim.record.content import (
     is_numeric,
 )
 from dynsim.record.scene import Scene
-from dynsim.record.writer import CHECKSUM, EVENT_COLUMNS, encode
+from dynsim.record.writer import CHECKSUM, EVENT_COLUMNS
 from dynsim.system.files import check_complete
 from dynsim.system.inputs import is_file
 
+_FORMATS = "dynsim-record-"
 SIZE_LIMIT = 2 << 30
 """A file may unpack to this many bytes, or to ``RATIO_LIMIT`` times its own size if that is more."""
 RATIO_LIMIT = 100
-READING_TIME = 10.0
-"""Of the process that reads a file without a checksum, and as much again for every 50 MB [s of processor time]."""
-_PATIENCE = 6.0
-"""Wall time that it gets, in times of its processor time: the machine may be busy."""
 _LAST_LINE = re.compile(rb"\ndynsim-sha256:([0-9a-f]{64})\n")
 _LAST_LINE_SIZE = 80
-_CHUNK_LIMIT = 64 << 20
 
 
-def read(path: Path) -> Content:
+def read(path: Path, *, trust: bool = False) -> Content:
     """Read a file.
+
+    Parameters
+    ----------
+    trust : also read a file whose digest is missing or wrong: one that another program has written or changed
 
     Raises
     ------
     RecordError
-        No such file; damaged, or no record; or it may be of another run than the files beside it.
+        No such file; damaged, or no record; its digest is missing or wrong and it is not trusted; or it may be of
+        another run than the files beside it.
     """
     try:
         if not is_file(path, RecordError):
@@ -70,21 +66,24 @@ def read(path: Path) -> Content:
             raise RecordError(f"{path}: no such record{hint}")
         check_complete(path)
         with path.open("rb") as stream:
-            verified = _verified(path, stream)
+            doubt = _doubt(path, stream)
     except (OSError, ValueError) as error:
         raise RecordError(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})") from error
-    if verified or not sys.executable or getattr(sys, "frozen", False):
-        return decode(path, path)
-    return decode(path, io.BytesIO(_read_apart(path)))
+    if doubt and not trust:
+        raise RecordError(f"{path}: {doubt}; {_TRUST}")
+    return decode(path, path, trust=trust)
 
 
-def _verified(path: Path, stream: BinaryIO) -> bool:
-    """Whether the bytes are those that were written; False if there is no checksum.
+_TRUST = "if you know where it comes from, --trust reads it (in Python: Record.load(path, trust=True))"
+
+
+def _doubt(path: Path, stream: BinaryIO) -> str:
+    """Why the bytes may not be those that dynsim wrote, "" when they are.
 
     Raises
     ------
     RecordError
-        They are not, or it is no HDF5 file.
+        It is no HDF5 file.
     """
     size = stream.seek(0, os.SEEK_END)
     stream.seek(max(size - _LAST_LINE_SIZE, 0))
@@ -93,80 +92,25 @@ def _verified(path: Path, stream: BinaryIO) -> bool:
     if not stream.read(8).startswith(b"\x89HDF\r\n\x1a\n"):
         raise RecordError(f"{path}: not a readable HDF5 file (it does not begin like one)")
     if found is None:
-        return False
+        return "it has no digest (SHA-256) at its end: it was cut short, or written by another program"
     stream.seek(0)
     actual, left = hashlib.sha256(), size - _LAST_LINE_SIZE
     while left and (block := stream.read(min(left, 1 << 20))):
         actual.update(block)
         left -= len(block)
     if actual.hexdigest().encode("ascii") != found[1]:
-        raise RecordError(f"{path}: damaged: its bytes do not agree with its checksum (SHA-256)")
-    return True
+        return "damaged, or changed since dynsim wrote it: its bytes do not agree with its digest (SHA-256)"
+    return ""
 
 
-def _read_apart(path: Path) -> bytes:
-    """Read a file of unknown state in another process, which may die of it; gives it back written anew."""
-    import subprocess
-
-    size = path.stat().st_size
-    seconds = READING_TIME * (1.0 + size / 50e6)
-    code = "from dynsim.record.reader import _hand_over; _hand_over()"
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "HDF5_PLUGIN_PRELOAD": "::"}
-    try:
-        result = subprocess.run(
-            [sys.executable, "-c", code, os.path.abspath(path), repr(seconds), repr(4 * _allowed(size) + (4 << 30))],
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            timeout=_PATIENCE * seconds,
-            check=False,
-        )
-    except subprocess.TimeoutExpired as error:
-        raise RecordError(f"{path}: damaged: reading it does not end") from error
-    if result.returncode < 0:
-        number = -result.returncode
-        what = "does not end" if number == signal.SIGXCPU else f"ends with {signal.Signals(number).name}"
-        raise RecordError(f"{path}: damaged: reading it {what}")
-    if result.returncode == _REFUSED:
-        raise RecordError(f"{path}: {result.stdout.decode('utf-8', errors='replace')}")
-    if result.returncode != 0:
-        last = result.stderr.decode("utf-8", errors="replace").strip().splitlines()[-1:]
-        raise RecordError(f"{path}: cannot be read ({''.join(last) or f'exit code {result.returncode}'})")
-    return result.stdout
-
-
-_REFUSED = 11
-"""Exit code of the process that reads apart: what is wrong is on its output."""
-
-
-def _hand_over() -> None:
-    """In the other process: the file, written anew, or the reason why not, to the output."""
-    path, seconds, memory = Path(sys.argv[1]), float(sys.argv[2]), int(sys.argv[3])
-    try:
-        import resource
-    except ImportError:  # not on Windows, where wall time must do
-        pass
-    else:
-        for kind, limit in ((resource.RLIMIT_CPU, math.ceil(seconds)), (resource.RLIMIT_AS, memory)):
-            _, hard = resource.getrlimit(kind)
-            resource.setrlimit(kind, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
-        resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))
-    try:
-        sys.stdout.buffer.write(encode(decode(path, path)))
-    except RecordError as error:
-        sys.stdout.buffer.write(str(error).removeprefix(f"{path}: ").encode("utf-8", errors="replace"))
-        sys.stdout.flush()
-        sys.exit(_REFUSED)
-    sys.stdout.flush()
-
-
-def decode(path: Path, source: Path | BinaryIO) -> Content:
-    """What an HDF5 file holds, checked part by part; nothing is believed.
+def decode(path: Path, source: Path | BinaryIO, *, trust: bool = False) -> Content:
+    """What an HDF5 file holds, checked part by part.
 
     Parameters
     ----------
     path : its name, for messages
     source : the file, or its bytes
+    trust : whether the content may differ from its checksum
 
     Raises
     ------
@@ -178,7 +122,7 @@ def decode(path: Path, source: Path | BinaryIO) -> Content:
     try:
         size = source.stat().st_size if isinstance(source, Path) else source.seek(0, os.SEEK_END)
         with h5py.File(source, "r") as file:
-            return _Reader(file, size).content()
+            return _Reader(file, size).content(trust)
     except RecordError as error:
         raise RecordError(f"{path}: {error}") from error
     except MemoryError as error:
@@ -202,13 +146,15 @@ class _Reader:
         self._size = size
         self._left = _allowed(size)
 
-    def content(self) -> Content:
+    def content(self, trust: bool) -> Content:
         import h5py
 
         file = self._file
         found = self._attribute(file, "format")
-        if not isinstance(found, str) or found not in (FORMAT, *OLDER):
-            raise RecordError(f"an HDF5 file, but not a dynsim record ({', '.join((FORMAT, *OLDER))})")
+        if not isinstance(found, str) or not found.startswith(_FORMATS):
+            raise RecordError(f"an HDF5 file, but not a dynsim record ({FORMAT})")
+        if found != FORMAT:
+            raise RecordError(f"a record of another format, {shown(found)}; this version of dynsim reads {FORMAT}")
         complete = self._attribute(file, "complete")
         if complete is None:
             raise RecordError("a dynsim record that lacks parts: no attribute complete")
@@ -239,13 +185,8 @@ class _Reader:
                 signals[name] = one
         content = Content(time, signals, summary, provenance, bool(complete), axes, self._events(), scene)
         wanted = self._attribute(file, CHECKSUM)
-        if wanted is not None and not (
-            isinstance(wanted, str) and wanted == checksum(content, texts[0], texts[1], drawn)
-        ):
-            raise RecordError(
-                "damaged: its content does not agree with its checksum; if you have changed it yourself, delete the "
-                f"attribute {CHECKSUM}"
-            )
+        if not trust and not (isinstance(wanted, str) and wanted == checksum(content, texts[0], texts[1], drawn)):
+            raise RecordError(f"damaged, or changed since: its content does not agree with its checksum; {_TRUST}")
         return replace(
             content,
             time=_native(time).astype(np.float64, copy=False),
@@ -309,9 +250,7 @@ class _Reader:
         if not is_numeric(dtype):
             raise RecordError(f"{what} holds {dtype}, not real numbers")
         self._check_storage(data, what)
-        if data.chunks is None:
-            return np.asarray(data[()])
-        return _unpacked(data, what)
+        return np.asarray(data[()])
 
     def _check_storage(self, data: Any, what: str) -> None:
         """Refuse what lies outside of the file, and sizes that are not there or beyond the limit."""
@@ -400,32 +339,6 @@ def _texts(found: NDArray[Any], what: str) -> tuple[str, ...]:
     if not all(isinstance(text, str) for text in texts):
         raise RecordError(f"{what} that are no texts")
     return texts
-
-
-def _unpacked(data: Any, what: str) -> NDArray[Any]:
-    """A data set in chunks. Not by the HDF5 library: it unpacks what there is, however much comes out."""
-    chunk, shape, dtype = data.chunks, data.shape, data.dtype
-    size = math.prod(chunk) * dtype.itemsize
-    if size > _CHUNK_LIMIT:
-        raise RecordError(f"{what} is in chunks of {size} bytes; {_CHUNK_LIMIT} are the most")
-    counts = [-(-length // step) for length, step in zip(shape, chunk, strict=True)]
-    if data.id.get_num_chunks() != math.prod(counts):
-        raise RecordError(f"{what} lacks {math.prod(counts) - data.id.get_num_chunks()} of {math.prod(counts)} chunks")
-    array = np.empty(shape, dtype)
-    packed = data.compression is not None
-    for place in itertools.product(*(range(0, n * step, step) for n, step in zip(counts, chunk, strict=True))):
-        skipped, raw = data.id.read_direct_chunk(place)
-        if packed and not skipped:
-            unpacker = zlib.decompressobj()
-            try:
-                raw = unpacker.decompress(raw, size + 1)
-            except zlib.error as error:
-                raise RecordError(f"{what} cannot be unpacked ({error})") from error
-        if len(raw) != size:
-            raise RecordError(f"{what} has a chunk of the wrong size")
-        part = array[tuple(slice(first, first + step) for first, step in zip(place, chunk, strict=True))]
-        part[...] = np.frombuffer(raw, dtype).reshape(chunk)[tuple(slice(length) for length in part.shape)]
-    return array
 
 
 def _native(array: NDArray[Any]) -> NDArray[Any]:

@@ -254,16 +254,21 @@ class Record:
         )
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Record:
-        """Read a record written by :meth:`save`, or by dynsim 0.1. What lies in the file is checked, not believed.
+    def load(cls, path: str | os.PathLike[str], *, trust: bool = False) -> Record:
+        """Read a record written by :meth:`save`.
+
+        Parameters
+        ----------
+        trust : also read a file whose digest is missing or wrong: one that another program has written or changed.
+            Its types, sizes and times are checked as ever.
 
         Raises
         ------
         RecordError
-            No such file, damaged, or not a dynsim record; or it lies beside the file ``INCOMPLETE`` of a run that died
-            while it was saved. The message has the file and the reason.
+            No such file, damaged, not a dynsim record, or its digest is missing or wrong and it is not trusted; or it
+            lies beside the file ``INCOMPLETE`` of a run that died while it was saved. The message has the file and the reason.
         """
-        content = reader.read(Path(path))
+        content = reader.read(Path(path), trust=trust)
         record = cls(content.time, provenance=content.provenance)
         record.signals.update(content.signals)
         record.summary.update(content.summary)

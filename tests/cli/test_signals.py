@@ -347,5 +347,5 @@ def test_what_described_older_records_goes_with_them(tmp_path: Path):
     assert subprocess.run(again, **options).returncode == 128 + signal.SIGTERM
     assert sorted(path.name for path in out.iterdir()) == ["elbow_4", "elbow_7", "no_elbow", "two_elbows"]
     assert Record.load(out / "two_elbows" / "record.h5").time[-1] == 0.03
-    assert not list((out / "two_elbows").glob("draw/figures/*"))
-    assert list((out / "no_elbow").glob("draw/figures/*"))
+    assert not list((out / "two_elbows").glob("figures/*"))
+    assert list((out / "no_elbow").glob("figures/*"))

@@ -205,13 +205,6 @@ def test_figures_as_pdf_and_svg(pendulum: Record, tmp_path: Path, kind: str, sta
     assert {path.name for path in paths} == {f"compare_hand_path.{kind}", f"compare_posture.{kind}"}
 
 
-def test_record_of_version_0_1_is_drawn(tmp_path: Path) -> None:
-    old = Record.load(Path(__file__).parents[1] / "data" / "record_0_1.h5")
-    assert_pngs(figures.draw(old, tmp_path), tmp_path, {"hand_path", "energy_ledger", "posture"})
-    titles = [axes.get_title() for axes in drawn(posture.posture(old)).axes]
-    assert "posture not drawn: the record has no scene" in titles
-
-
 def test_a_folder_that_cannot_be_written_is_a_record_error(pendulum: Record, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(RecordError, match="cannot write"):

@@ -1,0 +1,43 @@
+"""Code that lies in the working directory is not run."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dynsim.record import Record
+
+# What dynsim and its libraries import, under the names of the user's own files.
+NAMES = ("json", "signal", "numpy", "random", "resource", "h5py", "io")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with a record, and with modules that leave a mark when they are run."""
+    record = Record([0.0, 0.5, 1.0])
+    record.add("q", [[0.0], [0.1], [0.2]], "rad", labels=("joint_1",))
+    record.save(tmp_path / "record.h5")
+    for name in NAMES:
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'mark')!r}, 'a').write({name!r})\n")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("export", "record.h5", "--format", "csv"),
+        ("plot", "record.h5"),
+        ("view", "record.h5", "--no-open"),
+        ("list",),
+        ("check", "single_pendulum"),
+        ("export", "record.h5", "--format", "csv", "--trust"),
+    ],
+)
+def test_a_command_runs_nothing_of_the_working_directory(folder: Path, arguments: tuple[str, ...]) -> None:
+    command = Path(sys.executable).with_name("dynsim")
+    done = subprocess.run([command, *arguments], cwd=folder, capture_output=True, text=True, timeout=300)
+    assert not (folder / "mark").exists(), (folder / "mark").read_text()
+    assert "Traceback" not in done.stderr
