@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 from dynsim.cli.tables import print_comparison
-from dynsim.hardware.fault_table import markdown
 from dynsim.studies.bench.programs import (
     ABA,
     CONSTRAINT_DYNAMICS,
@@ -40,6 +39,9 @@ from dynsim.studies.bench.programs import (
 from dynsim.system.terminal import Terminal
 
 ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+from support.fault_table import markdown  # noqa: E402
+
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 NUMBER = re.compile(r"[−+-]?\d[\d.,]*(?:e[−+-]?\d+)?(?=<!-- = (\w+) -->)")
 TABLE = re.compile(r"(?<=<!-- table: )(\w+)( -->\n).*?(?=<!-- end -->)", re.DOTALL)

@@ -5,21 +5,34 @@ from __future__ import annotations
 import importlib
 import json
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynsim.errors import MissingEntry, RecordError, shown
-from dynsim.record.content import TIME
+from dynsim.record.content import TIME, Event, Signal
+from dynsim.record.scene import Scene
 
 if TYPE_CHECKING:
     import pandas
     import xarray
 
-    from dynsim.record.record import Record
+
+class Content(Protocol):
+    """What of a :class:`~dynsim.record.Record` is exported."""
+
+    time: NDArray[np.float64]
+    axes: dict[str, NDArray[np.float64]]
+    signals: dict[str, Signal]
+    events: list[Event]
+    scene: Scene | None
+    summary: Any
+    provenance: Any
+    complete: bool
 
 
-def to_dataframe(record: Record, axis: str) -> pandas.DataFrame:
+def to_dataframe(record: Content, axis: str) -> pandas.DataFrame:
     """A pandas DataFrame: time [s] is the index, every column of every signal on the time axis ``axis`` a column.
 
     Columns are called ``signal``, ``signal.label`` or, of vectors, ``signal.label.x``; their units are in
@@ -57,7 +70,7 @@ def to_dataframe(record: Record, axis: str) -> pandas.DataFrame:
     return frame
 
 
-def to_xarray(record: Record) -> xarray.Dataset:
+def to_xarray(record: Content) -> xarray.Dataset:
     """An xarray Dataset: signals over ``time`` or their own time axes, with ``units`` and ``long_name`` as attributes.
 
     Signals with the same labels share a dimension, which is called after the first of them (``q_label``); the third

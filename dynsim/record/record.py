@@ -266,7 +266,7 @@ class Record:
         ------
         RecordError
             No such file, damaged, not a dynsim record, or its digest is missing or wrong and it is not trusted; or it
-            lies beside the file ``INCOMPLETE`` of a run that died while it was saved. The message has the file and the reason.
+            lies beside the file ``INCOMPLETE`` of a run that died while it was saved. The message has file and reason.
         """
         content = reader.read(Path(path), trust=trust)
         record = cls(content.time, provenance=content.provenance)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
 from typing import Any, Generic, Literal, TypeVar, get_args
 
 from dynsim.engine import SIMULATION, Progress, simulate
 from dynsim.errors import DynsimError, ScenarioError, SimulationInterrupted, SimulationStopped, shown
 from dynsim.record import Record
 from dynsim.scenario import Scenario, require_scenario
+from dynsim.studies.outcome import LOST, RunResult
 from dynsim.studies.processes import SILENT, WorkerInterrupted, WorkerLost, WorkerSilent, run_in_processes
 from dynsim.system import interruption
 from dynsim.system.reuse import Reuse
@@ -22,32 +22,6 @@ Task = TypeVar("Task")
 ATTEMPTS = 2
 # Runs of fixed steps that are handed out at once: whole lanes of any processor.
 AT_ONCE = 8
-LOST = "its process was ended from outside"
-
-
-@dataclass(frozen=True)
-class RunResult:
-    """How one run of many ended.
-
-    Attributes
-    ----------
-    summary : numbers of the run; of one that stopped, what was simulated until then; empty when nothing was
-    reason : why it failed, "" when it did not
-    lost : with its process, which was ended, so that another attempt may do better
-    record : where it was asked for
-    wall_s : time that it took, all in all [s]
-    """
-
-    summary: dict[str, Any] = field(default_factory=dict)
-    reason: str = ""
-    lost: bool = False
-    record: Record | None = field(default=None, repr=False)
-    wall_s: float = 0.0
-
-    @property
-    def ok(self) -> bool:
-        """True for a run that came to its end."""
-        return not self.reason
 
 
 def simulate_batch(

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 from dynsim._version import __version__
 from dynsim.engine import SIMULATION, Progress
 from dynsim.errors import DynsimError
-from dynsim.studies.batch import LOST, RunResult
+from dynsim.studies.outcome import LOST, RunResult
 from dynsim.studies.worker import keep_memory
 from dynsim.system import interruption
 

@@ -10,8 +10,8 @@ from types import TracebackType
 from typing import Any
 
 from dynsim.errors import RecordError, ScenarioError, shown
-from dynsim.studies.batch import RunResult
 from dynsim.studies.columns import is_text, numbers
+from dynsim.studies.outcome import RunResult
 from dynsim.studies.plan import Point
 from dynsim.system.files import json_text, write_text
 

@@ -14,9 +14,10 @@ from dynsim._version import __version__
 from dynsim.engine.provenance import commit
 from dynsim.engine.results import save_run
 from dynsim.errors import RecordError, SimulationInterrupted
-from dynsim.studies.batch import Keep, RunResult, Work, run_all, shares_lanes
+from dynsim.studies.batch import Keep, Work, run_all, shares_lanes
 from dynsim.studies.cluster import ClusterError
 from dynsim.studies.journal import JOURNAL, OK, PLAN, Journal, Row, earlier_rows
+from dynsim.studies.outcome import RunResult
 from dynsim.studies.plan import Plan, Point
 from dynsim.studies.sweep_statistics import statistics
 from dynsim.studies.worker import WorkerError

@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 
 import pytest
+from support.fault_table import CASES, POLICIES, STATES, TORQUE_ADDRESS, broken_promises, cells, markdown, rig
 
 from dynsim.hardware.bus.packet import Instruction, Packet
-from dynsim.hardware.fault_table import CASES, POLICIES, STATES, TORQUE_ADDRESS, broken_promises, cells, markdown, rig
 
 pytestmark = pytest.mark.long
 

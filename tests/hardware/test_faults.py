@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.fault_table import CASES, POLICIES, Case, broken_promises
 
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.bus.packet import Instruction
-from dynsim.hardware.fault_table import CASES, POLICIES, Case, broken_promises
 from dynsim.hardware.replay.check import velocity_limit
 from dynsim.hardware.replay.rules import Cause, reaction_bound
 from dynsim.hardware.replay.states import State

@@ -26,7 +26,7 @@ faults:
 
 def make_motion(folder: Path) -> None:
     """A short record of the small robot of the bridge's tests, and its map."""
-    from dynsim.hardware.fault_table import MAP, swing
+    from support.fault_table import MAP, swing
 
     swing(0.1).save(folder / "rig.h5")
     (folder / "rig.yaml").write_text(MAP.replace("run_up: 20", "run_up: 20, approach_velocity: 1.0"), encoding="utf-8")

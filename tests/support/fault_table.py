@@ -1,6 +1,6 @@
 """What becomes of every fault under every policy in every state of a replay, by seeded runs on virtual servos.
 
-    python -m dynsim.hardware.fault_table --runs 100 --out results/reference/bridge_faults.json
+    PYTHONPATH=tests python -m support.fault_table --runs 100 --out results/reference/bridge_faults.json
 
 prints the table of docs/hardware.md. A cell is a fault, the state of the replay in which it strikes, and a policy; its
 runs differ in their seed: servo, instant, and what the fault does at random. Two things are held against the wire and

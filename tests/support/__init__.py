@@ -1,0 +1,1 @@
+"""What tests and documented studies of faults share."""
