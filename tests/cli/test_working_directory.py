@@ -41,3 +41,25 @@ def test_a_command_runs_nothing_of_the_working_directory(folder: Path, arguments
     done = subprocess.run([command, *arguments], cwd=folder, capture_output=True, text=True, timeout=300)
     assert not (folder / "mark").exists(), (folder / "mark").read_text()
     assert "Traceback" not in done.stderr
+
+
+SPAWN = """
+import sys
+from multiprocessing import get_context
+from dynsim.teleop.web.servos import safe_path
+
+if __name__ == "__main__":
+    with safe_path():
+        process = get_context("spawn").Process(target=print, args=("started",))
+        process.start()
+    process.join()
+    sys.exit(process.exitcode)
+"""
+
+
+def test_the_process_of_a_drive_runs_nothing_of_the_working_directory(folder: Path, tmp_path_factory) -> None:
+    script = tmp_path_factory.mktemp("elsewhere") / "drive.py"
+    script.write_text(SPAWN)
+    done = subprocess.run([sys.executable, script], cwd=folder, capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stdout) == (0, "started\n"), done.stderr
+    assert not (folder / "mark").exists()

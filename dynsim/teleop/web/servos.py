@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from types import TracebackType
@@ -102,6 +102,20 @@ class PipeFeed:
                 self._bytes += piece
 
 
+@contextmanager
+def safe_path() -> Iterator[None]:
+    """Python that is started within does not run a ``signal.py`` of the working directory."""
+    name = "PYTHONSAFEPATH"
+    if name in os.environ:
+        yield
+        return
+    os.environ[name] = "1"
+    try:
+        yield
+    finally:
+        del os.environ[name]
+
+
 class SimulationProcess:
     """A drive in a process of its own; within its block, after which nothing of it is left.
 
@@ -117,8 +131,9 @@ class SimulationProcess:
         samples, there = context.Pipe(duplex=False)
         if os.name == "posix":
             # Python's own helper lets signals through again when it is started: not while they are held.
-            resource_tracker.ensure_running()
-        with signals_held():
+            with safe_path():
+                resource_tracker.ensure_running()
+        with signals_held(), safe_path():
             heard = context.RawArray("d", [NOT_YET])
             self._process = context.Process(
                 target=simulate, args=(wanted, control, there, heard), name="dynsim simulation", daemon=True
