@@ -127,7 +127,8 @@ def test_compare_says_what_real_contacts_did(tmp_path: Path):
             ],
             "take integrator.method: auto or radau5",
         ),
-        (["plot", "other.h5"], "lacks parts"),
+        (["plot", "other.h5"], "has no digest (SHA-256) at its end"),
+        (["plot", "other.h5", "--trust"], "lacks parts"),
         (["run", "single_pendulum", "--out", "other.h5"], "is a file, not a folder"),
     ],
 )

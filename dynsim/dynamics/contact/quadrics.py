@@ -9,7 +9,6 @@ from dynsim.dynamics.contact.rows import point_row, sticking_rows
 from dynsim.dynamics.contact.unilateral import UnilateralArrays, slide_direction
 from dynsim.dynamics.tables import ContactArrays, ModelArrays, Workspace
 from dynsim.dynamics.tree.spatial import (
-    ZERO_VECTOR,
     dot_vector,
     point_acceleration,
     point_velocity,
@@ -21,7 +20,6 @@ from dynsim.dynamics.tree.spatial import (
     times_number,
     transform,
     vector,
-    wrench_at,
 )
 from dynsim.jit.kernel import exact_kernel, internal_kernel
 
@@ -128,7 +126,9 @@ def unit_force(rows, m, mu, at, n, t):
     signs of the one before.
     """
     x, y, z = n[0] - mu * t[0], n[1] - mu * t[1], n[2] - mu * t[2]
-    put_six(rows, m, ka.DIRECTION, wrench_at(at, (x, y, z), ZERO_VECTOR))
+    # Written out: a function of its own would have its products contracted.
+    wrench = at[1] * z - at[2] * y, at[2] * x - at[0] * z, at[0] * y - at[1] * x, x, y, z
+    put_six(rows, m, ka.DIRECTION, wrench)
 
 
 @internal_kernel
