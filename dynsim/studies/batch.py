@@ -20,8 +20,6 @@ Task = TypeVar("Task")
 
 # Processes that a run may take with it before it is given up: the first may have been ended for another's memory.
 ATTEMPTS = 2
-# Runs of fixed steps that are handed out at once: whole lanes of any processor.
-AT_ONCE = 8
 
 
 def simulate_batch(
@@ -34,9 +32,7 @@ def simulate_batch(
 ) -> list[RunResult]:
     """Simulate many scenarios; one that fails does not keep the others from running.
 
-    Every run is the same to the bit whatever ``jobs`` and whichever runs are beside it, and that of
-    :func:`dynsim.simulate`; runs of ``rk4`` share lanes, where they differ from it by rounding
-    (:func:`dynsim.engine.together.simulate_together`).
+    Every run is that of :func:`dynsim.simulate` to the bit, whatever ``jobs`` and whichever runs are beside it.
 
     Parameters
     ----------
@@ -70,8 +66,7 @@ def simulate_batch(
         if finished is not None:
             finished(task[0], result)
 
-    lanes = any(map(shares_lanes, runs))
-    if run_all(Work(_numbered, keep_records), list(enumerate(runs)), take, lanes, jobs=jobs, scheduler=scheduler):
+    if run_all(Work(_numbered, keep_records), list(enumerate(runs)), take, jobs=jobs, scheduler=scheduler):
         raise SimulationInterrupted(f"interrupted when {len(results)} of {len(runs)} runs were done")
     return [results[k] for k in range(len(runs))]
 
@@ -92,53 +87,16 @@ class Work(Generic[Task]):
     def __init__(self, load: Callable[[Task, Reuse], Scenario], keep: Keep) -> None:
         self._load, self._keep, self._reuse = load, keep, Reuse()
 
-    def __call__(self, tasks: Sequence[Task], look: Progress | None) -> list[RunResult]:
-        """Load and simulate some tasks, those that can together; see :func:`run_one`."""
-        results: dict[int, RunResult] = {}
-        together: dict[int, Scenario] = {}
-        for k, task in enumerate(tasks):
-            try:
-                scenario = self._load(task, self._reuse)
-            except Exception as error:
-                results[k] = _failed(error)
-                continue
-            if shares_lanes(scenario):
-                together[k] = scenario
-            else:
-                results[k] = run_one(scenario, self._keep, look, self._reuse)
-        return [one for _, one in sorted((results | _run_together(together, self._keep, look, self._reuse)).items())]
+    def __call__(self, task: Task, look: Progress | None) -> RunResult:
+        """Load and simulate a task; see :func:`run_one`."""
+        try:
+            scenario = self._load(task, self._reuse)
+        except Exception as error:
+            return _failed(error)
+        return run_one(scenario, self._keep, look, self._reuse)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self._load, self._keep)
-
-
-def shares_lanes(scenario: Scenario) -> bool:
-    """Whether several such scenarios are simulated at once, as far as is known without building them."""
-    if scenario.integrator.method != "rk4":
-        return False
-    # Imported here, as below: other methods need nothing of it.
-    from dynsim.engine.together import can_share
-
-    return can_share(scenario)
-
-
-def _run_together(
-    scenarios: dict[int, Scenario], keep: Keep, look: Progress | None, reuse: Reuse
-) -> dict[int, RunResult]:
-    if not scenarios:
-        return {}
-    from dynsim.engine.together import simulate_together
-
-    started = clock.perf_counter()
-    try:
-        ended = simulate_together(list(scenarios.values()), pictured=keep != "none", reuse=reuse)
-    except SimulationInterrupted:
-        raise
-    except Exception:
-        # A fault of dynsim in one of them: each by itself, as it would have been found alone.
-        return {k: run_one(scenario, keep, look, reuse) for k, scenario in scenarios.items()}
-    wall = (clock.perf_counter() - started) / len(scenarios)
-    return {k: _ended(one, keep, wall) for k, one in zip(scenarios, ended, strict=True)}
 
 
 def run_one(scenario: Scenario, keep: Keep, look: Progress | None, reuse: Reuse | None = None) -> RunResult:
@@ -181,17 +139,14 @@ def _line(error: Exception) -> str:
 
 
 def run_all(
-    work: Callable[[Sequence[Task], Progress], list[RunResult]],
+    work: Callable[[Task, Progress], RunResult],
     tasks: Sequence[Task],
     take: Callable[[Task, RunResult], None],
-    lanes: bool,
     *,
     jobs: int = 1,
     scheduler: str | None = None,
 ) -> bool:
     """Do ``work`` for all tasks here, in processes or on a cluster, and hand every result to ``take`` as it comes.
-
-    It gets neighbours at once where ``lanes`` says that they may share some, else one task at a time.
 
     Returns
     -------
@@ -205,33 +160,30 @@ def run_all(
     """
     if not isinstance(jobs, int) or jobs < 1:
         raise ScenarioError(f"jobs = {shown(jobs)}: must be a whole number of processes, 1 or more")
-    size = max(min(AT_ONCE, -(-len(tasks) // jobs)), 1) if lanes else 1
     if scheduler is not None:
         from dynsim.studies.cluster import run_on_cluster
 
-        return run_on_cluster(work, tasks, take, size, scheduler)
-    pieces = [tasks[first : first + size] for first in range(0, len(tasks), size)]
+        return run_on_cluster(work, tasks, take, scheduler)
     if jobs > 1:
 
-        def take_late(piece: Sequence[Task], result: Callable[[], list[RunResult] | None]) -> None:
+        def take_late(task: Task, result: Callable[[], RunResult | None]) -> None:
             try:
-                found = result()
+                ended = result()
             except (SimulationInterrupted, WorkerInterrupted):
                 return
             except WorkerSilent:
-                found = [RunResult({}, SILENT, lost=True)] * len(piece)
+                ended = RunResult({}, SILENT, lost=True)
             except WorkerLost:
-                found = [RunResult({}, f"{LOST}; is memory short for so many jobs?", lost=True)] * len(piece)
-            for task, one in zip(piece, found, strict=True) if found is not None else ():
-                take(task, one)
+                ended = RunResult({}, f"{LOST}; is memory short for so many jobs?", lost=True)
+            if ended is not None:
+                take(task, ended)
 
-        return run_in_processes(work, pieces, jobs, take_late, attempts=ATTEMPTS)
+        return run_in_processes(work, tasks, jobs, take_late, attempts=ATTEMPTS)
     try:
-        for piece in pieces:
-            results = work(piece, _no_look)
+        for task in tasks:
+            result = work(task, _no_look)
             interruption.keep()
-            for task, one in zip(piece, results, strict=True):
-                take(task, one)
+            take(task, result)
             interruption.heed()
             interruption.check()
     except SimulationInterrupted:

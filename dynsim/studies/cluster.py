@@ -39,16 +39,15 @@ class ClusterError(DynsimError):
 
 
 def run_on_cluster(
-    work: Callable[[Sequence[Task], Progress], list[RunResult]],
+    work: Callable[[Task, Progress], RunResult],
     tasks: Sequence[Task],
     take: Callable[[Task, RunResult], None],
-    together: int,
     address: str,
 ) -> bool:
     """Do ``work`` for all tasks on the workers of a scheduler, see :func:`dynsim.studies.batch.run_all`.
 
-    Tasks go in pieces of about a second, measured as they come back; a worker does so many of one ``together``. A piece
-    whose workers died again and again is taken apart, and what is left of it in the end is lost.
+    Tasks go in pieces of about a second, measured as they come back. A piece whose workers died again and again is
+    taken apart, and what is left of it in the end is lost.
 
     Raises
     ------
@@ -71,7 +70,7 @@ def run_on_cluster(
     wall = _PIECE_S
 
     def submit(piece: list[Task]) -> Any:
-        future = client.submit(_work_through, work, piece, together, __version__, pure=False)
+        future = client.submit(_work_through, work, piece, __version__, pure=False)
         out[future] = piece
         return future
 
@@ -133,16 +132,13 @@ def _quiet() -> Iterator[None]:
             logger.setLevel(level)
 
 
-def _work_through(
-    work: Callable[[Sequence[Task], Progress], list[RunResult]], tasks: Sequence[Task], together: int, version: str
-) -> list[RunResult]:
+def _work_through(work: Callable[[Task, Progress], RunResult], tasks: Sequence[Task], version: str) -> list[RunResult]:
     """On a worker: what there is to do for each task."""
     if version != __version__:
         raise ClusterError(f"a worker has dynsim {__version__}, this is {version}; install the same on all")
     keep_memory()
     with _one_at_a_time:
-        parts = [tasks[first : first + together] for first in range(0, len(tasks), together)]
-        return [result for part in parts for result in work(part, _no_look)]
+        return [work(task, _no_look) for task in tasks]
 
 
 def _no_look(time: float, stage: str = SIMULATION) -> None:

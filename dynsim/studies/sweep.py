@@ -14,7 +14,7 @@ from dynsim._version import __version__
 from dynsim.engine.provenance import commit
 from dynsim.engine.results import save_run
 from dynsim.errors import RecordError, SimulationInterrupted
-from dynsim.studies.batch import Keep, Work, run_all, shares_lanes
+from dynsim.studies.batch import Keep, Work, run_all
 from dynsim.studies.cluster import ClusterError
 from dynsim.studies.journal import JOURNAL, OK, PLAN, Journal, Row, earlier_rows
 from dynsim.studies.outcome import RunResult
@@ -68,8 +68,8 @@ def run_sweep(
     if keep_records != "none":
         check_writable(folder / RECORDS)
     # A key that no scenario has would fail in every run: the first of each variant tells.
-    firsts = [plan.scenario(point) for point in {point.variant: point for point in reversed(points)}.values()]
-    lanes = any(map(shares_lanes, firsts))
+    for point in {point.variant: point for point in reversed(points)}.values():
+        plan.scenario(point)
     header = _header(plan)
     with held(folder):
         earlier = earlier_rows(folder, header, resume, TABLES)
@@ -94,7 +94,7 @@ def run_sweep(
                 if progress is not None:
                     progress(len(rows), failed)
                 work = Work(plan.scenario, keep_records)
-                interrupted = run_all(work, left, take, lanes, jobs=jobs, scheduler=scheduler)
+                interrupted = run_all(work, left, take, jobs=jobs, scheduler=scheduler)
             done = [rows[run] for run in sorted(rows)]
             write_tables(done, plan, folder)
             if plan.laws:

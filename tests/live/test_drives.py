@@ -10,7 +10,6 @@ import pytest
 
 import dynsim
 from dynsim import Record, Scenario, load_scenario, simulate
-from dynsim.engine.together import simulate_together
 from dynsim.errors import DynsimError, ScenarioError
 from dynsim.hardware.replay.check import check_motion
 from dynsim.hardware.servo_map import load_servo_map
@@ -258,21 +257,6 @@ def test_what_cannot_be_driven_is_refused(name: str, change: dict[str, Any], rea
 def test_an_operator_needs_something_to_move() -> None:
     with pytest.raises(ScenarioError, match=r"controller\.operator"):
         dynsim.Simulation(load_scenario("six_axis_arm"), operator=object())  # type: ignore[arg-type]
-
-
-def test_runs_together_follow_their_operators() -> None:
-    """They share no lanes: nothing would be rewritten there."""
-    operator = {
-        "joints": ["base_yaw", "shoulder_pitch", "elbow_pitch"],
-        "commands": [{"at_s": 0, "hand": [0.05, 0, 0]}],
-    }
-    change = {"controller.hand": None, "controller.operator": operator, "duration_s": 0.2}
-    scenario = load_scenario("six_axis_arm", None, change | {"integrator.method": "rk4", "integrator.step_s": 1e-4})
-    record, again = simulate_together([scenario, scenario])
-    assert isinstance(record, Record)
-    assert isinstance(again, Record)
-    assert np.ptp(record["hand_position"][:, 0]) > 1e-3
-    assert_same(record, simulate(scenario))
 
 
 @pytest.mark.parametrize("name", ["snake_operator", "mobile_path", "six_axis_arm"])

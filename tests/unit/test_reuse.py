@@ -89,7 +89,7 @@ def test_runs_that_share_are_those_that_do_not(variant: str, overrides: dict[str
     work = Work(plan.scenario, "none")
     # Twice, the second time from the end: whatever was before.
     for point in points + points[::-1]:
-        (result,) = work([point], None)
+        result = work(point, None)
         scenario_of = partial(ELBOWS.load, variant, fixed | dict(point.values))
         reason, summary = outcome(lambda of=scenario_of: dynsim.simulate(of()).summary)
         assert result.reason == " ".join(reason.split())

@@ -349,36 +349,6 @@ def test_workers_make_messages_only_for_who_listens(listens: bool, monkeypatch: 
     assert sorted(heard) == ([f"number {number}" for number in range(3)] if listens else [])
 
 
-FIXED = SHORT | {"integrator.method": "rk4", "integrator.step_s": 1e-3}
-
-
-def test_runs_on_lanes_are_the_same_whatever_the_jobs_and_neighbours(tmp_path: Path):
-    """Of lengths that share lanes, one that is refused, and another structure between them."""
-    axes = (Axis.parse(f"{LENGTH}=0.5:1:5"), Axis.parse("integrator.step_s=0.001,0.002"), MASSES)
-    swept = Plan(PENDULUM, (None,), FIXED, axes)
-    rows = run_sweep(swept, tmp_path / "one")
-    assert run_sweep(swept, tmp_path / "two", jobs=2) == rows
-    assert [row.status for row in rows] == ["ok", "failed", "ok"] * 10
-    points = list(swept.points())
-    few = dynsim.simulate_batch([swept.scenario(points[k]) for k in (15, 2, 29)])
-    assert [numbers(result.summary) for result in few] == [rows[k].numbers for k in (15, 2, 29)]
-    for k in (0, 2, 29):
-        alone = numbers(dynsim.simulate(swept.scenario(points[k])).summary)
-        assert alone.keys() == rows[k].numbers.keys()
-        # But for sums that cancel: of 5 J, what the ledger does not explain.
-        assert all(value == pytest.approx(alone[key], rel=1e-9, abs=1e-12) for key, value in rows[k].numbers.items())
-
-
-def test_a_fault_in_runs_on_lanes_costs_none_of_them(monkeypatch: pytest.MonkeyPatch):
-    def faulty(*arguments: Any, **options: Any) -> Any:
-        raise ValueError("no lanes today")
-
-    scenarios = [dynsim.load_scenario("single_pendulum", overrides=FIXED | {LENGTH: length}) for length in (0.5, 1.0)]
-    monkeypatch.setattr("dynsim.engine.together.simulate_together", faulty)
-    results = dynsim.simulate_batch(scenarios)
-    assert [numbers(r.summary) for r in results] == [numbers(dynsim.simulate(s).summary) for s in scenarios]
-
-
 def test_the_table_has_every_run_whatever_the_jobs(tmp_path: Path):
     swept = plan(Axis.parse(f"{LENGTH}=0.5:1:3"), MASSES)
     one = run_sweep(swept, tmp_path / "one")
@@ -419,9 +389,9 @@ def test_resuming_runs_what_is_not_there(tmp_path: Path, monkeypatch: pytest.Mon
     ran: list[int] = []
 
     class Watched(module.Work):
-        def __call__(self, points: Any, look: Any) -> Any:
-            ran.extend(point.run for point in points)
-            return super().__call__(points, look)
+        def __call__(self, point: Any, look: Any) -> Any:
+            ran.append(point.run)
+            return super().__call__(point, look)
 
     monkeypatch.setattr(module, "Work", Watched)
     assert run_sweep(swept, tmp_path, resume=True) == whole

@@ -21,11 +21,8 @@ from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact.rows import set_modes
 from dynsim.dynamics.contact.unilateral import FROZEN, REFERENCE, STATIC, STRIBECK, VISCOUS
 from dynsim.dynamics.derivative import System, derivative
-from dynsim.dynamics.simd.system import derivatives, lane_workspace, lanes_of_runs
+from dynsim.dynamics.simd.system import derivatives, lane_workspace
 from dynsim.dynamics.simd.tables import AXES, spread_tables
-from dynsim.integrators.driver import advance
-from dynsim.integrators.fixed_step import advance_lanes, lane_runs
-from dynsim.integrators.run import FINISHED, PROJECTIONS, SAMPLE, STATUS
 from dynsim.jit.kernel import integers, reals
 
 pytestmark = pytest.mark.long
@@ -157,32 +154,6 @@ def of_lane(tables: System, k: int) -> System:
     return tables._replace(**parts)
 
 
-def test_runs_of_their_own_parameters():
-    """Runs of RK4 with masses, gains and references of their own, projected and sampled, against each alone."""
-    (b, q), rng, width = braced(np.random.default_rng(3)), np.random.default_rng(5), lanes_of_runs()
-    tables = varied(b.system, len(width), rng)
-    y, times, h = b.state(q, np.zeros(len(b.robot.links))), np.linspace(0.0, 0.1, 38), 1e-3
-    runs = [b.new_run(y, times, "rk4", step=h) for _ in width]
-    lanes, ws = lane_runs(runs), lane_workspace(b.ws, width)
-    for limit in (0, 1, 10**6):
-        advance_lanes(width, tables, ws, lanes, limit)
-    assert lanes.count[STATUS] == FINISHED
-    assert not lanes.failed.any()
-    for k in range(len(width)):
-        single = Bench(b.robot, of_lane(tables, k), copies(b.ws))
-        run = single.new_run(y, times, "rk4", step=h)
-        advance(single.system, single.ws, run, 10**6)
-        assert run.count[PROJECTIONS] > 0
-        assert lanes.projections[k] == run.count[PROJECTIONS]
-        assert lanes.count[SAMPLE] == run.count[SAMPLE] == 38
-        for name in ("y", "sample", "output", "extremes"):
-            found, expected = getattr(lanes, name)[..., k], getattr(run, name)
-            known = np.isfinite(expected)
-            np.testing.assert_array_equal(found[~known], expected[~known])
-            assert np.abs(found[known] - expected[known]).max() <= 1e-12 * np.abs(expected[known]).max()
-    assert np.ptp(lanes.y, axis=1).max() > 1e-4
-
-
 def short_run() -> np.ndarray:
     """Samples of RADAU5 with everything that it does on lanes."""
     b, q = braced(np.random.default_rng(3))
@@ -224,11 +195,3 @@ def test_other_processors_and_none(environment, tmp_path):
         check=True,
         timeout=600,
     )
-
-
-@pytest.mark.parametrize(("features", "width"), [("+avx,+avx2", 4), ("+avx,+avx2,+avx512f", 8), ("", 4)])
-def test_runs_share_as_many_lanes_as_registers_hold(features, width):
-    shown = "from dynsim.engine.together import LANES; print(LANES)"
-    environment = {**os.environ, "NUMBA_CPU_FEATURES": features}
-    done = subprocess.run([sys.executable, "-c", shown], env=environment, check=True, timeout=60, capture_output=True)
-    assert int(done.stdout) == width

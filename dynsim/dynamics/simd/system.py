@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numba.core import config, types
-from numba.core.registry import cpu_target
 
 from dynsim.dynamics.derivative import System, derivative
 from dynsim.dynamics.simd import forms  # noqa: F401
@@ -19,15 +18,6 @@ from dynsim.jit.kernel import internal_kernel, kernel
 COMPILED = not config.DISABLE_JIT
 # What says how wide lanes are: a tuple of so many zeros.
 FOUR, EIGHT = (0.0,) * 4, (0.0,) * 8
-
-
-def lanes_of_runs() -> tuple[float, ...]:
-    """Lanes for states that are many: as wide as the registers of the processor that the compiler writes for.
-
-    Eight where it has AVX-512. With AVX2 eight run out of registers and each takes no less time than one of four does.
-    """
-    *_, features = cpu_target.target_context.codegen().magic_tuple()
-    return EIGHT if "+avx512f" in features.split(",") else FOUR
 
 
 def lane_workspace(ws: Workspace, width: tuple) -> Workspace:

@@ -13,6 +13,3 @@ DYNSIM_RK43, DYNSIM_RK4 = "dynsim rk43 rtol 1e-6", "dynsim RK4 1 ms"
 DYNSIM_RADAU5 = "dynsim radau5 rtol 1e-6"
 MUJOCO_EULER, MUJOCO_IMPLICIT = "MuJoCo Euler 1 ms", "MuJoCo implicitfast 1 ms"
 """Of the whole job."""
-
-ONE_STATE, FOUR_LANES, EIGHT_LANES = "one state", "4 lanes", "8 lanes"
-"""Of states evaluated together, and of runs that share lanes."""

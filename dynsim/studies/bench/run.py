@@ -10,7 +10,7 @@ from typing import Any
 
 from dynsim._version import __version__
 from dynsim.engine.provenance import commit
-from dynsim.studies.bench import job, precision, right_hand_side, sweeps, together, variants
+from dynsim.studies.bench import job, precision, right_hand_side, sweeps, variants
 from dynsim.studies.bench.programs import (
     ABA,
     CONSTRAINT_DYNAMICS,
@@ -24,7 +24,6 @@ from dynsim.studies.bench.programs import (
     MUJOCO_EULER,
     MUJOCO_FREE,
     MUJOCO_IMPLICIT,
-    ONE_STATE,
     SCENARIO,
     STEP,
 )
@@ -50,10 +49,9 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
     -------
     dict, ready for JSON
         ``machine``, ``versions``, ``method`` (how it was measured), ``right_hand_side`` (per size: microseconds by
-        contender, medians and minima), ``job`` (per case and program: wall time and errors), ``together`` (per state
-        and per step of a run: microseconds alone and on lanes), ``variants`` (per variant, contacts and method: time),
-        ``sweeps`` (per number of runs and processes: wall time), ``precision`` (per shipped scenario, method and
-        tolerance: time, error, ledger), ``ratios`` (how many times longer the other program
+        contender, medians and minima), ``job`` (per case and program: wall time and errors), ``variants`` (per variant,
+        contacts and method: time), ``sweeps`` (per number of runs and processes: wall time), ``precision`` (per shipped
+        scenario, method and tolerance: time, error, ledger), ``ratios`` (how many times longer the other program
         takes, or dynsim otherwise), ``unavailable`` (what is missing and why).
     """
     report = progress or (lambda text, fraction: None)
@@ -76,9 +74,7 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
     for k, case in enumerate(job.CASES):
         report(f"10 s job, {case}", 0.4 + 0.2 * k / len(job.CASES))
         jobs += job.measure_job(case, 3 if quick else 21, with_mujoco=not mujoco_missing)
-    report("runs that share lanes", 0.6)
-    shared = together.measure(rounds, share)
-    report("variants, on a real floor too", 0.63)
+    report("variants, on a real floor too", 0.6)
     elbows = variants.measure(3 if quick else 9)
     report("sweeps", 0.65)
     swept = sweeps.measure(quick)
@@ -107,13 +103,12 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
         },
         "right_hand_side": sizes,
         "job": jobs,
-        "together": shared,
         "variants": elbows,
         "sweeps": swept,
         "precision": exact,
         "unavailable": {"mujoco": mujoco_missing} if mujoco_missing else {},
     }
-    result["ratios"] = [*_ratios(sizes, jobs), *_own_ratios(jobs, shared), *_at_equal_error(exact)]
+    result["ratios"] = [*_ratios(sizes, jobs), *_own_ratios(jobs), *_at_equal_error(exact)]
     result["ratios"] += [*_ratios_of_variants(elbows), *_growth(swept)]
     return result
 
@@ -181,8 +176,8 @@ def _growth(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return found
 
 
-def _own_ratios(jobs: list[dict[str, Any]], shared: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """How many times longer dynsim takes by rk43 than by radau5, and for one after the other than together."""
+def _own_ratios(jobs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """How many times longer dynsim takes by rk43 than by radau5."""
     rows = []
     for case in job.CASES:
         row = {one["program"]: one for one in jobs if one["case"] == case}
@@ -197,18 +192,6 @@ def _own_ratios(jobs: list[dict[str, Any]], shared: list[dict[str, Any]]) -> lis
                 "hand_error": explicit["hand_error_max_m"] / implicit["hand_error_max_m"],
             }
         )
-    for one in shared:
-        for name in one["median_us"]:
-            if name != ONE_STATE:
-                rows.append(
-                    {
-                        "task": one["task"],
-                        "peer": ONE_STATE,
-                        "dynsim": name,
-                        "time": one["median_us"][ONE_STATE] / one["median_us"][name],
-                        "time_minima": one["minimum_us"][ONE_STATE] / one["minimum_us"][name],
-                    }
-                )
     return rows
 
 

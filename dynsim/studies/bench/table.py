@@ -13,11 +13,8 @@ from dynsim.studies.bench.programs import (
     DYNSIM_RADAU5,
     DYNSIM_RK4,
     DYNSIM_RK43,
-    EIGHT_LANES,
-    FOUR_LANES,
     MUJOCO_EULER,
     MUJOCO_IMPLICIT,
-    ONE_STATE,
 )
 
 
@@ -65,13 +62,6 @@ def format_table(result: dict[str, Any]) -> list[Table]:
                 ratios.add_row(f"[bold]{task.removeprefix('10 s job, ')}[/bold]")
             ratios.add_row(f"  {row['peer']}", *("" for _ in sizes), _number(row["time"]), _number(row["hand_error"]))
 
-    together = _table("States evaluated together, median µs of each", "")
-    names = (ONE_STATE, FOUR_LANES, EIGHT_LANES)
-    for name in names:
-        together.add_column(name, justify="right")
-    for row in result["together"]:
-        together.add_row(row["task"], *(_number(row["median_us"].get(name)) for name in names))
-
     work = _table("Work and precision: CPU ms and error at rtol 1e-6", "")
     work.caption = f"ratio: time of rk43 over that of radau5 for an error of {precision.EQUAL_ERROR:g}"
     for method in precision.METHODS:
@@ -103,7 +93,7 @@ def format_table(result: dict[str, Any]) -> list[Table]:
     for contacts, variant in dict.fromkeys((row["contacts"], row["variant"]) for row in result["variants"]):
         least = (times_of.get((contacts, variant, method)) for method in variants.METHODS)
         elbows.add_row(f"{contacts}, {variant}", *(_number(seconds, 1e3) for seconds in least))
-    return [times, whole, ratios, together, elbows, many, work]
+    return [times, whole, ratios, elbows, many, work]
 
 
 def _table(title: str, first: str) -> Table:
