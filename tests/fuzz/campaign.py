@@ -128,6 +128,9 @@ class Worker:
         if "Timeout (" in log:
             return Outcome(HANG, "heeds no Ctrl-C", place, log[-1500:])
         code = process.returncode
+        if code == 130:
+            # Ctrl-C in the compiler, which cannot be ended but with its process.
+            return Outcome(INTERRUPTED, detail=log[-1500:])
         end = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         return Outcome(CRASH, f"the process ended: {end}", place, log[-1500:])
 
