@@ -133,6 +133,8 @@ def check_signal(name: str, signal: Signal, samples: Mapping[str, int]) -> None:
         raise RecordError(f"signal {name!r} has {data.shape[0]} samples, {where} has {samples[signal.axis]}")
     if data.ndim > 1 and len(signal.labels) != data.shape[1]:
         raise RecordError(f"signal {name!r} has {data.shape[1]} columns and {len(signal.labels)} labels")
+    if data.ndim == 1 and signal.labels:
+        raise RecordError(f"signal {name!r} has no columns and {len(signal.labels)} labels")
 
 
 def is_numeric(dtype: Any) -> bool:
