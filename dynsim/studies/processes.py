@@ -91,6 +91,7 @@ class _Worker:
     silent: float = 0.0
     said: deque[str] = field(default_factory=lambda: deque(maxlen=_LAST_LINES))
     threads: list[threading.Thread] = field(default_factory=list)
+    printing: threading.Lock = field(default_factory=threading.Lock)
 
     def begin(self, inbox: SimpleQueue[tuple[_Worker, tuple[Any, ...] | None]]) -> None:
         """Start the threads; what it sends comes to the inbox, None at its end."""
@@ -119,9 +120,17 @@ class _Worker:
         assert self.process.stderr is not None
         with suppress(OSError, ValueError), self.process.stderr as stream:
             for line in stream:
-                self.said.append(line.decode("utf-8", "replace").rstrip())
-                if self.ready and sys.stderr is not None:
-                    print(self.said[-1], file=sys.stderr, flush=True)
+                with self.printing:
+                    self.said.append(line.decode("utf-8", "replace").rstrip())
+                    if self.ready:
+                        _print(self.said[-1])
+
+    def is_ready(self) -> None:
+        """It has given its first sign of life: what it has written to stderr until then is written too."""
+        with self.printing:
+            self.ready = True
+            for line in self.said:
+                _print(line)
 
     @property
     def room(self) -> int:
@@ -139,6 +148,11 @@ class _Worker:
         # A process that it has started may have its streams open.
         for thread in self.threads:
             thread.join(_PATIENCE_S)
+
+
+def _print(line: str) -> None:
+    if sys.stderr is not None:
+        print(line, file=sys.stderr, flush=True)
 
 
 def run_in_processes(
@@ -257,7 +271,7 @@ class _Pool:
         worker.silent = 0.0
         match message:
             case (messages.READY,):
-                worker.ready = True
+                worker.is_ready()
             case (messages.HEARD,):
                 worker.heard = True
             case (messages.LOG, name, level, text):
