@@ -69,7 +69,7 @@ def make_record(
     record.add("torque", run.outputs("torque"), force, labels=driven, description="shaft torques, [WM] eq 25")
     record.add("power", current * voltage, "W", labels=driven, description="electrical power u i")
     record.add("hand_position", run.outputs("hand"), "m", labels=("x", "y", "z"))
-    target = prepared.control.target(record.time, prepared.reuse)
+    target = prepared.control.target(record.time)
     if target is not None:
         record.add("target_position", target, "m", labels=("x", "y", "z"))
     for integral, (name, text) in zip(_by_column(run.states("ledger")), metrics.INTEGRALS.items(), strict=True):
@@ -103,7 +103,7 @@ def make_record(
     for event in happened:
         record.add_event(event.time, event.kind, event.name)
     if pictured:
-        record.scene = robot_scene(robot, contacts, build.surfaces(scenario, prepared.reuse))
+        record.scene = robot_scene(robot, contacts, build.surfaces(scenario))
         add_body_poses(record)
     deficient, spread = int(prepared.workspace.counts[ka.DEPENDENT]), None
     shared: list[str] = []
@@ -134,7 +134,7 @@ def make_record(
         stops=tuple(prepared.stops),
         stepping=None if run.stepping is None else _stepping(run),
     )
-    record.summary = metrics.summarise(record, scenario, contacts, robot, counts, prepared.reuse)
+    record.summary = metrics.summarise(record, scenario, contacts, robot, counts)
     record.summary["warnings"] += beyond_stops(robot, prepared.stops, prepared.control)
     record.summary["warnings"] += without_effect(scenario, bool(robot.motors))
     record.summary["motors"] = motor_loads(record, robot)

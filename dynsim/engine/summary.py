@@ -22,7 +22,7 @@ from dynsim.model.drives import Drive, Motor, Servo, TorqueSource
 from dynsim.record import Record
 from dynsim.record.measures import RESIDUAL_LIMIT, STORES, base_summary, energy_turnover, hand_error, percent, sinks
 from dynsim.scenario import Scenario, build
-from dynsim.system.reuse import Reuse
+from dynsim.system.memo import recall
 
 # Integrals that the integrator carries, in the order of the state (dynsim.dynamics.ledger).
 INTEGRALS = {
@@ -160,9 +160,8 @@ def summarise(
     contacts: Sequence[Contact],
     robot: Robot,
     counts: Counts,
-    reuse: Reuse | None = None,
 ) -> dict[str, Any]:
-    """The content of ``summary.json``; ``reuse``: what other runs have computed."""
+    """The content of ``summary.json``."""
     duration = float(record.time[-1] - record.time[0]) if len(record) else 0.0
 
     def final(name: str) -> float:
@@ -170,10 +169,10 @@ def summarise(
 
     turnover = energy_turnover(record)
     residual = float(np.abs(record["energy_residual"]).max(initial=0.0))
-    lever = (reuse or Reuse()).of("lever", lambda: gravity_lever(robot), robot)
+    lever = recall("lever", lambda: gravity_lever(robot), robot)
     floor = residual_floor(record, robot, scenario.integrator.rtol, counts.unilateral is not None, lever)
     denominator = max(turnover, floor)
-    sunk = sinking(robot, build.surfaces(scenario, reuse), record["q"], reuse)
+    sunk = sinking(robot, build.surfaces(scenario), record["q"])
     summary: dict[str, Any] = {
         "scenario": scenario.name,
         "variant": scenario.variant,
