@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.draw.page.mesh_files import Mesh
+from dynsim.draw.geometry.mesh_files import Mesh
 from dynsim.record.quaternion import rotated
 
 Array = NDArray[np.float64]
@@ -19,7 +19,7 @@ ENDS = 3
 
 
 def solid(shape: dict[str, Any], meshes: list[Mesh], finer: int = 1) -> tuple[Array, Faces]:
-    """Corners, (n, 3) [m], and faces, (m, 4), of a shape of :mod:`dynsim.draw.page.solids`.
+    """Corners, (n, 3) [m], and faces, (m, 4), of a shape of :mod:`dynsim.draw.geometry.shapes`.
 
     A triangle repeats a corner. What is round has ``finer`` times as many faces around it.
     """

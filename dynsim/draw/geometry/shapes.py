@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.draw.page.meshes import Meshes
+from dynsim.draw.geometry.meshes import Meshes
 from dynsim.record.quaternion import of_turn
 from dynsim.record.scene import HERE, WORLD, Body, Scene, Shape, Surface
 from dynsim.record.surface_points import box_corners, surface_grids
