@@ -29,10 +29,10 @@ from dynsim.draw.figures.skeleton import (
 )
 from dynsim.draw.figures.solids import faces, outline
 from dynsim.draw.figures.style import Array
+from dynsim.draw.geometry.surfaces import round_patch, surface_grids
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
 from dynsim.record.scene import Surface
-from dynsim.record.surface_points import round_patch, surface_grids
 
 # An axis of the 3D view shorter than this share of the longest has two ticks.
 SHORT_AXIS = 0.45

@@ -21,11 +21,11 @@ from dynsim.draw.geometry.meshes import Meshes, simplified
 from dynsim.draw.geometry.robot import Contact, Robot, Sunk, contacts, largest_force, paths, sunk
 from dynsim.draw.geometry.shapes import body_shapes, drawn_shape, drawn_surface, gripper
 from dynsim.draw.geometry.solids import grid_faces, solid
+from dynsim.draw.geometry.surfaces import round_patch, surface_grids
 from dynsim.draw.geometry.wheels import cop_of, supports, wheel_groups
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import rotated
 from dynsim.record.scene import HERE, WORLD, Surface
-from dynsim.record.surface_points import round_patch, surface_grids
 
 Array = NDArray[np.float64]
 FINER = 2

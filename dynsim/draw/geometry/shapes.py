@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.draw.geometry.meshes import Meshes
+from dynsim.draw.geometry.surfaces import box_corners, surface_grids
 from dynsim.record.quaternion import of_turn
 from dynsim.record.scene import HERE, WORLD, Body, Scene, Shape, Surface
-from dynsim.record.surface_points import box_corners, surface_grids
 
 Array = NDArray[np.float64]
 # Radius of a rod drawn for a body without shapes, in parts of the robot's reach.
