@@ -27,8 +27,7 @@ from dynsim.draw.film.strokes import font, labels
 from dynsim.draw.geometry.camera import view_axes
 from dynsim.draw.geometry.meshes import Meshes
 from dynsim.draw.geometry.robot import bounds
-from dynsim.draw.geometry.shapes import body_shapes, from_z
-from dynsim.draw.geometry.solids import solid
+from dynsim.draw.geometry.shapes import body_shapes, from_z, solid
 from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.record.poses import ORIENTATION, POSITION, point_positions

@@ -27,8 +27,8 @@ from dynsim.draw.figures.skeleton import (
     skeleton,
     with_labels,
 )
-from dynsim.draw.figures.solids import faces, outline
 from dynsim.draw.figures.style import Array
+from dynsim.draw.geometry.shapes import grid_faces, outline
 from dynsim.draw.geometry.surfaces import round_patch, surface_grids
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
@@ -257,7 +257,7 @@ def _space_view(
     base = [] if body is None or not drawn else body.solids(body.shown()[-1])
     if base:
         # One collection: it sorts its faces by depth.
-        shown = np.concatenate([faces(solid) for solid in base])
+        shown = np.concatenate([corners[faces] for corners, faces in base])
         solid = Poly3DCollection(shown, facecolors=BASE_COLOUR, linewidths=0, shade=True, antialiased=False, zorder=2.5)
         axes.add_collection3d(solid, autolim=False)
     sunk = [] if body is None else [penetration.below_surfaces(body, row) for row in body.shown()]
@@ -315,12 +315,7 @@ def _draw_surface(axes: Axes3D, surface: Surface, low: Array, high: Array) -> No
         grids = surface_grids(surface, low, high)
     if surface.kind in ("height_field", "box"):
         grids = [_within(grid, low, high) for grid in grids]
-    cells = [
-        np.stack([grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]], axis=2).reshape(-1, 4, 3)
-        for grid in grids
-    ]
-    quads = np.concatenate(cells)
-    quads = quads[np.isfinite(quads).all(axis=(1, 2))]
+    quads = np.concatenate([corners[faces] for corners, faces in map(grid_faces, grids)])
     if len(quads):
         axes.add_collection3d(
             Poly3DCollection(list(quads), facecolors="#BBBBBB", alpha=0.25, linewidths=0, zorder=0, antialiased=False),
