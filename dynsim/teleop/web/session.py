@@ -15,7 +15,6 @@ from dynsim.draw.page import page
 from dynsim.errors import DynsimError, SimulationStopped
 from dynsim.record.quaternion import rotated
 from dynsim.record.scene import WORLD
-from dynsim.record.surface_points import normals
 from dynsim.system import interruption
 from dynsim.teleop.driven import NO_REQUEST, Driven, Order, Shown
 from dynsim.teleop.web.helm import DRIVING, Helm
@@ -208,7 +207,7 @@ class Session:
             if point.body != WORLD:
                 place, turn = shown.poses[point.body, :3], shown.poses[point.body, 3:]
                 at = place + rotated(turn, at)
-            normal = normals(surface, at[None])[0]
+            normal = surface.normal(at)
             found[point.name] = {
                 "force": round(touch.force, 3),
                 "normal": np.round(normal, 5).tolist(),
