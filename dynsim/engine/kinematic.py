@@ -14,9 +14,9 @@ from dynsim.engine.compilation import kernels_logged
 from dynsim.engine.kinematic_record import COORDINATES, make_record
 from dynsim.engine.kinematic_run import Run
 from dynsim.engine.mode_switching import ModeSwitcher
-from dynsim.engine.outcome import check_size, raise_stopped
+from dynsim.engine.outcome import check_size, interrupted, raise_stopped
 from dynsim.engine.provenance import provenance
-from dynsim.errors import ModelError, ScenarioError, SimulationInterrupted, SimulationStopped
+from dynsim.errors import ModelError, ScenarioError, SimulationStopped
 from dynsim.jit.kernel import integers, reals
 from dynsim.library.families import member
 from dynsim.record import Record
@@ -135,9 +135,7 @@ def simulate(
         interruption.keep()
         interruption.answered()
         reached = float(run.state.counts[ss.TICKS] * controller.schedule.period)
-        stop = SimulationInterrupted(
-            f"interrupted at t = {reached:.3f} s of {scenario.duration_s:g} s", time=reached, state=_named(run.state)
-        )
+        stop = interrupted(scenario, reached, _named(run.state))
     wall = clock.perf_counter() - started
     log.info("%s: integrated %d control periods in %.3f s", scenario.title, run.state.counts[ss.TICKS], wall)
     record = make_record(run, scenario, provenance(scenario), switcher, wall, pictured)

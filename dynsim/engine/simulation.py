@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dynsim.compile.model import Model
-from dynsim.compile.references.operated import VelocitySource
+from dynsim.compile.references.teleop import VelocitySource
 from dynsim.compile.tables import check_couplings
 from dynsim.dynamics import state as kst
 from dynsim.dynamics import tables as ka
@@ -144,10 +144,10 @@ class Simulation:
         run.clock[[ki.TIME, ki.COUNTED_SINCE]] = start
         run.tick[:, [ki.TICK_NEXT, ki.TICK_PHASE]] = start
         self._refill()
-        operated = self._prepared.control.operated
-        self._operator = None if operated is None else Operator(self.model, operated, operator)
-        if operated is not None and self._operator is not None:
-            self.every(1.0 / operated.rate, self._operator)
+        options = self._prepared.control.teleop
+        self._operator = None if options is None else Operator(self.model, options, operator)
+        if self._operator is not None:
+            self.every(1.0 / self._operator.options.rate, self._operator)
         elif operator is not None:
             raise ScenarioError("an operator needs a scenario with controller.operator, which says what it moves")
 
