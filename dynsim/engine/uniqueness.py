@@ -19,7 +19,6 @@ from dynsim.dynamics.contact.delassus import RANK_TOLERANCE
 from dynsim.dynamics.contact.quadrics import SIGNS_LIMIT
 from dynsim.dynamics.derivative import System, derivative, new_workspace
 from dynsim.dynamics.tree.articulated import accelerate
-from dynsim.engine.summary import MotionSpread
 from dynsim.integrators import run as ki
 from dynsim.model.description import Contact
 
@@ -37,6 +36,25 @@ SPREAD_SAMPLES = 5
 NULL_TOLERANCE = 1e-9
 # A spread below this fraction of the accelerations is rounding of the null space.
 SPREAD_TOLERANCE = 1e-7
+
+
+@dataclass(frozen=True)
+class MotionSpread:
+    """What dependent frictional rows leave open: the range of one joint's acceleration over all admissible splits.
+
+    Attributes
+    ----------
+    joint : name; unit : of its acceleration
+    time : [s]
+    low, high : least and greatest acceleration; taken : that of the run, from the split of least norm
+    """
+
+    joint: str
+    unit: str
+    time: float
+    low: float
+    high: float
+    taken: float
 
 
 @dataclass(frozen=True)
