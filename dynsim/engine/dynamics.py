@@ -19,7 +19,7 @@ from dynsim.integrators import run as ki
 from dynsim.record import Event, Record
 from dynsim.scenario import Scenario
 from dynsim.system import interruption
-from dynsim.system.reuse import Reuse
+from dynsim.system.memo import recall
 
 __all__ = ["Prepared", "check", "prepare", "simulate"]
 
@@ -31,16 +31,14 @@ _ALL = 1 << 62
 TICKS = 10
 
 
-def simulate(
-    scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True, reuse: Reuse | None = None
-) -> Record:
+def simulate(scenario: Scenario, progress: Progress | None = None, *, pictured: bool = True) -> Record:
     """See :func:`dynsim.engine.simulate`."""
-    prepared = prepare(scenario, progress, reuse=reuse)
+    prepared = prepare(scenario, progress)
     if prepared.control.teleop is not None:
         return _teleoperated(scenario, progress, pictured)
     size = prepared.model.n, len(prepared.contacts), len(prepared.stops)
     # Loading or compiling the kernels is no integration time.
-    prepared.reuse.of("kernels", partial(attended.load, prepared), prepared.choice.method, *size)
+    recall("kernels", partial(attended.load, prepared), prepared.choice.method, *size)
     watch, run = attended.WallWatch(scenario.integrator.wall_limit_s), prepared.run
 
     def look() -> None:

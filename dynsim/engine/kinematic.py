@@ -37,7 +37,6 @@ from dynsim.snake.kinematics import pose_of_point
 from dynsim.snake.state import State, new_rig, new_state, new_trace
 from dynsim.snake.ticks import record_row, run_ticks
 from dynsim.system import interruption
-from dynsim.system.reuse import Reuse
 
 log = logging.getLogger(__name__)
 
@@ -111,9 +110,8 @@ def simulate(
     source: CommandSource | None = None,
     *,
     pictured: bool = True,
-    reuse: Reuse | None = None,
 ) -> Record:
-    """See :func:`dynsim.engine.simulate`; also raises what :func:`prepare` raises. Nothing is reused.
+    """See :func:`dynsim.engine.simulate`; also raises what :func:`prepare` raises.
 
     A live ``source`` (joystick) replaces the commands and paths of the scenario. It is asked in every control period,
     with what the robot has done; to run in real time it waits in ``read`` until the period has come.

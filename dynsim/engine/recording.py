@@ -61,7 +61,7 @@ def make_record(
     record.add("torque", run.outputs("torque"), force, labels=driven, description="shaft torques, [WM] eq 25")
     record.add("power", current * voltage, "W", labels=driven, description="electrical power u i")
     record.add("hand_position", run.outputs("hand"), "m", labels=("x", "y", "z"))
-    target = prepared.control.target(record.time, prepared.reuse)
+    target = prepared.control.target(record.time)
     if target is not None:
         record.add("target_position", target, "m", labels=("x", "y", "z"))
     for integral, (name, text) in zip(_by_column(run.states("ledger")), metrics.INTEGRALS.items(), strict=True):
@@ -95,7 +95,7 @@ def make_record(
     for event in happened:
         record.add_event(event.time, event.kind, event.name)
     if pictured:
-        record.scene = robot_scene(robot, contacts, build.surfaces(scenario, prepared.reuse))
+        record.scene = robot_scene(robot, contacts, build.surfaces(scenario))
         add_body_poses(record)
     record.summary = metrics.summarise(record, scenario, prepared, wall)
     return record

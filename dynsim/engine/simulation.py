@@ -42,6 +42,7 @@ from dynsim.record.measures import TIP_OVER
 from dynsim.scenario import Scenario, require_scenario
 from dynsim.scenario.build import check_start
 from dynsim.system import interruption
+from dynsim.system.memo import Memo, remembering
 
 Array = NDArray[np.float64]
 
@@ -109,7 +110,9 @@ class Simulation:
             raise ScenarioError(f"a simulation from t = {start:g} s cannot end at {end:g} s")
         self._scenario = scenario
         self._end = min(end, _FAR)
-        self._prepared = prepare(scenario, pushable=True, times=np.full(1, np.inf), end=self._end, motors=motors)
+        # Tables that callers may change are nobody else's.
+        with remembering(Memo()):
+            self._prepared = prepare(scenario, pushable=True, times=np.full(1, np.inf), end=self._end, motors=motors)
         self._time, self._wall, self._loaded = start, 0.0, False
         # Of a ring, and of a run that goes on from another, the ledger counts from the first sample on.
         self._relative = trace is not None or state is not None

@@ -20,6 +20,7 @@ from dynsim.model.drives import Drive, TorqueSource
 from dynsim.record import Record
 from dynsim.record.measures import RESIDUAL_LIMIT, STORES, base_summary, energy_turnover, hand_error, sinks
 from dynsim.scenario import Scenario, build
+from dynsim.system.memo import recall
 
 # Integrals that the integrator carries, in the order of the state (dynsim.dynamics.ledger).
 INTEGRALS = {
@@ -88,7 +89,7 @@ def gravity_lever(robot: Robot) -> tuple[float, float]:
 def summarise(record: Record, scenario: Scenario, prepared: Prepared, wall: float) -> dict[str, Any]:
     """The content of ``summary.json`` for a run that has taken ``wall`` [s]."""
     run, robot, contacts = prepared.run, prepared.model.robot, prepared.contacts
-    unilateral, reuse = prepared.system.unilateral, prepared.reuse
+    unilateral = prepared.system.unilateral
     duration = float(record.time[-1] - record.time[0]) if len(record) else 0.0
 
     def final(name: str) -> float:
@@ -96,10 +97,10 @@ def summarise(record: Record, scenario: Scenario, prepared: Prepared, wall: floa
 
     turnover = energy_turnover(record)
     residual = float(np.abs(record["energy_residual"]).max(initial=0.0))
-    lever = reuse.of("lever", lambda: gravity_lever(robot), robot)
+    lever = recall("lever", lambda: gravity_lever(robot), robot)
     floor = residual_floor(record, robot, scenario.integrator.rtol, unilateral is not None, lever)
     scale = max(turnover, floor)
-    sunk = sinking(robot, build.surfaces(scenario, reuse), record["q"], reuse)
+    sunk = sinking(robot, build.surfaces(scenario), record["q"])
     summary: dict[str, Any] = {
         "scenario": scenario.name,
         "variant": scenario.variant,

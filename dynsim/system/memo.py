@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import struct
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -15,7 +17,7 @@ T = TypeVar("T")
 KEPT = 4
 
 
-class Reuse:
+class Memo:
     """Results of pure functions, each known by what it was computed from.
 
     Numbers, texts and arrays are the same where their bits are (−0.0 is not 0.0, 1 is not 1.0), and so are tuples,
@@ -26,15 +28,9 @@ class Reuse:
     def __init__(self) -> None:
         self._kept: dict[str, OrderedDict[Hashable, tuple[Any, Any]]] = {}
 
-    def of(self, what: str, make: Callable[[], T], *inputs: Any) -> T:
-        """What ``make`` gives, or gave for the same inputs.
-
-        Parameters
-        ----------
-        what : kind of result; each keeps the last :data:`KEPT`
-        inputs : all that the result depends on
-        """
-        kept, key = self._kept.setdefault(what, OrderedDict()), _bits(inputs)
+    def recall(self, kind: str, make: Callable[[], T], *inputs: Any) -> T:
+        """See :func:`recall`."""
+        kept, key = self._kept.setdefault(kind, OrderedDict()), _bits(inputs)
         if key in kept:
             kept.move_to_end(key)
             return cast(T, kept[key][1])
@@ -44,6 +40,31 @@ class Reuse:
         if len(kept) > KEPT:
             kept.popitem(last=False)
         return result
+
+
+_current: ContextVar[Memo | None] = ContextVar("memo", default=None)
+
+
+@contextmanager
+def remembering(memo: Memo | None = None) -> Iterator[None]:
+    """Within: :func:`recall` goes by this memo; by default by the one around, or a new one where there is none."""
+    token = _current.set(memo or _current.get() or Memo())
+    try:
+        yield
+    finally:
+        _current.reset(token)
+
+
+def recall(kind: str, make: Callable[[], T], *inputs: Any) -> T:
+    """What ``make`` gives, or gave within the same :func:`remembering` for the same inputs.
+
+    Parameters
+    ----------
+    kind : of the result; each keeps the last :data:`KEPT`
+    inputs : all that the result depends on
+    """
+    memo = _current.get()
+    return make() if memo is None else memo.recall(kind, make, *inputs)
 
 
 def _bits(value: Any) -> Hashable:

@@ -14,16 +14,16 @@ from dynsim.scenario import build, read_scenario, shipped_scenarios
 from dynsim.studies.batch import Work
 from dynsim.studies.columns import numbers
 from dynsim.studies.plan import Axis, Plan
-from dynsim.system.reuse import KEPT, Reuse
+from dynsim.system.memo import KEPT, Memo, recall, remembering
 
 ELBOWS = read_scenario("elbow_comparison")
 
 
 def test_results_are_known_by_the_bits_of_their_inputs():
-    reuse, made = Reuse(), itertools.count()
+    memo, made = Memo(), itertools.count()
 
     def of(*inputs: Any) -> int:
-        return reuse.of("count", lambda: next(made), *inputs)
+        return memo.recall("count", lambda: next(made), *inputs)
 
     array = np.array([1.0, 0.0])
     first = of(array, [1.0, {"a": (2, None)}])
@@ -46,13 +46,30 @@ def test_results_are_known_by_the_bits_of_their_inputs():
 
 
 def test_only_the_last_results_are_kept_and_no_errors():
-    reuse, made = Reuse(), []
+    memo, made = Memo(), []
     for k in [*range(KEPT + 1), 0, KEPT]:
-        reuse.of("k", lambda k=k: made.append(k), k)
+        memo.recall("k", lambda k=k: made.append(k), k)
     assert made == [*range(KEPT + 1), 0]
     for _ in range(2):
         with pytest.raises(ZeroDivisionError):
-            reuse.of("broken", lambda: 1 / 0)
+            memo.recall("broken", lambda: 1 / 0)
+
+
+def test_a_memo_lasts_as_long_as_its_context_and_the_outer_one_is_shared():
+    made = itertools.count()
+
+    def of(key: str) -> int:
+        return recall("count", lambda: next(made), key)
+
+    assert of("a") != of("a")
+    with remembering():
+        first = of("a")
+        with remembering():
+            assert of("a") == first
+        with remembering(Memo()):
+            assert of("a") != first
+        assert of("a") == first
+    assert of("a") != first
 
 
 def outcome(run: Callable[[], Any]) -> tuple[str, Any]:
