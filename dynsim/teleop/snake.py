@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from dynsim.compile.scene import snake_scene
-from dynsim.engine.kinematic import advance_piece, load_kernels, mode_switcher, prepare, read_commands
-from dynsim.engine.kinematic_record import COORDINATES, OBSTACLES, make_record
-from dynsim.engine.provenance import provenance
+from dynsim.engine.kinematic import prepare
+from dynsim.engine.kinematic_record import OBSTACLES, make_record
+from dynsim.engine.kinematic_run import COORDINATES
 from dynsim.record import Record
 from dynsim.record.poses import poses_at
 from dynsim.scenario import Scenario
@@ -35,9 +35,8 @@ class SnakeSession:
         self._command = Command((0.0,) * 6)
         self._commands: list[dict[str, Any]] = []
         self._run = prepare(with_controller(scenario, longest, controller), self)
-        self._switcher = mode_switcher(self._run)
-        load_kernels(self._run)
-        self.still = make_record(self._run, scenario, provenance(scenario), self._switcher, 0.0)
+        self._run.load_kernels()
+        self.still = make_record(self._run, scenario, 0.0)
         self._scene = snake_scene(self._run.description)
         group = "gripper" if self._run.description.point_offset > 0.0 else "head"
         self.axes = tuple(
@@ -50,12 +49,12 @@ class SnakeSession:
     @property
     def ticks(self) -> int:
         """Control periods so far."""
-        return int(self._run.state.counts[ss.TICKS])
+        return self._run.tick
 
     @property
     def time(self) -> float:
         """[s]."""
-        return self.ticks * self.period
+        return self._run.time
 
     @property
     def finished(self) -> bool:
@@ -83,8 +82,8 @@ class SnakeSession:
             self._commands.append({"at_s": self.ticks * self.period, **entry})
         if self.ticks == 0:
             # What was known when the run was prepared is not what is commanded now.
-            read_commands(self._run, waiting=False)
-        advance_piece(self._run, self._switcher)
+            self._run.read_commands(waiting=False)
+        self._run.advance()
 
     def frame(self) -> Frame:
         """The posture now."""
@@ -103,7 +102,7 @@ class SnakeSession:
             extra={
                 "wheels": run.controller.law.grounded[row].tolist(),
                 "gripper": int(self._command.closed),
-                "mode": run.controller.modes.numbers[row],
+                "mode": run.mode,
             },
             touching={},
         )
@@ -125,4 +124,4 @@ class SnakeSession:
         """The record of all ticks so far; its scenario is the script."""
         duration = max(self.ticks, 1) * self.period
         script = with_controller(self._scenario, duration, {**self._controller, "commands": self._commands})
-        return make_record(self._run, script, provenance(script), self._switcher, 0.0)
+        return make_record(self._run, script, 0.0)
