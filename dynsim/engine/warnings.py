@@ -12,9 +12,8 @@ from dynsim.compile.contact_law import START_TOLERANCE, JointStop, told
 from dynsim.compile.control import JointControl
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.contact import unilateral as ku
+from dynsim.engine.force_indeterminacy import motion_spread, sharing
 from dynsim.engine.prepare import Prepared
-from dynsim.engine.sharing import sharing
-from dynsim.engine.uniqueness import motion_spread
 from dynsim.integrators import run as ki
 from dynsim.integrators.contacts import events as kev
 from dynsim.integrators.stepping import tables as kt
