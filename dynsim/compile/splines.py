@@ -62,7 +62,7 @@ def quintic_coefficients(spacing: float, values: Array) -> Array:
     return reals(powers / h ** np.arange(6))
 
 
-def clamped_cubic(knots: ArrayLike, values: Array, times: Array) -> Array:
+def clamped_cubic(knots: ArrayLike, values: Array, times: Array, level: bool = True) -> Array:
     """The C² cubic spline through samples, level at both ends and held beyond them, at some times.
 
     Parameters
@@ -70,6 +70,7 @@ def clamped_cubic(knots: ArrayLike, values: Array, times: Array) -> Array:
     knots : (K,), K ≥ 2, increasing [s]
     values : (K, ...)
     times : (T,) [s]
+    level : else it is not bent at both ends (a natural spline)
 
     Returns
     -------
@@ -84,6 +85,9 @@ def clamped_cubic(knots: ArrayLike, values: Array, times: Array) -> Array:
     band[:, 1] = 1.0
     band[1:-1, 0], band[1:-1, 1], band[1:-1, 2] = h[1:, 0], 2.0 * (h[:-1, 0] + h[1:, 0]), h[:-1, 0]
     slope[1:-1] = 3.0 * (h[1:] * mean[:-1] + h[:-1] * mean[1:])
+    if not level:
+        band[0, 1:3], band[-1, 0:2] = (2.0, 1.0), (1.0, 2.0)
+        slope[0], slope[-1] = 3.0 * mean[0], 3.0 * mean[-1]
     solve_banded(band, 1, 1, slope)
     t = np.clip(times, at[0], at[-1])
     k = np.clip(np.searchsorted(at, t, side="right") - 1, 0, len(at) - 2)

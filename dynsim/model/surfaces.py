@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
@@ -35,6 +35,9 @@ class Surface(Protocol):
 
     def normals(self, positions: Array) -> Array:
         """:meth:`normal` at many points, (T, 3) → (T, 3)."""
+
+    def shifted(self, by: Array) -> Surface:
+        """The same surface elsewhere, moved by a vector [m]."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,10 @@ class Quadric:
                 value / np.maximum(slope, 1e-300),
             )
         )
+
+    def shifted(self, by: Array) -> Quadric:
+        """The same surface elsewhere, moved by a vector [m]."""
+        return Quadric(self.Q, self.b - self.Q @ by, float(self.c - self.b @ by + 0.5 * by @ self.Q @ by))
 
     def normal(self, position: Array) -> Array:
         """∇C/|∇C| at a point, (3,); zero where there is none, as in the middle of a sphere."""
@@ -144,6 +151,10 @@ class Box(_Shaped):
     edges: Array
     edge_radius: float
 
+    def shifted(self, by: Array) -> Box:
+        """The same box elsewhere, moved by a vector [m]."""
+        return replace(self, centre=self.centre + by)
+
 
 @dataclass(frozen=True)
 class HeightField(_Shaped):
@@ -159,6 +170,10 @@ class HeightField(_Shaped):
     origin: Array
     spacing: Array
     heights: Array = field(repr=False)
+
+    def shifted(self, by: Array) -> HeightField:
+        """The same field elsewhere, moved by a vector [m]."""
+        return replace(self, origin=self.origin + by[:2], heights=self.heights + by[2])
 
     @cached_property
     def coefficients(self) -> Array:

@@ -62,8 +62,8 @@ def robot_and_contacts(scenario: Scenario) -> tuple[Robot, list[Contact]]:
     if config.initial is None:
         return built, touching
     points = _nameable(scenario, built)
-    places = [contact.geometry for contact in points]
-    return recall("posture", lambda: _posed(scenario, built, points), built, config.initial, places), touching
+    known = [contact.geometry for contact in points], _first_references(scenario, built)
+    return recall("posture", lambda: _posed(scenario, built, points), built, config.initial, *known), touching
 
 
 def unposed(scenario: Scenario) -> Robot:
@@ -106,6 +106,9 @@ def _nameable(scenario: Scenario, built: Robot) -> list[Contact]:
 def _posed(scenario: Scenario, built: Robot, touching: Sequence[Contact]) -> Robot:
     """The robot in the posture that ``initial`` asks for."""
     initial = scenario.config.initial
+    first = _first_references(scenario, built)
+    if first is not None:
+        built = replace(built, q0=first)
     if initial is None or not initial.on_surface:
         return built
     points = {contact.name: contact for contact in touching}
@@ -113,6 +116,21 @@ def _posed(scenario: Scenario, built: Robot, touching: Sequence[Contact]) -> Rob
         return replace(built, q0=on_surfaces(Model(built), points, initial.on_surface, initial.keep))
     except ModelError as error:
         raise ModelError(str(error), keys=("initial",)) from error
+
+
+def _first_references(scenario: Scenario, built: Robot) -> Array | None:
+    """Coordinates where waypoints of joints begin, (nq,), the others as they are; None where that is not asked for."""
+    initial = scenario.config.initial
+    if initial is None or not initial.on_references:
+        return None
+    waypoints = getattr(scenario.controller, "joints", None)
+    if not waypoints:
+        raise ModelError("initial.on_references: no joint has waypoints; give controller.joints", keys=("initial",))
+    q = built.initial.copy()
+    for name, path in waypoints.items():
+        if name in built.joint_names:
+            q[built.position_index[built.joint_names.index(name)]] = path.values[0]
+    return q
 
 
 def build_model(scenario: Scenario) -> Model:
@@ -165,7 +183,11 @@ def controller(
         raise ModelError("the scenario has no controller; its motors are short-circuited")
     if scenario.engine != families.member("controller", config.type).ENGINE:
         raise ModelError(f"controller {config.type!r} cannot drive a {scenario.plant.type!r}")
-    if touching is None:
+    if isinstance(machine, Model) and scenario.config.surface_error is not None:
+        # What it plans with is not what is there.
+        believed = scenario.config.model_copy(update={"surface_error": None})
+        touching = contacts(replace(scenario, config=believed), machine.robot)
+    elif touching is None:
         touching = contacts(scenario, machine.robot) if isinstance(machine, Model) else ()
     points = {contact.name: contact for contact in touching}
     declared = [name for name in points if name in scenario.config.contacts.points]
@@ -216,13 +238,17 @@ class _Looked(Mapping[str, Contact]):
 
 
 def surfaces(scenario: Scenario) -> dict[str, Surface]:
-    """All surfaces by name, whether anything touches them or not."""
+    """All surfaces by name, where they are, whether anything touches them or not."""
     context, configs = BuildContext(scenario.duration_s), scenario.config.surfaces
+    error = scenario.config.surface_error
 
     def built() -> dict[str, Surface]:
-        return {name: families.build("surface", config, context, SURFACES) for name, config in configs.items()}
+        found = {name: families.build("surface", config, context, SURFACES) for name, config in configs.items()}
+        if error is None or not any(error.shift_m):
+            return found
+        return {name: surface.shifted(np.array(error.shift_m)) for name, surface in found.items()}
 
-    return recall("surfaces", built, scenario.duration_s, configs)
+    return recall("surfaces", built, scenario.duration_s, configs, error)
 
 
 def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact]:
@@ -264,7 +290,14 @@ def contacts(scenario: Scenario, described: Robot | None = None) -> list[Contact
         law = {"friction": options.friction, **_unilateral(options, ContactPoint(body=""))}
         described = robot(scenario) if described is None else described
         result += [replace(one, **law) for one in candidates(options.candidates, described, known, result)]
-    return result
+    error = scenario.config.surface_error
+    return result if error is None else [_rubbed(contact, error.friction_factor) for contact in result]
+
+
+def _rubbed(contact: Contact, factor: float) -> Contact:
+    """The contact with its coefficients of friction times a factor."""
+    static = None if contact.static_friction is None else factor * contact.static_friction
+    return replace(contact, friction=factor * contact.friction, static_friction=static)
 
 
 def _bilateral(options: Contacts) -> dict[str, Any]:

@@ -130,17 +130,25 @@ class Initial(StrictConfig):
         default=[], description="contact points, also disabled ones, that start exactly on their surfaces"
     )
     keep: list[str] = Field(default=[], description="joints that do not move for it, and `hand` for the hand's place")
+    on_references: bool = Field(default=False, description="joints with waypoints start where those begin")
     equilibrium: bool = Field(
         default=False, description="currents that hold posture, weight, loads and braces at rest, with the least heat"
     )
 
     @model_validator(mode="after")
     def _check_effect(self) -> Self:
-        if not self.on_surface and not self.equilibrium:
+        if not self.on_surface and not self.equilibrium and not self.on_references:
             raise error_at("on_surface", "names no contact point; name some, or set equilibrium: true")
         if self.keep and not self.on_surface:
             raise error_at("keep", "has no effect without on_surface, for which joints move; remove it")
         return self
+
+
+class SurfaceError(StrictConfig):
+    """By what surfaces differ from those that the controller plans with: how well a plan bears it."""
+
+    shift_m: Vector3 = Field(default=[0.0, 0.0, 0.0], description="of all surfaces, in the world")
+    friction_factor: NonNegative = Field(default=1.0, description="times every coefficient of friction")
 
 
 class Integrator(StrictConfig):
@@ -208,6 +216,9 @@ class ScenarioConfig(StrictConfig):
     controller: union("controller") | None = None  # type: ignore[valid-type]
     surfaces: dict[str, union("surface")] = {}  # type: ignore[valid-type]
     contacts: Contacts = Contacts()
+    surface_error: SurfaceError | None = Field(
+        default=None, description="by what surfaces and friction differ from those that the controller plans with"
+    )
     initial: Initial | None = Field(default=None, description="posture and currents of the start")
     loads: dict[str, LoadConfig] = Field(default={}, description="forces, torques and payloads by name")
     integrator: Integrator = Integrator()

@@ -78,16 +78,18 @@ def planned_voltages(
     return np.asarray(resistance * current + inductance * rate + constant * v[:, columns])
 
 
-def _pressing_torques(
+def pressing(
     model: Model,
     times: Array,
     q: Array,
     v: Array,
-    vdot: Array,
     braces: Mapping[str, tuple[Contact, float | None]],
-    min_N: float,
-) -> Array:
-    """Torques of the motors along the references, (T, n), with braces that press."""
+    min_N: float = MIN_N,
+) -> tuple[BracePlanner, Array]:
+    """Braces that press along references, and their tables for the kernels, (T, c, BRACE_SIZE).
+
+    Friction against the slip of the references, μ f_n v/√(v² + v_s²) with v_s of :data:`SLIP_SCALE`.
+    """
     attached = []
     for name, (contact, _) in braces.items():
         if contact.tip is not None:
@@ -112,6 +114,20 @@ def _pressing_torques(
         # A point at rest along the surface is planned without friction: what holds it then, its history decides.
         friction = np.where(speed > SLIP_MIN, contact.friction * speed / np.hypot(speed, SLIP_SCALE), 0.0)
         tables[:, k] = brace_rows(touching, normals, friction, min_N, np.nan if force is None else force, slip)
+    return planner, tables
+
+
+def _pressing_torques(
+    model: Model,
+    times: Array,
+    q: Array,
+    v: Array,
+    vdot: Array,
+    braces: Mapping[str, tuple[Contact, float | None]],
+    min_N: float,
+) -> Array:
+    """Torques of the motors along the references, (T, n), with braces that press."""
+    planner, tables = pressing(model, times, q, v, braces, min_N)
     torques, solved = planner.torques(q, v, vdot, tables)
     if solved < len(times):
         raise ModelError(

@@ -43,7 +43,9 @@ class HandReference(StrictConfig):
     """A path of the hand, turned into references of ``joints`` by inverse kinematics."""
 
     path: PathChoice
-    joints: list[str] = Field(min_length=1, description="joints that follow the path; the others hold")
+    joints: list[str] = Field(
+        description="joints that follow the path, the others hold; none: controller.joints lead the hand along it"
+    )
     braces: list[str] = Field(default=[], description="contact points that the joints keep on their surfaces meanwhile")
     tolerance_m: Positive = Field(default=1e-6, description="a target further off than this is unreachable")
 
@@ -58,12 +60,28 @@ class JointPath(StrictConfig):
     """Waypoints of one joint: a cubic spline, at rest at both ends and held beyond them."""
 
     times_s: list[float] = Field(min_length=2)
-    angles_deg: list[float] = Field(min_length=2)
+    angles_deg: list[float] | None = Field(default=None, min_length=2, description="of a revolute joint")
+    positions_m: list[float] | None = Field(default=None, min_length=2, description="of a prismatic joint")
+    ends: Literal["rest", "free"] = Field(default="rest", description="free: the spline is not bent at its ends")
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        check_waypoints(self.times_s, self.angles_deg, "angles_deg")
+        if (self.angles_deg is None) == (self.positions_m is None):
+            raise error_at("angles_deg", "give either angles_deg or, of a prismatic joint, positions_m")
+        if self.angles_deg is not None:
+            check_waypoints(self.times_s, self.angles_deg, "angles_deg")
+        elif self.positions_m is not None:
+            check_waypoints(self.times_s, self.positions_m, "positions_m")
         return self
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """Positions at the waypoints [rad or m]."""
+        return np.array(self.positions_m) if self.angles_deg is None else np.deg2rad(self.angles_deg)
+
+    def positions(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The spline at times [s] [rad or m]."""
+        return clamped_cubic(self.times_s, self.values, times, self.ends == "rest")
 
 
 class TorquePath(StrictConfig):
@@ -124,6 +142,8 @@ class Config(StrictConfig):
         both = [name for name in self.joints if self.hand is not None and name in self.hand.joints]
         if both:
             raise ValueError(f"{both[0]} cannot follow both the hand path and waypoints of its own")
+        if self.hand is not None and not self.hand.joints and not self.joints:
+            raise error_at("hand.joints", "names no joint that follows the path; name some, or give controller.joints")
         if self.operator is not None:
             planned = [name for name in PLANNED if name in self.model_fields_set and getattr(self, name)]
             planned = [name for name in planned if getattr(self, name) != "none"]
@@ -161,12 +181,12 @@ def build(config: Config, context: BuildContext) -> JointControl:
     if config.joints or config.torques or path is not None or base_path is not None or planned:
         times = _knots(config.knot_spacing_s, context.duration)
         for name, joint in config.joints.items():
-            positions[name] = clamped_cubic(joint.times_s, np.deg2rad(joint.angles_deg), times)
+            positions[name] = joint.positions(times)
         for name, torque in config.torques.items():
             positions[name] = clamped_cubic(torque.times_s, np.array(torque.torques_N_m), times)
         if base_path is not None:
             positions |= _wheel_angles(robot, base_path, times)
-        if config.hand is not None and path is not None:
+        if config.hand is not None and config.hand.joints and path is not None:
             hand, targets = config.hand, targets_on(path, times)
             base = _base_coordinates(robot, positions, times)
             braces = [_contact(context, name, "hand.braces") for name in hand.braces]
@@ -237,8 +257,10 @@ def _check_names(config: Config, model: Model) -> None:
         if name not in sources:
             raise ModelError(f"controller: torques.{name}: only motors of type torque take torques")
     for name in config.joints:
-        if robot.links[model.joint_names.index(name)].units[0] != "rad":
-            raise ModelError(f"controller: {name!r} is prismatic; waypoints in angles_deg are for revolute joints")
+        revolute = robot.links[model.joint_names.index(name)].units[0] == "rad"
+        if revolute != (config.joints[name].positions_m is None):
+            kind, key = ("revolute", "angles_deg") if revolute else ("prismatic", "positions_m")
+            raise ModelError(f"controller: {name!r} is {kind}; give its waypoints in {key}")
     wheels = () if robot.base is None else robot.base.wheels
     for wheel in wheels:
         if wheel in in_hand:
