@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from dynsim.draw import page as view
     from dynsim.engine import check, simulate
     from dynsim.engine.simulation import Simulation, State
+    from dynsim.planner.answer import BracePlan, plan_braces
     from dynsim.record import Record
     from dynsim.scenario import Scenario, build_model, load_scenario
     from dynsim.studies.batch import simulate_batch
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Brace",
+    "BracePlan",
     "DynsimError",
     "Model",
     "Record",
@@ -40,6 +42,7 @@ __all__ = [
     "compare",
     "film",
     "load_scenario",
+    "plan_braces",
     "simulate",
     "simulate_batch",
     "view",
@@ -48,6 +51,7 @@ __all__ = [
 # Loaded on first use: numba and pydantic take a second that `dynsim --help` need not wait for.
 _HOME = {
     "Brace": "dynsim.compile.bracing",
+    "BracePlan": "dynsim.planner.answer",
     "Model": "dynsim.compile.model",
     "Record": "dynsim.record",
     "Scenario": "dynsim.scenario",
@@ -57,6 +61,7 @@ _HOME = {
     "check": "dynsim.engine",
     "compare": "dynsim.studies.compare",
     "load_scenario": "dynsim.scenario",
+    "plan_braces": "dynsim.planner.answer",
     "simulate": "dynsim.engine",
     "simulate_batch": "dynsim.studies.batch",
 }

@@ -26,6 +26,8 @@ from dynsim.cli.display import console, errors, labelled, progress, record_files
 from dynsim.cli.drawing import Figures, Page, draw, draw_all
 from dynsim.cli.hardware import export, hw
 from dynsim.cli.hw_drive import EXAMPLE, hw_drive
+from dynsim.cli.plan import EXAMPLE as PLAN_EXAMPLE
+from dynsim.cli.plan import plan
 from dynsim.cli.sweep import sweep
 from dynsim.cli.teleop import teleop
 from dynsim.cli.view import open_page, tell_of_view, view
@@ -245,6 +247,7 @@ def plot(
         draw(Figures(named, out or Path("figures"), format_, together=True), quiet=False)
 
 
+app.command(epilog=PLAN_EXAMPLE)(plan)
 app.command(epilog="Example: dynsim teleop snake_operator --speed 0.2")(teleop)
 app.command(epilog="Example: dynsim view results/elbow_comparison/*/record.h5 --ghost")(view)
 app.command(epilog="Example: dynsim animate results/elbow_comparison/two_elbows --out film.gif --view side")(animate)

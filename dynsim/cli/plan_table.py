@@ -1,0 +1,62 @@
+"""A plan of braces for the terminal."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.table import Table
+
+from dynsim.planner.answer import BracePlan, Size
+from dynsim.system.terminal import escaped
+
+
+def print_plan(console: Console, plan: BracePlan) -> None:
+    """A row for each number of braces, then what refused plans and what was not found."""
+    table = Table(title=f"{escaped(plan.task.scenario.title)}: braces", title_justify="left")
+    for head in ("braces", "on", "heat [W]", "simulated [W]", "k_p [V/rad]", "forces [N]", "found", "survives"):
+        table.add_column(head, justify="left" if head in ("on", "survives") else "right")
+    for size in plan.sizes:
+        table.add_row(*_cells(size))
+    console.print(table)
+    best = plan.best
+    if best is not None:
+        console.print(f"best: {escaped(best.label)}", highlight=False, soft_wrap=True)
+    for size in plan.sizes:
+        for text in _notes(size):
+            console.print(f"{size.count} braces: {escaped(text)}", highlight=False, soft_wrap=True)
+    missed, reached = len(plan.tally.missed), len(plan.tally.reached)
+    if missed:
+        console.print(
+            f"no posture found for {missed} of {missed + reached} sets tried: not found, which does not say impossible",
+            highlight=False,
+            soft_wrap=True,
+        )
+
+
+def _cells(size: Size) -> tuple[str, ...]:
+    if size.planned is None:
+        return str(size.count), "not found", "–", "–", "–", "–", f"0/{size.rounds}", "–"
+    dense, nominal = size.planned.dense, None if size.verdict is None else size.verdict.nominal
+    forces = f"{dense.forces.min():.3g} … {dense.forces.max():.3g}" if size.count else "–"
+    survives = {True: "yes", False: "no", None: "not verified"}[size.survives]
+    return (
+        str(size.count),
+        escaped(size.label),
+        f"{size.heat:.4g}",
+        "–" if nominal is None else f"{nominal.heat_W:.4g}",
+        f"{size.k_p:g}",
+        forces,
+        f"{size.agreed}/{size.rounds}",
+        survives,
+    )
+
+
+def _notes(size: Size) -> list[str]:
+    notes = [f"refused, {size.reason}"] if size.planned is not None and size.reason else []
+    if size.planned is None:
+        notes.append(size.reason)
+    if size.tolerance is not None:
+        notes.append(
+            f"bears {1e3 * size.tolerance[0]:.2g} mm of surface, and {100 * size.tolerance[1]:.2g} % of friction"
+        )
+    notes += [f"{label} would be cheaper, but: {why}" for label, why in size.cheaper]
+    return notes

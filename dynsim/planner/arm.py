@@ -1,0 +1,152 @@
+"""A robot as the tables of the compiled statics: the joints that move, and the surfaces around it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dynsim.compile.model import Model
+from dynsim.errors import ModelError
+from dynsim.jit.kernel import integers, reals
+from dynsim.model.description import Array
+from dynsim.model.drives import Motor
+from dynsim.model.surfaces import Surface, shape_arrays
+from dynsim.planner.compiled import Arm
+
+# How far plans stay from joint limits [rad or m], at most so much of the range: what soft gains give way by.
+FROM_STOP, FROM_STOP_SHARE = 0.05, 0.05
+
+
+@dataclass(frozen=True)
+class MovingArm:
+    """The joints of a robot that a plan moves, in their order, on a base that stands.
+
+    Attributes
+    ----------
+    tables : for the compiled functions
+    links : index of each joint's link in the robot
+    columns : of each joint in q
+    surfaces : names, in the order of the tables
+    """
+
+    model: Model
+    tables: Arm
+    links: tuple[int, ...]
+    columns: tuple[int, ...]
+    surfaces: tuple[str, ...]
+
+    @property
+    def n(self) -> int:
+        """Number of joints that move."""
+        return len(self.links)
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Their names."""
+        return tuple(self.model.robot.links[i].joint for i in self.links)
+
+    def attached(self, body: str, point: Array) -> tuple[int, Array]:
+        """Which joint carries a body or frame, and the point in the frame of that joint's link [m]."""
+        link, on_link = self.model.robot.attach(body, point)
+        if link not in self.links:
+            raise ModelError(f"{body} stands still: only what the arm's joints move can be braced")
+        return self.links.index(link), on_link
+
+    def coordinates(self, q: Array) -> Array:
+        """All coordinates of the robot for positions of the joints, (T, n) → (T, nq)."""
+        whole = np.tile(self.model.robot.initial, (len(q), 1))
+        whole[:, list(self.columns)] = q
+        return whole
+
+
+def moving_arm(model: Model, surfaces: Mapping[str, Surface]) -> MovingArm:
+    """Tables of a robot.
+
+    Raises
+    ------
+    ModelError
+        A joint with several coordinates, coupled joints, a hand that no joint moves, or a joint without a DC motor.
+    """
+    robot = model.robot
+    if robot.couplings:
+        raise ModelError("plan: not for robots with coupled joints, which share a motor")
+    wheels = () if robot.base is None else robot.base.wheels
+    links = [i for i, link in enumerate(robot.links) if link.joint not in wheels]
+    motors = {motor.joint: motor for motor in robot.motors}
+    heat, greatest = [], []
+    for i in links:
+        link = robot.links[i]
+        if link.kind not in ("revolute", "prismatic"):
+            raise ModelError(
+                f"plan: {link.joint} is a joint of kind {link.kind}; revolute and prismatic ones are planned"
+            )
+        motor = motors.get(link.joint)
+        if not isinstance(motor, Motor):
+            raise ModelError(
+                f"plan: {link.joint} has no DC motor, whose heat is what is planned for; give it plant…motor"
+            )
+        heat.append(motor.resistance / motor.joint_constant**2)
+        current = min(motor.greatest_current, motor.voltage_limit / motor.resistance)
+        greatest.append(min(motor.joint_constant * current, link.effort_limit))
+    place_of, start = {robot.links[i].name: k for k, i in enumerate(links)}, robot.initial
+    parent, rotation, place = [], [], []
+    for i in links:
+        link = robot.links[i]
+        R, p = link.R_PJ, link.p_PJ
+        if link.parent is not None and link.parent not in place_of:
+            R_WP, p_WP = model.body_pose(link.parent, start)
+            R, p = R_WP @ R, p_WP + R_WP @ p
+        parent.append(place_of.get(link.parent, -1) if link.parent is not None else -1)
+        rotation.append(R)
+        place.append(p)
+    hand, hand_point = robot.attach(*robot.hand)
+    if hand not in links:
+        raise ModelError("plan: no joint moves the hand")
+    chosen = [robot.links[i] for i in links]
+    tables = Arm(
+        parent=integers(parent),
+        prismatic=integers([link.kind == "prismatic" for link in chosen]),
+        rotation=reals(rotation),
+        place=reals(place),
+        axis=reals([link.axis for link in chosen]),
+        mass=reals([link.inertia.mass for link in chosen]),
+        com=reals([link.inertia.com for link in chosen]),
+        losses=reals(model.damping[links]),
+        heat=reals(heat),
+        greatest=reals(greatest),
+        lower=reals([link.lower for link in chosen]),
+        upper=reals([link.upper for link in chosen]),
+        gravity=reals(robot.gravity),
+        hand=integers([links.index(hand)]),
+        hand_point=reals(hand_point),
+        shapes=shape_arrays([(surface, 0.0, np.zeros(3), False) for surface in surfaces.values()]),
+    )
+    room = np.minimum(FROM_STOP, FROM_STOP_SHARE * (tables.upper - tables.lower))
+    bounded = np.isfinite(room)
+    tables.lower[bounded] += room[bounded]
+    tables.upper[bounded] -= room[bounded]
+    for bound, sign in ((tables.lower, 1.0), (tables.upper, -1.0)):
+        one_sided = np.isfinite(bound) & ~bounded
+        bound[one_sided] += sign * FROM_STOP
+    columns = tuple(robot.position_index[i] for i in links)
+    return MovingArm(model, tables, tuple(links), columns, tuple(surfaces))
+
+
+def axis_points(arm: MovingArm, shares: Sequence[float]) -> list[tuple[int, Array, float, float]]:
+    """Points along the axes of all links: joint that carries them, point [m], radius [m], share of the way.
+
+    From each link's joint to the ends that :func:`dynsim.compile.clearance.axis_ends` gives it.
+    """
+    from dynsim.compile.clearance import axis_ends
+
+    robot = arm.model.robot
+    ends = axis_ends(robot)
+    return [
+        (k, share * end, robot.links[i].radius, share)
+        for k, i in enumerate(arm.links)
+        for end in ends[robot.links[i].name]
+        if np.linalg.norm(end) > 1e-9
+        for share in shares
+    ]

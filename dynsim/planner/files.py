@@ -1,0 +1,45 @@
+"""Files of a plan: numbers, the scenario that runs, a table, figures, and a page of the best beside the unbraced."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+from dynsim.planner.answer import BracePlan
+from dynsim.scenario import to_yaml
+from dynsim.system.files import check_writable, replacing, write_json
+
+PLAN_FILES = ("plan.json", "plan.yaml", "plan_table.csv", "plan_table.json", "view.html")
+
+
+def check_plan_folder(folder: Path) -> None:
+    """Raise before the work what could not be written after it."""
+    check_writable(folder, PLAN_FILES)
+
+
+def save_plan(plan: BracePlan, folder: Path, figures: bool = True, kind: str = "png") -> None:
+    """Write all files of a plan to a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / "plan.json", plan.json)
+    write_json(folder / "plan_table.json", plan.table)
+    with replacing(folder / "plan_table.csv") as stream:
+        stream.write(_csv(plan).encode())
+    if plan.best is None:
+        return
+    with replacing(folder / "plan.yaml") as stream:
+        stream.write(to_yaml(plan.yaml).encode())
+    if figures:
+        from dynsim.planner.pictures import draw_plan
+
+        draw_plan(plan, folder, kind)
+
+
+def _csv(plan: BracePlan) -> str:
+    """The table with the columns of all its rows."""
+    columns = list(dict.fromkeys(key for row in plan.table for key in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(plan.table)
+    return text.getvalue()

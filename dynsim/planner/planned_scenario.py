@@ -1,0 +1,141 @@
+"""A plan as a scenario that runs: posture at the start, references of all joints, braces that press, and gains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from dynsim.model.description import Array
+from dynsim.planner.dense import Dense
+from dynsim.planner.problem import Candidate, Task
+from dynsim.scenario import Scenario
+from dynsim.scenario.reading import scenario_from_resolved
+
+# Digits that waypoints are written with: a nanometre at the end of any arm.
+DIGITS = 10
+# Gain of joints that press no brace [V/rad], and below which part of the greatest lever a joint is one.
+STIFF, FREE = 500.0, 0.05
+# Instants at which that is looked at.
+LOOKS = 12
+# Keys of the controller that a plan replaces.
+REPLACED = (
+    "hand",
+    "joints",
+    "torques",
+    "feed_forward",
+    "brace",
+    "min_N",
+    "operator",
+    "k_p_V_per_rad",
+    "k_d_V_s_per_rad",
+)
+BILATERAL_ONLY = ("slip_smoothing_m_s", "pulling_friction")
+
+
+def damping_gain(k_p: float) -> float:
+    """k_d [V s/rad] that goes with k_p [V/rad]: that of the published arm (500 and 20), over the root of the ratio."""
+    return 20.0 * float(np.sqrt(k_p / 500.0))
+
+
+def stiffness_gains(task: Task, braces: tuple[Candidate, ...], dense: Dense, k_p: float) -> Array:
+    """k_p of each moved joint, (n,): ``k_p`` where it presses braces onto their surfaces, else at least STIFF.
+
+    A joint that moves no brace along its normal bears any error of the surface, however stiff: the yaw of an arm on a
+    floor, and joints beyond the last brace. They hold the hand where soft ones would let it go.
+    """
+    if not braces:
+        return np.full(task.arm.n, k_p)
+    problem, none = task.problem(braces, 1), np.zeros((1, len(braces)))
+    pressing = np.zeros(task.arm.n)
+    for row in dense.q[:: max(len(dense.q) // LOOKS, 1)]:
+        problem.evaluate(row[None].copy(), none)
+        rates = np.abs(problem.work.gap_rate[0, : len(braces)])
+        pressing = np.maximum(pressing, (rates / rates.max(axis=1, keepdims=True)).max(axis=0))
+    return np.where(pressing > FREE, k_p, max(k_p, STIFF))
+
+
+def common(task: Task) -> dict[str, Any]:
+    """What all plans of a scenario share: the scenario without what they replace."""
+    data = dict(task.scenario.resolved)
+    data["name"] = f"{task.scenario.name}_plan"
+    data.pop("variant", None)
+    controller = dict(data["controller"])
+    hand = controller["hand"]
+    for key in REPLACED:
+        controller.pop(key, None)
+    controller["hand"] = {"path": hand["path"], "joints": []}
+    data["controller"] = controller
+    contacts = dict(data["contacts"])
+    for key in BILATERAL_ONLY:
+        contacts.pop(key, None)
+    contacts.pop("reference_tolerance_m", None)
+    data["contacts"] = contacts | {"law": "unilateral", "candidates": "points", "points": {}}
+    data["integrator"] = {"method": "auto"}
+    data.pop("initial", None)
+    return data
+
+
+def particular(task: Task, braces: tuple[Candidate, ...], dense: Dense, k_p: float) -> dict[str, Any]:
+    """What is of one plan alone."""
+    arm = task.arm
+    joints = {}
+    for name, link, column in zip(arm.joints, arm.links, dense.q.T, strict=True):
+        angular = arm.model.robot.links[link].units[0] == "rad"
+        values = np.round(np.rad2deg(column) if angular else column, DIGITS).tolist()
+        joints[name] = {
+            "times_s": np.round(dense.times, DIGITS).tolist(),
+            "angles_deg" if angular else "positions_m": values,
+            **({} if dense.rests else {"ends": "free"}),
+        }
+    own = dict(zip(arm.joints, stiffness_gains(task, braces, dense, k_p).tolist(), strict=True))
+    gains = [own.get(motor.joint, STIFF) for motor in arm.model.robot.motors]
+    damping = [round(damping_gain(gain), 4) for gain in gains]
+    controller: dict[str, Any] = {
+        "k_p_V_per_rad": gains if len(set(gains)) > 1 else k_p,
+        "k_d_V_s_per_rad": damping if len(set(damping)) > 1 else damping[0],
+        "joints": joints,
+    }
+    names = [brace.name for brace in braces]
+    initial: dict[str, Any] = {"on_references": True}
+    if braces:
+        controller |= {"brace": "optimal", "min_N": task.options.min_N}
+        initial["on_surface"] = names
+    else:
+        controller["feed_forward"] = "dynamics"
+    points = {
+        brace.name: {
+            "body": brace.body,
+            "point_m": list(brace.point_m),
+            "surface": brace.surface,
+            **({"radius_m": brace.radius} if brace.radius else {}),
+        }
+        for brace in braces
+    }
+    return {"controller": controller, "contacts": {"points": points}, "initial": initial}
+
+
+def merged(shared: dict[str, Any], own: dict[str, Any], variant: str = "") -> dict[str, Any]:
+    """A whole scenario from both."""
+    return {
+        **shared,
+        **({"variant": variant} if variant else {}),
+        "controller": shared["controller"] | own["controller"],
+        "contacts": shared["contacts"] | own["contacts"],
+        "initial": own["initial"],
+    }
+
+
+def scenario(
+    task: Task,
+    braces: tuple[Candidate, ...],
+    dense: Dense,
+    k_p: float,
+    variant: str = "",
+    more: Mapping[str, Any] | None = None,
+) -> Scenario:
+    """The plan as a scenario; ``more``: sections on top."""
+    return scenario_from_resolved(
+        merged(common(task), particular(task, braces, dense, k_p), variant) | dict(more or {})
+    )

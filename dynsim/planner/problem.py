@@ -1,0 +1,333 @@
+"""What is planned: an arm, surfaces, the path of its hand, and the points that may be braced."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from dynsim.compile.control import HandPath
+from dynsim.compile.model import Model
+from dynsim.compile.protocols import BuildContext
+from dynsim.errors import ModelError
+from dynsim.jit.kernel import integers, reals
+from dynsim.library import families
+from dynsim.model.description import Array
+from dynsim.model.surfaces import Quadric
+from dynsim.planner.arm import MovingArm, axis_points, moving_arm
+from dynsim.planner.compiled import Course, Points
+from dynsim.planner.local import Problem
+from dynsim.scenario import Scenario, build
+
+# Weight of the bend of the postures along the path [W/rad²]: for uniqueness; no part of the cost that is reported.
+SMOOTHNESS = 1e-3
+# Where along links clearance is asked for, beside their ends.
+ALONG = (0.33, 0.67)
+# Clearance of those points [m].
+LINK_CLEARANCE = 2e-3
+# Targets that differ by less are the same [m].
+SAME = 1e-6
+# Chords at knots of a single pass: how far from its ends the two of a coarse one lie.
+INSET = 0.2
+
+Kind = Literal["there_and_back", "closed", "open"]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A point that may be braced, in the frame of the link that carries it, and a surface that it may lean on.
+
+    Attributes
+    ----------
+    name : of the point
+    body : link, or frame, as the scenario names it; point_m: in its frame [m]
+    joint, on_joint : index of the arm's joint that carries it, and the point in the frame of that link [m]
+    radius : of a sphere about the point, that touches [m]
+    surface : name
+    """
+
+    name: str
+    body: str
+    point_m: tuple[float, float, float]
+    joint: int
+    on_joint: Array = field(compare=False, repr=False)
+    radius: float
+    surface: str
+
+    @property
+    def place(self) -> tuple[str, tuple[float, float, float]]:
+        """The point, whatever it leans on: it can lean on one surface only."""
+        return self.body, self.point_m
+
+    @property
+    def label(self) -> str:
+        """Point and surface."""
+        return f"{self.name} on {self.surface}"
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a designer may choose.
+
+    Attributes
+    ----------
+    candidates : bodies or declared contact points, ``first:last`` for all from one to the other; empty: all links
+        beyond the second, and declared points
+    along : shares of the way along links that are candidates too, beside their joints
+    radius_m : of candidates; None: that of their links, and of declared points what they say
+    count : least and greatest number of braces
+    surfaces : that may be leaned on; empty: all
+    peak : cost of the greatest torque [W/(N m)]
+    clearance_m : of joints that are not braced; links between them must not touch
+    min_N : least normal force of a brace
+    starts : postures that the search begins with
+    """
+
+    candidates: tuple[str, ...] = ()
+    along: tuple[float, ...] = ()
+    radius_m: float | None = None
+    count: tuple[int, int] = (0, 3)
+    surfaces: tuple[str, ...] = ()
+    peak: float = 0.0
+    clearance_m: float = 0.01
+    min_N: float = 0.5
+    starts: int = 3
+    seed: int = 0
+    exhaustive: bool = False
+
+
+@dataclass(frozen=True)
+class Task:
+    """A scenario as a planning problem."""
+
+    scenario: Scenario
+    options: Options
+    arm: MovingArm
+    path: HandPath
+    kind: Kind
+    candidates: tuple[Candidate, ...]
+    friction: float
+
+    @property
+    def duration(self) -> float:
+        """Of the path [s]."""
+        return float(self.scenario.duration_s)
+
+    def targets(self, times: Array) -> Array:
+        """Of the hand [m], (T, 3)."""
+        return np.asarray(self.path.position(np.asarray(times, dtype=np.float64)), dtype=np.float64)
+
+    @property
+    def span(self) -> float:
+        """Time that the knots cover [s]: of a path there and back, half of it."""
+        return 0.5 * self.duration if self.kind == "there_and_back" else self.duration
+
+    def times(self, count: int) -> Array:
+        """Of so many knots [s]."""
+        if count == 1:
+            return np.array([0.5 * self.span])
+        if self.kind == "closed":
+            return np.linspace(0.0, self.span, count, endpoint=False)
+        if count == 2:
+            return np.array([INSET, 1.0 - INSET]) * self.span
+        return np.linspace(0.0, self.span, count)
+
+    @cached_property
+    def clear(self) -> list[tuple[int, Array, float, float, str, int]]:
+        """Points that stay clear where they are not braced.
+
+        Joint, point [m], radius [m], margin [m], name, index of the surface; of planes the ends of links are enough.
+        """
+        robot, arm = self.arm.model.robot, self.arm
+        found: list[tuple[int, Array, float, float, str, int]] = []
+        rng = np.random.default_rng(0)
+        postures = arm.coordinates(rng.normal(size=(4, arm.n)))
+
+        def moves(link: int, point: Array) -> bool:
+            places = np.array([arm.model.point_position(link, point, q) for q in postures])
+            return bool(np.ptp(places, axis=0).max() > 1e-9)
+
+        margin = self.options.clearance_m
+        ends = [(k, np.zeros(3), self._thickness(k), margin, robot.links[i].joint) for k, i in enumerate(arm.links)]
+        hand, hand_point = robot.attach(*robot.hand)
+        ends.append((arm.links.index(hand), hand_point, robot.links[hand].radius, margin, "hand"))
+        middles = [
+            (k, point, radius, LINK_CLEARANCE, f"{robot.links[arm.links[k]].name} at {share:g}")
+            for k, point, radius, share in axis_points(arm, ALONG)
+        ]
+        surfaces = build.surfaces(self.scenario)
+        for index, name in enumerate(arm.surfaces):
+            surface = surfaces[name]
+            flat = isinstance(surface, Quadric) and surface.drawn.kind == "plane"
+            for k, point, radius, least, label in ends if flat else [*ends, *middles]:
+                if moves(arm.links[k], point):
+                    found.append((k, point, radius, least, f"{label} on {name}", index))
+        return found
+
+    def _thickness(self, k: int) -> float:
+        """Radius about the beginning of a link: the larger one of those that meet there [m]."""
+        links, parent = self.arm.model.robot.links, int(self.arm.tables.parent[k])
+        own = links[self.arm.links[k]].radius
+        return own if parent < 0 else max(own, links[self.arm.links[parent]].radius)
+
+    def points(self, braces: Sequence[Candidate]) -> Points:
+        """Tables of braces, then of what stays clear."""
+        names = self.arm.surfaces
+        braced = [(b.joint, b.on_joint, b.radius, 0.0, b.name, names.index(b.surface)) for b in braces]
+        free = [
+            point
+            for point in self.clear
+            if not any(point[0] == b[0] and point[5] == b[5] and np.allclose(point[1], b[1]) for b in braced)
+        ]
+        rows = [*braced, *free]
+        return Points(
+            body=integers([row[0] for row in rows]),
+            point=reals(np.array([row[1] for row in rows]).reshape(-1, 3)),
+            radius=reals([row[2] for row in rows]),
+            surface=integers([row[5] for row in rows]),
+            margin=reals([row[3] for row in rows]),
+            friction=reals(np.full(len(braces), self.friction)),
+        )
+
+    def course(self, count: int) -> tuple[Course, Array]:
+        """Knots and instants of so many knots, and the smoothness S of their postures.
+
+        Velocities are chords between neighbouring knots, never slopes of a spline through them: those an optimiser
+        would make vanish exactly at the knots, and slide in between.
+        """
+        times, span = self.times(count), self.span
+        instants: list[tuple[int, Array, float]] = []
+
+        def chord(a: int, b: int, time: float) -> Array:
+            row = np.zeros(count)
+            row[a] -= 1.0 / time
+            row[b] += 1.0 / time
+            return row
+
+        both = self.kind == "there_and_back"
+        if count == 1:
+            instants.append((0, np.zeros(1), 1.0))
+        elif count == 2 and self.kind != "closed":
+            ahead = chord(0, 1, span)
+            for k in range(2):
+                instants += [(k, ahead, 0.25), (k, -ahead, 0.25)] if both else [(k, ahead, 0.5)]
+        elif self.kind == "closed":
+            instants += [(k, chord(k, (k + 1) % count, span / count), 1.0 / count) for k in range(count)]
+        else:
+            spacing, share = span / (count - 1), 0.5 / (count - 1)
+            for k in range(count):
+                if k < count - 1:
+                    instants.append((k, chord(k, k + 1, spacing), share))
+                if k > 0:
+                    back = chord(k, k - 1, spacing)
+                    instants.append((k, back if both else -back, share))
+        if count < 3:
+            bend = np.diff(np.eye(count), axis=0)
+        elif self.kind == "closed":
+            bend = np.roll(np.eye(count), 1, axis=1) - 2.0 * np.eye(count) + np.roll(np.eye(count), -1, axis=1)
+        else:
+            bend = np.diff(np.eye(count), 2, axis=0)
+        smooth = np.sqrt(SMOOTHNESS) * bend
+        course = Course(
+            target=reals(self.targets(times)),
+            knot=integers([k for k, _, _ in instants]),
+            chord=reals([row for _, row, _ in instants]),
+            share=reals([share for _, _, share in instants]),
+            smooth=reals(smooth.T @ smooth),
+        )
+        return course, smooth
+
+    def problem(self, braces: Sequence[Candidate], count: int) -> Problem:
+        """Of one set of braces at so many knots."""
+        course, smooth = self.course(count)
+        return Problem(self.arm.tables, self.points(braces), course, self.options.min_N, smooth, peak=self.options.peak)
+
+
+def task(scenario: Scenario, options: Options) -> Task:
+    """The planning problem of a scenario: its plant, surfaces, friction and the hand's path.
+
+    Raises
+    ------
+    ModelError
+        No arm with DC motors, no path of the hand, no surface, or candidates that there are not.
+    """
+    robot = build.robot(scenario)
+    model = Model(robot)
+    surfaces = build.surfaces(scenario)
+    if not surfaces and options.count[1] > 0:
+        raise ModelError("plan: the scenario has no surfaces to lean on; give it some, or ask for --count 0:0")
+    hand = getattr(scenario.controller, "hand", None)
+    if hand is None:
+        raise ModelError("plan: the scenario has no controller.hand.path, along which the arm could be planned")
+    path = families.build("path", hand.path, BuildContext(scenario.duration_s), HandPath)
+    arm = moving_arm(model, surfaces)
+    unknown = [name for name in options.surfaces if name not in surfaces]
+    if unknown:
+        raise ModelError(f"plan: no surface {unknown[0]!r}; surfaces: {', '.join(surfaces) or 'none'}")
+    chosen = options.surfaces or tuple(surfaces)
+    candidates = _candidates(scenario, arm, options, chosen)
+    if not candidates and options.count[1] > 0:
+        raise ModelError("plan: no candidates for braces; name links or contact points with --candidates")
+    kind = _kind(path, scenario.duration_s)
+    return Task(scenario, options, arm, path, kind, tuple(candidates), scenario.config.contacts.friction)
+
+
+def _kind(path: HandPath, duration: float) -> Kind:
+    """Whether a path comes back the way it went, or to where it began."""
+    times = np.linspace(0.0, duration, 33)
+    there = np.asarray(path.position(times))
+    if np.abs(there - there[::-1]).max() <= SAME and np.ptp(there, axis=0).max() > SAME:
+        return "there_and_back"
+    return "closed" if np.abs(there[0] - there[-1]).max() <= SAME else "open"
+
+
+def _candidates(scenario: Scenario, arm: MovingArm, options: Options, surfaces: Sequence[str]) -> list[Candidate]:
+    """Points that may be braced, each with each surface that it may lean on."""
+    robot, declared = arm.model.robot, scenario.config.contacts.points
+    links = [robot.links[i].name for i in arm.links]
+    wanted: list[str] = []
+    for text in options.candidates:
+        first, _, last = text.partition(":")
+        if not last:
+            wanted.append(text)
+            continue
+        for end in (first, last):
+            if end not in links:
+                raise ModelError(f"plan: no link {end!r} in {text!r}; links: {', '.join(links)}")
+        wanted += links[links.index(first) : links.index(last) + 1]
+    if not wanted:
+        wanted = [*declared, *links[2:]]
+    along = {(k, share): point for k, point, _, share in axis_points(arm, options.along)}
+    found: list[Candidate] = []
+    known: list[tuple[int, Array]] = []
+
+    def add(name: str, body: str, point: Array, radius: float, on: Sequence[str]) -> None:
+        joint, on_joint = arm.attached(body, point)
+        if any(joint == k and np.allclose(on_joint, there) for k, there in known):
+            return
+        known.append((joint, on_joint))
+        radius = radius if options.radius_m is None else options.radius_m
+        at = tuple(float(x) for x in point)
+        found.extend(Candidate(name, body, at, joint, on_joint, radius, surface) for surface in on)  # type: ignore[arg-type]
+
+    for name in wanted:
+        if name in declared:
+            point = declared[name]
+            on = [point.surface] if point.surface in surfaces else list(surfaces)
+            add(name, point.body, np.array(point.point_m), point.radius_m, on)
+            continue
+        if name not in links:
+            known_names = ", ".join([*declared, *links])
+            raise ModelError(f"plan: no candidate {name!r}; links and contact points: {known_names}")
+        k = links.index(name)
+        radius = robot.links[arm.links[k]].radius
+        parent = int(arm.tables.parent[k])
+        thick = radius if parent < 0 else max(radius, robot.links[arm.links[parent]].radius)
+        add(name, name, np.zeros(3), thick, surfaces)
+        for share in options.along:
+            if (k, share) in along:
+                add(f"{name}_at_{share:g}", name, along[k, share], radius, surfaces)
+    return found

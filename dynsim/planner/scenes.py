@@ -1,0 +1,109 @@
+"""Random scenes for the planner, and the kept study of them: ``python -m dynsim.planner.scenes --out results/planner``.
+
+Arms of 7 to 10 joints whose hand goes there and back along a short way, over a floor, a pipe, a box, or with a joint
+about a third axis. Nobody has tuned anything on a scene: its seed is its number.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from dynsim.scenario import Scenario
+from dynsim.scenario.reading import scenario_from_resolved
+
+KINDS = ("floor", "pipe", "box", "third_axis")
+PERIOD_S = 10.0
+LIMIT_DEG = [-120.0, 120.0]
+MOTOR = {
+    "type": "dc",
+    "torque_constant_N_m_per_A": 0.203,
+    "resistance_ohm": 1.1,
+    "inductance_H": 1.7e-3,
+    "rotor_inertia_kg_m2": 1.64e-4,
+    "gear_damping_N_m_s_per_rad": 0.01,
+}
+
+
+def kind_of(seed: int) -> str:
+    """What a scene has beside its arm."""
+    return KINDS[seed % 4]
+
+
+def along_of(seed: int) -> tuple[float, ...]:
+    """Shares along links that are candidates too: the middle, in every third scene."""
+    return (0.5,) if seed % 3 == 0 else ()
+
+
+def scene(seed: int) -> dict[str, Any]:
+    """The scenario of a scene as plain data."""
+    rng = np.random.default_rng(seed)
+
+    def drawn(low: float, high: float, digits: int = 3) -> float:
+        return round(float(rng.uniform(low, high)), digits)
+
+    kind, pitching = kind_of(seed), int(rng.integers(6, 10))
+    chain = [_link("z", 0.0, 0.1, 5.0)]
+    for i in range(pitching):
+        axis = "x" if kind == "third_axis" and i == pitching // 2 else "y"
+        length = drawn(0.2, 0.34)
+        chain.append(_link(axis, length, drawn(0.08, 0.2), 4.0 if i < 3 else 3.0, LIMIT_DEG))
+    payload = drawn(0.0, 0.15) if rng.random() < 0.6 else 0.0
+    height = drawn(0.0, 0.25)
+    reach, friction = sum(link["length_m"] for link in chain), drawn(0.1, 0.35, 2)
+    distance, up, azimuth = drawn(0.55, 0.8) * reach, drawn(0.25, 0.55), drawn(-0.3, 0.3)
+    way = rng.normal(size=3) * [1.0, 1.0, 0.5]
+    way = way / np.linalg.norm(way) * drawn(0.12, 0.25)
+    start = np.array([distance * np.cos(azimuth), distance * np.sin(azimuth), up])
+    end = start + way
+    if end[2] < 0.15:
+        end[2] = 2.0 * start[2] - end[2]
+    surfaces: dict[str, Any] = {"floor": {"type": "plane", "point_m": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}}
+    x = drawn(0.3, 0.55) * distance
+    if kind == "pipe":
+        point = [round(x, 3), 0.0, drawn(-0.02, 0.12)]
+        surfaces["pipe"] = {
+            "type": "cylinder",
+            "point_m": point,
+            "axis": [0.0, 1.0, 0.0],
+            "radius_m": drawn(0.06, 0.15),
+        }
+    if kind == "box":
+        center = [round(x, 3), 0.0, drawn(0.02, 0.1)]
+        edges = [drawn(0.2, 0.4), 2.0, 0.2]
+        surfaces["box"] = {"type": "box", "center_m": center, "edges_m": edges, "edge_radius_m": 0.02}
+    points = [start.round(4).tolist(), end.round(4).tolist(), start.round(4).tolist()]
+    path = {"type": "waypoints", "times_s": [0.0, 0.5 * PERIOD_S, PERIOD_S], "points_m": points}
+    loads = {}
+    if payload:
+        tip = [0.0, 0.0, chain[-1]["length_m"]]
+        loads["payload"] = {"type": "payload", "body": f"link_{len(chain)}", "point_m": tip, "mass_kg": payload}
+    return {
+        "name": f"scene_{seed}",
+        "duration_s": PERIOD_S,
+        "plant": {"type": "serial_arm", "base": {"position_m": [0.0, 0.0, height]}, "chain": chain},
+        "controller": {
+            "type": "joint_pd",
+            "hand": {"joints": [f"joint_{k + 1}" for k in range(len(chain))], "path": path},
+        },
+        "surfaces": surfaces,
+        "contacts": {"law": "unilateral", "friction": friction},
+        "loads": loads,
+    }
+
+
+def _link(axis: str, length: float, mass: float, gear: float, limit: list[float] | None = None) -> dict[str, Any]:
+    return {
+        "axis": axis,
+        "length_m": length,
+        "mass_kg": mass,
+        "damping_N_m_s_per_rad": 0.3,
+        "motor": MOTOR | {"gear_ratio": gear},
+        **({} if limit is None else {"limit_deg": limit}),
+    }
+
+
+def scene_scenario(seed: int) -> Scenario:
+    """The scene as a scenario."""
+    return scenario_from_resolved(scene(seed))

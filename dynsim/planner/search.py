@@ -1,0 +1,358 @@
+"""The search over sets of braces: they grow one by one from the best smaller ones.
+
+All sets of one brace are solved at one posture of the path without slip, the best of them again where they slip, and
+the best of those grow. What fails is "not found", never "impossible": postures are found from others by least change.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+
+from dynsim.jit.kernel import reals
+from dynsim.model.description import Array
+from dynsim.planner.dense import Dense, references, touching_links
+from dynsim.planner.local import Local, Problem, solve
+from dynsim.planner.problem import Candidate, Task
+
+# Sets of each size that go on from the cheap problem, and from the one with slip.
+BEAM = 4
+# Postures that a round begins with, and random ones that are tried for them.
+POSTURES, DRAWS = 2, 60
+# Sets of each size and round that whole paths are made for, and those that are made finer in the end.
+PATHS, KEPT = 3, 3
+# Part of a cost that is no gain worth another path.
+SAME_COST = 0.99
+# Knots of whole paths: the search's, and the answer's.
+PATH_KNOTS, FINE_KNOTS = 9, 17
+CLOSED_KNOTS, CLOSED_FINE = 12, 24
+
+Set = tuple[Candidate, ...]
+Tell = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A set of braces with the best postures found for it along the whole path."""
+
+    braces: Set
+    times: Array
+    local: Local
+    dense: Dense
+
+    @property
+    def heat(self) -> float:
+        """Along the dense references [W]."""
+        return self.dense.heat
+
+
+@dataclass
+class Tally:
+    """What a search has done.
+
+    Attributes
+    ----------
+    solves : local problems solved
+    drawn, drawn_on : random postures tried, and those that could be put onto the path
+    reached, missed : sets for which a posture was found, and those for which none was
+    heats : by size, the best heat of each round along the path [W], by the knots; inf: none
+    refused : sets that have a path, and why they are none of the answer
+    """
+
+    solves: int = 0
+    drawn: int = 0
+    drawn_on: int = 0
+    reached: set[Set] = field(default_factory=set)
+    missed: set[Set] = field(default_factory=set)
+    heats: dict[int, list[float]] = field(default_factory=dict)
+    refused: dict[Set, str] = field(default_factory=dict)
+
+
+class Search:
+    """A search with its problems, which are made once for each set."""
+
+    def __init__(self, task: Task, tell: Tell | None = None) -> None:
+        self.task, self.tally = task, Tally()
+        self._tell = tell or (lambda text, share: None)
+        self.single_heats: dict[Set, float] = {}
+        self._rng = np.random.default_rng(task.options.seed)
+        self.coarse = 4 if task.kind == "closed" else 2
+        self.path = CLOSED_KNOTS if task.kind == "closed" else PATH_KNOTS
+        self.fine = CLOSED_FINE if task.kind == "closed" else FINE_KNOTS
+
+    def solve(self, braces: Set, start: Array, count: int, turns: int = 40) -> Local | None:
+        """Local optimum from postures at other knots, or from one posture."""
+        problem = self.problem(braces, count)
+        self.tally.solves += 1
+        return solve(problem, self.spread(start, count), turns)
+
+    def problem(self, braces: Set, count: int) -> Problem:
+        return self.task.problem(braces, count)
+
+    def spread(self, start: Array, count: int) -> Array:
+        """Postures at so many knots, on lines between those given at others; (n,) or (K, n)."""
+        given = np.atleast_2d(start)
+        if len(given) == 1 or count == 1:
+            return reals(np.tile(given[len(given) // 2], (count, 1)))
+        times, at = self.task.times(len(given)), self.task.times(count)
+        if self.task.kind == "closed":
+            times, given = np.append(times, self.task.span), np.vstack([given, given[:1]])
+        return reals(np.stack([_line(at, times, column) for column in given.T], axis=1))
+
+    def _starts(self, first: bool) -> list[Array]:
+        """Random postures with the hand in the middle of the path, clear of all surfaces; the initial one too."""
+        problem, found = self.problem((), 1), list[Array]()
+        arm = self.task.arm
+        initial = arm.model.robot.initial[list(arm.columns)]
+        for draw in range(DRAWS):
+            Q = reals(initial if first and draw == 0 else self.draw())[None]
+            self.tally.drawn += 1
+            if problem.retract(Q, 60) <= 1e-7:
+                found.append(Q[0])
+                self.tally.drawn_on += 1
+                if len(found) == POSTURES:
+                    break
+        return found
+
+    def draw(self) -> Array:
+        """A random posture: links forward along the way to the path, each bent from that by some 40°.
+
+        Joints that do not turn about a horizontal axis are near their initial position, those at the root turn towards
+        the target.
+        """
+        arm, rng = self.task.arm, self._rng
+        tables, model = arm.tables, arm.model
+        q = model.robot.initial[list(arm.columns)].copy()
+        target = self.task.targets(np.array([0.5 * self.task.span]))[0]
+        for j in range(arm.n):
+            low, high = tables.lower[j], tables.upper[j]
+            if tables.prismatic[j]:
+                q[j] += 0.2 * rng.normal()
+            else:
+                whole = arm.coordinates(q[None])[0]
+                R, p = model.body_pose(arm.links[j], whole)
+                axis = R @ tables.axis[j]
+                along = self._along(j)
+                way = target - p
+                if along is None or np.linalg.norm(np.cross(axis, way)) < 1e-6:
+                    # A link without length turns what comes after it towards the target.
+                    along = np.array([0.0, 0.0, 1.0])
+                now, there = R @ along, way
+                if abs(axis[2]) > 0.9:
+                    next_axis = self._horizontal_after(j, q)
+                    if next_axis is not None:
+                        # The plane of the joints after it holds the target.
+                        now = np.cross(next_axis, [0.0, 0.0, 1.0])
+                    spread = 0.1
+                else:
+                    spread = 0.7
+                    there = way * np.array([1.0, 1.0, 0.0])
+                if abs(axis[2]) <= 0.9 and abs(np.dot(axis, there)) > 0.7 * np.linalg.norm(there):
+                    q[j] += 0.2 * rng.normal()
+                else:
+                    now, there = now - axis * (axis @ now), there - axis * (axis @ there)
+                    angle = np.arctan2(axis @ np.cross(now, there), now @ there)
+                    q[j] += (
+                        angle
+                        + spread * rng.normal()
+                        - (rng.uniform(0.0, 1.2) * self._up(axis, there) if j < 2 else 0.0)
+                    )
+                    q[j] = (q[j] + np.pi) % (2.0 * np.pi) - np.pi
+            q[j] = min(max(q[j], low), high)
+        return q
+
+    @staticmethod
+    def _up(axis: Array, ahead: Array) -> float:
+        """Which turn about an axis lifts what points ahead: 1, −1, or 0 for an upright axis."""
+        return -float(np.sign(np.cross(axis, ahead)[2])) if abs(axis[2]) < 0.9 else 0.0
+
+    def _along(self, j: int) -> Array | None:
+        """From a joint to the next one or the hand, in its link's frame; None for a link without length."""
+        arm = self.task.arm
+        children = [k for k in range(arm.n) if arm.tables.parent[k] == j]
+        end = arm.tables.place[children[0]] if children else arm.tables.hand_point
+        size = float(np.linalg.norm(end))
+        return end / size if size > 1e-9 else None
+
+    def _horizontal_after(self, j: int, q: Array) -> Array | None:
+        """Axis of the first joint after j that lies level, in W."""
+        arm = self.task.arm
+        whole = arm.coordinates(q[None])[0]
+        for k in range(j + 1, arm.n):
+            R, _ = arm.model.body_pose(arm.links[k], whole)
+            axis = np.asarray(R @ arm.tables.axis[k])
+            if not arm.tables.prismatic[k] and abs(axis[2]) < 0.5:
+                return axis
+        return None
+
+    def run(self) -> dict[int, list[Planned]]:
+        """The best sets of each size with whole paths, by heat along their dense references; sizes may be empty.
+
+        Rounds are independent searches, each from two postures of its own: how often they agree is what can be said of
+        the distance to the optimum.
+        """
+        least, most = self.task.options.count
+        best: dict[Set, Local] = {}
+        coarse: dict[Set, float] = {}
+        rounds = self.task.options.starts
+        for number in range(rounds):
+            self._tell("searching", number / (rounds + 1))
+            for size, ranked in self._round(number, most).items():
+                heats = [math.inf]
+                for cost, braces, Q in ranked[: PATHS if size else 1]:
+                    if cost > SAME_COST * coarse.get(braces, math.inf):
+                        # Nothing new: the path that is known already.
+                        heats.append(best[braces].heat if braces in best else math.inf)
+                        continue
+                    coarse[braces] = cost
+                    local = self._whole(braces, Q)
+                    if local is None:
+                        self.tally.refused.setdefault(braces, "postures found, but none along the whole path")
+                        continue
+                    heats.append(local.heat)
+                    if braces not in best or local.cost < best[braces].cost:
+                        best[braces] = local
+                        self.tally.refused.pop(braces, None)
+                self.tally.heats.setdefault(size, []).append(min(heats))
+        planned: dict[int, list[Planned]] = {}
+        for size in range(least, most + 1):
+            self._tell("refining", (rounds + size / (most + 1)) / (rounds + 1))
+            planned[size] = self._refined([(braces, r) for braces, r in best.items() if len(braces) == size])
+        return planned
+
+    def _round(self, number: int, most: int) -> dict[int, list[tuple[float, Set, Array]]]:
+        """Sets of each size with cost and posture, the best first, from new starts."""
+        starts = self._starts(first=number == 0)
+        found: dict[int, list[tuple[float, Set, Array]]] = {}
+        unbraced = [r for q in starts if (r := self.solve((), q, 1)) is not None]
+        if not unbraced:
+            return found
+        hanging = min(unbraced, key=lambda r: r.cost)
+        found[0] = [(hanging.cost, (), hanging.Q)]
+        front: list[tuple[Set, list[Array]]] = [((), [*starts, hanging.Q])]
+        for size in range(1, most + 1):
+            cheap = self._cheap(self._sets(size, front))
+            slipping = self._slipping(cheap, 2 * BEAM)
+            if slipping and not self.task.options.exhaustive:
+                _, braces, Q = slipping[0]
+                swaps = {grown: [Q] for grown in self._swaps(braces) if grown not in cheap}
+                slipping += self._slipping(self._cheap(swaps), 2)
+                slipping.sort(key=lambda item: item[0])
+            found[size] = slipping[:BEAM]
+            front = [(braces, [Q[len(Q) // 2]]) for _, braces, Q in found[size]]
+            if not front:
+                break
+        return found
+
+    def _cheap(self, sets: Mapping[Set, list[Array]]) -> dict[Set, Local]:
+        """Sets at one posture without slip, from postures."""
+        found: dict[Set, Local] = {}
+        for braces, postures in sets.items():
+            tried = [r for q in postures if (r := self.solve(braces, q, 1, 25)) is not None]
+            if tried:
+                found[braces] = min(tried, key=lambda r: r.cost)
+                self.tally.missed.discard(braces)
+                if len(braces) == 1:
+                    self.single_heats[braces] = min(found[braces].heat, self.single_heats.get(braces, math.inf))
+                self.tally.reached.add(braces)
+            elif braces not in self.tally.reached:
+                self.tally.missed.add(braces)
+        return found
+
+    def _slipping(self, cheap: Mapping[Set, Local], count: int) -> list[tuple[float, Set, Array]]:
+        """The best of them at few knots with slip, the best first."""
+        ranked = sorted(cheap.items(), key=lambda item: item[1].cost)[:count]
+        found = [
+            (r.cost, braces, r.Q)
+            for braces, local in ranked
+            if (r := self.solve(braces, local.Q, self.coarse, 30)) is not None
+        ]
+        return sorted(found, key=lambda item: item[0])
+
+    def _swaps(self, braces: Set) -> list[Set]:
+        """Sets with one brace exchanged for another candidate."""
+        kept = [tuple(one for one in braces if one != out) for out in braces]
+        grown = [
+            tuple(one for one in self.task.candidates if one in rest or one == new)
+            for rest in kept
+            for new in self.task.candidates
+            if new not in braces
+        ]
+        return [one for one in dict.fromkeys(grown) if _fits(one)]
+
+    def _sets(self, size: int, front: Sequence[tuple[Set, list[Array]]]) -> dict[Set, list[Array]]:
+        """Sets that grow from smaller ones, with postures to start from."""
+        candidates = self.task.candidates
+        sets: dict[Set, list[Array]] = {}
+        if self.task.options.exhaustive:
+            for chosen in combinations(candidates, size):
+                if _fits(chosen):
+                    sets[chosen] = [Q for _, postures in front for Q in postures][: 2 * BEAM]
+            return sets
+        for braces, postures in front:
+            for candidate in candidates:
+                grown = tuple(one for one in candidates if one in braces or one == candidate)
+                if len(grown) == size and _fits(grown):
+                    sets.setdefault(grown, []).extend(postures)
+        return sets
+
+    def _whole(self, braces: Set, Q: Array) -> Local | None:
+        """A whole path from postures at few knots."""
+        local = self.solve(braces, Q, self.path, 30)
+        return self._walked(braces, Q, self.path) if local is None else local
+
+    def _refined(self, paths: Sequence[tuple[Set, Local]]) -> list[Planned]:
+        """The best of whole paths at more knots, by the heat of their dense references."""
+        found = []
+        for braces, local in sorted(paths, key=lambda item: item[1].cost)[:KEPT]:
+            better = self.solve(braces, local.Q, self.fine, 20)
+            options = [(self.path, local)] if better is None else [(self.fine, better), (self.path, local)]
+            for count, one in options:
+                dense = references(self.task, braces, self.task.times(count), one.Q)
+                if isinstance(dense, str):
+                    self.tally.refused[braces] = dense
+                    continue
+                collision = touching_links(self.task, dense.times, dense.q)
+                if collision:
+                    self.tally.refused[braces] = collision
+                    continue
+                self.tally.refused.pop(braces, None)
+                found.append(Planned(braces, self.task.times(count), one, dense))
+                break
+        return sorted(found, key=lambda one: one.heat)
+
+    def _walked(self, braces: Set, Q: Array, count: int) -> Local | None:
+        """A path from a posture in its middle, knot after knot: where all at once does not reach."""
+        whole = self.problem(braces, count)
+        targets, middle = whole.course.target, count // 2
+        single = self.problem(braces, 1)
+        out = np.zeros((count, self.task.arm.n))
+        for knots in (range(middle, count), range(middle, -1, -1)):
+            q = reals(np.atleast_2d(Q)[len(np.atleast_2d(Q)) // 2])[None]
+            for k in knots:
+                single.course.target[0] = targets[k]
+                if single.retract(q, 60) > 1e-7:
+                    return None
+                out[k] = q[0]
+        self.tally.solves += 1
+        return solve(whole, out, 30)
+
+
+def _fits(braces: Sequence[Candidate]) -> bool:
+    """Whether each point leans on one surface only."""
+    return len({one.place for one in braces}) == len(braces)
+
+
+def _line(at: Array, times: Array, values: Array) -> Array:
+    """Linear between times, and straight on beyond them."""
+    out = np.interp(at, times, values)
+    before, after = at < times[0], at > times[-1]
+    first = (values[1] - values[0]) / (times[1] - times[0])
+    last = (values[-1] - values[-2]) / (times[-1] - times[-2])
+    out[before] = values[0] + first * (at[before] - times[0])
+    out[after] = values[-1] + last * (at[after] - times[-1])
+    return out

@@ -1,0 +1,272 @@
+"""Whether a plan survives: whole dynamics with friction and surfaces that are not as planned."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from dynsim.model.description import Array
+from dynsim.model.drives import Motor
+from dynsim.planner import planned_scenario
+from dynsim.planner.dense import Dense, nearest
+from dynsim.planner.local import ON
+from dynsim.planner.problem import Candidate, Task
+from dynsim.record import Record
+from dynsim.record.measures import hand_target
+from dynsim.scenario import Scenario
+from dynsim.studies.batch import simulate_batch
+
+# Part of a driver's limit of current that counts as reached.
+AT_LIMIT = 0.999
+# Below its limits a joint touches its stop [rad or m].
+AT_STOP = 1e-6
+# Deeper than that what is not declared would touch [m]: samples, and the tolerance of references.
+SUNK = 1e-4
+# Gains that are tried of each plan.
+TRIES = 3
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """What corners are run, and what a plan that survives keeps there.
+
+    Attributes
+    ----------
+    friction : factors of μ; shift_m: of all surfaces upwards, against gravity [m]
+    heat : times the planned one
+    hand_m : root mean square of the hand's error beside the surface's [m]
+    wall_s : longer than so a corner is refused [s]
+    """
+
+    friction: tuple[float, ...] = (1.0, 0.8, 1.2)
+    shift_m: tuple[float, ...] = (0.0, 0.005, -0.005)
+    heat: float = 1.5
+    hand_m: float = 0.005
+    wall_s: float = 10.0
+    gains: tuple[float, ...] = (500.0, 200.0, 100.0, 50.0, 20.0, 10.0, 5.0)
+
+
+@dataclass(frozen=True)
+class Corner:
+    """A run away from the plan.
+
+    Attributes
+    ----------
+    heat_W : mean; hand_rms_m: of the hand's error; NaN where the run ended early
+    closed : share of the time that each brace touches
+    reason : why it is refused, with time and quantity; empty: it survives
+    """
+
+    friction: float
+    shift_m: float
+    heat_W: float = float("nan")
+    hand_rms_m: float = float("nan")
+    closed: dict[str, float] = field(default_factory=dict)
+    reason: str = ""
+
+    @property
+    def label(self) -> str:
+        """Where it lies."""
+        return f"friction × {self.friction:g}, surfaces {1e3 * self.shift_m:+g} mm"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Corners of one plan with its gains; the first is the nominal one."""
+
+    k_p: float
+    corners: tuple[Corner, ...]
+
+    @property
+    def reason(self) -> str:
+        """Of the first corner that is refused."""
+        return next((f"{c.label}: {c.reason}" for c in self.corners if c.reason), "")
+
+    @property
+    def survives(self) -> bool:
+        return bool(self.corners) and not self.reason
+
+    @property
+    def nominal(self) -> Corner | None:
+        return self.corners[0] if self.corners else None
+
+
+class Verifier:
+    """Runs corners of the plans of one task, several at once."""
+
+    def __init__(self, task: Task, tolerances: Tolerances, jobs: int = 1) -> None:
+        self.task, self.tolerances, self.jobs = task, tolerances, jobs
+
+    def verify(self, plans: Sequence[tuple[tuple[Candidate, ...], Dense]]) -> list[Verdict]:
+        """Of each plan the largest gains with which it survives, or what refuses it with the smallest tried.
+
+        Statics say where to begin: pressed by δ, a brace's force changes by δ/(J K⁻¹ Jᵀ), K = K_m k_p/R. From there on
+        smaller gains are tried. The nominal run comes first; where it fails, no other is made.
+        """
+        gains = self.tolerances.gains
+        first, *others = [(mu, shift) for shift in self.tolerances.shift_m for mu in self.tolerances.friction]
+        left = {}
+        for number, (braces, dense) in enumerate(plans):
+            borne = [k_p for k_p in gains if self._bears(braces, dense, k_p)]
+            left[number] = (borne or [min(gains)])[: TRIES if braces else 1]
+        verdicts: dict[int, Verdict] = {}
+        while left:
+            trial = {number: tried.pop(0) for number, tried in left.items()}
+            nominal = self._runs([(*plans[number], k_p, first) for number, k_p in trial.items()])
+            verdicts |= {n: Verdict(k_p, (c,)) for (n, k_p), c in zip(trial.items(), nominal, strict=True)}
+            sound = [n for n in trial if verdicts[n].survives and plans[n][0]]
+            rest = self._runs([(*plans[n], trial[n], place) for n in sound for place in others])
+            for k, n in enumerate(sound):
+                corners = rest[k * len(others) : (k + 1) * len(others)]
+                verdicts[n] = Verdict(trial[n], (*verdicts[n].corners, *corners))
+            # Where the nominal run fails, softer gains move it further away.
+            left = {n: tried for n, tried in left.items() if tried and n in sound and not verdicts[n].survives}
+        return [verdicts[number] for number in range(len(plans))]
+
+    def corners(
+        self, braces: tuple[Candidate, ...], dense: Dense, k_p: float, places: Sequence[tuple[float, float]]
+    ) -> list[Corner]:
+        """Some corners of one plan, (factor of μ, shift [m])."""
+        return self._runs([(braces, dense, k_p, place) for place in places])
+
+    def _runs(self, runs: Sequence[tuple[tuple[Candidate, ...], Dense, float, tuple[float, float]]]) -> list[Corner]:
+        """Corners of plans, several at once."""
+        if not runs:
+            return []
+        scenarios = [self.perturbed(braces, dense, k_p, *place) for braces, dense, k_p, place in runs]
+        results = simulate_batch(scenarios, jobs=min(self.jobs, len(runs)), keep_records="all")
+        found = []
+        for (braces, dense, _, (mu, shift)), result in zip(runs, results, strict=True):
+            if result.record is None or not result.ok:
+                found.append(Corner(mu, shift, reason=result.reason))
+            else:
+                found.append(self._judged(braces, dense, mu, shift, result.record))
+        return found
+
+    def perturbed(
+        self, braces: tuple[Candidate, ...], dense: Dense, k_p: float, friction: float = 1.0, shift: float = 0.0
+    ) -> Scenario:
+        """The plan's scenario with surfaces and friction that are not as planned."""
+        more: dict[str, Any] = {}
+        if friction != 1.0 or shift != 0.0:
+            more["surface_error"] = {"shift_m": (shift * self._up).tolist(), "friction_factor": friction}
+        more["integrator"] = {"method": "auto", "wall_limit_s": self.tolerances.wall_s}
+        more["record"] = {"rate_hz": 100.0}
+        return planned_scenario.scenario(self.task, braces, dense, k_p, more=more)
+
+    @property
+    def _up(self) -> Array:
+        gravity = self.task.arm.model.robot.gravity
+        return -gravity / np.linalg.norm(gravity)
+
+    def _bears(self, braces: tuple[Candidate, ...], dense: Dense, k_p: float) -> bool:
+        """Whether statics let the heat stay within what is allowed when surfaces are off by the most."""
+        worst = max(map(abs, self.tolerances.shift_m), default=0.0)
+        if not braces or worst == 0.0:
+            return True
+        task, tables = self.task, self.task.arm.tables
+        motors = {motor.joint: motor for motor in task.arm.model.robot.motors}
+        gains = planned_scenario.stiffness_gains(task, braces, dense, k_p)
+        constants = [m.joint_constant / m.resistance for j in task.arm.joints if isinstance(m := motors[j], Motor)]
+        stiffness = gains * np.array(constants)
+        problem = task.problem(braces, 1)
+        work, up = problem.work, self._up
+        hot, none = 0.0, np.zeros((len(problem.course.knot), len(braces)))
+        rows = range(0, len(dense.times), max(len(dense.times) // 12, 1))
+        for t in rows:
+            problem.evaluate(dense.q[t : t + 1].copy(), none)
+            J = work.gap_rate[0, : len(braces)]
+            rise = np.array([up @ normal for normal in work.normal])
+            torque = dense.torques[min(round(dense.times[t] / dense.fine[1]), len(dense.fine) - 1)]
+            pressed = J @ (J / stiffness).T + ON * np.eye(len(braces))
+            hottest = 0.0
+            for shift in (worst, -worst):
+                change = J.T @ np.linalg.solve(pressed, shift * rise)
+                hottest = max(hottest, float(tables.heat @ (torque - change) ** 2))
+            hot += hottest
+        return hot / len(rows) <= 1.2 * self.tolerances.heat * dense.heat
+
+    def _judged(self, braces: tuple[Candidate, ...], dense: Dense, mu: float, shift: float, record: Record) -> Corner:
+        """What a run shows, and the first thing that refuses it."""
+        tolerances, time = self.tolerances, record.time
+        heat = float(record.summary["joule_heat_J"]) / float(time[-1])
+        target = hand_target(record)
+        assert target is not None
+        error = np.linalg.norm(record["hand_position"] - target, axis=1)
+        rms = float(np.sqrt(np.mean(error**2)))
+        closed = {one["name"]: float(one["closed_fraction"]) for one in record.summary["contacts"]}
+        reason = ""
+        allowed = abs(shift) + tolerances.hand_m
+        if heat > tolerances.heat * dense.heat:
+            power = record["heat_joule"].ravel() if "heat_joule" in record else np.zeros(len(time))
+            late = np.flatnonzero(power > tolerances.heat * dense.heat * np.maximum(time, 0.1 * time[-1]))
+            since = float(time[late[0]]) if late.size else float(time[-1])
+            reason = (
+                f"{heat:.3g} W of heat, more than {tolerances.heat:g} × {dense.heat:.3g} W from t = {since:.3g} s on"
+            )
+        elif rms > allowed:
+            k = int(error.argmax())
+            reason = f"hand off by {1e3 * rms:.3g} mm rms (allowed {1e3 * allowed:.3g} mm), most at t = {time[k]:.3g} s"
+        else:
+            reason = self._touches(braces, record, shift) or self._limits(record)
+        return Corner(mu, shift, heat, rms, closed, reason)
+
+    def _touches(self, braces: tuple[Candidate, ...], record: Record, shift: float) -> str:
+        """What is not declared and would touch."""
+        arm = self.task.arm
+        places = np.array([record.labels["q"].index(joint) for joint in arm.joints])
+        q = record["q"][:, places]
+        # Surfaces that are up are arms that are down.
+        distance, what, when = nearest(self.task, braces, record.time, q, shift * self._up)
+        if distance < -SUNK:
+            return f"{what}: {-1e3 * distance:.3g} mm deep at t = {when:.3g} s, though no brace"
+        return ""
+
+    def _limits(self, record: Record) -> str:
+        """A limit of motor, joint or base that is reached."""
+        robot, time = self.task.arm.model.robot, record.time
+        for motor, voltage, current in zip(robot.motors, record["voltage"].T, record["current"].T, strict=True):
+            if not isinstance(motor, Motor):
+                continue
+            for name, values, limit, unit in (
+                ("voltage", voltage, motor.voltage_limit, "V"),
+                ("current", current, AT_LIMIT * motor.current_limit, "A"),
+            ):
+                at = np.flatnonzero(np.abs(values) >= limit)
+                if at.size:
+                    return f"{motor.joint}: {name} at its limit of {limit:.3g} {unit} at t = {time[at[0]]:.3g} s"
+        for link, k in zip(robot.links, robot.position_index, strict=True):
+            values = record["q"][:, k]
+            at = np.flatnonzero((values <= link.lower + AT_STOP) | (values >= link.upper - AT_STOP))
+            if at.size:
+                return f"{link.joint}: at its stop at t = {time[at[0]]:.3g} s"
+        if robot.base is not None:
+            margin = record["tip_margin"]
+            if float(margin.min()) < 0.0:
+                return f"the base tips at t = {time[int(margin.argmin())]:.3g} s"
+        return ""
+
+    def tolerance(self, braces: tuple[Candidate, ...], dense: Dense, k_p: float, steps: int = 5) -> tuple[float, float]:
+        """Greatest error of the surfaces [m] and of friction (as a share) that do hold, each by bisection alone."""
+
+        def holds(place: tuple[float, float]) -> bool:
+            other = (2.0 - place[0], -place[1])
+            return not any(c.reason for c in self.corners(braces, dense, k_p, [place, other]))
+
+        def largest(most: float, place: Callable[[float], tuple[float, float]]) -> float:
+            low, high = 0.0, most
+            if holds(place(high)):
+                return high
+            for _ in range(steps):
+                middle = 0.5 * (low + high)
+                low, high = (middle, high) if holds(place(middle)) else (low, middle)
+            return low
+
+        if self.corners(braces, dense, k_p, [(1.0, 0.0)])[0].reason:
+            return 0.0, 0.0
+        shift = largest(max(map(abs, self.tolerances.shift_m)), lambda x: (1.0, x))
+        friction = largest(max(abs(f - 1.0) for f in self.tolerances.friction), lambda x: (1.0 + x, 0.0))
+        return shift, friction

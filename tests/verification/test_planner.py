@@ -1,0 +1,252 @@
+"""The planner of braces: derivatives, closed forms, and what its plans cost when they are run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import dynsim
+from dynsim.compile.bracing import Brace
+from dynsim.compile.splines import clamped_cubic, quintic_rates
+from dynsim.errors import ModelError, ScenarioError
+from dynsim.jit.kernel import integers, reals
+from dynsim.model.surfaces import Box, HeightField, Quadric, shape_arrays
+from dynsim.planner import compiled
+from dynsim.planner.compiled import Arm, Course, Points
+from dynsim.planner.local import Problem
+from dynsim.planner.problem import Options, task
+from dynsim.planner.scenes import scene, scene_scenario
+from dynsim.planner.search import Search
+from dynsim.planner.verify import Tolerances, Verifier
+from dynsim.scenario.reading import scenario_from_resolved
+
+
+def sphere(center: np.ndarray, radius: float) -> Quadric:
+    return Quadric(np.eye(3) / radius, -center / radius, float(center @ center - radius**2) / (2.0 * radius))
+
+
+def cylinder(center: np.ndarray, axis: np.ndarray, radius: float) -> Quadric:
+    P = np.eye(3) - np.outer(axis, axis)
+    return Quadric(P / radius, -P @ center / radius, float(center @ P @ center - radius**2) / (2.0 * radius))
+
+
+def rotation(rng: np.random.Generator) -> np.ndarray:
+    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    return q * np.sign(np.linalg.det(q))
+
+
+@pytest.fixture(scope="module")
+def tree() -> tuple[Problem, np.ndarray, np.ndarray, np.ndarray]:
+    """A branched arm with both kinds of joints, whose spheres lean on one surface of each kind."""
+    rng, n, c = np.random.default_rng(1), 7, 5
+    axes = rng.normal(size=(n, 3))
+    normal = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])
+    surfaces = [
+        Quadric(np.zeros((3, 3)), normal, 0.3),
+        cylinder(np.array([0.1, 0.0, -1.0]), np.array([0.0, 1.0, 0.0]), 0.4),
+        sphere(np.array([0.1, 0.2, -1.0]), 0.5),
+        Box(np.array([0.0, 0.0, -2.0]), rotation(rng), np.ones(3), 0.1),
+        HeightField(np.array([-3.0, -3.0]), np.array([0.5, 0.5]), 0.2 * rng.normal(size=(13, 13)) - 3.0),
+    ]
+    arm = Arm(
+        parent=integers([-1, 0, 1, 2, 2, 4, 5]),
+        prismatic=integers([0, 0, 1, 0, 0, 1, 0]),
+        rotation=reals([rotation(rng) for _ in range(n)]),
+        place=reals(0.3 * rng.normal(size=(n, 3))),
+        axis=reals(axes / np.linalg.norm(axes, axis=1)[:, None]),
+        mass=reals(rng.uniform(0.1, 1.0, n)),
+        com=reals(0.2 * rng.normal(size=(n, 3))),
+        losses=reals(rng.uniform(0.0, 1.0, n)),
+        heat=reals(rng.uniform(1.0, 3.0, n)),
+        greatest=reals(np.full(n, np.inf)),
+        lower=reals(np.full(n, -9.0)),
+        upper=reals(np.full(n, 9.0)),
+        gravity=reals([0.0, 0.5, -9.81]),
+        hand=integers([6]),
+        hand_point=reals([0.1, 0.0, 0.3]),
+        shapes=shape_arrays([(surface, 0.0, np.zeros(3), False) for surface in surfaces]),
+    )
+    points = Points(
+        body=integers([6, 5, 4, 6, 3]),
+        point=reals(0.3 * rng.normal(size=(c, 3))),
+        radius=reals([0.1, 0.05, 0.2, 0.1, 0.15]),
+        surface=integers(range(c)),
+        margin=reals(np.zeros(c)),
+        friction=reals(np.full(c, 0.3)),
+    )
+    course = Course(
+        target=reals(np.zeros((2, 9))),
+        knot=integers([0, 1, 1]),
+        chord=reals(rng.normal(size=(3, 2))),
+        share=reals([0.3, 0.3, 0.4]),
+        smooth=reals(np.zeros((2, 2))),
+    )
+    Q, V = rng.normal(size=(2, n)), 0.01 * rng.normal(size=(3, n))
+    return Problem(arm, points, course, 0.5, np.zeros((1, 2))), Q, V, rng.uniform(1.0, 5.0, size=(3, c))
+
+
+def test_derivatives_are_those_of_differences(tree: tuple[Problem, np.ndarray, np.ndarray, np.ndarray]) -> None:
+    """Of torques by posture, rate and force, of gaps and of the hand: all surfaces, revolute and prismatic joints."""
+    problem, Q, V, F = tree
+    work, course = problem.work, problem.course
+
+    def evaluated(Q: np.ndarray, V: np.ndarray, F: np.ndarray) -> tuple[np.ndarray, ...]:
+        compiled.evaluate(problem.arm, problem.points, course, work, Q, V, F, False)
+        return work.torque.copy(), work.gap.copy(), work.hand.copy()
+
+    def slope(at, h: float) -> np.ndarray:  # type: ignore[no-untyped-def]
+        # Fourth order: 1e-9 of rounding and truncation together.
+        return (8.0 * (at(h) - at(-h)) - (at(2.0 * h) - at(-2.0 * h))) / (12.0 * h)
+
+    compiled.evaluate(problem.arm, problem.points, course, work, Q, V, F, True)
+    by_q, by_v, by_f, gap, hand = (
+        one.copy() for one in (work.by_q, work.by_v, work.by_f, work.gap_rate, work.hand_rate)
+    )
+    for j in range(Q.shape[1]):
+        for k in range(2):
+            step = np.zeros_like(Q)
+            step[k, j] = 1.0
+            torques = slope(lambda h, step=step: evaluated(Q + h * step, V, F)[0], 1e-4)
+            here = course.knot == k
+            assert np.abs(torques[here] - by_q[here, :, j]).max() < 1e-8 * np.abs(by_q).max()
+            for index, exact in ((1, gap), (2, hand)):
+                found = slope(lambda h, step=step, index=index: evaluated(Q + h * step, V, F)[index], 1e-3)
+                assert np.abs(found[k] - exact[k, :, j]).max() < 1e-8
+        rate = np.zeros_like(V)
+        rate[:, j] = 1.0
+        found = slope(lambda h, rate=rate: evaluated(Q, V + h * rate, F)[0], 1e-5)
+        assert np.abs(found - by_v[:, :, j]).max() < 1e-8 * np.abs(by_v).max()
+    difference = evaluated(Q, V, F)[0] - evaluated(Q, V, 0.0 * F)[0]
+    assert np.abs(difference - np.einsum("ejc,ec->ej", by_f, F)).max() < 1e-12 * np.abs(difference).max()
+
+
+MOTOR = {
+    "type": "dc", "torque_constant_N_m_per_A": 0.2, "resistance_ohm": 1.0, "inductance_H": 1e-3,
+    "rotor_inertia_kg_m2": 1e-4, "gear_ratio": 3.0,
+}  # fmt: skip
+
+
+def level_arm(masses: list[float], along: float) -> dynsim.Scenario:
+    """Links of 1 m along x whose hand stays, and a floor that spheres of 5 cm reach."""
+    link = {"length_m": 1.0, "radius_m": 0.01, "motor": MOTOR}
+    chain = [link | {"mass_kg": mass, "initial_deg": 90.0 if k == 0 else 0.0} for k, mass in enumerate(masses)]
+    hand = [float(len(masses)), 0.0, 0.0]
+    path = {"type": "waypoints", "times_s": [0.0, 1.0, 2.0], "points_m": [hand, hand, hand]}
+    return scenario_from_resolved(
+        {
+            "name": "level",
+            "duration_s": 2.0,
+            "plant": {"type": "serial_arm", "chain": chain},
+            "controller": {"type": "joint_pd", "hand": {"joints": [f"joint_{len(masses)}"], "path": path}},
+            "surfaces": {"floor": {"type": "plane", "point_m": [0.0, 0.0, -0.05], "normal": [0.0, 0.0, 1.0]}},
+            "contacts": {"law": "unilateral", "friction": 0.0},
+        }
+    )
+
+
+def heat_at(masses: list[float], link: int, share: float) -> tuple[float, float]:
+    """Heat [W] and force [N] of an arm that lies level with one brace at a share of one link."""
+    scenario = level_arm(masses, share)
+    options = Options(candidates=(f"link_{link}",), along=(share,), radius_m=0.05, count=(1, 1), clearance_m=0.0)
+    problem = task(scenario, options)
+    brace = next(one for one in problem.candidates if one.name.endswith(f"_at_{share:g}"))
+    local = problem.problem((brace,), 1)
+    Q = reals(problem.arm.model.robot.initial)[None]
+    F = local.forces(Q)
+    local.evaluate(Q, F)
+    return local.heat(), float(F[0, 0])
+
+
+def test_one_link_carries_nothing_wherever_it_is_braced() -> None:
+    """The moment of the support takes that of the weight: f = m g (L/2)/a, at any a > 0."""
+    for share in (0.3, 0.5, 1.0):
+        heat, force = heat_at([0.4], 1, share)
+        assert heat == pytest.approx(0.0, abs=1e-12)
+        assert force == pytest.approx(0.4 * 9.81 * 0.5 / share, rel=1e-9)
+
+
+def test_two_links_are_best_braced_where_the_moment_vanishes() -> None:
+    """f a = m_2 g/2 and f (1 + a) = m_1 g/2 + 3/2 m_2 g: f = (m_1/2 + m_2) g at a = m_2/(m_1 + 2 m_2) of link 2."""
+    m1, m2 = 0.4, 0.2
+    best = m2 / (m1 + 2.0 * m2)
+    heat, force = heat_at([m1, m2], 2, best)
+    assert heat == pytest.approx(0.0, abs=1e-12)
+    assert force == pytest.approx((0.5 * m1 + m2) * 9.81, rel=1e-9)
+    assert min(heat_at([m1, m2], 2, share)[0] for share in (0.2, 0.3)) > 1e-3
+
+
+@pytest.fixture(scope="module")
+def found() -> tuple[Search, dict]:  # type: ignore[type-arg]
+    """Plans of a scene with a floor and a joint about a third axis, with slip on the way."""
+    search = Search(task(scene_scenario(11), Options(starts=2)))
+    return search, search.run()
+
+
+def test_heat_is_that_of_brace_statics_along_the_references(found) -> None:  # type: ignore[no-untyped-def]
+    """The public statics at each instant, with friction against the slip as planned voltages have it."""
+    search, planned = found
+    plan = planned[1][0]
+    arm, dense, brace = search.task.arm, plan.dense, plan.braces[0]
+    model = arm.model
+    q = clamped_cubic(dense.times, dense.q, dense.fine)
+    v, vdot = quintic_rates(float(dense.fine[1]), q)
+    heat = []
+    for position, rate, acceleration in zip(q, v, vdot, strict=True):
+        touching = np.array(brace.point_m) + model.body_pose(brace.body, position)[0].T @ [0.0, 0.0, -brace.radius]
+        slip = model.point_jacobian(brace.body, touching, position) @ rate
+        slip[2] = 0.0
+        speed = float(np.linalg.norm(slip))
+        friction = search.task.friction * speed / np.hypot(speed, 5e-3)
+        lean = Brace(brace.body, touching, np.array([0.0, 0.0, 1.0]), friction, sliding=slip if speed > 1e-9 else None)
+        heat.append(model.brace_statics(position, rate, acceleration, {"brace": lean}).heat)
+    assert dense.heat == pytest.approx(float(np.trapezoid(heat, dense.fine) / dense.fine[-1]), rel=1e-3)
+
+
+def test_plans_run_as_planned_and_bear_errors_of_the_scene(found) -> None:  # type: ignore[no-untyped-def]
+    """The nominal run takes the planned heat; gains that are chosen bear 5 mm and a fifth of friction."""
+    search, planned = found
+    plan = planned[1][0]
+    verdict = Verifier(search.task, Tolerances()).verify([(plan.braces, plan.dense)])[0]
+    nominal = verdict.nominal
+    assert nominal is not None
+    # Bound of the issue: 5 % of the plan.
+    assert nominal.heat_W == pytest.approx(plan.heat, rel=0.05)
+    assert nominal.hand_rms_m < 1e-3
+    assert verdict.survives, verdict.reason
+    assert len(verdict.corners) == 9
+
+
+def test_more_seeds_give_the_same_plans() -> None:
+    """Three seeds within 2 % of each other: what a search that finds the optimum does."""
+    heats = [
+        Search(task(scene_scenario(4), Options(count=(2, 2), starts=2, seed=seed))).run()[2][0].heat
+        for seed in (0, 1, 2)
+    ]
+    assert max(heats) < 1.02 * min(heats)
+
+
+def test_a_path_out_of_reach_is_answered_in_words() -> None:
+    data = scene(4)
+    points = data["controller"]["hand"]["path"]["points_m"]
+    data["controller"]["hand"]["path"]["points_m"] = [[9.0 + x, y, z] for x, y, z in points]
+    plan = dynsim.plan_braces(scenario_from_resolved(data), count=(0, 1), verify=False, starts=1)
+    assert plan.best is None
+    assert [size["braces"] for size in plan.json["sizes"]] == [[], []]
+    assert all("out of reach" in size.reason for size in plan.sizes)
+    with pytest.raises(ScenarioError, match="out of reach"):
+        plan.scenario(1)
+
+
+def test_what_cannot_be_planned_is_refused_with_its_reason() -> None:
+    scenario = scene_scenario(4)
+    with pytest.raises(ModelError, match=r"no candidate 'elbow'"):
+        dynsim.plan_braces(scenario, candidates=["elbow"], verify=False)
+    with pytest.raises(ScenarioError, match="count"):
+        dynsim.plan_braces(scenario, count=(2, 1))
+    with pytest.raises(ModelError, match="no surface 'roof'"):
+        dynsim.plan_braces(scenario, surfaces=["roof"], verify=False)
+    bare = replace(scenario, config=scenario.config.model_copy(update={"controller": None}))
+    with pytest.raises(ModelError, match=r"controller\.hand\.path"):
+        dynsim.plan_braces(bare, verify=False)
