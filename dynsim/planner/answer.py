@@ -92,12 +92,14 @@ class BracePlan:
     ----------
     task : the problem; sizes: the answer for each number of braces; tally: what the search has done
     singles : by candidate, least heat of a single brace at one posture [W], of those that were found
+    ranked : by number of braces, sets with whole paths and their heat [W], the answer first
     """
 
     task: Task
     sizes: tuple[Size, ...]
     tally: Tally
     singles: dict[str, float]
+    ranked: dict[int, list[tuple[str, float]]]
 
     def __repr__(self) -> str:
         best = self.best
@@ -293,7 +295,7 @@ def plan_braces(
     verify: bool = True,
     explain: bool = False,
     exhaustive: bool = False,
-    starts: int = 3,
+    starts: int = 6,
     seed: int = 0,
     jobs: int = 1,
     tolerances: Tolerances | None = None,
@@ -350,7 +352,15 @@ def plan_braces(
         if verify:
             sizes = _verified(problem, search, sizes, found, tolerances or Tolerances(), jobs, explain, tell)
     singles = {one[0].label: heat for one, heat in search.single_heats.items()}
-    return BracePlan(problem, tuple(sizes), search.tally, singles)
+    singles = {one.label: singles[one.label] for one in problem.candidates if one.label in singles}
+    ranked = {size.count: _ranked(size, found[size.count]) for size in sizes}
+    return BracePlan(problem, tuple(sizes), search.tally, singles, ranked)
+
+
+def _ranked(size: Size, found: Sequence[Planned]) -> list[tuple[str, float]]:
+    """Sets of a size with their heat, the answer first."""
+    names = [(", ".join(b.label for b in one.braces) or "none", one.heat) for one in found]
+    return sorted(names, key=lambda one: (one[0] != size.label, one[1]))
 
 
 def _answered(search: Search, count: int, ranked: Sequence[Planned]) -> Size:

@@ -11,6 +11,7 @@ from scipy.interpolate import CubicSpline
 from dynsim.compile.references.feed_forward import pressing
 from dynsim.compile.splines import clamped_cubic, quintic_rates
 from dynsim.dynamics.contact.braces import tables as kb
+from dynsim.errors import ModelError
 from dynsim.jit.kernel import reals
 from dynsim.model.description import Array, Contact
 from dynsim.planner.local import ON
@@ -20,7 +21,9 @@ from dynsim.scenario import build
 # Instants of one pass along the path, at least; and the most time between two [s].
 INSTANTS, SPACING = 50, 0.1
 # Slower than this the hand rests [m/s].
-RESTS = 1e-6
+RESTS = 1e-2
+# Instants at which links are compared with each other.
+LOOKS = 11
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ def references(task: Task, braces: tuple[Candidate, ...], knots: Array, Q: Array
     count = factor * max(INSTANTS, int(np.ceil(span / SPACING)))
     half = np.linspace(0.0, span, count + 1)
     start, end = (np.linalg.norm(np.diff(task.targets(np.array(pair)), axis=0)) for pair in _ends(task.duration))
-    rests = bool(max(start, end) / 1e-4 < 1e-2)
+    rests = bool(max(start, end) / 1e-4 < RESTS)
     if task.kind == "closed":
         spline = CubicSpline(np.append(knots, span), np.vstack([Q, Q[:1]]), bc_type="periodic")
     elif rests or task.kind == "there_and_back":
@@ -111,7 +114,10 @@ def statics(task: Task, braces: tuple[Candidate, ...], times: Array, q: Array, r
     placed: dict[str, tuple[Contact, float | None]] = {
         name: (contact, None) for name, contact in contacts(task, braces).items()
     }
-    planner, tables = pressing(model, fine, whole, rates, placed, task.options.min_N)
+    try:
+        planner, tables = pressing(model, fine, whole, rates, placed, task.options.min_N)
+    except ModelError as error:
+        return f"between knots the postures jump: {error}"
     torques, forces = np.zeros((len(fine), model.n)), np.zeros((len(fine), len(braces)))
     for t in range(len(fine)):
         row = slice(t, t + 1)
@@ -164,7 +170,12 @@ def nearest(
 
 
 def touching_links(task: Task, times: Array, q: Array) -> str:
-    """In words which links that are no neighbours would touch each other, and when; empty: none."""
+    """In words which links that are no neighbours would touch each other, and when; empty: none.
+
+    At some instants of the first pass.
+    """
+    chosen = np.unique(np.linspace(0, np.searchsorted(times, task.span), LOOKS).astype(int))
+    times, q = times[chosen], q[chosen]
     from dynsim.compile.clearance import axis_ends
 
     arm = task.arm

@@ -4,8 +4,112 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dynsim.planner.answer import BracePlan
+import numpy as np
+
+from dynsim.compile.clearance import axis_ends
+from dynsim.draw.figures.plan import PlanPicture, Pose, draw_plan_figures
+from dynsim.errors import SimulationStopped
+from dynsim.model.description import Array
+from dynsim.planner.answer import BracePlan, Size
+from dynsim.planner.problem import Task
+from dynsim.record import Record
+from dynsim.scenario import build
+
+# Instants of the first pass that the arm is drawn at.
+POSES = 4
+# Points of the grid that surfaces are drawn from, each way, and how far it goes beyond the arm [m].
+GRID, BEYOND = 160, 0.15
 
 
 def draw_plan(plan: BracePlan, folder: Path, kind: str) -> None:
     """Figures into ``figures/``, and ``view.html``."""
+    draw_plan_figures(picture(plan), folder / "figures", kind)
+    from dynsim.draw.page import html
+
+    shown = _records(plan)
+    if shown:
+        html.write(shown, folder / "view.html")
+
+
+def _records(plan: BracePlan) -> dict[str, Record]:
+    """Runs of the best and of the unbraced plan, those that come to their ends."""
+    shown: dict[str, Record] = {}
+    best = plan.best
+    for size in plan.sizes:
+        if size.planned is None or not (size is best or size.count == 0):
+            continue
+        try:
+            shown[size.variant] = plan.record(size.count)
+        except SimulationStopped as stop:
+            if stop.record is not None:
+                shown[size.variant] = stop.record
+    return shown
+
+
+def picture(plan: BracePlan) -> PlanPicture:
+    """What the figures of a plan show."""
+    task, best = plan.task, plan.best
+    assert best is not None
+    heading = _heading(task)
+    poses = _poses(task, best, heading)
+    path = _seen(task.targets(np.linspace(0.0, task.duration, 200)), heading)
+    points = np.vstack([path, *(line for pose in poses for line in pose.lines)])
+    low, high = points.min(axis=0) - BEYOND, points.max(axis=0) + BEYOND
+    along, up = np.linspace(low[0], high[0], GRID), np.linspace(low[1], high[1], GRID)
+    grid = along[None, :, None] * heading + up[:, None, None] * np.array([0.0, 0.0, 1.0])
+    grid = grid.reshape(-1, 3)
+    gaps = [surface.gaps(grid) for surface in build.surfaces(task.scenario).values()]
+    ground = np.min(gaps, axis=0).reshape(GRID, GRID) if gaps else np.ones((GRID, GRID))
+    found = {size.count: size for size in plan.sizes if size.planned is not None}
+    return PlanPicture(
+        title=task.scenario.title,
+        poses=poses,
+        path=path,
+        ground=(along, up, ground),
+        sets={count: plan.ranked[count] for count in found},
+        survives={count: size.survives for count, size in found.items()},
+        singles=plan.singles,
+        corners={
+            count: (size.heat, [(c.label, c.heat_W, 1e3 * c.hand_rms_m) for c in size.verdict.corners])
+            for count, size in found.items()
+            if size.verdict is not None
+        },
+    )
+
+
+def _heading(task: Task) -> Array:
+    """Level unit vector from the arm's base to its path."""
+    middle = task.targets(np.array([0.5 * task.span]))[0] - task.arm.tables.place[0]
+    middle[2] = 0.0
+    size = float(np.linalg.norm(middle))
+    return middle / size if size > 1e-9 else np.array([1.0, 0.0, 0.0])
+
+
+def _seen(points: Array, heading: Array) -> Array:
+    """Points from the side: along the heading, and up; (T, 3) → (T, 2)."""
+    return np.stack([points @ heading, points[..., 2]], axis=-1)
+
+
+def _poses(task: Task, size: Size, heading: Array) -> list[Pose]:
+    """The arm at some instants of the first pass."""
+    assert size.planned is not None
+    arm, model, dense = task.arm, task.arm.model, size.planned.dense
+    ends, surfaces = axis_ends(model.robot), build.surfaces(task.scenario)
+    poses = []
+    last = int(np.searchsorted(dense.times, task.span))
+    for t in np.linspace(0, min(last, len(dense.times) - 1), POSES).astype(int):
+        q = arm.coordinates(dense.q[t : t + 1])[0]
+        lines = []
+        for link in arm.links:
+            R, p = model.body_pose(link, q)
+            for end in ends[model.robot.links[link].name]:
+                if np.linalg.norm(end) > 1e-9:
+                    lines.append(_seen(np.array([p, p + R @ end]), heading))
+        points, forces = np.zeros((len(size.braces), 3)), np.zeros((len(size.braces), 3))
+        now = min(round(dense.times[t] / dense.fine[1]), len(dense.fine) - 1)
+        for k, brace in enumerate(size.braces):
+            centre = model.point_position(brace.body, np.array(brace.point_m), q)
+            normal = surfaces[brace.surface].normal(centre)
+            points[k], forces[k] = centre - brace.radius * normal, dense.forces[now, k] * normal
+        poses.append(Pose(float(dense.times[t]), lines, _seen(points, heading), _seen(forces, heading)))
+    return poses

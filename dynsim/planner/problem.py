@@ -94,7 +94,7 @@ class Options:
     peak: float = 0.0
     clearance_m: float = 0.01
     min_N: float = 0.5
-    starts: int = 3
+    starts: int = 6
     seed: int = 0
     exhaustive: bool = False
 
@@ -110,6 +110,11 @@ class Task:
     kind: Kind
     candidates: tuple[Candidate, ...]
     friction: float
+
+    @cached_property
+    def _courses(self) -> dict[int, tuple[Course, Array]]:
+        """Those that were asked for, by their number of knots."""
+        return {}
 
     @property
     def duration(self) -> float:
@@ -177,11 +182,8 @@ class Task:
         """Tables of braces, then of what stays clear."""
         names = self.arm.surfaces
         braced = [(b.joint, b.on_joint, b.radius, 0.0, b.name, names.index(b.surface)) for b in braces]
-        free = [
-            point
-            for point in self.clear
-            if not any(point[0] == b[0] and point[5] == b[5] and np.allclose(point[1], b[1]) for b in braced)
-        ]
+        taken = {(b[0], b[5], *b[1].round(9).tolist()) for b in braced}
+        free = [point for point in self.clear if (point[0], point[5], *point[1].round(9).tolist()) not in taken]
         rows = [*braced, *free]
         return Points(
             body=integers([row[0] for row in rows]),
@@ -241,8 +243,11 @@ class Task:
         return course, smooth
 
     def problem(self, braces: Sequence[Candidate], count: int) -> Problem:
-        """Of one set of braces at so many knots."""
-        course, smooth = self.course(count)
+        """Of one set of braces at so many knots; its targets are its own."""
+        if count not in self._courses:
+            self._courses[count] = self.course(count)
+        course, smooth = self._courses[count]
+        course = course._replace(target=course.target.copy())
         return Problem(self.arm.tables, self.points(braces), course, self.options.min_N, smooth, peak=self.options.peak)
 
 

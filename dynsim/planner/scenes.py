@@ -6,12 +6,19 @@ about a third axis. Nobody has tuned anything on a scene: its seed is its number
 
 from __future__ import annotations
 
+import json
+import sys
+import time as clock
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from dynsim.planner.answer import plan_braces
 from dynsim.scenario import Scenario
 from dynsim.scenario.reading import scenario_from_resolved
+from dynsim.studies.processes import cores
+from dynsim.system.files import write_json
 
 KINDS = ("floor", "pipe", "box", "third_axis")
 PERIOD_S = 10.0
@@ -107,3 +114,66 @@ def _link(axis: str, length: float, mass: float, gear: float, limit: list[float]
 def scene_scenario(seed: int) -> Scenario:
     """The scene as a scenario."""
     return scenario_from_resolved(scene(seed))
+
+
+def planned(seed: int, jobs: int) -> dict[str, Any]:
+    """The plan of a scene in numbers: heat, sets, corners, and what it cost."""
+    scenario, started = scene_scenario(seed), clock.perf_counter()
+    cpu = clock.process_time()
+    searched: list[float] = []
+
+    def tell(text: str, share: float) -> None:
+        if text == "verifying" and not searched:
+            searched.append(clock.process_time() - cpu)
+
+    plan = plan_braces(scenario, along=along_of(seed), jobs=jobs, tell=tell)
+    best = plan.best
+    rows = []
+    for size in plan.sizes:
+        corners = () if size.verdict is None else size.verdict.corners
+        nominal = corners[0].heat_W if corners else float("nan")
+        rows.append(
+            {
+                "count": size.count,
+                "braces": size.label if size.planned else None,
+                "heat_W": round(size.heat, 5) if size.planned else None,
+                "simulated_W": round(nominal, 5) if np.isfinite(nominal) else None,
+                "k_p_V_per_rad": size.k_p,
+                "survives": size.survives,
+                "reason": size.reason,
+                "rounds_that_found_it": f"{size.agreed}/{size.rounds}",
+            }
+        )
+    return {
+        "seed": seed,
+        "kind": kind_of(seed),
+        "joints": plan.task.arm.n,
+        "candidates": len(plan.task.candidates),
+        "friction": plan.task.friction,
+        "search_cpu_s": round(searched[0], 2) if searched else None,
+        "wall_s": round(clock.perf_counter() - started, 1),
+        "best": None if best is None else best.count,
+        "sizes": rows,
+    }
+
+
+def main(arguments: list[str]) -> None:
+    """Plan scenes and write their numbers: [--out FOLDER] [FIRST LAST]."""
+    folder = Path("results/planner")
+    if "--out" in arguments:
+        k = arguments.index("--out")
+        folder = Path(arguments[k + 1])
+        del arguments[k : k + 2]
+    first, last = (int(arguments[0]), int(arguments[-1])) if arguments else (1, 20)
+    found = []
+    # What is compiled, or loaded, is no part of a scene's time.
+    planned(first, 1)
+    for seed in range(first, last + 1):
+        found.append(planned(seed, cores()))
+        print(json.dumps(found[-1]), flush=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / "scenes.json", found)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

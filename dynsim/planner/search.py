@@ -20,16 +20,16 @@ from dynsim.planner.local import Local, Problem, solve
 from dynsim.planner.problem import Candidate, Task
 
 # Sets of each size that go on from the cheap problem, and from the one with slip.
-BEAM = 4
+BEAM = 5
 # Postures that a round begins with, and random ones that are tried for them.
 POSTURES, DRAWS = 2, 60
 # Sets of each size and round that whole paths are made for, and those that are made finer in the end.
-PATHS, KEPT = 3, 3
+PATHS, KEPT = 4, 3
 # Part of a cost that is no gain worth another path.
 SAME_COST = 0.99
 # Knots of whole paths: the search's, and the answer's.
-PATH_KNOTS, FINE_KNOTS = 9, 17
-CLOSED_KNOTS, CLOSED_FINE = 12, 24
+PATH_KNOTS, FINE_KNOTS = 9, (17, 33)
+CLOSED_KNOTS, CLOSED_FINE = 12, (24, 48)
 
 Set = tuple[Candidate, ...]
 Tell = Callable[[str, float], None]
@@ -308,21 +308,23 @@ class Search:
     def _refined(self, paths: Sequence[tuple[Set, Local]]) -> list[Planned]:
         """The best of whole paths at more knots, by the heat of their dense references."""
         found = []
-        for braces, local in sorted(paths, key=lambda item: item[1].cost)[:KEPT]:
-            better = self.solve(braces, local.Q, self.fine, 20)
-            options = [(self.path, local)] if better is None else [(self.fine, better), (self.path, local)]
-            for count, one in options:
-                dense = references(self.task, braces, self.task.times(count), one.Q)
-                if isinstance(dense, str):
-                    self.tally.refused[braces] = dense
-                    continue
-                collision = touching_links(self.task, dense.times, dense.q)
-                if collision:
-                    self.tally.refused[braces] = collision
-                    continue
+        for braces, coarse in sorted(paths, key=lambda item: item[1].cost)[:KEPT]:
+            kept: list[Planned] = []
+            local, why = coarse, ""
+            for count in (self.path, *self.fine):
+                better = local if count == self.path else self.solve(braces, local.Q, count, 20)
+                if better is None:
+                    break
+                local = better
+                dense = references(self.task, braces, self.task.times(count), local.Q)
+                why = dense if isinstance(dense, str) else touching_links(self.task, dense.times, dense.q)
+                if not isinstance(dense, str) and not why:
+                    kept.append(Planned(braces, self.task.times(count), local, dense))
+            if kept:
+                found.append(min(kept, key=lambda one: one.heat))
                 self.tally.refused.pop(braces, None)
-                found.append(Planned(braces, self.task.times(count), one, dense))
-                break
+            else:
+                self.tally.refused[braces] = why
         return sorted(found, key=lambda one: one.heat)
 
     def _walked(self, braces: Set, Q: Array, count: int) -> Local | None:

@@ -1,0 +1,168 @@
+"""Figures of a plan of braces: posture with forces along the path, heat by set, map of single braces, robustness."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from dynsim.draw.figures.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PULLING,
+    Array,
+    log_axis,
+    new_figure,
+    number,
+    save_all,
+)
+
+# Length of an arrow of the greatest force, over the height of what is seen.
+ARROW = 0.35
+
+
+@dataclass(frozen=True)
+class Pose:
+    """The arm at one instant, seen from the side: along its heading and up [m].
+
+    Attributes
+    ----------
+    time : [s]
+    lines : of each link both ends, (2, 2)
+    points, forces : of the braces, (c, 2) [m] and [N]
+    """
+
+    time: float
+    lines: Sequence[Array]
+    points: Array
+    forces: Array
+
+
+@dataclass(frozen=True)
+class PlanPicture:
+    """What the figures of a plan show.
+
+    Attributes
+    ----------
+    title : of the scenario
+    poses : of the best plan; path: of the hand, (T, 2) [m]
+    ground : distance from the nearest surface on a grid: along, up, and (up, along) [m]
+    sets : label and heat [W] by number of braces; the first of each is the answer
+    survives : of the answers
+    singles : heat of single braces by candidate [W]
+    corners : of the answers, by number of braces: labels, heat [W] and hand's error [mm]; planned heat
+    """
+
+    title: str
+    poses: Sequence[Pose]
+    path: Array
+    ground: tuple[Array, Array, Array]
+    sets: Mapping[int, Sequence[tuple[str, float]]]
+    survives: Mapping[int, bool | None]
+    singles: Mapping[str, float]
+    corners: Mapping[int, tuple[float, Sequence[tuple[str, float, float]]]]
+
+
+def posture(picture: PlanPicture) -> Figure | None:
+    """The best plan from the side at some instants, with the forces of its braces."""
+    if not picture.poses:
+        return None
+    along, up, gap = picture.ground
+    shape = float(np.ptp(up) / np.ptp(along))
+    figure = new_figure(min(1.2 + 6.6 * shape, 6.0), f"{picture.title}: posture and forces of the best plan")
+    axes = figure.subplots()
+    axes.contourf(along, up, gap, levels=[-1e9, 0.0], colors=["#D9D9D9"])
+    axes.contour(along, up, gap, levels=[0.0], colors=[GREY], linewidths=0.8)
+    largest = max((float(np.linalg.norm(pose.forces, axis=1).max(initial=0.0)) for pose in picture.poses), default=0.0)
+    for k, pose in enumerate(picture.poses):
+        shade = 0.25 + 0.75 * (k + 1) / len(picture.poses)
+        for line in pose.lines:
+            axes.plot(*line.T, color=BLUE, alpha=shade, marker="o", markersize=2.5, linewidth=1.6)
+        for point, force in zip(pose.points, pose.forces, strict=True):
+            if largest > 0.0:
+                tip = force / largest * ARROW * np.ptp(up)
+                arrow = {"arrowstyle": "-|>", "color": PULLING, "alpha": shade, "shrinkA": 0.0, "shrinkB": 0.0}
+                axes.annotate("", xy=point, xytext=point - tip, arrowprops=arrow)
+    axes.plot(*picture.path.T, color=GREEN, linewidth=2.0, label="path of the hand")
+    if largest > 0.0:
+        axes.plot([], [], color=PULLING, label=f"forces on braces, at most {number(largest, 3)} N")
+    axes.set(xlabel="along the heading [m]", ylabel="up [m]", aspect="equal")
+    axes.legend(loc="upper right")
+    return figure
+
+
+def heat_by_set(picture: PlanPicture) -> Figure | None:
+    """Heat of the best sets of each size; the answers filled, those that do not survive hatched."""
+    rows = [(count, label, heat, k) for count, sets in picture.sets.items() for k, (label, heat) in enumerate(sets)]
+    if not rows:
+        return None
+    figure = new_figure(1.2 + 0.26 * len(rows), f"{picture.title}: heat of the motors by set of braces")
+    axes = figure.subplots()
+    for y, (count, _, heat, k) in enumerate(rows):
+        lost = k == 0 and picture.survives.get(count) is False
+        axes.barh(
+            y, heat, color=BLUE if k == 0 else "#B9D4E8", hatch="////" if lost else None, edgecolor="white", height=0.75
+        )
+        text = f" {number(heat, 3)} W" + (", does not survive" if lost else "")
+        axes.text(heat, y, text, va="center", fontsize=7.0)
+    axes.set_yticks(range(len(rows)), [f"{count}: {label}" for count, label, _, _ in rows], fontsize=7.0)
+    axes.invert_yaxis()
+    axes.set_xlabel("mean heat [W]")
+    if max(heat for *_, heat, _ in rows) > 20.0 * min(heat for *_, heat, _ in rows):
+        log_axis(axes, "x")
+    axes.margins(x=0.25)
+    return figure
+
+
+def single_braces(picture: PlanPicture) -> Figure | None:
+    """Least heat of an arm with one brace, by the point that is braced, in the middle of the path without slip."""
+    if not picture.singles:
+        return None
+    figure = new_figure(3.0, f"{picture.title}: one brace, by where it is")
+    axes = figure.subplots()
+    names = list(picture.singles)
+    axes.bar(range(len(names)), list(picture.singles.values()), color=ORANGE)
+    axes.set_xticks(range(len(names)), names, rotation=45.0, ha="right", fontsize=7.0)
+    axes.set_ylabel("heat, no slip [W]")
+    axes.set_yscale("log")
+    return figure
+
+
+def robustness(picture: PlanPicture) -> Figure | None:
+    """Heat, over the planned one, and the hand's error of the answers where the scene is not as planned."""
+    shown = {count: corners for count, corners in picture.corners.items() if len(corners[1]) > 1}
+    if not shown:
+        return None
+    figure = new_figure(4.2, f"{picture.title}: the plans where the scene is not as planned")
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    labels = [label for label, _, _ in next(iter(shown.values()))[1]]
+    width = 0.8 / len(shown)
+    for k, (count, (planned, corners)) in enumerate(shown.items()):
+        at = np.arange(len(corners)) + (k - 0.5 * (len(shown) - 1)) * width
+        colour = (BLUE, GREEN, ORANGE, GREY, PULLING)[k % 5]
+        upper.bar(at, [heat / planned for _, heat, _ in corners], width, color=colour, label=f"{count} braces")
+        lower.bar(at, [error for _, _, error in corners], width, color=colour)
+    upper.axhline(1.0, color="black", linewidth=0.6)
+    upper.set_ylabel("heat over planned")
+    lower.set_ylabel("hand's error, rms [mm]")
+    lower.set_xticks(range(len(labels)), labels, rotation=25.0, ha="right", fontsize=6.5)
+    upper.legend(ncols=4)
+    return figure
+
+
+FIGURES = {
+    "plan_posture": posture,
+    "plan_heat": heat_by_set,
+    "plan_single_braces": single_braces,
+    "plan_robustness": robustness,
+}
+
+
+def draw_plan_figures(picture: PlanPicture, folder: Path, kind: str) -> list[Path]:
+    """All figures of a plan to a folder; returns the files."""
+    return save_all(FIGURES, picture, folder, kind)
