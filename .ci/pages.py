@@ -488,11 +488,45 @@ def faults() -> str:
     return "\n" + markdown(data("reference/bridge_faults.json")["cells"]).strip("\n") + "\n\n"
 
 
+def planned_arm() -> str:
+    """The published arm: braces with friction and without."""
+    rows = []
+    for friction, file in (("0.1", "published"), ("0", "frictionless")):
+        for size in data(f"planner/{file}.json"):
+            place = size["braces"].replace(" on floor", "")
+            forces = NONE
+            if size["normal_force_min_N"] is not None:
+                forces = f"{fixed(size['normal_force_min_N'], 1)} … {fixed(size['normal_force_max_N'], 1)}"
+            heat, simulated = number(size["heat_W"]), number(size["simulated_W"])
+            verdict = "yes" if size["survives"] else "no"
+            rows.append((friction, place, heat, simulated, forces, f"{size['k_p_V_per_rad']:g}", verdict))
+    heads = ("μ", "braces", "heat [W]", "simulated [W]", "forces [N]", "k_p [V/rad]", "survives")
+    return lines(heads, rows, left=2)
+
+
+def planned_scenes() -> str:
+    """Scenes of the planner: the answer of each."""
+    rows = []
+    for scene in data("planner/scenes.json"):
+        free = scene["sizes"][0]["heat_W"]
+        best = next((size for size in scene["sizes"] if size["count"] == scene["best"]), None)
+        head = (str(scene["seed"]), scene["kind"].replace("_", " "), str(scene["joints"]), f"{scene['friction']:g}")
+        if best is None:
+            rows.append((*head, NONE, NONE, NONE, NONE, NONE))
+            continue
+        gain, verdict = f"{best['k_p_V_per_rad']:g}", "yes" if best["survives"] else "no"
+        rows.append((*head, number(free), str(best["count"]), number(best["heat_W"]), gain, verdict))
+    return lines(
+        ("scene", "with", "joints", "μ", "unbraced [W]", "braces", "heat [W]", "k_p", "survives"), rows, left=2
+    )
+
+
 TABLES: dict[str, Callable[[], str]] = {
     one.__name__: one
     for one in (
         elbows_in_short, elbows, glued_and_real, overturning_holds, overturning_drives, assumptions, ledger,
         against_rk43, time_stepping, endings, right_hand_side, ratios, job, precision, sweeps, comparison, faults,
+        planned_arm, planned_scenes,
     )
 }  # fmt: skip
 

@@ -25,7 +25,7 @@ BEAM = 5
 POSTURES, DRAWS = 2, 60
 # Sets of each size and round that whole paths are made for, and those that are made finer in the end.
 PATHS, KEPT = 4, 3
-# Part of a cost that is no gain worth another path.
+# Costs of one set whose ratio is nearer to 1 are the same posture, which needs no other path.
 SAME_COST = 0.99
 # Knots of whole paths: the search's, and the answer's.
 PATH_KNOTS, FINE_KNOTS = 9, (17, 33)
@@ -204,9 +204,11 @@ class Search:
             for size, ranked in self._round(number, most).items():
                 heats = [math.inf]
                 for cost, braces, Q in ranked[: PATHS if size else 1]:
-                    if cost > SAME_COST * coarse.get(braces, math.inf):
-                        # Nothing new: the path that is known already.
-                        heats.append(best[braces].heat if braces in best else math.inf)
+                    known = coarse.get(braces, math.inf)
+                    if cost > SAME_COST * known:
+                        # Nothing new: the path that is known already, or a worse posture of its set.
+                        if cost * SAME_COST <= known and braces in best:
+                            heats.append(best[braces].heat)
                         continue
                     coarse[braces] = cost
                     local = self._whole(braces, Q)
