@@ -295,7 +295,7 @@ def plain_text(root: Element, name: str) -> str:
             elif key in _ATTRIBUTES.get(element.tag, ()):
                 attributes += f" {key}={quoteattr(' '.join(_words(value)))}"
         # Pinocchio refuses dynamics without a loss, which the specification allows.
-        if element.tag == "dynamics" and not attributes:
+        if element.tag == "dynamics" and not element.attributes.keys() & set(_ATTRIBUTES["dynamics"]):
             return ""
         inside = "".join(
             written(child, _CHILDREN.get(child.tag, ())) for child in element.children if child.tag in tags
