@@ -105,7 +105,10 @@ def test_what_a_page_names_exists(name: str) -> None:
     assert missing(text) == []
 
 
-@pytest.mark.parametrize("path", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))], ids=lambda path: path.name)
+DOCS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+@pytest.mark.parametrize("path", DOCS, ids=lambda path: path.name)
 def test_files_of_a_run_have_the_names_that_are_written(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     assert set(re.findall(r"`([\w.]+\.html)`", text)) <= {VIEW}
