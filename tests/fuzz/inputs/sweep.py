@@ -70,6 +70,7 @@ def losses() -> list[str]:
     table = Path("out/sweep.csv")
     if not table.is_file():
         raise RecordError("refused")
+    csv.field_size_limit(1 << 30)  # a key of the journal names a column, however long it is
     with table.open(encoding="utf-8", newline="") as stream:
         rows = list(csv.DictReader(stream))
     found = [] if len(rows) == 4 else [f"{len(rows)} runs of 4 are in the table"]
