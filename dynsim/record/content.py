@@ -15,7 +15,7 @@ from dynsim.errors import RecordError
 from dynsim.record.scene import Scene
 
 FORMAT = "dynsim-record-2"
-"""Formats that are read too. 1 (dynsim 0.1) has one time axis, no events and no scene."""
+"""Of the records that are written; others are refused."""
 TIME = "time"
 """Name of the axis that signals are on unless they name another."""
 
