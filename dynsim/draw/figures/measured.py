@@ -48,7 +48,7 @@ def joints(record: Record) -> Figure | None:
         style.line(axes, record.time, measured, color=style.BLUE, label="measured")
         style.line(axes, record.time, goal, color=style.BLACK, linestyle=(0, (4, 2)), lw=0.9, label="goal")
         axes.set_ylabel(f"{label}\n[{unit}]")
-        _at_least(axes, 0.02)
+        style.at_least(axes, 0.02)
         _mark_replay(axes, record)
     for axes in grid.T.ravel()[len(shown) :]:
         axes.set_axis_off()
@@ -118,7 +118,7 @@ def servos(record: Record) -> Figure | None:
             if joint in columns:
                 style.line(axes, record.times(name), columns[joint], label=joint, **_look(place))
         axes.set_ylabel(label)
-        _at_least(axes, 0.5)
+        style.at_least(axes, 0.5)
         _mark_replay(axes, record, named=axes is grid[0, 0])
     if timed:
         _cycles(grid[-1, 0], record)
@@ -179,14 +179,6 @@ def _finite(measure: Callable[[Array], float], values: Array) -> float:
 def _look(place: int) -> dict[str, object]:
     row, colour = divmod(place, len(COLOURS))
     return {"color": COLOURS[colour], "linestyle": DASHES[row % len(DASHES)], "lw": 1.0}
-
-
-def _at_least(axes: Axes, span: float) -> None:
-    """Do not blow up the steps of a sensor to the height of the panel."""
-    low, high = axes.get_ylim()
-    if high - low < span:
-        middle = 0.5 * (low + high)
-        axes.set_ylim(middle - 0.5 * span, middle + 0.5 * span)
 
 
 def _mark_replay(axes: Axes, record: Record, *, named: bool = False) -> None:

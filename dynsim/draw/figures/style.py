@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import matplotlib
 import numpy as np
+from cycler import cycler
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -61,6 +62,7 @@ _LOOK: Any = {
     "axes.grid": True,
     "axes.axisbelow": True,
     "axes.xmargin": 0.0,
+    "axes.prop_cycle": cycler(color=VARIANT_COLOURS),
     "grid.color": "#E3E3E3",
     "grid.linewidth": 0.5,
     "xtick.major.width": 0.6,
@@ -88,9 +90,9 @@ def look() -> Iterator[None]:
         yield
 
 
-def new_figure(height: float, title: str) -> Figure:
+def new_figure(height: float, title: str, *, width: float = WIDTH) -> Figure:
     """An empty figure [inch] that belongs to no pyplot and needs no display."""
-    figure = Figure(figsize=(WIDTH, height), layout="constrained")
+    figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     # A long title is smaller: it would be cut off at both sides.
     figure.suptitle(title, fontsize=TITLE * min(1.0, TITLE_LONG / max(len(title), 1)))
@@ -237,6 +239,14 @@ def log_axis(axes: Axes, which: str = "y") -> None:
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if near else (1.0,)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
+
+
+def at_least(axes: Axes, span: float) -> None:
+    """Widen the vertical axis to a ``span``: rounding, or the steps of a sensor, are not blown up to its height."""
+    low, high = axes.get_ylim()
+    if high - low < span:
+        middle = 0.5 * (low + high)
+        axes.set_ylim(middle - 0.5 * span, middle + 0.5 * span)
 
 
 def legend_above(axes: Axes, columns: int = 3) -> None:

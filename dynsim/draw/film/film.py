@@ -121,7 +121,7 @@ class Film:
             image.paste(painter.frame(time), place)
         draw = ImageDraw.Draw(image)
         draw.text((10, 5), self._title, fill="#202428", font=font(13))
-        clock = f"{time:.2f} s" + (f"  ({self._speed:g}×)" if self._speed != 1.0 else "")
+        clock = f"{time:.2f} s" + (f"  ({self._speed:.3g}×)" if self._speed != 1.0 else "")
         draw.text((self.size[0] - 10, 5), clock, fill="#202428", font=font(13), anchor="ra")
         if len(self._places) > 1:
             for x, y in self._places:
