@@ -142,9 +142,7 @@ class Record:
         return self.signals[name]
 
     def __repr__(self) -> str:
-        scenario = self.provenance.get("scenario")
-        names = [scenario.get("name"), scenario.get("variant")] if isinstance(scenario, Mapping) else []
-        title = " / ".join(str(name) for name in names if name)
+        title = self.title
         span = f", {self.time[0]:g} to {self.time[-1]:g} s" if len(self) else ""
         first = ", ".join(list(self.signals)[:_SHOWN]) + (", …" if len(self.signals) > _SHOWN else "")
         parts = [f"{len(self)} samples{span}", f"{len(self.signals)} signals{f' ({first})' if first else ''}"]
@@ -194,6 +192,13 @@ class Record:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    @property
+    def title(self) -> str:
+        """Scenario and variant, or the robot of a measured run; "" where neither is known."""
+        scenario, robot = self.provenance.get("scenario"), self.provenance.get("robot")
+        names = [scenario.get("name"), scenario.get("variant")] if isinstance(scenario, Mapping) else []
+        return " / ".join(str(name) for name in names if name) or (f"{robot}, measured" if robot else "")
 
     @property
     def units(self) -> dict[str, str]:

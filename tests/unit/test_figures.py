@@ -616,13 +616,6 @@ def test_ten_motors_are_an_envelope_and_six(braced: Record) -> None:
     assert len(shown) == 1 + motors.LARGEST
 
 
-def test_a_curve_on_another_is_dashed_and_others_are_not() -> None:
-    time = np.linspace(0.0, 1.0, 50)
-    curves = {"a": (time, time), "b": (time, time + 1e-3), "c": (time, 1.0 - time)}
-    looks = style.told_apart(style.variant_styles(list(curves)), curves)
-    assert [look["linestyle"] for look in looks.values()] == ["-", style.OVER[0], "-"]
-
-
 def test_what_lies_below_a_surface_is_marked(braced: Record) -> None:
     body, _ = skeleton.skeleton(braced)
     assert body is not None

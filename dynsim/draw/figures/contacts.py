@@ -54,10 +54,7 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
     more = sum(-(-(len(having[name]) + 1) // 2) - 1 for name in chosen) * style.LEGEND_ROW / 72.0
     figure = style.new_figure(1.0 + ROW * len(chosen) + more, title + note)
     series = [[one for r in having[name].values() for one in _series(r, name)] for name in chosen]
-    styles = style.told_apart(
-        style.variant_styles(list(records)),
-        *({v: (r.time, _force(r, name)) for v, r in having[name].items()} for name in chosen),
-    )
+    styles = style.variant_styles(list(records))
     rows = style.time_rows(figure, series, max(map(style.settle_time, runs)))
     for name, panels in zip(chosen, rows, strict=True):
         # What the panel of the beginning shows would be a heap of marks in the other one.

@@ -84,15 +84,7 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
     finals = np.array([record["energy_electrical"][-1] for record in shown.values()])
     logarithmic = bool(finals.min() > 0.0 and finals.max() > LOG_RATIO * finals.min())
     least = 0.02 * float(finals.min())
-    styles = style.told_apart(
-        style.variant_styles(list(records)),
-        {
-            name: (record.time, np.log(np.maximum(energy, least)) if logarithmic else energy)
-            for name, record in shown.items()
-            for energy in (record["energy_electrical"],)
-        },
-        {name: (record.time, record["work_mechanical"]) for name, record in shown.items()},
-    )
+    styles = style.variant_styles(list(records))
     for name, record in shown.items():
         style.line(over_time, record.time, record["energy_electrical"], label=name, **styles[name])
         style.line(work, record.time, record["work_mechanical"], **styles[name])

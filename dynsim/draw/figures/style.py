@@ -11,13 +11,11 @@ from typing import Any, TypeVar
 import matplotlib
 import numpy as np
 from cycler import cycler
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
 from dynsim.record import Record
@@ -25,7 +23,6 @@ from dynsim.system.files import replacing
 from dynsim.system.terminal import plain
 
 T = TypeVar("T")
-Name = TypeVar("Name", str, int)
 Array = NDArray[np.float64]
 # A quantity over time, (T,) and (T,) or (T, k).
 Series = tuple[Array, Array]
@@ -76,9 +73,6 @@ _LOOK: Any = {
 LINE_POINTS = 4000
 # A panel of the transient shows this times its length, and there is none where that is most of the run.
 TRANSIENT_ROOM, TRANSIENT_MOST = 1.2, 0.8
-# Curves that lie closer together than this share of a panel's height hide each other; those on top get these dashes.
-SAME = 0.012
-OVER = ((0, (5, 4)), (0, (2, 2.5)), (0, (6, 2, 1.5, 2)))
 # Height of a row of a legend [point].
 LEGEND_ROW = 12.5
 
@@ -108,26 +102,10 @@ def save(figure: Figure, path: Path) -> Path:
         The file cannot be written; an older one is left as it was.
     """
     # Names from files: no font has a picture for a control character.
-    for text in _texts(figure):
+    for text in figure.findobj(Text):
         text.set_text(plain(text.get_text()))
-    for axes in figure.axes:
-        for axis in (axes.xaxis, axes.yaxis):
-            if not axis.label.get_text():
-                # Else matplotlib measures all numbers again, several times, for the place of nothing.
-                axis.set_label_coords(0.5, 0.0)
     figure.set_dpi(DPI)
     return write(figure, path)
-
-
-def _texts(artist: Artist) -> Iterator[Text]:
-    """All texts but numbers at axes: to ask for those would make all ticks, for one more time."""
-    if isinstance(artist, Text):
-        yield artist
-    elif isinstance(artist, Axis) and not isinstance(artist.get_major_locator(), FixedLocator):
-        yield artist.label
-    else:
-        for child in artist.get_children():
-            yield from _texts(child)
 
 
 def save_all(
@@ -169,12 +147,8 @@ def write(figure: Figure, path: Path) -> Path:
 
 def title(record: Record, what: str) -> str:
     """``what`` with scenario and variant (of a measured run: the robot), and how far an incomplete run came."""
-    scenario = record.provenance.get("scenario", {})
-    robot = record.provenance.get("robot")
-    name = " / ".join(text for text in (scenario.get("name", ""), scenario.get("variant", "")) if text)
-    name = name or (f"{robot}, measured" if robot else "")
     note = "" if record.complete else f" (incomplete: ends at {record.time[-1]:.3g} s)"
-    return f"{name or 'record'}: {what}{note}"
+    return f"{record.title or 'record'}: {what}{note}"
 
 
 def comparison_title(records: Sequence[Record], what: str) -> str:
@@ -182,10 +156,10 @@ def comparison_title(records: Sequence[Record], what: str) -> str:
     return f"{records[0].provenance.get('scenario', {}).get('name', '') or 'comparison'}: {what}"
 
 
-def variant_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Colour and width (and, beyond seven variants, line style) of every variant, by position.
+def variant_styles(names: Sequence[T]) -> dict[T, dict[str, Any]]:
+    """Colour and width (and, beyond seven curves, line style) of variants, or of curves of one run, by position.
 
-    Later variants lie on top and are thinner, so that equal curves are still seen to be several.
+    Later ones lie on top and are thinner, so that equal curves are still seen to be several.
     """
     many = len(VARIANT_COLOURS)
     dashes = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1, 1, 1)))
@@ -197,32 +171,6 @@ def variant_styles(names: Sequence[str]) -> dict[str, dict[str, Any]]:
         }
         for k, name in enumerate(names)
     }
-
-
-def told_apart(looks: Mapping[Name, Mapping[str, Any]], *panels: Mapping[Name, Series]) -> dict[Name, dict[str, Any]]:
-    """The looks with dashes for curves that would hide an earlier one, in any of the panels that they share.
-
-    One hides another where it is within ``SAME`` of the panel's height for more than half of the time. What lies below
-    shows through the gaps.
-    """
-    found = {name: dict(look) for name, look in looks.items()}
-    over: dict[Name, int] = dict.fromkeys(looks, 0)
-    for curves in panels:
-        start, end = (pick(float(time[k]) for time, _ in curves.values()) for pick, k in ((max, 0), (min, -1)))
-        at = np.linspace(start, end, 200)
-        sampled = {name: np.interp(at, *curve) for name, curve in curves.items()}
-        values = np.concatenate(list(sampled.values()))
-        values = values[np.isfinite(values)]
-        near = SAME * float(np.ptp(values)) if values.size else 0.0
-        done: list[Name] = []
-        for name, one in sampled.items():
-            hidden: list[Name] = [other for other in done if np.mean(np.abs(one - sampled[other]) <= near) > 0.5]
-            over[name] = max([over[name], *(over[other] + 1 for other in hidden)])
-            done.append(name)
-    for name, depth in over.items():
-        if depth:
-            found[name]["linestyle"] = OVER[min(depth, len(OVER)) - 1]
-    return found
 
 
 def number(value: float, digits: int = 4) -> str:

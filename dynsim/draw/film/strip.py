@@ -54,13 +54,10 @@ class Strip:
         if self._image is None:
             return None
         image = self._image.copy()
-        x = self._at(time)
-        ImageDraw.Draw(image).line([x, self._top, x, self._bottom], fill=CURSOR, width=2)
+        box = self._axes.get_window_extent()
+        x, _ = self._axes.transData.transform((time, 0.0))
+        ImageDraw.Draw(image).line([x, self._size[1] - box.y1, x, self._size[1] - box.y0], fill=CURSOR, width=2)
         return image
-
-    def _at(self, time: float) -> float:
-        (t0, x0), (t1, x1) = self._scale
-        return x0 + (x1 - x0) * (time - t0) / (t1 - t0)
 
     def _draw(self, records: Mapping[str, Record], name: str) -> None:
         figure = Figure(figsize=(self._size[0] / DPI, self._size[1] / DPI), dpi=DPI, layout="constrained")
@@ -113,10 +110,7 @@ class Strip:
             )
         canvas.draw()
         self._image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-        box = axes.get_window_extent()
-        low, high = axes.get_xlim()
-        self._scale = (low, float(box.x0)), (high, float(box.x1))
-        self._top, self._bottom = self._size[1] - float(box.y1), self._size[1] - float(box.y0)
+        self._axes = axes
 
 
 def largest(values: style.Array, count: int) -> list[int]:

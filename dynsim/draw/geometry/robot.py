@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 POSE_ERROR = 4e-5
 # Frames of a longer run are thinned though poses between them be off by more.
 FRAMES = 20_000
+WORLD_AXES = np.eye(3)
 HERE_POINT: Vector3 = (0.0, 0.0, 0.0)
 
 
@@ -91,11 +92,9 @@ def _every(count: int, stride: int) -> NDArray[np.intp]:
     return np.unique(np.append(np.arange(0, count, stride), count - 1))
 
 
-def bounds(robots: Sequence[Robot], turn: float = 0.0) -> tuple[Array, Array]:
-    """The box, turned about z by ``turn`` [rad], in which everything moves, with some room, (3,) and (3,) [m]."""
-    pooled = moving(robots)
-    c, s = math.cos(turn), math.sin(turn)
-    pooled = pooled @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+def bounds(robots: Sequence[Robot], axes: Array = WORLD_AXES) -> tuple[Array, Array]:
+    """The box along some axes, unit vectors (3, 3), in which everything moves, with some room, (3,) and (3,) [m]."""
+    pooled = moving(robots) @ axes.T
     low, high = pooled.min(axis=0), pooled.max(axis=0)
     # What hardly moves is not blown up to fill the window, and what is flat has some depth to stand in.
     span, reach = float((high - low).max()), max(robot.reach for robot in robots)
@@ -150,8 +149,6 @@ def paths(record: Record, scene: Scene) -> Iterator[tuple[str, Array]]:
     if scene.hand is not None:
         yield "hand", np.asarray(point_positions(record, scene.hand), dtype=np.float64)
     target = hand_target(record)
-    if target is None and "hand_position_goal" in record:
-        target = record["hand_position_goal"]
     if target is None and "w_target" in record:
         target = record["w_target"][:, :3]
     if target is not None:
