@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from dynsim.draw.figures import events, style
 from dynsim.draw.figures.style import Array
+from dynsim.draw.geometry.surfaces import box_about
 from dynsim.record import Record
 from dynsim.record.measures import hand_error, hand_target
 
@@ -130,9 +131,7 @@ def _planes(figure: Figure, records: list[Record]) -> list[Axes]:
     """Three square panels of one scale, large enough for hands and targets."""
     points = [record["hand_position"] for record in records]
     points += [target for record in records if (target := hand_target(record)) is not None]
-    everything = np.concatenate(points)
-    everything = everything[np.isfinite(everything).all(axis=1)]
-    low, high = (everything.min(axis=0), everything.max(axis=0)) if len(everything) else (np.zeros(3), np.zeros(3))
+    low, high = box_about(points)
     span = float((high - low).max())
     half = 0.56 * span if span > 0.0 else 0.05
     middle = 0.5 * (low + high)

@@ -10,6 +10,7 @@ import numpy as np
 from dynsim.draw.figures import style
 from dynsim.draw.figures.style import Array
 from dynsim.draw.geometry.shapes import Faces, corners_of
+from dynsim.draw.geometry.surfaces import box_about
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
 from dynsim.record.poses import ORIENTATION, POSITION, point_positions
@@ -50,10 +51,6 @@ class Skeleton:
             else:
                 lines.append((points[carrier], points[body]))
         return np.array(lines)
-
-    def carriers(self) -> list[int | None]:
-        """The body that each of the :meth:`segments` is of; None of what leads there from the world."""
-        return [carrier for carrier, _ in self._segments()]
 
     def _segments(self) -> list[tuple[int | None, int | None]]:
         """The body that a segment is of and the one that it leads to: None for the world, and for the hand."""
@@ -231,10 +228,7 @@ def with_labels(extent: tuple[Array, Array], labels: Sequence[Label], scale: flo
 
 def bounds(records: Sequence[Record], drawn: Sequence[Array]) -> tuple[Array, Array]:
     """Corners of the box that a 3D view shows [m]."""
-    points = _points(records, drawn)
-    if not len(points):
-        return np.zeros(3), np.ones(3)
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = box_about(_clouds(records, drawn))
     # A flat picture still needs some depth to stand in.
     extra = np.maximum(0.15 * float((high - low).max() or 1.0) - 0.5 * (high - low), 0.0)
     return low - extra, high + extra
@@ -242,18 +236,14 @@ def bounds(records: Sequence[Record], drawn: Sequence[Array]) -> tuple[Array, Ar
 
 def extent_of(plane: SidePlane, drawn: Sequence[Array], records: Sequence[Record]) -> tuple[Array, Array]:
     """Corners of what a side view shows [m]."""
-    flat = plane.project(_points(records, drawn))
-    low, high = flat.min(axis=0), flat.max(axis=0)
+    low, high = box_about([plane.project(points) for points in _clouds(records, drawn)])
     span = float((high - low).max() or 1.0)
     # An upright arm would leave no width for the axis.
     extra = np.maximum(np.array([0.3, 0.05]) * span - 0.5 * (high - low), 0.0) + 0.05 * span
     return low - extra, high + extra
 
 
-def _points(records: Sequence[Record], drawn: Sequence[Array]) -> Array:
-    """Everything that must be in the picture, (N, 3)."""
-    points = [record["hand_position"] for record in records]
-    points += [target for record in records if (target := hand_target(record)) is not None]
-    points += [segments.reshape(-1, 3) for segments in drawn]
-    pooled = np.concatenate(points)
-    return pooled[np.isfinite(pooled).all(axis=1)]
+def _clouds(records: Sequence[Record], drawn: Sequence[Array]) -> list[Array]:
+    """Everything that must be in the picture, (…, 3) each."""
+    targets = [target for record in records if (target := hand_target(record)) is not None]
+    return [*(record["hand_position"] for record in records), *targets, *drawn]

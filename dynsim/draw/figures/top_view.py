@@ -17,6 +17,7 @@ from dynsim.draw.figures.posture import ARM_COLOUR
 from dynsim.draw.figures.skeleton import Skeleton, skeleton
 from dynsim.draw.figures.style import Array
 from dynsim.draw.geometry.shapes import outline
+from dynsim.draw.geometry.surfaces import box_about
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
 from dynsim.record.poses import point_positions
@@ -55,8 +56,7 @@ def top_view(record: Record) -> Figure | None:
     else:
         world, own = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
     _draw_world(world, body, rows)
-    world.set_xlim(low[0], high[0])
-    world.set_ylim(low[1], high[1])
+    world.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     _draw_own(own, body, rows)
     for axes in (world, own):
         axes.set_aspect("equal", adjustable="box", anchor="N")
@@ -92,12 +92,7 @@ def _extent(body: Skeleton, rows: Rows) -> tuple[Array, Array]:
         points.append(target[:, :2])
     points += [_track(body, one, rows) for one in (*body.scene.contacts, *body.scene.supports)]
     points += [corners[:, :2] for row in rows[[0, -1]] for corners, _ in body.solids(row)]
-    points.append(body.segments(int(rows[-1])).reshape(-1, 3)[:, :2])
-    everything = np.concatenate(points)
-    everything = everything[np.isfinite(everything).all(axis=1)]
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    room = 0.05 * float((high - low).max())
-    return low - room, high + room
+    return box_about([*points, body.segments(int(rows[-1]))[..., :2]], 0.05)
 
 
 def _track(body: Skeleton, point: Point, rows: Rows) -> Array:
@@ -176,11 +171,8 @@ def _draw_own(axes: Axes, body: Skeleton, rows: Rows) -> None:
     reach = 0.75 * float((high - low).max())
     known = path[np.isfinite(path).all(axis=1)]
     near = known[((known >= low - reach) & (known <= high + reach)).all(axis=1)]
-    everything = np.concatenate([drawn, near])
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    room = 0.06 * float((high - low).max())
-    axes.set_xlim(low[0] - room, high[0] + room)
-    axes.set_ylim(low[1] - room, high[1] + room)
+    low, high = box_about([drawn, near], 0.06)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     lost = 1.0 - len(near) / max(len(path), 1)
     axes.set_title("in the base's frame" + (f"; {100 * lost:.2g} % of the path is farther off" if lost > 0.0 else ""))
     axes.set_xlabel("ahead [m]")

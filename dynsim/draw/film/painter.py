@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw
 
-from dynsim.draw.figures.style import BLACK, BLUE, GREEN, GREY, ORANGE, PULLING, SKY
+from dynsim.draw.figures.style import BLACK, BLUE, DEEP, GREEN, GREY, ORANGE, PULLING, SKY
 from dynsim.draw.film.strokes import Box, arrow, dashes, font, labels, line, ring
 from dynsim.draw.geometry.camera import Camera
 from dynsim.draw.geometry.meshes import Meshes, simplified
@@ -36,7 +36,6 @@ BODY, HUB, WHEEL, SUPPORT = "#AEB7C4", "#4A5260", "#3A4048", "#D5EAF8"
 FRICTION = "#7A3E9D"
 # Friction of less than this share of the largest normal force has no arrow.
 FRICTION_SHOWN = 1e-3
-DEEP = "#882255"
 MODES = {0: GREY, 1: ORANGE, 2: GREEN}
 # Towards the light, seen by the viewer: right, up, near.
 LIGHT = np.array([-0.35, 0.75, 0.56]) / np.linalg.norm([-0.35, 0.75, 0.56])
@@ -99,7 +98,7 @@ class Painter:
         self._gripped = hand.body if hand is not None and "gripper" in record else WORLD
         self._solids = self._moving(shapes)
         self._contacts = contacts(robot)
-        self._sunk = sunk(robot)
+        self._sunk = sunk(record, robot.scene)
         self._full = largest_force(self._contacts)
         self._ways = dict(paths(record, robot.scene))
         self._supports = supports(robot.scene, self._wheels)

@@ -220,12 +220,11 @@ class Sunk:
     depth: Array
 
 
-def sunk(robot: Robot, rows: NDArray[np.intp] | slice = slice(None)) -> list[Sunk]:
+def sunk(record: Record, scene: Scene, rows: NDArray[np.intp] | list[int] | slice = slice(None)) -> list[Sunk]:
     """Joints, and the hand, below surfaces at samples of the record: surfaces hold contact points only.
 
     Bodies of a mobile base, and wheels, stand where the model has them.
     """
-    record, scene = robot.record, robot.scene
     wheels = {k for k, body in enumerate(scene.bodies) if body.joint.signal == "rho"} | set(scene.base)
     points = [(body.joint.name, k, HERE_POINT) for k, body in enumerate(scene.bodies) if k not in wheels]
     if scene.hand is not None and scene.hand.body != WORLD:

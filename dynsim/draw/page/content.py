@@ -93,7 +93,7 @@ def _record(name: str, robot: Robot, blocks: Blocks, meshes: Meshes, low: Array,
         "sunk": [
             {"name": one.name, "surface": one.surface, "body": one.body, "p": list(one.position)}
             | {"least": one.least, "depth": blocks.add(one.depth, 1e-5)}
-            for one in sunk(robot, rows)
+            for one in sunk(record, scene, rows)
         ],
         "wheels": None if groups.down is None else {"names": groups.names, "down": blocks.add(groups.down[rows])},
         "supports": supports(scene, groups),
