@@ -38,33 +38,19 @@ class Skeleton:
 
         Nothing leads from the world or a body to what moves freely beside it.
         """
-        points = self.record[POSITION][row].astype(np.float64)
+        points, base = self.record[POSITION][row].astype(np.float64), self.scene.base
         lines = []
-        for carrier, body in self._segments():
-            if body is None:
-                hand = self.scene.hand
-                assert hand is not None
-                lines.append((points[hand.body], point_positions(self.record, hand, row)))
-            elif carrier is None:
-                # A sliding joint at the root moves its body away from where it is mounted.
-                lines.append((np.array(self.scene.bodies[body].joint.position), points[body]))
-            else:
-                lines.append((points[carrier], points[body]))
-        return np.array(lines)
-
-    def _segments(self) -> list[tuple[int | None, int | None]]:
-        """The body that a segment is of and the one that it leads to: None for the world, and for the hand."""
-        # A mobile base is drawn as what it is, see dynsim.draw.geometry.shapes.
-        solid = self.scene.base
-        bodies = [
-            (k, body) for k, body in enumerate(self.scene.bodies) if k not in solid and not _moves_beside(body.joint)
-        ]
-        found: list[tuple[int | None, int | None]] = [(None, k) for k, body in bodies if body.parent == WORLD]
-        found += [(body.parent, k) for k, body in bodies if body.parent not in (WORLD, *solid)]
+        for k, body in enumerate(self.scene.bodies):
+            # A mobile base is drawn as what it is, see :meth:`solids`.
+            if k in base or body.parent in base or _moves_beside(body.joint):
+                continue
+            # A sliding joint at the root moves its body away from where it is mounted.
+            start = np.array(body.joint.position) if body.parent == WORLD else points[body.parent]
+            lines.append((start, points[k]))
         hand = self.scene.hand
         if hand is not None and hand.body != WORLD:
-            found.append((hand.body, None))
-        return found
+            lines.append((points[hand.body], point_positions(self.record, hand, row)))
+        return np.array(lines)
 
     def solids(self, row: int) -> list[tuple[Array, Faces]]:
         """Corners, (n, 3) [m], and faces of the shapes of a mobile base and its wheels at a sample."""
