@@ -245,17 +245,18 @@ class Record:
 
     def to_hdf5(self) -> memoryview:
         """The bytes of the file that :meth:`save` writes."""
-        return writer.encode(
-            Content(
-                time=self.time,
-                signals=self.signals,
-                summary=self.summary,
-                provenance=self.provenance,
-                complete=self.complete,
-                axes=self.axes,
-                events=self.events,
-                scene=self.scene,
-            )
+        return writer.encode(self._content())
+
+    def _content(self) -> Content:
+        return Content(
+            time=self.time,
+            signals=self.signals,
+            summary=self.summary,
+            provenance=self.provenance,
+            complete=self.complete,
+            axes=self.axes,
+            events=self.events,
+            scene=self.scene,
         )
 
     @classmethod
@@ -285,11 +286,11 @@ class Record:
 
     def to_dataframe(self, axis: str = TIME) -> pandas.DataFrame:
         """A pandas DataFrame of the signals on one time axis, see :func:`dynsim.record.export.to_dataframe`."""
-        return export.to_dataframe(self, axis)
+        return export.to_dataframe(self._content(), axis)
 
     def to_xarray(self) -> xarray.Dataset:
         """An xarray Dataset of all signals, see :func:`dynsim.record.export.to_xarray`."""
-        return export.to_xarray(self)
+        return export.to_xarray(self._content())
 
 
 def _entries(what: str, entries: Mapping[str, Any]) -> Entries:

@@ -86,8 +86,7 @@ def margin_comparison(records: Mapping[str, Record]) -> Figure | None:
         _mark_tipping(axes, some, [colours[name] for name in shown])
     panels[0].set_ylabel("tip margin")
     events.explain(panels[-1], events.mark_variants([panels], shown, colours))
-    handles, labels = panels[-1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=1)
+    style.legend_below(figure, panels[-1:], 1)
     return figure
 
 

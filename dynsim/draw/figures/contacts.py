@@ -70,7 +70,7 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
                 if alone and is_real(record):
                     _draw_modes(axes, record, name)
                 elif alone:
-                    fill = {"color": style.PULLING, "alpha": 0.3, "linewidth": 0, "interpolate": True}
+                    fill: dict[str, Any] = {"color": style.PULLING, "alpha": 0.3, "linewidth": 0, "interpolate": True}
                     axes.fill_between(record.time, force, 0.0, where=force < 0.0, label="_pulling", **fill)
                 if len(panels) > 1 and axes is panels[0]:
                     _draw_samples(axes, record, name, colour)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -100,7 +101,7 @@ def energy_comparison(records: Mapping[str, Record]) -> Figure | None:
     colours = {name: str(look["color"]) for name, look in styles.items()}
     events.explain(work, events.mark_variants([(over_time,), (work,)], shown, colours))
     _totals(total, list(shown), finals, [str(styles[name]["color"]) for name in shown], logarithmic)
-    figure.legend(*over_time.get_legend_handles_labels(), loc="outside lower center", ncols=min(len(shown), 5))
+    style.legend_below(figure, [over_time], 5)
     return figure
 
 
@@ -142,7 +143,7 @@ def ledger(record: Record) -> Figure | None:
     events.mark_all([(axes,) for axes in panels], record)
     if not near:
         panels[-1].set_xlabel(f"{panels[-1].get_xlabel()}\n{_residual_note(record, turnover)}")
-    figure.legend(*whole.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    style.legend_below(figure, [whole], 3)
     return figure
 
 
@@ -217,7 +218,7 @@ def _totals(axes: Axes, names: Sequence[str], values: Array, colours: Sequence[s
         axes.margins(x=0.05, y=0.08)
     for place, value in zip(places.tolist(), values.tolist(), strict=True):
         part = f"\n1/{style.number(largest / value, 3)}" if logarithmic and value < largest else ""
-        look = {"textcoords": "offset points", "ha": "center", "va": "bottom", "fontsize": 7.5}
+        look: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "va": "bottom", "fontsize": 7.5}
         text = f"{style.number(value)}{part}"
         axes.annotate(text, (place, max(value, 0.0)), xytext=(0, 6 if logarithmic else 2), **look)
     axes.set_xticks(places, names, rotation=30 if len(names) <= 4 else 60, ha="right")

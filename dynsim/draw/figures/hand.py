@@ -113,7 +113,7 @@ def error_comparison(records: Mapping[str, Record]) -> Figure | None:
     rows[1][0].set_ylabel("vertical error [mm]")
     colours = {name: str(look["color"]) for name, look in styles.items()}
     events.explain(rows[1][-1], events.mark_variants(rows, shown, colours))
-    figure.legend(*rows[0][-1].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    style.legend_below(figure, rows[0][-1:], 2)
     return figure
 
 
@@ -182,16 +182,13 @@ def edge_on(points: Array) -> Array:
 
 
 def _legend_below(figure: Figure, axes: Axes) -> None:
-    handles, labels = axes.get_legend_handles_labels()
     followed = {line.get_label() for line in axes.get_lines() if line.get_linestyle() != "None"}
-    start = axes.plot([], [], **START)
-    handles, labels = [*handles, *start], [*labels, "start of the hand"]
+    axes.plot([], [], label="start of the hand", **START)
     for target in (TARGET, GOALS):
         # One that is held is a mark itself.
         if target in followed:
-            handles += axes.plot([], [], "x", color=style.BLACK, markersize=5)
-            labels.append(f"start of the {target}")
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 4))
+            axes.plot([], [], "x", color=style.BLACK, markersize=5, label=f"start of the {target}")
+    style.legend_below(figure, [axes], 4)
 
 
 def _error_label(name: str, record: Record) -> str:

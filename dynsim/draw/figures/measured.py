@@ -52,7 +52,7 @@ def joints(record: Record) -> Figure | None:
     for axes in grid.T.ravel()[len(shown) :]:
         axes.set_axis_off()
     _label_time(grid)
-    figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    style.legend_below(figure, [grid[0, 0]], 2)
     return figure
 
 

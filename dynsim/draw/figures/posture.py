@@ -77,7 +77,7 @@ def posture(record: Record) -> Figure | None:
     _frame_side(side, plane, extent, () if body is None else body.scene.surfaces)
     if note:
         side.set_title(note, color=style.PULLING)
-    _legend(figure, [side])
+    style.legend_below(figure, [side], 5)
     return figure
 
 
@@ -117,7 +117,7 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     # Labels of narrow panels would overlap: one stands for all.
     for axes in grid[:, [k for k in range(columns) if columns > 2 and k != columns // 2]].ravel():
         axes.set_xlabel("")
-    _legend(figure, list(grid.ravel()))
+    style.legend_below(figure, list(grid.ravel()), 5)
     return figure
 
 
@@ -131,15 +131,6 @@ def _with_labels(
         wide = with_labels(extent, labels, scale)
         scale = float((room / (wide[1] - wide[0])).min())
     return wide, scale
-
-
-def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
-    """One legend for all panels; the arm itself needs no entry."""
-    known: dict[str, Any] = {}
-    for axes in panels:
-        handles, labels = axes.get_legend_handles_labels()
-        known.update(dict(zip(labels, handles, strict=True)))
-    figure.legend(known.values(), known.keys(), loc="outside lower center", ncols=len(known))
 
 
 def _frame_side(axes: Axes, plane: SidePlane, extent: tuple[Array, Array], surfaces: Sequence[Surface]) -> None:
@@ -202,15 +193,16 @@ def _side_view(
     for _, _, position, force in () if body is None else body.contacts():
         axes.plot(*plane.project(position), zorder=6, linestyle="none", **_contact_mark(force))
     labels = contact_labels(body, plane, scale)
-    if body is not None and (below := sunk(record, body.scene, body.shown())):
+    rows = np.array([] if body is None else body.shown(), dtype=np.intp)
+    if body is not None and (below := sunk(record, body.scene, rows)):
+        ring: dict[str, Any] = {"markersize": 9, "markerfacecolor": "none", "color": style.DEEP, "zorder": 5}
         for one in below:
             point = Point(one.name, "hand", one.body, one.position)
-            places = plane.project(point_positions(record, point, body.shown())[one.depth > one.least])
-            axes.plot(*places.T, "o", markersize=9, markerfacecolor="none", color=style.DEEP, zorder=5)
+            places = plane.project(point_positions(record, point, rows)[one.depth > one.least])
+            axes.plot(*places.T, "o", **ring)
         deepest = max(below, key=lambda one: float(one.depth.max()))
         text = f"below {deepest.surface}, up to {style.number(1e3 * float(deepest.depth.max()), 3)} mm"
-        label = text if named else "below a surface"
-        axes.plot([], [], "o", markersize=9, markerfacecolor="none", color=style.DEEP, label=label)
+        axes.plot([], [], "o", label=text if named else "below a surface", **ring)
     for label in labels:
         axes.annotate(
             label.text,

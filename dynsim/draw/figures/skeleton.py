@@ -9,11 +9,12 @@ import numpy as np
 
 from dynsim.draw.figures import style
 from dynsim.draw.figures.style import Array
+from dynsim.draw.geometry.robot import placed
 from dynsim.draw.geometry.shapes import Faces, corners_of
 from dynsim.draw.geometry.surfaces import box_about
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
-from dynsim.record.poses import ORIENTATION, POSITION, point_positions
+from dynsim.record.poses import POSITION, point_positions
 from dynsim.record.scene import WORLD, Joint, Point, Scene, Surface
 
 # Postures drawn faintly, evenly over the run, besides the last one.
@@ -100,14 +101,8 @@ def _moves_beside(joint: Joint) -> bool:
 
 def skeleton(record: Record) -> tuple[Skeleton | None, str]:
     """The robot of a record, or why it cannot be drawn."""
-    scene = record.scene
-    if scene is None or not scene.bodies:
-        return None, "posture not drawn: the record has no scene"
-    if POSITION not in record or ORIENTATION not in record:
-        return None, "posture not drawn: not every joint was recorded"
-    if record[POSITION].shape != (len(record), len(scene.bodies), 3):
-        return None, "posture not drawn: the scene has other bodies than the record"
-    return Skeleton(record, scene), ""
+    scene, lacking = placed(record)
+    return (None, f"posture not drawn: {lacking}") if scene is None else (Skeleton(record, scene), "")
 
 
 @dataclass(frozen=True)

@@ -208,6 +208,15 @@ def legend_above(axes: Axes, columns: int = 3) -> None:
     axes.set_title(" ", y=1.0, pad=6.0 + LEGEND_ROW * max(rows - 1, 0))
 
 
+def legend_below(figure: Figure, panels: Sequence[Axes], columns: int) -> None:
+    """One legend for some panels, below all of the figure."""
+    named: dict[str, Any] = {}
+    for axes in panels:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            named.setdefault(label, handle)
+    figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=min(len(named), columns))
+
+
 def settle_time(record: Record) -> float:
     """``metrics.settle_s`` of the record's scenario [s]."""
     return float(record.provenance.get("scenario", {}).get("metrics", {}).get("settle_s", 0.0))

@@ -48,11 +48,10 @@ def top_view(record: Record) -> Figure | None:
     wide = size[0] > 1.8 * size[1]
     # In a row of its own the world is as high as its width makes it, with 0.6 inch for its labels.
     above = 0.6 + 6.3 * float(size[1] / size[0])
-    height = 0.3 + above + BELOW if wide else 0.9 + float(np.clip(3.9 * size[1] / size[0], 3.3, 6.0))
+    height = 0.8 + above + BELOW if wide else 0.9 + float(np.clip(3.9 * size[1] / size[0], 3.3, 6.0))
     figure = style.new_figure(height, style.title(record, "base from above"))
     if wide:
-        grid = figure.add_gridspec(2, 2, height_ratios=[above, BELOW], width_ratios=[1.0, 1.25])
-        world, own = figure.add_subplot(grid[0, :]), figure.add_subplot(grid[1, 0])
+        world, own = figure.subplots(2, 1, height_ratios=[above, BELOW])
     else:
         world, own = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
     _draw_world(world, body, rows)
@@ -60,15 +59,7 @@ def top_view(record: Record) -> Figure | None:
     _draw_own(own, body, rows)
     for axes in (world, own):
         axes.set_aspect("equal", adjustable="box", anchor="N")
-    handles, labels = world.get_legend_handles_labels()
-    more = [pair for pair in zip(*own.get_legend_handles_labels(), strict=True) if pair[1] not in labels]
-    handles, labels = [*handles, *(one for one, _ in more)], [*labels, *(text for _, text in more)]
-    if wide:
-        beside = figure.add_subplot(grid[1, 1])
-        beside.set_axis_off()
-        beside.legend(handles, labels, loc="center", ncols=2)
-    else:
-        figure.legend(handles, labels, loc="outside lower center", ncols=4)
+    style.legend_below(figure, [world, own], 4)
     return figure
 
 

@@ -48,12 +48,22 @@ class Robot:
     reach: float
 
 
+def placed(record: Record) -> tuple[Scene | None, str]:
+    """The scene of a record that has the poses of its bodies, or what it lacks to be drawn."""
+    scene = record.scene
+    if scene is None or not scene.bodies:
+        return None, "the record has no scene"
+    if POSITION not in record or ORIENTATION not in record:
+        return None, "not every joint was recorded"
+    if record[POSITION].shape != (len(record), len(scene.bodies), 3):
+        return None, "the scene has other bodies than the record"
+    return scene, ""
+
+
 def robot_of(record: Record) -> Robot | None:
     """The robot of a record; None without samples, a scene, or the poses of its bodies."""
-    scene = record.scene
-    if scene is None or not scene.bodies or not {POSITION, ORIENTATION} <= set(record) or not len(record):
-        return None
-    if record[POSITION].shape != (len(record), len(scene.bodies), 3):
+    scene, _ = placed(record)
+    if scene is None or not len(record):
         return None
     position = record[POSITION][np.isfinite(record[POSITION]).all(axis=(1, 2))]
     if not len(position):
@@ -220,7 +230,7 @@ class Sunk:
     depth: Array
 
 
-def sunk(record: Record, scene: Scene, rows: NDArray[np.intp] | list[int] | slice = slice(None)) -> list[Sunk]:
+def sunk(record: Record, scene: Scene, rows: NDArray[np.intp] | slice = slice(None)) -> list[Sunk]:
     """Joints, and the hand, below surfaces at samples of the record: surfaces hold contact points only.
 
     Bodies of a mobile base, and wheels, stand where the model has them.
