@@ -77,12 +77,7 @@ class View:
         for down, pair in zip(self.grounded, self.wheels, strict=True):
             # From the side a lifted pair is a little above the ground: the model has no height for it ([T] II.A).
             raised = np.array([0.0, 0.0 if above or down else 0.35 * self.radius])
-            look: dict[str, Any] = {
-                "facecolor": GROUND if down else LIFT,
-                "edgecolor": GROUND,
-                "lw": 0.7,
-                "zorder": 4 if above else 2,
-            }
+            look: dict[str, Any] = {"facecolor": GROUND if down else LIFT, "edgecolor": GROUND, "lw": 0.7}
             for corners in pair:
                 axes.add_patch(
                     Polygon(outline(self.project(corners, above)) + raised, zorder=4 if above else 2, **look)
