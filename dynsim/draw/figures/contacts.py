@@ -75,7 +75,7 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
                 if len(panels) > 1 and axes is panels[0]:
                     _draw_samples(axes, record, name, colour)
             if not all(map(is_real, having[name].values())):
-                _mark_pulling(axes)
+                style.shade_below_zero(axes, "surface pulls")
         panels[0].set_ylabel(f"{name}\nfₙ [N]")
         style.legend_above(panels[-1], columns=4 if alone else 2)
     _note_sampling(rows, runs)
@@ -211,13 +211,3 @@ def _draw_modes(axes: Axes, record: Record, name: str) -> None:
             spans, (0.0, 1.0), transform=axes.get_xaxis_transform(), color=colour, linewidth=0, zorder=0.2, label=label
         )
     axes.set_xlim(limits)
-
-
-def _mark_pulling(axes: Axes) -> None:
-    """Shade what lies below zero, if any of the axis does."""
-    axes.axhline(0.0, color=style.PULLING, linewidth=0.8)
-    low, high = axes.get_ylim()
-    if low >= 0.0:
-        return
-    axes.axhspan(low, 0.0, color=style.PULLING, alpha=0.13, linewidth=0, label="surface pulls")
-    axes.set_ylim(low, high)

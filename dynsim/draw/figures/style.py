@@ -199,6 +199,15 @@ def at_least(axes: Axes, span: float) -> None:
         axes.set_ylim(middle - 0.5 * span, middle + 0.5 * span)
 
 
+def shade_below_zero(axes: Axes, label: str) -> None:
+    """The zero line, and what lies below it shaded, if any of the axis does."""
+    axes.axhline(0.0, color=PULLING, linewidth=0.8)
+    low, high = axes.get_ylim()
+    if low < 0.0:
+        axes.axhspan(low, 0.0, color=PULLING, alpha=0.13, linewidth=0, label=label)
+        axes.set_ylim(low, high)
+
+
 def legend_above(axes: Axes, columns: int = 3) -> None:
     """The legend over the axes, where it hides nothing; room is kept for as many rows as it has."""
     rows = -(-len(axes.get_legend_handles_labels()[1]) // columns)
