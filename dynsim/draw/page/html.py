@@ -35,7 +35,8 @@ def page(records: Mapping[str, Record], *, ghost: bool = False, scripts: Sequenc
         There is nothing to be seen: no record with samples and a scene; or three.js is not installed.
     """
     data = packed(records, ghost=ghost)
-    title = next((record.title for record in records.values() if record.title), "record")
+    titles = (record.title.partition(" / ")[0] for record in records.values())
+    title = next(filter(None, titles), "record")
     allowed = f"; connect-src {html.escape(connect)}" if connect else ""
     return _filled({"title": html.escape(title), "data": data, "connect": allowed}, scripts)
 
