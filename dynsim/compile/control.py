@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from dynsim.compile.references.operated import Operated
+from dynsim.compile.references.teleop import TeleopOptions
 from dynsim.compile.rolling import coordinates, rolled
 from dynsim.compile.splines import quintic_coefficients
 from dynsim.dynamics import tables as ka
@@ -62,7 +62,7 @@ class JointControl:
 
     Only DC motors take the gains; ``k_p`` of a servo says whether it follows its position. References of a torque
     source are its torques [N m]. ``sample_time`` is the period [s] at which commands are taken, to be held in between;
-    None: they follow the state continuously. Where there is ``operated``, an operator rewrites references on the way.
+    None: they follow the state continuously. Where there is ``teleop``, an operator rewrites references on the way.
     """
 
     k_p: NDArray[np.float64]
@@ -70,7 +70,7 @@ class JointControl:
     reference: ReferenceArrays
     path: HandPath | None
     sample_time: float | None = None
-    operated: Operated | None = None
+    teleop: TeleopOptions | None = None
 
     @classmethod
     def absent(cls, robot: Robot) -> JointControl:

@@ -10,7 +10,7 @@ import io
 import itertools
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -152,60 +152,6 @@ class ScenarioFile:
         if variant is not None and not variants and variant != data.get("variant"):
             raise ScenarioError(f"{path}: has no variants, so there is no {variant!r}")
         return variants, variant
-
-    def near(self, variant: str | None, overrides: Mapping[str, Any]) -> Near:
-        """What loads scenarios that differ from one variant with some overrides in few values."""
-        return Near(self, variant, overrides)
-
-
-class Near:
-    """Scenarios of one variant that differ in few values: the rest is merged and validated once, and shared.
-
-    Sections (keys at the top) without a changed value are the same objects in all of them.
-    """
-
-    def __init__(self, file: ScenarioFile, variant: str | None, overrides: Mapping[str, Any]) -> None:
-        self._file, self._variant, self._overrides = file, variant, dict(overrides)
-        self._first: Scenario | None = None
-        self._merged: dict[str, Any] = {}
-        self._name: str | None = None
-
-    def load(self, values: Mapping[str, Any]) -> Scenario:
-        """What :meth:`ScenarioFile.load` gives for the overrides with ``values`` on top.
-
-        Raises
-        ------
-        ScenarioError
-            The same.
-        """
-        with suppress(ScenarioError, ValidationError):
-            if (scenario := self._changed(values)) is not None:
-                return scenario
-        # All that is unusual, errors above all, is found by the long way.
-        return self._file.load(self._variant, self._overrides | dict(values))
-
-    def _changed(self, values: Mapping[str, Any]) -> Scenario | None:
-        """The scenario, with nothing but the changed sections merged and validated anew; None where that is not all."""
-        if self._first is None:
-            self._first = self._file.load(self._variant, self._overrides)
-            variants, self._name = self._file.chosen(self._variant)
-            self._merged, _ = _merged(self._file.path, self._file.data, variants, self._name, self._overrides)
-        first, merged, origin = self._first, self._merged, self._first.origin
-        sections = {key.split(".")[0] for key in values}
-        sound = sections.isdisjoint(("name", "variant", *TOP)) and sections <= first.config.model_fields_set
-        if origin is None or not sound or not self._overrides.keys().isdisjoint(values):
-            return None
-        changed = {section: _plain(merged[section]) for section in sections}
-        for key, value in values.items():
-            _override(changed, key, _plain(value), origin.overriding, self._name)
-        _make_absolute(changed, self._file.path.parent)
-        _check_sizes(changed, (), origin)
-        # Parts that are models are not validated again.
-        parts = {name: getattr(first.config, name) for name in first.config.model_fields_set}
-        validated = ScenarioConfig.model_validate(parts | changed)
-        config = first.config.model_copy(update={name: getattr(validated, name) for name in sections})
-        origin = replace(origin, overrides=(*origin.overrides, *values))
-        return Scenario(config.name, config.variant, config, first.source, origin)
 
 
 def _merged(

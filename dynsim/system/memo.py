@@ -10,6 +10,7 @@ from contextvars import ContextVar
 from typing import Any, TypeVar, cast
 
 import numpy as np
+from pydantic import BaseModel
 
 T = TypeVar("T")
 
@@ -21,8 +22,8 @@ class Memo:
     """Results of pure functions, each known by what it was computed from.
 
     Numbers, texts and arrays are the same where their bits are (−0.0 is not 0.0, 1 is not 1.0), and so are tuples,
-    lists and dicts of such; anything else only where it is the same object, which must not be changed. Whoever takes a
-    result must not change it either. A function that raises is called again next time.
+    lists, dicts and configurations of such; anything else only where it is the same object, which must not be changed.
+    Whoever takes a result must not change it either. A function that raises is called again next time.
     """
 
     def __init__(self) -> None:
@@ -81,4 +82,7 @@ def _bits(value: Any) -> Hashable:
         return kind, tuple((name, _bits(one)) for name, one in value.items())
     if value is None or kind in (int, bool, str, bytes):
         return kind, value
+    if isinstance(value, BaseModel):
+        # Some say an error of what is set to its default, and none of what is left out.
+        return kind, frozenset(value.model_fields_set), _bits(value.__dict__), _bits(value.__pydantic_private__)
     return kind, id(value)

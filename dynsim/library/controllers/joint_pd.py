@@ -16,7 +16,7 @@ from dynsim.compile.model import Model
 from dynsim.compile.protocols import BuildContext
 from dynsim.compile.references.feed_forward import planned_voltages
 from dynsim.compile.references.inverse_kinematics import follow
-from dynsim.compile.references.operated import Operated
+from dynsim.compile.references.teleop import TeleopOptions
 from dynsim.compile.rolling import rolled, wheel_angles
 from dynsim.compile.splines import clamped_cubic, quintic_coefficients
 from dynsim.config.base import NonNegative, Positive, StrictConfig, check_waypoints, error_at
@@ -183,14 +183,14 @@ def build(config: Config, context: BuildContext) -> JointControl:
         sample_time=config.sample_time_s,
         voltages=_planned(config, context, times, positions) if planned else None,
     )
-    return control if config.operator is None else replace(control, operated=_operated(config.operator, context))
+    return control if config.operator is None else replace(control, teleop=_teleop(config.operator, context))
 
 
-def _operated(operator: Operator, context: BuildContext) -> Operated:
+def _teleop(operator: Operator, context: BuildContext) -> TeleopOptions:
     robot = context.model.robot
     if any(command.base is not None for command in operator.commands):
         _check_base(robot, ("controller", "operator"))
-    return Operated(
+    return TeleopOptions(
         rate=operator.rate_hz,
         joints=tuple(operator.joints),
         braces=tuple(_contact(context, name, "operator.braces") for name in operator.braces),

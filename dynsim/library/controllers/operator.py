@@ -8,7 +8,7 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from dynsim.compile.references.operated import BASE, HAND, VELOCITIES, VelocityScript
+from dynsim.compile.references.teleop import BASE, HAND, VELOCITIES, VelocityScript
 from dynsim.config.base import NonNegative, Positive, StrictConfig, Vector3
 
 BaseVelocity = Annotated[list[float], Field(min_length=2, max_length=2)]
