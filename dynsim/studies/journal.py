@@ -13,7 +13,7 @@ from typing import Any
 from dynsim.errors import RecordError, ScenarioError, shown
 from dynsim.studies.columns import numbers
 from dynsim.studies.outcome import RunResult
-from dynsim.studies.plan import Point
+from dynsim.studies.sweep_plan import Point
 from dynsim.system.files import json_text, write_text
 
 PLAN, JOURNAL = "sweep.json", "runs.jsonl"
@@ -26,7 +26,7 @@ class Row:
 
     Attributes
     ----------
-    run, variant, values : see :class:`dynsim.studies.plan.Point`
+    run, variant, values : see :class:`dynsim.studies.sweep_plan.Point`
     status : ``ok``, ``failed`` (and would again) or ``lost`` with its process
     reason : why it failed
     numbers : of its summary, see :func:`dynsim.studies.columns.numbers`
@@ -82,7 +82,7 @@ class Row:
 
     @property
     def identity(self) -> str:
-        """See :class:`dynsim.studies.plan.Point`."""
+        """See :class:`dynsim.studies.sweep_plan.Point`."""
         return Point(self.run, self.variant, self.values).identity
 
     def cells(self) -> dict[str, Any]:

@@ -16,8 +16,8 @@ from dynsim.errors import DynsimError, RecordError
 from dynsim.scenario import read_scenario
 from dynsim.studies import sweep as sweep_module
 from dynsim.studies.journal import JOURNAL, PLAN, Journal, Row
-from dynsim.studies.plan import Axis, Plan
 from dynsim.studies.sweep import run_sweep
+from dynsim.studies.sweep_plan import Axis, Plan
 from dynsim.system.files import held
 
 SHORT = {"duration_s": 0.01, "metrics.settle_s": 0.0}

@@ -24,8 +24,8 @@ TEXTS = ("variant", "status", "reason", "warnings")
 def make_sweep(folder: Path) -> None:
     """A small, sound sweep of four runs in ``folder``, of no commit: those of a tree that is edited would not go on."""
     from dynsim.scenario import read_scenario
-    from dynsim.studies.plan import Axis, Plan
     from dynsim.studies.sweep import run_sweep
+    from dynsim.studies.sweep_plan import Axis, Plan
 
     forget_commit()
     overrides = {"duration_s": 0.01, "metrics.settle_s": 0}
