@@ -52,18 +52,8 @@ def _draw(axes: Axes, record: Record, name: str, shown: np.ndarray, looks: Mappi
     values, labels = record[name], record.labels[name]
     called = {} if record.scene is None else record.scene.wheel_names
     if len(shown) < values.shape[1]:
-        low = style.thin(record.time, values.min(axis=1))
-        high = style.thin(record.time, values.max(axis=1))
-        # Both bounds on the times of either: thinning keeps different ones.
-        time = np.union1d(low[0], high[0])
-        axes.fill_between(
-            time,
-            np.interp(time, *low),
-            np.interp(time, *high),
-            color="#CFCFCF",
-            linewidth=0,
-            label=f"all {len(labels)} motors",
-        )
+        low, high = values.min(axis=1), values.max(axis=1)
+        axes.fill_between(record.time, low, high, color="#CFCFCF", linewidth=0, label=f"all {len(labels)} motors")
     for k in shown:
         style.line(axes, record.time, values[:, k], label=called.get(labels[k], labels[k]), **looks[k])
     axes.axhline(0.0, color=style.GREY, linewidth=0.6)

@@ -40,9 +40,7 @@ def below_surfaces(body: Skeleton, row: int) -> Below:
         if not np.isfinite(points).all():
             continue
         for surface in body.scene.surfaces:
-            inside = np.flatnonzero(surface.value(points) < 0.0)
-            depth = np.zeros(len(points))
-            depth[inside] = [-surface.gap(points[k]) for k in inside]
+            depth = np.maximum(-surface.gap(points), 0.0)
             if not depth.max() > radius + NOT_BELOW:
                 continue
             below = depth > NOT_BELOW

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dynsim.draw.figures import style
-from dynsim.draw.figures.solids import solids
 from dynsim.draw.figures.style import Array
+from dynsim.draw.geometry.shapes import Faces, corners_of
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
 from dynsim.record.poses import ORIENTATION, POSITION, point_positions
@@ -57,7 +57,7 @@ class Skeleton:
 
     def _segments(self) -> list[tuple[int | None, int | None]]:
         """The body that a segment is of and the one that it leads to: None for the world, and for the hand."""
-        # A mobile base is drawn as what it is, see dynsim.draw.figures.solids.
+        # A mobile base is drawn as what it is, see dynsim.draw.geometry.shapes.
         solid = self.scene.base
         bodies = [
             (k, body) for k, body in enumerate(self.scene.bodies) if k not in solid and not _moves_beside(body.joint)
@@ -69,13 +69,13 @@ class Skeleton:
             found.append((hand.body, None))
         return found
 
-    def solids(self, row: int) -> list[Array]:
-        """Points on the shapes of a mobile base and its wheels at a sample, (n, 3) [m] each."""
-        return solids(self.record, self.scene.base, row)
+    def solids(self, row: int) -> list[tuple[Array, Faces]]:
+        """Corners, (n, 3) [m], and faces of the shapes of a mobile base and its wheels at a sample."""
+        return [one for body in self.scene.base for one in corners_of(self.record, self.scene, body, row)]
 
     def bases(self) -> list[list[Array]]:
-        """Solids of a mobile base for each of the postures."""
-        return [self.solids(k) for k in self.shown()]
+        """Corners of a mobile base's solids for each of the postures."""
+        return [[corners for corners, _ in self.solids(k)] for k in self.shown()]
 
     def postures(self) -> list[Array]:
         """Segments at some samples, those of the last one last; a run that diverged may end in some without poses."""

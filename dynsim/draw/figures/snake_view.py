@@ -21,7 +21,7 @@ from matplotlib.patches import Circle, Patch, Polygon
 from matplotlib.ticker import Locator
 from numpy.typing import NDArray
 
-from dynsim.draw.figures.solids import outline
+from dynsim.draw.geometry.shapes import outline
 from dynsim.record import Record
 from dynsim.snake.geometry import snake_geometry
 

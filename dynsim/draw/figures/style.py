@@ -70,7 +70,7 @@ _LOOK: Any = {
     # A line of a million points overflows Agg's cell block unless it is drawn in pieces.
     "agg.path.chunksize": 20_000,
 }
-# Lines of more points than this are thinned: a figure is some 1200 pixels wide.
+# Curves in space of more points than this are thinned: a figure is some 1200 pixels wide.
 LINE_POINTS = 4000
 # A panel of the transient shows this times its length, and there is none where that is most of the run.
 TRANSIENT_ROOM, TRANSIENT_MOST = 1.2, 0.8
@@ -253,19 +253,6 @@ def settle_time(record: Record) -> float:
     return float(record.provenance.get("scenario", {}).get("metrics", {}).get("settle_s", 0.0))
 
 
-def thin(time: Array, values: Array) -> Series:
-    """At most about ``LINE_POINTS`` points of a line: the smallest and the largest of each bin, so that peaks stay."""
-    size = -(-2 * len(time) // LINE_POINTS)
-    if len(time) <= LINE_POINTS:
-        return time, values
-    whole = len(time) // size * size
-    bins = values[:whole].reshape(-1, size)
-    first = np.arange(0, whole, size)
-    kept = np.concatenate([first + bins.argmin(axis=1), first + bins.argmax(axis=1), np.arange(whole, len(time))])
-    kept = np.unique(np.append(kept, len(time) - 1))
-    return time[kept], values[kept]
-
-
 def sparse(points: Array) -> Array:
     """At most about ``LINE_POINTS`` points of a curve in space."""
     kept = np.linspace(0, len(points) - 1, min(len(points), LINE_POINTS)).astype(int)
@@ -274,7 +261,7 @@ def sparse(points: Array) -> Array:
 
 def line(axes: Axes, time: Array, values: Array, **options: Any) -> None:
     """Plot a quantity over time; a single sample as a dot."""
-    axes.plot(*thin(time, values), marker="o" if len(time) == 1 else None, markersize=3, **options)
+    axes.plot(time, values, marker="o" if len(time) == 1 else None, markersize=3, **options)
 
 
 def time_rows(
@@ -298,7 +285,9 @@ def time_rows(
         For each row (transient, whole run) or (whole run,); draw everything in all of them.
     """
     end = max(time[-1] for row in rows for time, _ in row)
-    found = [transient_of(row, settle, end) for row in rows]
+    found = [_transient(row, settle) for row in rows]
+    # One that lasts for most of the run needs no panel.
+    found = [one if one is not None and one.end < TRANSIENT_MOST * end / TRANSIENT_ROOM else None for one in found]
     window = max((one.end for one in found if one is not None), default=0.0)
     split = window > 0.0
     grid = figure.subplots(
@@ -329,12 +318,6 @@ class Transient:
     low: float
     high: float
     largest: float
-
-
-def transient_of(row: Sequence[Series], settle: float, end: float) -> Transient | None:
-    """The transient of a row of a run up to ``end`` [s]; None where it lasts for most of it or nothing need be cut."""
-    found = _transient(row, settle)
-    return found if found is not None and found.end < TRANSIENT_MOST * end / TRANSIENT_ROOM else None
 
 
 def _transient(row: Sequence[Series], settle: float) -> Transient | None:

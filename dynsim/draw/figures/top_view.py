@@ -15,8 +15,8 @@ from dynsim.draw.figures import style
 from dynsim.draw.figures.hand import edge_on, target_name
 from dynsim.draw.figures.posture import ARM_COLOUR
 from dynsim.draw.figures.skeleton import Skeleton, skeleton
-from dynsim.draw.figures.solids import outline
 from dynsim.draw.figures.style import Array
+from dynsim.draw.geometry.shapes import outline
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
 from dynsim.record.poses import point_positions
@@ -91,7 +91,7 @@ def _extent(body: Skeleton, rows: Rows) -> tuple[Array, Array]:
     if (target := hand_target(record)) is not None:
         points.append(target[:, :2])
     points += [_track(body, one, rows) for one in (*body.scene.contacts, *body.scene.supports)]
-    points += [solid[:, :2] for row in rows[[0, -1]] for solid in body.solids(row)]
+    points += [corners[:, :2] for row in rows[[0, -1]] for corners, _ in body.solids(row)]
     points.append(body.segments(int(rows[-1])).reshape(-1, 3)[:, :2])
     everything = np.concatenate(points)
     everything = everything[np.isfinite(everything).all(axis=1)]
@@ -146,7 +146,7 @@ def _draw_own(axes: Axes, body: Skeleton, rows: Rows) -> None:
     record = body.record
     x, y, heading = record["base_pose"][rows[-1]]
     turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
-    parts = [(solid[:, :2] - [x, y]) @ turn for solid in body.solids(int(rows[-1]))]
+    parts = [(solid[:, :2] - [x, y]) @ turn for solid, _ in body.solids(int(rows[-1]))]
     for part in parts:
         axes.add_patch(Polygon(outline(part), facecolor="#EEEEEE", edgecolor=style.GREY, lw=0.7, zorder=1))
     corners = (support_corners(body, int(rows[-1])) - [x, y]) @ turn
@@ -188,7 +188,7 @@ def _draw_own(axes: Axes, body: Skeleton, rows: Rows) -> None:
 
 
 def _draw_outline(axes: Axes, body: Skeleton, row: int, *, label: str, **look: Any) -> None:
-    for k, solid in enumerate(body.solids(row)):
+    for k, (solid, _) in enumerate(body.solids(row)):
         patch = Polygon(outline(solid[:, :2]), edgecolor=ARM_COLOUR, lw=0.8, zorder=2, **look)
         patch.set_label(label if k == 0 else "_")
         axes.add_patch(patch)

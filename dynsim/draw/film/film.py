@@ -13,14 +13,14 @@ from PIL import Image, ImageDraw
 from dynsim.draw.figures.style import GREY, VARIANT_COLOURS
 from dynsim.draw.figures.style import title as titled
 from dynsim.draw.film import encode
-from dynsim.draw.film.camera import FROM, Camera, View, view_axes
 from dynsim.draw.film.painter import FINER, PAPER, Painter
 from dynsim.draw.film.strip import Strip
 from dynsim.draw.film.strokes import font
-from dynsim.draw.page.robot import Array, azimuth, bounds, moving, robots
+from dynsim.draw.geometry.camera import FROM, Camera, View, view_axes
+from dynsim.draw.geometry.robot import Array, azimuth, bounds, moving, robots
+from dynsim.draw.geometry.surfaces import box_corners
 from dynsim.errors import RecordError
 from dynsim.record import Record
-from dynsim.record.surface_points import box_corners
 from dynsim.system.files import replacing
 from dynsim.system.terminal import plain
 

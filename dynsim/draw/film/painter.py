@@ -13,19 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageColor, ImageDraw
 
-from dynsim.draw.figures.solids import outline
 from dynsim.draw.figures.style import BLACK, BLUE, GREEN, GREY, ORANGE, PULLING, SKY
-from dynsim.draw.film.camera import Camera
-from dynsim.draw.film.solids import grid_faces, solid
 from dynsim.draw.film.strokes import Box, arrow, dashes, font, labels, line, ring
-from dynsim.draw.page.meshes import Meshes, simplified
-from dynsim.draw.page.robot import Contact, Robot, Sunk, contacts, largest_force, paths, sunk
-from dynsim.draw.page.solids import body_shapes, drawn_shape, drawn_surface, gripper
-from dynsim.draw.page.wheels import cop_of, supports, wheel_groups
+from dynsim.draw.geometry.camera import Camera
+from dynsim.draw.geometry.meshes import Meshes, simplified
+from dynsim.draw.geometry.robot import Contact, Robot, Sunk, contacts, largest_force, paths, sunk
+from dynsim.draw.geometry.shapes import body_shapes, drawn_shape, drawn_surface, grid_faces, gripper, outline, solid
+from dynsim.draw.geometry.surfaces import round_patch, surface_grids
+from dynsim.draw.geometry.wheels import cop_of, supports, wheel_groups
 from dynsim.record.poses import ORIENTATION, POSITION
 from dynsim.record.quaternion import rotated
 from dynsim.record.scene import HERE, WORLD, Surface
-from dynsim.record.surface_points import round_patch, surface_grids
 
 Array = NDArray[np.float64]
 FINER = 2

@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim._version import __version__
-from dynsim.draw.page.blocks import Blocks
-from dynsim.draw.page.meshes import Meshes, simplified
-from dynsim.draw.page.meshes import packed as packed_mesh
-from dynsim.draw.page.robot import POSE_ERROR, Robot, azimuth, bounds, contacts, paths, robot_of, robots, sunk
-from dynsim.draw.page.solids import body_shapes, drawn_shape, drawn_surface, gripper, thinnest
-from dynsim.draw.page.wheels import cop_of, supports, wheel_groups
+from dynsim.draw.geometry.meshes import Meshes, simplified
+from dynsim.draw.geometry.robot import POSE_ERROR, Robot, azimuth, bounds, contacts, paths, robot_of, robots, sunk
+from dynsim.draw.geometry.shapes import body_shapes, drawn_shape, drawn_surface, gripper, thinnest
+from dynsim.draw.geometry.wheels import cop_of, supports, wheel_groups
+from dynsim.draw.page.blocks import Blocks, packed_mesh
 from dynsim.record import TIME, Record, Signal
 from dynsim.record.measures import hand_target
 from dynsim.record.poses import ORIENTATION, POSITION

@@ -16,7 +16,6 @@ from dynsim.draw.page import page
 from dynsim.errors import DynsimError, SimulationStopped
 from dynsim.record.quaternion import rotated
 from dynsim.record.scene import WORLD
-from dynsim.record.surface_points import normals
 from dynsim.system import interruption
 from dynsim.teleop.session import NO_REQUEST, Command, LiveFrame, Session
 from dynsim.teleop.web.deadman import DRIVING, Deadman
@@ -238,7 +237,7 @@ class LiveDrive:
             if point.body != WORLD:
                 pose = frame.poses[point.body]
                 at = pose[:3] + rotated(pose[3:], at)
-            normal = normals(surface, at[None])[0]
+            normal = surface.normal(at)
             forces[point.name] = {
                 "force": round(touch.force, 3),
                 "normal": np.round(normal, 5).tolist(),

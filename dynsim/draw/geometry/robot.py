@@ -13,8 +13,7 @@ from dynsim.errors import RecordError
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
 from dynsim.record.poses import ORIENTATION, POSITION, point_positions
-from dynsim.record.scene import NOT_BELOW, WORLD, Point, Scene, Surface, Vector3
-from dynsim.record.surface_points import normals
+from dynsim.record.scene import NOT_BELOW, WORLD, Point, Scene, Vector3
 
 Array = NDArray[np.float64]
 # Poses between the frames of a page are interpolated: to this [m].
@@ -196,7 +195,7 @@ def contacts(robot: Robot, rows: NDArray[np.intp] | slice = slice(None)) -> list
         if mode is not None and not mode.any():
             continue
         place = np.asarray(point_positions(record, point, rows), dtype=np.float64)
-        normal = normals(surface, place)
+        normal = surface.normal(place)
         force = np.asarray(record["contact_normal_force"][rows, k], dtype=np.float64)
         tangent = None
         if "contact_force" in record:
@@ -240,23 +239,10 @@ def sunk(robot: Robot, rows: NDArray[np.intp] | slice = slice(None)) -> list[Sun
         allowed = scene.bodies[k].radius + NOT_BELOW
         for surface in scene.surfaces:
             with np.errstate(all="ignore"):
-                depth = -distance(surface, place)
+                depth = -surface.gap(place)
             if (depth > allowed).any():
                 found.append(Sunk(name, surface.name, k, position, allowed, depth))
     return found
-
-
-def distance(surface: Surface, points: Array) -> Array:
-    """Distance of points from a surface along the normal, (T, 3) → (T,) [m], as :meth:`Surface.gap` has it."""
-    value = surface.value(points)
-    if surface.kind in ("box", "height_field"):
-        return value
-    slope = points @ np.array(surface.Q) + np.array(surface.b)
-    size = np.linalg.norm(slope, axis=-1)
-    n = slope / np.where(size > 0.0, size, 1.0)[:, None]
-    inner = size * size - 2.0 * np.einsum("ti,ij,tj->t", n, np.array(surface.Q), n) * value
-    with np.errstate(all="ignore"):
-        return np.asarray(np.where(inner > 0.0, 2.0 * value / (size + np.sqrt(np.maximum(inner, 0.0))), value / size))
 
 
 def largest_force(found: Sequence[Contact]) -> float:
