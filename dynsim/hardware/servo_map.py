@@ -32,6 +32,7 @@ from dynsim.hardware.data_sheet import Objection, objections_to_limits, objectio
 from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.safety import Bus, Safety, objections_to_times
 from dynsim.hardware.strict_yaml import Finite, Positive, Within, read_yaml
+from dynsim.snake.lifting import Lifts
 from dynsim.system.files import file_name
 from dynsim.system.inputs import is_file
 
@@ -159,32 +160,6 @@ class ServoEntry(StrictModel):
     zero_tick: Annotated[int, Field(ge=-(1 << 20), le=1 << 20)] = 2048
     label: str | None = None
     hold_at_deg: Finite | None = None
-
-
-class Lifts(StrictModel):
-    """How wheel pairs that the record lifts are lifted.
-
-    Attributes
-    ----------
-    signal : str
-        Signal of the record with 1 where a wheel pair is on the ground, 0 where it is lifted.
-    joints : tuple of str
-        The pitch joints on the axles of the first, second, ... pair: every pair but the last has one. Lifting is added
-        to what they do otherwise; the first, on the axle that carries the head, follows the record and keeps the head
-        where it is.
-    clearance_mm : float
-        Height of the lower wheel of a lifted pair above the floor.
-    blend_s : float
-        Time to lift a pair, and to put it down [s of record time].
-    tilt_mm : float
-        A record is refused where one wheel of a grounded pair would be further above the floor: a bent base twists.
-    """
-
-    signal: str = "grounded"
-    joints: Annotated[tuple[str, ...], Field(min_length=1)]
-    clearance_mm: Positive = 5.0
-    blend_s: Positive = 0.3
-    tilt_mm: Positive = 2.5
 
 
 def _is_a_file_name(robot: str) -> str:

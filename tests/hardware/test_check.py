@@ -10,8 +10,8 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
+from dynsim.errors import CheckRefused
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
-from dynsim.hardware.errors import CheckRefused
 from dynsim.hardware.replay.check import check_motion, plan_cycle, velocity_limit
 from dynsim.hardware.replay.trajectory import Path, path_of_record
 from dynsim.hardware.servo_map import load_servo_map

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from support.fault_table import CASES, Case
 
-from dynsim.errors import DynsimError
+from dynsim.errors import CheckRefused, DynsimError
 from dynsim.hardware.bus.clock import Clock
-from dynsim.hardware.errors import CheckRefused, OutputsFailed, PortError, ReplayAborted
+from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted
 from dynsim.hardware.replay.check import motion_margins
 from dynsim.hardware.replay.display import displayed
 from dynsim.hardware.replay.drive import SILENCE, DrivenMotion, check_drive, lead

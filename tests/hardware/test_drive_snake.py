@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from dynsim import load_scenario
+from dynsim.errors import CheckRefused
 from dynsim.hardware.bus.clock import Clock
-from dynsim.hardware.errors import CheckRefused
 from dynsim.hardware.replay.check import check_motion
 from dynsim.hardware.replay.drive import check_drive, lead
 from dynsim.hardware.replay.growing import GrowingPath, Sample

@@ -12,8 +12,8 @@ from typing import Literal, cast
 
 import numpy as np
 
+from dynsim.errors import CheckRefused
 from dynsim.hardware.bus.control_table import HEALTH_BLOCK, STATE_BLOCK, TICKS_PER_TURN
-from dynsim.hardware.errors import CheckRefused
 from dynsim.hardware.replay.measured import unmeasured
 from dynsim.hardware.replay.motion import Array, Course, CyclePlan, Needs, Planned
 from dynsim.hardware.replay.trajectory import (

@@ -16,11 +16,10 @@ from dynsim.config.base import StrictModel
 from dynsim.errors import RecordError, shown
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.errors import ComparisonGateFailed
-from dynsim.hardware.replay.lifting import lifted
 from dynsim.hardware.replay.states import State
-from dynsim.hardware.servo_map import Lifts
 from dynsim.hardware.strict_yaml import read_yaml
 from dynsim.record import Record
+from dynsim.snake.lifting import Lifts, lifted
 
 Array = NDArray[np.float64]
 MAX_DELAY = 0.5

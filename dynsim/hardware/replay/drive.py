@@ -19,7 +19,7 @@ from typing import Protocol
 
 import numpy as np
 
-from dynsim.hardware.errors import CheckRefused
+from dynsim.errors import CheckRefused
 from dynsim.hardware.replay.check import ROUNDING, motion_margins, plan_cycle
 from dynsim.hardware.replay.growing import GrowingPath, Sample
 from dynsim.hardware.replay.motion import Array, Course, CyclePlan, Needs

@@ -7,7 +7,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.hardware.replay.lifting import wheel_offsets
+from dynsim.hardware.replay.trajectory import wheel_offsets
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import TIME, Record
 from dynsim.record.poses import ORIENTATION, POSITION, add_body_poses, point_positions

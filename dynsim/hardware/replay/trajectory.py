@@ -12,12 +12,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dynsim.hardware.errors import CheckRefused
-from dynsim.hardware.replay.lifting import wheel_offsets
+from dynsim.errors import CheckRefused
+from dynsim.hardware.replay.motion import Array
 from dynsim.hardware.servo_map import Servo, ServoMap
 from dynsim.record import TIME, Record
+from dynsim.snake.lifting import grounded_pairs, lifted
 
 REST = 1e-6
 """Joint speed [rad/s] below which a record counts as at rest."""
@@ -28,6 +28,8 @@ COMMON = 0.1
 JERK_WINDOW = 0.1
 """Over which the change of acceleration is averaged [s]: twice the lag of these servos (43.5 ms). A single jump in the
 velocity of a record is a knock, and bounded by the acceleration; jumps one after the other wear the gears."""
+GROUNDED = "grounded"
+"""Where dynsim's own records say which wheel pairs are on the ground; looked at when the map has no ``lifts``."""
 SHAKING_WINDOW = 0.3
 """In which velocity that is gained and lost again counts as shaking [s]."""
 
@@ -48,10 +50,10 @@ class Path:
         Time of the last sample of the record [s], counted from its first.
     """
 
-    time: NDArray[np.float64]
-    position: NDArray[np.float64]
-    rate_after: NDArray[np.float64]
-    rate_before: NDArray[np.float64]
+    time: Array
+    position: Array
+    rate_after: Array
+    rate_before: Array
     record_end: float
 
     @property
@@ -62,7 +64,7 @@ class Path:
     def end(self) -> float:
         return float(self.time[-1])
 
-    def at(self, time: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def at(self, time: float) -> tuple[Array, Array]:
         """Position [rad] and velocity [rad/s], shape (N,), at a path time [s]; at rest outside of the path."""
         if time <= self.time[0]:
             return self.position[0].copy(), np.zeros(self.position.shape[1])
@@ -102,7 +104,7 @@ class Path:
             acceleration = np.stack([2 * b / h / h, (2 * b + 6 * a) / h / h, self._steps()])
         return Extremes(left + h * at_position, position, left + h * at_velocity, velocity, ends, acceleration)
 
-    def _steps(self) -> NDArray[np.float64]:
+    def _steps(self) -> Array:
         """Acceleration for the step in rate at the beginning of every interval [rad/s²], shape (T-1, N).
 
         A rate that is held from sample to sample stands for the middle of its interval, so that the step between two
@@ -113,7 +115,7 @@ class Path:
         steps[1:] = (self.rate_after[1:] - self.rate_before[:-1]) / (0.5 * (h[1:] + h[:-1]))
         return steps
 
-    def jerk(self, window: float, since: float = -math.inf) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def jerk(self, window: float, since: float = -math.inf) -> tuple[Array, Array]:
         """Change of acceleration per time, averaged in magnitude over ``window`` [s] of path time.
 
         j(t) = (1/window) Σ |a_{k+1} − a_k| over the knots between t − window and t, in which a_k is the mean of what
@@ -137,7 +139,7 @@ class Path:
         jerk, where = self._worst(ends, within)
         return jerk / window, where
 
-    def shaking(self, window: float, since: float = -math.inf) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def shaking(self, window: float, since: float = -math.inf) -> tuple[Array, Array]:
         """Velocity that is gained and lost again, or lost and gained again, within ``window`` [s] of path time.
 
         min(P, N), in which P = ∫ max(q'', 0) dt and N = ∫ max(−q'', 0) dt over the window, steps in rate included. It
@@ -169,15 +171,13 @@ class Path:
         ends, up = self._within(gained, window, since)
         return self._worst(ends, np.minimum(up, self._within(lost, window, since)[1]))
 
-    def _accelerations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _accelerations(self) -> tuple[Array, Array]:
         """Acceleration of the interpolant at the beginning and the end of every interval [rad/s²], shape (T-1, N)."""
         h = np.diff(self.time)[:, None]
         m0, m1, rise = h * self.rate_after, h * self.rate_before, np.diff(self.position, axis=0)
         return (6 * rise - 4 * m0 - 2 * m1) / h / h, (-6 * rise + 2 * m0 + 4 * m1) / h / h
 
-    def _within(
-        self, total: NDArray[np.float64], window: float, since: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _within(self, total: Array, window: float, since: float) -> tuple[Array, Array]:
         """What ``total``, a running sum at the knots, grows by within windows: their ends (M,) [s], growth (M, N).
 
         The growth is straight between windows that begin or end at a knot.
@@ -187,15 +187,13 @@ class Path:
         with np.errstate(over="ignore", invalid="ignore"):
             return ends, self._interpolated(total, ends) - self._interpolated(total, ends - window)
 
-    def _interpolated(self, values: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _interpolated(self, values: Array, times: Array) -> Array:
         """Values at the knots (T, N), straight between them and constant outside, at other times: (M, N)."""
         left = np.clip(np.searchsorted(self.time, times, side="right") - 1, 0, len(self.time) - 2)
         fraction = np.clip((times - self.time[left]) / (self.time[left + 1] - self.time[left]), 0.0, 1.0)[:, None]
         return values[left] + fraction * (values[left + 1] - values[left])
 
-    def _worst(
-        self, ends: NDArray[np.float64], values: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _worst(self, ends: Array, values: Array) -> tuple[Array, Array]:
         """Of each joint the largest value, and the end of its window."""
         worst = values.argmax(axis=0)
         return values[worst, np.arange(values.shape[1])], np.minimum(ends[worst], self.end)
@@ -205,12 +203,12 @@ class Path:
 class Extremes:
     """Candidates for extreme values, each with its path time; all of shape (candidates, T-1, N)."""
 
-    position_time: NDArray[np.float64]
-    position: NDArray[np.float64]
-    velocity_time: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    acceleration_time: NDArray[np.float64]
-    acceleration: NDArray[np.float64]
+    position_time: Array
+    position: Array
+    velocity_time: Array
+    velocity: Array
+    acceleration_time: Array
+    acceleration: Array
 
 
 def path_of_record(record: Record, servo_map: ServoMap) -> Path:
@@ -281,7 +279,7 @@ def long_steps(record: Record, factor: float, share: float) -> list[str]:
     ]
 
 
-def column_of(record: Record, signal: str, servo: Servo, unit: str) -> NDArray[np.float64]:
+def column_of(record: Record, signal: str, servo: Servo, unit: str) -> Array:
     """The column of ``signal`` that ``servo`` follows, shape (T,).
 
     Raises
@@ -309,6 +307,34 @@ def column_of(record: Record, signal: str, servo: Servo, unit: str) -> NDArray[n
         bad = int(np.flatnonzero(~np.isfinite(data))[0])
         raise CheckRefused(f"{servo.joint}: {signal!r} is {data[bad]} at t = {record.time[bad]:g} s")
     return data
+
+
+def wheel_offsets(record: Record, servo_map: ServoMap) -> dict[str, Array]:
+    """What lifting adds to the joints that the map names for it, shape (T,) each [rad]; none where nothing is lifted.
+
+    Raises
+    ------
+    CheckRefused
+        The record lifts wheels and the map does not say how, or it lifts what cannot be lifted.
+    """
+    lifts = servo_map.lifts
+    if lifts is None:
+        _refuse_lifted_wheels(record)
+        return {}
+    return dict(zip(lifts.joints, lifted(record, lifts).hinge.T, strict=True))
+
+
+def _refuse_lifted_wheels(record: Record) -> None:
+    if GROUNDED not in record:
+        return
+    up = np.flatnonzero((grounded_pairs(record, GROUNDED) == 0).any(axis=0))
+    if len(up):
+        names = ", ".join(record.labels[GROUNDED][k] for k in up)
+        raise CheckRefused(
+            f"the record lifts wheel pairs ({names}) and the servo map does not say how: without it they would drag "
+            "over the floor. Add to the map, for example:\n"
+            "  lifts: {joints: [psi3, psi4, psi5, psi6, psi7, psi8], clearance_mm: 5, blend_s: 0.3}"
+        )
 
 
 def _at_rest_at_both_ends(path: Path, acceleration: float) -> Path:

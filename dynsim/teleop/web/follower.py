@@ -23,13 +23,12 @@ from typing import Any
 import numpy as np
 
 from dynsim.engine.results import save_drive
-from dynsim.errors import DynsimError, RecordError
-from dynsim.hardware.errors import CheckRefused
+from dynsim.errors import CheckRefused, DynsimError, RecordError
 from dynsim.hardware.replay.drive import lead
 from dynsim.hardware.replay.growing import Sample
 from dynsim.hardware.replay.held_back import HeldBack
-from dynsim.hardware.replay.lifting import SIGNAL as LIFTED
 from dynsim.hardware.replay.signals import ignore_stops
+from dynsim.hardware.replay.trajectory import GROUNDED as LIFTED
 from dynsim.hardware.replay.trajectory import column_of
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import Record
