@@ -138,7 +138,7 @@ def _out_and_back(start: float, way: float) -> Path:
     time = np.concatenate([leg, duration + PAUSE + leg])
     position = start + way * np.concatenate([fraction, 1 - fraction])[:, None]
     rates = way * np.concatenate([rate, -rate])[:, None]
-    return Path(time, position, rates[:-1], rates[1:], float(time[-1]))
+    return Path(time, position, rates[:-1], rates[1:])
 
 
 def _alone(servo_map: ServoMap, servo: Servo) -> ServoMap:

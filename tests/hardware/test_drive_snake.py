@@ -13,8 +13,8 @@ from dynsim.errors import CheckRefused
 from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.replay.check import check_motion
 from dynsim.hardware.replay.drive import check_drive, lead
-from dynsim.hardware.replay.growing import GrowingPath, Sample
-from dynsim.hardware.replay.held_back import HeldBack
+from dynsim.hardware.replay.incremental_path import IncrementalPath, Sample
+from dynsim.hardware.replay.lift_lookahead import LiftLookahead
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import Record
@@ -54,7 +54,7 @@ class SimulatedSnake:
         reader, writer = get_context("spawn").Pipe(duplex=False)
         self.heard = [NOT_YET]
         still, columns = self.driven.still(), Columns(self.driven.still(), servo_map, self.driven)
-        self.held_back = HeldBack(still, servo_map, self.driven.period)
+        self.held_back = LiftLookahead(still, servo_map, self.driven.period)
         self.follower = ServoFollower(
             self.driven, columns, lead(servo_map), writer, self.heard, lifting_columns(servo_map), self.held_back
         )
@@ -228,7 +228,7 @@ def test_a_drive_may_end_at_any_tick(ticks: int) -> None:
     samples, simulated = postures(ticks, {150: 4})
     assert [one.time for one in samples] == pytest.approx(simulated.time)
     path = check_motion(simulated, snake_map()).path
-    growing = GrowingPath(samples[0], snake_map())
+    growing = IncrementalPath(samples[0], snake_map())
     for sample in samples[1:]:
         assert growing.append(sample, keep=0.0) == []
         for back in (0.0, 0.002):
@@ -240,7 +240,7 @@ def test_what_rises_at_the_end_is_left_on_its_way() -> None:
     with pytest.raises(CheckRefused, match=r"for 0\.150 s only"):
         check_motion(simulated, snake_map())
     assert samples[-1].time == pytest.approx(0.9)
-    growing = GrowingPath(samples[0], snake_map())
+    growing = IncrementalPath(samples[0], snake_map())
     assert [words for one in samples[1:] if (words := growing.append(one, keep=0.0))] == []
 
 

@@ -25,8 +25,8 @@ import numpy as np
 from dynsim.engine.results import save_drive
 from dynsim.errors import CheckRefused, DynsimError, RecordError
 from dynsim.hardware.replay.drive import lead
-from dynsim.hardware.replay.growing import Sample
-from dynsim.hardware.replay.held_back import HeldBack
+from dynsim.hardware.replay.incremental_path import Sample
+from dynsim.hardware.replay.lift_lookahead import LiftLookahead
 from dynsim.hardware.replay.signals import ignore_stops
 from dynsim.hardware.replay.trajectory import GROUNDED as LIFTED
 from dynsim.hardware.replay.trajectory import column_of
@@ -175,7 +175,7 @@ class ServoFollower:
         samples: Connection,
         heard: Any,
         lifting: list[int],
-        held_back: HeldBack | None,
+        held_back: LiftLookahead | None,
     ) -> None:
         self._driven, self._columns = driven, columns
         self._ahead = ahead + (held_back.delay if held_back is not None else 0.0)
@@ -243,7 +243,7 @@ def simulate(wanted: Wanted, control: Connection, samples: Connection, heard: An
         driven = drive(wanted.scenario, pace=wanted.pace, limit=wanted.longest)
         still = driven.still()
         columns = Columns(still, wanted.servo_map, driven)
-        held_back = HeldBack(still, wanted.servo_map, driven.period) if wanted.servo_map.lifts else None
+        held_back = LiftLookahead(still, wanted.servo_map, driven.period) if wanted.servo_map.lifts else None
         lifting = lifting_columns(wanted.servo_map)
         follower = ServoFollower(driven, columns, lead(wanted.servo_map), samples, heard, lifting, held_back)
         session = Session(driven, wanted.scenario.variant or wanted.scenario.name, follower)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dynsim.hardware.replay.growing import Sample
+from dynsim.hardware.replay.incremental_path import Sample
 from dynsim.hardware.replay.motion import Array
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import Record
@@ -46,7 +46,7 @@ class _Held:
     down: Array
 
 
-class HeldBack:
+class LiftLookahead:
     """Postures of a simulation from its start on, and as :class:`Sample` with what lifting adds.
 
     Parameters
