@@ -23,9 +23,9 @@ from dynsim.hardware.replay.check import CheckedMotion, plan_cycle
 from dynsim.hardware.replay.machine import Replay
 from dynsim.hardware.replay.motion import QUINTIC_PEAK, quintic
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.start import read_ticks
 from dynsim.hardware.replay.states import State, StopRequest
 from dynsim.hardware.replay.trajectory import Path
+from dynsim.hardware.replay.verify import read_ticks
 from dynsim.hardware.servo_map import Servo, ServoMap
 
 ANGLE = math.radians(3.0)

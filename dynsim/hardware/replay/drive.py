@@ -23,10 +23,10 @@ from dynsim.errors import CheckRefused
 from dynsim.hardware.replay.check import ROUNDING, MotionLimits, plan_cycle
 from dynsim.hardware.replay.incremental_path import IncrementalPath, Sample
 from dynsim.hardware.replay.motion import Array, Course, CyclePlan, Needs
-from dynsim.hardware.replay.registers import needs_of_map
 from dynsim.hardware.replay.rules import Cause, Fault
 from dynsim.hardware.replay.states import Stopped
 from dynsim.hardware.replay.trajectory import HOLE, Path
+from dynsim.hardware.replay.verify import needs_of_map
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import Record
 from dynsim.record.scene import Scene

@@ -27,7 +27,7 @@ from dynsim.errors import CheckRefused, DynsimError, RecordError
 from dynsim.hardware.replay.drive import lead
 from dynsim.hardware.replay.incremental_path import Sample
 from dynsim.hardware.replay.lift_lookahead import LiftLookahead
-from dynsim.hardware.replay.signals import ignore_stops
+from dynsim.hardware.replay.states import ignore_stops
 from dynsim.hardware.replay.trajectory import GROUNDED as LIFTED
 from dynsim.hardware.replay.trajectory import column_of
 from dynsim.hardware.servo_map import ServoMap
