@@ -13,7 +13,7 @@ from dynsim.compile.clearance import _Clear, gaps, sinking
 from dynsim.scenario import build, read_scenario
 from dynsim.studies.batch import Work
 from dynsim.studies.columns import numbers
-from dynsim.studies.plan import Axis, Plan
+from dynsim.studies.sweep_plan import Axis, Plan
 from dynsim.system.memo import KEPT, Memo, recall, remembering
 
 ELBOWS = read_scenario("elbow_comparison")

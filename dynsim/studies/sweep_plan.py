@@ -204,7 +204,7 @@ class Plan:
             Its values do not make a scenario.
         """
         values = {entry: value for key, value in point.values.items() for entry in self._entries(key)}
-        return self.file.load(point.variant, self.overrides | values)
+        return self.file.load(point.variant, {**self.overrides, **values})
 
     def _entries(self, key: str) -> list[str]:
         """Keys that one with ``*`` stands for, by what the file has before its variants; the key itself without.
