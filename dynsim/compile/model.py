@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from dynsim.compile.bracing import Brace, BraceStatics, PreparedBraces
+from dynsim.compile.hand_posture import hand_posture
 from dynsim.compile.tables import compile_model
 from dynsim.config.problems import listed
 from dynsim.dynamics import ledger
 from dynsim.dynamics import tables as ka
 from dynsim.dynamics.tree import articulated, joints, points, sweep
 from dynsim.errors import ModelError, shown
-from dynsim.model.description import Array, Robot
+from dynsim.model.description import Array, Contact, Robot
 from dynsim.record import notebook
 
 _FLOAT64 = np.dtype(np.float64)
@@ -190,6 +191,43 @@ class Model:
         if self._braces is None or not self._braces.are(braces):
             self._braces = PreparedBraces(self.robot, self.arrays, braces)
         return self._braces.solve(positions, rates, accelerations)
+
+    def inverse_kinematics(
+        self,
+        target: ArrayLike,
+        q: ArrayLike | None = None,
+        *,
+        orientation: ArrayLike | None = None,
+        braces: Sequence[Contact] = (),
+        tolerance: float = 1e-9,
+    ) -> Array:
+        """A posture near ``q`` that has the hand at ``target``, within the limits of the joints, (nq,).
+
+        Damped Gauss–Newton steps of least change dq = Jᵀ (J Jᵀ + λ 1)⁻¹ e, λ falling with the error; joints at their
+        limits leave the motion to the others.
+
+        Parameters
+        ----------
+        target : (3,) of the hand [m]
+        q : (nq,) to start from, which selects the branch; default: the initial posture
+        orientation : (3, 3) rotation of the hand's body or frame in the world; default: any
+        braces : points that are on their surfaces, see :func:`dynsim.scenario.build.contacts`
+        tolerance : what may be left of position, gaps [m] and angles [rad]
+
+        Raises
+        ------
+        UnreachableReference
+            With what is left, and the joints that are at their limits.
+        ModelError
+            Joints of several coordinates, coupled joints, no rotation.
+        """
+        wanted = None
+        if orientation is not None:
+            wanted = np.array(_numbers(orientation, "orientation"))
+            if wanted.shape != (3, 3) or not np.abs(wanted @ wanted.T - np.eye(3)).max() < 1e-6:
+                raise ModelError("orientation must be a rotation, (3, 3)")
+        start = self.robot.initial if q is None else self._vector(q, "q", self._position_names)
+        return hand_posture(self, self._point(target), np.array(start), wanted, braces, tolerance)
 
     def point_position(self, body: str | int, point: ArrayLike, q: ArrayLike) -> Array:
         """World position of a point fixed on a body, or in a frame of one by its name, (3,) [m]."""

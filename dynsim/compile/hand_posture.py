@@ -1,0 +1,101 @@
+"""Postures that put the hand somewhere, turned as asked for, with points on their surfaces and joints within limits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dynsim.errors import ModelError, UnreachableReference
+from dynsim.model.description import Array, Contact
+
+if TYPE_CHECKING:
+    from dynsim.compile.model import Model
+
+ITERATIONS = 200
+# Longest step of a coordinate in one turn [rad or m], so that the branch of the start is kept.
+STEP_MAX = 0.3
+# Greatest damping, far from the target; near it the steps are Newton's.
+DAMPING = 1e-2
+
+
+def turn_error(R: Array, wanted: Array) -> Array:
+    """Rotation vector that turns R to ``wanted``, (3,) [rad]."""
+    E = wanted @ R.T
+    axis = 0.5 * np.array([E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]])
+    sine, cosine = float(np.linalg.norm(axis)), 0.5 * float(np.trace(E) - 1.0)
+    if sine < 1e-9:
+        if cosine > 0.0:
+            return axis
+        # Half a turn: about the axis that it leaves alone.
+        k = int(np.argmax(np.diag(E)))
+        column = E[:, k] + np.eye(3)[:, k]
+        return np.asarray(np.pi * column / np.linalg.norm(column))
+    return np.asarray(axis * (np.arctan2(sine, cosine) / sine))
+
+
+def hand_posture(
+    model: Model, target: Array, q: Array, orientation: Array | None, braces: Sequence[Contact], tolerance: float
+) -> Array:
+    """See :meth:`dynsim.Model.inverse_kinematics`."""
+    robot = model.robot
+    if robot.couplings or model.nq != model.n:
+        raise ModelError("inverse_kinematics: for arms whose joints each have a coordinate of their own")
+    if any(contact.tip is not None for contact in braces):
+        raise ModelError("inverse_kinematics: braces are points or spheres, no axes of links")
+    lower, upper = (np.array([getattr(link, side) for link in robot.links]) for side in ("lower", "upper"))
+    revolute = np.array([link.units[0] == "rad" for link in robot.links])
+    hand, axes = robot.attach(*robot.hand)[0], robot.attached_axes(robot.hand[0])
+    q = np.clip(q, lower, upper)
+    error = np.zeros(0)
+    for _ in range(ITERATIONS):
+        position, J = model.point_position_and_jacobian(*robot.hand, q)
+        errors, rows = [target - position], [J]
+        if orientation is not None:
+            R, origin = model.body_pose(hand, q)
+            errors.append(turn_error(R @ axes, orientation))
+            rows.append(_turning(model, hand, R, origin, q) * revolute)
+        for contact in braces:
+            place, rate = model.point_position_and_jacobian(contact.body, contact.point, q)
+            errors.append(np.array([contact.radius - contact.surface.gap(place)]))
+            rows.append((contact.surface.normal(place) @ rate)[None])
+        error, J = np.concatenate(errors), np.vstack(rows)
+        size = float(np.abs(error).max())
+        if size <= tolerance:
+            return q
+        q = _stepped(q, J, error * min(1.0, 0.3 / size), size, lower, upper)
+    at = [robot.links[k].joint for k in range(model.n) if q[k] in (lower[k], upper[k])]
+    held = f"; at their limits: {', '.join(at)}" if at else ""
+    left = float(np.abs(error).max())
+    raise UnreachableReference(
+        f"no posture near the start has hand, orientation and braces in place: {left:.3g} m or rad are left{held}; "
+        "start elsewhere, or ask for less"
+    )
+
+
+def _stepped(q: Array, J: Array, error: Array, size: float, lower: Array, upper: Array) -> Array:
+    """A damped Gauss–Newton step; joints that it would take beyond their limits stay there, and the rest take over."""
+    free = np.ones(len(q), dtype=bool)
+    for _ in range(len(q)):
+        A = J[:, free]
+        damping = 1e-12 + DAMPING * min(size, 1.0) ** 2
+        step = np.zeros(len(q))
+        step[free] = A.T @ np.linalg.solve(A @ A.T + damping * np.eye(len(A)), error)
+        step *= min(1.0, STEP_MAX / max(float(np.abs(step).max(initial=0.0)), 1e-300))
+        beyond = free & (((q + step < lower) & (q <= lower)) | ((q + step > upper) & (q >= upper)))
+        if not beyond.any() or not free.any():
+            break
+        free &= ~beyond
+    return np.clip(q + step, lower, upper)
+
+
+def _turning(model: Model, body: int, R: Array, origin: Array, q: Array) -> Array:
+    """Angular velocity of a body for each unit of rate, (3, n): from the velocities of two of its points."""
+    at_origin = model.point_position_and_jacobian(body, np.zeros(3), q)[1]
+    found = np.zeros((3, model.n))
+    for k in range(3):
+        # ω × e_k, and ω = ½ Σ e_k × (ω × e_k).
+        swept = model.point_position_and_jacobian(body, np.eye(3)[k], q)[1] - at_origin
+        found += 0.5 * np.cross(R[:, k], swept.T).T
+    return found

@@ -1,0 +1,63 @@
+"""Inverse kinematics of a model: position, orientation, braces and limits, by going there and looking."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import dynsim
+from dynsim.compile.hand_posture import turn_error
+from dynsim.errors import ModelError, UnreachableReference
+from dynsim.planner.scenes import scene
+from dynsim.scenario import build
+from dynsim.scenario.reading import scenario_from_resolved
+
+
+@pytest.fixture(scope="module")
+def arm() -> tuple[dynsim.Model, list]:  # type: ignore[type-arg]
+    """A scene with a joint about a third axis, ten joints, stops at 120°; link 5 may lean on the floor."""
+    data = scene(3)
+    data["contacts"]["points"] = {"elbow": {"body": "link_5", "radius_m": 0.01}}
+    scenario = scenario_from_resolved(data)
+    return dynsim.build_model(scenario), build.contacts(scenario)
+
+
+def test_hand_and_orientation_are_reached(arm) -> None:  # type: ignore[no-untyped-def]
+    """Poses of random postures, from starts near by."""
+    model, _ = arm
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        there = rng.uniform(-1.0, 1.0, model.n)
+        target = model.point_position(*model.robot.hand, there)
+        R, _ = model.body_pose(model.robot.hand[0], there)
+        q = model.inverse_kinematics(target, there + rng.normal(0.0, 0.1, model.n), orientation=R)
+        assert np.abs(model.point_position(*model.robot.hand, q) - target).max() < 1e-9
+        assert np.abs(model.body_pose(model.robot.hand[0], q)[0] - R).max() < 1e-8
+
+
+def test_braces_stay_on_their_surfaces_within_limits(arm) -> None:  # type: ignore[no-untyped-def]
+    model, braces = arm
+    start = np.array([0.0, 0.9, 0.5, 0.6, -0.3, -0.4, -0.3, 0.0, 0.5, 0.2])
+    target = np.array([1.4, 0.1, 0.3])
+    q = model.inverse_kinematics(target, start, braces=braces)
+    place = model.point_position("link_5", [0.0, 0.0, 0.0], q)
+    assert abs(place[2] - 0.01) < 1e-9
+    assert np.abs(model.point_position(*model.robot.hand, q) - target).max() < 1e-9
+    stops = np.array([(link.lower, link.upper) for link in model.robot.links])
+    assert (q >= stops[:, 0]).all()
+    assert (q <= stops[:, 1]).all()
+
+
+def test_what_is_out_of_reach_says_how_far(arm) -> None:  # type: ignore[no-untyped-def]
+    model, _ = arm
+    with pytest.raises(UnreachableReference, match="are left"):
+        model.inverse_kinematics([9.0, 0.0, 0.0])
+    with pytest.raises(ModelError, match="rotation"):
+        model.inverse_kinematics([1.0, 0.0, 0.3], orientation=np.ones((3, 3)))
+
+
+def test_half_a_turn_has_an_axis() -> None:
+    """The rotation vector of π about any axis, where the sine says nothing."""
+    for axis in np.eye(3):
+        R = 2.0 * np.outer(axis, axis) - np.eye(3)
+        assert np.abs(np.abs(turn_error(np.eye(3), R)) - np.pi * axis).max() < 1e-7
