@@ -21,8 +21,8 @@ import numpy as np
 from dynsim.dynamics.contact.distance import ShapeArrays, distance
 from dynsim.jit.kernel import internal_kernel, kernel
 
-# Slip [m/s] over which friction grows to its value: that of planned voltages.
-SLIP_SCALE = 5e-3
+# Slip [m/s] over which friction grows to its value: steep enough to charge braces that creep, smooth enough for steps.
+SLIP_SCALE = 2e-3
 # What is lost of a row of constraints that others imply.
 DEPENDENT = 1e-9
 # Of multipliers and forces, relative to their scale: nothing is gained by letting go of a bound.

@@ -22,6 +22,9 @@ from dynsim.scenario import build
 INSTANTS, SPACING = 50, 0.1
 # Slower than this the hand rests [m/s].
 RESTS = 1e-2
+# Slip [m/s] over which the friction that is charged grows to its value: a brace that creeps feels all of it, whatever
+# planned voltages, which must not ring, make of it.
+CHARGED = 1e-3
 # Instants at which links are compared with each other.
 LOOKS = 11
 
@@ -55,8 +58,8 @@ def references(task: Task, braces: tuple[Candidate, ...], knots: Array, Q: Array
     """Dense references through postures at knots, (K, n); in words why there are none.
 
     A spline through the knots, every instant put back onto path and surfaces. The heat is that of
-    :func:`dynsim.compile.references.feed_forward.pressing` along them, accelerations and losses included: what a run of
-    the plan has in its voltages. ``factor`` : so many times as many instants
+    :func:`dynsim.compile.references.feed_forward.pressing` along them, accelerations and losses included, with all of
+    the friction that a creeping brace feels. ``factor`` : so many times as many instants
     """
     span = task.span
     count = factor * max(INSTANTS, int(np.ceil(span / SPACING)))
@@ -115,7 +118,7 @@ def statics(task: Task, braces: tuple[Candidate, ...], times: Array, q: Array, r
         name: (contact, None) for name, contact in contacts(task, braces).items()
     }
     try:
-        planner, tables = pressing(model, fine, whole, rates, placed, task.options.min_N)
+        planner, tables = pressing(model, fine, whole, rates, placed, task.options.min_N, CHARGED)
     except ModelError as error:
         return f"between knots the postures jump: {error}"
     torques, forces = np.zeros((len(fine), model.n)), np.zeros((len(fine), len(braces)))

@@ -37,6 +37,7 @@ class Tolerances:
     ----------
     friction : factors of μ; shift_m: of all surfaces upwards, against gravity [m]
     heat : times the planned one
+    nominal : share of the planned heat by which the nominal run may differ
     hand_m : root mean square of the hand's error beside the surface's [m]
     wall_s : longer than so a corner is refused [s]
     """
@@ -44,6 +45,7 @@ class Tolerances:
     friction: tuple[float, ...] = (1.0, 0.8, 1.2)
     shift_m: tuple[float, ...] = (0.0, 0.005, -0.005)
     heat: float = 1.5
+    nominal: float = 0.05
     hand_m: float = 0.005
     wall_s: float = 10.0
     gains: tuple[float, ...] = (500.0, 200.0, 100.0, 50.0, 20.0, 10.0, 5.0)
@@ -207,6 +209,8 @@ class Verifier:
             reason = (
                 f"{heat:.3g} W of heat, more than {tolerances.heat:g} × {dense.heat:.3g} W from t = {since:.3g} s on"
             )
+        elif mu == 1.0 and shift == 0.0 and abs(heat - dense.heat) > tolerances.nominal * dense.heat:
+            reason = f"{heat:.3g} W of heat, not the planned {dense.heat:.3g} W, over the whole run"
         elif rms > allowed:
             k = int(error.argmax())
             reason = f"hand off by {1e3 * rms:.3g} mm rms (allowed {1e3 * allowed:.3g} mm), most at t = {time[k]:.3g} s"

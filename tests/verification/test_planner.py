@@ -15,6 +15,7 @@ from dynsim.jit.kernel import integers, reals
 from dynsim.model.surfaces import Box, HeightField, Quadric, shape_arrays
 from dynsim.planner import compiled
 from dynsim.planner.compiled import Arm, Course, Points
+from dynsim.planner.dense import CHARGED
 from dynsim.planner.local import Problem
 from dynsim.planner.problem import Options, task
 from dynsim.planner.scenes import scene, scene_scenario
@@ -185,7 +186,7 @@ def found() -> tuple[Search, dict]:  # type: ignore[type-arg]
 
 
 def test_heat_is_that_of_brace_statics_along_the_references(found) -> None:  # type: ignore[no-untyped-def]
-    """The public statics at each instant, with friction against the slip as planned voltages have it."""
+    """The public statics at each instant, with friction against the slip as braces that creep feel it."""
     search, planned = found
     plan = planned[1][0]
     arm, dense, brace = search.task.arm, plan.dense, plan.braces[0]
@@ -198,7 +199,7 @@ def test_heat_is_that_of_brace_statics_along_the_references(found) -> None:  # t
         slip = model.point_jacobian(brace.body, touching, position) @ rate
         slip[2] = 0.0
         speed = float(np.linalg.norm(slip))
-        friction = search.task.friction * speed / np.hypot(speed, 5e-3)
+        friction = search.task.friction * speed / np.hypot(speed, CHARGED)
         lean = Brace(brace.body, touching, np.array([0.0, 0.0, 1.0]), friction, sliding=slip if speed > 1e-9 else None)
         heat.append(model.brace_statics(position, rate, acceleration, {"brace": lean}).heat)
     assert dense.heat == pytest.approx(float(np.trapezoid(heat, dense.fine) / dense.fine[-1]), rel=1e-3)

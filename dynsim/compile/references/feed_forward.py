@@ -85,10 +85,11 @@ def pressing(
     v: Array,
     braces: Mapping[str, tuple[Contact, float | None]],
     min_N: float = MIN_N,
+    slip_scale: float = SLIP_SCALE,
 ) -> tuple[BracePlanner, Array]:
     """Braces that press along references, and their tables for the kernels, (T, c, BRACE_SIZE).
 
-    Friction against the slip of the references, μ f_n v/√(v² + v_s²) with v_s of :data:`SLIP_SCALE`.
+    Friction against the slip of the references, μ f_n v/√(v² + v_s²), v_s = ``slip_scale`` [m/s].
     """
     attached = []
     for name, (contact, _) in braces.items():
@@ -112,7 +113,7 @@ def pressing(
         speed = np.linalg.norm(slip, axis=1)
         slip[speed <= SLIP_MIN] = 0.0
         # A point at rest along the surface is planned without friction: what holds it then, its history decides.
-        friction = np.where(speed > SLIP_MIN, contact.friction * speed / np.hypot(speed, SLIP_SCALE), 0.0)
+        friction = np.where(speed > SLIP_MIN, contact.friction * speed / np.hypot(speed, slip_scale), 0.0)
         tables[:, k] = brace_rows(touching, normals, friction, min_N, np.nan if force is None else force, slip)
     return planner, tables
 
