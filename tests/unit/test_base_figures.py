@@ -15,8 +15,8 @@ from scipy.spatial import ConvexHull
 import dynsim
 from dynsim.draw import figures
 from dynsim.draw.figures import arm, base, motors, posture, skeleton, solids, style, top_view
-from dynsim.hardware.export import export_record, joint_motion
 from dynsim.record import Event, Record, measures
+from dynsim.record.joint_motion import export_record, joint_motion
 from dynsim.record.measures import percent
 from dynsim.record.scene import Scene, Shape
 from dynsim.scenario import load_scenario
