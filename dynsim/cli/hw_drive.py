@@ -86,8 +86,7 @@ def hw_drive(
         from dynsim.hardware.replay.display import displayed
         from dynsim.hardware.replay.drive import check_drive
         from dynsim.hardware.replay.session import run_replay, shown_by
-        from dynsim.hardware.replay.signals import stop_on_signals
-        from dynsim.hardware.replay.states import StopRequest
+        from dynsim.hardware.replay.states import StopRequest, stop_on_signals
         from dynsim.hardware.servo_map import load_servo_map
         from dynsim.hardware.virtual.faults import load_fault_script
         from dynsim.scenario import load_scenario

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dynsim._version import __version__
 from dynsim.compile.scene import snake_scene
-from dynsim.engine.kinematic_run import COORDINATES, SnakeRun
+from dynsim.engine.kinematic_run import SnakeRun
 from dynsim.engine.provenance import provenance
 from dynsim.jit.kernel import reals
 from dynsim.record import Record
@@ -17,12 +17,12 @@ from dynsim.record.poses import add_body_poses
 from dynsim.scenario import Scenario
 from dynsim.scenario.effect import without_effect
 from dynsim.snake import state as ss
-from dynsim.snake.description import conditioning
+from dynsim.snake.description import COORDINATES, conditioning
 from dynsim.snake.kinematics import new_chain, posture_points
-from dynsim.snake.state import Trace
+from dynsim.snake.state import SnakeTrace
 from dynsim.snake.ticks import record_row
 
-# Why the target waited, in the order of the counters of dynsim.snake.state.State; the last is the rest: after
+# Why the target waited, in the order of the counters of dynsim.snake.state.SnakeState; the last is the rest: after
 # an obstacle, until switching has brought the joints below switching.release_fraction of their limits.
 OBSTACLES = ("joint limit", "rate limit", "singular posture", "attitude at beta = 90 deg", "release of the joints")
 OUT_OF_REACH = 1.0
@@ -64,7 +64,7 @@ def make_record(run: SnakeRun, scenario: Scenario, wall: float, pictured: bool =
     description, state, law = run.description, run.state, run.controller.law
     model, period, ticks = run.model, run.controller.schedule.period, run.tick
     rows = -(-ticks // run.stride) + 1
-    trace = Trace(*(array[:rows] for array in run.trace))
+    trace = SnakeTrace(*(array[:rows] for array in run.trace))
     record_row(model, law, state, run.rig, rows - 1, trace)
     if rows > 1:  # no control period begins at the end: what was held goes on
         for array in (trace.u, trace.slip, trace.at_limit):

@@ -12,6 +12,7 @@ from dynsim.errors import ModelError, ScenarioError, SimulationStopped
 from dynsim.jit.kernel import integers, reals
 from dynsim.snake import state as ss
 from dynsim.snake.description import (
+    COORDINATES,
     FIXING,
     NO_REQUEST,
     SWITCHING,
@@ -22,10 +23,9 @@ from dynsim.snake.description import (
     TaskSpaceController,
 )
 from dynsim.snake.kinematics import SnakeModel, pose_of_point
-from dynsim.snake.state import Rig, State, Trace, new_rig, new_state, new_trace
+from dynsim.snake.state import Rig, SnakeState, SnakeTrace, new_rig, new_state, new_trace
 from dynsim.snake.ticks import record_row, run_ticks
 
-COORDINATES = ("x", "y", "z", "alpha", "beta", "gamma")
 CHUNK = 500  # ticks between two looks at signals and the progress bar: about 25 ms, at worst ten times as long
 
 
@@ -59,9 +59,9 @@ class SnakeRun:
 
     def __post_init__(self) -> None:
         model, description, controller = self.model, self.description, self.controller
-        self.state: State = new_state(model)
+        self.state: SnakeState = new_state(model)
         self.rig: Rig = new_rig(model)
-        self.trace: Trace = new_trace(model, -(-self.ticks // self.stride) + 1)
+        self.trace: SnakeTrace = new_trace(model, -(-self.ticks // self.stride) + 1)
         self.gripper: NDArray[np.int64] = np.zeros(self.ticks, dtype=np.int64)
         state = self.state
         state.base[:], state.phi[:] = description.initial_base_pose, description.initial_joints
@@ -235,5 +235,5 @@ class SnakeRun:
         return float(trace.cost[-1]), float(trace.margin.min())
 
 
-def _copy(state: State) -> State:
-    return State(*(array.copy() for array in state))
+def _copy(state: SnakeState) -> SnakeState:
+    return SnakeState(*(array.copy() for array in state))

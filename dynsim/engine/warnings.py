@@ -380,9 +380,8 @@ def _overloaded(loads: Sequence[dict[str, Any]]) -> list[str]:
                 over.append((rms / nominal, f"{one['joint']} {rms:.3g} of {nominal:g} {unit.replace('_', ' ')}"))
         if over:
             texts = [text for _, text in sorted(over, key=lambda entry: -entry[0])]
-            verb = "is" if len(texts) == 1 else "are"
             found.append(
-                f"{', '.join(texts)}: the {what}, rms over the run, {verb} more than nominal, which the motor does not "
+                f"{', '.join(texts)}: the {what}, rms over the run, is more than nominal, which a motor does not "
                 "stand for long; brace the arm, go slower, or take a larger motor"
             )
     return found

@@ -114,24 +114,22 @@ class ScenarioFile:
 
     def load(self, variant: str | None = None, overrides: Mapping[str, Any] | None = None) -> Scenario:
         """See :func:`load_scenario`."""
-        path, data = self.path, self.data
         variants, variant = self.chosen(variant)
-        if overrides is not None and not (
-            isinstance(overrides, Mapping) and all(isinstance(key, str) for key in overrides)
-        ):
+        overrides = {} if overrides is None else overrides
+        if not (isinstance(overrides, Mapping) and all(isinstance(key, str) for key in overrides)):
             raise ScenarioError(
                 f"overrides must map dotted keys to values, as {{'integrator.rtol': 1e-8}} does, not {shown(overrides)}"
             )
-        merged, origin = _merged(path, data, variants, variant, overrides or {})
+        merged, origin = self._merged(variant, overrides)
         try:
             config = ScenarioConfig.model_validate(merged)
         except ValidationError as error:
             unknown = unknown_keys(error, merged, origin, ScenarioConfig, TOP)
             if unknown:
                 for other in [name for name in itertools.islice(variants, VARIANTS_SEARCHED) if name != variant]:
-                    unknown += _unknown_keys_of(path, data, variants, other, overrides or {})
+                    unknown += self._unknown_keys(other, overrides)
             raise ScenarioError(explain(error, merged, origin, unknown)) from None
-        return Scenario(config.name, config.variant, config, path, origin)
+        return Scenario(config.name, config.variant, config, self.path, origin)
 
     def chosen(self, variant: str | None) -> tuple[Mapping[str, Any], str | None]:
         """All variants, and the name of the one that is meant, None without any; ScenarioError if there is no such."""
@@ -153,46 +151,41 @@ class ScenarioFile:
             raise ScenarioError(f"{path}: has no variants, so there is no {variant!r}")
         return variants, variant
 
+    def _merged(self, variant: str | None, overrides: Mapping[str, Any]) -> tuple[dict[str, Any], Origin]:
+        """One variant of a file with overrides on top, and where its values come from."""
+        shared = YamlMapping()
+        shared.update({key: value for key, value in self.data.items() if key != "variants"})
+        shared.lines = {key: line for key, line in self.data.lines.items() if key in shared}
+        variants: Any = self.data.get("variants")
+        difference: Any = variants.get(variant) if variants and variant is not None else None
+        if difference is None:
+            difference = {}
+        if not isinstance(difference, Mapping):
+            line = f":{variants.lines[variant]}" if isinstance(variants, YamlMapping) and variant is not None else ""
+            raise ScenarioError(f"{self.path}{line}: variant {value_text(variant)} must be a mapping of what differs")
+        overriding = "--set" if isinstance(overrides, SetOptions) else "overrides"
+        origin = Origin(self.path, (difference, shared), tuple(overrides), overriding)
+        merged = _plain(_merge(shared, difference))
+        for key, value in overrides.items():
+            _override(merged, key, _plain(value), overriding, variant)
+        if merged.get("name") in (None, ""):
+            merged["name"] = self.path.stem
+        if variant is not None:
+            merged["variant"] = variant
+        _make_absolute(merged, self.path.parent)
+        _check_sizes(merged, (), origin)
+        return merged, origin
 
-def _merged(
-    path: Path, data: YamlMapping, variants: Mapping[str, Any], variant: str | None, overrides: Mapping[str, Any]
-) -> tuple[dict[str, Any], Origin]:
-    """One variant of a file with overrides on top, and where its values come from."""
-    shared = YamlMapping()
-    shared.update({key: value for key, value in data.items() if key != "variants"})
-    shared.lines = {key: line for key, line in data.lines.items() if key in shared}
-    difference: Any = variants.get(variant) if variant is not None else None
-    if difference is None:
-        difference = {}
-    if not isinstance(difference, Mapping):
-        line = f":{variants.lines[variant]}" if isinstance(variants, YamlMapping) and variant is not None else ""
-        raise ScenarioError(f"{path}{line}: variant {value_text(variant)} must be a mapping of what differs")
-    overriding = "--set" if isinstance(overrides, SetOptions) else "overrides"
-    origin = Origin(path, (difference, shared), tuple(overrides), overriding)
-    merged = _plain(_merge(shared, difference))
-    for key, value in overrides.items():
-        _override(merged, key, _plain(value), overriding, variant)
-    if merged.get("name") in (None, ""):
-        merged["name"] = path.stem
-    if variant is not None:
-        merged["variant"] = variant
-    _make_absolute(merged, path.parent)
-    _check_sizes(merged, (), origin)
-    return merged, origin
-
-
-def _unknown_keys_of(
-    path: Path, data: YamlMapping, variants: Mapping[str, Any], variant: str, overrides: Mapping[str, Any]
-) -> list[str]:
-    """Unknown keys of another variant; nothing when it has other faults."""
-    try:
-        merged, origin = _merged(path, data, variants, variant, overrides)
-        ScenarioConfig.model_validate(merged)
-    except ScenarioError:
+    def _unknown_keys(self, variant: str, overrides: Mapping[str, Any]) -> list[str]:
+        """Unknown keys of a variant; nothing when it has other faults."""
+        try:
+            merged, origin = self._merged(variant, overrides)
+            ScenarioConfig.model_validate(merged)
+        except ScenarioError:
+            return []
+        except ValidationError as error:
+            return unknown_keys(error, merged, origin, ScenarioConfig, TOP)
         return []
-    except ValidationError as error:
-        return unknown_keys(error, merged, origin, ScenarioConfig, TOP)
-    return []
 
 
 def scenario_from_resolved(resolved: Mapping[str, Any]) -> Scenario:
@@ -253,8 +246,6 @@ def _plain(value: Any) -> Any:
         return [_plain(item) for item in value]
     if isinstance(value, bool) or value is None:
         return value
-    if isinstance(value, np.generic):
-        return value.item()
     for kind in (int, float, str):
         if isinstance(value, kind):
             return kind(value)

@@ -19,7 +19,7 @@ from dynsim.model.drives import TorqueSource
 from dynsim.record import Record
 from dynsim.record.poses import poses_at
 from dynsim.scenario import Scenario, build
-from dynsim.teleop.session import Array, Axis, Command, Frame, SpeedLimits, with_controller
+from dynsim.teleop.session import Array, Command, LiveFrame, PilotAxis, SpeedLimits, with_controller
 
 log = logging.getLogger(__name__)
 
@@ -71,7 +71,7 @@ class ArmSession:
                 f"(joints with a motor: {', '.join(sorted(driven)) or 'none'})"
             )
         self.axes = tuple(
-            Axis(_NAMES[k], "hand" if k < BASE.start else "base", *units.get(_NAMES[k], ("m/s", limits.hand)))
+            PilotAxis(_NAMES[k], "hand" if k < BASE.start else "base", *units.get(_NAMES[k], ("m/s", limits.hand)))
             for k in self._parts
         )
 
@@ -104,7 +104,7 @@ class ArmSession:
         self.ticks += 1
         self.simulation.advance((self.ticks - 0.5) / self._rate)
 
-    def frame(self) -> Frame:
+    def frame(self) -> LiveFrame:
         """The posture now."""
         simulation, scene = self.simulation, self.still.scene
         robot, operator = simulation.robot, simulation.operator
@@ -115,7 +115,7 @@ class ArmSession:
         if robot.base is not None:
             pose = base_pose(robot, q[None])[0].tolist()
             positions["base_pose"] = dict(zip(("x", "y", "heading"), pose, strict=True))
-        return Frame(
+        return LiveFrame(
             time=simulation.time,
             poses=poses_at(scene, positions),
             hand=operator.target.copy(),

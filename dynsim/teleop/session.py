@@ -22,7 +22,7 @@ NO_REQUEST = 0
 
 
 @dataclass(frozen=True)
-class Axis:
+class PilotAxis:
     """One velocity that a pilot gives.
 
     Attributes
@@ -54,7 +54,7 @@ class Command:
 
 
 @dataclass(frozen=True)
-class Frame:
+class LiveFrame:
     """What a pilot sees after a tick.
 
     Attributes
@@ -97,7 +97,7 @@ class Session(Protocol):
     still : a moment of the same robot at its start, for a page to be made of
     """
 
-    axes: tuple[Axis, ...]
+    axes: tuple[PilotAxis, ...]
     modes: tuple[int, ...]
     has_gripper: bool
     period: float
@@ -118,7 +118,7 @@ class Session(Protocol):
     def tick(self, command: Command) -> None:
         """Advance by one period; SimulationStopped where there is no going on."""
 
-    def frame(self) -> Frame:
+    def frame(self) -> LiveFrame:
         """What there is to see now."""
 
     def joints(self) -> Mapping[str, Array]:

@@ -10,13 +10,12 @@ import numpy as np
 from dynsim.compile.scene import snake_scene
 from dynsim.engine.kinematic import prepare
 from dynsim.engine.kinematic_record import OBSTACLES, make_record
-from dynsim.engine.kinematic_run import COORDINATES
 from dynsim.record import Record
 from dynsim.record.poses import poses_at
 from dynsim.scenario import Scenario
 from dynsim.snake import state as ss
-from dynsim.snake.description import FIXING, SWITCHING, CommandBlock, Feedback
-from dynsim.teleop.session import NO_REQUEST, Array, Axis, Command, Frame, SpeedLimits, with_controller
+from dynsim.snake.description import COORDINATES, FIXING, SWITCHING, CommandBlock, Feedback
+from dynsim.teleop.session import NO_REQUEST, Array, Command, LiveFrame, PilotAxis, SpeedLimits, with_controller
 
 REQUESTS = {SWITCHING: "switching", FIXING: "fixing"}
 
@@ -40,7 +39,7 @@ class SnakeSession:
         self._scene = snake_scene(self._run.description)
         group = "gripper" if self._run.description.point_offset > 0.0 else "head"
         self.axes = tuple(
-            Axis(name, group, *(("m/s", limits.hand) if k < 3 else ("rad/s", limits.turn)))
+            PilotAxis(name, group, *(("m/s", limits.hand) if k < 3 else ("rad/s", limits.turn)))
             for k, name in enumerate(COORDINATES)
         )
         self.modes = self._run.controller.modes.numbers
@@ -85,7 +84,7 @@ class SnakeSession:
             self._run.read_commands(waiting=False)
         self._run.advance()
 
-    def frame(self) -> Frame:
+    def frame(self) -> LiveFrame:
         """The posture now."""
         run, state = self._run, self._run.state
         signals = {
@@ -94,7 +93,7 @@ class SnakeSession:
             "rho": dict(zip(run.description.wheel_names, state.rho.tolist(), strict=True)),
         }
         row = int(state.counts[ss.MODE])
-        return Frame(
+        return LiveFrame(
             time=self.time,
             poses=poses_at(self._scene, signals),
             hand=state.w_target[:3].copy(),

@@ -19,9 +19,9 @@ import dynsim
 from dynsim import cli
 from dynsim.cli import commands
 from dynsim.cli.display import record_files
-from dynsim.draw.figures.style import BLUE, PULLING
+from dynsim.draw.figures.style import BLUE, DEEP, PULLING
 from dynsim.draw.film import Film, write
-from dynsim.draw.film.painter import DEEP, FINER, FRICTION, Painter
+from dynsim.draw.film.painter import FINER, FRICTION, Painter
 from dynsim.draw.film.strip import Strip, largest
 from dynsim.draw.film.strokes import font, labels
 from dynsim.draw.geometry.camera import view_axes

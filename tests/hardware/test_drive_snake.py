@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from dynsim import load_scenario
+from dynsim.errors import CheckRefused
 from dynsim.hardware.bus.clock import Clock
-from dynsim.hardware.errors import CheckRefused
 from dynsim.hardware.replay.check import check_motion
 from dynsim.hardware.replay.drive import check_drive
-from dynsim.hardware.replay.growing import GrowingPath, Sample
+from dynsim.hardware.replay.incremental_path import IncrementalPath, Sample
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import Record
@@ -147,7 +147,7 @@ def test_goals_are_those_of_the_replay_of_the_finished_record(regular: tuple[Run
     # A stop, what is held back, two samples and a cycle; at first and at the end more or less.
     behind = np.array(feed.behind)[50:-50]
     assert behind.min() >= 0.5 * run.map.safety.stop_time + BLEND
-    assert behind.max() <= 0.5 * run.map.safety.stop_time + feed.follower.held_back.delay + 2.0 / RATE
+    assert behind.max() <= 0.5 * run.map.safety.stop_time + feed.follower.lookahead.delay + 2.0 / RATE
 
 
 def test_wheels_that_are_lifted_clear_the_floor_and_others_stand_on_it(regular: tuple[Run, SimulatedSnake]) -> None:
@@ -213,8 +213,8 @@ def postures(duration: int, requests: Mapping[int, int]) -> tuple[list[Sample], 
     found = []
     for tick in range(duration):
         feed.session.tick(command(tick, requests))
-        found += feed.follower.held_back.add(columns.sample(), *columns.base(feed.follower.held_back.yaw))
-    return [feed.follower.first, *found, *feed.follower.held_back.rest()], feed.session.record()
+        found += feed.follower.lookahead.add(columns.sample(), *columns.base(feed.follower.lookahead.yaw))
+    return [feed.follower.first, *found, *feed.follower.lookahead.rest()], feed.session.record()
 
 
 @pytest.mark.parametrize("ticks", [1, 2, 30, 61, 63, 230, 270])
@@ -223,7 +223,7 @@ def test_a_drive_may_end_at_any_tick(ticks: int) -> None:
     samples, simulated = postures(ticks, {150: 4})
     assert [one.time for one in samples] == pytest.approx(simulated.time)
     path = check_motion(simulated, snake_map()).path
-    growing = GrowingPath(samples[0], snake_map())
+    growing = IncrementalPath(samples[0], snake_map())
     for sample in samples[1:]:
         assert growing.append(sample, keep=0.0) == []
         for back in (0.0, 0.002):
@@ -235,7 +235,7 @@ def test_what_rises_at_the_end_is_left_on_its_way() -> None:
     with pytest.raises(CheckRefused, match=r"for 0\.150 s only"):
         check_motion(simulated, snake_map())
     assert samples[-1].time == pytest.approx(0.9)
-    growing = GrowingPath(samples[0], snake_map())
+    growing = IncrementalPath(samples[0], snake_map())
     assert [words for one in samples[1:] if (words := growing.append(one, keep=0.0))] == []
 
 

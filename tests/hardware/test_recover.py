@@ -16,14 +16,12 @@ import pytest
 
 from dynsim.errors import RecordError
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted
-from dynsim.hardware.replay import session, stream
-from dynsim.hardware.replay.folder import move_away
+from dynsim.hardware.replay import output, session
 from dynsim.hardware.replay.loop import Loop
-from dynsim.hardware.replay.recover import recover
-from dynsim.hardware.replay.rows import row_type
+from dynsim.hardware.replay.measured import recover
+from dynsim.hardware.replay.output import PART, GrowingFile, move_away, row_type
 from dynsim.hardware.replay.session import run_replay
 from dynsim.hardware.replay.states import ReplayResult
-from dynsim.hardware.replay.stream import PART, GrowingFile
 from dynsim.record import Record
 
 from .conftest import Rig
@@ -138,7 +136,7 @@ def no_thread(*_: object) -> None:
 
 @pytest.mark.parametrize(
     ("owner", "method", "fault"),
-    [(GrowingFile, "append", no_room), (threading.Thread, "start", no_thread), (stream, "lock", no_room)],
+    [(GrowingFile, "append", no_room), (threading.Thread, "start", no_thread), (output, "lock", no_room)],
 )
 def test_a_refused_start_leaves_no_empty_files(rig: Rig, tmp_path: Path, monkeypatch, owner, method, fault) -> None:
     run = rig.prepare()
@@ -274,7 +272,7 @@ def test_a_complete_record_is_not_called_failed(rig: Rig, tmp_path: Path, monkey
     assert summary["outputs_failed"].keys() == {"removal of measured.part"}
     assert summary["timing"]["cycles"] == len(Record.load(tmp_path / "left/measured.h5"))
     with monkeypatch.context() as patch:
-        patch.setattr(stream.RowStream, "pump", no_room)
+        patch.setattr(output.RowStream, "pump", no_room)
         with pytest.raises(OutputsFailed, match=r"streamed record failed: .*; .*measured\.h5 is complete$"):
             replay(rig, tmp_path / "streamed")
     assert recover(tmp_path / "left").complete

@@ -8,12 +8,12 @@ import json
 import pytest
 
 from dynsim.snake.description import SWITCHING
-from dynsim.teleop.session import Axis
+from dynsim.teleop.session import PilotAxis
 from dynsim.teleop.web.deadman import DRIVING, NOBODY, RELEASED, SILENCE, SILENT, Deadman
 from dynsim.teleop.web.live import RealTimeClock
 from dynsim.teleop.web.pilot import PilotCommand, Refused, parse
 
-AXES = (Axis("x", "hand", "m/s", 0.1), Axis("turn", "base", "rad/s", 0.5))
+AXES = (PilotAxis("x", "hand", "m/s", 0.1), PilotAxis("turn", "base", "rad/s", 0.5))
 
 
 class Clock:

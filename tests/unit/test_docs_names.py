@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 
 import dynsim
+from dynsim.engine.results import VIEW
 from dynsim.library.families import FAMILIES
+from dynsim.record import FORMAT
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "dynsim"
@@ -101,6 +103,16 @@ def test_what_a_page_names_exists(name: str) -> None:
     assert len(paths(text)) > 15
     assert len(claims(text)) > 12
     assert missing(text) == []
+
+
+DOCS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+@pytest.mark.parametrize("path", DOCS, ids=lambda path: path.name)
+def test_files_of_a_run_have_the_names_that_are_written(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert set(re.findall(r"`([\w.]+\.html)`", text)) <= {VIEW}
+    assert set(re.findall(r"dynsim-record-\d", text)) <= {FORMAT}
 
 
 @pytest.mark.parametrize(

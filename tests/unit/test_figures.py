@@ -23,11 +23,11 @@ from dynsim.draw.figures import (
     events,
     hand,
     motors,
-    penetration,
     posture,
     skeleton,
     style,
 )
+from dynsim.draw.geometry import robot
 from dynsim.engine import summary as metrics
 from dynsim.errors import RecordError
 from dynsim.record import Event, Record, measures
@@ -616,17 +616,10 @@ def test_ten_motors_are_an_envelope_and_six(braced: Record) -> None:
     assert len(shown) == 1 + motors.LARGEST
 
 
-def test_a_curve_on_another_is_dashed_and_others_are_not() -> None:
-    time = np.linspace(0.0, 1.0, 50)
-    curves = {"a": (time, time), "b": (time, time + 1e-3), "c": (time, 1.0 - time)}
-    looks = style.told_apart(style.variant_styles(list(curves)), curves)
-    assert [look["linestyle"] for look in looks.values()] == ["-", style.OVER[0], "-"]
-
-
 def test_what_lies_below_a_surface_is_marked(braced: Record) -> None:
     body, _ = skeleton.skeleton(braced)
     assert body is not None
-    assert penetration.below_surfaces(body, 0).depth == 0.0
+    assert robot.sunk(braced, body.scene, np.array([0])) == []
     sunk = copy.copy(braced)
     sunk.signals = dict(braced.signals)
     moved = braced["body_position"].copy()
@@ -634,11 +627,11 @@ def test_what_lies_below_a_surface_is_marked(braced: Record) -> None:
     sunk.signals["body_position"] = dataclasses.replace(braced.signals["body_position"], data=moved)
     body, _ = skeleton.skeleton(sunk)
     assert body is not None
-    found = penetration.below_surfaces(body, len(sunk) - 1)
+    found = robot.sunk(sunk, body.scene, np.array([len(sunk) - 1]))
     # Of a horizontal floor at zero the depth is the height of the lowest point.
     lowest = -body.segments(len(sunk) - 1)[..., 2].min()
-    assert found.depth == pytest.approx(lowest, rel=1e-12)
-    assert (found.pieces[..., 2] < 0.0).all()
+    assert max(one.depth.max() for one in found) == pytest.approx(lowest, rel=1e-12)
+    assert {one.surface for one in found} == {"floor"}
     assert "below floor, up to" in texts(drawn(posture.posture(sunk)))
     assert "below" not in texts(drawn(posture.posture(braced)))
 

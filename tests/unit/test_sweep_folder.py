@@ -142,6 +142,7 @@ DAMAGES: list[tuple[str, Callable[[Path], None], str, str]] = [
     ("row's reason a number", row(reason=0), SECOND, "reason = 0"),
     ("row's numbers nothing", row(numbers=None), SECOND, "numbers = None"),
     ("row's numbers texts", row(numbers={"energy": "much"}), SECOND, "numbers = {"),
+    ("row's numbers too large", row(numbers={"energy": 10**400}), SECOND, "numbers = {"),
     ("row's warnings a list", row(warnings=[]), SECOND, "warnings = []"),
     ("table a folder", as_folder("sweep.csv"), "sweep.csv", "in the way"),
     ("other table a folder", as_folder("sweep.parquet"), "sweep.parquet", "in the way"),

@@ -161,6 +161,14 @@ def test_white_space_beside_a_number_is_no_reason_to_lose_a_mass(tmp_path: Path)
     assert (inertia.mass, inertia.com.tolist(), inertia.tensor[0, 0]) == (4.0, [0.0, 0.0, 0.25], 0.1)
 
 
+def test_dynamics_with_extensions_alone_are_none(tmp_path: Path) -> None:
+    """Pinocchio's parser refuses them, also where their attributes have the names of others."""
+    text = GOOD.replace('<dynamics damping="0.5" friction="0"/>', '<dynamics name="x" joint="y" multiplier="2"/>')
+    assert text != GOOD
+    (tmp_path / "extended.urdf").write_text(text)
+    assert read_urdf(tmp_path / "extended.urdf").links[0].damping == 0.0
+
+
 def test_extensions_of_programs_are_passed_over(tmp_path: Path) -> None:
     extended = (
         '<robot xmlns:xacro="http://wiki.ros.org/xacro" name="r"><gazebo><link name="x"><inertial/></link></gazebo>'

@@ -54,10 +54,7 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
     more = sum(-(-(len(having[name]) + 1) // 2) - 1 for name in chosen) * style.LEGEND_ROW / 72.0
     figure = style.new_figure(1.0 + ROW * len(chosen) + more, title + note)
     series = [[one for r in having[name].values() for one in _series(r, name)] for name in chosen]
-    styles = style.told_apart(
-        style.variant_styles(list(records)),
-        *({v: (r.time, _force(r, name)) for v, r in having[name].items()} for name in chosen),
-    )
+    styles = style.variant_styles(list(records))
     rows = style.time_rows(figure, series, max(map(style.settle_time, runs)))
     for name, panels in zip(chosen, rows, strict=True):
         # What the panel of the beginning shows would be a heap of marks in the other one.
@@ -73,12 +70,12 @@ def _forces(records: Mapping[str, Record], title: str) -> Figure | None:
                 if alone and is_real(record):
                     _draw_modes(axes, record, name)
                 elif alone:
-                    fill = {"color": style.PULLING, "alpha": 0.3, "linewidth": 0, "interpolate": True}
+                    fill: dict[str, Any] = {"color": style.PULLING, "alpha": 0.3, "linewidth": 0, "interpolate": True}
                     axes.fill_between(record.time, force, 0.0, where=force < 0.0, label="_pulling", **fill)
                 if len(panels) > 1 and axes is panels[0]:
                     _draw_samples(axes, record, name, colour)
             if not all(map(is_real, having[name].values())):
-                _mark_pulling(axes)
+                style.shade_below_zero(axes, "surface pulls")
         panels[0].set_ylabel(f"{name}\nfₙ [N]")
         style.legend_above(panels[-1], columns=4 if alone else 2)
     _note_sampling(rows, runs)
@@ -214,13 +211,3 @@ def _draw_modes(axes: Axes, record: Record, name: str) -> None:
             spans, (0.0, 1.0), transform=axes.get_xaxis_transform(), color=colour, linewidth=0, zorder=0.2, label=label
         )
     axes.set_xlim(limits)
-
-
-def _mark_pulling(axes: Axes) -> None:
-    """Shade what lies below zero, if any of the axis does."""
-    axes.axhline(0.0, color=style.PULLING, linewidth=0.8)
-    low, high = axes.get_ylim()
-    if low >= 0.0:
-        return
-    axes.axhspan(low, 0.0, color=style.PULLING, alpha=0.13, linewidth=0, label="surface pulls")
-    axes.set_ylim(low, high)

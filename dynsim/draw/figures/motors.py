@@ -14,9 +14,6 @@ from dynsim.record import Record
 
 # Up to so many motors a line each; beyond that as many with the largest currents, and the envelope of all.
 LARGEST = 6
-# Six colours that are told apart; dashes for six more.
-COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, style.BLACK)
-DASHES = ("-", (0, (4, 1.5)))
 
 
 def motors(record: Record) -> Figure | None:
@@ -34,10 +31,7 @@ def motors(record: Record) -> Figure | None:
     rows = style.time_rows(
         figure, [[(record.time, record[name])] for name, _ in signals], style.settle_time(record), compress=True
     )
-    looks = style.told_apart(
-        {k: {"color": COLOURS[place], "lw": 1.3} for place, k in enumerate(shown)},
-        *({k: (record.time[late], record[name][late, k]) for k in shown} for name, _ in signals),
-    )
+    looks = style.variant_styles(shown.tolist())
     for (name, label), panels in zip(signals, rows, strict=True):
         for axes in panels:
             _draw(axes, record, name, shown, looks)

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D  # type: ignore[import-untyped]
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection  # type: ignore[import-untyped]
 
-from dynsim.draw.figures import penetration, style
+from dynsim.draw.figures import style
 from dynsim.draw.figures.hand import edge_on, target_name
 from dynsim.draw.figures.skeleton import (
     LABEL_SIZE,
@@ -28,11 +28,13 @@ from dynsim.draw.figures.skeleton import (
     with_labels,
 )
 from dynsim.draw.figures.style import Array
+from dynsim.draw.geometry.robot import sunk
 from dynsim.draw.geometry.shapes import grid_faces, outline
 from dynsim.draw.geometry.surfaces import round_patch, surface_grids
 from dynsim.record import Record
 from dynsim.record.measures import hand_target
-from dynsim.record.scene import Surface
+from dynsim.record.poses import point_positions
+from dynsim.record.scene import Point, Surface
 
 # An axis of the 3D view shorter than this share of the longest has two ticks.
 SHORT_AXIS = 0.45
@@ -75,7 +77,7 @@ def posture(record: Record) -> Figure | None:
     _frame_side(side, plane, extent, () if body is None else body.scene.surfaces)
     if note:
         side.set_title(note, color=style.PULLING)
-    _legend(figure, [side])
+    style.legend_below(figure, [side], 5)
     return figure
 
 
@@ -96,26 +98,18 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     columns = min(len(shown), 4 if size[1] > size[0] else 2)
     lines = -(-len(shown) // columns)
     room = np.array([FULL if columns == 1 else 2.0 * HALF / columns, 72.0 * 3.2])
-    # All have one width; rows without labels need no height for them.
-    rows = [list(shown)[start : start + columns] for start in range(0, len(shown), columns)]
     framed, scale = _with_labels((low, high), list(shown.values()), plane, room)
-    extents = []
-    for row in rows:
-        labels = [label for name in row for label in contact_labels(shown[name], plane, scale)]
-        base, top = with_labels((low, high), labels, scale)
-        extents.append((np.array([framed[0][0], base[1]]), np.array([framed[1][0], top[1]])))
-    widest = 6.4 / columns
-    heights = [float(np.clip(widest * (top[1] - base[1]) / (top[0] - base[0]), 0.8, 3.2)) for base, top in extents]
+    size = framed[1] - framed[0]
+    each = float(np.clip(6.4 / columns * size[1] / size[0], 0.8, 3.2))
     figure = style.new_figure(
-        0.9 + 0.3 * lines + sum(heights), style.comparison_title(some, "postures at the end, and before (faint)")
+        0.9 + (0.3 + each) * lines, style.comparison_title(some, "postures at the end, and before (faint)")
     )
-    grid = figure.subplots(lines, columns, sharex=True, sharey="row", squeeze=False, height_ratios=heights)
+    grid = figure.subplots(lines, columns, sharex=True, sharey="row", squeeze=False)
     styles = style.variant_styles(list(records))
     for axes, (name, body) in zip(grid.ravel(), shown.items(), strict=False):
         colour = str(styles[name]["color"])
-        extent = extents[list(shown).index(name) // columns]
         _side_view(axes, records[name], body, drawn[name], plane, scale, colour=colour, path=style.GREY, named=False)
-        _frame_side(axes, plane, extent, body.scene.surfaces)
+        _frame_side(axes, plane, framed, body.scene.surfaces)
         axes.set_title(name, color=styles[name]["color"], fontweight="bold")
         axes.label_outer()
     for axes in grid.ravel()[len(shown) :]:
@@ -123,7 +117,7 @@ def posture_comparison(records: Mapping[str, Record]) -> Figure | None:
     # Labels of narrow panels would overlap: one stands for all.
     for axes in grid[:, [k for k in range(columns) if columns > 2 and k != columns // 2]].ravel():
         axes.set_xlabel("")
-    _legend(figure, list(grid.ravel()))
+    style.legend_below(figure, list(grid.ravel()), 5)
     return figure
 
 
@@ -137,15 +131,6 @@ def _with_labels(
         wide = with_labels(extent, labels, scale)
         scale = float((room / (wide[1] - wide[0])).min())
     return wide, scale
-
-
-def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
-    """One legend for all panels; the arm itself needs no entry."""
-    known: dict[str, Any] = {}
-    for axes in panels:
-        handles, labels = axes.get_legend_handles_labels()
-        known.update(dict(zip(labels, handles, strict=True)))
-    figure.legend(known.values(), known.keys(), loc="outside lower center", ncols=len(known))
 
 
 def _frame_side(axes: Axes, plane: SidePlane, extent: tuple[Array, Array], surfaces: Sequence[Surface]) -> None:
@@ -186,7 +171,6 @@ def _side_view(
             axes.add_patch(
                 Polygon(corners, facecolor=face, edgecolor=colour, lw=0.8, alpha=1.0 if last else 0.22, zorder=2.5)
             )
-    sunk = [] if body is None else [penetration.below_surfaces(body, row) for row in body.shown()]
     for k, segments in enumerate(drawn):
         last = k == len(drawn) - 1
         flat = plane.project(segments)
@@ -200,10 +184,6 @@ def _side_view(
             zorder=3 if last else 2,
         )
         axes.add_collection(lines)
-        if len(sunk[k].pieces):
-            axes.add_collection(
-                LineCollection(list(plane.project(sunk[k].pieces)), zorder=3.2, **_sunk_look(last), capstyle="butt")
-            )
         if last and len(flat) <= DOTS:
             axes.plot(*flat[:-1, 1].T, "o", color="white", markeredgecolor=colour, markersize=4, zorder=4)
     if (wanted := hand_target(record)) is not None:
@@ -213,9 +193,16 @@ def _side_view(
     for _, _, position, force in () if body is None else body.contacts():
         axes.plot(*plane.project(position), zorder=6, linestyle="none", **_contact_mark(force))
     labels = contact_labels(body, plane, scale)
-    if (deepest := max(sunk, key=lambda one: one.depth, default=None)) is not None and deepest.depth > 0.0:
-        text = f"below {deepest.surface}, up to {style.number(1e3 * deepest.depth, 3)} mm"
-        axes.plot([], [], label=text if named else "below a surface", color=penetration.COLOUR, lw=4.0)
+    rows = np.array([] if body is None else body.shown(), dtype=np.intp)
+    if body is not None and (below := sunk(record, body.scene, rows)):
+        ring: dict[str, Any] = {"markersize": 9, "markerfacecolor": "none", "color": style.DEEP, "zorder": 5}
+        for one in below:
+            point = Point(one.name, "hand", one.body, one.position)
+            places = plane.project(point_positions(record, point, rows)[one.depth > one.least])
+            axes.plot(*places.T, "o", **ring)
+        deepest = max(below, key=lambda one: float(one.depth.max()))
+        text = f"below {deepest.surface}, up to {style.number(1e3 * float(deepest.depth.max()), 3)} mm"
+        axes.plot([], [], "o", label=text if named else "below a surface", **ring)
     for label in labels:
         axes.annotate(
             label.text,
@@ -234,11 +221,6 @@ def _side_view(
 def _opacity(k: int, count: int) -> float:
     """Of the k-th posture: the later the darker, the last one in full."""
     return 1.0 if k == count - 1 else 0.12 + 0.2 * k / count
-
-
-def _sunk_look(last: bool) -> dict[str, Any]:
-    """What of a posture lies below a surface."""
-    return {"colors": penetration.COLOUR, "linewidths": 4.0 if last else 2.2, "alpha": 1.0 if last else 0.5}
 
 
 def _space_view(
@@ -260,7 +242,6 @@ def _space_view(
         shown = np.concatenate([corners[faces] for corners, faces in base])
         solid = Poly3DCollection(shown, facecolors=BASE_COLOUR, linewidths=0, shade=True, antialiased=False, zorder=2.5)
         axes.add_collection3d(solid, autolim=False)
-    sunk = [] if body is None else [penetration.below_surfaces(body, row) for row in body.shown()]
     for k, segments in enumerate(drawn):
         last = k == len(drawn) - 1
         lines = Line3DCollection(
@@ -271,9 +252,6 @@ def _space_view(
             zorder=3 if last else 2,
         )
         axes.add_collection3d(lines, autolim=False)
-        if len(sunk[k].pieces):
-            sinking = Line3DCollection(list(sunk[k].pieces), zorder=3 if last else 2, **_sunk_look(last))
-            axes.add_collection3d(sinking, autolim=False)
         if last and len(segments) <= DOTS:
             axes.plot(*segments[:-1, 1].T, "o", color="white", markeredgecolor=ARM_COLOUR, markersize=3, zorder=4)
     if (wanted := hand_target(record)) is not None:

@@ -124,5 +124,6 @@ def _collada(content: bytes) -> Mesh:
 def _diffuse(material: Any) -> Array:
     """Red, green and blue of a material from 0 to 1; NaN where it has a texture or none of them."""
     colour = getattr(material.effect, "diffuse", None)
-    known = isinstance(colour, tuple) and len(colour) > 2 and np.isfinite(colour[:3]).all()
-    return np.clip(colour[:3], 0.0, 1.0) if known else _UNKNOWN
+    if isinstance(colour, tuple) and len(colour) > 2 and np.isfinite(colour[:3]).all():
+        return np.clip(colour[:3], 0.0, 1.0)
+    return _UNKNOWN

@@ -39,8 +39,8 @@ class Meshes:
     def of_robot(self, record: Record) -> None:
         """Look for what follows where the robot of this record came from."""
         scenario = record.provenance.get("scenario", {})
-        files = _named(scenario.get("plant", {}) if isinstance(scenario, Mapping) else {}, "file")
-        self._folders = tuple(Path(file).parent for file in files)
+        files = named(scenario.get("plant", {}) if isinstance(scenario, Mapping) else {}, "file")
+        self._folders = tuple(Path(file).parent for file in files if isinstance(file, str))
 
     def index(self, file: str) -> int | None:
         """Number of a mesh among those of the page; None where there is none, or it cannot be read."""
@@ -183,11 +183,13 @@ def _joined(parts: Sequence[Mesh]) -> Mesh:
     )
 
 
-def _named(tree: Any, key: str) -> Iterator[str]:
-    """Texts of a key, wherever it is."""
+def named(tree: Any, key: str) -> Iterator[Any]:
+    """Values of a key, wherever it is."""
     if isinstance(tree, Mapping):
         for name, value in tree.items():
-            if name == key and isinstance(value, str):
+            if name == key:
                 yield value
-            else:
-                yield from _named(value, key)
+            yield from named(value, key)
+    elif isinstance(tree, (list, tuple)):
+        for value in tree:
+            yield from named(value, key)

@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 POSE_ERROR = 4e-5
 # Frames of a longer run are thinned though poses between them be off by more.
 FRAMES = 20_000
+WORLD_AXES = np.eye(3)
 HERE_POINT: Vector3 = (0.0, 0.0, 0.0)
 
 
@@ -47,12 +48,22 @@ class Robot:
     reach: float
 
 
+def placed(record: Record) -> tuple[Scene | None, str]:
+    """The scene of a record that has the poses of its bodies, or what it lacks to be drawn."""
+    scene = record.scene
+    if scene is None or not scene.bodies:
+        return None, "the record has no scene"
+    if POSITION not in record or ORIENTATION not in record:
+        return None, "not every joint was recorded"
+    if record[POSITION].shape != (len(record), len(scene.bodies), 3):
+        return None, "the scene has other bodies than the record"
+    return scene, ""
+
+
 def robot_of(record: Record) -> Robot | None:
     """The robot of a record; None without samples, a scene, or the poses of its bodies."""
-    scene = record.scene
-    if scene is None or not scene.bodies or not {POSITION, ORIENTATION} <= set(record) or not len(record):
-        return None
-    if record[POSITION].shape != (len(record), len(scene.bodies), 3):
+    scene, _ = placed(record)
+    if scene is None or not len(record):
         return None
     position = record[POSITION][np.isfinite(record[POSITION]).all(axis=(1, 2))]
     if not len(position):
@@ -91,11 +102,9 @@ def _every(count: int, stride: int) -> NDArray[np.intp]:
     return np.unique(np.append(np.arange(0, count, stride), count - 1))
 
 
-def bounds(robots: Sequence[Robot], turn: float = 0.0) -> tuple[Array, Array]:
-    """The box, turned about z by ``turn`` [rad], in which everything moves, with some room, (3,) and (3,) [m]."""
-    pooled = moving(robots)
-    c, s = math.cos(turn), math.sin(turn)
-    pooled = pooled @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+def bounds(robots: Sequence[Robot], axes: Array = WORLD_AXES) -> tuple[Array, Array]:
+    """The box along some axes, unit vectors (3, 3), in which everything moves, with some room, (3,) and (3,) [m]."""
+    pooled = moving(robots) @ axes.T
     low, high = pooled.min(axis=0), pooled.max(axis=0)
     # What hardly moves is not blown up to fill the window, and what is flat has some depth to stand in.
     span, reach = float((high - low).max()), max(robot.reach for robot in robots)
@@ -150,8 +159,6 @@ def paths(record: Record, scene: Scene) -> Iterator[tuple[str, Array]]:
     if scene.hand is not None:
         yield "hand", np.asarray(point_positions(record, scene.hand), dtype=np.float64)
     target = hand_target(record)
-    if target is None and "hand_position_goal" in record:
-        target = record["hand_position_goal"]
     if target is None and "w_target" in record:
         target = record["w_target"][:, :3]
     if target is not None:
@@ -223,12 +230,11 @@ class Sunk:
     depth: Array
 
 
-def sunk(robot: Robot, rows: NDArray[np.intp] | slice = slice(None)) -> list[Sunk]:
+def sunk(record: Record, scene: Scene, rows: NDArray[np.intp] | slice = slice(None)) -> list[Sunk]:
     """Joints, and the hand, below surfaces at samples of the record: surfaces hold contact points only.
 
     Bodies of a mobile base, and wheels, stand where the model has them.
     """
-    record, scene = robot.record, robot.scene
     wheels = {k for k, body in enumerate(scene.bodies) if body.joint.signal == "rho"} | set(scene.base)
     points = [(body.joint.name, k, HERE_POINT) for k, body in enumerate(scene.bodies) if k not in wheels]
     if scene.hand is not None and scene.hand.body != WORLD:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -124,3 +126,17 @@ def round_patch(surface: Surface, low: Array, high: Array) -> Array:
 def box_corners(low: Array, high: Array) -> Array:
     """The eight corners of a box, (8, 3)."""
     return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+
+
+def box_about(clouds: Sequence[Array], room: float = 0.0) -> tuple[Array, Array]:
+    """Corners of the box about all points that are finite, (…, k) each, with ``room`` in parts of its longest edge.
+
+    A unit box where there is none.
+    """
+    points = np.concatenate([cloud.reshape(-1, cloud.shape[-1]) for cloud in clouds])
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return np.zeros(points.shape[1]), np.ones(points.shape[1])
+    low, high = points.min(axis=0), points.max(axis=0)
+    edge = room * float((high - low).max())
+    return low - edge, high + edge

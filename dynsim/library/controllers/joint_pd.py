@@ -22,7 +22,7 @@ from dynsim.compile.splines import clamped_cubic, quintic_coefficients
 from dynsim.config.base import NonNegative, Positive, StrictConfig, check_waypoints, error_at
 from dynsim.errors import ModelError
 from dynsim.library import families
-from dynsim.library.controllers.operator import Operator
+from dynsim.library.controllers.operator import OperatorConfig
 from dynsim.model.base_pose import base_row
 from dynsim.model.description import Contact, Robot
 from dynsim.model.drives import Motor, Servo, TorqueSource
@@ -89,7 +89,9 @@ class Config(StrictConfig):
     k_d_V_s_per_rad: NonNegative | list[NonNegative] = Field(default=20.0, description="V s/m at a prismatic joint")
     hand: HandReference | None = Field(default=None, description="a path for the hand")
     base: BaseReference | None = Field(default=None, description="a path for the mobile base; none: it holds")
-    operator: Operator | None = Field(default=None, description="velocities for hand and mobile base, instead of paths")
+    operator: OperatorConfig | None = Field(
+        default=None, description="velocities for hand and mobile base, instead of paths"
+    )
     joints: dict[str, JointPath] = Field(default={}, description="waypoints by joint name")
     torques: dict[str, TorquePath] = Field(default={}, description="torques of motors of type torque by joint name")
     feed_forward: Literal["none", "gravity", "dynamics"] = Field(
@@ -186,7 +188,7 @@ def build(config: Config, context: BuildContext) -> JointControl:
     return control if config.operator is None else replace(control, teleop=_teleop(config.operator, context))
 
 
-def _teleop(operator: Operator, context: BuildContext) -> TeleopOptions:
+def _teleop(operator: OperatorConfig, context: BuildContext) -> TeleopOptions:
     robot = context.model.robot
     if any(command.base is not None for command in operator.commands):
         _check_base(robot, ("controller", "operator"))

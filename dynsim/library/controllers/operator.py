@@ -24,7 +24,7 @@ class Velocity(StrictConfig):
     base: BaseVelocity | None = Field(default=None, description="ahead [m/s], to the left [rad/s]")
 
 
-class Operator(StrictConfig):
+class OperatorConfig(StrictConfig):
     """References that follow velocities, rewritten at every tick; the commands may come from a live operator."""
 
     rate_hz: Positive = Field(default=100.0, description="ticks, at which references are rewritten")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 
-from dynsim.teleop.session import NO_REQUEST, Axis, Command
+from dynsim.teleop.session import NO_REQUEST, Command, PilotAxis
 from dynsim.teleop.web.pilot import PilotCommand
 
 SILENCE = 0.25
@@ -25,7 +25,7 @@ class Deadman:
     axes : velocities of the robot; clock : seconds that only rise
     """
 
-    def __init__(self, axes: Sequence[Axis], clock: Callable[[], float]) -> None:
+    def __init__(self, axes: Sequence[PilotAxis], clock: Callable[[], float]) -> None:
         self._limits = [axis.limit for axis in axes]
         self._clock, self._lock = clock, threading.Lock()
         self._newest: PilotCommand | None = None

@@ -23,13 +23,12 @@ from typing import Any
 import numpy as np
 
 from dynsim.engine.results import save_drive
-from dynsim.errors import DynsimError, RecordError
-from dynsim.hardware.errors import CheckRefused
+from dynsim.errors import CheckRefused, DynsimError, RecordError
 from dynsim.hardware.replay.drive import lead
-from dynsim.hardware.replay.growing import Sample
-from dynsim.hardware.replay.held_back import HeldBack
-from dynsim.hardware.replay.lifting import SIGNAL as LIFTED
-from dynsim.hardware.replay.signals import ignore_stops
+from dynsim.hardware.replay.incremental_path import Sample
+from dynsim.hardware.replay.lift_lookahead import LiftLookahead
+from dynsim.hardware.replay.states import ignore_stops
+from dynsim.hardware.replay.trajectory import GROUNDED as LIFTED
 from dynsim.hardware.replay.trajectory import column_of
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import Record
@@ -170,14 +169,14 @@ class ServoFollower:
 
     def __init__(self, session: Session, servo_map: ServoMap, samples: Connection, heard: Any) -> None:
         self._session, self._columns = session, Columns(session, servo_map)
-        self.held_back = HeldBack(session.still, servo_map, session.period) if servo_map.lifts else None
+        self.lookahead = LiftLookahead(session.still, servo_map, session.period) if servo_map.lifts else None
         # By how much the simulation may be ahead of the servos [s].
-        self._ahead = lead(servo_map) + (self.held_back.delay if self.held_back is not None else 0.0)
+        self._ahead = lead(servo_map) + (self.lookahead.delay if self.lookahead is not None else 0.0)
         self._samples, self._heard, self._lifting = samples, heard, lifting_columns(servo_map)
         self.first = self._columns.sample()
         self._frame = frame_of(len(self.first.position), len(self._lifting))
-        if self.held_back is not None:
-            self.first = self.held_back.begin(self.first, *self._columns.base(self.held_back.yaw))
+        if self.lookahead is not None:
+            self.first = self.lookahead.begin(self.first, *self._columns.base(self.lookahead.yaw))
 
     @property
     def begun(self) -> bool:
@@ -189,16 +188,16 @@ class ServoFollower:
 
     @property
     def steady(self) -> bool:
-        return self.held_back is None or self.held_back.steady(self._session.time)
+        return self.lookahead is None or self.lookahead.steady(self._session.time)
 
     def hear(self) -> None:
-        sample, held_back = self._columns.sample(), self.held_back
-        for whole in [sample] if held_back is None else held_back.add(sample, *self._columns.base(held_back.yaw)):
+        sample, lookahead = self._columns.sample(), self.lookahead
+        for whole in [sample] if lookahead is None else lookahead.add(sample, *self._columns.base(lookahead.yaw)):
             self._tell(whole)
 
     def finish(self) -> None:
         """There was no tick that is not to be followed: what is held back goes on."""
-        for sample in self.held_back.rest() if self.held_back is not None else []:
+        for sample in self.lookahead.rest() if self.lookahead is not None else []:
             self._tell(sample)
 
     def end(self, how: float) -> None:

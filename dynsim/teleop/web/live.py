@@ -17,7 +17,7 @@ from dynsim.errors import DynsimError, SimulationStopped
 from dynsim.record.quaternion import rotated
 from dynsim.record.scene import WORLD
 from dynsim.system import interruption
-from dynsim.teleop.session import NO_REQUEST, Command, Frame, Session
+from dynsim.teleop.session import NO_REQUEST, Command, LiveFrame, Session
 from dynsim.teleop.web.deadman import DRIVING, Deadman
 from dynsim.teleop.web.server import FRAMES, Server
 
@@ -224,7 +224,7 @@ class LiveDrive:
             **frame.extra,
         }
 
-    def _contacts(self, frame: Frame) -> dict[str, Any]:
+    def _contacts(self, frame: LiveFrame) -> dict[str, Any]:
         """Forces as the page takes them: the normal, and what is left beside it."""
         scene, forces = self.session.still.scene, dict[str, Any]()
         if scene is None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from dynsim.errors import DynsimError
-from dynsim.hardware.replay.growing import Sample
+from dynsim.hardware.replay.incremental_path import Sample
 from dynsim.hardware.replay.motion import Array
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.studies.processes import signals_held

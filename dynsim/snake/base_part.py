@@ -29,9 +29,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.hardware.errors import CheckRefused
+from dynsim.errors import CheckRefused
 from dynsim.record import Record
-from dynsim.record.scene import Body, Scene
+from dynsim.snake.geometry import wheels_of
 
 Array = NDArray[np.float64]
 NEWTON_STEPS = 12
@@ -177,32 +177,17 @@ def base_part(record: Record, pairs: tuple[str, ...]) -> BasePart:
         joint = body.joint
         if joint.kind != "revolute" or joint.axis != (0.0, 0.0, 1.0) or body.parent != index[ahead]:
             raise CheckRefused(f"{body.name} is not behind {ahead} on a yaw joint: its wheels cannot be lifted")
-    wheels = [_wheels(scene, body, index[body.name]) for body in bodies]
-    axle = np.array([x for x, _, _ in wheels])
+    wheels = [wheels_of(scene, name) for name in pairs]
+    if bare := [name for name, on_body in zip(pairs, wheels, strict=True) if not on_body]:
+        raise CheckRefused(f"the record's scene has no wheels on {bare[0]}")
+    axle = np.array([on_body[0].along for on_body in wheels])
     joints = np.array([body.joint.position[0] for body in bodies[1:]])
     return BasePart(
         pairs=pairs,
         before=axle[:-1] - joints,
         behind=-axle[1:],
-        half_track=np.array([side for _, side, _ in wheels]),
-        radius=wheels[0][2],
+        half_track=np.array([on_body[0].beside for on_body in wheels]),
+        radius=wheels[0][0].radius,
         signal=bodies[1].joint.signal,
         yaw=tuple(body.joint.labels[0] for body in bodies[1:]),
     )
-
-
-def _wheels(scene: Scene, body: Body, index: int) -> tuple[float, float, float]:
-    """Where along a body its axle is, half track and radius [m].
-
-    A wheel is a shape of the body, or a body that turns on it.
-    """
-    beside = [(*shape.position[:2], shape.size[0]) for shape in body.shapes if shape.position[1] != 0.0]
-    beside += [
-        (*other.joint.position[:2], other.shapes[0].size[0])
-        for other in scene.bodies
-        if other.parent == index and other.joint.position[1] != 0.0 and other.shapes
-    ]
-    if not beside:
-        raise CheckRefused(f"the record's scene has no wheels on {body.name}")
-    x, side, radius = beside[0]
-    return x, abs(side), radius

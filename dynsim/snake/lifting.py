@@ -6,41 +6,53 @@ The record says which pairs are on the ground, 0 or 1; the robot needs time for 
 
 from the sample t_up on in which it is first lifted, and is zero again at t_down, when it is first grounded: a pair is
 in the air only while the record says so. Pitch angles follow from the heights and the yaw angles of every sample
-(:mod:`dynsim.hardware.replay.base_part`), before anything moves.
+(:mod:`dynsim.snake.base_part`), before anything moves.
 """
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from dynsim.hardware.errors import CheckRefused
-from dynsim.hardware.replay.base_part import BasePart, Fold, base_part
-from dynsim.hardware.servo_map import Lifts, ServoMap
+from dynsim.config.base import Positive, StrictConfig
+from dynsim.errors import CheckRefused
 from dynsim.record import TIME, Record
+from dynsim.snake.base_part import BasePart, Fold, base_part
 
 Array = NDArray[np.float64]
 SAMPLES_PER_BLEND = 20
 """Fewer of them, and the path between two samples is no longer at the heights of the samples."""
 ROUNDING = 1e-9
 """By so much less a time may be than it must [s]."""
-SIGNAL = "grounded"
-"""Where dynsim's own records say which wheel pairs are on the ground; looked at when the map has no ``lifts``."""
 
 
-def wheel_offsets(record: Record, servo_map: ServoMap) -> dict[str, Array]:
-    """What lifting adds to the joints that the map names for it, shape (T,) each [rad]; none where nothing is lifted.
+class Lifts(StrictConfig):
+    """How wheel pairs that the record lifts are lifted.
 
-    Raises
-    ------
-    CheckRefused
-        The record lifts wheels and the map does not say how, or it lifts what cannot be lifted.
+    Attributes
+    ----------
+    signal : str
+        Signal of the record with 1 where a wheel pair is on the ground, 0 where it is lifted.
+    joints : tuple of str
+        The pitch joints on the axles of the first, second, ... pair: every pair but the last has one. Lifting is added
+        to what they do otherwise; the first, on the axle that carries the head, follows the record and keeps the head
+        where it is.
+    clearance_mm : float
+        Height of the lower wheel of a lifted pair above the floor.
+    blend_s : float
+        Time to lift a pair, and to put it down [s of record time].
+    tilt_mm : float
+        A record is refused where one wheel of a grounded pair would be further above the floor: a bent base twists.
     """
-    lifts = servo_map.lifts
-    if lifts is None:
-        _refuse_lifted_wheels(record)
-        return {}
-    return dict(zip(lifts.joints, lifted(record, lifts).hinge.T, strict=True))
+
+    signal: str = "grounded"
+    joints: Annotated[tuple[str, ...], Field(min_length=1)]
+    clearance_mm: Positive = 5.0
+    blend_s: Positive = 0.3
+    tilt_mm: Positive = 2.5
 
 
 def lifted(record: Record, lifts: Lifts) -> Fold:
@@ -51,7 +63,7 @@ def lifted(record: Record, lifts: Lifts) -> Fold:
     CheckRefused
         No such signal, or it lifts pairs that cannot be lifted, or not for so short a time; with pair and time.
     """
-    grounded = _grounded(record, lifts.signal)
+    grounded = grounded_pairs(record, lifts.signal)
     pairs = record.labels[lifts.signal]
     refuse_other_joints(lifts, pairs)
     time = record.time - record.time[0]
@@ -110,20 +122,7 @@ def refuse_long_steps(lifts: Lifts, step: float) -> None:
         )
 
 
-def _refuse_lifted_wheels(record: Record) -> None:
-    if SIGNAL not in record:
-        return
-    up = np.flatnonzero((_grounded(record, SIGNAL) == 0).any(axis=0))
-    if len(up):
-        names = ", ".join(record.labels[SIGNAL][k] for k in up)
-        raise CheckRefused(
-            f"the record lifts wheel pairs ({names}) and the servo map does not say how: without it they would drag "
-            "over the floor. Add to the map, for example:\n"
-            "  lifts: {joints: [psi3, psi4, psi5, psi6, psi7, psi8], clearance_mm: 5, blend_s: 0.3}"
-        )
-
-
-def _grounded(record: Record, name: str) -> Array:
+def grounded_pairs(record: Record, name: str) -> Array:
     """1 where a pair is on the ground, shape (T, pairs)."""
     if name not in record:
         raise CheckRefused(f"lifts.signal: the record has no {name!r}; it has {', '.join(record)}")

@@ -1,7 +1,7 @@
 """Wheel pairs that are lifted while a pilot drives: postures are held back until it is known what lifting adds.
 
 The height of a pair at a time t depends on when it is put down only where that is within ``lifts.blend_s``
-(:mod:`dynsim.hardware.replay.lifting`). So the posture of t is whole as soon as it is known which pairs are on the
+(:mod:`dynsim.snake.lifting`). So the posture of t is whole as soon as it is known which pairs are on the
 ground until t + blend_s. The rate of what is added is a central difference, for which the posture after it is folded
 first. What leaves here is what the replay of the finished record makes of it, by the same functions.
 """
@@ -12,9 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dynsim.hardware.replay.base_part import base_part
-from dynsim.hardware.replay.growing import Sample
-from dynsim.hardware.replay.lifting import (
+from dynsim.hardware.replay.incremental_path import Sample
+from dynsim.hardware.replay.motion import Array
+from dynsim.hardware.servo_map import ServoMap
+from dynsim.record import Record
+from dynsim.snake.base_part import base_part
+from dynsim.snake.lifting import (
     ROUNDING,
     folded,
     height_of,
@@ -23,9 +26,6 @@ from dynsim.hardware.replay.lifting import (
     refuse_short_lift,
     refuse_what_cannot_stand,
 )
-from dynsim.hardware.replay.motion import Array
-from dynsim.hardware.servo_map import ServoMap
-from dynsim.record import Record
 
 
 @dataclass
@@ -46,7 +46,7 @@ class _Held:
     down: Array
 
 
-class HeldBack:
+class LiftLookahead:
     """Postures of a simulation from its start on, and as :class:`Sample` with what lifting adds.
 
     Parameters
