@@ -53,7 +53,7 @@ def run_replay(
 
     What an earlier replay left there is moved away first. While the replay runs its log and its cycles are written by a
     thread of their own, the cycles to ``measured.part``: when this process dies
-    :func:`dynsim.hardware.replay.recover.recover` makes a record of it.
+    :func:`dynsim.hardware.replay.measured.recover` makes a record of it.
 
     ``connection`` gives bus and clock (:func:`dynsim.hardware.ports.bus_on`); the other parameters are those of
     :class:`dynsim.hardware.replay.machine.Replay`.
