@@ -26,10 +26,9 @@ from dynsim.studies.bench.programs import (
     ABA,
     CONSTRAINT_DYNAMICS,
     DYNSIM_CONTACTS,
+    DYNSIM_DOPRI5,
     DYNSIM_FREE,
     DYNSIM_RADAU5,
-    DYNSIM_RK4,
-    DYNSIM_RK43,
     LCABA,
     MUJOCO_CONTACTS,
     MUJOCO_EULER,
@@ -347,20 +346,20 @@ def ledger() -> str:
     return ruled(heads, rules, rows)
 
 
-def against_rk43() -> str:
+def against_dopri5() -> str:
     rows = []
-    for scenario, one in validation()["against_rk43"].items():
+    for scenario, one in validation()["against_dopri5"].items():
         evaluations = [
-            " to ".join(grouped(n) for n in dict.fromkeys(one[key])) for key in ("evaluations_rk43", "evaluations")
+            " to ".join(grouped(n) for n in dict.fromkeys(one[key])) for key in ("evaluations_dopri5", "evaluations")
         ]
         differences = [
             small(one[key]) if key in one else ""
             for key in ("joint", "electrical_energy_J", "hand_error_rms_m", "events_s")
         ]
-        both = [small(one["ledger_rk43"]), small(one["ledger"])]
+        both = [small(one["ledger_dopri5"]), small(one["ledger"])]
         rows.append([f"`{scenario}`", f"`{one['method']}`", *differences, *both, *evaluations])
-    heads = ["scenario", "by", "joint", "energy", "hand's error", "events, s", "ledger `rk43`", "now"]
-    return lines([*heads, "right-hand sides `rk43`", "now"], rows, left=2)
+    heads = ["scenario", "by", "joint", "energy", "hand's error", "events, s", "ledger `dopri5`", "default"]
+    return lines([*heads, "right-hand sides `dopri5`", "default"], rows, left=2)
 
 
 def time_stepping() -> str:
@@ -429,7 +428,7 @@ def ratios() -> str:
 
 def job() -> str:
     programs = (
-        ("dynsim, `rk43`", DYNSIM_RK43), ("dynsim, `radau5`", DYNSIM_RADAU5), ("dynsim, RK4 1 ms", DYNSIM_RK4),
+        ("dynsim, `dopri5`", DYNSIM_DOPRI5), ("dynsim, `radau5`", DYNSIM_RADAU5),
         ("MuJoCo, Euler 1 ms", MUJOCO_EULER), ("MuJoCo, implicitfast 1 ms", MUJOCO_IMPLICIT),
     )  # fmt: skip
     rows: list[list[str]] = []
@@ -492,7 +491,7 @@ TABLES: dict[str, Callable[[], str]] = {
     one.__name__: one
     for one in (
         elbows_in_short, elbows, glued_and_real, overturning_holds, overturning_drives, assumptions, ledger,
-        against_rk43, time_stepping, endings, right_hand_side, ratios, job, precision, sweeps, comparison, faults,
+        against_dopri5, time_stepping, endings, right_hand_side, ratios, job, precision, sweeps, comparison, faults,
     )
 }  # fmt: skip
 

@@ -39,9 +39,8 @@ def test_quick_run(small: None) -> None:
     assert result["machine"]["cpu"]
     assert result["versions"]["mujoco"]
     errors = {row["program"]: row["hand_error_max_m"] for row in result["job"]}
-    # RK4 at 1 ms is near its stability limit in the first milliseconds; the adaptive run is held small by stability.
-    assert errors[programs.DYNSIM_RK43] < 1e-7
-    assert errors[programs.DYNSIM_RK4] < 2e-5
+    # Held small by stability.
+    assert errors[programs.DYNSIM_DOPRI5] < 1e-7
     assert errors[programs.DYNSIM_RADAU5] < 1e-6
     # First order at 1 ms, but the same arm: a millimetre, not a centimetre.
     assert 1e-5 < errors[programs.MUJOCO_EULER] < 3e-3
@@ -75,8 +74,8 @@ def test_times_at_equal_error_are_read_between_the_tolerances() -> None:
     def row(method: str, error: float, cpu: float) -> dict:
         return {"method": method, "error": error, "cpu_minimum_s": cpu}
 
-    # rk43 is held by stability: better than asked for at no less work.
-    rows = [row("radau5", 1e-4, 1.0), row("radau5", 1e-8, 4.0), row("rk43", 1e-8, 30.0), row("rk43", 1e-10, 60.0)]
-    assert precision.work_at_equal_error(rows, "radau5", "rk43", 1e-6) == pytest.approx(15.0)
-    assert precision.work_at_equal_error(rows, "radau5", "rk43", 1e-9) is None
-    assert precision.work_at_equal_error(rows, "rk43", "rk43", 1e-9) == 1.0
+    # dopri5 is held by stability: better than asked for at no less work.
+    rows = [row("radau5", 1e-4, 1.0), row("radau5", 1e-8, 4.0), row("dopri5", 1e-8, 30.0), row("dopri5", 1e-10, 60.0)]
+    assert precision.work_at_equal_error(rows, "radau5", "dopri5", 1e-6) == pytest.approx(15.0)
+    assert precision.work_at_equal_error(rows, "radau5", "dopri5", 1e-9) is None
+    assert precision.work_at_equal_error(rows, "dopri5", "dopri5", 1e-9) == 1.0

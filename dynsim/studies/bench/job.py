@@ -18,9 +18,8 @@ from dynsim.integrators.driver import advance
 from dynsim.scenario import build, load_scenario
 from dynsim.studies.bench import mujoco_peer
 from dynsim.studies.bench.programs import (
+    DYNSIM_DOPRI5,
     DYNSIM_RADAU5,
-    DYNSIM_RK4,
-    DYNSIM_RK43,
     MUJOCO_EULER,
     MUJOCO_IMPLICIT,
     SCENARIO,
@@ -63,12 +62,8 @@ CASES = {
         "two_elbows", "soft", False, "dynsim: the paper's bilateral law; MuJoCo: its soft unilateral contact"
     ),
 }
-# Method, first or fixed step, rtol, atol.
-_INTEGRATORS = {
-    DYNSIM_RK43: ("rk43", 0.0, 1e-6, 1e-8),
-    DYNSIM_RADAU5: ("radau5", 0.0, 1e-6, 1e-8),
-    DYNSIM_RK4: ("rk4", STEP, 1e-6, 1e-8),
-}
+_METHODS = {DYNSIM_DOPRI5: "dopri5", DYNSIM_RADAU5: "radau5"}
+_RTOL, _ATOL = 1e-6, 1e-8
 _TIGHT = {"integrator.method": "dopri5", "integrator.rtol": 1e-11, "integrator.atol": 1e-13}
 
 
@@ -83,7 +78,7 @@ def measure_job(case_name: str, rounds: int, *, with_mujoco: bool) -> list[dict[
 
     paths: dict[str, tuple[Array, Array]] = {}
     timed: list[Timed] = []
-    for name in _INTEGRATORS:
+    for name in _METHODS:
         timed.append(Timed(name, _dynsim_job(name, reference, paths)))
     if with_mujoco:
         for name, integrator in ((MUJOCO_EULER, "euler"), (MUJOCO_IMPLICIT, "implicitfast")):
@@ -145,12 +140,11 @@ def _advance(prepared: Prepared) -> None:
 
 
 def _dynsim_job(name: str, reference: Prepared, paths: dict[str, tuple[Array, Array]]) -> Callable[[int], int]:
-    method, step, rtol, atol = _INTEGRATORS[name]
     n, na, c = reference.model.n, len(reference.system.drives.table), len(reference.contacts)
     y = np.zeros_like(reference.run.y)
     y[block(reference.run.layout, "q")] = reference.model.robot.initial
     run = ki.new_run(
-        ki.METHODS[method],
+        ki.METHODS[_METHODS[name]],
         y,
         reference.run.layout,
         reference.run.columns,
@@ -160,10 +154,10 @@ def _dynsim_job(name: str, reference: Prepared, paths: dict[str, tuple[Array, Ar
         sample_time=reference.run.sample_time,
         hand=(reference.run.hand_link, reference.run.hand_point),
         end=float(reference.run.clock[ki.END]),
-        step=step,
+        step=0.0,
         step_max=np.inf,
-        rtol=rtol,
-        atol=atol,
+        rtol=_RTOL,
+        atol=_ATOL,
         lanes=has_forms(reference.system),
     )
     prepared = replace(reference, run=run)

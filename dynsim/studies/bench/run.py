@@ -15,10 +15,9 @@ from dynsim.studies.bench.programs import (
     ABA,
     CONSTRAINT_DYNAMICS,
     DYNSIM_CONTACTS,
+    DYNSIM_DOPRI5,
     DYNSIM_FREE,
     DYNSIM_RADAU5,
-    DYNSIM_RK4,
-    DYNSIM_RK43,
     LCABA,
     MUJOCO_CONTACTS,
     MUJOCO_EULER,
@@ -114,7 +113,7 @@ def run_bench(quick: bool = False, progress: BenchProgress | None = None) -> dic
 
 
 def _ratios_of_variants(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """How many times longer rk43 takes than radau5; all variants on a real floor than glued; and a small inductance."""
+    """How many times longer dopri5 takes than radau5, all variants on a real floor than glued, a small inductance."""
 
     def total(contacts: str, method: str, variant: str | None = None) -> float:
         return sum(
@@ -177,15 +176,15 @@ def _growth(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _own_ratios(jobs: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """How many times longer dynsim takes by rk43 than by radau5."""
+    """How many times longer dynsim takes by dopri5 than by radau5."""
     rows = []
     for case in job.CASES:
         row = {one["program"]: one for one in jobs if one["case"] == case}
-        explicit, implicit = row[DYNSIM_RK43], row[DYNSIM_RADAU5]
+        explicit, implicit = row[DYNSIM_DOPRI5], row[DYNSIM_RADAU5]
         rows.append(
             {
                 "task": f"10 s job, {case}, by method",
-                "peer": DYNSIM_RK43,
+                "peer": DYNSIM_DOPRI5,
                 "dynsim": DYNSIM_RADAU5,
                 "time": explicit["cpu_median_s"] / implicit["cpu_median_s"],
                 "time_minima": explicit["cpu_minimum_s"] / implicit["cpu_minimum_s"],
@@ -196,19 +195,18 @@ def _own_ratios(jobs: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _at_equal_error(exact: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """How many times longer the explicit methods take than radau5 for the same error of 1e-6."""
+    """How many times longer dopri5 takes than radau5 for the same error of 1e-6."""
     rows = []
     for scenario in dict.fromkeys(row["scenario"] for row in exact):
         of_one = [row for row in exact if row["scenario"] == scenario]
-        for explicit in ("rk43", "dopri5"):
-            rows.append(
-                {
-                    "task": f"{scenario}, error {precision.EQUAL_ERROR:g}",
-                    "peer": f"dynsim {explicit}",
-                    "dynsim": "dynsim radau5",
-                    "time": precision.work_at_equal_error(of_one, "radau5", explicit, precision.EQUAL_ERROR),
-                }
-            )
+        rows.append(
+            {
+                "task": f"{scenario}, error {precision.EQUAL_ERROR:g}",
+                "peer": "dynsim dopri5",
+                "dynsim": "dynsim radau5",
+                "time": precision.work_at_equal_error(of_one, "radau5", "dopri5", precision.EQUAL_ERROR),
+            }
+        )
     return rows
 
 
@@ -232,7 +230,7 @@ def _ratios(sizes: list[dict[str, Any]], jobs: list[dict[str, Any]]) -> list[dic
     for case in job.CASES:
         row = {one["program"]: one for one in jobs if one["case"] == case}
         for peer in (MUJOCO_EULER, MUJOCO_IMPLICIT):
-            for ours in (DYNSIM_RK43, DYNSIM_RADAU5, DYNSIM_RK4):
+            for ours in (DYNSIM_DOPRI5, DYNSIM_RADAU5):
                 entry = {"task": f"10 s job, {case}", "peer": peer, "dynsim": ours}
                 known = peer in row
                 for key, kind in (

@@ -10,16 +10,15 @@ from rich.table import Table
 from dynsim.studies.bench import job, precision, variants
 from dynsim.studies.bench.programs import (
     CONTENDERS,
+    DYNSIM_DOPRI5,
     DYNSIM_RADAU5,
-    DYNSIM_RK4,
-    DYNSIM_RK43,
     MUJOCO_EULER,
     MUJOCO_IMPLICIT,
 )
 
 
 def format_table(result: dict[str, Any]) -> list[Table]:
-    """The result as tables that fit 80 columns: microseconds, whole jobs, ratios (RK4's are in the JSON only)."""
+    """The result as tables that fit 80 columns: microseconds, whole jobs, ratios."""
     sizes = result["right_hand_side"]
     times = _table("One right-hand side (Pinocchio: solve, MuJoCo: step), median µs", "links")
     for row in sizes:
@@ -34,7 +33,7 @@ def format_table(result: dict[str, Any]) -> list[Table]:
     for case in job.CASES:
         whole.add_row(f"[bold]{case}[/bold]")
         by_program = {row["program"]: row for row in result["job"] if row["case"] == case}
-        for program in (DYNSIM_RK43, DYNSIM_RADAU5, DYNSIM_RK4, MUJOCO_EULER, MUJOCO_IMPLICIT):
+        for program in (DYNSIM_DOPRI5, DYNSIM_RADAU5, MUJOCO_EULER, MUJOCO_IMPLICIT):
             row = by_program.get(program, {})
             whole.add_row(
                 f"  {program}{'' if row.get('same_physics', True) else ' *'}",
@@ -63,7 +62,7 @@ def format_table(result: dict[str, Any]) -> list[Table]:
             ratios.add_row(f"  {row['peer']}", *("" for _ in sizes), _number(row["time"]), _number(row["hand_error"]))
 
     work = _table("Work and precision: CPU ms and error at rtol 1e-6", "")
-    work.caption = f"ratio: time of rk43 over that of radau5 for an error of {precision.EQUAL_ERROR:g}"
+    work.caption = f"ratio: time of dopri5 over that of radau5 for an error of {precision.EQUAL_ERROR:g}"
     for method in precision.METHODS:
         work.add_column(method, justify="right")
         work.add_column("error", justify="right")
@@ -76,7 +75,7 @@ def format_table(result: dict[str, Any]) -> list[Table]:
             for method in precision.METHODS
             for cell in (_number(at[method]["cpu_minimum_s"], 1e3), f"{at[method]['error']:.0e}")
         ]
-        equal = precision.work_at_equal_error(rows, "radau5", "rk43", precision.EQUAL_ERROR)
+        equal = precision.work_at_equal_error(rows, "radau5", "dopri5", precision.EQUAL_ERROR)
         work.add_row(scenario, *cells, _number(equal))
     many = _table("Sweeps of 10 s of two elbows, wall s", "runs")
     jobs = sorted({row["jobs"] for row in result["sweeps"]})

@@ -14,7 +14,7 @@ from dynsim.studies.bench.programs import SCENARIO
 
 FLOOR = f"{SCENARIO}_floor"
 SMALL_INDUCTANCE = 1e-5  # [H]
-METHODS = ("rk43", "radau5")
+METHODS = ("dopri5", "radau5")
 _INDUCTANCE = "plant.link.motor.inductance_H"
 
 GLUED, REAL, SMALL = "glued", "real floor", f"glued, L = {SMALL_INDUCTANCE:g} H"
@@ -33,7 +33,7 @@ def measure(rounds: int) -> list[dict[str, Any]]:
             for _ in range(rounds):
                 for method in METHODS:
                     # An explicit method follows the motors' own rates: minutes.
-                    if not (name == SMALL and method == "rk43"):
+                    if not (name == SMALL and method == "dopri5"):
                         samples[method].append(_seconds(file, variant, {**overrides, "integrator.method": method}))
             rows += [
                 {"contacts": name, "variant": variant, "method": method, "cpu_minimum_s": min(values)}
