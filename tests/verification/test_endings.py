@@ -15,7 +15,7 @@ import pytest
 
 import dynsim
 from dynsim.engine import attended, kinematic
-from dynsim.errors import SimulationInterrupted, ScenarioError, SimulationStopped
+from dynsim.errors import ScenarioError, SimulationInterrupted, SimulationStopped
 from dynsim.integrators import driver, events, steps
 from dynsim.integrators import run as ki
 from dynsim.integrators.radau5 import newton as kn
