@@ -43,6 +43,10 @@ class UnreachableReference(DynsimError):
     """A reference path that the named joints cannot follow (time and distance are in the message)."""
 
 
+class CheckRefused(DynsimError):
+    """A motion that a robot must not make, or cannot; joint or body, time and margin are in the message."""
+
+
 class RecordError(DynsimError):
     """A record cannot be written or read."""
 

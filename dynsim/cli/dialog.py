@@ -15,10 +15,8 @@ from dynsim.hardware.errors import ReplayInterrupted
 from dynsim.hardware.nudge import ANGLE, Nudge, nudge, swapped
 from dynsim.hardware.ports import VIRTUAL, bus_on
 from dynsim.hardware.replay.motion import Task
-from dynsim.hardware.replay.registers import QUANTITIES, LimitRow, differences
-from dynsim.hardware.replay.signals import stop_on_signals
-from dynsim.hardware.replay.start import way_to_start
-from dynsim.hardware.replay.states import StopRequest
+from dynsim.hardware.replay.states import StopRequest, stop_on_signals
+from dynsim.hardware.replay.verify import QUANTITIES, LimitRow, differences, way_to_start
 from dynsim.hardware.servo_map import Servo, ServoMap
 
 ANSWERS = ("y", "n", "again")

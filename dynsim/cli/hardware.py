@@ -180,8 +180,7 @@ def replay(
         from dynsim.hardware.ports import VIRTUAL, bus_on
         from dynsim.hardware.replay.display import displayed
         from dynsim.hardware.replay.session import run_replay, shown_by
-        from dynsim.hardware.replay.signals import stop_on_signals
-        from dynsim.hardware.replay.states import StopRequest
+        from dynsim.hardware.replay.states import StopRequest, stop_on_signals
         from dynsim.hardware.virtual.faults import load_fault_script
 
         if (faults or plant) and port != VIRTUAL:
@@ -247,10 +246,10 @@ def recover(
     ] = None,
 ) -> None:
     """Make a measured record, marked incomplete, of the cycles that a replay had written when it died."""
-    from dynsim.hardware.replay import recover as recovery
-    from dynsim.hardware.replay.folder import MEASURED
+    from dynsim.hardware.replay import measured
+    from dynsim.hardware.replay.output import MEASURED
 
-    record = recovery.recover(folder, out)
+    record = measured.recover(folder, out)
     span = f", {record.time[0]:.2f} to {record.time[-1]:.2f} s" if len(record) else ""
     state = "complete" if record.complete else "incomplete"
     console.print(f"{len(record)} cycles{span}, {state}: {(out or folder) / MEASURED}")
@@ -310,8 +309,7 @@ def virtual(
 ) -> None:
     """Virtual servos behind a pseudo-terminal, for any Dynamixel tool. Ctrl-C ends it."""
     with client_library():
-        from dynsim.hardware.replay.signals import stop_on_signals
-        from dynsim.hardware.replay.states import StopRequest
+        from dynsim.hardware.replay.states import StopRequest, stop_on_signals
         from dynsim.hardware.servo_map import load_servo_map
         from dynsim.hardware.virtual.faults import load_fault_script
         from dynsim.hardware.virtual.line import line_for_map

@@ -86,14 +86,13 @@ def hw_drive(
         from dynsim.hardware.replay.display import displayed
         from dynsim.hardware.replay.drive import check_drive
         from dynsim.hardware.replay.session import run_replay, shown_by
-        from dynsim.hardware.replay.signals import stop_on_signals
-        from dynsim.hardware.replay.states import StopRequest
+        from dynsim.hardware.replay.states import StopRequest, stop_on_signals
         from dynsim.hardware.servo_map import load_servo_map
         from dynsim.hardware.virtual.faults import load_fault_script
         from dynsim.scenario import load_scenario
         from dynsim.system.files import check_writable
-        from dynsim.teleop.driven import Pace
-        from dynsim.teleop.web.follower import Wanted
+        from dynsim.teleop.session import SpeedLimits
+        from dynsim.teleop.web.follower import DriveRequest
         from dynsim.teleop.web.servos import SimulationProcess
 
     if faults and port != VIRTUAL:
@@ -103,10 +102,11 @@ def hw_drive(
     script = load_fault_script(faults, servo_map.ids) if faults else None
     folder = out or new_folder(Path("results", loaded.name))
     check_writable(folder, RUN_FILES)
-    wanted = Wanted(loaded, servo_map, Pace(speed, turn, base_speed), longest, http_port, until_closed, folder)
+    limits = SpeedLimits(speed, turn, base_speed)
+    request = DriveRequest(loaded, servo_map, limits, longest, http_port, until_closed, folder)
     moves, stop = live or port == VIRTUAL, StopRequest()
     result: Any = None
-    with SimulationProcess(wanted) as process:
+    with SimulationProcess(request) as process:
         with console.status("loading the kernels; the first time they are compiled, which takes half a minute"):
             ready = process.ready()
         motion = check_drive(
@@ -167,7 +167,7 @@ def hw_drive(
     if done.saved:
         _tell_files(loaded.variant or loaded.name, folder, result, quiet=quiet)
         if not quiet:
-            tell_drive(done.account, done.driven, folder)
+            tell_drive(done.report, done.driven, folder)
     if error is None and not quiet:
         left = "ON, holding" if result.end_state == "holding" else "off"
         console.print(f"driven; torque {left}; {folder / SERVOS / 'measured.h5'}")

@@ -11,10 +11,6 @@ class ServoMapError(DynsimError):
     """A servo map, fault script or gate file that cannot be read or is not valid (file, line, key, fix)."""
 
 
-class CheckRefused(DynsimError):
-    """The offline check found a motion the robot must not make; joint, time and margin are in the message."""
-
-
 class PortError(DynsimError):
     """The port cannot be opened, is held by another process, or died."""
 

@@ -48,7 +48,7 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
     if rate is not None:
         if not 0 < rate < np.inf:
             raise RecordError(f"--rate must be positive, not {rate}")
-        path_between = JointPath(time, position, velocity[:-1], velocity[1:], float(time[-1]))
+        path_between = JointPath(time, position, velocity[:-1], velocity[1:])
         time = np.arange(0.0, time[-1] + 0.5 / rate, 1.0 / rate).clip(max=time[-1])
         knots = [_within(path_between, instant) for instant in time]
         position, velocity = np.array([q for q, _ in knots]), np.array([v for _, v in knots])

@@ -23,9 +23,9 @@ from dynsim.hardware.replay.check import CheckedMotion, plan_cycle
 from dynsim.hardware.replay.machine import Replay
 from dynsim.hardware.replay.motion import QUINTIC_PEAK, quintic
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.start import read_ticks
 from dynsim.hardware.replay.states import State, StopRequest
 from dynsim.hardware.replay.trajectory import Path
+from dynsim.hardware.replay.verify import read_ticks
 from dynsim.hardware.servo_map import Servo, ServoMap
 
 ANGLE = math.radians(3.0)
@@ -138,7 +138,7 @@ def _out_and_back(start: float, way: float) -> Path:
     time = np.concatenate([leg, duration + PAUSE + leg])
     position = start + way * np.concatenate([fraction, 1 - fraction])[:, None]
     rates = way * np.concatenate([rate, -rate])[:, None]
-    return Path(time, position, rates[:-1], rates[1:], float(time[-1]))
+    return Path(time, position, rates[:-1], rates[1:])
 
 
 def _alone(servo_map: ServoMap, servo: Servo) -> ServoMap:

@@ -8,10 +8,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from dynsim.config.base import StrictModel, error_at
+from dynsim.config.base import Positive, StrictConfig, error_at
 from dynsim.hardware.bus.control_table import BAUD_RATES
-from dynsim.hardware.data_sheet import Objection, rounded_up
-from dynsim.hardware.strict_yaml import Positive, Within
+from dynsim.hardware.strict_yaml import Objection, Within, rounded_up
 
 LONGEST_REACTION = 0.5
 """From the first cycle that shows a fault to the rule that declares it [s]."""
@@ -26,7 +25,7 @@ FaultPolicy = Literal["hold", "decelerate", "off"]
 _BAUD_CHOICES = [rate for rate in BAUD_RATES if rate <= 4_000_000]
 
 
-class Bus(StrictModel):
+class Bus(StrictConfig):
     """The serial line.
 
     Attributes
@@ -55,14 +54,14 @@ class Bus(StrictModel):
         return self
 
 
-class Supply(StrictModel):
+class Supply(StrictConfig):
     """Voltage range in which the robot may move [V]."""
 
     lowest: Positive = 10.0
     highest: Positive = 14.8
 
 
-class Safety(StrictModel):
+class Safety(StrictConfig):
     """When to abort, and how to stop.
 
     Attributes

@@ -9,14 +9,15 @@ Joint angle and servo position are tied by
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, model_validator
 
-from dynsim.config.base import StrictModel, error_at
+from dynsim.config.base import Positive, StrictConfig, error_at
 from dynsim.config.problems import suggest
 from dynsim.errors import shown
 from dynsim.hardware.bus.control_table import (
@@ -25,13 +26,14 @@ from dynsim.hardware.bus.control_table import (
     RAD_PER_TICK,
     RAD_S_PER_UNIT,
     TICKS_PER_TURN,
+    VOLT_PER_UNIT,
     OperatingMode,
     ServoModel,
 )
-from dynsim.hardware.data_sheet import Objection, objections_to_limits, objections_to_safety, rounded_up
 from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.safety import Bus, Safety, objections_to_times
-from dynsim.hardware.strict_yaml import Finite, Positive, Within, read_yaml
+from dynsim.hardware.strict_yaml import Objection, Within, read_yaml, rounded_up
+from dynsim.snake.lifting import Lifts
 from dynsim.system.files import file_name
 from dynsim.system.inputs import is_file
 
@@ -41,10 +43,17 @@ SHIPPED = _CHECKOUT if _CHECKOUT.is_dir() else _PACKAGE / "shipped_scenarios" / 
 """Folder of the servo maps that come with dynsim."""
 
 
+HIGHEST_SUPPLY, RATED_SUPPLY = 14.8, 12.0
+"""Of the recommended range of the MX series, and of its data sheet [V]; speed and torque grow with the supply."""
+FURTHEST_OFF = 1.0
+"""Following error of a position servo beyond which the rule would watch nothing [rad]."""
+ROOM = 20.0
+"""Temperature of a room, and so of a servo that has not moved yet [°C]."""
+
 _NO_LIMIT = "bounds nothing that a servo can do, or lets nothing pass"
 
 
-class Follows(StrictModel):
+class Follows(StrictConfig):
     """Signals of the record a servo follows.
 
     Attributes
@@ -63,7 +72,7 @@ class Follows(StrictModel):
     rates: Literal["continuous", "held"] = "continuous"
 
 
-class Limits(StrictModel):
+class Limits(StrictConfig):
     """What a joint may do.
 
     Attributes
@@ -85,7 +94,7 @@ class Limits(StrictModel):
         (:meth:`dynsim.hardware.replay.trajectory.Path.shaking`).
     """
 
-    position_deg: tuple[Finite, Finite] | None = None
+    position_deg: tuple[float, float] | None = None
     velocity: Positive
     torque: Positive
     acceleration: Annotated[Positive, Within(0.01, 1e5, "rad/s²", _NO_LIMIT)] = 2000.0
@@ -102,7 +111,7 @@ _POSITION_NEEDS_LIMITS: dict[str, Any] = {
 }
 
 
-class Kind(StrictModel):
+class Kind(StrictConfig):
     """Everything servos of one sort have in common.
 
     Attributes
@@ -131,60 +140,61 @@ class Kind(StrictModel):
     model_config = ConfigDict(json_schema_extra=_POSITION_NEEDS_LIMITS)
 
     @model_validator(mode="after")
-    def _position_limits_fit_the_mode(self) -> Kind:
-        limits = self.limits.position_deg
-        if self.mode == "position" and limits is None:
-            raise error_at("limits", "a servo in position mode needs limits.position_deg: [lowest, highest]")
-        if limits is not None and not limits[0] < limits[1]:
-            raise error_at("limits.position_deg", f"{limits[0]} is not below {limits[1]}")
-        for key, text in objections_to_limits(
-            MODELS[self.model],
-            self.gear,
-            turns_to_angle=self.mode == "position",
-            position_deg=limits,
-            velocity=self.limits.velocity,
-            torque=self.limits.torque,
-            following_error=self.following_error,
-        ):
+    def _fits_its_servo(self) -> Kind:
+        for key, text in self._objections():
             raise error_at(key, text)
         return self
 
+    def _objections(self) -> Iterator[Objection]:
+        """What no servo of this model and gear can do, and rules that could never fire."""
+        model, gear, limits, error = MODELS[self.model], self.gear, self.limits, self.following_error
+        position = limits.position_deg
+        speed = model.no_load_speed * HIGHEST_SUPPLY / RATED_SUPPLY / gear
+        stall = model.stall_torque * HIGHEST_SUPPLY / RATED_SUPPLY * gear
+        in_position_mode = self.mode == "position"
+        if in_position_mode and position is None:
+            yield "limits", "a servo in position mode needs limits.position_deg: [lowest, highest]"
+        if position is not None and not position[0] < position[1]:
+            yield "limits.position_deg", f"{position[0]} is not below {position[1]}"
+        if limits.velocity > speed:
+            yield "limits.velocity", f"a {model.name} turns this joint at {speed:.3g} rad/s at most"
+        if limits.torque > stall:
+            yield "limits.torque", f"a {model.name} stalls at {stall:.3g} N m here: the rule would never fire"
+        if limits.torque < (least := model.torque(1) * gear):
+            text = f"is below what a {model.name} can tell from none; use {rounded_up(least):g} N m or more"
+            yield "limits.torque", text
+        unit, name = (RAD_PER_TICK, "rad") if in_position_mode else (RAD_S_PER_UNIT, "rad/s")
+        if error < unit / gear:
+            yield "following_error", f"is below what the servo can tell; use {rounded_up(unit / gear):g} {name} or more"
+        if not in_position_mode and position is not None:
+            text = "a servo in velocity mode is not held to angles; leave it out, or use mode: position"
+            yield "limits.position_deg", text
+        if in_position_mode and position is not None:
+            if (position[1] - position[0]) * gear > 360.0:
+                text = f"position mode knows one turn of the servo, {360 / gear:.4g}° of this joint"
+                yield "limits.position_deg", text
+            if error > FURTHEST_OFF:
+                yield "following_error", f"is more than {FURTHEST_OFF:g} rad: the rule would watch nothing"
+        elif error > limits.velocity:
+            yield "following_error", "is more than limits.velocity: a servo that stands still would not be noticed"
 
-class ServoEntry(StrictModel):
+
+def _not_a_flag(value: Any) -> Any:
+    """``True`` equals 1, so a choice among numbers takes it."""
+    if isinstance(value, bool):
+        raise ValueError("must be 1 or -1")
+    return value
+
+
+class ServoEntry(StrictConfig):
     """One servo: its kind, bus ID, sense, zero, and (held joints) the angle it keeps instead of following a record."""
 
     kind: str
     id: Annotated[int, Field(ge=0, le=MAX_ID)]
-    sign: Literal[1, -1] = 1
+    sign: Annotated[Literal[1, -1], BeforeValidator(_not_a_flag)] = 1
     zero_tick: Annotated[int, Field(ge=-(1 << 20), le=1 << 20)] = 2048
     label: str | None = None
-    hold_at_deg: Finite | None = None
-
-
-class Lifts(StrictModel):
-    """How wheel pairs that the record lifts are lifted.
-
-    Attributes
-    ----------
-    signal : str
-        Signal of the record with 1 where a wheel pair is on the ground, 0 where it is lifted.
-    joints : tuple of str
-        The pitch joints on the axles of the first, second, ... pair: every pair but the last has one. Lifting is added
-        to what they do otherwise; the first, on the axle that carries the head, follows the record and keeps the head
-        where it is.
-    clearance_mm : float
-        Height of the lower wheel of a lifted pair above the floor.
-    blend_s : float
-        Time to lift a pair, and to put it down [s of record time].
-    tilt_mm : float
-        A record is refused where one wheel of a grounded pair would be further above the floor: a bent base twists.
-    """
-
-    signal: str = "grounded"
-    joints: Annotated[tuple[str, ...], Field(min_length=1)]
-    clearance_mm: Positive = 5.0
-    blend_s: Positive = 0.3
-    tilt_mm: Positive = 2.5
+    hold_at_deg: float | None = None
 
 
 def _is_a_file_name(robot: str) -> str:
@@ -195,7 +205,7 @@ def _is_a_file_name(robot: str) -> str:
     return robot
 
 
-class _MapFile(StrictModel):
+class _MapFile(StrictConfig):
     """A servo map: which servo follows which column of a record, and what that joint may do."""
 
     model_config = ConfigDict(title="ServoMap")
@@ -208,43 +218,86 @@ class _MapFile(StrictModel):
     servos: Annotated[dict[str, ServoEntry], Field(json_schema_extra={"minProperties": 1})]
 
     @model_validator(mode="after")
-    def _servos_are_consistent(self) -> _MapFile:
+    def _entries_fit_each_other(self) -> _MapFile:
+        objections = itertools.chain(self._in_names(), self._in_safety(), objections_to_times(self.bus, self.safety))
+        for key, text in itertools.chain(objections, self._in_zeros()):
+            raise error_at(key, text)
+        return self
+
+    def _in_names(self) -> Iterator[Objection]:
+        """IDs and columns that are used twice, kinds and joints that do not exist."""
         if not self.servos:
-            raise error_at("servos", "the map names none")
+            yield "servos", "the map names none"
         owner: dict[int, str] = {}
         follower: dict[tuple[str, str], str] = {}
         for joint, entry in self.servos.items():
             if entry.kind not in self.kinds:
                 like = suggest(entry.kind, self.kinds)
-                raise error_at(f"servos.{joint}.kind", f"is not one of {', '.join(self.kinds)}{like}")
+                yield f"servos.{joint}.kind", f"is not one of {', '.join(self.kinds)}{like}"
             if entry.id in owner:
-                raise error_at(f"servos.{joint}.id", f"is also the ID of {owner[entry.id]}")
+                yield f"servos.{joint}.id", f"is also the ID of {owner[entry.id]}"
             owner[entry.id] = joint
             column = (self.kinds[entry.kind].follows.position, entry.label or joint)
             if entry.hold_at_deg is None and (other := follower.setdefault(column, joint)) != joint:
-                raise error_at(f"servos.{joint}.label", f"{other} already follows {column[1]!r} of {column[0]!r}")
+                yield f"servos.{joint}.label", f"{other} already follows {column[1]!r} of {column[0]!r}"
         for joint in self.lifts.joints if self.lifts else ():
             if joint not in self.servos:
-                raise error_at("lifts.joints", f"{joint} is none of the servos")
-            if self.kinds[self.servos[joint].kind].mode != "position" or self.servos[joint].hold_at_deg not in (
-                None,
-                0,
-            ):
-                raise error_at(
-                    "lifts.joints", f"{joint} must be in position mode and follow the record or be held at 0"
-                )
-        return self
+                yield "lifts.joints", f"{joint} is none of the servos"
+            entry = self.servos[joint]
+            if self.kinds[entry.kind].mode != "position" or entry.hold_at_deg not in (None, 0):
+                yield "lifts.joints", f"{joint} must be in position mode and follow the record or be held at 0"
 
-    @model_validator(mode="after")
-    def _entries_fit_each_other(self) -> _MapFile:
-        used = {name: self.kinds[name] for name in dict.fromkeys(entry.kind for entry in self.servos.values())}
-        for key, text in (*_objections_to_kinds(self.safety, used), *objections_to_times(self.bus, self.safety)):
-            raise error_at(key, text)
+    def _in_safety(self) -> Iterator[Objection]:
+        """What the kinds that are used, or their servos' models, cannot do of what ``safety`` asks for.
+
+        Among it are thresholds at which the servos have long protected themselves, by going limp.
+        """
+        safety, hottest, supply = self.safety, self.safety.temperature_max, self.safety.supply
+        kinds = {name: self.kinds[name] for name in dict.fromkeys(entry.kind for entry in self.servos.values())}
+        if supply.lowest >= supply.highest:
+            yield "safety.supply.lowest", "is not below supply.highest"
+        if hottest <= ROOM:
+            text = f"is no more than the {ROOM:g} °C of a room: every run would abort; use 65 or so"
+            yield "safety.temperature_max", text
+        for model in (MODELS[kind.model] for kind in kinds.values()):
+            limp = model.fields["temperature_limit"].default
+            low, high = model.fields["min_voltage"].low, model.fields["max_voltage"].high
+            if hottest > limp:
+                yield "safety.temperature_max", f"a {model.name} goes limp at {limp} °C"
+            if low is not None and supply.lowest < low * VOLT_PER_UNIT:
+                yield "safety.supply.lowest", f"a {model.name} does not work below {low * VOLT_PER_UNIT:g} V"
+            if high is not None and supply.highest > high * VOLT_PER_UNIT:
+                yield "safety.supply.highest", f"a {model.name} does not work above {high * VOLT_PER_UNIT:g} V"
+        for name, kind in kinds.items():
+            limits = kind.limits
+            if kind.mode == "position" and safety.approach_velocity > limits.velocity:
+                text = f"is above kinds.{name}.limits.velocity; use {limits.velocity:g} or less"
+                yield "safety.approach_velocity", text
+            if (needed := limits.velocity / safety.stop_time) > limits.acceleration:
+                least = rounded_up(limits.velocity / limits.acceleration)
+                text = f"stops kinds.{name} with {needed:.4g} rad/s², above its limit; use {least:g} or more"
+                yield "safety.stop_time", text
+            if safety.run_up > limits.acceleration:
+                text = f"is above kinds.{name}.limits.acceleration, {limits.acceleration:g} rad/s²; use that or less"
+                yield "safety.run_up", text
+
+    def _in_zeros(self) -> Iterator[Objection]:
+        """Servos in position mode that are to be held where they must not be, or have nowhere to go."""
         for joint, entry in self.servos.items():
             kind = self.kinds[entry.kind]
-            for key, text in _objections_to_servo(entry, kind):
-                raise error_at(f"servos.{joint}.{key}", text)
-        return self
+            limits = kind.limits.position_deg
+            if kind.mode != "position" or limits is None:
+                continue
+            if entry.hold_at_deg is not None and not limits[0] <= entry.hold_at_deg <= limits[1]:
+                text = f"is beyond limits.position_deg; use {limits[0]:g} to {limits[1]:g}"
+                yield f"servos.{joint}.hold_at_deg", text
+            lowest, highest = Servo(joint, entry, kind).tick_limits
+            if lowest > highest:
+                text = (
+                    f"leaves no tick of 0 to {TICKS_PER_TURN - 1}, the turn of position mode, within "
+                    "limits.position_deg; use that of the zero posture (`dynsim hw calibrate`)"
+                )
+                yield f"servos.{joint}.zero_tick", text
 
 
 class Servo:
@@ -348,45 +401,6 @@ class ServoMap:
             return {}
         label = {servo.joint: servo.label for servo in self.servos}
         return {"lifts": self.lifts.model_dump() | {"joints": [label[joint] for joint in self.lifts.joints]}}
-
-
-def _objections_to_kinds(safety: Safety, kinds: dict[str, Kind]) -> Iterable[Objection]:
-    """What the kinds that are used, or their servos' models, cannot do of what ``safety`` asks for."""
-    supply = safety.supply
-    models = [MODELS[kind.model] for kind in kinds.values()]
-    for key, text in objections_to_safety(models, safety.temperature_max, (supply.lowest, supply.highest)):
-        yield f"safety.{key}", text
-    for name, kind in kinds.items():
-        limits = kind.limits
-        if kind.mode == "position" and safety.approach_velocity > limits.velocity:
-            yield "safety.approach_velocity", f"is above kinds.{name}.limits.velocity; use {limits.velocity:g} or less"
-        if (needed := limits.velocity / safety.stop_time) > limits.acceleration:
-            least = limits.velocity / limits.acceleration
-            yield (
-                "safety.stop_time",
-                f"stops kinds.{name} with {needed:.4g} rad/s², above its limit; use {rounded_up(least):g} or more",
-            )
-        if safety.run_up > limits.acceleration:
-            yield (
-                "safety.run_up",
-                f"is above kinds.{name}.limits.acceleration, {limits.acceleration:g} rad/s²; use that or less",
-            )
-
-
-def _objections_to_servo(entry: ServoEntry, kind: Kind) -> Iterable[Objection]:
-    """A servo in position mode that is to be held where it must not be, or has nowhere to go."""
-    limits = kind.limits.position_deg
-    if kind.mode != "position" or limits is None:
-        return
-    if entry.hold_at_deg is not None and not limits[0] <= entry.hold_at_deg <= limits[1]:
-        yield "hold_at_deg", f"is beyond limits.position_deg; use {limits[0]:g} to {limits[1]:g}"
-    lowest, highest = Servo("", entry, kind).tick_limits
-    if lowest > highest:
-        yield (
-            "zero_tick",
-            f"leaves no tick of 0 to {TICKS_PER_TURN - 1}, the turn of position mode, within limits.position_deg; "
-            "use that of the zero posture (`dynsim hw calibrate`)",
-        )
 
 
 def load_servo_map(path: str | Path) -> ServoMap:

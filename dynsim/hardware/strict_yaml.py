@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Any, TypeVar
 
-from pydantic import BaseModel, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
+from pydantic import BaseModel, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
 from pydantic_core import core_schema
 
 from dynsim.config.problems import Origin, explain, unknown_keys
 from dynsim.hardware.errors import ServoMapError
 from dynsim.system.inputs import parse_yaml, read_text
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Objection = tuple[str, str]
+"""Dotted key of a file, and what is wrong with it."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,11 @@ class Within:
 
 
 _Schema = TypeVar("_Schema", bound=BaseModel)
+
+
+def rounded_up(value: float) -> float:
+    """A short number to offer instead of one that was refused, not below ``value``: to 1e-4."""
+    return math.ceil(value * 1e4) / 1e4
 
 
 def read_yaml(path: Path, schema: type[_Schema], context: dict[str, Any] | None = None) -> _Schema:

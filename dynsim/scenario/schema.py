@@ -172,15 +172,6 @@ class Integrator(StrictConfig):
             raise ValueError("is no longer there; take dopri5, or time_stepping where steps are to be fixed")
         return value
 
-    @model_validator(mode="before")
-    @classmethod
-    def _renamed(cls, value: object) -> object:
-        if isinstance(value, dict) and "time_limit_h" in value:
-            raise error_at(
-                "time_limit_h", "is no longer there; wall_limit_s, in seconds, refuses runs too, and ends them"
-            )
-        return value
-
     @model_validator(mode="after")
     def _check_method(self) -> Self:
         stepping = self.method == "time_stepping"

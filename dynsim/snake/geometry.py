@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dynsim.errors import MissingEntry
 from dynsim.record import Record
 from dynsim.record.scene import Scene
 
@@ -33,40 +35,40 @@ class SnakeGeometry:
 
 
 def snake_geometry(record: Record) -> SnakeGeometry:
-    """Geometry of the snake of a record; one of version 0.1 has no scene, but has it in its provenance.
+    """Geometry of the snake of a record.
 
     Raises
     ------
     MissingEntry
-        It is in neither.
+        The record has no scene.
     """
     if record.scene is None:
-        old = record.provenance["snake"]
-        return SnakeGeometry(
-            head_joints=old["head_joints"],
-            pitch=np.array(old["pitch"], dtype=bool),
-            lower=np.array(old["lower_rad"]),
-            upper=np.array(old["upper_rad"]),
-            wheel_radius=old["wheel_radius_m"],
-            half_track=np.array(old["half_track_m"]),
-        )
+        raise MissingEntry("the record has no scene, which says what the snake is like")
     names = record.labels["phi"]
     joints = {body.joint.name: body.joint for body in record.scene.bodies}
     lower, upper = np.array([[joints[name].lower, joints[name].upper] for name in names], dtype=np.float64).T
-    wheels = [_wheels(record.scene, pair) for pair in record.labels["grounded"]]
+    wheels = [wheels_of(record.scene, pair) for pair in record.labels["grounded"]]
     return SnakeGeometry(
         head_joints=len(names) - len(wheels) + 1,
         pitch=np.array([abs(joints[name].axis[1]) > 0.5 for name in names]),
         lower=lower,
         upper=upper,
-        wheel_radius=wheels[0][0][0],
-        half_track=np.array([max(side for _, side in pair) for pair in wheels]),
+        wheel_radius=wheels[0][0].radius,
+        half_track=np.array([max(wheel.beside for wheel in pair) for pair in wheels]),
     )
 
 
-def _wheels(scene: Scene, pair: str) -> list[tuple[float, float]]:
-    """Radius and distance from the middle of the axle of the wheels on a body: its own, and bodies that turn on it."""
+class Wheel(NamedTuple):
+    """Of a wheel pair: where along its body the axle is, how far beside the middle of the body it is, radius [m]."""
+
+    along: float
+    beside: float
+    radius: float
+
+
+def wheels_of(scene: Scene, pair: str) -> list[Wheel]:
+    """Wheels on a body: shapes of its own, and bodies that turn on it."""
     index = {body.name: k for k, body in enumerate(scene.bodies)}[pair]
-    own = [(shape.size[0], abs(shape.position[1])) for shape in scene.bodies[index].shapes if shape.position[1] != 0.0]
-    turning = [body for body in scene.bodies if body.parent == index and body.joint.signal == "rho"]
-    return own + [(body.shapes[0].size[0], abs(body.joint.position[1])) for body in turning]
+    places = [(shape.position, shape) for shape in scene.bodies[index].shapes]
+    places += [(body.joint.position, body.shapes[0]) for body in scene.bodies if body.parent == index and body.shapes]
+    return [Wheel(place[0], abs(place[1]), shape.size[0]) for place, shape in places if place[1] != 0.0]

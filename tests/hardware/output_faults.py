@@ -20,10 +20,9 @@ from rich.console import Console
 
 import dynsim
 from dynsim.hardware.replay import display, session
-from dynsim.hardware.replay.journal import Journal
 from dynsim.hardware.replay.loop import Loop
 from dynsim.hardware.replay.machine import Replay
-from dynsim.hardware.replay.stream import Background
+from dynsim.hardware.replay.output import Background, Journal
 
 PACKAGE = str(Path(dynsim.__file__).parent)
 OS_CALLS = ("open", "write", "fsync", "replace", "rename", "mkdir", "unlink", "close", "fdopen", "scandir", "readlink")

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
+from dynsim.errors import CheckRefused
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
-from dynsim.hardware.errors import CheckRefused
 from dynsim.hardware.replay.check import check_motion, plan_cycle, velocity_limit
 from dynsim.hardware.replay.trajectory import Path, path_of_record
 from dynsim.hardware.servo_map import load_servo_map
@@ -80,7 +80,7 @@ def test_a_record_in_motion_gets_a_run_up_and_a_run_out_at_rest(rig) -> None:
     path = path_of_record(rig.record, rig.map)
     first, last = rig.record["v"][0], rig.record["v"][-1]
     assert path.start == pytest.approx(-np.abs(first).max() / 20)
-    assert path.end - path.record_end == pytest.approx(
+    assert path.end - np.ptp(rig.record.time) == pytest.approx(
         max(np.abs(last).max(), np.abs(rig.record["rho_dot"][-1]).max()) / 20
     )
     for time in (path.start, path.end):
@@ -140,7 +140,7 @@ def quintics(knots: np.ndarray, seed: int) -> Path:
     """A path whose interpolant is known as polynomials: random angles and rates at the knots."""
     random = np.random.default_rng(seed)
     rates = random.normal(size=(len(knots), 2))
-    return Path(knots, random.normal(size=(len(knots), 2)), rates[:-1], rates[1:], float(knots[-1]))
+    return Path(knots, random.normal(size=(len(knots), 2)), rates[:-1], rates[1:])
 
 
 def test_extremes_of_the_acceleration_are_those_of_the_interpolant() -> None:
@@ -162,7 +162,7 @@ def test_extremes_of_the_acceleration_are_those_of_the_interpolant() -> None:
 def test_a_held_rate_that_steps_is_an_acceleration_over_the_time_it_stands_for() -> None:
     """From 1 rad/s held for 0.1 s to 2 rad/s held for 0.3 s: 1 rad/s in 0.2 s, and nothing between the knots."""
     rates = np.array([[1.0], [2.0]])
-    path = Path(np.array([0.0, 0.1, 0.4]), np.array([[0.0], [0.1], [0.7]]), rates, rates, 0.4)
+    path = Path(np.array([0.0, 0.1, 0.4]), np.array([[0.0], [0.1], [0.7]]), rates, rates)
     acceleration = path.extremes().acceleration[..., 0]
     assert acceleration[2] == pytest.approx([0.0, 5.0])
     assert acceleration[:2] == pytest.approx(0.0, abs=1e-12)
@@ -172,7 +172,7 @@ def test_the_jerk_of_a_smooth_path_is_the_mean_of_its_third_derivative() -> None
     """q = sin ωt: |d³q/dt³| = ω³ |cos ωt|, whose mean over a window of half a period is 2ω³/π wherever it begins."""
     omega, time = 7.0, np.linspace(0.0, 2.0, 2001)
     rates = omega * np.cos(omega * time)[:, None]
-    path = Path(time, np.sin(omega * time)[:, None], rates[:-1], rates[1:], 2.0)
+    path = Path(time, np.sin(omega * time)[:, None], rates[:-1], rates[1:])
     jerk, _ = path.jerk(math.pi / omega)
     assert jerk[0] == pytest.approx(2 * omega**3 / math.pi, rel=1e-3)
 
@@ -202,7 +202,7 @@ def test_the_jerk_of_a_zigzag_does_not_depend_on_the_window() -> None:
     """Held rates ±d/h: the acceleration at the knots is ±2d/h², and changes by 4d/h² in every step."""
     time, angle = 0.005 * np.arange(200), 0.012 * (np.arange(200) % 2)
     rates = (np.diff(angle) / 0.005)[:, None]
-    path = Path(time, angle[:, None], rates, rates, float(time[-1]))
+    path = Path(time, angle[:, None], rates, rates)
     for window in (0.02, 0.05, 0.1):
         assert path.jerk(window)[0][0] == pytest.approx(4 * 0.012 / 0.005**3, rel=1e-9)
 
@@ -253,11 +253,11 @@ def test_shaking_of_a_smooth_path_is_the_velocity_it_gains_and_loses() -> None:
     time = np.linspace(0.0, 4.0, 2001)
     rate = 2 * np.cos(2 * math.pi * time)
     angle = 2 * np.sin(2 * math.pi * time) / (2 * math.pi)
-    path = Path(time, angle[:, None], rate[:-1, None], rate[1:, None], 4.0)
+    path = Path(time, angle[:, None], rate[:-1, None], rate[1:, None])
     for window, expected in ((0.5, 2.0), (1.0, 4.0), (0.248, 2 * (1 - math.cos(2 * math.pi * 0.124)))):
         assert path.shaking(window)[0][0] == pytest.approx(expected, rel=1e-4)
     # The cubic between three knots turns on the way: v = 1 − 3s + 3s², so 1 to ¼ and back to 1 within an interval.
-    one = Path(np.array([0.0, 1.0]), np.array([[0.0], [0.5]]), np.array([[1.0]]), np.array([[1.0]]), 1.0)
+    one = Path(np.array([0.0, 1.0]), np.array([[0.0], [0.5]]), np.array([[1.0]]), np.array([[1.0]]))
     assert one.shaking(1.0)[0][0] == pytest.approx(0.75)
 
 

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 from support.fault_table import CASES, Case
 
-from dynsim.errors import DynsimError
+from dynsim.errors import CheckRefused, DynsimError
 from dynsim.hardware.bus.clock import Clock
-from dynsim.hardware.errors import CheckRefused, OutputsFailed, PortError, ReplayAborted
-from dynsim.hardware.replay.check import motion_margins
+from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted
+from dynsim.hardware.replay.check import MotionLimits
 from dynsim.hardware.replay.display import displayed
 from dynsim.hardware.replay.drive import SILENCE, DrivenMotion, check_drive, lead
-from dynsim.hardware.replay.growing import GrowingPath, Sample
+from dynsim.hardware.replay.incremental_path import IncrementalPath, Sample
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.session import run_replay, shown_by
 from dynsim.hardware.replay.states import Progress, State, StopRequest
@@ -420,16 +420,14 @@ def test_sample_by_sample_the_limits_are_those_of_the_check(
     causes: set[str] = set()
     for seed in range(40):
         time, angle, rate = noisy(seed, 0.03 * (seed / 40) ** 4)
-        growing = GrowingPath(Sample(0.0, angle[0], np.zeros(3)), servo_map)
-        growing._held[:] = held
+        path = IncrementalPath(Sample(0.0, angle[0], np.zeros(3)), servo_map)
+        path._held[:] = held
         broken = [
-            words
-            for k in range(1, len(time))
-            if (words := growing.append(Sample(time[k], angle[k], rate[k]), keep=0.0))
+            words for k in range(1, len(time)) if (words := path.append(Sample(time[k], angle[k], rate[k]), keep=0.0))
         ][:1]
         straight = np.diff(angle, axis=0) / STEP
         rates = (straight, straight) if held else (rate[:-1], rate[1:])
-        margins = motion_margins(RobotPath(time, angle, *rates, float(time[-1])), servo_map, 1.0)
+        margins = list(MotionLimits(servo_map).margins(RobotPath(time, angle, *rates)))
         if not all(margin.holds for margin in margins):
             assert broken, [str(margin) for margin in margins if not margin.holds]
             refused += 1
@@ -444,16 +442,16 @@ def test_sample_by_sample_the_limits_are_those_of_the_check(
 
 
 def test_a_path_that_grows_forgets_only_what_nobody_asks_for(rig: Rig) -> None:
-    growing = GrowingPath(Sample(0.0, *swinging(0.0)), rig.map)
+    path = IncrementalPath(Sample(0.0, *swinging(0.0)), rig.map)
     times = STEP * np.arange(1, 8000)
     for time in times:
-        assert growing.append(Sample(time, *swinging(time)), keep=time - 0.5) == []
+        assert path.append(Sample(time, *swinging(time)), keep=time - 0.5) == []
         for before in (0.0, 0.2, 0.4999):
             if time > 1.0 and round(time / STEP) % 100 == 0:
-                position, rate = growing.at(time - before)
+                position, rate = path.at(time - before)
                 assert position == pytest.approx(swinging(time - before)[0], abs=3e-9)
                 assert (before == 0.0) or rate == pytest.approx(swinging(time - before)[1], abs=1e-6)
-    assert len(growing._time) < 2000
+    assert len(path._path.time) < 2000
 
 
 # -- what the loop lets out -------------------------------------------------------------------------------------------

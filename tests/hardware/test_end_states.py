@@ -12,10 +12,9 @@ import pytest
 
 from dynsim.hardware.bus.packet import Instruction, Packet
 from dynsim.hardware.errors import ReplayAborted
-from dynsim.hardware.replay.end_state import ServoEnd, of_the_whole
 from dynsim.hardware.replay.rules import Cause
 from dynsim.hardware.replay.session import run_replay
-from dynsim.hardware.replay.states import State, StopRequest
+from dynsim.hardware.replay.states import ServoEnd, State, StopRequest, of_the_whole
 from dynsim.hardware.servo_map import load_servo_map
 
 from .conftest import Rig, Run

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 
 from dynsim.hardware.bus.clock import VirtualClock
-from dynsim.hardware.replay.journal import Journal
-from dynsim.hardware.replay.run_log import Recorder, RunLog
+from dynsim.hardware.replay.output import Journal, Recorder, RunLog
 from dynsim.hardware.replay.states import StopRequest
 
 

@@ -15,17 +15,17 @@ import pinocchio as pin
 import pytest
 from scipy.optimize import linprog
 
-from dynsim.errors import RecordError
-from dynsim.hardware.errors import CheckRefused, ServoMapError
+from dynsim.errors import CheckRefused, RecordError
+from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.ports import bus_on
-from dynsim.hardware.replay.base_part import Fold, base_part
 from dynsim.hardware.replay.check import check_motion
 from dynsim.hardware.replay.compare import compare_records
-from dynsim.hardware.replay.lifting import lifted
 from dynsim.hardware.replay.machine import Replay
 from dynsim.hardware.replay.trajectory import path_of_record
-from dynsim.hardware.servo_map import SHIPPED, Lifts, ServoMap, load_servo_map
+from dynsim.hardware.servo_map import SHIPPED, ServoMap, load_servo_map
 from dynsim.record import Record
+from dynsim.snake.base_part import Fold, base_part
+from dynsim.snake.lifting import Lifts, lifted
 
 LINK, RADIUS, GRIPPER = 0.0905, 0.05, 0.09  # [T] Table I, IV.B
 HALF_TRACK = np.array([0.075, 0.06, 0.075, 0.06, 0.075, 0.06, 0.06])

@@ -203,7 +203,7 @@ def test_a_measured_snake_can_be_viewed() -> None:
         columns = [k for k, servo in enumerate(servo_map.servos) if servo.kind.follows.position == name]
         labels = tuple(servo_map.servos[k].label for k in columns)
         measured.add(name, goals[:, columns], "rad", labels=labels)
-    describe(measured, simulated.scene, State, motion.unmeasured)
+    describe(measured, simulated.scene, motion.unmeasured)
     wheels = [k for k, name in enumerate(simulated.labels["body_position"]) if name.startswith("wheel")]
     others = np.delete(np.arange(len(simulated.labels["body_position"])), wheels)
     for rows in (others, wheels):

@@ -16,7 +16,7 @@ from typing import Any
 
 import dynamixel_sdk as sdk
 import pytest
-from dynamixel_sdk import COMM_SUCCESS, PortHandler, Protocol1PacketHandler, Protocol2PacketHandler
+from dynamixel_sdk import COMM_SUCCESS, PortHandler, Protocol2PacketHandler
 from processes import started, wait_for
 
 from dynsim.hardware.bus.control_table import BAUD_RATES, MODELS, MX_106, RAD_PER_TICK
@@ -140,10 +140,6 @@ def test_every_instruction_of_the_makers_library(port: PortHandler) -> None:
     assert library.write1ByteTxRx(port, 4, F["id"].address, 9) == (COMM_SUCCESS, 0)
     assert library.write1ByteTxRx(port, 3, F["protocol"].address, 1) == (COMM_SUCCESS, 0)
     assert set(library.broadcastPing(port)[0]) == {1, 2, 9}
-    older = Protocol1PacketHandler()
-    assert older.ping(port, 3) == (NUMBER_OF[3], COMM_SUCCESS, 0)
-    assert older.write1ByteTxRx(port, 3, F["protocol"].address, 2) == (COMM_SUCCESS, 0)
-    assert alive(3)
 
 
 def test_the_makers_easy_library(device: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import threading
+import time
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -15,14 +16,12 @@ import pytest
 
 from dynsim.errors import RecordError
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted
-from dynsim.hardware.replay import session, stream
-from dynsim.hardware.replay.folder import move_away
+from dynsim.hardware.replay import output, session
 from dynsim.hardware.replay.loop import Loop
-from dynsim.hardware.replay.recover import recover
-from dynsim.hardware.replay.rows import RowMemory
+from dynsim.hardware.replay.measured import recover
+from dynsim.hardware.replay.output import PART, GrowingFile, move_away, row_type
 from dynsim.hardware.replay.session import run_replay
 from dynsim.hardware.replay.states import ReplayResult
-from dynsim.hardware.replay.stream import PART, GrowingFile
 from dynsim.record import Record
 
 from .conftest import Rig
@@ -78,7 +77,7 @@ def test_the_whole_stream_is_the_whole_record_but_incomplete(streamed, tmp_path:
 def test_a_stream_cut_anywhere_keeps_its_whole_rows(streamed, rig: Rig, tmp_path: Path) -> None:
     record, stream = streamed
     head = stream.index(b"\n") + 1
-    size = RowMemory(len(rig.map.servos)).type.itemsize
+    size = row_type(len(rig.map.servos)).itemsize
     assert len(stream) == head + size * len(record)
     for cut in (0, 1, size - 1, size, 100 * size + 7, len(stream) - head - 1):
         (tmp_path / PART).write_bytes(stream[: head + cut])
@@ -98,7 +97,7 @@ def test_a_stream_cut_anywhere_keeps_its_whole_rows(streamed, rig: Rig, tmp_path
 
 def test_zeros_after_a_power_cut_are_no_cycles(streamed, rig: Rig, tmp_path: Path) -> None:
     record, stream = streamed
-    size = RowMemory(len(rig.map.servos)).type.itemsize
+    size = row_type(len(rig.map.servos)).itemsize
     (tmp_path / PART).write_bytes(stream + bytes(3 * size))
     same(record, recover(tmp_path), len(record))
 
@@ -137,7 +136,7 @@ def no_thread(*_: object) -> None:
 
 @pytest.mark.parametrize(
     ("owner", "method", "fault"),
-    [(GrowingFile, "append", no_room), (threading.Thread, "start", no_thread), (stream, "lock", no_room)],
+    [(GrowingFile, "append", no_room), (threading.Thread, "start", no_thread), (output, "lock", no_room)],
 )
 def test_a_refused_start_leaves_no_empty_files(rig: Rig, tmp_path: Path, monkeypatch, owner, method, fault) -> None:
     run = rig.prepare()
@@ -207,8 +206,11 @@ def test_where_the_old_result_cannot_go_nothing_is_moved(rig: Rig, tmp_path: Pat
 def test_a_killed_process_leaves_all_but_the_last_interval(rig: Rig, tmp_path: Path, monkeypatch) -> None:
     """The folder as it is at some instant is what a SIGKILL at that instant would leave."""
     monkeypatch.setattr(session, "INTERVAL", 0.02)
-    done, cycles = threading.Event(), 0
-    exchange = Loop.exchange
+    cycles, exchange, part = 0, Loop.exchange, tmp_path / "run" / PART
+
+    def rows_on_disk() -> int:
+        _, _, rows = part.read_bytes().partition(b"\n")
+        return len(rows) // row_type(len(rig.map.servos)).itemsize
 
     def watched(self, *arguments, **options):
         nonlocal cycles
@@ -216,16 +218,15 @@ def test_a_killed_process_leaves_all_but_the_last_interval(rig: Rig, tmp_path: P
         cycles += 1
         if cycles == 150:
             # Wall time passes, for the other thread; the loop's own clock stands still.
-            size = RowMemory(3).type.itemsize
-            while (tmp_path / "run" / PART).stat().st_size < 150 * size:
-                done.wait(0.001)
+            while rows_on_disk() < 150:
+                time.sleep(0.001)
             shutil.copytree(tmp_path / "run", tmp_path / "killed")
         return cycle
 
     monkeypatch.setattr(Loop, "exchange", watched)
     result = replay(rig, tmp_path / "run")
     recovered = recover(tmp_path / "killed")
-    assert len(recovered) >= 150
+    assert len(recovered) == 150
     np.testing.assert_array_equal(recovered["q_goal"], result.record["q_goal"][: len(recovered)])
 
 
@@ -271,7 +272,7 @@ def test_a_complete_record_is_not_called_failed(rig: Rig, tmp_path: Path, monkey
     assert summary["outputs_failed"].keys() == {"removal of measured.part"}
     assert summary["timing"]["cycles"] == len(Record.load(tmp_path / "left/measured.h5"))
     with monkeypatch.context() as patch:
-        patch.setattr(stream.RowStream, "pump", no_room)
+        patch.setattr(output.RowStream, "pump", no_room)
         with pytest.raises(OutputsFailed, match=r"streamed record failed: .*; .*measured\.h5 is complete$"):
             replay(rig, tmp_path / "streamed")
     assert recover(tmp_path / "left").complete

@@ -6,9 +6,8 @@ import math
 
 import pytest
 
-from dynsim.hardware.replay.registers import compare_limits, difference_lines, needs_of_map
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.verify import snapshot
+from dynsim.hardware.replay.verify import compare_limits, difference_lines, needs_of_map, snapshot
 from dynsim.hardware.servo_map import load_servo_map
 
 

@@ -4,8 +4,7 @@ import threading
 
 import pytest
 
-from dynsim.hardware.replay.run_log import RunLog
-from dynsim.hardware.replay.stream import Background
+from dynsim.hardware.replay.output import Background, RunLog
 
 
 def test_lines_reach_the_file_while_the_run_goes_on_and_no_terminal_obeys_them(tmp_path):

@@ -10,8 +10,7 @@ import pytest
 
 from dynsim.hardware.bus.packet import Instruction, Packet
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.signals import stop_on_signals
-from dynsim.hardware.replay.states import Progress, State, StopRequest
+from dynsim.hardware.replay.states import Progress, State, StopRequest, stop_on_signals
 
 ON_THE_WAY = [State.CONNECT, State.VERIFY, State.ARM, State.MOVE_TO_START, State.SETTLE, State.REPLAY, State.DISARM]
 

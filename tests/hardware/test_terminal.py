@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from processes import wait_for
 
+from dynsim.hardware.replay.output import PART
 from dynsim.hardware.replay.states import State
-from dynsim.hardware.replay.stream import PART
 from dynsim.record import Record
 
 from .test_pseudo_terminal import Servos, command, virtual_servos

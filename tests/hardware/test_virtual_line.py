@@ -1,4 +1,4 @@
-"""Several servos on one line, each with its own bit rate, ID and protocol, under the maker's client library."""
+"""Several servos on one line, each with its own bit rate and ID, under the maker's client library."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from dynamixel_sdk import (
     GroupBulkWrite,
     GroupSyncRead,
     GroupSyncWrite,
-    Protocol1PacketHandler,
     Protocol2PacketHandler,
 )
 
@@ -27,7 +26,7 @@ from dynsim.hardware.virtual.servos import BOOT_TIME
 
 F = MX_106.fields
 BAUD, BAUD_CODE = 1_000_000, 3
-LIBRARY, LIBRARY_1 = Protocol2PacketHandler(), Protocol1PacketHandler()
+LIBRARY = Protocol2PacketHandler()
 KINDS = list(MODELS.values())
 
 
@@ -111,33 +110,11 @@ def test_two_servos_with_one_id_garble_each_other_but_both_obey(three: Line) -> 
     assert [three.servos.registers[id_]["led"] for id_ in (1, 2, 3)] == [1, 1, 0]
 
 
-def test_a_servo_in_protocol_1_answers_protocol_1_only_and_can_be_set_back(three: Line) -> None:
+def test_a_servo_in_another_protocol_is_silent_and_the_others_are_not(three: Line) -> None:
     assert three.write(2, "protocol", 1) == (COMM_SUCCESS, 0)
     assert not three.answers(2)
     assert set(LIBRARY.broadcastPing(three.port)[0]) == {1, 3}
-    assert LIBRARY_1.ping(three.port, 2) == (MX_28.number, COMM_SUCCESS, 0)
-    assert LIBRARY_1.ping(three.port, 1)[1] == COMM_RX_TIMEOUT
-    three.servos.measure(1)
-    position = three.servos.registers[2]["present_position"]
-    assert LIBRARY_1.read4ByteTxRx(three.port, 2, F["present_position"].address) == (position, COMM_SUCCESS, 0)
-    assert LIBRARY_1.write1ByteTxRx(three.port, 2, F["present_temperature"].address, 1) == (COMM_SUCCESS, 1 << 3)
-    assert LIBRARY_1.regWriteTxRx(three.port, 2, F["led"].address, 1, [1]) == (COMM_SUCCESS, 0)
-    assert three.servos.registers[2]["led"] == 0
-    LIBRARY_1.action(three.port, 254)
-    assert three.servos.registers[2]["led"] == 1
-    LIBRARY_1.syncWriteTxOnly(three.port, F["led"].address, 1, [2, 0], 2)
-    assert three.servos.registers[2]["led"] == 0
-    assert LIBRARY_1.write1ByteTxRx(three.port, 2, F["protocol"].address, 2) == (COMM_SUCCESS, 0)
-    assert three.answers(2)
-    assert LIBRARY_1.ping(three.port, 2)[1] == COMM_RX_TIMEOUT
-
-
-def test_a_factory_reset_in_protocol_1_brings_the_servo_back_as_delivered(three: Line) -> None:
-    three.write(2, "protocol", 1)
-    assert LIBRARY_1.factoryReset(three.port, 2)[0] == COMM_SUCCESS
-    three.wait(BOOT_TIME)
-    assert three.answers(1, baud=57_600), "ID 1, 57600 bit/s, Protocol 2"
-    assert LIBRARY.ping(three.port, 1)[0] == MX_28.number
+    assert three.write(2, "protocol", 2)[0] == COMM_RX_TIMEOUT
 
 
 @pytest.mark.parametrize(

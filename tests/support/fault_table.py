@@ -30,10 +30,9 @@ from dynsim.hardware.bus.clock import VirtualClock
 from dynsim.hardware.bus.dynamixel_bus import DynamixelBus
 from dynsim.hardware.bus.packet import Instruction, Packet
 from dynsim.hardware.replay.check import CheckedMotion, check_motion
-from dynsim.hardware.replay.end_state import SILENT
 from dynsim.hardware.replay.machine import Replay
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.states import Progress, ReplayResult, State, StopRequest
+from dynsim.hardware.replay.states import SILENT, Progress, ReplayResult, State, StopRequest
 from dynsim.hardware.replay.trajectory import path_of_record
 from dynsim.hardware.safety import FaultPolicy
 from dynsim.hardware.servo_map import ServoMap, load_servo_map

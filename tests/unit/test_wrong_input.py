@@ -18,8 +18,8 @@ from dynsim.draw import figures
 from dynsim.draw.figures import snake as snake_figures
 from dynsim.draw.figures import style
 from dynsim.engine import provenance
-from dynsim.errors import DynsimError, MissingEntry, ModelError, RecordError, ScenarioError
-from dynsim.hardware.errors import CheckRefused, ServoMapError
+from dynsim.errors import CheckRefused, DynsimError, MissingEntry, ModelError, RecordError, ScenarioError
+from dynsim.hardware.errors import ServoMapError
 from dynsim.hardware.export import export_record
 from dynsim.hardware.replay.check import check_motion
 from dynsim.hardware.replay.compare import compare_records

@@ -218,13 +218,11 @@ def test_the_wall_limit_ends_a_snake():
     assert len(raised.value.record.time) > 1
 
 
-def test_the_key_that_the_wall_limit_replaces_is_told():
+def test_methods_that_are_gone_are_refused_with_what_to_take():
     for method in ("rk4", "rk43"):
         says = rf"integrator\.method = '?{method}'?: is no longer there; take dopri5, or time_stepping where steps are"
         with pytest.raises(ScenarioError, match=says):
             dynsim.load_scenario("single_pendulum", overrides={"integrator.method": method})
-    with pytest.raises(ScenarioError, match=r"integrator\.time_limit_h = 3: is no longer there; wall_limit_s"):
-        dynsim.load_scenario("single_pendulum", overrides={"integrator.time_limit_h": 3})
 
 
 # ---- Who listens while compiled code runs

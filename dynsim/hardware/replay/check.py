@@ -7,13 +7,15 @@ outside of the limits is refused as a whole, before a port is opened.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, cast
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
+from dynsim.errors import CheckRefused
 from dynsim.hardware.bus.control_table import HEALTH_BLOCK, STATE_BLOCK, TICKS_PER_TURN
-from dynsim.hardware.errors import CheckRefused
 from dynsim.hardware.replay.measured import unmeasured
 from dynsim.hardware.replay.motion import Array, Course, CyclePlan, Needs, Planned
 from dynsim.hardware.replay.trajectory import (
@@ -181,7 +183,7 @@ def check_motion(
     plan = plan_cycle(servo_map, rate if rate is not None else servo_map.bus.rate)
     _check_duration(record, speed)
     path = path_of_record(record, servo_map)
-    margins = motion_margins(path, servo_map, speed) + _torque_margins(record, servo_map)
+    margins = [*MotionLimits(servo_map).margins(path, speed), *_torque_margins(record, servo_map)]
     violations = [margin for margin in margins if not margin.holds]
     if violations:
         lines = [f"{len(violations)} limit(s) violated, nothing was sent:", *(f"  {entry}" for entry in violations)]
@@ -246,51 +248,67 @@ def plan_cycle(servo_map: ServoMap, rate: float) -> CyclePlan:
     return CyclePlan(rate, cycle_time, health_time, max(1, math.ceil(health_time / available)))
 
 
-def motion_margins(path: Path, servo_map: ServoMap, speed: float, since: float = -math.inf) -> list[Margin]:
-    """The tightest place of every joint against each limit of its motion; of jerk and shaking in windows that end after
-    ``since`` [s].
-    """
-    extremes = path.extremes()
-    # The windows are of the robot's time, of which `speed` seconds of the path pass in a second.
-    jerk, jerk_time = path.jerk(JERK_WINDOW * speed, since)
-    shaking, shaking_time = path.shaking(SHAKING_WINDOW * speed, since)
-    with np.errstate(over="ignore"):
-        velocity = speed * extremes.velocity
-        acceleration = speed * (speed * extremes.acceleration)
-        jerk = speed * (speed * (speed * jerk))
-    margins = []
-    for column, servo in enumerate(servo_map.servos):
-        if servo.in_position_mode:
-            position, at = extremes.position[..., column].ravel(), extremes.position_time[..., column].ravel()
-            low, high = position_bounds(servo)
-            below, above = int(position.argmin()), int(position.argmax())
-            if position[below] - low < high - position[above]:
-                margins.append(_margin(servo, "position", position[below], low, position[below] - low, at[below]))
-            else:
-                margins.append(_margin(servo, "position", position[above], high, high - position[above], at[above]))
-        limits = servo.kind.limits
-        for quantity, values, times, limit in (
-            ("velocity", velocity, extremes.velocity_time, velocity_limit(servo)),
-            ("acceleration", acceleration, extremes.acceleration_time, limits.acceleration),
-            ("jerk", jerk, jerk_time, limits.jerk),
-            ("shaking", speed * shaking, shaking_time, limits.shaking),
-        ):
-            of_joint, at = values[..., column].ravel(), times[..., column].ravel()
-            worst = int(np.abs(of_joint).argmax())
-            value = of_joint[worst]
-            margins.append(_margin(servo, cast(Quantity, quantity), value, limit, limit - abs(value), at[worst]))
-    return margins
+class MotionLimits:
+    """Limits of the joints of a map for the paths that they may go along, of whole records and of single intervals."""
+
+    def __init__(self, servo_map: ServoMap) -> None:
+        self._servos = servo_map.servos
+        self._in_position_mode = np.array([servo.in_position_mode for servo in self._servos])
+        self._low, self._high = np.array([position_bounds(servo) for servo in self._servos]).T
+        limits = [servo.kind.limits for servo in self._servos]
+        self._highest: dict[Quantity, Array] = {
+            "velocity": np.array([velocity_limit(servo) for servo in self._servos]),
+            "acceleration": np.array([one.acceleration for one in limits]),
+            "jerk": np.array([one.jerk for one in limits]),
+            "shaking": np.array([one.shaking for one in limits]),
+        }
+
+    def margins(
+        self, path: Path, speed: float = 1.0, since: float = -math.inf, *, broken: bool = False
+    ) -> Iterator[Margin]:
+        """The tightest place of every joint against each limit of its motion, in intervals and windows that end after
+        ``since`` [s]; only those where a limit is ``broken``.
+        """
+        extremes = path.extremes(since)
+        # The windows are of the robot's time, of which `speed` seconds of the path pass in a second.
+        jerk, jerk_time = path.jerk(JERK_WINDOW * speed, since)
+        shaking, shaking_time = path.shaking(SHAKING_WINDOW * speed, since)
+        with np.errstate(over="ignore"):
+            values: dict[Quantity, tuple[Array, Array]] = {
+                "velocity": (speed * extremes.velocity, extremes.velocity_time),
+                "acceleration": (speed * (speed * extremes.acceleration), extremes.acceleration_time),
+                "jerk": (speed * (speed * (speed * jerk)), jerk_time),
+                "shaking": (speed * shaking, shaking_time),
+            }
+        position, at = (part.reshape(-1, len(self._servos)) for part in (extremes.position, extremes.position_time))
+        places = [self._tightest_position(position, at)]
+        for quantity, (value, time) in values.items():
+            limit = self._highest[quantity]
+            worst, when = _of_each(value, time, np.abs(value.reshape(-1, len(limit))).argmax(axis=0))
+            places.append((worst, limit, limit - np.abs(worst), when))
+        table = np.array(places).transpose(2, 0, 1)  # (N, quantities, 4)
+        wanted = ~(table[..., 2] >= -ROUNDING) if broken else np.ones(table.shape[:2], dtype=bool)
+        wanted[:, 0] &= self._in_position_mode
+        quantities: list[Quantity] = ["position", *values]
+        for joint, quantity in np.argwhere(wanted):
+            yield Margin(self._servos[joint].joint, quantities[quantity], *table[joint, quantity].tolist())
+
+    def _tightest_position(self, position: Array, time: Array) -> tuple[Array, Array, Array, Array]:
+        lowest, lowest_time = _of_each(position, time, position.argmin(axis=0))
+        highest, highest_time = _of_each(position, time, position.argmax(axis=0))
+        below = lowest - self._low < self._high - highest
+        return (
+            np.where(below, lowest, highest),
+            np.where(below, self._low, self._high),
+            np.where(below, lowest - self._low, self._high - highest),
+            np.where(below, lowest_time, highest_time),
+        )
 
 
-def _margin(
-    servo: Servo,
-    quantity: Quantity,
-    value: float,
-    limit: float,
-    margin: float,
-    at: float,
-) -> Margin:
-    return Margin(servo.joint, quantity, float(value), float(limit), float(margin), float(at))
+def _of_each(values: Array, times: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Of each joint the value in one of the rows, and its time; shape (N,)."""
+    columns = np.arange(len(rows))
+    return values.reshape(-1, len(rows))[rows, columns], times.reshape(-1, len(rows))[rows, columns]
 
 
 def position_bounds(servo: Servo) -> tuple[float, float]:
@@ -304,15 +322,13 @@ def velocity_limit(servo: Servo) -> float:
     return min(servo.kind.limits.velocity, servo.model.no_load_speed / servo.gear)
 
 
-def _torque_margins(record: Record, servo_map: ServoMap) -> list[Margin]:
-    margins = []
+def _torque_margins(record: Record, servo_map: ServoMap) -> Iterator[Margin]:
     for servo in servo_map.servos:
         signal = servo.kind.follows.torque
         if signal is None or servo.hold_at is not None:
             continue
         torque = column_of(record, signal, servo, "N m")
         highest = int(np.abs(torque).argmax())
-        limit = servo.kind.limits.torque
-        at = record.time[highest] - record.time[0]
-        margins.append(_margin(servo, "torque", torque[highest], limit, limit - abs(torque[highest]), at))
-    return margins
+        value, limit = float(torque[highest]), servo.kind.limits.torque
+        time = float(record.time[highest] - record.time[0])
+        yield Margin(servo.joint, "torque", value, limit, limit - abs(value), time)

@@ -5,22 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 from scipy.optimize import minimize_scalar
 
-from dynsim.config.base import StrictModel
+from dynsim.config.base import Positive, StrictConfig
 from dynsim.errors import RecordError, shown
 from dynsim.hardware.bus.control_table import RAD_PER_TICK
 from dynsim.hardware.errors import ComparisonGateFailed
-from dynsim.hardware.replay.lifting import lifted
 from dynsim.hardware.replay.states import State
-from dynsim.hardware.servo_map import Lifts
 from dynsim.hardware.strict_yaml import read_yaml
 from dynsim.record import Record
+from dynsim.snake.lifting import Lifts, lifted
 
 Array = NDArray[np.float64]
 MAX_DELAY = 0.5
@@ -31,10 +30,9 @@ MOVING = 3 * RAD_PER_TICK
 """A joint that moves less than this [rad], three steps of a servo's encoder, says nothing about delay."""
 WHEEL_ANGLE, WHEEL_RATE = "rho", "rho_dot"
 """Signals of what turns on and on: where it stands says nothing, how far it has turned and how fast it turns does."""
-Bound = Annotated[float, Field(gt=0)]
 
 
-class Gate(StrictModel):
+class Gate(StrictConfig):
     """What a comparison must not exceed.
 
     Attributes
@@ -48,12 +46,12 @@ class Gate(StrictModel):
         Rate, and angle turned since the start, of the worst wheel; a comparison without wheels fails.
     """
 
-    rms_rad: Bound | None = None
-    max_rad: Bound | None = None
-    rms_delay_removed_rad: Bound | None = None
-    delay_s: Bound | None = None
-    wheel_rate_rms_rad_s: Bound | None = None
-    wheel_angle_max_rad: Bound | None = None
+    rms_rad: Positive | None = None
+    max_rad: Positive | None = None
+    rms_delay_removed_rad: Positive | None = None
+    delay_s: Positive | None = None
+    wheel_rate_rms_rad_s: Positive | None = None
+    wheel_angle_max_rad: Positive | None = None
 
 
 @dataclass(frozen=True)

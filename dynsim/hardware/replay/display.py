@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.progress import BarColumn, TextColumn
 from rich.progress import Progress as Bar
 
+from dynsim.hardware.replay.output import Background
 from dynsim.hardware.replay.states import Progress
-from dynsim.hardware.replay.stream import Background
 
 DRAWING_INTERVAL = 0.1
 """Between two drawings [s]."""

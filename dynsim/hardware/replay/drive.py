@@ -19,14 +19,14 @@ from typing import Protocol
 
 import numpy as np
 
-from dynsim.hardware.errors import CheckRefused
-from dynsim.hardware.replay.check import ROUNDING, motion_margins, plan_cycle
-from dynsim.hardware.replay.growing import GrowingPath, Sample
+from dynsim.errors import CheckRefused
+from dynsim.hardware.replay.check import ROUNDING, MotionLimits, plan_cycle
+from dynsim.hardware.replay.incremental_path import IncrementalPath, Sample
 from dynsim.hardware.replay.motion import Array, Course, CyclePlan, Needs
-from dynsim.hardware.replay.registers import needs_of_map
 from dynsim.hardware.replay.rules import Cause, Fault
 from dynsim.hardware.replay.states import Stopped
 from dynsim.hardware.replay.trajectory import HOLE, Path
+from dynsim.hardware.replay.verify import needs_of_map
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import Record
 from dynsim.record.scene import Scene
@@ -65,7 +65,7 @@ class Feed(Protocol):
     def tell(self, time: float) -> None:
         """The servos are at this time of the simulation [s]; it may go on to :func:`lead` beyond.
 
-        By more where its postures are held back (:mod:`dynsim.hardware.replay.held_back`).
+        By more where its postures are held back (:mod:`dynsim.hardware.replay.lift_lookahead`).
         """
         ...
 
@@ -136,8 +136,8 @@ def check_drive(
     """
     plan = plan_cycle(servo_map, rate if rate is not None else servo_map.bus.rate)
     still = np.zeros((1, len(first.position)))
-    start = Path(np.array([0.0, step]), np.stack([first.posture, first.posture]), still, still, step)
-    broken = [margin for margin in motion_margins(start, servo_map, 1.0) if not margin.holds]
+    start = Path(np.array([0.0, step]), np.stack([first.posture, first.posture]), still, still)
+    broken = list(MotionLimits(servo_map).margins(start, broken=True))
     if broken:
         lines = "\n".join(f"  {margin}" for margin in broken)
         raise CheckRefused(f"the drive would begin beyond {len(broken)} limit(s), nothing was sent:\n{lines}")
@@ -161,7 +161,7 @@ class DrivenCourse:
         self.time, self.speed = 0.0, 0.0
         self._motion, self._feed = motion, motion.feed
         self._stop_time = motion.servo_map.safety.stop_time
-        self._path = GrowingPath(motion.first, motion.servo_map)
+        self._path = IncrementalPath(motion.first, motion.servo_map)
         self._silent = 0.0
 
     @property

@@ -7,24 +7,40 @@ and what the servos do in the end is read from them.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
-from dynsim.hardware.bus.protocol import NoAnswer, RequestRefused
+from dynsim.hardware.bus.control_table import HEALTH_BLOCK, describe_hardware_error
+from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused
 from dynsim.hardware.errors import PortError
-from dynsim.hardware.replay.end_state import AT_REST, ServoEnd, of_the_whole, read_back, read_health
-from dynsim.hardware.replay.journal import Journal
 from dynsim.hardware.replay.loop import FIELDS, Array, Loop
-from dynsim.hardware.replay.rules import Cause, Cycle, Fault
-from dynsim.hardware.replay.states import NOT_ARMED, UNARMED, ReplayResult, State
+from dynsim.hardware.replay.output import Journal
+from dynsim.hardware.replay.rules import Cause, Cycle, Fault, decode_health
+from dynsim.hardware.replay.states import (
+    HOLDING,
+    LIMP,
+    MOVING,
+    NOT_ARMED,
+    TRIPPED,
+    UNARMED,
+    ReplayResult,
+    ServoEnd,
+    State,
+    of_the_whole,
+)
 from dynsim.hardware.safety import FaultPolicy
+from dynsim.hardware.servo_map import Servo
 
 REST_TIME = 1.0
 """Longest wait for the servos to stand still, and for silent ones to come back (a restart takes 0.3 s) [s]."""
 REST_CYCLES = 10
+AT_REST = 0.1
+"""Slower joints and wheels stand still [rad/s]; a few units of the velocity register."""
+READS = 3
+"""Times a servo is asked before it counts as silent."""
 
 
 class Ending:
@@ -277,3 +293,40 @@ class Ending:
                     loop.bus.write(id_, FIELDS["bus_watchdog"], 0)
         confirmed = f"; NOT confirmed by ID {', '.join(map(str, still_on))}" if still_on else ""
         self._journal.say(f"torque off{confirmed}")
+
+
+def read_health(bus: Bus, servos: Sequence[Servo]) -> dict[int, dict[str, int]]:
+    """Registers 64 to 146 of every servo that answers, by ID and name.
+
+    Raises
+    ------
+    PortError
+    """
+    found: dict[int, dict[str, int]] = {}
+    for _ in range(READS):
+        silent = [servo for servo in servos if servo.id not in found]
+        if not silent:
+            break
+        replies = bus.sync_read([servo.id for servo in silent], *HEALTH_BLOCK).replies
+        found |= {servo.id: decode_health(servo, replies[servo.id].data) for servo in silent if servo.id in replies}
+    return found
+
+
+def read_back(bus: Bus, servos: Sequence[Servo]) -> tuple[ServoEnd, ...]:
+    """What every servo is doing now. Raises PortError."""
+    health = read_health(bus, servos)
+    return tuple(
+        _end(servo, health[servo.id]) if servo.id in health else ServoEnd(servo.joint, servo.id) for servo in servos
+    )
+
+
+def _end(servo: Servo, registers: dict[str, int]) -> ServoEnd:
+    torque, error = bool(registers["torque_enable"]), registers["hardware_error"]
+    position, velocity = servo.to_angle(registers["present_position"]), servo.to_velocity(registers["present_velocity"])
+    if not torque:
+        doing = f"limp: {describe_hardware_error(error)}" if error else LIMP
+    elif registers["bus_watchdog"] == -1:
+        doing = TRIPPED
+    else:
+        doing = HOLDING if abs(velocity) < AT_REST else MOVING
+    return ServoEnd(servo.joint, servo.id, torque, error, position, velocity, doing)

@@ -15,10 +15,9 @@ from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.bus.control_table import HEALTH_BLOCK, MX_106, RAD_PER_TICK, STATE_BLOCK
 from dynsim.hardware.bus.protocol import Bus
 from dynsim.hardware.replay.check import velocity_limit
-from dynsim.hardware.replay.journal import Journal
 from dynsim.hardware.replay.motion import Course, Task
+from dynsim.hardware.replay.output import Journal, Recorder
 from dynsim.hardware.replay.rules import AbortRules, Cause, Cycle, Fault, decode_health
-from dynsim.hardware.replay.run_log import Recorder
 from dynsim.hardware.replay.states import State, Stopped, StopRequest
 from dynsim.hardware.servo_map import ServoMap
 
@@ -177,25 +176,31 @@ class Loop:
         exchange = self._clock.now() - began
         servos = self.map.servos
         count = len(servos)
-        cycle = Cycle(
-            self.goal.copy(),
-            self.goal_rate.copy(),
-            np.full(count, np.nan),
-            np.full(count, np.nan),
-            np.full(count, np.nan),
-            np.zeros(count, dtype=bool),
-            lateness,
-        )
+        position, velocity, torque = np.full((3, count), np.nan)
+        alert = np.zeros(count, dtype=bool)
         for index, servo in enumerate(servos):
             reply = block.replies.get(servo.id)
             if reply is None:
                 continue
             effort, units, ticks = STATE.unpack(reply.data)
-            cycle.torque[index] = servo.to_torque(effort)
-            cycle.velocity[index] = servo.to_velocity(units)
-            cycle.position[index] = servo.to_angle(ticks)
-            cycle.alert[index] = reply.alert
-        cycle.outdated = tuple(block.outdated)
+            torque[index] = servo.to_torque(effort)
+            velocity[index] = servo.to_velocity(units)
+            position[index] = servo.to_angle(ticks)
+            alert[index] = reply.alert
+        cycle = Cycle(
+            time=began,
+            goal_position=self.goal.copy(),
+            goal_velocity=self.goal_rate.copy(),
+            position=position,
+            velocity=velocity,
+            torque=torque,
+            alert=alert,
+            lateness=lateness,
+            skipped=skipped,
+            exchange=exchange,
+            stray=block.stray_bytes,
+            outdated=tuple(block.outdated),
+        )
         self.measured = np.where(cycle.missed, self.measured, cycle.position)
         self._cycles += 1
         if self._cycles % self._health_every == 0:
@@ -207,18 +212,9 @@ class Loop:
         now = self._clock.now()
         if self._heard_at < math.inf:
             cycle.silence, self._heard_at = max(began - self._heard_at, now - began), now
-        self._journal.guard(
-            "record",
-            self._recorder.add,
-            time=began,
-            path_time=self.course.time if self.course and self.path_started is not None else math.nan,
-            origin=math.nan if self.path_started is None else self.path_started,
-            state=int(self._journal.state),
-            exchange=exchange,
-            stray=block.stray_bytes,
-            skipped=skipped,
-            cycle=cycle,
-        )
+        origin = math.nan if self.path_started is None else self.path_started
+        path_time = self.course.time if self.course and self.path_started is not None else math.nan
+        self._journal.guard("record", self._recorder.add, cycle, self._journal.state, path_time, origin)
         self._report(cycle)
         return cycle
 

@@ -20,19 +20,14 @@ from dynsim.hardware.bus.control_table import RAD_S2_PER_UNIT, RAD_S_PER_UNIT, W
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused, too_busy
 from dynsim.hardware.errors import PortError
 from dynsim.hardware.replay.check import velocity_limit
-from dynsim.hardware.replay.end_state import AT_REST, read_health
-from dynsim.hardware.replay.ending import Ending
-from dynsim.hardware.replay.folder import REGISTERS, REGISTERS_AFTER_FAULT
-from dynsim.hardware.replay.journal import Journal
+from dynsim.hardware.replay.ending import AT_REST, Ending, read_health
 from dynsim.hardware.replay.loop import FIELDS, Loop
-from dynsim.hardware.replay.measured import describe
+from dynsim.hardware.replay.measured import describe, measured_record, timing_of
 from dynsim.hardware.replay.motion import QUINTIC_PEAK, Approach, Planned, Task
-from dynsim.hardware.replay.registers import difference_lines
-from dynsim.hardware.replay.rows import Layout, measured_record, timing_of
+from dynsim.hardware.replay.output import REGISTERS, REGISTERS_AFTER_FAULT, Journal, Layout, Recorder, RunLog
 from dynsim.hardware.replay.rules import Cause, Fault, watchdog_units
-from dynsim.hardware.replay.run_log import Recorder, RunLog
 from dynsim.hardware.replay.states import UNARMED, Progress, ReplayResult, State, Stopped, StopRequest
-from dynsim.hardware.replay.verify import Registers, all_registers, configure, verify
+from dynsim.hardware.replay.verify import Registers, all_registers, configure, difference_lines, verify
 from dynsim.hardware.safety import FaultPolicy
 from dynsim.hardware.servo_map import Servo, ServoMap
 from dynsim.system.files import write_json
@@ -320,10 +315,10 @@ class Replay:
 
     def _sum_up(self) -> None:
         """Record and timing of the run."""
-        result, rows = self.result, self.recorder.rows.all()
+        result, rows = self.result, self.recorder.all()
         result.timing = timing_of(rows, self.layout)
         started = self.loop.path_started if self.loop.path_started is not None else self.loop.origin
-        record = describe(measured_record(rows, self.layout, started), self.motion.scene, State, self.motion.unmeasured)
+        record = describe(measured_record(rows, self.layout, started), self.motion.scene, self.motion.unmeasured)
         record.complete = result.fault is None
         for fault in result.faults:
             record.add_event(fault.time - started, "fault", fault.cause.value, description=fault.text)

@@ -1,22 +1,81 @@
-"""What makes a measured record one that describes itself: the scene of the record that was followed, poses, events."""
+"""The measured run: a record that describes itself, of the cycles of a replay, also of one that has died.
+
+Its scene, poses and events are those of the record that was followed, with joints where the servos were measured.
+"""
 
 from __future__ import annotations
 
-from enum import IntEnum
+import itertools
+import json
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynsim.hardware.replay.lifting import wheel_offsets
+from dynsim.errors import RecordError
+from dynsim.hardware.replay.output import MEASURED, PART, PART_FORMAT, SUMMARY, Layout, Rows, is_held, row_type
+from dynsim.hardware.replay.states import State, TimingStatistics
+from dynsim.hardware.replay.trajectory import GROUNDED, wheel_offsets
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.record import TIME, Record
 from dynsim.record.poses import ORIENTATION, POSITION, add_body_poses, point_positions
 from dynsim.record.scene import Scene
+from dynsim.system.files import json_text, replace_together
 
 Array = NDArray[np.float64]
-GROUNDED = "grounded"
 LIFTING = "lifting"
 FOLLOWED = "of the record that was followed, at record_time: no servo measures it"
+END_STATE = "not known: the program died"
+
+
+def timing_of(rows: Rows, layout: Layout) -> TimingStatistics | None:
+    """None before the second cycle."""
+    if len(rows) < 2:
+        return None
+    path_time = rows["path_time"]
+    # Cycles in which the path went on; of the first there is no time before.
+    followed = np.isfinite(path_time) & (np.diff(path_time, prepend=np.nan) != 0)
+    periods, lateness, exchange = np.diff(rows["time"]), rows["lateness"], rows["exchange"]
+    return TimingStatistics(
+        cycles=len(rows),
+        skipped_cycles=int(rows["skipped"].sum()),
+        missed_statuses=int(np.isnan(rows["position"]).sum()),
+        stray_bytes=int(rows["stray"].sum()),
+        period_mean=float(periods.mean()),
+        period_max=float(periods.max()),
+        lateness_p50=float(np.percentile(lateness, 50)),
+        lateness_p99=float(np.percentile(lateness, 99)),
+        lateness_max=float(lateness.max()),
+        path_late=float(rows["skipped"][followed].sum() / layout.provenance["rate_Hz"]),
+        exchange_mean=float(exchange.mean()),
+        exchange_max=float(exchange.max()),
+    )
+
+
+def measured_record(rows: Rows, layout: Layout, origin: float) -> Record:
+    """The measured run; time 0 is ``origin`` on the clock of the rows [s], the start of the replayed motion."""
+    record = Record(rows["time"] - origin, provenance=layout.provenance)
+    joints = tuple(layout.joints)
+    record.add("record_time", rows["path_time"], "s", description="time in the replayed record")
+    record.add("state", rows["state"].astype(np.int64), "1", description="see replay.State")
+    units = {"position": "rad", "velocity": "rad/s"}
+    for (name, source, columns), suffix in itertools.product(layout.groups(), ("", "_goal")):
+        labels = tuple(layout.labels[column] for column in columns)
+        field = f"goal_{source}" if suffix else source
+        record.add(name + suffix, rows[field][:, columns], units[source], labels=labels)
+    record.add("torque_estimate", rows["torque"], "N m", labels=joints, description="from motor current or load")
+    record.add("supply_voltage", rows["volts"], "V", labels=joints)
+    record.add("temperature", rows["celsius"], "degC", labels=joints)
+    missed = np.isnan(rows["position"])
+    record.add("missed", missed, "1", labels=joints, description="no valid status in this cycle")
+    record.add("alert", rows["alert"], "1", labels=joints, description="alert bit of the status")
+    record.add("lateness", rows["lateness"], "s", description="cycle start after its deadline")
+    record.add("exchange", rows["exchange"], "s", description="duration of the cycle's bus traffic")
+    timing = timing_of(rows, layout)
+    record.summary["timing"] = timing.as_dict() if timing else {}
+    return record
 
 
 def unmeasured(record: Record, servo_map: ServoMap) -> Record | None:
@@ -50,7 +109,7 @@ def unmeasured(record: Record, servo_map: ServoMap) -> Record | None:
     return found
 
 
-def describe(record: Record, scene: Scene | None, states: type[IntEnum], followed: Record | None = None) -> Record:
+def describe(record: Record, scene: Scene | None, followed: Record | None = None) -> Record:
     """Add to a measured run what it is drawn from; the record itself is changed and given back.
 
     Every change of the signal ``state`` becomes an event. With a scene (that of the record that was followed) the poses
@@ -60,7 +119,7 @@ def describe(record: Record, scene: Scene | None, states: type[IntEnum], followe
     """
     if len(record):
         for row in np.flatnonzero(np.diff(record["state"], prepend=-1)):
-            record.add_event(record.time[row], "state", states(int(record["state"][row])).name)
+            record.add_event(record.time[row], "state", State(int(record["state"][row])).name)
     record.scene = scene
     if scene is None or not len(record):
         return record
@@ -121,3 +180,96 @@ def _placed(record: Record, scene: Scene, followed: Record, at: Array, suffix: s
             return None
         found.add(name, np.column_stack(list(columns.values())), "rad", labels=tuple(columns))
     return found if add_body_poses(found) else None
+
+
+def recover(folder: Path, out: Path | None = None) -> Record:
+    """Make ``measured.h5`` and ``summary.json`` of a ``measured.part`` that was left over, and remove that.
+
+    The record is marked incomplete. A summary that is there is of the same replay, which ended, and could not write its
+    record: what it says of the end is kept. A measured record that is already there is of the same replay too (what an
+    earlier one left is moved away before), and whole: it stays, and is all there is to do.
+
+    Parameters
+    ----------
+    out : folder for record and summary, where there is none yet; ``folder`` then stays as it is, and may be read-only
+
+    Raises
+    ------
+    RecordError
+        There is neither a streamed nor a whole record, it is empty or cannot be read, or its replay is still running;
+        the record cannot be written, or ``out`` has one.
+    """
+    part = folder / PART
+    try:
+        if part.is_file() and is_held(part):
+            raise RecordError(f"{part}: the replay that writes it is still running")
+        record = whole = _kept(folder / MEASURED)
+        if not part.is_file() and not (whole and whole.complete):
+            raise RecordError(f"{folder}: no {PART} there: nothing to recover")
+        if record is None:
+            record = _read(part)
+            record.summary |= {"end_state": END_STATE} | _summary(folder / SUMMARY) | {"recovered": True}
+        if out is not None:
+            _save(record, out, new=True)
+            return record
+        if whole is None:
+            _save(record, folder)
+        part.unlink(missing_ok=True)
+    except OSError as error:
+        raise RecordError(f"{part}: cannot be recovered ({error.strerror})") from error
+    return record
+
+
+def _save(record: Record, folder: Path, *, new: bool = False) -> None:
+    """Record and summary; where they are to be ``new``, none may be there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    there = [name for name in (MEASURED, SUMMARY, PART) if new and (folder / name).exists()]
+    if there:
+        raise RecordError(f"{folder}: has {', '.join(there)} already; give another folder (--out)")
+    summary = json_text(record.summary).encode("utf-8")
+    replace_together(folder, {MEASURED: record.to_hdf5(), SUMMARY: summary})
+
+
+def _kept(measured: Path) -> Record | None:
+    """The record beside a streamed one, if it is whole."""
+    with suppress(RecordError):
+        return Record.load(measured)
+    return None
+
+
+def _summary(path: Path) -> dict[str, Any]:
+    """What a replay that came to its end has said of it; empty where there is nothing, or nothing whole."""
+    with suppress(FileNotFoundError, ValueError):
+        found = json.loads(path.read_bytes())
+        return found if isinstance(found, dict) else {}
+    return {}
+
+
+def _read(part: Path) -> Record:
+    content = part.read_bytes()
+    if not content:
+        raise RecordError(f"{part}: is empty, the replay died before its first cycle: nothing to recover, remove it")
+    line, _, data = content.partition(b"\n")
+    try:
+        header: dict[str, Any] = json.loads(line)
+        layout = Layout(**header["layout"])
+        kind = row_type(len(layout.joints))
+        if header["format"] != PART_FORMAT or header["row"] != json.loads(json.dumps(kind.descr)):
+            raise ValueError("another version of dynsim wrote it")
+        scene = Scene.from_json(header["scene"]) if header["scene"] else None
+    except (ValueError, TypeError, KeyError) as error:
+        raise RecordError(f"{part}: is no streamed record of a replay ({error})") from error
+    # The last row may have been cut off in the middle.
+    rows = _sound(np.frombuffer(data[: len(data) // kind.itemsize * kind.itemsize], dtype=kind))
+    origins = rows["origin"][np.isfinite(rows["origin"])]
+    origin = origins[0] if len(origins) else rows["time"][0] if len(rows) else 0.0
+    record = describe(measured_record(rows, layout, float(origin)), scene)
+    record.complete = False
+    return record
+
+
+def _sound(rows: Rows) -> Rows:
+    """The rows before the first whose time is not after the one before it: a power cut may leave zeros at the end."""
+    forward = np.diff(rows["time"], prepend=-np.inf) > 0
+    broken = np.flatnonzero(~(forward & np.isfinite(rows["time"])))
+    return rows[: broken[0]] if len(broken) else rows

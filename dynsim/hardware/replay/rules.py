@@ -76,6 +76,8 @@ class Cycle:
 
     Attributes
     ----------
+    time : float
+        When it began, on the replay's clock [s].
     goal_position, goal_velocity : array
         [rad], [rad/s].
     position, velocity, torque : array
@@ -83,6 +85,12 @@ class Cycle:
     alert : bool array
     lateness : float
         Start after the deadline [s].
+    skipped : int
+        Cycles that were left out before it.
+    exchange : float
+        Duration of its bus traffic, but for the health of a servo [s].
+    stray : int
+        Bytes that were no answer.
     silence : float
         Longest time in which the servos heard nothing, from the cycle before to the end of this one [s].
     outdated : tuple of int
@@ -91,6 +99,7 @@ class Cycle:
         Registers of the servo whose health was read, by ID; empty when none was.
     """
 
+    time: float
     goal_position: NDArray[np.float64]
     goal_velocity: NDArray[np.float64]
     position: NDArray[np.float64]
@@ -98,6 +107,9 @@ class Cycle:
     torque: NDArray[np.float64]
     alert: NDArray[np.bool_]
     lateness: float
+    skipped: int
+    exchange: float
+    stray: int
     silence: float = 0.0
     outdated: tuple[int, ...] = ()
     health: dict[int, dict[str, int]] = field(default_factory=dict)

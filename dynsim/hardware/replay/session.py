@@ -14,13 +14,21 @@ from dynsim.errors import DynsimError
 from dynsim.hardware.bus.clock import Clock
 from dynsim.hardware.bus.protocol import Bus
 from dynsim.hardware.errors import OutputsFailed, PortError, ReplayAborted, ReplayInterrupted, VerificationFailed
-from dynsim.hardware.replay.folder import LOG, MEASURED, SUMMARY, move_away
 from dynsim.hardware.replay.machine import RECORD, Replay
 from dynsim.hardware.replay.motion import Task
+from dynsim.hardware.replay.output import (
+    INTERVAL,
+    LOG,
+    MEASURED,
+    PART,
+    SUMMARY,
+    Background,
+    RowStream,
+    RunLog,
+    move_away,
+)
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.run_log import RunLog
 from dynsim.hardware.replay.states import Progress, ReplayResult, StopRequest
-from dynsim.hardware.replay.stream import INTERVAL, PART, Background, RowStream
 from dynsim.hardware.safety import FaultPolicy
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.system.files import json_text, replace_together, write_json
@@ -45,7 +53,7 @@ def run_replay(
 
     What an earlier replay left there is moved away first. While the replay runs its log and its cycles are written by a
     thread of their own, the cycles to ``measured.part``: when this process dies
-    :func:`dynsim.hardware.replay.recover.recover` makes a record of it.
+    :func:`dynsim.hardware.replay.measured.recover` makes a record of it.
 
     ``connection`` gives bus and clock (:func:`dynsim.hardware.ports.bus_on`); the other parameters are those of
     :class:`dynsim.hardware.replay.machine.Replay`.
@@ -157,7 +165,7 @@ def _open_log(folder: Path) -> tuple[RunLog, Path | None]:
 def _stream(replay: Replay, log: RunLog, folder: Path) -> Background:
     stream = None
     try:
-        stream = RowStream(folder / PART, replay.recorder.rows, replay.layout, replay.motion.scene)
+        stream = RowStream(folder / PART, replay.recorder, replay.layout, replay.motion.scene)
         background = Background([log, stream], INTERVAL)
     except (OSError, RuntimeError) as error:
         # What holds nothing would pass for a replay that died.

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
 from enum import IntEnum
 from typing import Any
 
-from dynsim.hardware.replay.end_state import ServoEnd
-from dynsim.hardware.replay.registers import LimitRow
-from dynsim.hardware.replay.rows import TimingStatistics
+from dynsim.hardware.bus.control_table import describe_hardware_error
 from dynsim.hardware.replay.rules import Cause, Fault
+from dynsim.hardware.replay.verify import LimitRow
 from dynsim.record import Record
 
 
@@ -31,6 +33,11 @@ class State(IntEnum):
 UNARMED = (State.CONNECT, State.VERIFY, State.DRY_RUN)
 
 NOT_ARMED = "not armed"
+
+HOLDING, LIMP, MOVING = "holding", "limp: off", "moving"
+SILENT, TRIPPED = "does not answer", "watchdog tripped"
+WHOLE = {HOLDING: "holding", LIMP: "off", SILENT: "unreachable"}
+"""What the robot does where all its servos do the same; other things are called as they are."""
 
 
 class StopRequest:
@@ -53,6 +60,54 @@ class StopRequest:
             raise Stopped(Fault(Cause.INTERRUPTED, "stopped by the user"))
 
 
+def _there(*names: str) -> list[signal.Signals]:
+    return [getattr(signal, name) for name in names if hasattr(signal, name)]
+
+
+# Of these only the first counts. When a terminal is closed both the system and the shell send SIGHUP, and `timeout`
+# sends SIGTERM to the process and to its group: nobody has asked twice, and a robot that is let go falls.
+# The others would end the process, and leave a moving robot to its watchdogs.
+_ONCE = _there(
+    "SIGTERM", "SIGHUP", "SIGQUIT", "SIGTSTP", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGVTALRM", "SIGPROF", "SIGXCPU",
+    "SIGIO", "SIGPWR", "SIGSTKFLT",
+)  # fmt: skip
+# Of a terminal that the process may not write to or that is gone, and of a disk quota: the write fails, nothing else.
+_PASSED_OVER = _there("SIGTTOU", "SIGTTIN", "SIGPIPE", "SIGXFSZ")
+
+
+@contextmanager
+def stop_on_signals(stop: StopRequest) -> Iterator[None]:
+    """Signals only count up ``stop``: an exception out of a handler would tear a bus transaction in two.
+
+    Ctrl-C counts every time; SIGTERM, SIGHUP, SIGQUIT (Ctrl-\\), SIGTSTP (Ctrl-Z, which would leave a moving robot
+    without goals) and all others by which a process ends ask for the controlled stop only. A SIGHUP
+    that is ignored (``nohup``) stays so.
+    """
+
+    def ask_once(*_: Any) -> None:
+        stop.count = max(stop.count, 1)
+
+    handlers: dict[signal.Signals, Any] = {signal.SIGINT: stop}
+    handlers |= dict.fromkeys(_ONCE, ask_once) | dict.fromkeys(_PASSED_OVER, signal.SIG_IGN)
+    for number in _there("SIGHUP"):
+        if signal.getsignal(number) == signal.SIG_IGN:
+            del handlers[number]
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            # None: set by C code, which Python cannot give back.
+            if handler is not None:
+                signal.signal(number, handler)
+
+
+def ignore_stops() -> None:
+    """Of a process that ends when another one says so: the signals that ask that one for a stop mean nothing here."""
+    for number in (signal.SIGINT, *_ONCE):
+        signal.signal(number, signal.SIG_IGN)
+
+
 @dataclass(frozen=True)
 class Progress:
     """What a display may show after every cycle.
@@ -72,6 +127,97 @@ class Progress:
     fraction: float
     following_error: float
     temperature: float
+
+
+@dataclass(frozen=True)
+class ServoEnd:
+    """One servo at the end.
+
+    Attributes
+    ----------
+    joint : str
+    id : int
+    torque : bool or None
+        Whether it is on; None, as all that follows, where the servo did not answer.
+    error : int or None
+        Hardware error register.
+    position, velocity : float or None
+        Of the joint [rad], [rad/s].
+    doing : str
+        "holding", "limp: off", "limp: <hardware error>", "moving", "watchdog tripped" or "does not answer".
+    """
+
+    joint: str
+    id: int
+    torque: bool | None = None
+    error: int | None = None
+    position: float | None = None
+    velocity: float | None = None
+    doing: str = SILENT
+
+    def as_dict(self) -> dict[str, Any]:
+        """With units in the names, for summaries."""
+        found = asdict(self)
+        found["position_rad"], found["velocity_rad_s"] = found.pop("position"), found.pop("velocity")
+        return found
+
+    def __str__(self) -> str:
+        text = f"{self.joint} (ID {self.id}): {self.doing}"
+        if self.error:
+            text += f", error: {describe_hardware_error(self.error)}"
+        return text if self.position is None else f"{text}, {self.position:.4f} rad, {self.velocity:.3f} rad/s"
+
+
+def of_the_whole(servos: Sequence[ServoEnd]) -> str:
+    """One phrase for all servos: "holding", "off", "unreachable", or who does what.
+
+    The largest group is counted, the others are named, as in
+    "mixed: 16 holding; wheel1, wheel2 does not answer; elbow limp: overload".
+    """
+    groups: dict[str, list[str]] = {}
+    for servo in servos:
+        groups.setdefault(servo.doing, []).append(servo.joint)
+    if len(groups) <= 1:
+        doing = next(iter(groups), SILENT)
+        return WHOLE.get(doing, doing)
+    largest = max(groups, key=lambda doing: len(groups[doing]))
+    told = [
+        f"{len(joints)} {doing}" if doing == largest and len(joints) > 1 else f"{', '.join(joints)} {doing}"
+        for doing, joints in sorted(groups.items(), key=lambda group: -len(group[1]))
+    ]
+    return f"mixed: {'; '.join(told)}"
+
+
+@dataclass(frozen=True)
+class TimingStatistics:
+    """How well the loop kept its deadlines.
+
+    Attributes
+    ----------
+    cycles, skipped_cycles, missed_statuses, stray_bytes : int
+    period_mean, period_max, lateness_p50, lateness_p99, lateness_max, exchange_mean, exchange_max : float
+        Time between cycle starts, start after the deadline, writing all goals and reading all states [s].
+    path_late : float
+        By how much the path ended later than planned, for the cycles that were skipped on it [s].
+    """
+
+    cycles: int
+    skipped_cycles: int
+    missed_statuses: int
+    stray_bytes: int
+    period_mean: float
+    period_max: float
+    lateness_p50: float
+    lateness_p99: float
+    lateness_max: float
+    path_late: float
+    exchange_mean: float
+    exchange_max: float
+
+    def as_dict(self) -> dict[str, float | int]:
+        """With the unit in the name, for summaries."""
+        seconds = {f"{name}_s": value for name, value in vars(self).items() if isinstance(value, float)}
+        return {name: value for name, value in vars(self).items() if isinstance(value, int)} | seconds
 
 
 @dataclass

@@ -10,14 +10,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dynsim.hardware.errors import CheckRefused
-from dynsim.hardware.replay.lifting import wheel_offsets
+from dynsim.errors import CheckRefused
+from dynsim.hardware.replay.motion import Array
 from dynsim.hardware.servo_map import Servo, ServoMap
 from dynsim.record import TIME, Record
+from dynsim.snake.lifting import grounded_pairs, lifted
 
 REST = 1e-6
 """Joint speed [rad/s] below which a record counts as at rest."""
@@ -28,6 +30,8 @@ COMMON = 0.1
 JERK_WINDOW = 0.1
 """Over which the change of acceleration is averaged [s]: twice the lag of these servos (43.5 ms). A single jump in the
 velocity of a record is a knock, and bounded by the acceleration; jumps one after the other wear the gears."""
+GROUNDED = "grounded"
+"""Where dynsim's own records say which wheel pairs are on the ground; looked at when the map has no ``lifts``."""
 SHAKING_WINDOW = 0.3
 """In which velocity that is gained and lost again counts as shaking [s]."""
 
@@ -44,15 +48,12 @@ class Path:
         At the knots [rad], in the order of the servo map.
     rate_after, rate_before : array, shape (T-1, N)
         Joint rates at the beginning and the end of every interval [rad/s].
-    record_end : float
-        Time of the last sample of the record [s], counted from its first.
     """
 
-    time: NDArray[np.float64]
-    position: NDArray[np.float64]
-    rate_after: NDArray[np.float64]
-    rate_before: NDArray[np.float64]
-    record_end: float
+    time: Array
+    position: Array
+    rate_after: Array
+    rate_before: Array
 
     @property
     def start(self) -> float:
@@ -62,30 +63,47 @@ class Path:
     def end(self) -> float:
         return float(self.time[-1])
 
-    def at(self, time: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def at(self, time: float) -> tuple[Array, Array]:
         """Position [rad] and velocity [rad/s], shape (N,), at a path time [s]; at rest outside of the path."""
         if time <= self.time[0]:
             return self.position[0].copy(), np.zeros(self.position.shape[1])
         if time >= self.time[-1]:
             return self.position[-1].copy(), np.zeros(self.position.shape[1])
         left = int(np.searchsorted(self.time, time, side="right")) - 1
-        h = self.time[left + 1] - self.time[left]
+        h, q0, m0, b, a = self._cubics(left)
         s = (time - self.time[left]) / h
-        q0, q1 = self.position[left], self.position[left + 1]
-        m0, m1 = h * self.rate_after[left], h * self.rate_before[left]
-        a, b = 2 * q0 - 2 * q1 + m0 + m1, -3 * q0 + 3 * q1 - 2 * m0 - m1
         return q0 + s * (m0 + s * (b + s * a)), (m0 + s * (2 * b + 3 * s * a)) / h
 
-    def extremes(self) -> Extremes:
+    def since(self, time: float, more: int) -> Path:
+        """From the knot at or before a time on [s], and ``more`` knots before that."""
+        first = max(0, int(np.searchsorted(self.time, time, side="right")) - 1 - more)
+        return Path(self.time[first:], self.position[first:], self.rate_after[first:], self.rate_before[first:])
+
+    def longer(self, time: float, position: Array, rate_after: Array, rate_before: Array) -> Path:
+        """The same with one more knot, and rates at the beginning and the end of the interval before it."""
+        return Path(
+            np.append(self.time, time),
+            np.concatenate([self.position, position[None]]),
+            np.concatenate([self.rate_after, rate_after[None]]),
+            np.concatenate([self.rate_before, rate_before[None]]),
+        )
+
+    def _cubics(self, k: int | slice) -> tuple[Array, ...]:
+        """Of intervals: h [s], q0, m0, b, a, so that q = q0 + m0 s + b s² + a s³ with s from 0 to 1."""
+        h = (self.time[1:][k] - self.time[:-1][k])[..., None]
+        q0, q1 = self.position[:-1][k], self.position[1:][k]
+        m0, m1 = h * self.rate_after[k], h * self.rate_before[k]
+        return h, q0, m0, -3 * q0 + 3 * q1 - 2 * m0 - m1, 2 * q0 - 2 * q1 + m0 + m1
+
+    def extremes(self, since: float = -math.inf) -> Extremes:
         """Every interval's extreme positions, velocities and accelerations, between the knots too.
 
         Acceleration q'' = (2b + 6a s)/h² is straight within an interval of length h, s = (t − t_k)/h: its extremes are
-        the two ends. Where the rate itself steps, the step over the time it stands for is the third candidate.
+        the two ends. Where the rate itself steps, the step over the time it stands for is the third candidate. Only
+        intervals that end after ``since`` [s] count.
         """
-        h = np.diff(self.time)[:, None]
-        q0, q1 = self.position[:-1], self.position[1:]
-        m0, m1 = h * self.rate_after, h * self.rate_before
-        a, b = 2 * q0 - 2 * q1 + m0 + m1, -3 * q0 + 3 * q1 - 2 * m0 - m1  # (T-1, N)
+        late = slice(max(0, int(np.searchsorted(self.time, since, side="right")) - 1), None)
+        h, q0, m0, b, a = self._cubics(late)
         # Position is extreme where 3a s² + 2b s + m0 = 0, velocity where 6a s + 2b = 0. The root is taken in the form
         # that does not cancel; where an interval has none, its ends stand in.
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -96,13 +114,14 @@ class Path:
         at_velocity = np.where((at_velocity >= 0) & (at_velocity <= 1), at_velocity, 0.0)
         position = q0 + at_position * (m0 + at_position * (b + at_position * a))
         velocity = (m0 + at_velocity * (2 * b + 3 * at_velocity * a)) / h
-        left = self.time[:-1, None]
+        left = self.time[:-1][late, None]
         ends = np.stack([left, left + h, left]) + np.zeros_like(a)
         with np.errstate(over="ignore"):  # an infinite one is beyond any limit
-            acceleration = np.stack([2 * b / h / h, (2 * b + 6 * a) / h / h, self._steps()])
+            acceleration = np.stack([*(one[late] for one in self._accelerations), self._steps[late]])
         return Extremes(left + h * at_position, position, left + h * at_velocity, velocity, ends, acceleration)
 
-    def _steps(self) -> NDArray[np.float64]:
+    @cached_property
+    def _steps(self) -> Array:
         """Acceleration for the step in rate at the beginning of every interval [rad/s²], shape (T-1, N).
 
         A rate that is held from sample to sample stands for the middle of its interval, so that the step between two
@@ -113,7 +132,7 @@ class Path:
         steps[1:] = (self.rate_after[1:] - self.rate_before[:-1]) / (0.5 * (h[1:] + h[:-1]))
         return steps
 
-    def jerk(self, window: float, since: float = -math.inf) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def jerk(self, window: float, since: float = -math.inf) -> tuple[Array, Array]:
         """Change of acceleration per time, averaged in magnitude over ``window`` [s] of path time.
 
         j(t) = (1/window) Σ |a_{k+1} − a_k| over the knots between t − window and t, in which a_k is the mean of what
@@ -129,15 +148,15 @@ class Path:
             Where the window of that value ends [s].
         """
         with np.errstate(over="ignore", invalid="ignore"):
-            first, last = self._accelerations()
-            at_knots = np.concatenate([first[:1], 0.5 * (last[:-1] + first[1:]) + self._steps()[1:], last[-1:]])
-            variation = np.cumsum(np.abs(np.diff(at_knots, axis=0)), axis=0)
+            first, last = self._accelerations
+            at_knots = np.concatenate([first[:1], 0.5 * (last[:-1] + first[1:]) + self._steps[1:], last[-1:]])
+            variation = np.abs(at_knots[1:] - at_knots[:-1]).cumsum(axis=0)
         variation = np.concatenate([np.zeros_like(first[:1]), variation])
         ends, within = self._within(variation, window, since)
         jerk, where = self._worst(ends, within)
         return jerk / window, where
 
-    def shaking(self, window: float, since: float = -math.inf) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def shaking(self, window: float, since: float = -math.inf) -> tuple[Array, Array]:
         """Velocity that is gained and lost again, or lost and gained again, within ``window`` [s] of path time.
 
         min(P, N), in which P = ∫ max(q'', 0) dt and N = ∫ max(−q'', 0) dt over the window, steps in rate included. It
@@ -153,64 +172,61 @@ class Path:
         time : array, shape (N,)
             Where the window of that value ends [s].
         """
-        h = np.diff(self.time)[:, None]
+        h, count = np.diff(self.time)[:, None], self.position.shape[1]
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            first, last = self._accelerations()
+            first, last = self._accelerations
             # q'' is straight in an interval: where it changes sign the rate turns on the way.
             turning = self.rate_after + 0.5 * h * first * (first / (first - last))
             turning = np.where(first * last < 0, turning, self.rate_before)
-            changes = np.stack([turning - self.rate_after, self.rate_before - turning])
-            changes = np.concatenate([changes, np.zeros_like(changes[:1])])
-            changes[2, :-1] = self.rate_after[1:] - self.rate_before[:-1]
-            gained, lost = (
-                np.concatenate([np.zeros_like(first[:1]), np.cumsum(np.maximum(part, 0.0).sum(axis=0), axis=0)])
-                for part in (changes, -changes)
-            )
-        ends, up = self._within(gained, window, since)
-        return self._worst(ends, np.minimum(up, self._within(lost, window, since)[1]))
+            # Until the rate turns, from there on, and the step at the end of the interval: gained and lost.
+            changes = np.zeros((3, len(h), 2 * count))
+            changes[0, :, :count] = turning - self.rate_after
+            changes[1, :, :count] = self.rate_before - turning
+            changes[2, :-1, :count] = self.rate_after[1:] - self.rate_before[:-1]
+            changes[..., count:] = -changes[..., :count]
+            total = np.zeros((len(self.time), 2 * count))
+            np.maximum(changes, 0.0).sum(axis=0).cumsum(axis=0, out=total[1:])
+        ends, within = self._within(total, window, since)
+        return self._worst(ends, np.minimum(within[:, :count], within[:, count:]))
 
-    def _accelerations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    @cached_property
+    def _accelerations(self) -> tuple[Array, Array]:
         """Acceleration of the interpolant at the beginning and the end of every interval [rad/s²], shape (T-1, N)."""
-        h = np.diff(self.time)[:, None]
-        m0, m1, rise = h * self.rate_after, h * self.rate_before, np.diff(self.position, axis=0)
-        return (6 * rise - 4 * m0 - 2 * m1) / h / h, (-6 * rise + 2 * m0 + 4 * m1) / h / h
+        h, _, _, b, a = self._cubics(slice(None))
+        return 2 * b / h / h, (2 * b + 6 * a) / h / h
 
-    def _within(
-        self, total: NDArray[np.float64], window: float, since: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _within(self, total: Array, window: float, since: float) -> tuple[Array, Array]:
         """What ``total``, a running sum at the knots, grows by within windows: their ends (M,) [s], growth (M, N).
 
-        The growth is straight between windows that begin or end at a knot.
+        The growth is straight between windows that begin or end at a knot, and no larger in one that reaches beyond the
+        path.
         """
         ends = np.concatenate([self.time, self.time + window])
-        ends = ends[ends > since]
+        ends = ends[(ends > since) & (ends <= self.end)]
         with np.errstate(over="ignore", invalid="ignore"):
             return ends, self._interpolated(total, ends) - self._interpolated(total, ends - window)
 
-    def _interpolated(self, values: NDArray[np.float64], times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values at the knots (T, N), straight between them and constant outside, at other times: (M, N)."""
-        left = np.clip(np.searchsorted(self.time, times, side="right") - 1, 0, len(self.time) - 2)
-        fraction = np.clip((times - self.time[left]) / (self.time[left + 1] - self.time[left]), 0.0, 1.0)[:, None]
+    def _interpolated(self, values: Array, times: Array) -> Array:
+        """Values at the knots (T, N), straight between them and the first one before, at other times: (M, N)."""
+        left = np.maximum(np.searchsorted(self.time[:-1], times, side="right") - 1, 0)
+        fraction = np.maximum((times - self.time[left]) / (self.time[left + 1] - self.time[left]), 0.0)[:, None]
         return values[left] + fraction * (values[left + 1] - values[left])
 
-    def _worst(
-        self, ends: NDArray[np.float64], values: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _worst(self, ends: Array, values: Array) -> tuple[Array, Array]:
         """Of each joint the largest value, and the end of its window."""
         worst = values.argmax(axis=0)
-        return values[worst, np.arange(values.shape[1])], np.minimum(ends[worst], self.end)
+        return values[worst, np.arange(values.shape[1])], ends[worst]
 
 
-@dataclass(frozen=True)
-class Extremes:
+class Extremes(NamedTuple):
     """Candidates for extreme values, each with its path time; all of shape (candidates, T-1, N)."""
 
-    position_time: NDArray[np.float64]
-    position: NDArray[np.float64]
-    velocity_time: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    acceleration_time: NDArray[np.float64]
-    acceleration: NDArray[np.float64]
+    position_time: Array
+    position: Array
+    velocity_time: Array
+    velocity: Array
+    acceleration_time: Array
+    acceleration: Array
 
 
 def path_of_record(record: Record, servo_map: ServoMap) -> Path:
@@ -242,9 +258,7 @@ def path_of_record(record: Record, servo_map: ServoMap) -> Path:
         position[:, column] += offset
         rate_after[:, column] += rate[:-1]
         rate_before[:, column] += rate[1:]
-    return _at_rest_at_both_ends(
-        Path(time, position, rate_after, rate_before, float(time[-1])), servo_map.safety.run_up
-    )
+    return _at_rest_at_both_ends(Path(time, position, rate_after, rate_before), servo_map.safety.run_up)
 
 
 def _check_time(record: Record) -> None:
@@ -281,7 +295,7 @@ def long_steps(record: Record, factor: float, share: float) -> list[str]:
     ]
 
 
-def column_of(record: Record, signal: str, servo: Servo, unit: str) -> NDArray[np.float64]:
+def column_of(record: Record, signal: str, servo: Servo, unit: str) -> Array:
     """The column of ``signal`` that ``servo`` follows, shape (T,).
 
     Raises
@@ -311,18 +325,46 @@ def column_of(record: Record, signal: str, servo: Servo, unit: str) -> NDArray[n
     return data
 
 
+def wheel_offsets(record: Record, servo_map: ServoMap) -> dict[str, Array]:
+    """What lifting adds to the joints that the map names for it, shape (T,) each [rad]; none where nothing is lifted.
+
+    Raises
+    ------
+    CheckRefused
+        The record lifts wheels and the map does not say how, or it lifts what cannot be lifted.
+    """
+    lifts = servo_map.lifts
+    if lifts is None:
+        _refuse_lifted_wheels(record)
+        return {}
+    return dict(zip(lifts.joints, lifted(record, lifts).hinge.T, strict=True))
+
+
+def _refuse_lifted_wheels(record: Record) -> None:
+    if GROUNDED not in record:
+        return
+    up = np.flatnonzero((grounded_pairs(record, GROUNDED) == 0).any(axis=0))
+    if len(up):
+        names = ", ".join(record.labels[GROUNDED][k] for k in up)
+        raise CheckRefused(
+            f"the record lifts wheel pairs ({names}) and the servo map does not say how: without it they would drag "
+            "over the floor. Add to the map, for example:\n"
+            "  lifts: {joints: [psi3, psi4, psi5, psi6, psi7, psi8], clearance_mm: 5, blend_s: 0.3}"
+        )
+
+
 def _at_rest_at_both_ends(path: Path, acceleration: float) -> Path:
-    time, position, rate_after, rate_before = path.time, path.position, path.rate_after, path.rate_before
-    first, last = rate_after[:1], rate_before[-1:]
+    first, last = path.rate_after[0], path.rate_before[-1]
     rest = np.zeros_like(first)
-    if (fastest := np.abs(first).max()) > REST:
-        duration = fastest / acceleration
-        time = np.concatenate([[-duration], time])
-        position = np.concatenate([position[:1] - 0.5 * duration * first, position])
-        rate_after, rate_before = np.concatenate([rest, rate_after]), np.concatenate([first, rate_before])
     if (fastest := np.abs(last).max()) > REST:
         duration = fastest / acceleration
-        time = np.concatenate([time, [path.record_end + duration]])
-        position = np.concatenate([position, position[-1:] + 0.5 * duration * last])
-        rate_after, rate_before = np.concatenate([rate_after, last]), np.concatenate([rate_before, rest])
-    return Path(time, position, rate_after, rate_before, path.record_end)
+        path = path.longer(path.end + duration, path.position[-1] + 0.5 * duration * last, last, rest)
+    if (fastest := np.abs(first).max()) > REST:
+        duration = fastest / acceleration
+        path = Path(
+            np.concatenate([[-duration], path.time]),
+            np.concatenate([path.position[:1] - 0.5 * duration * first, path.position]),
+            np.concatenate([rest[None], path.rate_after]),
+            np.concatenate([first[None], path.rate_before]),
+        )
+    return path

@@ -1,12 +1,24 @@
-"""Are the servos on the bus the ones of the map, set up as the replay needs them, and fit to move?"""
+"""Are the servos on the bus the ones of the map, set up as the replay needs them, fit to move, and near its start?
+
+What limits a servo has stored itself is shown beside those of the map: they act where this program does not reach. The
+servo ignores goals beyond them without a word, and goes limp at its own thresholds. A difference that makes the map
+untrue keeps the robot from being armed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from dynsim.hardware.bus.control_table import (
+    HARDWARE_ERRORS,
     HEALTH_BLOCK,
     MODEL_BY_NUMBER,
+    RAD_S_PER_UNIT,
     RETURN_DELAY_SECONDS_PER_UNIT,
     STATE_BLOCK,
     VOLT_PER_UNIT,
@@ -14,8 +26,9 @@ from dynsim.hardware.bus.control_table import (
     describe_hardware_error,
 )
 from dynsim.hardware.bus.protocol import Bus, NoAnswer, RequestRefused, too_busy
-from dynsim.hardware.replay.motion import Task
-from dynsim.hardware.replay.registers import LimitRow, compare_limits
+from dynsim.hardware.errors import VerificationFailed
+from dynsim.hardware.replay.motion import QUINTIC_PEAK, Needs, Task
+from dynsim.hardware.safety import Safety
 from dynsim.hardware.servo_map import Servo, ServoMap
 
 EEPROM_BLOCK = (0, 64)
@@ -27,6 +40,10 @@ STATUS_TO_ALL = 2
 ACKNOWLEDGE = (
     "check power, cable, ID and baud rate (`dynsim hw scan`); a servo with Protocol 1 firmware does not answer"
 )
+
+QUANTITIES = ("position °", "velocity rad/s", "torque N m", "temperature °C", "supply V")
+VOLTAGE_SHUTDOWN = 1 << next(bit for bit, name in HARDWARE_ERRORS.items() if name == "input voltage")
+ATTEMPTS = 3
 
 Registers = dict[str, int]
 
@@ -181,3 +198,208 @@ def _trial_reads(bus: Bus, servo_map: ServoMap, poll: Callable[[], None]) -> lis
         for servo in servo_map.servos
         if missed[servo.id] > TRIAL_MISSES
     ]
+
+
+@dataclass(frozen=True)
+class LimitRow:
+    """One servo's limits beside the map's.
+
+    Attributes
+    ----------
+    joint : str
+    id : int
+    cells : tuple of (str, str)
+        What the servo has stored and what the map says, for each of QUANTITIES.
+    refused : tuple of str
+        Differences with which the robot must not be armed.
+    differs : tuple of str
+        Other differences worth knowing.
+    """
+
+    joint: str
+    id: int
+    cells: tuple[tuple[str, str], ...]
+    refused: tuple[str, ...]
+    differs: tuple[str, ...]
+
+
+def needs_of_map(servo: Servo) -> Needs:
+    """All that the map allows."""
+    low, high = servo.position_limits
+    return Needs(low, high, servo.kind.limits.velocity)
+
+
+def compare_limits(servo: Servo, registers: Registers, safety: Safety, needs: Needs) -> LimitRow:
+    """The limits in a servo's EEPROM, beside those of the map.
+
+    Refused are limits within which the servo would ignore goals of the motion or fall behind it, and thresholds with
+    which it goes limp before the replay's own rule can stop it, or protects itself later than its data sheet says.
+    """
+    compared = (
+        _position(servo, registers, needs),
+        _velocity(servo, registers, needs),
+        _torque(servo, registers),
+        _temperature(servo, registers, safety),
+        _supply(registers, safety),
+    )
+    return LimitRow(
+        servo.joint,
+        servo.id,
+        tuple((one.servo, one.map) for one in compared),
+        tuple(one.refused for one in compared if one.refused),
+        tuple(one.differs for one in compared if one.differs),
+    )
+
+
+class _Compared(NamedTuple):
+    servo: str = "-"
+    map: str = "-"
+    refused: str = ""
+    differs: str = ""
+
+
+def _position(servo: Servo, registers: Registers, needs: Needs) -> _Compared:
+    if not servo.in_position_mode:
+        return _Compared()
+    low, high = registers["min_position"], registers["max_position"]
+    own = np.degrees(sorted((servo.to_angle(low), servo.to_angle(high))))
+    told = np.degrees(servo.position_limits)
+    goals, allowed = sorted((servo.to_ticks(needs.low), servo.to_ticks(needs.high))), servo.tick_limits
+    refused = differs = ""
+    if goals[0] < low or goals[1] > high:
+        refused = f"the motion needs ticks {goals[0]} to {goals[1]}, its own limits are {low} to {high}"
+    elif allowed[0] < low or allowed[1] > high:
+        differs = f"its own position limits are narrower than the map's: ticks {low} to {high}"
+    return _Compared(f"{own[0]:.0f} to {own[1]:.0f}", f"{told[0]:.0f} to {told[1]:.0f}", refused, differs)
+
+
+def _velocity(servo: Servo, registers: Registers, needs: Needs) -> _Compared:
+    units, told = registers["velocity_limit"], servo.kind.limits.velocity
+    own = units * RAD_S_PER_UNIT / servo.gear
+    refused = differs = ""
+    below = units < abs(servo.to_velocity_units(told))
+    if below and not servo.in_position_mode:
+        refused = f"its velocity limit is {own:.2f} rad/s, below the map's; faster goals would be ignored silently"
+    elif units < abs(servo.to_velocity_units(needs.fastest)):
+        refused = f"the motion needs {needs.fastest:.2f} rad/s, its velocity limit is {own:.2f}: it would lag"
+    elif below:
+        differs = f"its velocity limit of {own:.2f} rad/s is below the map's"
+    return _Compared(f"{own:.2f}", f"{told:.2f}", refused, differs)
+
+
+def _torque(servo: Servo, registers: Registers) -> _Compared:
+    told = servo.kind.limits.torque
+    if "current_limit" not in registers:
+        return _Compared(map=f"{told:.1f}")
+    # It bounds the goals of the modes that control current; neither of those that a map can name is one.
+    own = servo.gear * servo.model.torque(registers["current_limit"])
+    below = f"its current limit is worth {own:.1f} N m, below the map's" if own < told else ""
+    return _Compared(f"{own:.1f}", f"{told:.1f}", differs=below)
+
+
+def _temperature(servo: Servo, registers: Registers, safety: Safety) -> _Compared:
+    own, told = registers["temperature_limit"], safety.temperature_max
+    refused = ""
+    if own <= told:
+        refused = f"goes limp at {own} °C, before the map's temperature_max of {told:g} °C stops the robot"
+    elif own > (highest := servo.model.fields["temperature_limit"].default):
+        refused = f"its temperature limit is {own} °C, a {servo.model.name} is to shut down at {highest} °C"
+    return _Compared(f"{own}", f"{told:g}", refused)
+
+
+def _supply(registers: Registers, safety: Safety) -> _Compared:
+    low, high = registers["min_voltage"] * VOLT_PER_UNIT, registers["max_voltage"] * VOLT_PER_UNIT
+    told = safety.supply
+    refused = differs = ""
+    if not (low <= told.lowest and told.highest <= high):
+        outside = f"outside of {low:g} to {high:g} V, within the map's supply range"
+        if registers["shutdown"] & VOLTAGE_SHUTDOWN:
+            refused = f"goes limp {outside}"
+        else:
+            differs = f"raises its alert {outside}"
+    return _Compared(f"{low:g} to {high:g}", f"{told.lowest:g} to {told.highest:g}", refused, differs)
+
+
+def difference_lines(rows: Sequence[LimitRow]) -> list[str]:
+    """The rows as a table of text, every cell "servo | map", with the differences below."""
+    table = [["joint", "ID", *QUANTITIES]]
+    table += [[row.joint, str(row.id), *(" | ".join(cell) for cell in row.cells)] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in table]
+    return ["limits, stored in the servo | of the map:", *lines, *differences(rows)]
+
+
+def differences(rows: Sequence[LimitRow]) -> list[str]:
+    """Differences worth knowing, one line each, refused ones first."""
+    refused = [f"{row.joint} (ID {row.id}): {text}" for row in rows for text in row.refused]
+    return refused + [f"note: {row.joint} (ID {row.id}): {text}" for row in rows for text in row.differs]
+
+
+@dataclass(frozen=True)
+class Distance:
+    """Where one joint stands, and where the motion begins [rad]."""
+
+    joint: str
+    now: float
+    start: float
+
+    def __str__(self) -> str:
+        return f"{self.joint} {abs(self.start - self.now):.3f} rad (from {self.now:.3f} to {self.start:.3f})"
+
+
+@dataclass(frozen=True)
+class WayToStart:
+    """The move before a replay.
+
+    Attributes
+    ----------
+    distances : tuple of Distance
+        Of the joints in position mode, the furthest first.
+    duration : float
+        [s].
+    far : tuple of Distance
+        Those beyond ``safety.start_distance``.
+    """
+
+    distances: tuple[Distance, ...]
+    duration: float
+    far: tuple[Distance, ...]
+
+
+def way_to_start(bus: Bus, servo_map: ServoMap, start: NDArray[np.float64]) -> WayToStart:
+    """Read where the joints stand; ``start`` is the posture to go to [rad], shape (N,).
+
+    Raises
+    ------
+    VerificationFailed
+        A servo does not answer.
+    """
+    ticks = read_ticks(bus, [servo for servo in servo_map.servos if servo.in_position_mode])
+    distances = [
+        Distance(servo.joint, servo.to_angle(ticks[servo.id]), float(target))
+        for servo, target in zip(servo_map.servos, start, strict=True)
+        if servo.in_position_mode
+    ]
+    distances.sort(key=lambda one: -abs(one.start - one.now))
+    furthest = abs(distances[0].start - distances[0].now) if distances else 0.0
+    far = [one for one in distances if abs(one.start - one.now) > servo_map.safety.start_distance]
+    duration = QUINTIC_PEAK * furthest / servo_map.safety.approach_velocity
+    return WayToStart(tuple(distances), duration, tuple(far))
+
+
+def read_ticks(bus: Bus, servos: list[Servo]) -> dict[int, int]:
+    """Servo position by ID. Raises VerificationFailed where one does not answer."""
+    ticks: dict[int, int] = {}
+    for _ in range(ATTEMPTS):
+        missing = [servo.id for servo in servos if servo.id not in ticks]
+        if not missing:
+            break
+        for id_, reply in bus.sync_read(missing, *STATE_BLOCK).replies.items():
+            ticks[id_] = int.from_bytes(reply.data[6:10], "little", signed=True)
+    silent = [f"{servo.joint} (ID {servo.id})" for servo in servos if servo.id not in ticks]
+    if silent:
+        busy = too_busy(bus)
+        raise VerificationFailed(
+            f"no answer from {', '.join(silent)}: check power, cable, ID and baud rate{busy and '; '}{busy}"
+        )
+    return ticks

@@ -1,4 +1,4 @@
-"""Who understands what is on the line: servos sorted by bit rate, protocol and ID, as they are set now."""
+"""Who understands what is on the line: servos sorted by bit rate and ID, as they are set now."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 from dynsim.hardware.bus.control_table import MAX_ID
 from dynsim.hardware.virtual.registers import ServoRegisters
 
+PROTOCOL = 2
+"""That of the line. A servo in which another one is set is silent for good, as nobody speaks it."""
+
 
 @dataclass
 class Hearing:
-    """Servos of one bit rate and protocol, named by the ID they had at first.
+    """Servos of one bit rate, named by the ID they had at first.
 
     Attributes
     ----------
@@ -31,30 +34,15 @@ class Hearing:
     members: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
-class Addresses:
-    """Sorts servos; :meth:`sort` again when one of their settings has changed."""
-
-    def __init__(self, servos: Mapping[int, ServoRegisters]) -> None:
-        self._servos = servos
-        self.sort()
-
-    def sort(self) -> None:
-        """Take over what the registers say now."""
-        self._hearing: dict[tuple[int, int], Hearing] = {}
-        self._protocols: dict[int, tuple[int, ...]] = {}
-        for place, (first_id, registers) in enumerate(self._servos.items()):
-            baud, protocol = registers.baud, registers["protocol"]
-            hearing = self._hearing.setdefault((baud, protocol), Hearing())
-            hearing.members = np.append(hearing.members, place)
-            self._protocols[baud] = tuple({*self._protocols.get(baud, ()), protocol})
-            hearing.by_id.setdefault(registers["id"], []).append(first_id)
-            if registers["shadow_id"] <= MAX_ID and registers["shadow_id"] != registers["id"]:
-                hearing.by_shadow.setdefault(registers["shadow_id"], []).append(first_id)
-
-    def protocols(self, baud: int) -> tuple[int, ...]:
-        """Protocols of the servos that are set to a bit rate [bit/s]; none where nobody is."""
-        return self._protocols.get(baud, ())
-
-    def hearing(self, baud: int, protocol: int) -> Hearing:
-        """Those who understand a packet."""
-        return self._hearing[baud, protocol]
+def by_bit_rate(servos: Mapping[int, ServoRegisters]) -> dict[int, Hearing]:
+    """Who understands a packet, by its bit rate [bit/s]; as the registers say now."""
+    found: dict[int, Hearing] = {}
+    for place, (first_id, registers) in enumerate(servos.items()):
+        if registers["protocol"] != PROTOCOL:
+            continue
+        hearing = found.setdefault(registers.baud, Hearing())
+        hearing.members = np.append(hearing.members, place)
+        hearing.by_id.setdefault(registers["id"], []).append(first_id)
+        if registers["shadow_id"] <= MAX_ID and registers["shadow_id"] != registers["id"]:
+            hearing.by_shadow.setdefault(registers["shadow_id"], []).append(first_id)
+    return found

@@ -9,13 +9,13 @@ from typing import Annotated, Literal
 
 from pydantic import Field, ValidationInfo, model_validator
 
-from dynsim.config.base import StrictModel, error_at
+from dynsim.config.base import StrictConfig, error_at
 from dynsim.hardware.strict_yaml import read_yaml
 
 Probability = Annotated[float, Field(ge=0, le=1)]
 
 
-class _Timed(StrictModel):
+class _Timed(StrictConfig):
     """Active from ``at`` [s after the first torque enable] for ``duration`` [s]; absent: always, for good."""
 
     at: Annotated[float, Field(ge=0)] | None = None
@@ -117,7 +117,7 @@ Fault = Annotated[
 ]
 
 
-class FaultScript(StrictModel):
+class FaultScript(StrictConfig):
     """Faults of one run.
 
     Attributes

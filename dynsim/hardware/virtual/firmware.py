@@ -1,4 +1,4 @@
-"""What servos do with instructions: the part that both protocols share, and Protocol 2.0."""
+"""What servos do with instructions of Protocol 2.0, and answer."""
 
 from __future__ import annotations
 
@@ -49,55 +49,11 @@ def together(frames: Sequence[tuple[int, bytes]]) -> Answer:
 
 
 class Firmware:
-    """Carries out instructions on servos, whatever the packets look like.
-
-    Servos are named by the ID they had at first.
-    """
+    """Carries out instructions on servos. These are named by the ID they had at first."""
 
     def __init__(self, servos: VirtualServos) -> None:
-        self.servos = servos
+        self._servos = servos
         self._registered: dict[int, tuple[int, bytes]] = {}
-
-    def awake(self, hearing: Hearing, id_: int) -> list[int]:
-        """Servos that have an ID and are not dead, off or starting."""
-        return list(filter(self.servos.listens, hearing.by_id.get(id_, ())))
-
-    def shadows(self, hearing: Hearing, id_: int) -> list[int]:
-        """Servos of which it is the secondary ID."""
-        return list(filter(self.servos.listens, hearing.by_shadow.get(id_, ())))
-
-    def write(self, servo: int, address: int, data: bytes) -> StatusError:
-        return self.servos.write(servo, address, data)
-
-    def register(self, servo: int, address: int, data: bytes) -> StatusError:
-        """Keep a write until :meth:`act`."""
-        self._registered[servo] = (address, data)
-        self.servos.registers[servo]["registered_instruction"] = 1
-        return StatusError.NONE
-
-    def act(self, servo: int) -> StatusError:
-        """Carry out the registered write; a restart has forgotten it."""
-        registers = self.servos.registers[servo]
-        if not registers["registered_instruction"]:
-            return StatusError.RESULT_FAIL
-        registers["registered_instruction"] = 0
-        return self.servos.write(servo, *self._registered.pop(servo))
-
-    def clear_turns(self, servo: int) -> StatusError:
-        """Count turns from here; only at rest."""
-        index = self.servos.ids.index(servo)
-        if abs(self.servos.plant.velocity[index]) > self.servos.registers[servo]["moving_threshold"] * RAD_S_PER_UNIT:
-            return StatusError.RESULT_FAIL
-        self.servos.forget_turns(index)
-        return StatusError.NONE
-
-
-class Protocol2:
-    """Answers to packets of Protocol 2.0."""
-
-    def __init__(self, firmware: Firmware) -> None:
-        self._firmware = firmware
-        self._servos = firmware.servos
 
     def answers(self, packet: Packet, hearing: Hearing) -> Iterator[Answer]:
         """Carry out an instruction; what comes back, in the order of the line."""
@@ -131,21 +87,21 @@ class Protocol2:
                 yield from self._answers_of_each(packet, hearing)
 
     def _write_silently(self, id_: int, address: int, data: bytes, hearing: Hearing) -> None:
-        for servo in self._firmware.awake(hearing, id_):
+        for servo in self._awake(hearing, id_):
             self._servos.write(servo, address, data)
         if hearing.by_shadow and address >= EEPROM_END:
-            for servo in self._firmware.shadows(hearing, id_):
+            for servo in self._shadows(hearing, id_):
                 self._servos.write(servo, address, data)
 
     def _answers_of_each(self, packet: Packet, hearing: Hearing) -> Iterator[Answer]:
         broadcast = packet.id == BROADCAST_ID
-        for servo in self._firmware.shadows(hearing, packet.id):
+        for servo in self._shadows(hearing, packet.id):
             if packet.instruction in SHADOWED and int.from_bytes(packet.parameters[0:2], "little") >= EEPROM_END:
                 self._reply(servo, packet.id, packet)
         # A list: the instruction may give a servo another ID.
         for id_ in sorted(hearing.by_id) if broadcast else [packet.id]:
             frames = []
-            for servo in self._firmware.awake(hearing, id_):
+            for servo in self._awake(hearing, id_):
                 reply = self._reply(servo, id_, packet)
                 if reply and (not broadcast or packet.instruction == Instruction.PING):
                     frames.append((servo, encode(reply)))
@@ -153,7 +109,7 @@ class Protocol2:
                 yield together(frames)
 
     def _reply(self, servo: int, id_: int, packet: Packet) -> Packet | None:
-        registers, firmware, p = self._servos.registers[servo], self._firmware, packet.parameters
+        registers, p = self._servos.registers[servo], packet.parameters
         answers_all = registers["status_return_level"] == 2
         match packet.instruction:
             case Instruction.PING:
@@ -162,11 +118,11 @@ class Protocol2:
             case Instruction.READ if len(p) == 4:
                 return self._read(servo, id_, int.from_bytes(p[0:2], "little"), int.from_bytes(p[2:4], "little"))
             case Instruction.WRITE if len(p) >= 3:
-                error = firmware.write(servo, int.from_bytes(p[0:2], "little"), p[2:])
+                error = self._servos.write(servo, int.from_bytes(p[0:2], "little"), p[2:])
             case Instruction.REG_WRITE if len(p) >= 3:
-                error = firmware.register(servo, int.from_bytes(p[0:2], "little"), p[2:])
+                error = self._register(servo, int.from_bytes(p[0:2], "little"), p[2:])
             case Instruction.ACTION:
-                error = firmware.act(servo)
+                error = self._act(servo)
             case Instruction.REBOOT | Instruction.FACTORY_RESET:
                 # The answer goes out before, as the servo was.
                 answer = self._status(servo, id_, StatusError.NONE)
@@ -180,14 +136,14 @@ class Protocol2:
                     answer = self._status(servo, id_, StatusError.DATA_RANGE)
                 return answer if answers_all else None
             case Instruction.CLEAR if p == CLEAR_TURNS:
-                error = firmware.clear_turns(servo)
+                error = self._clear_turns(servo)
             case _:
                 error = StatusError.INSTRUCTION
         return self._status(servo, id_, error) if answers_all else None
 
     def _read_many(self, entries: Sequence[tuple[int, int, int]], hearing: Hearing) -> Iterator[Answer]:
         for id_, address, length in entries:
-            replies = [(servo, self._read(servo, id_, address, length)) for servo in self._firmware.awake(hearing, id_)]
+            replies = [(servo, self._read(servo, id_, address, length)) for servo in self._awake(hearing, id_)]
             if frames := [(servo, encode(reply)) for servo, reply in replies if reply]:
                 yield together(frames)
 
@@ -195,7 +151,7 @@ class Protocol2:
         """One packet, of which every servo sends its part; behind one that is silent nobody speaks (unverified)."""
         speakers, replies = [], []
         for id_, address, length in entries:
-            servo = next(iter(self._firmware.awake(hearing, id_)), None)
+            servo = next(iter(self._awake(hearing, id_)), None)
             reply = None if servo is None else self._read(servo, id_, address, length)
             if servo is None or reply is None:
                 break
@@ -218,3 +174,33 @@ class Protocol2:
     def _status(self, servo: int, id_: int, error: StatusError, data: bytes = b"") -> Packet:
         alert = ALERT if self._servos.registers[servo]["hardware_error"] else 0
         return Packet(id_, STATUS, data, error | alert)
+
+    def _awake(self, hearing: Hearing, id_: int) -> list[int]:
+        """Servos that have an ID and are not dead, off or starting."""
+        return list(filter(self._servos.listens, hearing.by_id.get(id_, ())))
+
+    def _shadows(self, hearing: Hearing, id_: int) -> list[int]:
+        """Servos of which it is the secondary ID."""
+        return list(filter(self._servos.listens, hearing.by_shadow.get(id_, ())))
+
+    def _register(self, servo: int, address: int, data: bytes) -> StatusError:
+        """Keep a write until :meth:`_act`."""
+        self._registered[servo] = (address, data)
+        self._servos.registers[servo]["registered_instruction"] = 1
+        return StatusError.NONE
+
+    def _act(self, servo: int) -> StatusError:
+        """Carry out the registered write; a restart has forgotten it."""
+        registers = self._servos.registers[servo]
+        if not registers["registered_instruction"]:
+            return StatusError.RESULT_FAIL
+        registers["registered_instruction"] = 0
+        return self._servos.write(servo, *self._registered.pop(servo))
+
+    def _clear_turns(self, servo: int) -> StatusError:
+        """Count turns from here; only at rest."""
+        index = self._servos.ids.index(servo)
+        if abs(self._servos.plant.velocity[index]) > self._servos.registers[servo]["moving_threshold"] * RAD_S_PER_UNIT:
+            return StatusError.RESULT_FAIL
+        self._servos.forget_turns(index)
+        return StatusError.NONE

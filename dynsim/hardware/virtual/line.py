@@ -15,9 +15,8 @@ from dynsim.hardware.bus.control_table import BAUD_RATES, RAD_PER_TICK, RETURN_D
 from dynsim.hardware.bus.packet import STATUS, Decoder, Packet
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.hardware.virtual.faults import FaultScript
-from dynsim.hardware.virtual.firmware import Firmware, Protocol2
+from dynsim.hardware.virtual.firmware import Firmware
 from dynsim.hardware.virtual.injection import Injection
-from dynsim.hardware.virtual.protocol1 import Decoder1, Protocol1
 from dynsim.hardware.virtual.registers import ServoRegisters
 from dynsim.hardware.virtual.servo_plant import ServoPlant
 from dynsim.hardware.virtual.servos import PHYSICS_STEP, VirtualServos
@@ -47,7 +46,7 @@ class VirtualLine:
     supply : float
         Voltage of the supply without load [V].
     listener : callable, optional
-        Called with (time, packet) for every valid packet of Protocol 2.0 that a servo can hear.
+        Called with (time, packet) for every valid packet that a servo can hear.
     """
 
     def __init__(
@@ -64,9 +63,8 @@ class VirtualLine:
         self.servos = VirtualServos(servos, positions=positions, plant=plant, script=script, supply=supply)
         self.listener = listener
         self._faults = Injection(self.servos, script)
-        firmware = Firmware(self.servos)
-        self._protocols: dict[int, Protocol1 | Protocol2] = {1: Protocol1(firmware), 2: Protocol2(firmware)}
-        self._decoders: dict[tuple[int, int], Decoder | Decoder1] = {}
+        self._firmware = Firmware(self.servos)
+        self._decoders: dict[int, Decoder] = {}
         self._heard = 0.0
         self._faults.apply()
 
@@ -110,21 +108,21 @@ class VirtualLine:
         given_up = start - self._heard > BYTE_TIMEOUT
         self._heard = end
         # To servos at another bit rate this is noise.
-        for protocol in self.servos.addresses.protocols(baud):
-            decoder = self._decoders.setdefault((baud, protocol), Decoder() if protocol == 2 else Decoder1())
+        if baud in self.servos.hearing:
+            decoder = self._decoders.setdefault(baud, Decoder())
             packets = [*decoder.flush()] if given_up else []
             for packet in [*packets, *decoder.feed(data)]:
-                if packet.instruction != STATUS and protocol in self.servos.addresses.protocols(baud):
-                    arrivals += self._execute(packet, protocol, end, baud)
+                if packet.instruction != STATUS and baud in self.servos.hearing:
+                    arrivals += self._execute(packet, end, baud)
         return arrivals
 
-    def _execute(self, packet: Packet, protocol: int, now: float, baud: int) -> list[tuple[float, bytes]]:
-        hearing = self.servos.addresses.hearing(baud, protocol)
+    def _execute(self, packet: Packet, now: float, baud: int) -> list[tuple[float, bytes]]:
+        hearing = self.servos.hearing[baud]
         self.servos.hear(hearing, now)
-        if self.listener and protocol == 2:
+        if self.listener:
             self.listener(now, packet)
         arrivals: list[tuple[float, bytes]] = []
-        for answer in self._protocols[protocol].answers(packet, hearing):
+        for answer in self._firmware.answers(packet, hearing):
             first = answer.servos[0]
             if not answer.chained:
                 now += self.servos.registers[first]["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT + TURNAROUND

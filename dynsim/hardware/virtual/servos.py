@@ -17,7 +17,7 @@ from dynsim.hardware.bus.control_table import (
     OperatingMode,
 )
 from dynsim.hardware.bus.packet import StatusError
-from dynsim.hardware.virtual.addresses import Addresses, Hearing
+from dynsim.hardware.virtual.addresses import Hearing, by_bit_rate
 from dynsim.hardware.virtual.faults import AngleFault, Fault, FaultScript, TemperatureRamp, VoltageSag
 from dynsim.hardware.virtual.registers import ServoRegisters
 from dynsim.hardware.virtual.servo_plant import Drive, InertialLoad, ServoPlant
@@ -66,8 +66,8 @@ class VirtualServos:
         ServoRegisters by the ID that a servo had at first.
     ids : list of int
         Those IDs.
-    addresses : Addresses
-        Who hears what.
+    hearing : dict of int to Hearing
+        Who hears what, by bit rate.
     time : float
         [s].
     torque_since : float
@@ -91,7 +91,7 @@ class VirtualServos:
     ) -> None:
         self.registers = dict(registers)
         self.ids = list(registers)
-        self.addresses = Addresses(self.registers)
+        self.hearing = by_bit_rate(self.registers)
         self._models = [table.model for table in registers.values()]
         self.plant: ServoPlant = plant or InertialLoad(self._models, np.array(list(positions), dtype=np.float64))
         self.supply = supply
@@ -181,14 +181,14 @@ class VirtualServos:
                 self.torque_since = self.time
         self.reload(index)
         if address < COMMUNICATION_END:
-            self.addresses.sort()
+            self.hearing = by_bit_rate(self.registers)
         return StatusError.NONE
 
     def reset(self, id_: int, keep: Collection[str]) -> None:
         """As delivered but for the registers ``keep``, then a restart."""
         self.registers[id_].reset(keep)
         self.reload(self.ids.index(id_))
-        self.addresses.sort()
+        self.hearing = by_bit_rate(self.registers)
         self.reboot(id_)
 
     def reboot(self, id_: int) -> None:

@@ -1,0 +1,195 @@
+"""Meshes of robots from URDF files: found, read once each, simplified together to what a page can carry."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.draw.geometry.mesh_files import Mesh, read_mesh
+from dynsim.errors import RecordError
+from dynsim.record import Record
+
+# Triangles of all meshes of a page at most: some 1 MB of it.
+TRIANGLES = 100_000
+# Corners nearer to each other than this share of a mesh's size are one: STL repeats them for every triangle.
+_WELD = 2.0**-20
+# The same before a mesh is simplified: slivers, of which meshes from CAD are full, would hold that up. The next one is
+# tried where this many times too many triangles are left.
+_COARSE, _TOO_MANY = (1 / 500, 1 / 250, 1 / 120, 1 / 60, 1 / 30), 1.5
+# Where the collapses of fast_simplification end: at an error of a hundredth of the size.
+_AGGRESSIVENESS = 2.5
+# Fewer triangles than a tetrahedron has are no solid.
+_LEAST = 4
+
+
+class Meshes:
+    """Meshes, each once; those of a record are looked for where its robot's file is."""
+
+    def __init__(self) -> None:
+        self.found: list[Mesh] = []
+        self._folders: tuple[Path, ...] = ()
+        self._known: dict[Path, int | None] = {}
+        self._missing: dict[str, None] = {}
+
+    def of_robot(self, record: Record) -> None:
+        """Look for what follows where the robot of this record came from."""
+        scenario = record.provenance.get("scenario", {})
+        files = named(scenario.get("plant", {}) if isinstance(scenario, Mapping) else {}, "file")
+        self._folders = tuple(Path(file).parent for file in files if isinstance(file, str))
+
+    def index(self, file: str) -> int | None:
+        """Number of a mesh among those of the page; None where there is none, or it cannot be read."""
+        for path in self._places(file):
+            if path not in self._known:
+                self._known[path] = self._read(path)
+            if (found := self._known[path]) is not None:
+                return found
+        self._missing[file.rpartition("/")[2]] = None
+        return None
+
+    def notes(self) -> list[str]:
+        """What could not be drawn."""
+        names = list(self._missing)
+        more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+        return [f"meshes not found, rods instead: {', '.join(names[:4])}{more}"] if names else []
+
+    def _places(self, file: str) -> Iterator[Path]:
+        """Where a mesh may lie: beside the robot's file, or in its package, found like ROS does or above that file."""
+        if not file.startswith("package://"):
+            for folder in self._folders:
+                yield folder / file.removeprefix("file://")
+            return
+        package, _, rest = file.removeprefix("package://").partition("/")
+        roots = [above for folder in self._folders for above in (folder, *folder.parents)]
+        roots += [Path(one) for one in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if one]
+        roots += [Path(one, "share") for one in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if one]
+        for root in roots:
+            yield root / package / rest
+            if root.name == package:
+                yield root / rest
+
+    def _read(self, path: Path) -> int | None:
+        try:
+            if not path.is_file():
+                return None
+            self.found.append(welded(read_mesh(path)))
+        except (RecordError, OSError, ValueError):
+            return None
+        return len(self.found) - 1
+
+
+def welded(mesh: Mesh, near: float = _WELD) -> Mesh:
+    """The same surface with corners as one that are ``near``, a share of its size, without triangles that are lines.
+
+    Raises
+    ------
+    ValueError
+        Nothing is left of it.
+    """
+    corners, triangles, colours = mesh
+    low, size = _box(corners[triangles])
+    if not size > 0.0:
+        raise ValueError("a mesh without size")
+    _, place, number = np.unique(
+        np.rint((corners - low) / (near * size)), axis=0, return_index=True, return_inverse=True
+    )
+    faces = number.reshape(-1)[triangles]
+    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    if not whole.any():
+        raise ValueError("a mesh without faces")
+    used, faces = np.unique(faces[whole], return_inverse=True)
+    return Mesh(corners[place[used]], faces.reshape(-1, 3), None if colours is None else colours[whole])
+
+
+def _box(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """The lowest corner of the box about some points, and its longest side [m]."""
+    pooled = corners.reshape(-1, 3)
+    low = pooled.min(axis=0)
+    return low, float((pooled.max(axis=0) - low).max())
+
+
+def simplified(meshes: Sequence[Mesh], most: int = TRIANGLES) -> list[Mesh]:
+    """The same surfaces with together about ``most`` triangles; all of those that have no more.
+
+    Edges collapse where the surface changes least (quadric error metrics, Garland and Heckbert 1997). Parts of one
+    colour are simplified apart from each other, the largest first, and keep their borders: no crack opens between them.
+    """
+    limit = _limit([len(rows) for mesh in meshes for rows in _by_colour(mesh)], most)
+    return [_simplified(mesh, limit) for mesh in meshes]
+
+
+def _simplified(mesh: Mesh, most: int) -> Mesh:
+    """A mesh with at most about so many triangles of each colour."""
+    sizes = [len(rows) for rows in _by_colour(mesh)]
+    wanted = sum(min(size, most) for size in sizes)
+    if wanted == sum(sizes):
+        return mesh
+    for near in _COARSE:
+        coarse = welded(mesh, near)
+        found = welded(_joined([_decimated(coarse, rows, most) for rows in _by_colour(coarse)]))
+        if len(found.triangles) <= _TOO_MANY * wanted:
+            break
+    return found
+
+
+def _by_colour(mesh: Mesh) -> list[NDArray[np.intp]]:
+    """Rows of the triangles of each colour."""
+    if mesh.colours is None:
+        return [np.arange(len(mesh.triangles))]
+    _, number = np.unique(np.nan_to_num(mesh.colours, nan=-1.0), axis=0, return_inverse=True)
+    number = number.reshape(-1)
+    return [np.flatnonzero(number == k) for k in range(int(number.max()) + 1)]
+
+
+def _limit(counts: Sequence[int], most: int) -> int:
+    """The largest size to which those that are larger must come down, so that all have ``most`` together."""
+    left = most
+    for k, count in enumerate(sorted(counts)):
+        share = left // (len(counts) - k)
+        if count > share:
+            return max(share, _LEAST)
+        left -= count
+    return most
+
+
+def _decimated(mesh: Mesh, rows: NDArray[np.intp], most: int) -> Mesh:
+    """Some triangles of a mesh as a mesh of at most about so many."""
+    used, faces = np.unique(mesh.triangles[rows], return_inverse=True)
+    corners, faces = mesh.corners[used], faces.reshape(-1, 3)
+    paint = None if mesh.colours is None else mesh.colours[rows]
+    if len(faces) <= most:
+        return Mesh(corners, faces, paint)
+    from fast_simplification import simplify
+
+    # Its thresholds are lengths: a mesh may be in millimetres.
+    low, size = _box(corners)
+    unit = (corners - low) / size
+    fewer, faces = simplify(unit, faces.astype(np.int32), target_count=most, agg=_AGGRESSIVENESS, preserve_border=True)
+    return Mesh(low + size * fewer, faces.astype(np.int64), None if paint is None else paint[: len(faces)])
+
+
+def _joined(parts: Sequence[Mesh]) -> Mesh:
+    starts = np.cumsum([0, *(len(part.corners) for part in parts)])
+    colours = [part.colours for part in parts if part.colours is not None]
+    return Mesh(
+        np.concatenate([part.corners for part in parts]),
+        np.concatenate([part.triangles + start for part, start in zip(parts, starts, strict=False)]),
+        np.concatenate(colours) if colours else None,
+    )
+
+
+def named(tree: Any, key: str) -> Iterator[Any]:
+    """Values of a key, wherever it is."""
+    if isinstance(tree, Mapping):
+        for name, value in tree.items():
+            if name == key:
+                yield value
+            yield from named(value, key)
+    elif isinstance(tree, (list, tuple)):
+        for value in tree:
+            yield from named(value, key)

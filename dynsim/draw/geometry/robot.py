@@ -1,0 +1,269 @@
+"""A record as something that moves in space: what pages and films of it share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.errors import RecordError
+from dynsim.record import Record
+from dynsim.record.measures import hand_target
+from dynsim.record.poses import ORIENTATION, POSITION, point_positions
+from dynsim.record.scene import NOT_BELOW, WORLD, Point, Scene, Vector3
+
+Array = NDArray[np.float64]
+# Poses between the frames of a page are interpolated: to this [m].
+POSE_ERROR = 4e-5
+# Frames of a longer run are thinned though poses between them be off by more.
+FRAMES = 20_000
+WORLD_AXES = np.eye(3)
+HERE_POINT: Vector3 = (0.0, 0.0, 0.0)
+
+
+def robots(records: Mapping[str, Record]) -> dict[str, Robot]:
+    """Robots of those records that have something to be seen, by the names of the records.
+
+    Raises
+    ------
+    RecordError
+        None has samples and a scene with the poses of its bodies.
+    """
+    found = {name: robot for name, record in records.items() if (robot := robot_of(record)) is not None}
+    if not found:
+        raise RecordError("nothing to view: a record needs samples, a scene, and the poses of its bodies")
+    return found
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A record whose bodies were placed, and the samples that become frames of the page."""
+
+    record: Record
+    scene: Scene
+    rows: NDArray[np.intp]
+    reach: float
+
+
+def placed(record: Record) -> tuple[Scene | None, str]:
+    """The scene of a record that has the poses of its bodies, or what it lacks to be drawn."""
+    scene = record.scene
+    if scene is None or not scene.bodies:
+        return None, "the record has no scene"
+    if POSITION not in record or ORIENTATION not in record:
+        return None, "not every joint was recorded"
+    if record[POSITION].shape != (len(record), len(scene.bodies), 3):
+        return None, "the scene has other bodies than the record"
+    return scene, ""
+
+
+def robot_of(record: Record) -> Robot | None:
+    """The robot of a record; None without samples, a scene, or the poses of its bodies."""
+    scene, _ = placed(record)
+    if scene is None or not len(record):
+        return None
+    position = record[POSITION][np.isfinite(record[POSITION]).all(axis=(1, 2))]
+    if not len(position):
+        return None
+    ends = [position[0], *(point_positions(record, p, 0)[None] for p in scene.points)]
+    known = np.concatenate(ends)
+    reach = float(np.ptp(known[np.isfinite(known).all(axis=1)], axis=0).max(initial=0.0)) or 0.5
+    return Robot(record, scene, _frames(record, reach), reach)
+
+
+def _frames(record: Record, reach: float) -> NDArray[np.intp]:
+    """Samples between which the poses of all others follow to ``POSE_ERROR``: each 2^n-th one, and the last."""
+    count = len(record)
+    position, turn = record[POSITION].reshape(count, -1), record[ORIENTATION].reshape(count, -1)
+    stride, arm = 1, min(reach, 1.0)
+    while 4 * stride < count:
+        rows = _every(count, 2 * stride)
+        # What is left out, and the ends of its interval.
+        between = np.delete(np.arange(count), rows)
+        left = np.searchsorted(rows, between) - 1
+        a, b = rows[left], rows[left + 1]
+        t = record.time
+        share = ((t[between] - t[a]) / np.maximum(t[b] - t[a], 1e-12))[:, None].astype(np.float32)
+        with np.errstate(all="ignore"):
+            off = [
+                np.abs(x[between] - (x[a] + share * (x[b] - x[a]))).max(initial=0.0) * weight
+                for x, weight in ((position, 1.0), (turn, 2.0 * arm))
+            ]
+        if not max(off) <= POSE_ERROR and count // stride <= FRAMES:
+            break
+        stride *= 2
+    return _every(count, stride)
+
+
+def _every(count: int, stride: int) -> NDArray[np.intp]:
+    return np.unique(np.append(np.arange(0, count, stride), count - 1))
+
+
+def bounds(robots: Sequence[Robot], axes: Array = WORLD_AXES) -> tuple[Array, Array]:
+    """The box along some axes, unit vectors (3, 3), in which everything moves, with some room, (3,) and (3,) [m]."""
+    pooled = moving(robots) @ axes.T
+    low, high = pooled.min(axis=0), pooled.max(axis=0)
+    # What hardly moves is not blown up to fill the window, and what is flat has some depth to stand in.
+    span, reach = float((high - low).max()), max(robot.reach for robot in robots)
+    least = max(0.24 * span, 0.6 * reach if span < 0.6 * reach else 0.0)
+    room = np.maximum(0.5 * (least - (high - low)), 0.0) + 0.03 * least + max(map(_thickness, robots))
+    return low - room, high + room
+
+
+def moving(robots: Sequence[Robot]) -> Array:
+    """Places of all bodies and the hand, its target, and ends of what stands still, (n, 3) [m]."""
+    points = []
+    for robot in robots:
+        record = robot.record
+        found = [record[POSITION].reshape(-1, 3).astype(np.float64), *(one for _, one in paths(record, robot.scene))]
+        # The last samples of a run that diverged are far from everything else.
+        points += found if record.complete else [_without_ends(one) for one in found]
+        for shape in robot.scene.fixed:
+            middle, half = np.array(shape.position), 0.5 * max(shape.size) if shape.kind != "mesh" else 0.0
+            points += [np.stack([middle - half, middle + half])]
+    pooled = np.concatenate(points)
+    return np.asarray(pooled[np.isfinite(pooled).all(axis=1)])
+
+
+def _without_ends(points: Array) -> Array:
+    """Points without the outermost hundredth at either end of each axis, (T, 3)."""
+    points = points[np.isfinite(points).all(axis=1)]
+    return np.clip(points, *np.percentile(points, (1.0, 99.0), axis=0)) if len(points) else points
+
+
+def _thickness(robot: Robot) -> float:
+    """How far shapes reach beside the lines between the bodies, more or less [m]."""
+    shapes = [shape for body in robot.scene.bodies for shape in body.shapes]
+    round_ = [shape.size[0] for shape in shapes if shape.kind in ("cylinder", "capsule", "sphere")]
+    boxes = [0.5 * sorted(shape.size)[1] for shape in shapes if shape.kind == "box"]
+    meshes = [0.08 * robot.reach for shape in shapes if shape.kind == "mesh"]
+    return min(max([*round_, *boxes, *meshes], default=0.0), 0.5 * robot.reach)
+
+
+def azimuth(robots: Sequence[Robot]) -> float:
+    """Direction in which robot and hand reach furthest, (−π/2, π/2] about z [rad]: the page looks across it."""
+    clouds = [robot.record[POSITION][robot.rows][..., :2].reshape(-1, 2).astype(np.float64) for robot in robots]
+    clouds += [path[robot.rows, :2] for robot in robots for _, path in paths(robot.record, robot.scene)]
+    points = np.concatenate(clouds)
+    points = points[np.isfinite(points).all(axis=1)]
+    spread = points - points.mean(axis=0)
+    x, y = np.linalg.eigh(spread.T @ spread)[1][:, 1].tolist()
+    return math.atan2(y, x) if x > 0.0 or (x == 0.0 and y > 0.0) else math.atan2(-y, -x)
+
+
+def paths(record: Record, scene: Scene) -> Iterator[tuple[str, Array]]:
+    """Ways of the hand and of its target, as far as they are known, (T, 3) [m] each."""
+    if scene.hand is not None:
+        yield "hand", np.asarray(point_positions(record, scene.hand), dtype=np.float64)
+    target = hand_target(record)
+    if target is None and "w_target" in record:
+        target = record["w_target"][:, :3]
+    if target is not None:
+        yield "target", np.asarray(target, dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Contact:
+    """What a contact point did.
+
+    Attributes
+    ----------
+    friction : coefficient of the cone that its force cannot leave, 0 where it is not known
+    normal : unit vectors into the free side, (T, 3)
+    force : normal force, positive where the surface pushes, (T,) [N]
+    tangent : the rest of its force, (T, 3) [N], None where it was not recorded
+    mode : 0 open, 1 slips, 2 sticks, (T,), under the unilateral law
+    """
+
+    point: Point
+    friction: float
+    normal: Array
+    force: Array
+    tangent: Array | None
+    mode: Array | None
+
+
+def contacts(robot: Robot, rows: NDArray[np.intp] | slice = slice(None)) -> list[Contact]:
+    """Contact points at samples of the record; under the unilateral law those that ever touched."""
+    record, scene = robot.record, robot.scene
+    if "contact_normal_force" not in record:
+        return []
+    names = record.labels["contact_normal_force"]
+    found = []
+    for point in scene.contacts:
+        surface = scene.surface(point.surface)
+        if surface is None or point.name not in names:
+            continue
+        k = names.index(point.name)
+        mode = record["contact_mode"][rows, k] if "contact_mode" in record else None
+        if mode is not None and not mode.any():
+            continue
+        place = np.asarray(point_positions(record, point, rows), dtype=np.float64)
+        normal = surface.normal(place)
+        force = np.asarray(record["contact_normal_force"][rows, k], dtype=np.float64)
+        tangent = None
+        if "contact_force" in record:
+            tangent = record["contact_force"][rows, k] - force[:, None] * normal
+        found.append(Contact(point, _friction(record, point.name), normal, force, tangent, mode))
+    return found
+
+
+@dataclass(frozen=True)
+class Sunk:
+    """A joint or the hand that was below a surface by more than the radius of its link.
+
+    Attributes
+    ----------
+    body, position : index, and the point in the body's frame [m]
+    least : it counts from this depth on: the radius, and what poses are not told apart by [m]
+    depth : how far the point is below the surface, (T,) [m], negative above it
+    """
+
+    name: str
+    surface: str
+    body: int
+    position: Vector3
+    least: float
+    depth: Array
+
+
+def sunk(record: Record, scene: Scene, rows: NDArray[np.intp] | slice = slice(None)) -> list[Sunk]:
+    """Joints, and the hand, below surfaces at samples of the record: surfaces hold contact points only.
+
+    Bodies of a mobile base, and wheels, stand where the model has them.
+    """
+    wheels = {k for k, body in enumerate(scene.bodies) if body.joint.signal == "rho"} | set(scene.base)
+    points = [(body.joint.name, k, HERE_POINT) for k, body in enumerate(scene.bodies) if k not in wheels]
+    if scene.hand is not None and scene.hand.body != WORLD:
+        points.append((scene.hand.name, scene.hand.body, scene.hand.position))
+    found = []
+    for name, k, position in points:
+        place = np.asarray(point_positions(record, Point(name, "hand", k, position), rows), dtype=np.float64)
+        allowed = scene.bodies[k].radius + NOT_BELOW
+        for surface in scene.surfaces:
+            with np.errstate(all="ignore"):
+                depth = -surface.gap(place)
+            if (depth > allowed).any():
+                found.append(Sunk(name, surface.name, k, position, allowed, depth))
+    return found
+
+
+def largest_force(found: Sequence[Contact]) -> float:
+    """The force whose arrow has full length [N]: the 98th percentile, so that a spike does not shrink the rest."""
+    sizes = np.abs(np.concatenate([one.force for one in found])) if found else np.zeros(0)
+    sizes = sizes[np.isfinite(sizes)]
+    return max(float(np.percentile(sizes, 98.0)) if len(sizes) else 1.0, 1e-6)
+
+
+def _friction(record: Record, name: str) -> float:
+    """The coefficient of the cone that the force of a contact cannot leave; 0 where it is not known."""
+    contacts = record.provenance.get("scenario", {}).get("contacts", {})
+    points = contacts.get("points") or {}
+    point = points.get(name, {}) if isinstance(points, Mapping) else {}
+    kinetic = [one.get("friction") for one in (point, contacts)]
+    held = [one.get("static_friction") for one in (point, contacts)]
+    known = [next((float(one) for one in both if one is not None), 0.0) for both in (kinetic, held)]
+    return max(known)

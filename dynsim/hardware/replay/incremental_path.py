@@ -1,0 +1,85 @@
+"""A path that comes knot by knot, each held against the limits of its joints before anything goes there.
+
+The limits are those of the offline check, and so is the function,
+:meth:`~dynsim.hardware.replay.check.MotionLimits.margins`: of a whole record it looks at every interval, here at the
+last one, and at the windows that end in it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from dynsim.hardware.replay.check import MotionLimits
+from dynsim.hardware.replay.motion import Array
+from dynsim.hardware.replay.trajectory import SHAKING_WINDOW, Path
+from dynsim.hardware.servo_map import ServoMap
+
+
+class Sample(NamedTuple):
+    """One posture: time [s], joint angles [rad] and rates [rad/s], shape (N,), in the order of the map.
+
+    ``lift`` and ``lift_rate`` are what lifting wheel pairs adds to them, as in
+    :func:`~dynsim.hardware.replay.trajectory.path_of_record`.
+    """
+
+    time: float
+    position: Array
+    velocity: Array
+    lift: Array | float = 0.0
+    lift_rate: Array | float = 0.0
+
+    @property
+    def posture(self) -> Array:
+        """Where the joints are to be [rad], shape (N,)."""
+        return self.position + self.lift
+
+
+class IncrementalPath:
+    """Knots of a path as they come, as far back as goals and limits need them.
+
+    Parameters
+    ----------
+    first : Sample
+        Where it rests.
+    servo_map : ServoMap
+    """
+
+    def __init__(self, first: Sample, servo_map: ServoMap) -> None:
+        self._limits = MotionLimits(servo_map)
+        self._held = np.array([servo.kind.follows.rates == "held" for servo in servo_map.servos])
+        rates = np.zeros((0, len(first.position)))
+        self._path = Path(np.array([first.time]), first.posture[None], rates, rates)
+        self._last = first
+
+    @property
+    def end(self) -> float:
+        """Time of the last knot [s]."""
+        return self._path.end
+
+    def at(self, time: float) -> tuple[Array, Array]:
+        """Joint angles [rad] and rates [rad/s] at a time [s]."""
+        return self._path.at(time)
+
+    def append(self, sample: Sample, *, keep: float) -> list[str]:
+        """One more knot, unless it breaks limits; which ones, in words. Of jerk and shaking as if the path ended there.
+
+        What is before ``keep`` [s], and before the windows of the limits, is dropped.
+        """
+        path, last = self._path, self._last
+        with np.errstate(all="ignore"):  # what is no number holds no bound
+            h = sample.time - last.time
+            held_rate = (sample.position - last.position) / h
+            # Before the first posture nothing is known: there the rate of the lift is that of the first interval.
+            lift_rate = (sample.lift - last.lift) / h if len(path.time) == 1 else last.lift_rate
+            after = np.where(self._held, held_rate, last.velocity) + lift_rate
+            before = np.where(self._held, held_rate, sample.velocity) + sample.lift_rate
+            # Windows are looked at that end after the last knot. Knots before these have a part in their acceleration.
+            longer = path.since(min(keep, path.end - SHAKING_WINDOW), 2).longer(
+                sample.time, sample.posture, after, before
+            )
+            broken = [str(margin) for margin in self._limits.margins(longer, since=path.end, broken=True)]
+        if not broken:
+            self._path, self._last = longer, sample
+        return broken

@@ -1,0 +1,555 @@
+"""What a replay lets out while it runs: a log to read along (``tail -f``), its cycles, progress.
+
+What is told is kept in memory by the loop, which waits for nobody; a thread takes it from there to a file or a display.
+A disk that is full or slow, a terminal that is held: neither touches the loop.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import os
+import struct
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ParamSpec, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dynsim.hardware.bus.clock import Clock
+from dynsim.hardware.bus.control_table import VOLT_PER_UNIT
+from dynsim.hardware.errors import PortError
+from dynsim.hardware.replay.rules import Cycle
+from dynsim.hardware.replay.states import Progress, State, StopRequest
+from dynsim.hardware.servo_map import ServoMap
+from dynsim.record.scene import Scene
+from dynsim.system.files import INCOMPLETE, lock
+from dynsim.system.terminal import plain
+
+INTERVAL = 0.5
+"""Between two writes of what has come since [s]: a process that is killed loses no more than this."""
+PATIENCE = 5.0
+"""Longest wait for a file or display that does not come back, after the run [s]."""
+LOG_INTERVAL = 1.0
+"""Between two lines about the following error [s]."""
+PART = "measured.part"
+"""Name of the file that grows during a run; the measured record takes its place at the end."""
+PART_FORMAT = 1
+MEASURED, SUMMARY, LOG = "measured.h5", "summary.json", "replay.log"
+REGISTERS, REGISTERS_AFTER_FAULT = "registers.json", "registers_after_fault.json"
+FILES = (PART, MEASURED, SUMMARY, LOG, REGISTERS, REGISTERS_AFTER_FAULT, INCOMPLETE)
+MADE_OF_THEM = ("comparison.*", "figures")
+"""What other commands put beside a measured record."""
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class Journal:
+    """Keeps the state of a replay, and tells of it. Nothing here raises.
+
+    Attributes
+    ----------
+    state : State
+    log : RunLog
+    observer : callable, optional
+        Called with a Progress after every cycle and on every change of state.
+    failures : dict
+        The first error of every output that failed, by its name; that output is off since.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        recorder: Recorder,
+        log: RunLog,
+        observer: Callable[[Progress], None] | None,
+        stop: StopRequest,
+    ) -> None:
+        self.state = State.CONNECT
+        self.observer = observer
+        self.log = log
+        self.failures: dict[str, BaseException] = {}
+        self._clock = clock
+        self._recorder = recorder
+        self._stop = stop
+        self._origin = clock.now()
+        self._last_logged = -math.inf
+        self._kept: list[tuple[float, str, str]] | None = None
+
+    def guard(self, what: str, call: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T | None:
+        """Run an output; None when it fails, and from then on without trying.
+
+        Parameters
+        ----------
+        what : str
+            Its name: what :attr:`failures` lists, and what is switched off by an error.
+        call : callable
+            A KeyboardInterrupt or SystemExit out of it becomes a request to stop: nothing may leave a moving robot.
+        """
+        if what in self.failures:
+            return None
+        try:
+            return call(*args, **kwargs)
+        except Exception as error:
+            self.failures[what] = error
+        except BaseException as error:
+            self.failures[what] = error
+            self._stop()
+        if what != "log":
+            self.say(f"{what} failed and is off from here: {self.failures[what]!r}")
+        return None
+
+    def enter(self, state: State) -> None:
+        self.state = state
+        self.say("enter")
+        self._observe(0.0, 0.0)
+
+    def say(self, text: str) -> None:
+        line = (self._clock.now() - self._origin, self.state.name, text)
+        if self._kept is None:
+            self._write(*line)
+        else:
+            self._kept.append(line)
+
+    def report(self, following_error: float, fraction: float) -> None:
+        """After a cycle: the worst following error [rad], and how much of the motion is done."""
+        if self._kept is not None:
+            return
+        now = self._clock.now()
+        if now - self._last_logged >= LOG_INTERVAL:
+            self._last_logged = now
+            hottest = self._recorder.hottest
+            self.say(
+                f"following error {following_error:.4f} rad"
+                + (f", hottest {hottest:.0f} °C" if hottest == hottest else "")
+            )
+        self._observe(fraction, following_error)
+
+    @contextmanager
+    def held_back(self) -> Iterator[None]:
+        """Within, nothing leaves: what is said is written afterwards, and the observer hears of nothing.
+
+        A disk or a terminal that blocks cannot delay what happens to the robot meanwhile.
+        """
+        self._kept = []
+        try:
+            yield
+        finally:
+            kept, self._kept = self._kept, None
+            for line in kept:
+                self._write(*line)
+
+    def _write(self, time: float, state: str, text: str) -> None:
+        self.guard("log", self.log.write, time, state, text)
+        if self.log.failure is not None:
+            self.failures.setdefault("log", self.log.failure)
+
+    def _observe(self, fraction: float, following_error: float) -> None:
+        if self.observer and self._kept is None:
+            progress = Progress(self.state, fraction, following_error, self._recorder.hottest)
+            self.guard("progress", self.observer, progress)
+
+
+Rows = NDArray[np.void]
+SCALARS = struct.Struct("=5d3i")
+"""Of a row."""
+
+
+def row_type(servos: int) -> np.dtype[np.void]:
+    """One cycle of so many servos, as it lies in memory: without gaps, in the byte order of the machine.
+
+    ``time``, ``origin`` (the clock when the path began, NaN before), ``path_time``, ``lateness`` and ``exchange`` in
+    [s]; positions [rad], velocities [rad/s] and torques [N·m] of joints, NaN where a status was missed; supply [V],
+    temperature [°C].
+    """
+    seconds = ["time", "origin", "path_time", "lateness", "exchange"]
+    numbers = ["state", "stray", "skipped"]
+    joints = ["goal_position", "goal_velocity", "position", "velocity", "torque", "volts", "celsius"]
+    return np.dtype(
+        [(name, "f8") for name in seconds]
+        + [(name, "i4") for name in numbers]
+        + [(name, "f8", (servos,)) for name in joints]
+        + [("alert", "?", (servos,))]
+    )
+
+
+class Recorder:
+    """Collects the timed cycles of a replay, as rows that never change: another thread may take them meanwhile.
+
+    Attributes
+    ----------
+    type : dtype
+        Of a row.
+    hottest : float
+        Servo [°C], NaN before the first health read.
+    """
+
+    def __init__(self, servo_map: ServoMap) -> None:
+        count = len(servo_map.servos)
+        self.type = row_type(count)
+        self.hottest = math.nan
+        self._rows: list[bytes] = []
+        self._columns = {servo.id: column for column, servo in enumerate(servo_map.servos)}
+        self._volts, self._celsius = np.full(count, np.nan), np.full(count, np.nan)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def add(self, cycle: Cycle, state: State, path_time: float, origin: float) -> None:
+        """Keep one cycle.
+
+        Parameters
+        ----------
+        path_time, origin : time along the path, and of its beginning on the clock [s]; NaN before it has begun
+        """
+        if cycle.health:
+            for id_, registers in cycle.health.items():
+                self._volts[self._columns[id_]] = registers["present_voltage"] * VOLT_PER_UNIT
+                self._celsius[self._columns[id_]] = registers["present_temperature"]
+            self.hottest = float(np.nanmax(self._celsius))
+        scalars = SCALARS.pack(
+            cycle.time, origin, path_time, cycle.lateness, cycle.exchange, state, cycle.stray, cycle.skipped
+        )
+        # Some microseconds faster than to assign them field by field, and this is done in every cycle.
+        arrays: tuple[Any, ...] = (
+            cycle.goal_position,
+            cycle.goal_velocity,
+            cycle.position,
+            cycle.velocity,
+            cycle.torque,
+            self._volts,
+            self._celsius,
+            cycle.alert,
+        )
+        self._rows.append(b"".join((scalars, *arrays)))
+
+    def since(self, first: int) -> bytes:
+        """Rows from number ``first`` on."""
+        return b"".join(self._rows[first:])
+
+    def all(self) -> Rows:
+        return np.frombuffer(self.since(0), dtype=self.type)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the columns of rows are called in a record.
+
+    Signals measured carry the names and labels of the signals followed; ``<name>_goal`` is what was commanded.
+
+    Attributes
+    ----------
+    joints : list of str
+    labels : list of str
+        Of the columns of the signals that the joints follow.
+    positions, velocities : list of str
+        The signal that each joint follows; held joints are among those of their kind.
+    provenance : dict
+    """
+
+    joints: list[str]
+    labels: list[str]
+    positions: list[str]
+    velocities: list[str]
+    provenance: dict[str, Any]
+
+    @classmethod
+    def of(cls, servo_map: ServoMap, provenance: dict[str, Any]) -> Layout:
+        servos = servo_map.servos
+        return cls(
+            list(servo_map.joints),
+            [servo.label for servo in servos],
+            [servo.kind.follows.position for servo in servos],
+            [servo.kind.follows.velocity for servo in servos],
+            provenance,
+        )
+
+    def groups(self) -> Iterator[tuple[str, str, list[int]]]:
+        """(signal, "position" or "velocity", columns)."""
+        for source, names in (("position", self.positions), ("velocity", self.velocities)):
+            for name in dict.fromkeys(names):
+                yield name, source, [column for column, one in enumerate(names) if one == name]
+
+
+class GrowingFile:
+    """A file that can be read while it grows; nobody else's, and held until it is closed.
+
+    See :func:`dynsim.system.files.lock`.
+
+    Attributes
+    ----------
+    path : Path
+
+    Raises
+    ------
+    OSError
+        It cannot be made, or is there already.
+    """
+
+    def __init__(self, path: Path) -> None:
+        # Not buffered: what a buffer still holds would be tried again, and fail again, when it is closed.
+        self.path = path
+        self._stream = path.open("xb", buffering=0)
+        try:
+            lock(self._stream.fileno(), wait=False)
+        except OSError:
+            self.discard()
+            raise
+
+    def append(self, data: bytes) -> None:
+        """Raises OSError."""
+        left = memoryview(data)
+        while left:
+            left = left[self._stream.write(left) or 0 :]
+
+    def sync(self) -> None:
+        """Wait until the disk has it. Raises OSError."""
+        os.fsync(self._stream.fileno())
+
+    def close(self) -> None:
+        """Raises OSError."""
+        self._stream.close()
+
+    def discard(self) -> None:
+        """Close and remove it: the run that it was made for does not begin."""
+        with suppress(OSError):
+            self._stream.close()
+        with suppress(OSError):
+            self.path.unlink()
+
+
+class RunLog:
+    """Lines "time [s]  state  text". They reach the file by :meth:`pump`, which another thread calls.
+
+    Parameters
+    ----------
+    path : path or None
+        None: the lines are only in ``lines``.
+
+    Attributes
+    ----------
+    lines : list of str
+    failure : Exception or None
+        Why the file ends before the run did.
+    wake : callable
+        Called after every line: the thread that pumps may be asleep.
+
+    Raises
+    ------
+    OSError
+        The file cannot be made.
+    """
+
+    name = "log"
+
+    def __init__(self, path: Path | None) -> None:
+        self.lines: list[str] = []
+        self.failure: Exception | None = None
+        self.wake: Callable[[], None] = lambda: None
+        self._file = GrowingFile(path) if path else None
+        self._written = 0
+
+    def write(self, time: float, state: str, text: str) -> None:
+        self.lines.append(plain(f"{time:10.4f}  {state:<13}  {text}"))
+        self.wake()
+
+    def pump(self) -> None:
+        count = len(self.lines)
+        if self._file and count > self._written:
+            text = "\n".join([*self.lines[self._written : count], ""])
+            self._written = count
+            self._file.append(text.encode("utf-8", errors="backslashreplace"))
+
+    def close(self) -> None:
+        if self._file:
+            self._file.close()
+
+    def discard(self) -> None:
+        if self._file:
+            self._file.discard()
+
+
+class RowStream:
+    """The rows of a replay on their way to ``measured.part``: one line of JSON, then rows as they lie in memory.
+
+    Parameters
+    ----------
+    path : path
+    recorder : Recorder
+    layout : Layout
+    scene : Scene or None
+        Of the replayed record.
+
+    Raises
+    ------
+    OSError
+        The file cannot be made, or its first line not be written.
+    """
+
+    name = "streamed record"
+
+    def __init__(self, path: Path, recorder: Recorder, layout: Layout, scene: Scene | None) -> None:
+        self.failure: Exception | None = None
+        self._recorder = recorder
+        self._written = 0
+        header = {
+            "format": PART_FORMAT,
+            "row": recorder.type.descr,
+            "layout": vars(layout),
+            "scene": scene.to_json() if scene else "",
+        }
+        self._file = GrowingFile(path)
+        try:
+            self._file.append(json.dumps(header, default=str).encode("utf-8") + b"\n")
+        except BaseException:
+            self._file.discard()
+            raise
+
+    def discard(self) -> None:
+        self._file.discard()
+
+    def pump(self) -> None:
+        rows = self._recorder.since(self._written)
+        if rows:
+            self._written += len(rows) // self._recorder.type.itemsize
+            self._file.append(rows)
+            self._file.sync()
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class Outlet(Protocol):
+    """Something that takes what the loop has left in memory to where it can be seen."""
+
+    name: str
+    failure: Exception | None
+
+    def pump(self) -> None:
+        """Take what has come since the last call. May raise: then it is not called again."""
+        ...
+
+    def close(self) -> None:
+        """After the last call of ``pump``, also after one that failed."""
+        ...
+
+
+class Background:
+    """A thread that pumps outlets, at least every ``interval`` [s] and whenever it is woken.
+
+    Raises
+    ------
+    RuntimeError
+        The system gives no thread; the outlets are closed.
+    """
+
+    def __init__(self, outlets: Sequence[Outlet], interval: float) -> None:
+        self._outlets = outlets
+        self._interval = interval
+        self._woken = threading.Event()
+        self._ending = False
+        self._at_work: Outlet | None = None
+        # Not waited for when Python ends: a terminal may be held for ever.
+        self._thread = threading.Thread(target=self._run, name="dynsim outlets", daemon=True)
+        try:
+            self._thread.start()
+        except BaseException:
+            self._close_outlets()
+            raise
+
+    def wake(self) -> None:
+        self._woken.set()
+
+    def close(self, patience: float = PATIENCE) -> dict[str, Exception]:
+        """Pump once more and end; the first error of every outlet that failed, by name.
+
+        Parameters
+        ----------
+        patience : longest wait [s]; an outlet that does not come back in this time has failed with a TimeoutError
+        """
+        self._ending = True
+        self.wake()
+        self._thread.join(patience)
+        failures = {outlet.name: outlet.failure for outlet in self._outlets if outlet.failure is not None}
+        stuck = self._at_work
+        if self._thread.is_alive() and stuck is not None:
+            failures.setdefault(stuck.name, TimeoutError(f"does not answer for {patience:g} s"))
+        return failures
+
+    def _run(self) -> None:
+        while not self._ending:
+            self._woken.wait(self._interval)
+            self._woken.clear()
+            self._each("pump")
+        self._each("pump")
+        self._close_outlets()
+
+    def _each(self, method: str) -> None:
+        for outlet in self._outlets:
+            if outlet.failure is None:
+                self._guard(outlet, method)
+        self._at_work = None
+
+    def _close_outlets(self) -> None:
+        for outlet in self._outlets:
+            self._guard(outlet, "close")
+        self._at_work = None
+
+    def _guard(self, outlet: Any, method: str) -> None:
+        self._at_work = outlet
+        try:
+            getattr(outlet, method)()
+        except Exception as error:
+            outlet.failure = outlet.failure or error
+
+
+def move_away(folder: Path) -> Path | None:
+    """Move what an earlier replay left to a folder ``previous_1``, ``previous_2``, … within; None if there is nothing.
+
+    Raises
+    ------
+    PortError
+        Another replay is writing there.
+    OSError
+        Something cannot be moved.
+    """
+    found = [folder / name for name in FILES if os.path.lexists(folder / name)]
+    if not found:
+        return None
+    if is_held(folder / PART):
+        raise PortError(f"{folder}: another replay is writing there; give this one another folder (--out)")
+    if folder / PART in found or folder / MEASURED in found:
+        found += [path for pattern in MADE_OF_THEM for path in folder.glob(pattern)]
+    place = _new_folder(folder)
+    for path in found:
+        path.rename(place / path.name)
+    return place
+
+
+def is_held(part: Path) -> bool:
+    """Whether the process that writes a streamed record is alive. Raises OSError."""
+    try:
+        descriptor = os.open(part, os.O_RDONLY)
+    except FileNotFoundError:
+        return False
+    try:
+        return not lock(descriptor, wait=False)
+    finally:
+        os.close(descriptor)
+
+
+def _new_folder(folder: Path) -> Path:
+    for number in itertools.count(1):
+        place = folder / f"previous_{number}"
+        try:
+            place.mkdir()
+        except FileExistsError:
+            continue
+        return place
+    raise AssertionError

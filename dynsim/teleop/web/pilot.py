@@ -1,0 +1,119 @@
+"""Commands of a pilot's browser: small JSON texts of a few known keys, everything else refused by name."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+from dynsim.snake.description import FIXING, NO_REQUEST, SWITCHING
+
+MOST_BYTES = 4096
+"""Of a message; a longer one closes the connection."""
+MOST_COUNT = 2**53
+"""What a browser can count to."""
+STEPS = 100
+"""In which full speed is divided: a stick that trembles does not fill the script."""
+REQUESTS = {"switching": SWITCHING, "fixing": FIXING}
+ACTIONS = ("take", "leave", "end")
+
+
+class Refused(ValueError):
+    """A message that is none; its text says why."""
+
+
+@dataclass(frozen=True)
+class PilotCommand:
+    """What the pilot asks for now.
+
+    Attributes
+    ----------
+    count : of the browser's messages, rising; axes : in parts of full speed, −1 to 1
+    held : the dead-man's key is held
+    request : a mode to go to, ``NO_REQUEST`` for none; closed : the gripper
+    """
+
+    count: int
+    axes: tuple[float, ...]
+    held: bool
+    request: int = NO_REQUEST
+    closed: bool = False
+
+
+def parse(text: str | bytes, axes: int, modes: tuple[int, ...]) -> PilotCommand | str:
+    """A command, or one of ``ACTIONS``.
+
+    Raises
+    ------
+    Refused
+        With what is wrong.
+    """
+    if not isinstance(text, str):
+        raise Refused("a binary message; texts are understood")
+    try:
+        message = json.loads(text, parse_constant=_no_number)
+    except Refused:
+        raise
+    except (ValueError, RecursionError):
+        raise Refused("no JSON") from None
+    if not isinstance(message, dict):
+        raise Refused("no JSON object")
+    if set(message) == {"do"}:
+        if message["do"] not in ACTIONS:
+            raise Refused(f"do: one of {', '.join(ACTIONS)}")
+        return str(message["do"])
+    if unknown := set(message) - {"n", "axes", "held", "mode", "closed"}:
+        raise Refused(f"unknown key {sorted(unknown)[0][:40]!r}")
+    return PilotCommand(
+        count=_count(message.get("n")),
+        axes=_axes(message.get("axes"), axes),
+        held=_flag(message, "held"),
+        request=_request(message.get("mode"), modes),
+        closed=_flag(message, "closed"),
+    )
+
+
+def _no_number(name: str) -> NoReturn:
+    raise Refused(f"{name} is no number")
+
+
+def _count(value: Any) -> int:
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= MOST_COUNT:
+        raise Refused("n: must count the messages")
+    return value
+
+
+def _axes(values: Any, count: int) -> tuple[float, ...]:
+    """As many as there are, finite; what is beyond full speed is full speed."""
+    if not isinstance(values, list) or len(values) != count:
+        raise Refused(f"axes: must be a list of {count} numbers")
+    found = []
+    for value in values:
+        # Whole numbers may have thousands of digits, and decimals overflow to infinity.
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, int | float)
+            or not (isinstance(value, int) or math.isfinite(value))
+        ):
+            raise Refused("axes: must be finite numbers")
+        found.append(round(STEPS * max(-1.0, min(1.0, value))) / STEPS)
+    return tuple(found)
+
+
+def _flag(message: dict[str, Any], key: str) -> bool:
+    value = message.get(key, False)
+    if not isinstance(value, bool):
+        raise Refused(f"{key}: must be true or false")
+    return value
+
+
+def _request(value: Any, modes: tuple[int, ...]) -> int:
+    if value is None:
+        return NO_REQUEST
+    if isinstance(value, str) and value in REQUESTS and modes:
+        return REQUESTS[value]
+    if isinstance(value, int) and not isinstance(value, bool) and value in modes:
+        return value
+    known = ", ".join([*REQUESTS, *map(str, modes)]) if modes else "none here"
+    raise Refused(f"mode: no such mode; known: {known}")

@@ -1,0 +1,394 @@
+"""How ordinary braced arms end: thousands of drawn scenes, of which each must come to its end or to a named stop.
+
+Arms of 3 to 12 joints with DC motors lean on planes, pipes, spheres, boxes and terrain: points that are declared, all
+joints or all links may touch, with friction that holds more or as much at rest, payloads, pushes, soft and stiff gains,
+hand paths.
+
+    PYTHONPATH=tests python -m support.endings --count 10000 --jobs 2
+
+writes results/endings/endings.json, which docs/validation.md quotes, in about half an hour; ``--journal FILE`` keeps
+what is done, and goes on with it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from dynsim._version import __version__
+from dynsim.engine import Progress, simulate
+from dynsim.errors import DynsimError, SimulationInterrupted, SimulationStopped
+from dynsim.scenario.reading import scenario_from_resolved
+from dynsim.studies.processes import WorkerInterrupted, WorkerLost, run_in_processes
+from dynsim.system.files import write_json
+
+Array = NDArray[np.float64]
+
+FILE = Path("results/endings/endings.json")
+SEED = 27
+# Wall time of a run after which it is told as one that was cut off [s]: a hundred times what the longest take.
+WALL_LIMIT_S = 60.0
+METHODS = ("radau5", "radau5", "dopri5", "time_stepping")
+SURFACES = ("plane", "cylinder", "sphere", "box", "height_field")
+FINISHED, REFUSED = "finished", "refused"
+TERRAINS = 4
+# Heights of the grid that a terrain has along each side, and their distance [m].
+GRID, SPACING = 24, 0.15
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How one scene ended.
+
+    Attributes
+    ----------
+    scene : its number
+    status : ``finished``, ``refused`` before the first step, or the kind of the stop
+    reason : of a stop or refusal
+    time_s : that was simulated [s]
+    wall_s : of its integration [s]
+    """
+
+    scene: int
+    method: str
+    surface: str
+    status: str
+    reason: str
+    time_s: float
+    wall_s: float
+
+
+def scene(number: int, terrains: Sequence[str]) -> dict[str, Any]:
+    """A scene by its number, as a scenario file would have it; ``terrains``: files of :func:`write_terrains`."""
+    random = np.random.default_rng([SEED, number])
+    method, surface = str(random.choice(METHODS)), str(random.choice(SURFACES))
+    duration = float(random.uniform(0.3, 1.0))
+    chain, elbow = _chain(random)
+    joints = _places(chain)
+    radius = float(random.uniform(0.01, 0.04))
+    candidates = str(random.choice(("points", "joints", "links"), p=(0.5, 0.3, 0.2)))
+    # On the surface, or as high above it as it falls in a tenth of a second.
+    braced = bool(random.random() < 0.6)
+    thick = 1.02 * radius if candidates == "links" else 0.0
+    below = joints[elbow] - [0.0, 0.0, thick + (0.0 if braced else float(random.uniform(0.0, 0.05)))]
+    points: dict[str, Any] = {"elbow": {"body": f"link_{elbow + 1}", "surface": surface}}
+    if candidates == "links":
+        points = {}
+    elif random.random() < 0.3:
+        points["hand"] = {
+            "body": f"link_{len(chain)}",
+            "point_m": [0.0, 0.0, chain[-1]["length_m"]],
+            "surface": surface,
+        }
+    kinetic = float(random.choice((0.0, 0.1, random.uniform(0.05, 1.0)), p=(0.1, 0.1, 0.8)))
+    contacts: dict[str, Any] = {"law": "unilateral", "friction": kinetic, "candidates": candidates, "points": points}
+    if random.random() < 0.5:
+        contacts["static_friction"] = kinetic * float(random.uniform(1.0, 2.0))
+        if random.random() < 0.2:
+            contacts["stribeck_m_s"] = float(random.choice((0.01, 0.1)))
+    if random.random() < 0.15:
+        contacts["restitution"] = float(random.uniform(0.1, 0.8))
+    found: dict[str, Any] = {
+        "name": f"scene_{number}",
+        "duration_s": duration,
+        "plant": {"type": "serial_arm", "link": _link(random, radius), "chain": chain},
+        "controller": _controller(random, chain, joints, duration),
+        "surfaces": {surface: _surface(random, surface, below, terrains)},
+        "contacts": contacts,
+        "integrator": {"method": method, "wall_limit_s": WALL_LIMIT_S},
+        "record": {"rate_hz": 50.0},
+        "metrics": {"settle_s": 0.0},
+    }
+    if braced and "elbow" in points:
+        found["initial"] = {"on_surface": ["elbow"]}
+    if loads := _loads(random, chain, duration):
+        found["loads"] = loads
+    return found
+
+
+def _chain(random: Generator) -> tuple[list[dict[str, Any]], int]:
+    """An arm that comes down to its elbow and goes up behind it; and the number of the joint that is its elbow."""
+    n = int(random.integers(3, 13))
+    yaw = bool(n > 3 and random.random() < 0.6)
+    elbow = int(random.integers(2 if yaw else 1, n))
+    chain: list[dict[str, Any]] = []
+    before = 0.0
+    for k in range(n):
+        # About its own axis a link turns only what comes behind it.
+        axis, angle, length = "z", float(random.uniform(-20, 20)), float(random.uniform(0.15, 0.4))
+        if k == 0 and yaw:
+            length = 0.0
+        elif k in (int(yaw), elbow) or random.random() < 0.8:
+            # The link's angle to the vertical: down before the elbow, up behind it.
+            pitch = float(random.uniform(95, 130) if k < elbow else random.uniform(30, 85))
+            axis, angle, before = "y", pitch - before, pitch
+        mass = float(random.uniform(0.1, 1.0))
+        chain.append({"axis": axis, "length_m": length, "mass_kg": mass, "initial_deg": angle})
+    return chain, elbow
+
+
+def _places(chain: Sequence[Mapping[str, Any]]) -> Array:
+    """Where joints and hand are at the start, (n + 1, 3) [m]."""
+    rotation, place, found = np.eye(3), np.zeros(3), []
+    for link in chain:
+        found.append(place)
+        angle = math.radians(link["initial_deg"])
+        c, s = math.cos(angle), math.sin(angle)
+        turn = [[c, 0, s], [0, 1, 0], [-s, 0, c]] if link["axis"] == "y" else [[c, -s, 0], [s, c, 0], [0, 0, 1]]
+        rotation = rotation @ np.array(turn)
+        place = place + link["length_m"] * rotation[:, 2]
+    return np.array([*found, place])
+
+
+def _link(random: Generator, radius: float) -> dict[str, Any]:
+    """What all links have: a published motor, or one of the size of Maxon's RE 40 with a gear of 113:1."""
+    motor: dict[str, Any] = {"type": "wang_minami"}
+    if random.random() < 0.5:
+        motor = {
+            "type": "dc",
+            "torque_constant_N_m_per_A": 0.0302,
+            "resistance_ohm": 0.299,
+            "inductance_H": 8.23e-5,
+            "rotor_inertia_kg_m2": 1.42e-5,
+            "gear_ratio": 113,
+            "gear_damping_N_m_s_per_rad": 3e-6,
+            "mass_kg": 0.48,
+        }
+    if random.random() < 0.4:
+        motor["voltage_limit_V"] = 24
+    return {"radius_m": radius, "damping_N_m_s_per_rad": float(random.uniform(0.02, 0.5)), "motor": motor}
+
+
+def _controller(
+    random: Generator, chain: Sequence[Mapping[str, Any]], joints: Array, duration: float
+) -> dict[str, Any]:
+    """Gains from soft to stiff; the arm holds, or moves some joints, or its hand."""
+    gain = float(10.0 ** random.uniform(1.0, 3.3))
+    found: dict[str, Any] = {"type": "joint_pd", "k_p_V_per_rad": gain, "k_d_V_s_per_rad": gain * 0.04}
+    moves = random.random()
+    if moves < 0.35:
+        for k in random.choice(len(chain), size=min(3, len(chain)), replace=False).tolist():
+            start = chain[k]["initial_deg"]
+            angles = [start, start + float(random.uniform(-40, 40)), start + float(random.uniform(-40, 40))]
+            times = [0.0, 0.5 * duration, duration]
+            found.setdefault("joints", {})[f"joint_{k + 1}"] = {"times_s": times, "angles_deg": angles}
+    elif moves < 0.55:
+        there = joints[-1] + random.uniform(-0.05, 0.05, size=3)
+        if all(link["axis"] == "y" for link in chain):
+            there[1] = 0.0
+        path = {"type": "line", "from_m": joints[-1].tolist(), "to_m": there.tolist(), "duration_s": duration}
+        found["hand"] = {"joints": [f"joint_{k + 1}" for k in range(len(chain))], "path": path}
+    return found
+
+
+def _surface(random: Generator, kind: str, below: Array, terrains: Sequence[str]) -> dict[str, Any]:
+    """A surface whose top is at a place, (3,) [m]."""
+    size = float(random.uniform(0.05, 0.3))
+    x, y, z = below.tolist()
+    if kind == "plane":
+        return {"type": kind, "point_m": [x, y, z], "normal": [float(random.uniform(-0.1, 0.1)), 0.0, 1.0]}
+    if kind == "cylinder":
+        angle = float(random.uniform(-0.5, 0.5))
+        axis = [math.sin(angle), math.cos(angle), 0.0]
+        return {"type": kind, "point_m": [x, y, z - size], "axis": axis, "radius_m": size}
+    if kind == "sphere":
+        return {"type": kind, "center_m": [x, y, z - size], "radius_m": size}
+    if kind == "box":
+        edges = random.uniform(0.1, 0.5, size=3).tolist()
+        turn = [0.0, 0.0, float(random.uniform(-90, 90))]
+        return {"type": kind, "center_m": [x, y, z - 0.5 * edges[2]], "edges_m": edges, "rpy_deg": turn}
+    # Where the arm is above the middle of it, it is nowhere higher than there.
+    corner = -0.5 * SPACING * (GRID - 1)
+    file = str(random.choice(list(terrains)))
+    return {"type": kind, "file": file, "spacing_m": [SPACING] * 2, "origin_m": [x + corner, y + corner, z]}
+
+
+def _loads(random: Generator, chain: Sequence[Mapping[str, Any]], duration: float) -> dict[str, Any]:
+    """A payload, a steady force, a push."""
+    last, found = f"link_{len(chain)}", dict[str, Any]()
+    if random.random() < 0.3:
+        tip = [0.0, 0.0, chain[-1]["length_m"]]
+        mass, size = float(random.uniform(0.1, 1.0)), 0.03
+        found["tool"] = {"type": "payload", "body": last, "point_m": tip, "mass_kg": mass, "radius_m": size}
+    if random.random() < 0.15:
+        found["wind"] = {"type": "constant", "body": last, "force_N": random.uniform(-3, 3, size=3).tolist()}
+    if random.random() < 0.15:
+        times = (np.array([0.2, 0.4, 0.6]) * duration).tolist()
+        force = [[0.0] * 3, random.uniform(-20, 20, size=3).tolist(), [0.0] * 3]
+        found["push"] = {"type": "samples", "body": last, "times_s": times, "force_N": force}
+    return found
+
+
+def write_terrains(folder: Path) -> list[str]:
+    """Height fields of hills, highest in the middle, where they are zero; their files."""
+    files = []
+    for k in range(TERRAINS):
+        random = np.random.default_rng([SEED, 1_000_000 + k])
+        x = SPACING * (np.arange(GRID) - 0.5 * (GRID - 1))
+        heights = np.zeros((GRID, GRID))
+        for _ in range(6):
+            size, wave, phase = random.uniform(0.01, 0.04), random.uniform(1.0, 4.0, size=2), random.uniform(0, 6.28, 2)
+            heights += size * np.outer(np.cos(wave[0] * x + phase[0]), np.cos(wave[1] * x + phase[1]))
+        middle = heights[GRID // 2 - 1 : GRID // 2 + 1, GRID // 2 - 1 : GRID // 2 + 1].max()
+        heights -= middle + 0.2 * np.hypot(*np.meshgrid(x, x))
+        path = folder / f"terrain_{k}.npy"
+        np.save(path, heights)
+        files.append(str(path))
+    return files
+
+
+def end(number: int, terrains: Sequence[str], look: Progress | None = None) -> Ending:
+    """Simulate a scene, however that ends.
+
+    Raises
+    ------
+    SimulationInterrupted
+        ``look`` raised KeyboardInterrupt, or Ctrl-C.
+    """
+    drawn, record = scene(number, terrains), None
+    status, reason, time = FINISHED, "", drawn["duration_s"]
+    try:
+        record = simulate(scenario_from_resolved(drawn), look, pictured=False)
+    except SimulationInterrupted:
+        raise
+    except SimulationStopped as stop:
+        status, reason, time, record = stop.kind, str(stop), stop.time, stop.record
+    except DynsimError as error:
+        status, reason, time = REFUSED, str(error), 0.0
+    method, surface = drawn["integrator"]["method"], next(iter(drawn["surfaces"]))
+    wall = 0.0 if record is None else float(record.summary["integration_wall_s"])
+    return Ending(number, method, surface, status, reason, time, wall)
+
+
+def endings(
+    numbers: Iterable[int], jobs: int, terrains: Sequence[str], take: Callable[[Ending], None]
+) -> tuple[list[Ending], bool]:
+    """How scenes end, in the order of their numbers, and whether Ctrl-C came before all had; ``take`` gets each."""
+    found: list[Ending] = []
+
+    def take_late(number: int, result: Callable[[], Ending | None]) -> None:
+        try:
+            ending = result()
+        except WorkerInterrupted:
+            return
+        except WorkerLost as lost:
+            ending = Ending(number, "", "", type(lost).__name__, "its process was lost", 0.0, 0.0)
+        except SimulationInterrupted:
+            return
+        if ending is not None:
+            found.append(ending)
+            take(ending)
+
+    interrupted = run_in_processes(_Work(terrains), numbers, jobs, take_late)
+    return sorted(found, key=lambda ending: ending.scene), interrupted
+
+
+class _Work:
+    """:func:`end` for processes."""
+
+    def __init__(self, terrains: Sequence[str]) -> None:
+        self._terrains = list(terrains)
+
+    def __call__(self, number: int, look: Progress) -> Ending:
+        return end(number, self._terrains, look)
+
+
+def account(found: Sequence[Ending]) -> dict[str, Any]:
+    """How many ended how, by method and surface; wall times; the first scene of each kind of stop or refusal."""
+    kinds = sorted({one.status for one in found})
+    walls = {
+        method: [one.wall_s for one in found if one.method == method and one.status != REFUSED]
+        for method in sorted(set(METHODS))
+    }
+    longest = max(found, key=lambda one: one.wall_s)
+    return {
+        "scenes": len(found),
+        "by_status": dict(Counter(one.status for one in found).most_common()),
+        "by_method": {name: _counted(one.status for one in found if one.method == name) for name in walls},
+        "by_surface": {name: _counted(one.status for one in found if one.surface == name) for name in SURFACES},
+        "wall_s": {name: {"median": float(np.median(w)), "longest": max(w)} for name, w in walls.items() if w},
+        "longest": {"scene": longest.scene, "wall_s": longest.wall_s, "status": longest.status},
+        "examples": {
+            kind: {"scene": first.scene, "method": first.method, "reason": _short(first.reason)}
+            for kind in kinds
+            if kind != FINISHED
+            for first in [next(one for one in found if one.status == kind)]
+        },
+        "refused_because": _counted(_why(one.reason) for one in found if one.status == REFUSED),
+    }
+
+
+def _counted(values: Iterable[str]) -> dict[str, int]:
+    return dict(Counter(values).most_common())
+
+
+def _short(reason: str) -> str:
+    return " ".join(reason.split())
+
+
+def _why(reason: str) -> str:
+    """A refusal without its names and numbers."""
+    words = ["…" if any(c.isdigit() or c in "'_" for c in word) else word for word in reason.split()[1:]]
+    return " ".join(word for k, word in enumerate(words) if word != "…" or words[k - 1] != "…")
+
+
+def _options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m support.endings", description=__doc__)
+    parser.add_argument("--count", type=int, default=10_000, help="scenes")
+    parser.add_argument("--first", type=int, default=0, help="number of the first")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument("--out", type=Path, default=FILE, help="file for the result")
+    parser.add_argument("--journal", type=Path, help="file with a line for each scene; those that have one are not run")
+    return parser.parse_args()
+
+
+def note(journal: Path, ending: Ending) -> None:
+    """Add a line to a journal."""
+    with journal.open("a", encoding="utf-8") as stream:
+        stream.write(json.dumps(asdict(ending)) + "\n")
+
+
+def noted(journal: Path | None) -> list[Ending]:
+    """What a journal has; a process that was killed may have left a line unfinished."""
+    found: list[Ending] = []
+    if journal is not None and journal.exists():
+        for line in journal.read_text("utf-8").splitlines():
+            with suppress(ValueError, TypeError):
+                found.append(Ending(**json.loads(line)))
+    return found
+
+
+def main() -> None:
+    """Run the scenes, print what became of them, and keep it."""
+    given = _options()
+    wanted = range(given.first, given.first + given.count)
+    earlier = [one for one in noted(given.journal) if one.scene in wanted]
+    left = sorted(set(wanted) - {one.scene for one in earlier})
+    keep: Callable[[Ending], None] = partial(note, given.journal) if given.journal is not None else lambda ending: None
+    with tempfile.TemporaryDirectory() as temporary:
+        ended, stopped = endings(left, given.jobs, write_terrains(Path(temporary)), keep)
+    result = account(sorted([*earlier, *ended], key=lambda one: one.scene))
+    print(json.dumps(result, indent=2, ensure_ascii=False))
+    if not stopped:
+        given.out.parent.mkdir(parents=True, exist_ok=True)
+        write_json(given.out, {"dynsim_version": __version__, "seed": SEED, **result})
+
+
+if __name__ == "__main__":
+    # By its name: other processes find it by that.
+    from support import endings as module
+
+    module.main()
