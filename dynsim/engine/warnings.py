@@ -326,7 +326,7 @@ def capped(stepping: dict[str, Any]) -> list[str]:
 def _base_warnings(record: Record, scenario: Scenario, prepared: Prepared) -> list[str]:
     """What a mobile base does that a real one could not do."""
     base, run, settle = prepared.model.robot.base, prepared.run, scenario.metrics.settle_s
-    if base is None or run.support is None:
+    if base is None:
         return []
     found = []
     load, traction = record["wheel_load"], record["traction_demand"]
