@@ -20,12 +20,12 @@ from dynsim.draw.figures import style
 from dynsim.engine import provenance
 from dynsim.errors import CheckRefused, DynsimError, MissingEntry, ModelError, RecordError, ScenarioError
 from dynsim.hardware.errors import ServoMapError
-from dynsim.hardware.export import export_record
 from dynsim.hardware.replay.check import check_motion
 from dynsim.hardware.replay.compare import compare_records
 from dynsim.hardware.servo_map import load_servo_map
 from dynsim.model.description import Inertia, Link, Robot
 from dynsim.record import Record
+from dynsim.record.joint_motion import export_record
 from dynsim.scenario import build, build_model, load_scenario, scenario_from_resolved, variant_names
 
 Q = np.zeros(10)
