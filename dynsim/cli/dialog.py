@@ -103,7 +103,7 @@ def find_senses(
         for servo in chosen:
             moved = _nudge(bus, clock, servo_map, servo, live=live or not real)
             if moved is None:
-                console.print(f"{servo.joint} (ID {servo.id}): fit to move")
+                console.print(f"{servo}: fit to move")
                 continue
             answer = _shown(console, moved, asked=asked)
             while answer == "again":

@@ -104,10 +104,10 @@ def _compare_with_map(found: list[Any], servo_map: Any) -> None:
     from dynsim.hardware.errors import VerificationFailed
 
     seen = {servo.id: servo for servo in found}
-    wrong = [f"{servo.joint} (ID {servo.id}) did not answer" for servo in servo_map.servos if servo.id not in seen]
+    wrong = [f"{servo} did not answer" for servo in servo_map.servos if servo.id not in seen]
     wrong += [f"ID {id_} is not in the map" for id_ in seen if id_ not in servo_map.ids]
     wrong += [
-        f"{servo.joint} (ID {servo.id}) is {seen[servo.id].model_name}, the map says {servo.model.name}"
+        f"{servo} is {seen[servo.id].model_name}, the map says {servo.model.name}"
         for servo in servo_map.servos
         if servo.id in seen and seen[servo.id].model != servo.model.number
     ]
@@ -175,12 +175,10 @@ def replay(
     Ctrl-C once: controlled stop. Twice: torque off.
     """
     with client_library():
-        from dynsim.cli.dialog import confirm_replay, print_limits
+        from dynsim.cli.dialog import confirm_replay
         from dynsim.hardware.errors import ServoMapError
         from dynsim.hardware.ports import VIRTUAL, bus_on
-        from dynsim.hardware.replay.display import displayed
-        from dynsim.hardware.replay.session import run_replay, shown_by
-        from dynsim.hardware.replay.states import StopRequest, stop_on_signals
+        from dynsim.hardware.replay.session import shown_by
         from dynsim.hardware.virtual.faults import load_fault_script
 
         if (faults or plant) and port != VIRTUAL:
@@ -194,29 +192,61 @@ def replay(
         moves = live or port == VIRTUAL
         if live and port != VIRTUAL:
             confirm_replay(console, servo_map, motion, port, asked=not yes)
-        stop = StopRequest()
         with shown_by({"standard output": sys.stdout}, folder) as lost:
-            with stop_on_signals(stop), nullcontext() if quiet else displayed(console, lost) as observer:
-                result = run_replay(
-                    motion,
-                    servo_map,
-                    bus_on(port, servo_map, script=script, plant=robot),
-                    folder,
-                    policy=policy.value if policy else None,
-                    live=moves,
-                    write_eeprom=configure,
-                    stop=stop,
-                    observer=observer,
-                    provenance={"port": port, "record": str(record), "simulated": simulated.provenance},
-                )
+            result = replayed(
+                motion,
+                servo_map,
+                bus_on(port, servo_map, script=script, plant=robot),
+                folder,
+                lost,
+                quiet=quiet,
+                live=moves,
+                policy=policy,
+                write_eeprom=configure,
+                provenance={"port": port, "record": str(record), "simulated": simulated.provenance},
+            )
             print_timing(result)
-            if not moves:
-                print_limits(console, result.limits)
-                console.print("dry run: servos verified and the bus timed, nothing was moved; --live moves")
-                return
-            left = "ON, holding" if result.end_state == "holding" else "off"
-            console.print(f"replayed; torque {left}; {folder / 'measured.h5'}")
-            console.print(f"compare: dynsim hw compare {record} {folder / 'measured.h5'}")
+            if moves:
+                tell_replay(result, "replayed", folder, record)
+            else:
+                tell_dry_run(result)
+
+
+def replayed(
+    motion: Any,
+    servo_map: Any,
+    connection: Any,
+    folder: Path,
+    lost: dict[str, BaseException],
+    *,
+    quiet: bool,
+    policy: Policy | None,
+    **options: Any,
+) -> Any:
+    """Run a replay that signals stop, with a progress bar unless ``quiet``; why that failed joins ``lost``."""
+    from dynsim.hardware.replay.display import displayed
+    from dynsim.hardware.replay.session import run_replay
+    from dynsim.hardware.replay.states import StopRequest, stop_on_signals
+
+    stop = StopRequest()
+    options |= {"policy": policy.value if policy else None, "stop": stop}
+    with stop_on_signals(stop), nullcontext() if quiet else displayed(console, lost) as observer:
+        return run_replay(motion, servo_map, connection, folder, observer=observer, **options)
+
+
+def tell_dry_run(result: Any) -> None:
+    """What a replay found that moved nothing."""
+    from dynsim.cli.dialog import print_limits
+
+    print_limits(console, result.limits)
+    console.print("dry run: servos verified and the bus timed, nothing was moved; --live moves")
+
+
+def tell_replay(result: Any, done: str, folder: Path, record: Path) -> None:
+    """How a motion was left that went well, and how to go on."""
+    left = "ON, holding" if result.end_state == "holding" else "off"
+    console.print(f"{done}; torque {left}; {folder / 'measured.h5'}")
+    console.print(f"compare: dynsim hw compare {record} {folder / 'measured.h5'}")
 
 
 def _plant(scenario: str, variant: str | None, servo_map: Any, motion: Any) -> Any:
@@ -427,8 +457,8 @@ def export(
     trust: TrustOption = False,
 ) -> None:
     """Write the joint motion of a record for other programs."""
-    from dynsim.hardware.export import SUFFIX, export_record
     from dynsim.record import Record
+    from dynsim.record.joint_motion import SUFFIX, export_record
 
     target = out or record.with_suffix(SUFFIX[format_.value])
     console.print(f"written: {export_record(Record.load(record, trust=trust), target, format_.value, rate=rate)}")

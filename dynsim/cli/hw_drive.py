@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,6 +22,9 @@ from dynsim.cli.hardware import (
     client_library,
     console,
     print_timing,
+    replayed,
+    tell_dry_run,
+    tell_replay,
 )
 from dynsim.cli.teleop import (
     BaseSpeedOption,
@@ -79,14 +81,12 @@ def hw_drive(
     """
     require_websockets()
     with client_library():
-        from dynsim.cli.dialog import confirm_replay, print_limits
+        from dynsim.cli.dialog import confirm_replay
         from dynsim.engine.results import RUN_FILES
         from dynsim.hardware.errors import ServoMapError
         from dynsim.hardware.ports import VIRTUAL, bus_on
-        from dynsim.hardware.replay.display import displayed
         from dynsim.hardware.replay.drive import check_drive
-        from dynsim.hardware.replay.session import run_replay, shown_by
-        from dynsim.hardware.replay.states import StopRequest, stop_on_signals
+        from dynsim.hardware.replay.session import shown_by
         from dynsim.hardware.servo_map import load_servo_map
         from dynsim.hardware.virtual.faults import load_fault_script
         from dynsim.scenario import load_scenario
@@ -104,7 +104,7 @@ def hw_drive(
     check_writable(folder, RUN_FILES)
     limits = SpeedLimits(speed, turn, base_speed)
     request = DriveRequest(loaded, servo_map, limits, longest, http_port, until_closed, folder)
-    moves, stop = live or port == VIRTUAL, StopRequest()
+    moves = live or port == VIRTUAL
     result: Any = None
     with SimulationProcess(request) as process:
         with console.status("loading the kernels; the first time they are compiled, which takes half a minute"):
@@ -125,21 +125,17 @@ def hw_drive(
         posture = dict(zip(servo_map.joints, motion.start.tolist(), strict=True))
         error: DynsimError | None = None
         try:
-            with (
-                shown_by({"standard output": sys.stdout}, folder / SERVOS) as lost,
-                stop_on_signals(stop),
-                nullcontext() if quiet else displayed(console, lost) as observer,
-            ):
-                result = run_replay(
+            with shown_by({"standard output": sys.stdout}, folder / SERVOS) as lost:
+                result = replayed(
                     motion,
                     servo_map,
                     bus_on(port, servo_map, script=script, posture=posture, in_wall_time=True),
                     folder / SERVOS,
-                    policy=policy.value if policy else None,
+                    lost,
+                    quiet=quiet,
                     live=moves,
+                    policy=policy,
                     write_eeprom=configure,
-                    stop=stop,
-                    observer=observer,
                     provenance={
                         "port": port,
                         "record": str(folder / "record.h5"),
@@ -161,17 +157,14 @@ def hw_drive(
     if result is not None and not quiet:
         print_timing(result)
     if not moves and error is None:
-        print_limits(console, result.limits)
-        console.print("dry run: servos verified and the bus timed, nothing was moved; --live moves")
+        tell_dry_run(result)
         return
     if done.saved:
         _tell_files(loaded.variant or loaded.name, folder, result, quiet=quiet)
         if not quiet:
             tell_drive(done.report, done.driven, folder)
     if error is None and not quiet:
-        left = "ON, holding" if result.end_state == "holding" else "off"
-        console.print(f"driven; torque {left}; {folder / SERVOS / 'measured.h5'}")
-        console.print(f"compare: dynsim hw compare {folder / 'record.h5'} {folder / SERVOS / 'measured.h5'}")
+        tell_replay(result, "driven", folder / SERVOS, folder / "record.h5")
     if error is not None:
         if done.failure is not None:
             errors.print(f"[red]error:[/] the simulation: {escaped(str(done.failure))}")

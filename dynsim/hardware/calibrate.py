@@ -43,7 +43,7 @@ def read_zero_ticks(bus: Bus, servos: Iterable[Servo]) -> dict[str, int]:
     for servo in chosen:
         seen = ticks[servo.joint]
         if len(seen) < READS // 2:
-            raise VerificationFailed(f"{servo.joint} (ID {servo.id}): {len(seen)} of {READS} reads answered")
+            raise VerificationFailed(f"{servo}: {len(seen)} of {READS} reads answered")
         if max(seen) - min(seen) > STILL:
             raise VerificationFailed(f"{servo.joint} moves (ticks {min(seen)} to {max(seen)}); hold it still")
     return {joint: int(np.median(seen)) for joint, seen in ticks.items()}
@@ -57,7 +57,7 @@ def refuse_torque(bus: Bus, servos: Iterable[Servo]) -> None:
         except (NoAnswer, RequestRefused) as error:
             raise VerificationFailed(f"{servo.joint}: {error}; check power, cable, ID and baud rate") from error
         if torque:
-            raise VerificationFailed(f"{servo.joint} (ID {servo.id}): torque is on; `dynsim hw stop` releases it")
+            raise VerificationFailed(f"{servo}: torque is on; `dynsim hw stop` releases it")
 
 
 def write_into_map(servo_map: ServoMap, key: Key, values: Mapping[str, int], path: Path) -> None:

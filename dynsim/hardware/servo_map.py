@@ -327,6 +327,9 @@ class Servo:
         limits = kind.limits.position_deg
         self.position_limits = (-math.inf, math.inf) if limits is None else tuple(math.radians(x) for x in limits)
 
+    def __str__(self) -> str:
+        return f"{self.joint} (ID {self.id})"
+
     @property
     def in_position_mode(self) -> bool:
         return self.kind.mode == "position"

@@ -14,11 +14,11 @@ from dynsim.draw.figures import style
 from dynsim.errors import RecordError
 from dynsim.hardware.bus.control_table import MX_106
 from dynsim.hardware.errors import ComparisonGateFailed, ServoMapError
-from dynsim.hardware.export import export_record
 from dynsim.hardware.replay.compare import Gate, check_gate, compare_records, draw_comparison, load_gate
 from dynsim.hardware.virtual.line import ADAPTER_LATENCY
 from dynsim.hardware.virtual.servo_plant import MotorLaw
 from dynsim.record import Record
+from dynsim.record.joint_motion import export_record
 
 from .conftest import swing
 

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 import dynsim
 from dynsim.draw import figures
 from dynsim.draw.figures import arm, base, motors, posture, skeleton, style, top_view
-from dynsim.hardware.export import export_record, joint_motion
 from dynsim.record import Event, Record, measures
+from dynsim.record.joint_motion import export_record, joint_motion
 from dynsim.record.measures import percent
 from dynsim.record.scene import Scene
 from dynsim.scenario import load_scenario

@@ -11,7 +11,7 @@ import pytest
 
 import dynsim
 from dynsim.cli import main
-from dynsim.hardware.export import joint_motion
+from dynsim.record.joint_motion import joint_motion
 from dynsim.scenario import build_model, scenario_from_resolved
 
 GOOD = """duration_s: 0.2

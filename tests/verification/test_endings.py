@@ -218,7 +218,7 @@ def test_the_wall_limit_ends_a_snake():
     assert len(raised.value.record.time) > 1
 
 
-def test_methods_that_are_gone_are_refused_with_what_to_take():
+def test_a_method_that_was_removed_is_told_with_its_replacement():
     for method in ("rk4", "rk43"):
         says = rf"integrator\.method = '?{method}'?: is no longer there; take dopri5, or time_stepping where steps are"
         with pytest.raises(ScenarioError, match=says):

@@ -24,8 +24,6 @@ from dynsim.snake.lifting import Lifts, lifted
 Array = NDArray[np.float64]
 MAX_DELAY = 0.5
 """Longest delay looked for [s]."""
-STRONG = 4
-"""Joints that the figure draws in colour where none are named: those with the largest rms."""
 MOVING = 3 * RAD_PER_TICK
 """A joint that moves less than this [rad], three steps of a servo's encoder, says nothing about delay."""
 WHEEL_ANGLE, WHEEL_RATE = "rho", "rho_dot"
@@ -362,97 +360,36 @@ def draw_comparison(comparison: Comparison, path: Path, joints: Sequence[str] = 
 
     Parameters
     ----------
-    joints : names of those drawn in colour, wheels among them; the ``STRONG`` worst of either if none are given
+    joints : names of those drawn in colour, wheels among them; the worst of either if none are given
 
     Raises
     ------
     RecordError
         A joint is not among those compared, or the file cannot be written.
     """
-    from dynsim.draw.figures import style
+    from dynsim.draw.figures.errors import Followed, draw_errors
 
     names = [joint.joint for joint in comparison.joints]
     wheels = [wheel.wheel for wheel in comparison.wheels]
     for name in joints:
         if name not in names + wheels:
             raise RecordError(f"no joint {shown(name)} was compared; there are: {', '.join(names + wheels)}")
-    drawn = [
-        _Drawn(
-            "joint angle [rad]",
-            "measured − simulated [mrad]",
-            "joints",
-            names,
-            [
-                (one.rms, f"{one.joint}: rms {1e3 * one.rms:.3g} mrad, at most {1e3 * one.max:.3g}")
-                for one in comparison.joints
-            ],
-            np.stack([comparison.simulated, comparison.measured]),
-            1e3,
-        )
+    texts = [f"{one.joint}: rms {1e3 * one.rms:.3g} mrad, at most {1e3 * one.max:.3g}" for one in comparison.joints]
+    rms, both = [one.rms for one in comparison.joints], np.stack([comparison.simulated, comparison.measured])
+    quantities = [
+        Followed("joints", "joint angle [rad]", "measured − simulated [mrad]", 1e3, names, rms, texts, both),
     ]
     if wheels:
-        labels = [
-            (one.rate_rms, f"{one.wheel}: rms {one.rate_rms:.3g} rad/s, angle at most {one.angle_max:.3g} rad")
+        texts = [
+            f"{one.wheel}: rms {one.rate_rms:.3g} rad/s, angle at most {one.angle_max:.3g} rad"
             for one in comparison.wheels
         ]
-        drawn.append(
-            _Drawn(
-                "wheel rate [rad/s]", "measured − sim. [rad/s]", "wheels", wheels, labels, comparison.wheel_rates, 1.0
-            )
+        rms, both = [one.rate_rms for one in comparison.wheels], comparison.wheel_rates
+        quantities.append(
+            Followed("wheels", "wheel rate [rad/s]", "measured − sim. [rad/s]", 1.0, wheels, rms, texts, both)
         )
-    with style.look():
-        figure = style.new_figure(
-            sum(4.2 + style.LEGEND_ROW / 72.0 * (3 + min(len(one.names), STRONG)) / 2 for one in drawn),
-            f"measured and simulated joints: delay {comparison.delay * 1e3:.1f} ms, worst {comparison.worst.joint} "
-            f"with rms {1e3 * comparison.worst.rms:.3g} mrad",
-        )
-        panels = figure.subplots(2 * len(drawn), 1, sharex=True)
-        for one, (values, errors) in zip(drawn, panels.reshape(-1, 2), strict=True):
-            one.draw(values, errors, comparison.time, joints)
-        panels[-1].set_xlabel("record time [s]")
-        return style.save(figure, path)
-
-
-@dataclass(frozen=True)
-class _Drawn:
-    """A kind of joints in the figure: two panels."""
-
-    quantity: str
-    error: str
-    kind: str
-    names: list[str]
-    labels: list[tuple[float, str]]  # rms, and words for the errors
-    values: Array  # (2, T, N), simulated and measured
-    scale: float
-
-    def draw(self, values: Any, errors: Any, time: Array, wanted: Sequence[str]) -> None:
-        """Values, measured over simulated, of some in colour, and errors of all."""
-        from dynsim.draw.figures import style
-
-        ranking = sorted(range(len(self.names)), key=lambda k: -self.labels[k][0])
-        named = [self.names.index(name) for name in dict.fromkeys(wanted) if name in self.names]
-        chosen = named or ranking[:STRONG]
-        looks = style.variant_styles([self.names[k] for k in chosen])
-        simulated, measured = self.values
-        for k in chosen:
-            colour = {"color": looks[self.names[k]]["color"], "linestyle": looks[self.names[k]]["linestyle"]}
-            style.line(values, time, measured[:, k], linewidth=1.2, **colour)
-            # On top and dashed: where both agree, both are seen.
-            over = {"color": style.BLACK, "linewidth": 0.9, "linestyle": (0, (4, 3))}
-            style.line(values, time, simulated[:, k], **over)
-        for k in [k for k in reversed(ranking) if k not in chosen] + chosen:
-            look: dict[str, Any] = {"color": "#CFCFCF", "linewidth": 0.7}
-            if k in chosen:
-                own = looks[self.names[k]]
-                look = {"color": own["color"], "linestyle": own["linestyle"], "linewidth": 1.2}
-                look["label"] = self.labels[k][1]
-            style.line(errors, time, self.scale * (measured[:, k] - simulated[:, k]), **look)
-        if len(chosen) < len(self.names):
-            left = len(self.names) - len(chosen)
-            errors.plot([], [], color="#CFCFCF", lw=0.7, label=f"the other {left} {self.kind}")
-        values.plot([], [], color=style.BLACK, lw=0.9, linestyle=(0, (4, 3)), label="simulated (measured in colour)")
-        style.legend_above(values)
-        style.legend_above(errors, columns=2)
-        values.set_ylabel(self.quantity)
-        errors.axhline(0.0, color=style.GREY, linewidth=0.6)
-        errors.set_ylabel(self.error)
+    title = (
+        f"measured and simulated joints: delay {comparison.delay * 1e3:.1f} ms, worst {comparison.worst.joint} "
+        f"with rms {1e3 * comparison.worst.rms:.3g} mrad"
+    )
+    return draw_errors(title, comparison.time, quantities, joints, path)

@@ -178,12 +178,12 @@ class Replay:
                 self.bus.write(servo.id, FIELDS[item], value)
             self.bus.write(servo.id, FIELDS[name], goal)
             if self.bus.read(servo.id, FIELDS[name]) != goal:
-                raise Stopped(Fault(Cause.ARMING, f"{servo.joint} (ID {servo.id}) did not take its goal", (servo.id,)))
+                raise Stopped(Fault(Cause.ARMING, f"{servo} did not take its goal", (servo.id,)))
             if servo.id in on:
                 self._check_still_on([servo])
             self.bus.write(servo.id, FIELDS["torque_enable"], 1)
             if not self.bus.read(servo.id, FIELDS["torque_enable"]):
-                raise Stopped(Fault(Cause.ARMING, f"{servo.joint} (ID {servo.id}): torque stays off", (servo.id,)))
+                raise Stopped(Fault(Cause.ARMING, f"{servo}: torque stays off", (servo.id,)))
             self.loop.take_over(index, goal, servo.to_angle(present))
         # Who stopped the robot meanwhile has not reached the servos that were armed after that.
         self._check_still_on(self._servos)
@@ -201,7 +201,7 @@ class Replay:
                 raise NoAnswer(servo.id, garbled=False)
         lost = [servo for servo in servos if not health[servo.id]["torque_enable"]]
         if lost:
-            names = ", ".join(f"{servo.joint} (ID {servo.id})" for servo in lost)
+            names = ", ".join(map(str, lost))
             text = f"{names}: torque is off again (switched off by another program, or restarted)"
             raise Stopped(Fault(Cause.TORQUE_LOST, text, tuple(servo.id for servo in lost)))
 

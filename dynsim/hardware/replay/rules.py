@@ -228,14 +228,18 @@ class AbortRules:
         ]
         if not hit:
             return []
-        return [Fault(Cause.ALERT, f"hardware error reported by {_names(hit)}", tuple(servo.id for servo in hit))]
+        return [
+            Fault(
+                Cause.ALERT, f"hardware error reported by {', '.join(map(str, hit))}", tuple(servo.id for servo in hit)
+            )
+        ]
 
     def _health(self, servo: Servo, registers: dict[str, int]) -> list[Fault]:
-        who, found = f"{servo.joint} (ID {servo.id})", []
+        found: list[Fault] = []
 
         def add(cause: Cause, text: str) -> None:
             if self._new(cause, servo.id):
-                found.append(Fault(cause, f"{who}: {text}", (servo.id,)))
+                found.append(Fault(cause, f"{servo}: {text}", (servo.id,)))
 
         if registers["hardware_error"]:
             add(Cause.ALERT, describe_hardware_error(registers["hardware_error"]))
@@ -249,7 +253,7 @@ class AbortRules:
         supply = self._safety.supply
         if not supply.lowest <= volts <= supply.highest and self._new(Cause.VOLTAGE):
             # One supply feeds all: no servo is singled out, they keep step.
-            text = f"{who}: {volts:.1f} V, allowed {supply.lowest:g} to {supply.highest:g} V"
+            text = f"{servo}: {volts:.1f} V, allowed {supply.lowest:g} to {supply.highest:g} V"
             found.append(Fault(Cause.VOLTAGE, text))
         return found
 
@@ -257,10 +261,10 @@ class AbortRules:
         hit = [self._servos[k] for k in indices if self._new(Cause.MISSED_STATUS, self._servos[k].id)]
         if not hit:
             return []
-        text = f"no status for {self._safety.missed_cycles} cycles: {_names(hit)}"
+        text = f"no status for {self._safety.missed_cycles} cycles: {', '.join(map(str, hit))}"
         outdated = [servo for servo in hit if servo.id in cycle.outdated]
         if outdated:
-            text += f"; answers to earlier requests come from {_names(outdated)}"
+            text += f"; answers to earlier requests come from {', '.join(map(str, outdated))}"
         if len(indices) == len(self._servos) > 1:
             text += "; nobody answers: is the supply or the line lost?"
         return [Fault(Cause.MISSED_STATUS, text, tuple(servo.id for servo in hit))]
@@ -286,10 +290,6 @@ class AbortRules:
             "the computer is too slow or too busy; close other programs, or give it more time by a lower --rate"
         )
         return [Fault(Cause.DEADLINE, text)]
-
-
-def _names(servos: list[Servo]) -> str:
-    return ", ".join(f"{servo.joint} (ID {servo.id})" for servo in servos)
 
 
 def _count(counters: NDArray[np.int64], hit: NDArray[np.bool_], unknown: NDArray[np.bool_]) -> NDArray[np.int64]:

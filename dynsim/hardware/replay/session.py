@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -28,8 +28,7 @@ from dynsim.hardware.replay.output import (
     move_away,
 )
 from dynsim.hardware.replay.rules import Cause
-from dynsim.hardware.replay.states import Progress, ReplayResult, StopRequest
-from dynsim.hardware.safety import FaultPolicy
+from dynsim.hardware.replay.states import ReplayResult
 from dynsim.hardware.servo_map import ServoMap
 from dynsim.system.files import json_text, replace_together, write_json
 
@@ -42,12 +41,8 @@ def run_replay(
     connection: AbstractContextManager[tuple[Bus, Clock]],
     folder: Path,
     *,
-    policy: FaultPolicy | None = None,
     live: bool = False,
-    write_eeprom: bool = False,
-    stop: StopRequest | None = None,
-    observer: Callable[[Progress], None] | None = None,
-    provenance: dict[str, Any] | None = None,
+    **options: Any,
 ) -> ReplayResult:
     """Replay a checked motion; ``measured.h5``, ``summary.json``, ``replay.log`` and register dumps go to ``folder``.
 
@@ -55,7 +50,7 @@ def run_replay(
     thread of their own, the cycles to ``measured.part``: when this process dies
     :func:`dynsim.hardware.replay.measured.recover` makes a record of it.
 
-    ``connection`` gives bus and clock (:func:`dynsim.hardware.ports.bus_on`); the other parameters are those of
+    ``connection`` gives bus and clock (:func:`dynsim.hardware.ports.bus_on`); the options are those of
     :class:`dynsim.hardware.replay.machine.Replay`.
 
     Raises
@@ -74,20 +69,7 @@ def run_replay(
     try:
         with connection as (bus, clock):
             log, moved = _open_log(folder)
-            replay = Replay(
-                motion,
-                servo_map,
-                bus,
-                clock,
-                policy=policy,
-                live=live,
-                write_eeprom=write_eeprom,
-                stop=stop,
-                log=log,
-                dump_folder=folder,
-                observer=observer,
-                provenance=provenance,
-            )
+            replay = Replay(motion, servo_map, bus, clock, live=live, log=log, dump_folder=folder, **options)
             background = _stream(replay, log, folder)
             try:
                 if moved:

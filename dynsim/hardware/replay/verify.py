@@ -79,7 +79,7 @@ def configure(bus: Bus, servo_map: ServoMap, report: Callable[[str], None]) -> N
         for name, value in _wanted_eeprom(servo, servo_map).items():
             if now[name] != value:
                 bus.write(servo.id, servo.model.fields[name], value)
-                report(f"{servo.joint} (ID {servo.id}): {name} {now[name]} -> {value}")
+                report(f"{servo}: {name} {now[name]} -> {value}")
 
 
 def _wanted_eeprom(servo: Servo, servo_map: ServoMap) -> Registers:
@@ -127,7 +127,7 @@ def verify(
         if registers["model_number"] == servo.model.number:
             rows.append(compare_limits(servo, registers, servo_map.safety, needs))
             found += [*rows[-1].refused, *_out_of_place(servo, registers)]
-        problems += [f"{servo.joint} (ID {servo.id}): {text}" for text in found]
+        problems += [f"{servo}: {text}" for text in found]
     missed = [] if problems else _trial_reads(bus, servo_map, poll)
     if (silent or missed) and (busy := too_busy(bus)):
         missed.append(busy)
@@ -193,7 +193,7 @@ def _trial_reads(bus: Bus, servo_map: ServoMap, poll: Callable[[], None]) -> lis
     if all(count == TRIAL_READS for count in missed.values()):
         return ["nobody answers a sync read: is the adapter's latency timer at 1 ms?"]
     return [
-        f"{servo.joint} (ID {servo.id}): {missed[servo.id]} of {TRIAL_READS} answers were missing or garbled; "
+        f"{servo}: {missed[servo.id]} of {TRIAL_READS} answers were missing or garbled; "
         "two servos with this ID, or a bad cable?"
         for servo in servo_map.servos
         if missed[servo.id] > TRIAL_MISSES
@@ -396,7 +396,7 @@ def read_ticks(bus: Bus, servos: list[Servo]) -> dict[int, int]:
             break
         for id_, reply in bus.sync_read(missing, *STATE_BLOCK).replies.items():
             ticks[id_] = int.from_bytes(reply.data[6:10], "little", signed=True)
-    silent = [f"{servo.joint} (ID {servo.id})" for servo in servos if servo.id not in ticks]
+    silent = [str(servo) for servo in servos if servo.id not in ticks]
     if silent:
         busy = too_busy(bus)
         raise VerificationFailed(

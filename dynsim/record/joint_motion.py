@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynsim.errors import RecordError
-from dynsim.hardware.replay.trajectory import Path as JointPath
-from dynsim.record import Record
+from dynsim.record.record import Record
 from dynsim.system.files import replacing
 
+Array = NDArray[np.float64]
 Format = Literal["csv", "joint-trajectory", "urdf-log"]
 SUFFIX: dict[str, str] = {"csv": ".csv", "joint-trajectory": ".trajectory.yaml", "urdf-log": ".jsonl"}
 RATES = {"q": "v", "phi": "phi_dot", "rho": "rho_dot"}
@@ -48,10 +48,12 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
     if rate is not None:
         if not 0 < rate < np.inf:
             raise RecordError(f"--rate must be positive, not {rate}")
-        path_between = JointPath(time, position, velocity[:-1], velocity[1:])
+        # One of the heavy libraries, which wait until somebody needs them.
+        from scipy.interpolate import CubicHermiteSpline
+
+        between = CubicHermiteSpline(time, position, velocity)
         time = np.arange(0.0, time[-1] + 0.5 / rate, 1.0 / rate).clip(max=time[-1])
-        knots = [_within(path_between, instant) for instant in time]
-        position, velocity = np.array([q for q, _ in knots]), np.array([v for _, v in knots])
+        position, velocity = between(time), between(time, 1)
     writers: dict[str, Callable[..., None]] = {
         "csv": partial(_write_csv, record),
         "joint-trajectory": _write_joint_trajectory,
@@ -67,7 +69,7 @@ def export_record(record: Record, path: Path, format_: Format, *, rate: float | 
 
 def joint_motion(
     record: Record,
-) -> tuple[list[str], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[list[str], Array, Array, Array]:
     """Joint names, time from 0 [s], positions and rates [rad, rad/s; m, m/s] of a record.
 
     Raises
@@ -103,22 +105,13 @@ def _in_both(record: Record, name: str, rate: str) -> list[str]:
     return [label for label in record.labels[name] if label in record.labels[rate]]
 
 
-def _within(path: JointPath, time: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    # The path is at rest beyond its ends; the record is not.
-    if time <= path.start:
-        return path.position[0], path.rate_after[0]
-    if time >= path.end:
-        return path.position[-1], path.rate_before[-1]
-    return path.at(time)
-
-
 def _write_csv(
     record: Record,
     file: TextIO,
     joints: list[str],
-    time: NDArray[np.float64],
-    q: NDArray[np.float64],
-    v: NDArray[np.float64],
+    time: Array,
+    q: Array,
+    v: Array,
 ) -> None:
     pairs = [(name, rate) for name, rate in RATES.items() if name in record and rate in record]
     units = [[record.units[pair[k]] for pair in pairs for _ in _in_both(record, *pair)] for k in (0, 1)]
@@ -128,9 +121,7 @@ def _write_csv(
     rows.writerows([f"{value:.9g}" for value in (t, *qs, *vs)] for t, qs, vs in zip(time, q, v, strict=True))
 
 
-def _write_joint_trajectory(
-    file: TextIO, joints: list[str], time: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64]
-) -> None:
+def _write_joint_trajectory(file: TextIO, joints: list[str], time: Array, q: Array, v: Array) -> None:
     file.write(f"joint_names: [{', '.join(map(_yaml_text, joints))}]\npoints:\n")
     for t, qs, vs in zip(time, q, v, strict=True):
         seconds, nanoseconds = divmod(round(t * 1e9), 1_000_000_000)
@@ -143,14 +134,12 @@ def _yaml_text(joint: str) -> str:
     return joint if re.fullmatch(r"[A-Za-z_][\w.-]*", joint) and joint.lower() not in _YAML_WORDS else json.dumps(joint)
 
 
-def _flow(values: NDArray[np.float64]) -> str:
+def _flow(values: Array) -> str:
     # YAML 1.1 reads "1e-05" as text: a float needs its point.
     return f"[{', '.join(f'{value:.9f}' for value in values)}]"
 
 
-def _write_urdf_log(
-    file: TextIO, joints: list[str], time: NDArray[np.float64], q: NDArray[np.float64], v: NDArray[np.float64]
-) -> None:
+def _write_urdf_log(file: TextIO, joints: list[str], time: Array, q: Array, v: Array) -> None:
     for t, qs, vs in zip(time, q, v, strict=True):
         line = {
             "time": round(float(t), 9),

@@ -1,0 +1,85 @@
+"""How far measured runs are from the simulated ones that they followed: the figure of `dynsim hw compare`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+
+from dynsim.draw.figures import style
+from dynsim.draw.figures.style import Array
+
+# Drawn in colour where none are named: those with the largest rms.
+STRONG = 4
+FAINT: dict[str, Any] = {"color": "#CFCFCF", "linewidth": 0.7}
+# On top and dashed: where both agree, both are seen.
+SIMULATED: dict[str, Any] = {"color": style.BLACK, "linewidth": 0.9, "linestyle": (0, (4, 3))}
+
+
+@dataclass(frozen=True)
+class Followed:
+    """A quantity that several joints have.
+
+    Attributes
+    ----------
+    kind : what they are, such as "joints"
+    quantity, error : labels of the axes, with units
+    scale : of the error's unit to that of the values
+    names : of the joints
+    rms : of their errors
+    texts : about their errors
+    values : (2, T, N), simulated and measured
+    """
+
+    kind: str
+    quantity: str
+    error: str
+    scale: float
+    names: list[str]
+    rms: list[float]
+    texts: list[str]
+    values: Array
+
+
+def draw_errors(title: str, time: Array, quantities: Sequence[Followed], named: Sequence[str], path: Path) -> Path:
+    """Two panels for each quantity: values of some joints, measured over simulated, and the errors of all.
+
+    Parameters
+    ----------
+    named : joints in colour, of any quantity; the ``STRONG`` worst of one of which none is named
+    """
+    with style.look():
+        rows = [style.LEGEND_ROW / 72.0 * (3 + min(len(one.names), STRONG)) / 2 for one in quantities]
+        figure = style.new_figure(sum(4.2 + row for row in rows), title)
+        panels = figure.subplots(2 * len(quantities), 1, sharex=True)
+        for one, (values, errors) in zip(quantities, panels.reshape(-1, 2), strict=True):
+            _draw(values, errors, time, one, named)
+        panels[-1].set_xlabel("record time [s]")
+        return style.save(figure, path)
+
+
+def _draw(values: Axes, errors: Axes, time: Array, one: Followed, named: Sequence[str]) -> None:
+    ranking = sorted(range(len(one.names)), key=lambda k: -one.rms[k])
+    chosen = [one.names.index(name) for name in dict.fromkeys(named) if name in one.names] or ranking[:STRONG]
+    looks = style.variant_styles([one.names[k] for k in chosen])
+    simulated, measured = one.values
+    coloured = {
+        k: {key: looks[one.names[k]][key] for key in ("color", "linestyle")} | {"linewidth": 1.2} for k in chosen
+    }
+    for k in chosen:
+        style.line(values, time, measured[:, k], **coloured[k])
+        style.line(values, time, simulated[:, k], **SIMULATED)
+    for k in [k for k in reversed(ranking) if k not in chosen] + chosen:
+        look = coloured[k] | {"label": one.texts[k]} if k in chosen else FAINT
+        style.line(errors, time, one.scale * (measured[:, k] - simulated[:, k]), **look)
+    if others := len(one.names) - len(chosen):
+        errors.plot([], [], label=f"the other {others} {one.kind}", **FAINT)
+    values.plot([], [], label="simulated (measured in colour)", **SIMULATED)
+    style.legend_above(values)
+    style.legend_above(errors, columns=2)
+    values.set_ylabel(one.quantity)
+    errors.axhline(0.0, color=style.GREY, linewidth=0.6)
+    errors.set_ylabel(one.error)
