@@ -76,6 +76,7 @@ def scan(
     """List the servos that answer, at every usual bit rate. Reads only."""
     with client_library():
         from dynsim.hardware.bus import scan as survey
+        from dynsim.hardware.bus.control_table import RETURN_DELAY_SECONDS_PER_UNIT, VOLT_PER_UNIT
         from dynsim.hardware.errors import VerificationFailed
         from dynsim.hardware.servo_map import load_servo_map
 
@@ -90,11 +91,13 @@ def scan(
     owners = {servo.id: servo for servo in servo_map.servos} if servo_map else {}
     table = Table("ID", "model", "fw", "bit/s", "mode", "delay µs", "V", "°C", "torque", "error", "joint")
     for servo in found:
-        numbers = [f"{servo.return_delay * 1e6:.0f}", f"{servo.voltage:.1f}", f"{servo.temperature:.0f}"]
-        error = f"0x{servo.hardware_error:02x}" if servo.hardware_error else "-"
+        told = servo.registers
+        delay, volts = told["return_delay"] * RETURN_DELAY_SECONDS_PER_UNIT, told["present_voltage"] * VOLT_PER_UNIT
+        numbers = [f"{delay * 1e6:.0f}", f"{volts:.1f}", f"{told['present_temperature']:.0f}"]
+        error = f"0x{told['hardware_error']:02x}" if told["hardware_error"] else "-"
         joint = owners[servo.id].joint if servo.id in owners else "-"
-        who = [str(servo.id), servo.model_name, *map(str, (servo.firmware, servo.baud, servo.mode))]
-        table.add_row(*who, *numbers, "ON" if servo.torque else "off", error, joint)
+        who = [str(servo.id), servo.model_name, *map(str, (servo.firmware, servo.baud, told["operating_mode"]))]
+        table.add_row(*who, *numbers, "ON" if told["torque_enable"] else "off", error, joint)
     console.print(table)
     if servo_map:
         _compare_with_map(found, servo_map)
